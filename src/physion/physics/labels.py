@@ -1,0 +1,50 @@
+"""The answer to the question of every trial: does the agent touch the patient?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from physion.physics.trajectory import Trajectory
+from physion.scenes.scene import OBSERVED_FRAMES, Scene
+
+CLOTH_CONTACT_GAP = 0.01
+"""Metres between cloth and patient below which they touch, for every cloth trial alike."""
+
+
+@dataclass(frozen=True)
+class Labels:
+    """What happened between agent and patient.
+
+    - ``contact``: they touch in some frame of the trial.
+    - ``first_frame``: the first such frame, None without contact.
+    - ``observed``: they touch already inside the observed frames, so nothing is left to predict.
+    - ``min_distance``: smallest gap between cloth and patient in metres, None without cloth.
+    - ``robust``: share of jittered simulations with the same outcome, None if not measured.
+    """
+
+    contact: bool
+    first_frame: int | None
+    observed: bool
+    min_distance: float | None = None
+    robust: float | None = None
+
+
+def label_contact(scene: Scene, trajectory: Trajectory) -> Labels:
+    """Label a trajectory by its contacts; by one physical gap where agent or patient is cloth."""
+    agent, patient = scene.index(scene.roles.agent), scene.index(scene.roles.patient)
+    if max(agent, patient) < len(scene.bodies):
+        frames = trajectory.contacts.frames_of(agent, patient)
+        distance = None
+    else:
+        gaps = trajectory.cloth_distance
+        frames = np.flatnonzero(gaps < CLOTH_CONTACT_GAP).astype(np.int32)
+        distance = float(np.nanmin(gaps)) if np.isfinite(gaps).any() else None
+    first = int(frames[0]) if len(frames) else None
+    return Labels(
+        contact=first is not None,
+        first_frame=first,
+        observed=first is not None and first < OBSERVED_FRAMES,
+        min_distance=distance,
+    )

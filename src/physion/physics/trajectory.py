@@ -1,0 +1,138 @@
+"""How a scene moved: pure arrays over frames, without engine or pixel."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from physion.errors import BadInputError
+
+Floats = NDArray[np.float32]
+Ints = NDArray[np.int32]
+
+ENVIRONMENT = -1
+"""Index that stands for the floor in contacts."""
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """One row for each pair that touches in a frame, at its deepest point.
+
+    A pair touches when the engine's contact pushed (impulse > 0) or the surfaces met.
+
+    - ``frame`` (C,): the frame that shows the touch.
+    - ``bodies`` (C, 2): indices of `Scene.names`, the smaller first; `ENVIRONMENT` is the floor.
+    - ``point`` (C, 3): metres, world. ``normal`` (C, 3): unit, from the first to the second body.
+    - ``impulse`` (C,): newton seconds along the normal during the frame, all points summed.
+    """
+
+    frame: Ints
+    bodies: Ints
+    point: Floats
+    normal: Floats
+    impulse: Floats
+
+    @classmethod
+    def empty(cls) -> Contacts:
+        """No contact at all."""
+        return cls(
+            np.zeros(0, np.int32),
+            np.zeros((0, 2), np.int32),
+            np.zeros((0, 3), np.float32),
+            np.zeros((0, 3), np.float32),
+            np.zeros(0, np.float32),
+        )
+
+    def frames_of(self, a: int, b: int) -> Ints:
+        """Sorted frames in which bodies ``a`` and ``b`` touch."""
+        pair = np.array([min(a, b), max(a, b)])
+        return np.unique(self.frame[(self.bodies == pair).all(axis=1)])
+
+
+@dataclass(frozen=True)
+class State:
+    """One instant: what an engine needs to go on from there.
+
+    Arrays are as in `Trajectory`, without the frame axis. ``frame`` counts from the start of the
+    trial, so that pushes that are still to come are given.
+    """
+
+    frame: int
+    positions: NDArray[np.float64]
+    rotations: NDArray[np.float64]
+    velocities: NDArray[np.float64]
+    angular_velocities: NDArray[np.float64]
+    cloth_vertices: NDArray[np.float64]
+    cloth_velocities: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """The motion of a scene. F frames, N rigid bodies, V cloth vertices.
+
+    - ``positions`` (F, N, 3): metres, of each body's pivot. Frame 0 is the start.
+    - ``rotations`` (F, N, 4): unit quaternions (w, x, y, z).
+    - ``velocities`` (F, N, 3): metres per second, of the centre of mass.
+    - ``angular_velocities`` (F, N, 3): radians per second, world axes.
+    - ``cloth_vertices`` (F, V, 3): metres; the cloths of the scene one after the other, each
+      row by row along x then y. V is 0 without cloth.
+    - ``completed``: all bodies came to rest, rather than the time being over.
+    - ``cloth_distance`` (F,): smallest gap in metres between the cloth's surface and the other
+      body of the question (agent or patient); NaN without cloth.
+    """
+
+    positions: Floats
+    rotations: Floats
+    velocities: Floats
+    angular_velocities: Floats
+    cloth_vertices: Floats
+    cloth_distance: Floats
+    contacts: Contacts
+    completed: bool
+    engine: str
+
+    def __post_init__(self) -> None:
+        frames = len(self.positions)
+        for name in ("rotations", "velocities", "angular_velocities", "cloth_vertices"):
+            if len(getattr(self, name)) != frames:
+                raise BadInputError(f"trajectory: {name} has not the {frames} frames of positions")
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def state(self, frame: int) -> State:
+        """The instant ``frame``, to start another simulation from."""
+        cloth = self.cloth_vertices.astype(np.float64)
+        before = max(frame - 1, 0)
+        return State(
+            frame,
+            self.positions[frame].astype(np.float64),
+            self.rotations[frame].astype(np.float64),
+            self.velocities[frame].astype(np.float64),
+            self.angular_velocities[frame].astype(np.float64),
+            cloth[frame],
+            (cloth[frame] - cloth[before]) / 0.01,
+        )
+
+    def digest(self) -> str:
+        """Hexadecimal SHA-256 of all arrays: equal trajectories, equal digests."""
+        sha = hashlib.sha256()
+        contacts = self.contacts
+        for array in (
+            self.positions,
+            self.rotations,
+            self.velocities,
+            self.angular_velocities,
+            self.cloth_vertices,
+            contacts.frame,
+            contacts.bodies,
+            contacts.point,
+            contacts.normal,
+            contacts.impulse,
+        ):
+            sha.update(repr((array.shape, array.dtype.str)).encode())
+            sha.update(np.ascontiguousarray(array).tobytes())
+        return sha.hexdigest()

@@ -1,0 +1,69 @@
+"""Names for things: scenarios, shapes, models, encoders, engines, rooms."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Iterator
+from importlib.metadata import entry_points
+from typing import Generic, TypeVar
+
+from physion.errors import PhysionError, UnknownNameError
+
+T = TypeVar("T")
+
+
+class Registry(Generic[T]):
+    """Holds one kind of thing under names.
+
+    A value is added by ``register`` (a decorator or a call), by a lazy ``"module:attribute"``
+    string, or by another package through the entry-point group ``physion.<kind>s``. Looking up
+    an unknown name raises `UnknownNameError` with the three closest names.
+    """
+
+    def __init__(self, kind: str, lazy: dict[str, str] | None = None) -> None:
+        self.kind = kind
+        self._values: dict[str, T] = {}
+        self._lazy: dict[str, str] = dict(lazy or {})
+        self._plugins_read = False
+
+    def register(self, name: str) -> Callable[[T], T]:
+        """Register the decorated value as ``name``; a second value of that name is an error."""
+
+        def add(value: T) -> T:
+            if name in self._values and self._values[name] is not value:
+                raise PhysionError(f"{self.kind} {name!r} is registered twice; choose another name")
+            self._values[name] = value
+            return value
+
+        return add
+
+    def get(self, name: str) -> T:
+        """Return the value called ``name``, importing it if it is lazy."""
+        if name not in self._values:
+            self._read_plugins()
+            if name not in self._lazy:
+                raise UnknownNameError(self.kind, name, self.names())
+            module, _, attribute = self._lazy[name].partition(":")
+            loaded = importlib.import_module(module)
+            # Importing the module may have registered the name by its own decorator.
+            if name not in self._values:
+                self._values[name] = getattr(loaded, attribute)
+        return self._values[name]
+
+    def names(self) -> list[str]:
+        """All names in alphabetical order, without importing anything."""
+        self._read_plugins()
+        return sorted(self._values.keys() | self._lazy.keys())
+
+    def _read_plugins(self) -> None:
+        if self._plugins_read:
+            return
+        self._plugins_read = True
+        for point in entry_points(group=f"physion.{self.kind}s"):
+            self._lazy.setdefault(point.name, point.value)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.names()
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names())

@@ -1,0 +1,29 @@
+"""Random numbers that depend on what is made, never on when or where it is made."""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+
+
+def stable_hash(*parts: str | int) -> int:
+    """A 128-bit number of the parts that is the same in every process and Python version."""
+    text = "\x1f".join(f"{type(part).__name__}:{part}" for part in parts)
+    return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=16).digest(), "little")
+
+
+def trial_seed(dataset: str | int, scenario: str, split: str, index: int) -> np.random.SeedSequence:
+    """The seed of one trial, a function of what names it and nothing else."""
+    return np.random.SeedSequence(stable_hash(dataset, scenario, split, index))
+
+
+def child_generator(seed: np.random.SeedSequence, name: str) -> np.random.Generator:
+    """The named random stream of a trial (``placement``, ``looks``, ``distractors``, ...).
+
+    Streams are independent of each other, so that drawing one number more for a distractor does
+    not move the agent.
+    """
+    entropy = seed.entropy
+    assert isinstance(entropy, int), "trial seeds are made by trial_seed"
+    return np.random.default_rng(np.random.SeedSequence([entropy, stable_hash(name)]))
