@@ -8,6 +8,7 @@ bottom face. Everything is frozen and serialises to JSON and back without loss.
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import math
 import types
@@ -93,11 +94,14 @@ class Cloth:
 
 @dataclass(frozen=True, slots=True)
 class Push:
-    """An impulse (newton seconds) at a point of the world, just before the step after ``frame``."""
+    """An impulse (newton seconds) at a point of the world, just before the step after ``frame``.
+
+    Without a ``point`` it acts on the centre of mass and gives no spin.
+    """
 
     body: str
     impulse: Vec3
-    point: Vec3
+    point: Vec3 | None = None
     frame: int = 0
 
 
@@ -197,6 +201,20 @@ class Scene:
             return self.names().index(name)
         except ValueError:
             raise BadSceneError(f"scene {self.name!r} holds no {name!r}") from None
+
+    def physics_digest(self) -> str:
+        """SHA-256 of all that decides the motion: equal for two scenes that only look different."""
+        bodies = [
+            [b.name, b.shape, b.position, b.scale, b.rotation, b.mass, b.kinematic, b.drag]
+            + [b.angular_drag, dataclasses.astuple(b.contact)]
+            for b in self.bodies
+            if not b.scenery
+        ]
+        cloths = [dataclasses.astuple(dataclasses.replace(c, look=Look())) for c in self.cloths]
+        rest = [dataclasses.astuple(x) for x in (*self.pushes, *self.joints, self.ending)]
+        roles = [self.roles.agent, self.roles.patient, self.settle_frames]
+        text = json.dumps([bodies, cloths, rest, roles])
+        return hashlib.sha256(text.encode()).hexdigest()
 
     def to_json(self) -> str:
         """One line of JSON that `Scene.from_json` turns back into an equal scene."""

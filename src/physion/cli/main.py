@@ -1,0 +1,68 @@
+"""``physion VERB ...``: finds the verb, imports only what it needs, turns errors into one line.
+
+Exit codes: 0 done; 1 done, but some trials failed or a check found a fault; 2 bad input or usage,
+nothing half-written; 130 interrupted, the same command goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+VERBS = {
+    "run": "the whole road: scenes, trials, models, readout, comparison, report",
+    "generate": "sample scenes and write trials",
+    "replay": "simulate official command logs and compare with the recorded outcomes",
+    "evaluate": "train models and readouts on trials and write their predictions",
+    "compare": "compare predictions with people",
+    "ls": "list scenarios, shapes, models, encoders, metrics",
+    "doctor": "check this machine and say what to install",
+}
+
+
+def _usage() -> str:
+    verbs = "\n".join(f"  {name:<10} {text}" for name, text in VERBS.items())
+    return (
+        "usage: physion VERB [options]     (physion VERB --help says which)\n\n"
+        f"{verbs}\n\n"
+        "exit codes: 0 done, 1 done with failures, 2 bad input, 130 interrupted"
+    )
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one verb; returns the exit code."""
+    words = sys.argv[1:] if argv is None else argv
+    if not words or words[0] in ("-h", "--help"):
+        print(_usage())
+        return 0 if words else 2
+    if words[0] == "--version":
+        from physion import __version__
+
+        print(f"physion {__version__}")
+        return 0
+    from physion.errors import PhysionError, UnknownNameError
+
+    try:
+        if words[0] not in VERBS:
+            raise UnknownNameError("verb", words[0], VERBS)
+        import tyro
+
+        module = importlib.import_module(f"physion.cli.{words[0]}")
+        options = tyro.cli(
+            module.Options,
+            args=words[1:],
+            prog=f"physion {words[0]}",
+            description=module.__doc__,
+        )
+        return int(module.main(options))
+    except PhysionError as error:
+        message = " ".join(str(error).split())
+        print(f"physion: {message}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("physion: interrupted; the same command goes on from here", file=sys.stderr)
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,48 @@
+"""The same scene again, a hair's breadth elsewhere: how far is its outcome a matter of luck?"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from physion.scenes.scene import Scene, Vec3
+
+
+def jitter_scene(scene: Scene, distance: float, generator: np.random.Generator) -> Scene:
+    """Move every body that can move, and every cloth, sideways by normal noise.
+
+    ``distance`` is the standard deviation in metres along x and along y. Bodies that a joint
+    holds together move together, and a push moves with its body.
+    """
+    leaders = {joint.child: joint.parent for joint in scene.joints}
+    moving = [body.name for body in scene.bodies if not (body.kinematic or body.scenery)]
+    moving += [cloth.name for cloth in scene.cloths]
+    shifts = {name: (*generator.normal(0.0, distance, 2).tolist(), 0.0) for name in moving}
+
+    def moved(name: str, position: Vec3) -> Vec3:
+        while name in leaders:
+            name = leaders[name]
+        dx, dy, dz = shifts.get(name, (0.0, 0.0, 0.0))
+        return (position[0] + dx, position[1] + dy, position[2] + dz)
+
+    return replace(
+        scene,
+        bodies=tuple(replace(b, position=moved(b.name, b.position)) for b in scene.bodies),
+        cloths=tuple(replace(c, position=moved(c.name, c.position)) for c in scene.cloths),
+        pushes=tuple(
+            p if p.point is None else replace(p, point=moved(p.body, p.point))
+            for p in scene.pushes
+        ),
+    )
+
+
+def pair_agreement(outcomes: np.ndarray) -> float:
+    """Chance that two different runs of one scene agree; ``outcomes`` is (runs,) of bool.
+
+    NaN for fewer than two runs.
+    """
+    runs, hits = len(outcomes), int(np.count_nonzero(outcomes))
+    if runs < 2:
+        return float("nan")
+    return (hits * (hits - 1) + (runs - hits) * (runs - hits - 1)) / (runs * (runs - 1))

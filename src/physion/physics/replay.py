@@ -1,0 +1,151 @@
+"""Official scenes simulated again: how often does our outcome equal the recorded one?"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import rankdata
+
+from physion.physics.engine import simulate
+from physion.physics.jitter import jitter_scene, pair_agreement
+from physion.physics.labels import label_contact
+from physion.scenes.scene import FRAME_TIME
+from physion.scenes.tdw import ImportedTrial
+from physion.seeds import child_generator, trial_seed
+
+
+@dataclass(frozen=True)
+class ReplayTask:
+    """One trial to replay, ``repeats`` more times with ``jitter`` metres of sideways noise."""
+
+    trial: ImportedTrial
+    jitter: float = 0.0
+    repeats: int = 0
+
+
+@dataclass(frozen=True)
+class Replay:
+    """One trial replayed. Frames count from 0; ``distance`` is the smallest cloth gap in metres.
+
+    ``cpu_seconds`` is the processor time of one simulation, ``physics_seconds`` what it covers.
+    ``jittered`` holds the outcomes of the runs with jitter.
+    """
+
+    name: str
+    scenario: str
+    recorded: bool
+    simulated: bool
+    recorded_frame: int | None
+    simulated_frame: int | None
+    frames: int
+    distance: float | None
+    cpu_seconds: float
+    physics_seconds: float
+    jittered: tuple[bool, ...] = ()
+
+    @property
+    def agrees(self) -> bool:
+        """Our outcome is the recorded one."""
+        return self.recorded == self.simulated
+
+
+def replay_trial(task: ReplayTask) -> Replay:
+    """Simulate one imported trial and set it beside what was recorded."""
+    scene, outcome = task.trial.scene, task.trial.outcome
+    started = time.process_time()
+    trajectory = simulate(scene)
+    spent = time.process_time() - started
+    labels = label_contact(scene, trajectory)
+    seed = trial_seed("jitter", scene.scenario, scene.name, 0)
+    outcomes = []
+    for repeat in range(task.repeats):
+        moved = jitter_scene(scene, task.jitter, child_generator(seed, f"repeat {repeat}"))
+        outcomes.append(label_contact(moved, simulate(moved)).contact)
+    return Replay(
+        name=scene.name,
+        scenario=scene.scenario,
+        recorded=outcome.contact,
+        simulated=labels.contact,
+        recorded_frame=outcome.first_frame,
+        simulated_frame=labels.first_frame,
+        frames=len(trajectory),
+        distance=labels.min_distance,
+        cpu_seconds=spent,
+        physics_seconds=(len(trajectory) - 1) * FRAME_TIME,
+        jittered=tuple(outcomes),
+    )
+
+
+@dataclass(frozen=True)
+class ReplayRow:
+    """One line of the replay table: a scenario, or the mean over scenarios.
+
+    - ``base_rate``: share of the commoner recorded outcome.
+    - ``agreement``: share of trials whose simulated outcome is the recorded one.
+    - ``frame_difference``: median of |simulated - recorded| first contact frame over the trials
+      with contact in both; NaN without any.
+    - ``auc``: area under the curve of the smallest cloth gap against the recorded outcome, 1 if
+      every contact is closer than every miss; NaN without cloth.
+    - ``milliseconds``: mean processor time of a trial; ``real_time``: physics time over it.
+    - ``ceiling``: chance that two jittered runs of a trial agree; NaN without jitter.
+    """
+
+    scenario: str
+    trials: int
+    base_rate: float
+    agreement: float
+    frame_difference: float
+    auc: float
+    milliseconds: float
+    real_time: float
+    ceiling: float
+
+
+def summarise(replays: Iterable[Replay]) -> list[ReplayRow]:
+    """The table by scenario, in the order of first appearance."""
+    groups: dict[str, list[Replay]] = {}
+    for replay in replays:
+        groups.setdefault(replay.scenario, []).append(replay)
+    return [_row(name, group) for name, group in groups.items()]
+
+
+def _row(scenario: str, group: list[Replay]) -> ReplayRow:
+    recorded = np.array([replay.recorded for replay in group])
+    both = [
+        abs(replay.simulated_frame - replay.recorded_frame)
+        for replay in group
+        if replay.simulated_frame is not None and replay.recorded_frame is not None
+    ]
+    distances = [replay.distance for replay in group if replay.distance is not None]
+    ceilings = [pair_agreement(np.array(replay.jittered)) for replay in group]
+    spent = sum(replay.cpu_seconds for replay in group)
+    return ReplayRow(
+        scenario=scenario,
+        trials=len(group),
+        base_rate=float(max(recorded.mean(), 1 - recorded.mean())),
+        agreement=float(np.mean([replay.agrees for replay in group])),
+        frame_difference=float(np.median(both)) if both else float("nan"),
+        auc=area_under_curve(-np.array(distances), recorded)
+        if len(distances) == len(group)
+        else float("nan"),
+        milliseconds=1000 * spent / len(group),
+        real_time=sum(replay.physics_seconds for replay in group) / max(spent, 1e-9),
+        ceiling=float(np.mean(ceilings)) if group[0].jittered else float("nan"),
+    )
+
+
+def area_under_curve(scores: np.ndarray, truth: np.ndarray) -> float:
+    """Chance that a random positive scores above a random negative, ties counting half.
+
+    ``scores`` (n,) any real, ``truth`` (n,) bool. NaN if only one class is there.
+    """
+    positives = int(truth.sum())
+    negatives = len(truth) - positives
+    if not (positives and negatives):
+        return float("nan")
+    ranks = rankdata(scores)
+    above = float(ranks[truth].sum()) - positives * (positives + 1) / 2
+    return above / (positives * negatives)
