@@ -1,0 +1,146 @@
+"""Check this machine: versions, cores, memory, GPU, codecs, write access; say what to install."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json as json_module
+import os
+import platform
+import shutil
+import tempfile
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from physion.cli.output import console
+
+EXTRAS = {
+    "models": ("torch", "torchvision", "timm", "lightning-fabric", "safetensors"),
+    "experiment": ("fastapi", "uvicorn", "sqlalchemy", "alembic", "argon2-cffi"),
+    "ray": ("ray",),
+    "slurm": ("submitit",),
+    "dev": ("pytest", "hypothesis", "ruff", "mypy", "import-linter"),
+}
+CORE = (
+    *("numpy", "scipy", "mujoco", "numba", "trimesh", "h5py", "hdf5plugin", "av", "pillow"),
+    *("pandas", "pyarrow", "scikit-learn", "statsmodels", "matplotlib", "tyro", "rich"),
+)
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to check."""
+
+    folder: Path = Path()
+    """Where trials would be written."""
+    json: bool = False
+    """Print one JSON object instead of lines."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line of the answer. ``remedy`` is the line that mends it, empty when all is well."""
+
+    name: str
+    value: str
+    good: bool = True
+    needed: bool = True
+    remedy: str = ""
+
+
+def main(options: Options) -> int:
+    """Print the checks; 1 if something that the core needs is missing."""
+    checks = [*machine(), *core(), *extras(), gpu(), codec(), writable(options.folder)]
+    if options.json:
+        print(json_module.dumps([asdict(check) for check in checks], indent=1))
+    else:
+        for check in checks:
+            mark = "ok     " if check.good else "MISSING" if check.needed else "absent "
+            remedy = f"   -> {check.remedy}" if check.remedy else ""
+            console.print(
+                f"{mark} {check.name:<18} {check.value}{remedy}", markup=False, soft_wrap=True
+            )
+    return 1 if any(check.needed and not check.good for check in checks) else 0
+
+
+def machine() -> list[Check]:
+    """Python, processor cores and memory."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    pages = os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 0
+    gigabytes = pages * os.sysconf("SC_PAGE_SIZE") / 2**30 if pages else float("nan")
+    version = platform.python_version()
+    fresh = tuple(map(int, version.split(".")[:2])) >= (3, 11)
+    return [
+        Check("physion", importlib.metadata.version("physion")),
+        Check("python", version, fresh, remedy="" if fresh else "install Python 3.11 or newer"),
+        Check("system", platform.platform()),
+        Check("cores", str(cores)),
+        Check("memory", f"{gigabytes:.1f} GiB"),
+    ]
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def core() -> list[Check]:
+    """Every package that generation and analysis need."""
+    found = {package: _version(package) for package in CORE}
+    return [
+        Check(
+            package,
+            version or "not installed",
+            version is not None,
+            remedy="" if version else f"pip install {package}",
+        )
+        for package, version in found.items()
+    ]
+
+
+def extras() -> list[Check]:
+    """Which optional parts are there; each missing one with the line that installs it."""
+    checks = []
+    for extra, packages in EXTRAS.items():
+        missing = [package for package in packages if _version(package) is None]
+        there = [f"{package} {_version(package)}" for package in packages if _version(package)]
+        value = ", ".join(there) if not missing else f"without {', '.join(missing)}"
+        remedy = f"pip install 'physion[{extra}]'" if missing else ""
+        checks.append(Check(f"extra {extra}", value, not missing, needed=False, remedy=remedy))
+    return checks
+
+
+def gpu() -> Check:
+    """The accelerator that torch sees."""
+    if _version("torch") is None:
+        return Check("gpu", "unknown without torch", False, needed=False)
+    import torch
+
+    if torch.cuda.is_available():
+        return Check("gpu", torch.cuda.get_device_name(0))
+    return Check("gpu", "none: everything runs on the processor", False, needed=False)
+
+
+def codec() -> Check:
+    """Whether movies can be written and read here."""
+    try:
+        import av
+
+        av.codec.Codec("libx264", "w")
+        av.codec.Codec("h264", "r")
+    except Exception as error:  # PyAV raises its own kinds, and ImportError without its library
+        return Check("codec", f"H.264: {error}", False, remedy="pip install --force-reinstall av")
+    return Check("codec", f"H.264 through PyAV {av.__version__}")
+
+
+def writable(folder: Path) -> Check:
+    """Whether trials can be written to ``folder``, and how much room is left."""
+    try:
+        with tempfile.NamedTemporaryFile(dir=folder):
+            pass
+        free = shutil.disk_usage(folder).free / 2**30
+    except OSError as error:
+        remedy = "choose another folder with --folder"
+        return Check("write access", f"{folder}: {error.strerror}", False, remedy=remedy)
+    return Check("write access", f"{folder.resolve()}, {free:.0f} GiB free")

@@ -1,0 +1,119 @@
+"""Command logs as text: lines become commands by trial, and every fault gets its place."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import re
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from physion.errors import BadInputError
+
+Command: TypeAlias = dict[str, Any]
+
+MAX_LOG_BYTES = 1 << 30
+"""A log larger than this when unpacked is refused; the largest official one has a few MB."""
+
+
+@dataclass(frozen=True)
+class ImportFailure:
+    """A trial that could not be imported: which file, which trial (None: all), and why."""
+
+    file: str
+    trial: str | None
+    message: str
+
+    def __str__(self) -> str:
+        where = self.file if self.trial is None else f"{self.file}, trial {self.trial}"
+        return f"{where}: {self.message}"
+
+
+@dataclass
+class CommandLog:
+    """One log: commands before the first trial, then by trial tag (line number, commands) a frame.
+
+    Trials with a broken line are in ``failures`` instead.
+    """
+
+    setup: list[Command] = field(default_factory=list)
+    trials: dict[str, list[tuple[int, list[Command]]]] = field(default_factory=dict)
+    failures: list[ImportFailure] = field(default_factory=list)
+
+
+def find_logs(root: Path) -> list[Path]:
+    """Every command log under ``root`` in the order of their paths."""
+    if not root.exists():
+        raise BadInputError(f"{root} does not exist; give a folder with official command logs")
+    if not root.is_dir():
+        raise BadInputError(f"{root} is a file; give the folder that holds the command logs")
+    logs = sorted([*root.rglob("tdw_commands.json"), *root.rglob("tdw_commands.json.gz")])
+    if not logs:
+        raise BadInputError(f"{root} holds no tdw_commands.json or tdw_commands.json.gz")
+    return logs
+
+
+def read_metadata(path: Path) -> list[dict[str, Any]]:
+    try:
+        data = json.loads(path.read_text())
+    except FileNotFoundError:
+        raise BadInputError(f"{path} is missing; it holds the outcomes of the trials") from None
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise BadInputError(f"{path} cannot be read: {error}") from error
+    if not isinstance(data, list) or not all(isinstance(record, dict) for record in data):
+        raise BadInputError(f"{path} is not a list with one object a trial")
+    return data
+
+
+def read_command_log(path: Path) -> CommandLog:
+    """Read a log, packed or not; `BadInputError` if it cannot be read to its end."""
+    log, broken, size = CommandLog(), set(), 0
+    opener: Callable[..., Any] = gzip.open if path.suffix == ".gz" else open
+    try:
+        with opener(path, "rt", encoding="utf-8") as lines:
+            for number, line in enumerate(lines, 1):
+                size += len(line)
+                if size > MAX_LOG_BYTES:
+                    raise BadInputError(f"{path} is larger than {MAX_LOG_BYTES} bytes unpacked")
+                if not line.strip():
+                    continue
+                tag = _tag(line)
+                try:
+                    commands = _parse_line(line)
+                except BadInputError as error:
+                    broken.add(tag)
+                    message = f"line {number}: {error}"
+                    log.failures.append(ImportFailure(str(path), tag or None, message))
+                    continue
+                if tag == "None":
+                    log.setup += commands
+                else:
+                    log.trials.setdefault(tag, []).append((number, commands))
+    except (OSError, EOFError, UnicodeDecodeError, zlib.error) as error:
+        raise BadInputError(f"{path} cannot be read to its end: {error}") from error
+    if not (log.trials or log.failures):
+        raise BadInputError(f"{path} holds no trial")
+    for tag in broken:
+        log.trials.pop(tag, None)
+    return log
+
+
+def _tag(line: str) -> str:
+    match = re.search(r"trial (\S+)\s*$", line[-40:])
+    return match.group(1) if match else ""
+
+
+def _parse_line(line: str) -> list[Command]:
+    try:
+        value, _ = json.JSONDecoder().raw_decode(line.lstrip())
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise BadInputError(f"is not JSON: {error}") from error
+    commands = value if isinstance(value, list) else [value]
+    if not all(isinstance(c, dict) and isinstance(c.get("$type"), str) for c in commands):
+        raise BadInputError('holds something that is not a command with a "$type"')
+    if not _tag(line):
+        raise BadInputError('does not end in "trial N"')
+    return commands
