@@ -1,0 +1,58 @@
+"""Files that are there whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from pathlib import Path
+
+PART_SUFFIX = ".part"
+"""How the name of a file that is still being written ends."""
+
+
+def write_atomic(path: Path, data: bytes) -> None:
+    """Write ``data`` to ``path`` so that no reader ever sees a part of it, not even after a crash.
+
+    The bytes go to a temporary name in the same folder, to the disk, and only then take the
+    place of ``path``. The temporary name belongs to this call alone, so that two writers of one
+    path do not meet. Raises ``OSError`` (disk full, no permission, ...) with nothing left behind.
+    """
+    # A short name of its own: adding to a long file name could pass the system's limit.
+    part = path.with_name(f".{os.getpid()}-{secrets.token_hex(8)}{PART_SUFFIX}")
+    try:
+        descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
+        try:
+            view = memoryview(data)
+            while len(view) > 0:
+                view = view[os.write(descriptor, view) :]
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+        os.replace(part, path)  # noqa: PTH105 - the plain call is what a test can make fail
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+    _sync_folder(path.parent)
+
+
+def remove_leftovers(folder: Path) -> int:
+    """Delete what killed writers left under ``folder``; the count of deleted files.
+
+    Only for the one process that has the folder to itself: it would take away the temporary
+    files of writers that are still alive.
+    """
+    leftovers = list(folder.rglob(f".*{PART_SUFFIX}"))
+    for part in leftovers:
+        part.unlink(missing_ok=True)
+    return len(leftovers)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make the renaming itself survive a power cut, where the system can sync a folder."""
+    if os.name != "posix":
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

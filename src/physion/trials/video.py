@@ -1,0 +1,184 @@
+"""Movies of trials: H.264 in MP4, written and read without a temporary file.
+
+Both movies of a trial are made here: the full one, and apart from it the observed one, which is
+encoded from its own frames alone, so that not even the encoder's look-ahead has seen the future.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+from av.video.reformatter import ColorRange, Colorspace, Interpolation, VideoReformatter
+from numpy.typing import NDArray
+
+from physion.errors import BadInputError
+from physion.scenes.scene import PLAYBACK_RATE
+
+CRF = 18
+"""x264's quality; below it yuv420p, not the codec, decides (reference: engines, section 6)."""
+GROUP = 15
+"""Frames from one key frame to the next, so that a seek decodes at most half a second."""
+_BT709 = 1
+"""Number of ITU-R BT.709 in the H.264 tables for matrix, primaries and transfer alike."""
+_SCALING = Interpolation.AREA | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
+"""Without exact rounding swscale darkens a flat grey by 2 of 255."""
+_INDEX_BYTES = (2048, 24)
+"""Room for the movie's index at its start: bytes for the header, and for each frame."""
+
+
+class MovieEncoder:
+    """Turns frames into the bytes of one MP4 file.
+
+    ``width`` and ``height`` are pixels, both even. ``frames`` says how many will be added, so
+    that the index has its room before the pictures and a browser plays at once ("faststart").
+    The same frames give the same bytes: one thread, no clock.
+    """
+
+    def __init__(
+        self, width: int, height: int, frames: int, *, rate: int = PLAYBACK_RATE, crf: int = CRF
+    ) -> None:
+        if width % 2 or height % 2 or min(width, height) < 2:
+            raise BadInputError(
+                f"a movie needs an even width and height, not {width} x {height} pixels"
+            )
+        self._expected, self._added = frames, 0
+        self._shape = (height, width, 3)
+        self._buffer = io.BytesIO()
+        room = _INDEX_BYTES[0] + _INDEX_BYTES[1] * frames
+        self._container = av.open(self._buffer, "w", format="mp4", options={"moov_size": str(room)})
+        stream: Any = self._container.add_stream("libx264", rate=rate)
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        stream.options = {
+            "crf": str(crf),
+            "preset": "veryfast",
+            "g": str(GROUP),
+            "threads": "1",
+        }
+        # Without these tags players guess the matrix, and saturated red comes out orange.
+        context = stream.codec_context
+        context.colorspace = context.color_primaries = context.color_trc = _BT709
+        context.color_range = int(ColorRange.MPEG)
+        self._stream = stream
+        self._reformatter = VideoReformatter()
+
+    def add(self, frame: NDArray[np.uint8]) -> None:
+        """Append one picture: (height, width, 3), sRGB, 0..255."""
+        if frame.shape != self._shape or frame.dtype != np.uint8:
+            raise BadInputError(
+                f"movie frame {self._added} is {frame.dtype} {frame.shape}, not uint8 {self._shape}"
+            )
+        picture = self._reformatter.reformat(
+            av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24"),
+            format="yuv420p",
+            dst_colorspace=Colorspace.ITU709,
+            src_color_range=ColorRange.JPEG,
+            dst_color_range=ColorRange.MPEG,
+        )
+        picture.pts = self._added
+        self._container.mux(self._stream.encode(picture))
+        self._added += 1
+
+    def finish(self) -> bytes:
+        """Close the movie and return the bytes of its file."""
+        if self._added != self._expected:
+            raise BadInputError(f"movie got {self._added} frames, not {self._expected}")
+        self._container.mux(self._stream.encode())
+        self._container.close()
+        return self._buffer.getvalue()
+
+
+def encode_movie(frames: NDArray[np.uint8], *, rate: int = PLAYBACK_RATE, crf: int = CRF) -> bytes:
+    """The bytes of a movie of ``frames`` (F, height, width, 3) in sRGB at ``rate`` a second."""
+    encoder = MovieEncoder(frames.shape[2], frames.shape[1], len(frames), rate=rate, crf=crf)
+    for frame in frames:
+        encoder.add(frame)
+    return encoder.finish()
+
+
+def read_frames(
+    path: Path,
+    *,
+    start: int = 0,
+    count: int | None = None,
+    stride: int = 1,
+    size: tuple[int, int] | None = None,
+) -> NDArray[np.uint8]:
+    """Frames ``start``, ``start + stride``, ... of a movie: (count, height, width, 3), sRGB.
+
+    ``count`` is how many frames to return, by default all to the end. ``size`` is (height,
+    width) in pixels to scale to, by averaging areas; by default that of the movie. A movie
+    that is missing, cut short, damaged, or shorter than asked raises `BadInputError`.
+    """
+    if start < 0 or stride < 1 or (count is not None and count < 1):
+        raise BadInputError(f"no frames at start {start}, stride {stride}, count {count}")
+    kept: list[NDArray[np.uint8]] = []
+    reformatter = VideoReformatter()
+    for index, picture in _decode(path):
+        if index < start or (index - start) % stride:
+            continue
+        height, width = size or (picture.height, picture.width)
+        # Conversion costs three times the decoding, so it is done for kept frames alone.
+        rgb = reformatter.reformat(
+            picture,
+            width=width,
+            height=height,
+            format="rgb24",
+            src_colorspace=Colorspace.ITU709,
+            src_color_range=ColorRange.MPEG,
+            dst_color_range=ColorRange.JPEG,
+            interpolation=int(_SCALING),
+        )
+        kept.append(rgb.to_ndarray())  # type: ignore[arg-type]
+        if len(kept) == count:
+            break
+    if not kept or (count is not None and len(kept) < count):
+        asked = "all frames" if count is None else f"{count} frames"
+        raise BadInputError(
+            f"movie {path} has not the {asked} asked for from {start} in steps of {stride}: "
+            f"it gave {len(kept)}"
+        )
+    return np.stack(kept)
+
+
+def count_frames(path: Path) -> int:
+    """Frames that a movie's index promises, without decoding one."""
+    with _open(path) as container:
+        return int(container.streams.video[0].frames)
+
+
+def _open(path: Path) -> Any:
+    if not path.is_file():
+        raise BadInputError(f"movie {path} is missing")
+    try:
+        container = av.open(str(path), metadata_errors="replace")
+    except (av.FFmpegError, ValueError) as error:
+        raise BadInputError(f"movie {path} cannot be read, generate it again: {error}") from error
+    if not container.streams.video:
+        container.close()
+        raise BadInputError(f"movie {path} holds no pictures")
+    return container
+
+
+def _decode(path: Path) -> Iterator[tuple[int, av.VideoFrame]]:
+    """Index and picture of every frame in order; `BadInputError` where the movie breaks off."""
+    with _open(path) as container:
+        stream = container.streams.video[0]
+        stream.codec_context.thread_count = 1
+        promised, index = stream.frames, 0
+        try:
+            for picture in container.decode(stream):
+                if picture.is_corrupt:
+                    raise BadInputError(f"movie {path} is damaged at frame {index}")
+                yield index, picture
+                index += 1
+        except av.FFmpegError as error:
+            raise BadInputError(f"movie {path} is damaged at frame {index}: {error}") from error
+        if index != promised:
+            raise BadInputError(
+                f"movie {path} is cut short: {index} of {promised} frames; generate it again"
+            )
