@@ -81,11 +81,16 @@ class ImportedTrial:
 
 @dataclass
 class TrialSet:
-    """Everything found under a folder: trials, failures, and unknown commands by name."""
+    """Everything found under a folder.
+
+    ``unknown`` counts commands that the importer does not know, ``unrecorded`` the trials of logs
+    for which ``metadata.json`` holds no outcome.
+    """
 
     trials: list[ImportedTrial] = field(default_factory=list)
     failures: list[ImportFailure] = field(default_factory=list)
     unknown: Counter[str] = field(default_factory=Counter)
+    unrecorded: int = 0
 
     def unique(self) -> tuple[list[ImportedTrial], int]:
         """Trials with different physics, and how many were left out as copies of another."""
@@ -127,11 +132,13 @@ def read_log(
     found.failures += log.failures
     for tag, frames in log.trials.items():
         try:
-            if not tag.isdigit() or int(tag) >= len(records):
-                raise BadInputError(f"metadata.json has {len(records)} entries and none for it")
+            if tag not in records:
+                # Familiarization trials were chosen by hand out of the log.
+                found.unrecorded += 1
+                continue
             commands = CommandReader(found.unknown)
             commands.read(log.setup, frames)
-            builder = _SceneBuilder(commands, records[int(tag)], path.parent, bounds or {})
+            builder = _SceneBuilder(commands, records[tag], path.parent, bounds or {})
             yield ImportedTrial(builder.scene(), builder.outcome(), tuple(builder.notes))
         except PhysionError as error:
             found.failures.append(ImportFailure(str(path), tag, str(error)))

@@ -56,16 +56,25 @@ def find_logs(root: Path) -> list[Path]:
     return logs
 
 
-def read_metadata(path: Path) -> list[dict[str, Any]]:
+def read_metadata(path: Path) -> dict[str, dict[str, Any]]:
+    """The records of ``metadata.json`` by the number of their trial, as text.
+
+    The number ends the stimulus name (``..._0012`` is trial 12); where a record has no such name
+    its place in the file is its number.
+    """
     try:
-        data = json.loads(path.read_text())
+        data = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise BadInputError(f"{path} is missing; it holds the outcomes of the trials") from None
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise BadInputError(f"{path} cannot be read: {error}") from error
     if not isinstance(data, list) or not all(isinstance(record, dict) for record in data):
         raise BadInputError(f"{path} is not a list with one object a trial")
-    return data
+    records = {}
+    for place, record in enumerate(data):
+        match = re.search(r"_(\d{4,})$", str(record.get("stimulus_name")))
+        records[str(int(match.group(1)) if match else place)] = record
+    return records
 
 
 def read_command_log(path: Path) -> CommandLog:
