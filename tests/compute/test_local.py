@@ -1,0 +1,183 @@
+"""Executors: every task ends in one outcome, whatever its worker does."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from physion.compute.executor import Executor, executors
+from physion.compute.local import LocalExecutor, SerialExecutor
+from physion.errors import BadInputError, PhysionError
+
+
+def square(number: int) -> int:
+    return number * number
+
+
+def fail_on_three(number: int) -> int:
+    if number == 3:
+        raise BadInputError("three is\nnot liked")
+    return number
+
+
+def disk_full(number: int) -> int:
+    raise OSError(28, "No space left on device")
+
+
+def die_on_two(number: int) -> int:
+    if number == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def die_once(marker: str) -> str:
+    path = Path(marker)
+    if not path.exists():
+        path.write_text("was here")
+        os.kill(os.getpid(), signal.SIGKILL)
+    return "second try"
+
+
+def leave(number: int) -> int:
+    os._exit(number)
+
+
+def hang(number: int) -> int:
+    if number == 1:
+        time.sleep(600)
+    return number
+
+
+def unsendable(number: int) -> object:
+    return lambda: number
+
+
+def numbers(*values: int) -> dict[str, int]:
+    return {f"task {value}": value for value in values}
+
+
+@pytest.mark.parametrize("executor", [SerialExecutor(), LocalExecutor(1), LocalExecutor(2)])
+def test_every_task_has_one_outcome(executor: Executor) -> None:
+    outcomes = list(executor.map(square, numbers(*range(20))))
+    assert {o.key: o.value for o in outcomes} == {f"task {n}": n * n for n in range(20)}
+    assert len(outcomes) == 20
+
+
+@pytest.mark.parametrize("executor", [SerialExecutor(), LocalExecutor(2)])
+def test_nothing_to_do_ends_at_once(executor: Executor) -> None:
+    assert list(executor.map(square, {})) == []
+
+
+@pytest.mark.parametrize("executor", [SerialExecutor(), LocalExecutor(1)])
+def test_an_exception_fails_its_task_alone_and_is_not_tried_again(executor: Executor) -> None:
+    outcomes = {o.key: o for o in executor.map(fail_on_three, numbers(1, 2, 3, 4))}
+    bad = outcomes.pop("task 3")
+    assert bad.error == "three is not liked" and bad.tries == 1
+    assert "fail_on_three" in bad.traceback
+    with pytest.raises(PhysionError, match="task 3: three"):
+        _ = bad.value
+    assert [o.value for o in outcomes.values()] == [1, 2, 4]
+
+
+@pytest.mark.parametrize("executor", [SerialExecutor(), LocalExecutor(1)])
+def test_system_errors_keep_their_number(executor: Executor) -> None:
+    (outcome,) = executor.map(disk_full, numbers(1))
+    assert outcome.errno == 28 and "No space left" in str(outcome.error)
+
+
+def test_a_poison_task_is_put_aside_after_three_deaths() -> None:
+    outcomes = {o.key: o for o in LocalExecutor(2).map(die_on_two, numbers(*range(6)))}
+    bad = outcomes.pop("task 2")
+    assert bad.tries == 3 and "SIGKILL" in str(bad.error)
+    assert sorted(o.value for o in outcomes.values()) == [0, 1, 3, 4, 5]
+    assert all(o.tries == 1 for o in outcomes.values()), "only the culprit is blamed"
+
+
+def test_a_task_whose_worker_was_killed_runs_again(tmp_path: Path) -> None:
+    (outcome,) = LocalExecutor(1).map(die_once, {"a": str(tmp_path / "marker")})
+    assert outcome.value == "second try" and outcome.tries == 2
+
+
+def test_exit_code_of_a_worker_is_told() -> None:
+    (outcome,) = LocalExecutor(1, tries=1).map(leave, {"a": 7})
+    assert outcome.error == "the worker process ended with exit code 7"
+
+
+def test_a_hanging_task_is_ended_and_the_others_go_on() -> None:
+    executor = LocalExecutor(1, tries=1, timeout=1.0)
+    outcomes = {o.key: o for o in executor.map(hang, numbers(1, 2, 3))}
+    assert "still at work" in str(outcomes["task 1"].error)
+    assert [outcomes[f"task {n}"].value for n in (2, 3)] == [2, 3]
+
+
+def test_a_result_that_cannot_travel_is_a_failure() -> None:
+    (outcome,) = LocalExecutor(1).map(unsendable, {"a": 1})
+    assert "cannot be sent" in str(outcome.error)
+
+
+def test_closing_the_iterator_ends_the_workers() -> None:
+    executor = LocalExecutor(2)
+    outcomes = executor.map(hang, numbers(0, 1, 2))
+    next(outcomes)
+    assert len(multiprocessing.active_children()) == 2
+    outcomes.close()  # type: ignore[attr-defined]
+    assert not multiprocessing.active_children()
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs Linux's /proc")
+def test_workers_end_when_the_parent_is_killed(tmp_path: Path) -> None:
+    script = tmp_path / "parent.py"
+    script.write_text(
+        "import time\n"
+        "from physion.compute.local import LocalExecutor\n"
+        "if __name__ == '__main__':\n"
+        "    for o in LocalExecutor(1).map(time.sleep, {'a': 0.0, 'b': 3.0, 'c': 600.0}):\n"
+        "        print(o.key, flush=True)\n"
+    )
+    parent = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None and parent.stdout.readline() == "a\n"
+    children = _children(parent.pid)
+    parent.kill()
+    parent.wait()
+    parent.stdout.close()
+    deadline = time.monotonic() + 20
+    while any(_runs(child) for child in children) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert children and not any(_runs(child) for child in children)
+
+
+def test_a_script_without_a_main_guard_is_told_so(tmp_path: Path) -> None:
+    script = tmp_path / "careless.py"
+    script.write_text(
+        "from physion.compute.local import LocalExecutor\n"
+        "print(list(LocalExecutor(1).map(abs, {'a': 1})))\n"
+    )
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=60)
+    assert done.returncode != 0 and "if __name__ == '__main__'" in done.stderr
+
+
+def test_registry_and_bad_numbers() -> None:
+    assert executors.get("local") is LocalExecutor
+    assert LocalExecutor().workers >= 1
+    with pytest.raises(PhysionError, match="at least 1"):
+        LocalExecutor(0)
+
+
+def _children(parent: int) -> set[int]:
+    folder = Path(f"/proc/{parent}/task")
+    lists = [(task / "children").read_text().split() for task in folder.iterdir()]
+    return {int(child) for children in lists for child in children}
+
+
+def _runs(process: int) -> bool:
+    try:
+        return Path(f"/proc/{process}/stat").read_text().split()[2] not in "ZX"
+    except FileNotFoundError:
+        return False
