@@ -1,0 +1,274 @@
+"""Import of official command logs: small hand-made logs, and the real ones."""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from physion.errors import BadInputError
+from physion.scenes.scene import Scene
+from physion.scenes.tdw import read_scenes
+from physion.scenes.tdw_commands import quaternion_from_euler, vector
+
+Command = dict[str, Any]
+
+
+def xyz(x: float, y: float, z: float) -> dict[str, float]:
+    return {"x": x, "y": y, "z": z}
+
+
+def thing(id_: int, name: str, position: dict[str, float], **more: Any) -> list[Command]:
+    """The commands that create one object, as the official generator writes them."""
+    commands: list[Command] = [
+        {
+            "$type": "add_object",
+            "name": name,
+            "category": "flex_primitive",
+            "position": position,
+            "rotation": more.get("rotation", xyz(0, 0, 0)),
+            "id": id_,
+        },
+        {"$type": "scale_object", "scale_factor": more.get("scale", xyz(1, 1, 1)), "id": id_},
+        {"$type": "set_mass", "id": id_, "mass": more.get("mass", 2.0)},
+    ]
+    if "color" in more:
+        r, g, b = more["color"]
+        commands.append({"$type": "set_color", "id": id_, "color": {"r": r, "g": g, "b": b}})
+    return commands
+
+
+def two_cubes() -> list[Command]:
+    return [
+        *thing(1, "cube", xyz(1, 0, 2), scale=xyz(2, 0.01, 3)),
+        {"$type": "set_kinematic_state", "id": 1, "is_kinematic": True, "use_gravity": True},
+        *thing(2, "cube", xyz(0, 0.5, 0)),
+    ]
+
+
+def write_log(folder: Path, trials: list[list[list[Command]]], packed: bool = False) -> Path:
+    """Write frames of trials as a log with its metadata, every outcome a contact at frame 7."""
+    folder.mkdir(parents=True, exist_ok=True)
+    setup = [
+        {"$type": "add_scene", "name": "tdw_room"},
+        {"$type": "set_field_of_view", "field_of_view": 60},
+    ]
+    lines = [f"{json.dumps(setup)} trial None"]
+    for number, frames in enumerate(trials):
+        lines += [f"{json.dumps(frame)} trial {number}" for frame in frames]
+        lines.append(f'{json.dumps([{"$type": "destroy_object", "id": 2}])} trial {number}')
+    text = "\n".join(lines) + "\n"
+    records = [
+        {
+            "stimulus_name": f"{folder.name}_{number:04d}",
+            "controller_name": "Collision",
+            "does_target_contact_zone": True,
+            "first_target_contact_zone_frame": 7,
+            "num_frames": 152,
+            "final_target_displacement": xyz(1, 2, 3),
+        }
+        for number in range(len(trials))
+    ]
+    (folder / "metadata.json").write_text(json.dumps(records))
+    if packed:
+        path = folder / "tdw_commands.json.gz"
+        path.write_bytes(gzip.compress(text.encode()))
+    else:
+        path = folder / "tdw_commands.json"
+        path.write_text(text)
+    return path
+
+
+def only_scene(folder: Path) -> Scene:
+    found = read_scenes(folder)
+    assert [str(failure) for failure in found.failures] == []
+    (trial,) = found.trials
+    return trial.scene
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_a_trial_becomes_a_scene(tmp_path: Path, packed: bool) -> None:
+    push = {"$type": "apply_force_at_position", "force": xyz(1, 2, 3), "position": xyz(4, 5, 6)}
+    write_log(tmp_path / "config", [[two_cubes(), [], [push | {"id": 2}]]], packed)
+    found = read_scenes(tmp_path)
+    (trial,) = found.trials
+    scene = trial.scene
+    assert scene.name == "config_0000"
+    assert (scene.scenario, scene.room) == ("collide", "bright")
+    zone, target = scene.bodies
+    assert (scene.roles.patient, scene.roles.agent) == (zone.name, target.name)
+    assert zone.position == (1, 2, 0) and zone.scale == (2, 3, 0.01) and zone.kinematic
+    assert scene.camera.fov == pytest.approx(math.radians(60))
+    (impulse,) = scene.pushes
+    assert impulse.frame == 2 and impulse.impulse == (1, 3, 2) and impulse.point == (4, 6, 5)
+    assert scene.roles.probe == target.name
+    assert trial.outcome.contact and trial.outcome.first_frame == 7
+    assert trial.outcome.displacement == (1, 3, 2)
+
+
+@pytest.mark.parametrize(
+    ("euler", "moved"),
+    [
+        # Unity, left-handed: a quarter turn about y (up) takes forward (z) to right (x).
+        ((0, 90, 0), {(0, 0, 1): (1, 0, 0)}),
+        ((90, 0, 0), {(0, 1, 0): (0, 0, 1)}),
+        ((0, 0, 90), {(1, 0, 0): (0, 1, 0)}),
+        # z first, then x, then y.
+        ((90, 90, 0), {(0, 1, 0): (1, 0, 0)}),
+    ],
+)
+def test_turns_keep_their_meaning(
+    euler: tuple[float, float, float], moved: dict[tuple[float, ...], tuple[float, ...]]
+) -> None:
+    w, x, y, z = quaternion_from_euler(xyz(*euler))
+    turn = Rotation.from_quat([x, y, z, w])
+    for before, after in moved.items():
+        ours = turn.apply(vector(xyz(*before)))
+        np.testing.assert_allclose(ours, vector(xyz(*after)), atol=1e-12)
+
+
+def test_target_is_the_last_of_its_colour_where_object_two_is_gone(tmp_path: Path) -> None:
+    red, blue = (1, 0, 0), (0, 0, 1)
+    commands = [
+        *thing(1, "cube", xyz(0, 0, 0)),
+        *thing(2, "cube", xyz(1, 10, 10), color=red),
+        {"$type": "destroy_object", "id": 2},
+        *thing(3, "sphere", xyz(0, 1, 0), color=blue),
+        *thing(4, "sphere", xyz(0, 2, 0), color=red),
+        *thing(5, "sphere", xyz(0, 3, 0), color=blue),
+    ]
+    write_log(tmp_path / "config", [[commands]])
+    scene = only_scene(tmp_path)
+    assert scene.roles.agent == "sphere_4"
+    assert [body.name for body in scene.bodies] == ["cube_1", "sphere_3", "sphere_4", "sphere_5"]
+
+
+def test_vanishing_bodies_are_left_out_and_noted(tmp_path: Path) -> None:
+    commands = two_cubes() + thing(3, "cube", xyz(0, 0, 0), scale=xyz(0, 0, 0), mass=0.0)
+    write_log(tmp_path / "config", [[commands]])
+    (trial,) = read_scenes(tmp_path).trials
+    assert len(trial.scene.bodies) == 2
+    assert any("cube_3" in note for note in trial.notes)
+
+
+def test_fixed_joints_drag_and_materials(tmp_path: Path) -> None:
+    commands = [
+        *two_cubes(),
+        *thing(3, "cylinder", xyz(0, 1.5, 0)),
+        {"$type": "add_fixed_joint", "parent_id": 2, "id": 3},
+        {"$type": "set_object_drag", "id": 3, "drag": 0.5, "angular_drag": 0.25},
+        {
+            "$type": "set_physic_material",
+            "id": 3,
+            "dynamic_friction": 0.1,
+            "static_friction": 0.2,
+            "bounciness": 0.3,
+        },
+    ]
+    write_log(tmp_path / "config", [[commands]])
+    scene = only_scene(tmp_path)
+    (joint,) = scene.joints
+    assert (joint.parent, joint.child) == ("cube_2", "cylinder_3")
+    body = scene.bodies[2]
+    assert (body.drag, body.angular_drag) == (0.5, 0.25)
+    contact = body.contact
+    assert (contact.dynamic_friction, contact.static_friction, contact.restitution) == (
+        0.1,
+        0.2,
+        0.3,
+    )
+
+
+def test_unknown_commands_are_counted_and_copies_found(tmp_path: Path) -> None:
+    frames = [[*two_cubes(), {"$type": "summon_dragon"}, {"$type": "summon_dragon"}]]
+    write_log(tmp_path / "config", [frames, frames])
+    found = read_scenes(tmp_path)
+    assert found.unknown == {"summon_dragon": 4}
+    unique, copies = found.unique()
+    assert (len(unique), copies) == (1, 1)
+
+
+def test_a_broken_line_costs_its_trial_alone(tmp_path: Path) -> None:
+    path = write_log(tmp_path / "config", [[two_cubes()], [two_cubes()]])
+    lines = path.read_text().splitlines()
+    lines[1] = '[{"$type": "add_object", trial 0'
+    path.write_text("\n".join(lines))
+    found = read_scenes(tmp_path)
+    assert [trial.scene.name for trial in found.trials] == ["config_0001"]
+    (failure,) = found.failures
+    assert failure.trial == "0" and "line 2" in failure.message
+    assert str(path) in str(failure)
+
+
+@pytest.mark.parametrize(
+    ("command", "complaint"),
+    [
+        ({"$type": "set_mass", "id": 9, "mass": 1}, "object 9 was never created"),
+        ({"$type": "set_mass", "id": 2}, "has no 'mass'"),
+        ({"$type": "scale_object", "id": 2, "scale_factor": {"x": 1}}, "x, y and z"),
+        (
+            {"$type": "scale_object", "id": 2, "scale_factor": xyz(1, math.inf, 1)},
+            "finite",
+        ),
+    ],
+)
+def test_bad_commands_name_line_and_trial(
+    tmp_path: Path, command: Command, complaint: str
+) -> None:
+    write_log(tmp_path / "config", [[two_cubes()], [[*two_cubes(), command]]])
+    found = read_scenes(tmp_path)
+    assert len(found.trials) == 1
+    (failure,) = found.failures
+    assert failure.trial == "1" and complaint in failure.message and "line 4" in failure.message
+
+
+def test_missing_metadata_costs_its_log_alone(tmp_path: Path) -> None:
+    write_log(tmp_path / "a", [[two_cubes()]])
+    write_log(tmp_path / "b", [[two_cubes()]])
+    (tmp_path / "a" / "metadata.json").unlink()
+    found = read_scenes(tmp_path)
+    assert [trial.scene.name for trial in found.trials] == ["b_0000"]
+    assert "metadata.json is missing" in str(found.failures[0])
+
+
+def test_truncated_archives_are_failures(tmp_path: Path) -> None:
+    path = write_log(tmp_path / "config", [[two_cubes()]], packed=True)
+    path.write_bytes(path.read_bytes()[:-20])
+    found = read_scenes(tmp_path)
+    assert not found.trials and "cannot be read to its end" in str(found.failures[0])
+
+
+def test_folders_without_logs_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="holds no tdw_commands"):
+        read_scenes(tmp_path)
+    with pytest.raises(BadInputError, match="does not exist"):
+        read_scenes(tmp_path / "nowhere")
+
+
+def test_official_logs_import_whole(official: Path) -> None:
+    found = read_scenes(official / "scenes")
+    assert found.failures == [] and not found.unknown
+    assert {trial.scene.scenario for trial in found.trials} == {
+        "dominoes",
+        "support",
+        "collide",
+        "contain",
+        "drop",
+        "link",
+        "roll",
+        "drape",
+    }
+    with (official / "stimuli" / "stimulus_names_and_labels.csv").open() as file:
+        published = {row["stim_ID"]: row["label"] == "True" for row in csv.DictReader(file)}
+    shared = [t for t in found.trials if t.scene.name in published]
+    assert len(shared) > 500
+    assert all(published[t.scene.name] == t.outcome.contact for t in shared)
+    for trial in found.trials[::50]:
+        assert Scene.from_json(trial.scene.to_json()) == trial.scene
