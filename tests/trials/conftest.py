@@ -1,0 +1,12 @@
+"""Shared by the tests of trials."""
+
+from __future__ import annotations
+
+import pytest
+from hand_made import Parts, make_parts
+
+
+@pytest.fixture(scope="session")
+def parts() -> Parts:
+    """A trial with cloth and contacts."""
+    return make_parts()
