@@ -1,0 +1,111 @@
+"""The pinhole camera: matrices, and the way between world points and pixels.
+
+Camera axes are x right, y down, z forward (along the optical axis). Pixel coordinates are
+continuous: the picture spans 0..width and 0..height, and the centre of the pixel in column ``j``
+and row ``i`` is ``(j + 0.5, i + 0.5)``. Depth is planar: metres along the optical axis, not along
+the ray.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from physion.errors import BadInputError
+from physion.scenes.scene import Camera
+
+Floats = NDArray[np.float64]
+
+
+def axes(camera: Camera) -> Floats:
+    """Rows are the camera's right, down and forward axes in the world, (3, 3), orthonormal.
+
+    A camera that looks straight up or down has no upright direction; +y is then up in the picture.
+    """
+    forward = np.subtract(camera.target, camera.position).astype(np.float64)
+    length = float(np.linalg.norm(forward))
+    if length == 0.0:
+        raise BadInputError("camera: position and target are the same point; move one of them")
+    forward /= length
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    if np.linalg.norm(right) < 1e-9:
+        right = np.cross(forward, (0.0, 1.0, 0.0))
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(forward, right), forward])
+
+
+def view_matrix(camera: Camera) -> Floats:
+    """World to camera coordinates, (4, 4), applied to column vectors (x, y, z, 1)."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = axes(camera)
+    matrix[:3, 3] = -matrix[:3, :3] @ np.asarray(camera.position)
+    return matrix
+
+
+def intrinsics(camera: Camera, width: int, height: int) -> Floats:
+    """Camera coordinates to homogeneous pixels, (3, 3); the third coordinate is the depth."""
+    focal = 0.5 * height / math.tan(0.5 * camera.fov)
+    return np.array([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]])
+
+
+def projection_matrix(camera: Camera, width: int, height: int) -> Floats:
+    """Camera coordinates to clip space as OpenGL defines it (x right, y up, z in -w..w), (4, 4).
+
+    It is what a viewer of another program needs; the rasteriser uses `intrinsics`.
+    """
+    scale = 1.0 / math.tan(0.5 * camera.fov)
+    near, far = camera.near, camera.far
+    return np.array(
+        [
+            [scale * height / width, 0.0, 0.0, 0.0],
+            [0.0, -scale, 0.0, 0.0],
+            [0.0, 0.0, (far + near) / (far - near), -2.0 * far * near / (far - near)],
+            [0.0, 0.0, 1.0, 0.0],
+        ]
+    )
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera with a picture size: everything that a projection needs.
+
+    ``to_pixels`` (3, 4) takes world points (x, y, z, 1) to homogeneous pixels (x w, y w, w), where
+    w is the depth in metres.
+    """
+
+    camera: Camera
+    width: int
+    height: int
+
+    @property
+    def to_pixels(self) -> Floats:
+        """World to homogeneous pixels, (3, 4)."""
+        camera = self.camera
+        return np.asarray(intrinsics(camera, self.width, self.height) @ view_matrix(camera)[:3])
+
+    def project(self, points: ArrayLike) -> tuple[Floats, Floats]:
+        """Pixel coordinates (..., 2) and depths (...) in metres of world points (..., 3).
+
+        Points behind the camera get a negative depth; their pixels mean nothing.
+        """
+        world = np.asarray(points, np.float64)
+        matrix = self.to_pixels
+        homogeneous = world @ matrix[:, :3].T + matrix[:, 3]
+        depth = homogeneous[..., 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return homogeneous[..., :2] / depth[..., None], depth
+
+    def unproject(self, pixels: ArrayLike, depth: ArrayLike) -> Floats:
+        """World points (..., 3) seen at pixel coordinates (..., 2) at a planar depth (...)."""
+        at = np.asarray(pixels, np.float64)
+        rays = np.concatenate([at, np.ones_like(at[..., :1])], axis=-1) @ self.ray_matrix.T
+        return np.asarray(self.camera.position) + rays * np.asarray(depth)[..., None]
+
+    @property
+    def ray_matrix(self) -> Floats:
+        """Takes (x, y, 1) in pixels to the world vector that reaches depth 1 there, (3, 3)."""
+        pixel_to_camera = np.linalg.inv(intrinsics(self.camera, self.width, self.height))
+        return np.asarray(axes(self.camera).T @ pixel_to_camera)

@@ -1,0 +1,339 @@
+"""Frames of a trial: colour, depth, normals, ids and flow from its scene and trajectory.
+
+A frame depends on the scene and on one instant of the trajectory (two for the flow), never on the
+frames that were rendered before it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from physion.errors import BadInputError, UnknownNameError
+from physion.physics.trajectory import Trajectory
+from physion.rendering.assembly import Assembly, assemble, place
+from physion.rendering.camera import View
+from physion.rendering.rasterizer import NOTHING, SAMPLES, measure, rasterize, rasterize_depth, transform
+from physion.rendering.rooms import Room, rooms
+from physion.rendering.shading import POINT, Light, Surfaces, shade, shade_still, to_linear, tone_table
+from physion.scenes.scene import Scene
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+
+PASSES = ("color", "depth", "normals", "ids", "flow")
+
+SHADOW_TEXEL = 0.016
+CONTACT_TEXEL = 0.03
+"""Metres that a texel of the shadow map and of the contact map spans."""
+LIFT = 0.03
+"""Metres off its surface at which a point asks whether it is in shadow."""
+CONTACT_REACH = 0.25
+"""Metres above the ground below which a thing darkens it."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One rendered instant; None for passes that were not asked for. H rows, W columns.
+
+    Colour is anti-aliased; the other passes are one exact sample at each pixel centre.
+
+    - ``color`` (H, W, 3) uint8: sRGB.
+    - ``depth`` (H, W) float32: metres along the optical axis (planar z, not along the ray);
+      infinity where nothing is seen.
+    - ``normals`` (H, W, 3) float32: unit, world axes, of the smooth surface without relief;
+      towards the camera on cloth; zero where nothing is seen.
+    - ``ids`` (H, W) int16: 0 is the room, i + 1 is the i-th of `Scene.names`.
+    - ``flow`` (H, W, 2) float32: forward, in pixels (x right, y down): the surface point at the
+      centre of a pixel in this frame is, in the next one, at that centre plus the flow, whether or
+      not it can be seen there. Zero in the last frame and for the room. NaN for a point that
+      passes behind the camera.
+    """
+
+    color: NDArray[np.uint8] | None = None
+    depth: F32 | None = None
+    normals: F32 | None = None
+    ids: NDArray[np.int16] | None = None
+    flow: F32 | None = None
+
+
+@dataclass(frozen=True)
+class Settings:
+    """``still_layer``: draw and shade what never moves once, not in every frame. The frames are
+    the same either way, to the byte."""
+
+    still_layer: bool = True
+
+
+class _Maps(NamedTuple):
+    """World to texels (3, 4), and the map of what never moves (H, W)."""
+
+    matrix: F64
+    still: F32
+
+
+class Renderer:
+    """Renders any frame of one trial at ``width`` x ``height`` pixels."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        trajectory: Trajectory,
+        width: int = 256,
+        height: int = 256,
+        settings: Settings = Settings(),  # noqa: B008 - frozen
+    ) -> None:
+        if width < 1 or height < 1:
+            raise BadInputError(f"a picture of {width} x {height} pixels cannot be rendered")
+        self.scene, self.trajectory = scene, trajectory
+        self.width, self.height = width, height
+        self._check()
+        self.room: Room = rooms.get(scene.room)
+        self._view = View(scene.camera, width, height)
+        self._assembly = assembly = assemble(scene, self.room)
+        self._first = assembly.first_triangle if settings.still_layer else 0
+        self._tones = tone_table(self.room.exposure)
+        self._still_vertices, self._still_normals = place(assembly, scene, trajectory, 0, False)
+        self._edges = np.zeros((len(assembly.faces), 9))
+        self._shadow, self._contact = self._still_maps()
+        self._ids, self._inverse, self._points = self._still_picture()
+        self._still_shading: F32 | None = None
+        self._still_passes: tuple[F32, F32, NDArray[np.int16], F32] | None = None
+
+    def _check(self) -> None:
+        scene, trajectory = self.scene, self.trajectory
+        cloth = sum(c.resolution**2 for c in scene.cloths)
+        bodies = trajectory.positions.shape[1]
+        if bodies != len(scene.bodies) or trajectory.cloth_vertices.shape[1] != cloth:
+            raise BadInputError(
+                f"trajectory of {bodies} bodies and {trajectory.cloth_vertices.shape[1]} cloth "
+                f"vertices is not one of scene {scene.name!r} with {len(scene.bodies)} bodies and "
+                f"{cloth} cloth vertices"
+            )
+
+    def _still_maps(self) -> tuple[_Maps, _Maps]:
+        """Shadow and contact map over the region where the trial begins, with what never moves."""
+        center, half = _region(self.scene)
+        maps = []
+        for matrix, size in (
+            _lamp_matrix(np.asarray(self.room.lamp_direction), center, half),
+            _ground_matrix(center, half),
+        ):
+            still = np.full((size, size), np.inf, np.float32)
+            self._draw_map(still, matrix, self._still_vertices, False)
+            maps.append(_Maps(matrix, still))
+        return maps[0], maps[1]
+
+    def _draw_map(self, depth: F32, matrix: F64, vertices: F64, moving: bool) -> None:
+        """Add the moving bodies, or the others without the room, to a depth map."""
+        assembly = self._assembly
+        points = np.empty_like(vertices)
+        transform(vertices, matrix, points)
+        first, last = assembly.room_triangles, assembly.first_triangle
+        if moving:
+            first, last = assembly.first_triangle, len(assembly.faces)
+        rasterize_depth(points, assembly.faces, first, last, depth)
+
+    def _still_picture(self) -> tuple[I32, F32, F64]:
+        """What never moves, drawn: triangle ids, inverse depths, homogeneous pixels."""
+        assembly = self._assembly
+        ids = np.full((self.height, self.width, len(SAMPLES)), NOTHING, np.int32)
+        inverse = np.zeros(ids.shape, np.float32)
+        points = np.empty((assembly.vertex_count, 3))
+        transform(self._still_vertices, self._view.to_pixels, points)
+        still = assembly.faces[: assembly.first_triangle]
+        self._draw(points, still, 0, ids, inverse)
+        return ids, inverse, points
+
+    def _draw(self, points: F64, faces: I32, first: int, ids: I32, inverse: F32) -> None:
+        camera, two_sided = self.scene.camera, self._assembly.two_sided
+        rasterize(
+            points, faces, two_sided, first, camera.near, camera.far, self._edges, ids, inverse
+        )
+
+    def render(self, frame: int, passes: Sequence[str] = ("color",)) -> Frame:
+        """Render the passes named, of `PASSES`, of frame ``frame`` (negative counts from the end)."""
+        for name in passes:
+            if name not in PASSES:
+                raise UnknownNameError("pass", name, PASSES)
+        count = len(self.trajectory)
+        if not -count <= frame < count:
+            raise BadInputError(f"frame {frame} of a trajectory of {count} frames does not exist")
+        frame %= count
+        assembly = self._assembly
+        vertices, normals = place(assembly, self.scene, self.trajectory, frame, True)
+        vertices += self._still_vertices
+        normals += self._still_normals
+        points = self._points.copy()
+        first = assembly.first_vertex
+        transform(vertices[first:], self._view.to_pixels, points[first:])
+        ids, inverse = self._ids.copy(), self._inverse.copy()
+        self._draw(points, assembly.faces, assembly.first_triangle, ids, inverse)
+        color = self._color(ids, vertices, normals) if "color" in passes else None
+        if not set(passes) - {"color"}:
+            return Frame(color=color)
+        depth, normal, identity, flow = self._measure(ids, points, normals, frame, "flow" in passes)
+        return Frame(
+            color=color,
+            depth=depth if "depth" in passes else None,
+            normals=normal if "normals" in passes else None,
+            ids=identity if "ids" in passes else None,
+            flow=flow if "flow" in passes else None,
+        )
+
+    def frames(self, passes: Sequence[str] = ("color",)) -> Iterator[Frame]:
+        """Render all frames, one after the other."""
+        for frame in range(len(self.trajectory)):
+            yield self.render(frame, passes)
+
+    def _color(self, ids: I32, vertices: F64, normals: F32) -> NDArray[np.uint8]:
+        maps = []
+        for matrix, still in (self._shadow, self._contact):
+            depth = still.copy()
+            self._draw_map(depth, matrix, vertices, True)
+            maps.append(depth)
+        light = self._light(maps[0], maps[1])
+        surfaces = self._surfaces(normals)
+        if self._still_shading is None:
+            still = np.zeros((self.height, self.width, POINT), np.float32)
+            if self._first:
+                shade_still(self._ids, surfaces, light, still)
+            self._still_shading = still
+        out = np.empty((self.height, self.width, 3), np.uint8)
+        background = to_linear(self.room.background)
+        shade(ids, self._first, surfaces, light, self._still_shading, background, self._tones, out)
+        return out
+
+    def _measure(
+        self, ids: I32, points: F64, normals: F32, frame: int, flow: bool
+    ) -> tuple[F32, F32, NDArray[np.int16], F32]:
+        if self._still_passes is None:
+            blank = (
+                np.full((self.height, self.width), np.inf, np.float32),
+                np.zeros((self.height, self.width, 3), np.float32),
+                np.zeros((self.height, self.width), np.int16),
+                np.zeros((self.height, self.width, 2), np.float32),
+            )
+            self._measure_into(self._ids, normals, points, 0, blank)
+            blank[3][...] = 0.0
+            self._still_passes = blank
+        later = points
+        following = frame + 1
+        if flow and following < len(self.trajectory):
+            later = points.copy()
+            vertices, _ = place(self._assembly, self.scene, self.trajectory, following, True)
+            first = self._assembly.first_vertex
+            transform(vertices[first:], self._view.to_pixels, later[first:])
+        out = (
+            self._still_passes[0].copy(),
+            self._still_passes[1].copy(),
+            self._still_passes[2].copy(),
+            self._still_passes[3].copy(),
+        )
+        self._measure_into(ids, normals, later, self._assembly.first_triangle, out)
+        if later is points:
+            out[3][...] = 0.0
+        return out
+
+    def _measure_into(
+        self,
+        ids: I32,
+        normals: F32,
+        later: F64,
+        first: int,
+        out: tuple[F32, F32, NDArray[np.int16], F32],
+    ) -> None:
+        a = self._assembly
+        measure(ids, self._edges, a.faces, a.objects, normals, a.two_sided, later, first, *out)
+
+    def _surfaces(self, normals: F32) -> Surfaces:
+        a = self._assembly
+        return Surfaces(
+            self._edges, normals, a.uv, a.tangents, a.surface, a.material, a.materials, *a.atlas
+        )
+
+    def _light(self, shadow: F32, contact: F32) -> Light:
+        room = self.room
+        direction = np.asarray(room.lamp_direction)
+        return Light(
+            eye=np.asarray(self.scene.camera.position, np.float64),
+            rays=self._view.ray_matrix,
+            lamp=np.stack([direction / np.linalg.norm(direction), room.lamp]),
+            around=np.asarray(room.around),
+            mirrored=np.asarray(room.mirrored),
+            bounds=np.asarray([room.low, room.high]),
+            to_shadow=self._shadow.matrix,
+            to_contact=self._contact.matrix,
+            shadow=shadow,
+            contact=contact,
+            settings=np.array([LIFT, room.shadow, room.contact, CONTACT_REACH]),
+        )
+
+
+def render_frames(
+    scene: Scene,
+    trajectory: Trajectory,
+    *,
+    width: int = 256,
+    height: int = 256,
+    passes: Sequence[str] = ("color",),
+) -> Iterator[Frame]:
+    """Render all frames of a trial, lazily."""
+    return Renderer(scene, trajectory, width, height).frames(passes)
+
+
+def role_map(ids: NDArray[np.integer], scene: Scene) -> NDArray[np.uint8]:
+    """Picture (H, W, 4) that points out the agent in red and the patient in yellow, from ids.
+
+    Everything else is transparent: alpha is 0.
+    """
+    colors = np.zeros((len(scene.names()) + 1, 4), np.uint8)
+    colors[scene.index(scene.roles.agent) + 1] = (255, 0, 0, 255)
+    colors[scene.index(scene.roles.patient) + 1] = (255, 255, 0, 255)
+    return colors[ids]
+
+
+def _region(scene: Scene) -> tuple[F64, float]:
+    """Centre on the ground and half size in metres of where shadows fall.
+
+    It depends on the scene alone, so that a frame does not depend on the frames after it.
+    """
+    at = [(*body.position[:2], max(body.scale)) for body in scene.bodies]
+    at += [(*cloth.position[:2], max(cloth.size)) for cloth in scene.cloths]
+    x = np.array(at)
+    low = (x[:, :2] - x[:, 2:]).min(axis=0)
+    high = (x[:, :2] + x[:, 2:]).max(axis=0)
+    center = 0.5 * (low + high)
+    half = float(np.clip(0.5 * (high - low).max() + 1.0, 2.5, 6.0))
+    return np.array([*center, 0.0]), half
+
+
+def _lamp_matrix(direction: F64, center: F64, half: float) -> tuple[F64, int]:
+    """World to (texel, texel, distance) as the lamp sees the region, and the map's size."""
+    toward = direction / np.linalg.norm(direction)
+    right = np.cross((0.0, 1.0, 0.0), toward)
+    right /= np.linalg.norm(right)
+    rows = np.stack([right, np.cross(toward, right), -toward])
+    return _texel_matrix(rows, center, half, SHADOW_TEXEL)
+
+
+def _ground_matrix(center: F64, half: float) -> tuple[F64, int]:
+    """World to (texel, texel, height), and the map's size."""
+    return _texel_matrix(np.eye(3), center, half, CONTACT_TEXEL)
+
+
+def _texel_matrix(rows: F64, center: F64, half: float, texel: float) -> tuple[F64, int]:
+    size = int(np.ceil(2.0 * half / texel))
+    matrix = np.zeros((3, 4))
+    matrix[:2, :3] = rows[:2] / texel
+    matrix[:2, 3] = 0.5 * size - matrix[:2, :3] @ center
+    matrix[2, :3] = rows[2]
+    return matrix, size
+
+
+__all__ = ["PASSES", "Assembly", "Frame", "Renderer", "Settings", "render_frames", "role_map"]
