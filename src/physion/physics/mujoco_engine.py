@@ -1,0 +1,189 @@
+"""The rigid-body engine: MuJoCo's geometry and collisions, the official simulator's contact law.
+
+A step of 0.01 s, one a frame: contacts at the present poses; pushes, gravity, drag and the cap of
+the angular velocity; contact forces (`contact_solver`); poses move; then the velocities lose the
+speed that only corrected penetration. The same scene gives the same bytes: nothing here is random,
+parallel or dependent on time.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from physion.errors import BadInputError
+from physion.physics.contact_finder import ContactFinder
+from physion.physics.contact_record import ContactRecord
+from physion.physics.contact_solver import AnchorMemory, move_poses, no_anchors, solve_step
+from physion.physics.rigid_model import (
+    RigidModel,
+    build_model,
+    conjugate,
+    multiply_quaternions,
+    rotate_vectors,
+)
+from physion.physics.settings import Settings
+from physion.physics.sleeping import update_sleep
+from physion.physics.trajectory import State, Trajectory
+from physion.scenes.scene import Scene
+
+Array = NDArray[np.float64]
+
+VERSION = 1
+"""Raised whenever the same scene could move differently."""
+
+
+class MujocoEngine:
+    """Simulates rigid scenes; scenes with cloth go on to `physion.physics.cloth`."""
+
+    def __init__(self, settings: Settings | None = None) -> None:
+        self.settings = settings if settings is not None else Settings()
+
+    @property
+    def name(self) -> str:
+        """``mujoco-<version>+physion-<version of this engine>.<settings>``."""
+        return f"mujoco-{mujoco.__version__}+physion-{VERSION}.{self.settings.tag()}"
+
+    def simulate(
+        self, scene: Scene, *, start: State | None = None, frames: int | None = None
+    ) -> Trajectory:
+        """Move ``scene`` until it ends; see `physion.physics.engine.Engine.simulate`."""
+        if frames is not None and frames < 1:
+            raise BadInputError(f"frames must be at least 1, not {frames}")
+        run = RigidRun(scene, self.settings, start)
+        limit = scene.ending.max_frames if frames is None else frames
+        while len(run.positions) < limit:
+            if frames is None and len(run.positions) >= scene.ending.min_frames and run.all_asleep():
+                break
+            run.step()
+        return run.trajectory(self.name)
+
+
+class RigidRun:
+    """A scene while it moves: state, memory of the contacts, and what was recorded so far."""
+
+    def __init__(self, scene: Scene, settings: Settings, start: State | None = None) -> None:
+        self.scene, self.settings = scene, settings
+        self.model = build_model(scene, settings)
+        self.finder = ContactFinder(self.model, settings)
+        actors = self.model.actors
+        self.x, self.q = self.model.start_x.copy(), self.model.start_q.copy()
+        self.v, self.w = np.zeros((actors + 1, 3)), np.zeros((actors + 1, 3))
+        self.frame = 0
+        if start is not None:
+            self._take(start)
+        self.anchors: AnchorMemory = no_anchors()
+        self.counter = np.full(actors, settings.wake_time)
+        self.still_v, self.still_w = np.zeros((actors, 3)), np.zeros((actors, 3))
+        self.asleep = np.zeros(actors, np.bool_)
+        self.positions: list[Array] = []
+        self.rotations: list[Array] = []
+        self.velocities: list[Array] = []
+        self.spins: list[Array] = []
+        self.record = ContactRecord()
+        self._note()
+
+    def step(self) -> None:
+        """Move by one frame."""
+        s, model = self.settings, self.model
+        contacts, pairs = self.finder.find(self.x, self.q)
+        self._push()
+        awake = ~self.asleep
+        self._free_motion(awake)
+        move_v, move_w, load, *memory = solve_step(
+            contacts, self.anchors, self.x, self.q, self.v, self.w,
+            np.where(np.append(awake, True), model.inv_mass, 0.0),
+            np.where(np.append(awake, True)[:, None, None], model.inv_inertia, 0.0),
+            s.dt, s.position_iterations, s.velocity_iterations, s.friction_sweeps,
+            not s.friction_doubling, s.bias, s.max_depenetration_speed, s.bounce_threshold,
+            s.friction_gain, s.patch_cosine, s.anchor_distance, s.anchor_gap,
+        )  # fmt: skip
+        self.anchors = AnchorMemory(*memory)
+        move_poses(self.x, self.q, move_v, move_w, s.dt)
+        update_sleep(
+            contacts.bodies, move_v, move_w, self.q, model.inv_inertia, model.inv_mass,
+            self.counter, self.still_v, self.still_w, self.asleep,
+            s.sleep_threshold, s.wake_time, s.dt,
+        )  # fmt: skip
+        self.v[:-1][self.asleep] = 0.0
+        self.w[:-1][self.asleep] = 0.0
+        self.frame += 1
+        self.record.add(len(self.positions), contacts, pairs, load)
+        self._note()
+
+    def all_asleep(self) -> bool:
+        """Every body sleeps that has not fallen below the floor of the ending."""
+        above = self.pivots()[:, 2] >= self.scene.ending.floor
+        counted = np.unique(self.model.actor_of[above])
+        return bool(np.append(self.asleep, True)[counted].all())
+
+    def pivots(self) -> Array:
+        """World positions of all bodies (N, 3)."""
+        own = self.model.actor_of
+        return self.x[own] + rotate_vectors(self.q[own], self.model.pivot)
+
+    def trajectory(self, engine: str) -> Trajectory:
+        """All frames so far."""
+        frames = len(self.positions)
+        return Trajectory(
+            positions=np.asarray(self.positions, np.float32),
+            rotations=np.asarray(self.rotations, np.float32),
+            velocities=np.asarray(self.velocities, np.float32),
+            angular_velocities=np.asarray(self.spins, np.float32),
+            cloth_vertices=np.zeros((frames, 0, 3), np.float32),
+            cloth_distance=np.full(frames, np.nan, np.float32),
+            contacts=self.record.contacts(),
+            completed=self.all_asleep(),
+            engine=engine,
+        )
+
+    def _push(self) -> None:
+        for push in self.scene.pushes:
+            if push.frame != self.frame:
+                continue
+            actor = self.model.actor_of[self.scene.index(push.body)]
+            if actor == self.model.actors:
+                continue
+            impulse = np.asarray(push.impulse)
+            self.v[actor] += impulse * self.model.inv_mass[actor]
+            if push.point is not None:
+                turning = np.cross(np.asarray(push.point) - self.x[actor], impulse)
+                local = rotate_vectors(conjugate(self.q[actor]), turning)
+                spin = self.model.inv_inertia[actor] @ local
+                self.w[actor] += rotate_vectors(self.q[actor], spin)
+            self.asleep[actor] = False
+            self.counter[actor] = self.settings.wake_time
+
+    def _free_motion(self, awake: NDArray[np.bool_]) -> None:
+        """Gravity, drag, and the cap of the angular velocity, for everything awake."""
+        s = self.settings
+        self.v[:-1][awake, 2] -= s.gravity * s.dt
+        keep = np.maximum(1.0 - self.model.drag * s.dt, 0.0)
+        self.v[:-1] *= keep[:, :1]
+        self.w[:-1] *= keep[:, 1:]
+        speed = np.linalg.norm(self.w, axis=1, keepdims=True)
+        self.w *= np.minimum(1.0, s.max_angular_velocity / np.maximum(speed, 1e-12))
+
+    def _note(self) -> None:
+        own, model = self.model.actor_of, self.model
+        turned = self.q[own]
+        arm = rotate_vectors(turned, model.center)
+        self.positions.append(self.pivots())
+        self.rotations.append(multiply_quaternions(turned, model.turn))
+        self.velocities.append(self.v[own] + np.cross(self.w[own], arm))
+        self.spins.append(self.w[own])
+
+    def _take(self, start: State) -> None:
+        """Set the actors from the state of the first body of each."""
+        model = self.model
+        for actor in range(model.actors):
+            i = int(np.flatnonzero(model.actor_of == actor)[0])
+            turn = np.asarray(start.rotations[i], np.float64)
+            q = multiply_quaternions(turn / np.linalg.norm(turn), conjugate(model.turn[i]))
+            self.q[actor] = q
+            self.x[actor] = start.positions[i] - rotate_vectors(q, model.pivot[i])
+            self.w[actor] = start.angular_velocities[i]
+            arm = rotate_vectors(q, model.center[i])
+            self.v[actor] = start.velocities[i] - np.cross(self.w[actor], arm)
+        self.frame = start.frame

@@ -1,0 +1,64 @@
+"""The physical constants of the rigid-body engine, all in one place and all documented."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass
+
+from physion.scenes.scene import FRAME_TIME, GRAVITY, Contact
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """How the engine moves bodies. The defaults are those of the official simulator.
+
+    "Unity" means a default of Unity 2019's physics (PhysX 4), "official" a value that the official
+    command logs set, "PhysX" a constant of its patch-friction Gauss-Seidel solver.
+
+    - ``dt``: seconds of a step; one step is one frame (official, measured from free falls).
+    - ``gravity``: metres per second squared, downwards (official).
+    - ``position_iterations``: Gauss-Seidel sweeps with penetration bias (official: 32).
+    - ``velocity_iterations``: sweeps without bias, after the poses have moved (Unity: 1).
+    - ``friction_sweeps``: how many of the last position sweeps rub; 0 means all (PhysX: 3).
+    - ``friction_doubling``: every one of a patch's two anchors may carry the whole friction force,
+      so that flat contacts rub twice as strongly as Coulomb's law says. That is how the official
+      simulator behaves (Unity's "improved patch friction" is off); False shares the force out.
+    - ``contact_offset``: metres around every surface in which contacts are found (Unity: .01).
+    - ``bias``: share of a penetration or gap that one step closes (PhysX: .8).
+    - ``max_depenetration_speed``: metres per second (Unity: 10).
+    - ``bounce_threshold``: approach speed in m/s above which restitution acts (Unity: 2).
+    - ``friction_gain``: share of the tangential velocity that one sweep removes (PhysX: .8).
+    - ``patch_cosine``: contacts whose normals agree by this cosine form one patch (PhysX: .999).
+    - ``anchor_distance``: metres; a second friction anchor must be this far from the first, and
+      anchors this far apart along the normal are forgotten (PhysX: .025).
+    - ``anchor_gap``: metres; only contacts closer than this hold an anchor (PhysX: .04).
+    - ``max_angular_velocity``: radians per second, about the centre of mass (Unity: 7).
+    - ``sleep_threshold``: kinetic energy by mass in m²/s² (official: .01).
+    - ``wake_time``: seconds of stillness before a body may sleep (PhysX: .4).
+    - ``floor``: friction of the floor (Unity's default material).
+    """
+
+    dt: float = FRAME_TIME
+    gravity: float = GRAVITY
+    position_iterations: int = 32
+    velocity_iterations: int = 1
+    friction_sweeps: int = 3
+    friction_doubling: bool = True
+    contact_offset: float = 0.01
+    bias: float = 0.8
+    max_depenetration_speed: float = 10.0
+    bounce_threshold: float = 2.0
+    friction_gain: float = 0.8
+    patch_cosine: float = 0.999
+    anchor_distance: float = 0.025
+    anchor_gap: float = 0.04
+    max_angular_velocity: float = 7.0
+    sleep_threshold: float = 0.01
+    wake_time: float = 0.4
+    floor: Contact = Contact(0.6, 0.6, 0.0)
+
+    def tag(self) -> str:
+        """Eight hexadecimal digits that change whenever a setting does."""
+        text = json.dumps(asdict(self), sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:8]

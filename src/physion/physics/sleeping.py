@@ -1,0 +1,96 @@
+"""When resting bodies fall asleep, as PhysX decides it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True)
+def update_sleep(
+    bodies: Any,
+    v: Any,
+    w: Any,
+    q: Any,
+    inv_inertia: Any,
+    inv_mass: Any,
+    counter: Any,
+    still_v: Any,
+    still_w: Any,
+    asleep: Any,
+    threshold: float,
+    wake_time: float,
+    dt: float,
+) -> None:
+    """Advance the sleep clocks of all actors by a step.
+
+    ``bodies`` (C, 2) are the actors of the contacts of the step. ``v``, ``w`` are the velocities
+    that moved the poses. ``counter`` (A,) counts down from ``wake_time``; in its second half the
+    velocities add up in ``still_v``, ``still_w`` (A, 3), and a sum with more energy than
+    ``threshold`` times one plus the number of touching neighbours starts it anew. Touching actors
+    sleep together, when all their clocks are down, and wake together.
+    """
+    actors = len(counter)
+    island = np.arange(actors)
+    touching = np.zeros((actors, actors + 1), np.bool_)
+    for c in range(len(bodies)):
+        a, b = bodies[c, 0], bodies[c, 1]
+        if a < actors:
+            touching[a, b] = True
+        if b < actors:
+            touching[b, a] = True
+        if a < actors and b < actors and island[a] != island[b]:
+            low, high = min(island[a], island[b]), max(island[a], island[b])
+            for i in range(actors):
+                if island[i] == high:
+                    island[i] = low
+    for i in range(actors):
+        if asleep[i]:
+            continue
+        if counter[i] < 0.5 * wake_time or counter[i] < dt:
+            # Principal axes are not needed: the energy of spin is w.I.w in any frame.
+            energy = 0.0
+            for j in range(3):
+                still_v[i, j] += v[i, j]
+                energy += still_v[i, j] ** 2
+            qc = q[i] * np.array([1.0, -1.0, -1.0, -1.0])
+            local = _rotate(qc, w[i])
+            for j in range(3):
+                still_w[i, j] += local[j]
+            inertia = np.linalg.inv(inv_inertia[i])
+            energy += inv_mass[i] * (still_w[i] @ (inertia @ still_w[i]))
+            neighbours = np.sum(touching[i])
+            limit = (1.0 + neighbours) * threshold
+            if 0.5 * energy >= limit:
+                still_v[i] = 0.0
+                still_w[i] = 0.0
+                factor = min(0.5 * energy / limit, 2.0) if limit > 0 else 2.0
+                counter[i] = factor * 0.5 * wake_time + dt * neighbours
+                continue
+        counter[i] = max(counter[i] - dt, 0.0)
+    for i in range(actors):
+        if island[i] != i:
+            continue
+        ready = True
+        for j in range(actors):
+            if island[j] == i and counter[j] > 0.0:
+                ready = False
+        for j in range(actors):
+            if island[j] != i:
+                continue
+            if not ready and asleep[j]:
+                counter[j] = wake_time
+                asleep[j] = False
+            elif ready and not asleep[j]:
+                asleep[j] = True
+                still_v[j] = 0.0
+                still_w[j] = 0.0
+
+
+@njit(cache=True)
+def _rotate(q: Any, v: Any) -> Any:
+    axis = q[1:]
+    twice = 2.0 * np.cross(axis, v)
+    return v + q[0] * twice + np.cross(axis, twice)
