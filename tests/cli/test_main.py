@@ -1,0 +1,65 @@
+"""The command line: help is quick, faults are one line with exit code 2."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from physion.cli.main import VERBS, main
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = (
+        "import sys; from physion.cli.main import main; main(['--help']); "
+        "heavy = {'numpy', 'torch', 'mujoco', 'tyro', 'numba', 'pandas'} & set(sys.modules); "
+        "sys.exit(len(heavy))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert all(verb in done.stdout for verb in VERBS)
+
+
+@pytest.mark.parametrize("verb", sorted(VERBS))
+def test_every_verb_has_help(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as left:
+        main([verb, "--help"])
+    assert left.value.code == 0
+    assert f"physion {verb}" in capsys.readouterr().out
+
+
+def test_unknown_verbs_get_the_closest(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["reply"]) == 2
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1 and "replay" in message
+
+
+@pytest.mark.parametrize("content", [None, "empty", "file"])
+def test_bad_folders_are_one_line(
+    tmp_path: Path, content: str | None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "scenes"
+    if content == "empty":
+        folder.mkdir()
+    elif content == "file":
+        folder.write_text("not a folder")
+    target = tmp_path / "table.json"
+    assert main(["replay", str(folder), "--json", str(target)]) == 2
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1 and str(folder) in message
+    assert not target.exists() and not list(tmp_path.glob(".*part"))
+
+
+def test_doctor_says_what_is_here(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor"]) == 0
+    out = capsys.readouterr().out
+    assert "mujoco" in out and "H.264" in out and "write access" in out
+
+
+def test_doctor_refuses_a_folder_that_is_not_there(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["doctor", "--folder", str(tmp_path / "nowhere")]) == 1
+    assert "--folder" in capsys.readouterr().out

@@ -1,0 +1,97 @@
+"""The replay table, its ceiling and its area under the curve."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from sklearn.metrics import roc_auc_score
+
+from physion.physics.jitter import jitter_scene, pair_agreement
+from physion.physics.replay import Replay, area_under_curve, summarise
+from physion.scenes.scene import Body, Camera, Joint, Push, Roles, Scene
+
+
+def replay(name: str, recorded: bool, simulated: bool, **more: object) -> Replay:
+    values = {
+        "scenario": "collide",
+        "recorded_frame": 10 if recorded else None,
+        "simulated_frame": 13 if simulated else None,
+        "frames": 101,
+        "distance": None,
+        "cpu_seconds": 0.1,
+        "physics_seconds": 1.0,
+    }
+    return Replay(name=name, recorded=recorded, simulated=simulated, **(values | more))  # type: ignore[arg-type]
+
+
+def test_the_table_counts_what_it_says() -> None:
+    replays = [
+        replay("a", True, True),
+        replay("b", True, False),
+        replay("c", True, True, simulated_frame=9),
+        replay("d", False, False),
+    ]
+    (row,) = summarise(replays)
+    assert (row.trials, row.base_rate, row.agreement) == (4, 0.75, 0.75)
+    assert row.frame_difference == 2  # of 3 and 1
+    assert row.milliseconds == pytest.approx(100) and row.real_time == pytest.approx(10)
+    assert math.isnan(row.auc) and math.isnan(row.ceiling)
+
+
+def test_jittered_runs_give_the_ceiling() -> None:
+    replays = [
+        replay("a", True, True, jittered=(True, True, True, False)),
+        replay("b", True, True, jittered=(True, True, True, True)),
+    ]
+    (row,) = summarise(replays)
+    assert row.ceiling == pytest.approx((0.5 + 1.0) / 2)
+
+
+@given(st.lists(st.booleans(), min_size=2, max_size=12))
+def test_pair_agreement_is_the_share_of_equal_pairs(outcomes: list[bool]) -> None:
+    pairs = [a == b for i, a in enumerate(outcomes) for b in outcomes[:i]]
+    assert pair_agreement(np.array(outcomes)) == pytest.approx(np.mean(pairs))
+
+
+@given(st.lists(st.tuples(st.integers(0, 5), st.booleans()), min_size=2, max_size=30))
+def test_area_under_curve_is_sklearns(rows: list[tuple[int, bool]]) -> None:
+    scores = np.array([score for score, _ in rows], float)
+    truth = np.array([label for _, label in rows])
+    area = area_under_curve(scores, truth)
+    if truth.all() or not truth.any():
+        assert math.isnan(area)
+    else:
+        assert area == pytest.approx(roc_auc_score(truth, scores))
+
+
+def test_jitter_moves_what_can_move_and_keeps_joints_and_pushes_together() -> None:
+    scene = Scene(
+        name="s",
+        scenario="link",
+        bodies=(
+            Body("zone", "cube", (0.0, 0.0, 0.0), kinematic=True),
+            Body("base", "cube", (1.0, 0.0, 0.0)),
+            Body("pole", "cube", (1.0, 0.0, 1.0)),
+            Body("ring", "torus", (1.0, 0.0, 1.0)),
+        ),
+        roles=Roles("ring", "zone"),
+        camera=Camera((3.0, 3.0, 1.0)),
+        joints=(Joint("base", "pole"),),
+        pushes=(Push("base", (1.0, 0.0, 0.0), (1.0, 0.0, 0.5)),),
+    )
+    moved = jitter_scene(scene, 0.01, np.random.default_rng(0))
+
+    def shift(index: int) -> np.ndarray:
+        return np.subtract(moved.bodies[index].position, scene.bodies[index].position)
+
+    assert not shift(0).any()
+    assert shift(1).any() and shift(1)[2] == 0
+    np.testing.assert_array_equal(shift(1), shift(2))
+    assert not np.array_equal(shift(1), shift(3))
+    np.testing.assert_allclose(np.subtract(moved.pushes[0].point, scene.pushes[0].point), shift(1))
+    assert replace(moved, bodies=scene.bodies, pushes=scene.pushes) == scene
