@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import secrets
+from collections.abc import Iterator
 from pathlib import Path
+
+from physion.errors import PhysionError
+
+try:
+    import fcntl
+except ImportError:  # pragma: no cover - Windows
+    fcntl = None  # type: ignore[assignment]
 
 PART_SUFFIX = ".part"
 """How the name of a file that is still being written ends."""
@@ -56,3 +65,41 @@ def _sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+@contextlib.contextmanager
+def folder_lock(folder: Path) -> Iterator[None]:
+    """Have ``folder`` to oneself among the processes of this machine that ask for it too.
+
+    Raises `PhysionError` at once where another one has it. The system gives the lock back when
+    its holder dies, so a killed process leaves nothing to clean up.
+    """
+    if fcntl is None:  # pragma: no cover - no such locks on this system
+        yield
+        return
+    path = folder / ".lock"
+    while True:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(descriptor)
+            raise PhysionError(
+                f"another process is writing into {folder}; wait for it, or choose another folder"
+            ) from None
+        # The holder before may have deleted the file between our opening and our locking it.
+        if _same(path, descriptor):
+            break
+        os.close(descriptor)
+    try:
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+        os.close(descriptor)
+
+
+def _same(path: Path, descriptor: int) -> bool:
+    try:
+        return os.path.samestat(path.stat(), os.fstat(descriptor))
+    except FileNotFoundError:
+        return False

@@ -40,7 +40,7 @@ def images(frame: int) -> dict[str, NDArray[Any]]:
         "color": rng.integers(0, 255, (SIZE, SIZE, 3), dtype=np.uint8),
         "depth": rng.uniform(1, 9, (SIZE, SIZE)).astype(np.float32),
         "normals": rng.uniform(-1, 1, (SIZE, SIZE, 3)).astype(np.float16),
-        "ids": rng.integers(-1, 3, (SIZE, SIZE)).astype(np.int16),
+        "ids": rng.integers(0, 4, (SIZE, SIZE)).astype(np.int16),
         "flow": rng.normal(size=(SIZE, SIZE, 2)).astype(np.float16),
     }
 
@@ -90,8 +90,8 @@ def make_parts(name: str = "tiny", *, cloth: bool = True, contact_frame: int | N
     """Everything of a trial, consistent with itself."""
     scene = make_scene(name, cloth)
     trajectory = make_trajectory(scene, contact_frame)
-    ids = np.full((SIZE, SIZE), -1, np.int16)
-    ids[:8, :8], ids[8:24, :] = 0, 1
+    ids = np.zeros((SIZE, SIZE), np.int16)
+    ids[:8, :8], ids[8:24, :] = 1, 2
     metadata = Metadata(
         trial=name,
         dataset="tests",

@@ -334,5 +334,5 @@ def test_writer_refuses_what_does_not_fit(parts: Parts) -> None:
         writer.add_frame({"depth": np.zeros((3, 3))})
     with pytest.raises(BadInputError, match="0 frames of passes, not 60"):
         writer.finish()
-    with pytest.raises(BadInputError, match="ids name thing 7"):
+    with pytest.raises(BadInputError, match=r"ids of shape \(4, 4\) are not pixels in 0\.\.3"):
         TrialWriter(*parts._replace(ids=np.full((4, 4), 7, np.int16)))

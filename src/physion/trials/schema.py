@@ -30,9 +30,6 @@ MAX_CHUNK_BYTES = 2**28
 WHOLE_BYTES = 2**20
 """Fields up to this size are one chunk: a chunk a frame would cost more than the numbers."""
 
-ROOM = -1
-"""Value of ``ids`` where the picture shows the room and none of the scene's things."""
-
 _MAGIC = b"PHYSION TRIAL"
 _FILTERS = {h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32, h5py.h5z.FILTER_DEFLATE, 32015}
 _HDF5_ERRORS = (OSError, KeyError, RuntimeError, ValueError, TypeError, MemoryError, AttributeError)
@@ -67,7 +64,7 @@ FIELDS: Mapping[str, Field] = {
     "contacts/point": Field("<f4", ("contact", 3), "m"),
     "contacts/normal": Field("<f4", ("contact", 3), "unit, from the first to the second body"),
     "contacts/impulse": Field("<f4", ("contact",), "N s along the normal"),
-    "first_frame/ids": Field("<i2", ("row", "column"), "indices of Scene.names, -1 the room"),
+    "first_frame/ids": Field("<i2", ("row", "column"), "0 the room, i + 1 the i-th of Scene.names"),
     "first_frame/shares": Field("<f4", ("thing",), "share of the picture by Scene.names"),
 }
 """Fields that every trial file has, by path."""
@@ -76,7 +73,7 @@ PASSES: Mapping[str, Field] = {
     "color": Field("|u1", ("frame", "row", "column", 3), "sRGB"),
     "depth": Field("<f4", ("frame", "row", "column"), "distance along the view axis, m"),
     "normals": Field("<f2", ("frame", "row", "column", 3), "unit, world axes"),
-    "ids": Field("<i2", ("frame", "row", "column"), "indices of Scene.names, -1 the room"),
+    "ids": Field("<i2", ("frame", "row", "column"), "0 the room, i + 1 the i-th of Scene.names"),
     "flow": Field("<f2", ("frame", "row", "column", 2), "(right, down), pixels"),
 }
 """Image passes, kept under ``passes/`` when asked for, one frame a chunk."""

@@ -84,8 +84,8 @@ class Metadata:
 class TrialWriter:
     """Builds the bytes of a trial file; image passes come frame by frame, if there are any.
 
-    ``ids`` (H, W) names the thing that each pixel of frame 0 shows, as an index of
-    `Scene.names`, or -1 for the room. ``passes`` are the names that every `add_frame` brings.
+    ``ids`` (H, W) says what each pixel of frame 0 shows: 0 the room, i + 1 the i-th of
+    `Scene.names`, as the renderer has it. ``passes`` are the names that every `add_frame` brings.
     ``compatible`` packs with gzip, for readers without hdf5plugin. Same input, same bytes.
     """
 
@@ -260,7 +260,7 @@ class Trial:
 
     @cached_property
     def ids(self) -> NDArray[np.int16]:
-        """What each pixel of frame 0 shows: (H, W), indices of `Scene.names`, -1 for the room."""
+        """What each pixel of frame 0 shows (H, W): 0 the room, i + 1 the i-th of `Scene.names`."""
         return self._reader.array("first_frame/ids")
 
     @cached_property
@@ -282,11 +282,10 @@ class Trial:
 
 def _arrays(trajectory: Trajectory, ids: NDArray[Any], things: int) -> dict[str, NDArray[Any]]:
     """The arrays of a trial by the path of their field."""
-    shown = ids[ids >= 0]
-    if shown.size and shown.max() >= things:
-        raise BadInputError(f"ids name thing {shown.max()} of a scene with {things}")
-    counts = np.bincount(shown.ravel(), minlength=things)
-    arrays = {"first_frame/ids": ids, "first_frame/shares": counts / max(ids.size, 1)}
+    if ids.ndim != 2 or not ids.size or ids.min() < 0 or ids.max() > things:
+        raise BadInputError(f"ids of shape {ids.shape} are not pixels in 0..{things}")
+    counts = np.bincount(ids.ravel(), minlength=things + 1)[1:]
+    arrays = {"first_frame/ids": ids, "first_frame/shares": counts / ids.size}
     for name in (*_STATE, "cloth_vertices", "cloth_distance"):
         arrays[f"trajectory/{name}"] = getattr(trajectory, name)
     for name in _CONTACTS:

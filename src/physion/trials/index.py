@@ -1,0 +1,132 @@
+"""The index of a dataset: one row a trial, made from the files that are there."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pyarrow as pa
+
+from physion.atomic import write_atomic
+from physion.errors import BadInputError
+from physion.trials.layout import INDEX, SAFE_NAME, TrialPaths, find_trials
+from physion.trials.trial_file import Trial
+
+COLUMNS = {
+    "trial": "string",
+    "dataset": "string",
+    "scenario": "string",
+    "split": "string",
+    "index": "int64",
+    "preset": "string",
+    "seed": "string",
+    "contact": "bool",
+    "first_frame": "Int64",
+    "observed_contact": "bool",
+    "min_distance": "Float64",
+    "robust": "Float64",
+    "recorded_contact": "boolean",
+    "frames": "int64",
+    "observed_frames": "int64",
+    "completed": "bool",
+    "agent_share": "float64",
+    "patient_share": "float64",
+    "look": "string",
+    "width": "int64",
+    "height": "int64",
+    "engine": "string",
+    "renderer": "string",
+    "package": "string",
+    "digest": "string",
+    **{
+        f"{file}{what}": kind
+        for file in ("trial_file", "movie", "observed_movie", "map")
+        for what, kind in (("", "string"), ("_bytes", "int64"), ("_sha256", "string"))
+    },
+}
+"""Columns and their pandas types. ``trial`` is unique; ``*_share`` are shares of frame 0;
+``digest`` is the trajectory's; paths are relative to the dataset's folder, with forward slashes;
+the rest is as in `Labels` and `Metadata`."""
+
+
+def index_row(paths: TrialPaths) -> dict[str, Any]:
+    """The row of one trial, from its files; `BadInputError` where one is missing or broken."""
+    row: dict[str, Any] = {}
+    for name, path in paths.all().items():
+        try:
+            content = path.read_bytes()
+        except OSError as error:
+            raise BadInputError(f"{path} cannot be read: {error.strerror}") from error
+        row[name] = path.relative_to(paths.folder).as_posix()
+        row[f"{name}_bytes"] = len(content)
+        row[f"{name}_sha256"] = hashlib.sha256(content).hexdigest()
+    trial = Trial.open(paths.trial_file)
+    meta, labels, scene = trial.metadata, trial.labels, trial.scene
+    if (meta.trial, meta.scenario, meta.split) != (paths.trial, paths.scenario, paths.split):
+        raise BadInputError(
+            f"{paths.trial_file} is trial {meta.trial!r} of {meta.split}/{meta.scenario}: "
+            "it was moved or renamed"
+        )
+    row |= {name: getattr(meta, name) for name in COLUMNS if hasattr(meta, name)}
+    row |= {
+        "contact": labels.contact,
+        "first_frame": labels.first_frame,
+        "observed_contact": labels.observed,
+        "min_distance": labels.min_distance,
+        "robust": labels.robust,
+        "agent_share": float(trial.shares[scene.index(scene.roles.agent)]),
+        "patient_share": float(trial.shares[scene.index(scene.roles.patient)]),
+    }
+    return row
+
+
+def build_index(folder: Path) -> tuple[pd.DataFrame, dict[str, str]]:
+    """The index of all trials under ``folder``, and what is wrong with the others, by name."""
+    rows, problems = [], {}
+    for paths in find_trials(folder):
+        try:
+            rows.append(index_row(paths))
+        except BadInputError as error:
+            problems[paths.trial] = str(error)
+    return as_table(rows), problems
+
+
+def as_table(rows: list[dict[str, Any]]) -> pd.DataFrame:
+    """Rows as a table with the columns and types of `COLUMNS`, sorted by split and trial."""
+    table = pd.DataFrame(rows, columns=list(COLUMNS)).astype(COLUMNS)
+    return table.sort_values(["split", "scenario", "trial"], ignore_index=True)
+
+
+def write_index(folder: Path, table: pd.DataFrame) -> Path:
+    """Write the index of ``folder``, atomically; the same table gives the same bytes."""
+    buffer = io.BytesIO()
+    table.to_parquet(buffer, engine="pyarrow", compression="zstd", index=False)
+    path = folder / INDEX
+    write_atomic(path, buffer.getvalue())
+    return path
+
+
+def read_index(folder: Path) -> pd.DataFrame:
+    """The index of the dataset in ``folder``; `BadInputError` where there is no right one."""
+    path = folder / INDEX
+    if not folder.is_dir():
+        raise BadInputError(f"dataset folder {folder} does not exist")
+    if not path.is_file():
+        raise BadInputError(f"{folder} has no {INDEX}: it is no dataset, or is not finished")
+    try:
+        table = pd.read_parquet(path, engine="pyarrow")
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise BadInputError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
+    missing = [name for name in COLUMNS if name not in table.columns]
+    if missing:
+        raise BadInputError(f"{path} lacks the columns {missing}")
+    for name in ("trial", "split", "scenario"):
+        safe = table[name].astype("string").str.fullmatch(SAFE_NAME).fillna(False)
+        if not safe.all():
+            raise BadInputError(f"{path}: column {name!r} has {table[name][~safe].iloc[0]!r}")
+    if table["trial"].duplicated().any():
+        raise BadInputError(f"{path}: column 'trial' has names twice")
+    return table

@@ -1,0 +1,109 @@
+"""What is to be made: a task for each trial of a dataset."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from physion.errors import BadInputError, UnknownNameError
+from physion.scenes.scene import Scene
+from physion.seeds import trial_seed
+from physion.trials.layout import SAFE_NAME
+
+SPLITS = ("training", "readout", "testing", "familiarization")
+"""Trials for a model's own training, for its readout, for the test that people take too, and for
+people to practise on."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One trial to make: what names it is all that decides it.
+
+    A task without ``scene`` draws its scene from its scenario and ``preset`` (None for the
+    scenario's own parameters) with a seed of (dataset, scenario, split, index). A task with an
+    imported ``scene`` takes it as it is, and ``recorded_contact`` is the outcome that it came
+    with.
+    """
+
+    dataset: str
+    scenario: str
+    split: str
+    index: int
+    preset: str | None = None
+    scene: Scene | None = None
+    recorded_contact: bool | None = None
+
+    def __post_init__(self) -> None:
+        if self.split not in SPLITS:
+            raise UnknownNameError("split", self.split, SPLITS)
+        if self.index < 0:
+            raise BadInputError(f"trial index {self.index} is below 0")
+        for name in (self.dataset, self.scenario, self.trial):
+            if not re.fullmatch(SAFE_NAME, name):
+                raise BadInputError(
+                    f"{name!r} cannot be a file name: use up to 200 of A-Z a-z 0-9 . _ + -"
+                )
+
+    @property
+    def trial(self) -> str:
+        """Name of the trial, unique in its dataset."""
+        if self.scene is not None:
+            return self.scene.name
+        preset = f"_{self.preset}" if self.preset else ""
+        return f"{self.scenario}{preset}_{self.split}_{self.index:04d}"
+
+    def seed(self) -> np.random.SeedSequence:
+        """Where all randomness of the trial comes from."""
+        return trial_seed(self.dataset, self.scenario, self.split, self.index)
+
+
+def plan_dataset(
+    dataset: str,
+    scenarios: Iterable[str],
+    counts: Mapping[str, int],
+    presets: Mapping[str, Sequence[str]] | None = None,
+) -> list[Task]:
+    """Tasks for ``counts[split]`` trials of each scenario in each split.
+
+    ``presets`` names the presets of a scenario, which its trials take in turn. Raising a count
+    later adds trials and changes none.
+    """
+    tasks = []
+    for split, count in counts.items():
+        for scenario in scenarios:
+            names: Sequence[str | None] = (presets or {}).get(scenario) or (None,)
+            tasks += [
+                Task(dataset, scenario, split, index, names[index % len(names)])
+                for index in range(count)
+            ]
+    return tasks
+
+
+def plan_scenes(
+    dataset: str,
+    scenes: Iterable[Scene],
+    split: str = "testing",
+    recorded: Mapping[str, bool] | None = None,
+) -> list[Task]:
+    """Tasks for imported scenes, in their order; ``recorded`` gives outcomes by scene name."""
+    outcomes = recorded or {}
+    tasks = [
+        Task(dataset, scene.scenario, split, index, None, scene, outcomes.get(scene.name))
+        for index, scene in enumerate(scenes)
+    ]
+    check_names(tasks)
+    return tasks
+
+
+def check_names(tasks: Iterable[Task]) -> None:
+    """Raise `BadInputError` where two tasks would write the same trial."""
+    seen: set[str] = set()
+    for task in tasks:
+        # Some file systems take names that differ only in case for one.
+        name = task.trial.lower()
+        if name in seen:
+            raise BadInputError(f"two trials are called {task.trial!r}; names must be unique")
+        seen.add(name)
