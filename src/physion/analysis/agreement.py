@@ -1,0 +1,96 @@
+"""How alike two sets of answers are: plain functions of arrays over stimuli.
+
+Throughout, ``x`` is a model's P(contact) and ``y`` the share of people who say yes. What is
+undefined is NaN; nothing is clipped, rounded or corrected without saying so.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+CONSTANT = 1e-6
+"""Standard deviation of probabilities below which they count as constant: r is undefined then."""
+
+FEWEST = 3
+"""Stimuli below which r is undefined: any two points lie on a line."""
+
+
+def accuracy(answers: npt.ArrayLike, outcomes: npt.ArrayLike) -> float:
+    """Share of answers (bool) that equal the outcomes (bool); NaN without any."""
+    given, true = np.asarray(answers, dtype=bool), np.asarray(outcomes, dtype=bool)
+    return float(np.mean(given == true)) if len(given) else float("nan")
+
+
+def pearson(x: npt.ArrayLike, y: npt.ArrayLike) -> float:
+    """Pearson's r of two arrays of shape (n,); NaN where either is constant or n < 3."""
+    a, b = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
+    if len(a) < FEWEST:
+        return float("nan")
+    a, b = a - a.mean(), b - b.mean()
+    spread = np.sqrt(np.mean(a**2)), np.sqrt(np.mean(b**2))
+    if min(spread) < CONSTANT:
+        return float("nan")
+    return float(np.mean(a * b) / (spread[0] * spread[1]))
+
+
+def rmsd(x: npt.ArrayLike, y: npt.ArrayLike) -> float:
+    """Root of the mean squared difference, in the unit of the answers; NaN without any.
+
+    The "RMSE" of the released notebooks is this divided by sqrt(n).
+    """
+    difference = np.asarray(x, dtype=np.float64) - np.asarray(y, dtype=np.float64)
+    return float(np.sqrt(np.mean(difference**2))) if len(difference) else float("nan")
+
+
+def sampling_variance(y: npt.ArrayLike, count: npt.ArrayLike) -> Array:
+    """By how much a share of yes varies because only ``count`` people answered; shape (n,).
+
+    It is y(1 - y) / (count - 1), the unbiased estimate for independent answers, NaN for one
+    person. A share of 0 or 1 gives 0, so that single stimuli can be underestimated; the mean over
+    stimuli, for which alone it is used, is not.
+    """
+    share, people = np.asarray(y, dtype=np.float64), np.asarray(count, dtype=np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(people > 1, share * (1 - share) / (people - 1), np.nan)
+
+
+def reliability(y: npt.ArrayLike, count: npt.ArrayLike, people: float | None = None) -> float:
+    """The expected r of the average of these people with the average of as many others.
+
+    Per-stimulus tables hold no single answers, so no split halves; instead the variance over
+    stimuli is split into the binomial one (`sampling_variance`) and the rest:
+    reliability = rest / (rest + binomial). ``people`` asks for groups of that size instead (half
+    of the count gives what the official split halves give). Answers of one person are taken to be
+    independent, given the stimulus. NaN where people's answers are constant, where one person
+    alone answered, or where the binomial variance exceeds what is there.
+    """
+    share = np.asarray(y, dtype=np.float64)
+    if len(share) < FEWEST:
+        return float("nan")
+    noise = float(np.mean(sampling_variance(share, count)))
+    total = float(np.var(share, ddof=1))
+    true = total - noise
+    if not true > CONSTANT**2:
+        return float("nan")
+    if people is not None:
+        noise *= float(np.mean(np.asarray(count, dtype=np.float64))) / people
+    return true / (true + noise)
+
+
+def ceiling(y: npt.ArrayLike, count: npt.ArrayLike) -> float:
+    """The expected r with the average of these people of a model that knows the true shares.
+
+    The square root of `reliability`: a perfect model would reach this and not 1, since the average
+    of finitely many people is noisy. A model can exceed it by luck. NaN as there.
+    """
+    return float(np.sqrt(reliability(y, count)))
+
+
+def rmsd_floor(y: npt.ArrayLike, count: npt.ArrayLike) -> float:
+    """The expected RMSD of a model that knows the true shares: the root of the mean
+    `sampling_variance`; NaN without stimuli or with one person alone."""
+    noise = sampling_variance(y, count)
+    return float(np.sqrt(np.mean(noise))) if len(noise) else float("nan")

@@ -1,0 +1,63 @@
+"""Intervals by resampling stimuli.
+
+People and models answered the same stimuli, and stimuli are what one wants to generalise over, so
+stimuli are drawn with replacement; each scenario keeps its number of them. The participants are
+not resampled, which the tables by stimulus do not permit. All models of a comparison that answered
+the same stimuli get the same draws, so that differences between them are paired.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+
+from physion.seeds import stable_hash
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Bootstrap:
+    """How intervals are made: draws, seed, and the share of draws that an interval spans."""
+
+    resamples: int = 1000
+    seed: int = 0
+    level: float = 0.95
+
+    def __post_init__(self) -> None:
+        if self.resamples < 1 or not 0 < self.level < 1:
+            raise ValueError("a bootstrap needs resamples >= 1 and a level between 0 and 1")
+
+    def weights(self, stratum: str, n: int) -> Array:
+        """How often each of ``n`` stimuli is drawn, shape (resamples, n), rows that sum to n.
+
+        A function of the seed, the name of the stratum and n, and of nothing else.
+        """
+        return _weights(self.resamples, self.seed, stratum, n)
+
+    def interval(self, draws: Array) -> tuple[float, float]:
+        """The percentile interval of a statistic's ``draws`` (resamples,).
+
+        Draws in which the statistic is undefined are left out. NaN, NaN where that leaves less than
+        half of them.
+        """
+        defined = draws[np.isfinite(draws)]
+        if 2 * len(defined) < len(draws):
+            return float("nan"), float("nan")
+        tail = 50 * (1 - self.level)
+        low, high = np.percentile(defined, [tail, 100 - tail])
+        return float(low), float(high)
+
+
+@lru_cache(maxsize=64)
+def _weights(resamples: int, seed: int, stratum: str, n: int) -> Array:
+    generator = np.random.default_rng(stable_hash("bootstrap", seed, stratum, n))
+    drawn = generator.integers(0, n, size=(resamples, n)) if n else np.zeros((resamples, 0), int)
+    rows = np.arange(resamples)[:, None] * n
+    counts = np.bincount((drawn + rows).ravel(), minlength=resamples * n)
+    weights = counts.reshape(resamples, n).astype(np.float64)
+    weights.flags.writeable = False
+    return weights

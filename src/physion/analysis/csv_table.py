@@ -1,0 +1,73 @@
+"""CSV files from outside: read whole and checked, or refused with one clear line."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from physion.errors import BadInputError
+
+Array = npt.NDArray[np.float64]
+
+
+def read_csv(path: Path, columns: Iterable[str]) -> pd.DataFrame:
+    """The CSV file at ``path`` as text, which must have ``columns`` and at least one row.
+
+    Raises `BadInputError` for a file that is absent, of another kind, empty, or lacks a column.
+    """
+    if not path.is_file():
+        raise BadInputError(f"{path} is not a file")
+    try:
+        table = pd.read_csv(path, dtype=str, keep_default_na=False, encoding="utf-8")
+    except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError, OSError) as error:
+        raise BadInputError(f"{path} is not a CSV table: {error}") from error
+    require_columns(table, columns, str(path))
+    if table.empty:
+        raise BadInputError(f"{path} has a header and no rows")
+    return table
+
+
+def require_columns(table: pd.DataFrame, columns: Iterable[str], where: str) -> None:
+    """Raise `BadInputError` unless ``table`` has every one of ``columns``."""
+    missing = [column for column in columns if column not in table.columns]
+    if missing:
+        found = ", ".join(map(str, table.columns[:12]))
+        raise BadInputError(f"{where} lacks the column(s) {', '.join(missing)}; it has: {found}")
+
+
+def as_numbers(values: pd.Series, low: float, high: float, where: str) -> Array:
+    """``values`` as finite float64 in [low, high]; `BadInputError` names the first other one."""
+    numbers: Array = np.asarray(pd.to_numeric(values, errors="coerce"), dtype=np.float64)
+    good = np.isfinite(numbers) & (numbers >= low) & (numbers <= high)
+    if not good.all():
+        row = int(np.flatnonzero(~good)[0])
+        raise BadInputError(
+            f"{where}: row {row + 1} of column {values.name!r} holds {values.iloc[row]!r}; "
+            f"expected a number from {low:g} to {high:g}"
+        )
+    return numbers
+
+
+def as_booleans(values: pd.Series, where: str) -> npt.NDArray[np.bool_]:
+    """``values`` as bool: True/False, 1/0 or yes/no in any case; else `BadInputError`."""
+    words = {"true": True, "1": True, "1.0": True, "yes": True}
+    words |= {"false": False, "0": False, "0.0": False, "no": False}
+    found = [words.get(str(value).strip().lower()) for value in values]
+    for row, value in enumerate(found):
+        if value is None:
+            raise BadInputError(
+                f"{where}: row {row + 1} of column {values.name!r} holds {values.iloc[row]!r}; "
+                "expected True or False"
+            )
+    return np.array(found, dtype=bool)
+
+
+def refuse_duplicates(names: pd.Series, where: str) -> None:
+    """Raise `BadInputError` with the first name that occurs twice."""
+    twice = names[names.duplicated()]
+    if len(twice):
+        raise BadInputError(f"{where}: {twice.iloc[0]!r} stands in two rows; keep one")
