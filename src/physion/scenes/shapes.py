@@ -2,9 +2,11 @@
 
 Sizes are those of the official model records (reference/official-system.md, section 1.2), with
 their (x, y up, z) written as our (x, z, y up): the pivot is the centre of the bottom face, so that
-a shape stands on z = 0. The records give bounds alone. For shapes that fill their hull the record's
-"volume" is that of the bounding box, and for the torus it exceeds what a ring of these bounds can
-hold, so it says nothing about walls; what the bounds leave open is a named constant here.
+a shape stands on z = 0. The records give bounds alone; their "volume" is not that of the solid but,
+as far as it can be checked, the summed volume of boxes round the convex colliders: for shapes that
+are their own hull it is exactly that of the bounding box, and for a torus of 16 colliders it yields
+the same hole that a published picture shows (radius 0.429 against 0.430). What bounds and that sum
+leave open is a named constant here, with its reason.
 """
 
 from __future__ import annotations
@@ -38,24 +40,26 @@ CONE_SEGMENTS = 22
 """From the record: 0.9898 wide and 1 deep, which is a 22-sided cone with corners on one axis."""
 RING_SEGMENTS = 16
 """Sides of the torus, counted in a published picture."""
-TORUS_INNER = 0.43
+TORUS_INNER = 0.429
 """Inner radius of the torus: 0.688 (sd 0.004) of the outer 0.625, measured on 8 corners of a
-torus-shaped zone in a published picture."""
+torus-shaped zone in a published picture; 0.429 from the boxes of 16 colliders (0.2618)."""
 TORUS_BEVEL = 0.06
 """The torus' section is a rectangle with corners cut off by this much, judged from pictures."""
-PIPE_INNER = 0.4
-"""Inner radius of the pipe. Unknown; the record bounds it to 0.29 or more."""
+PIPE_INNER = 0.389
+"""Inner radius of the pipe: the boxes of 16 to 32 colliders add up to the record's 0.5146 for
+0.386 to 0.391."""
 BOWL_RADIUS, BOWL_HEIGHT = 0.4904, 0.3789
 BOWL_FLAT = 0.12
 """Radius of the bowl's flat bottom. Unknown: pictures show an outline that is round all over."""
-BOWL_WALL = 0.04
-"""Thickness of the bowl's wall in metres, judged from the rim in pictures."""
-BOWL_PIECE_WALL = 0.03
+BOWL_WALL = 0.045
+"""Thickness of the bowl's wall: 0.03 to 0.055 fit the record's 0.1715, by the number of colliders;
+the rim in pictures looks no thicker."""
+BOWL_PIECE_WALL = 0.035
 """Thickness at the corners of the bowl's pieces: the hull of a sector also fills the hollow behind
 its chords, and with this corner thickness the pieces have the volume of the drawn wall."""
 DUMBBELL_HEAD, DUMBBELL_BAR, DUMBBELL_HALF = 0.375, 0.12, 1.125
 """Radii of a dumbbell's two balls and of its bar, and half its length. Only the bounds are known;
-boxes round two balls and a bar of this radius add up to the volume in the record."""
+boxes round two balls and a bar of this radius add up to the record's 0.8873."""
 RAMP_PLATFORM, RAMP_DEPTH = 1.629, 2.0
 """Length of the ramps' platform. The slope starts at the pivot and falls towards -x: its lengths
 3.324 and 1.650 are then those of slopes of 30 and 60 per cent."""

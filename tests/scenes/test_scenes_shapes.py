@@ -1,0 +1,202 @@
+"""Shapes: bounds of the official records, closed outward meshes, pieces that stand for them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from physion.errors import UnknownNameError
+from physion.scenes.shapes import Shape, shape, shapes
+from physion.scenes.solids import Mesh, hull, solid_properties
+
+NAMES = shapes.names()
+# (low, high) of our axes, from the official model records: x, y = their z, z = their y.
+BOUNDS = {
+    "bowl": ((-0.4904, -0.4904, 0), (0.4904, 0.4904, 0.3789)),
+    "cone": ((-0.4949, -0.5, 0), (0.4949, 0.5, 1)),
+    "cube": ((-0.5, -0.5, 0), (0.5, 0.5, 1)),
+    "cylinder": ((-0.5, -0.5, 0), (0.5, 0.5, 1)),
+    "dumbbell": ((-0.375, -1.125, 0), (0.375, 1.125, 0.75)),
+    "octahedron": ((-0.5, -0.5, 0), (0.5, 0.5, 1.5)),
+    "pentagon": ((-0.4755, -0.5, 0), (0.4755, 0.4045, 1)),
+    "pipe": ((-0.5, -0.5, 0), (0.5, 0.5, 1)),
+    "platonic": ((-0.4472, -0.4253, 0), (0.4472, 0.4253, 1)),
+    "pyramid": ((-0.5303, -0.5303, 0), (0.5303, 0.5303, 1)),
+    "sphere": ((-0.5, -0.5, 0), (0.5, 0.5, 1)),
+    "torus": ((-0.625, -0.625, 0), (0.625, 0.625, 0.25)),
+    "triangular_prism": ((-0.5, -0.5, 0), (0.5, 0.5, 0.933)),
+    "ramp_with_platform_30": ((-3.324, -1, 0), (1.629, 1, 1.0007)),
+    "ramp_with_platform_60": ((-1.650, -1, 0), (1.629, 1, 1.0003)),
+}
+VOLUMES = {
+    "cube": 1.0,
+    "cylinder": math.pi / 4,
+    "sphere": math.pi / 6,
+    "cone": math.pi / 12,
+    "pyramid": 1.0607**2 / 3,
+    "octahedron": 0.5,
+    "pentagon": 2.5 * 0.25 * math.sin(math.radians(72)),
+    "triangular_prism": 0.5 * 0.933,
+    # Regular icosahedron: 5 (3 + sqrt 5) a^3 / 12 with a = 0.5 / sin 72 degrees.
+    "platonic": 5 * (3 + math.sqrt(5)) / 12 * (0.5 / math.sin(math.radians(72))) ** 3,
+    "dumbbell": 2 * 4 / 3 * math.pi * 0.375**3 + math.pi * 0.12**2 * (0.75 + 0.04),
+}
+
+
+def as_trimesh(mesh: Mesh) -> trimesh.Trimesh:
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+
+
+def contains(mesh: Mesh, points: np.ndarray) -> np.ndarray:
+    """Whether each of the points (K, 3) is inside, by the winding number (van Oosterom 1983)."""
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] - np.asarray(points)[:, None] for i in range(3))
+    la, lb, lc = (np.linalg.norm(x, axis=-1) for x in (a, b, c))
+    volume = np.einsum("kfi,kfi->kf", a, np.cross(b, c))
+    below = la * lb * lc + (a * b).sum(-1) * lc + (b * c).sum(-1) * la + (c * a).sum(-1) * lb
+    return np.arctan2(volume, below).sum(axis=1) > math.pi
+
+
+@pytest.fixture(params=NAMES)
+def any_shape(request: pytest.FixtureRequest) -> Shape:
+    return shape(request.param)
+
+
+def test_all_official_names_are_there() -> None:
+    assert set(BOUNDS) == set(NAMES)
+
+
+def test_unknown_name_gives_the_closest() -> None:
+    with pytest.raises(UnknownNameError, match="torus"):
+        shape("tours")
+
+
+def test_same_shape_is_built_once() -> None:
+    assert shape("bowl") is shape("bowl")
+
+
+def test_bounds_are_those_of_the_record(any_shape: Shape) -> None:
+    assert any_shape.bounds == pytest.approx(np.array(BOUNDS[any_shape.name]), abs=6e-4)
+
+
+def test_mesh_is_closed_and_faces_outward(any_shape: Shape) -> None:
+    solid = as_trimesh(any_shape.mesh)
+    assert solid.is_watertight
+    assert solid.is_winding_consistent
+    assert solid.volume > 0
+    assert solid.body_count == 1
+    assert (solid.area_faces > 1e-9).all()
+
+
+def test_volume_agrees_with_an_independent_one(any_shape: Shape) -> None:
+    assert any_shape.volume == pytest.approx(as_trimesh(any_shape.mesh).volume, rel=1e-9)
+
+
+@pytest.mark.parametrize("name", sorted(VOLUMES))
+def test_volume_is_the_geometric_one(name: str) -> None:
+    assert shape(name).volume == pytest.approx(VOLUMES[name], rel=0.025)
+
+
+def test_pieces_are_convex_and_inside_the_bounds(any_shape: Shape) -> None:
+    low, high = any_shape.bounds
+    for piece in any_shape.pieces:
+        corners = piece.mesh.vertices
+        assert (corners >= low - 1e-6).all() and (corners <= high + 1e-6).all()
+        assert hull(corners).faces.shape[0] >= 4
+        if piece.kind == "convex":
+            assert len(piece.vertices) == len(hull(piece.vertices).vertices)
+            assert piece.center == pytest.approx((corners.min(axis=0) + corners.max(axis=0)) / 2)
+
+
+def test_pieces_fill_the_mesh(any_shape: Shape) -> None:
+    total = sum(solid_properties(piece.mesh)[0] for piece in any_shape.pieces)
+    assert total == pytest.approx(any_shape.volume, rel=0.04)
+    # Same place, not only same volume: a random point is in both or in neither.
+    rng = np.random.default_rng(0)
+    points = rng.uniform(*any_shape.bounds, (500, 3))
+    drawn = contains(any_shape.mesh, points)
+    counts = sum(contains(piece.mesh, points).astype(int) for piece in any_shape.pieces)
+    assert (counts > 1).mean() < 0.01
+    assert (drawn != (counts > 0)).sum() < 0.25 * drawn.sum()
+
+
+@pytest.mark.parametrize("name", ["pipe", "torus"])
+def test_holes_go_through(name: str) -> None:
+    hollow = shape(name)
+    assert hollow.hollow
+    for piece in hollow.pieces:
+        x, y = piece.mesh.vertices[:, :2].T
+        assert np.hypot(x, y).min() > 0.38
+
+
+def test_bowl_is_open_above_and_has_a_floor() -> None:
+    bowl = shape("bowl")
+    points = np.array(
+        [[0.01, 0.01, 0.3], [0.01, 0.01, 0.02], [0.4, 0.01, 0.02], [0.47, 0.01, 0.36]]
+    )
+    assert contains(bowl.mesh, points).tolist() == [False, True, False, True]
+    for point, pieces in zip(points, (0, 1, 0, 1), strict=True):
+        assert sum(contains(p.mesh, point[None])[0] for p in bowl.pieces) == pieces
+
+
+@pytest.mark.parametrize("name", NAMES)
+@given(scale=st.tuples(*[st.floats(0.05, 3.0)] * 3))
+@settings(max_examples=5, deadline=None)
+def test_mass_properties_at_any_scale(name: str, scale: tuple[float, float, float]) -> None:
+    """Centre and inertia of the scaled solid agree with trimesh, and the pieces with both."""
+    known = shape(name)
+    ours = known.mass_properties(scale)
+    theirs = as_trimesh(known.mesh.moved(scale))
+    theirs.density = 1 / theirs.volume
+    assert ours.volume == pytest.approx(known.volume * math.prod(scale), rel=1e-9)
+    assert ours.center == pytest.approx(theirs.center_mass, abs=1e-6)
+    assert ours.inertia == pytest.approx(theirs.moment_inertia, rel=1e-4, abs=1e-6)
+    pieces = known.mass_properties(scale, of="pieces")
+    size = np.ptp(known.bounds, axis=0) * scale
+    assert np.abs(pieces.center - ours.center).max() < 0.02 * size.max()
+    assert np.trace(pieces.inertia) == pytest.approx(np.trace(ours.inertia), rel=0.05)
+
+
+def test_mass_properties_of_a_box_are_the_textbook_ones() -> None:
+    x, y, z = 0.3, 0.5, 2.0
+    found = shape("cube").mass_properties((x, y, z))
+    assert found.center == pytest.approx([0, 0, z / 2])
+    expected = np.diag([y * y + z * z, x * x + z * z, x * x + y * y]) / 12
+    assert found.inertia == pytest.approx(expected)
+
+
+def test_torus_agrees_with_the_record_of_its_colliders() -> None:
+    """The one check of the hollow shapes' walls: boxes round the pieces add up to the record."""
+    boxes = [np.ptp(piece.vertices, axis=0) for piece in shape("torus").pieces]
+    assert sum(map(np.prod, boxes)) == pytest.approx(0.26175, rel=0.01)
+    boxes = [np.ptp(piece.vertices, axis=0) for piece in shape("pipe").pieces]
+    assert sum(map(np.prod, boxes)) == pytest.approx(0.51461, rel=0.02)
+
+
+def test_ramp_falls_towards_minus_x() -> None:
+    points = np.array([[1.0, 0, 0.99], [-1.662, 0, 0.49], [-1.662, 0, 0.52]])
+    inside = contains(shape("ramp_with_platform_30").mesh, points)
+    assert inside.tolist() == [True, True, False]
+
+
+@given(
+    points=st.lists(
+        st.tuples(*[st.integers(-20, 20)] * 3), min_size=6, max_size=30, unique=True
+    ).filter(lambda p: np.linalg.matrix_rank(np.array(p) - np.array(p[0])) == 3)
+)
+@settings(max_examples=60, deadline=None)
+def test_hull_of_any_points_is_closed_and_holds_them(points: list[tuple[int, int, int]]) -> None:
+    solid = hull(np.array(points, float))
+    volume, center, _ = solid_properties(solid)
+    assert volume > 0
+    edges = {(int(f[i]), int(f[(i + 1) % 3])) for f in solid.faces for i in range(3)}
+    assert all((b, a) in edges for a, b in edges)
+    corners = solid.vertices[solid.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    for point in itertools.chain(points, [center]):
+        assert (np.einsum("ij,ij->i", normals, np.array(point) - corners[:, 0]) < 1e-6).all()
