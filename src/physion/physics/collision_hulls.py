@@ -1,28 +1,38 @@
-"""The convex pieces that a body collides with, as corner points."""
+"""The convex pieces that a body collides with, as corner points.
+
+The official simulator collides hulls of meshes throughout, balls and cylinders included; a hull
+rolls and rubs unlike a smooth ball, so ours are hulls as well.
+"""
 
 from __future__ import annotations
+
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from physion.scenes.scene import Vec3
+from physion.scenes.shapes import Piece, ball_mesh, shape
+
 Array = NDArray[np.float64]
 
+BALL_SEGMENTS = 24
+"""Meridians of a ball's hull, with half as many bands; PhysX allows 255 corners."""
 
-def collision_hulls(shape: str, scale: tuple[float, float, float]) -> list[Array]:
-    """STUB until scenes/shapes.py is here."""
-    s = np.asarray(scale)
-    if shape == "cylinder":
-        a = np.linspace(0, 2 * np.pi, 32, endpoint=False)
-        c = np.c_[0.5 * np.cos(a), 0.5 * np.sin(a), 0 * a]
-        return [np.concatenate([c, c + [0, 0, 1]]) * s]
-    if shape == "sphere":
-        u = np.linspace(0, np.pi, 13)[1:-1]
-        a = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-        p = [
-            [0.5 * np.sin(t) * np.cos(f), 0.5 * np.sin(t) * np.sin(f), 0.5 + 0.5 * np.cos(t)]
-            for t in u
-            for f in a
-        ]
-        return [np.array([*p, [0, 0, 0], [0, 0, 1]]) * s]
-    x = np.array([[i, j, k] for i in (-0.5, 0.5) for j in (-0.5, 0.5) for k in (0, 1)], float)
-    return [x * s]
+
+def collision_hulls(name: str, scale: Vec3) -> list[Array]:
+    """Corners (K, 3) of every convex piece of the shape called ``name``, scaled, about its pivot."""
+    return [corners * np.asarray(scale) for corners in _unit_hulls(name)]
+
+
+@cache
+def _unit_hulls(name: str) -> tuple[Array, ...]:
+    return tuple(_corners(piece) for piece in shape(name).pieces)
+
+
+def _corners(piece: Piece) -> Array:
+    if piece.kind == "convex":
+        return piece.vertices
+    if piece.kind == "sphere":
+        return ball_mesh(piece.half[0], BALL_SEGMENTS).moved(offset=piece.center).vertices
+    return piece.mesh.vertices

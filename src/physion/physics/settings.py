@@ -20,7 +20,7 @@ class Settings:
     - ``gravity``: metres per second squared, downwards (official).
     - ``position_iterations``: Gauss-Seidel sweeps with penetration bias (official: 32).
     - ``velocity_iterations``: sweeps without bias, after the poses have moved (Unity: 1).
-    - ``friction_sweeps``: how many of the last position sweeps rub; 0 means all (PhysX: 3).
+    - ``friction_sweeps``: how many of the last position sweeps rub; 0 means all (Unity: all).
     - ``friction_doubling``: every one of a patch's two anchors may carry the whole friction force,
       so that flat contacts rub twice as strongly as Coulomb's law says. That is how the official
       simulator behaves (Unity's "improved patch friction" is off); False shares the force out.
@@ -43,7 +43,7 @@ class Settings:
     gravity: float = GRAVITY
     position_iterations: int = 32
     velocity_iterations: int = 1
-    friction_sweeps: int = 3
+    friction_sweeps: int = 0
     friction_doubling: bool = True
     contact_offset: float = 0.01
     bias: float = 0.8
