@@ -18,6 +18,8 @@ from physion.compute.local import LocalExecutor
 from physion.physics.replay import Replay, ReplayRow, ReplayTask, replay_trial, summarise
 from physion.scenes.tdw import TrialSet, read_scenes
 
+SHOWN_FAILURES = 5
+
 
 @dataclass(frozen=True)
 class Options:
@@ -65,10 +67,8 @@ def main(options: Options) -> int:
 
 def _print(rows: Sequence[ReplayRow], copies: int, found: TrialSet, failures: list[str]) -> None:
     table = Table(title="Simulated outcome against the recorded one")
-    for column in ("scenario", "trials", "base", "agreement", "ceiling", "AUC", "first contact"):
+    for column in ("scenario", "trials", "base", "agree", "ceiling", "AUC", "frames", "ms", "speed"):
         table.add_column(column, justify="left" if column == "scenario" else "right")
-    table.add_column("ms a trial", justify="right")
-    table.add_column("x real time", justify="right")
     for row in rows:
         table.add_row(
             row.scenario,
@@ -79,15 +79,21 @@ def _print(rows: Sequence[ReplayRow], copies: int, found: TrialSet, failures: li
             _number(row.auc),
             f"±{row.frame_difference:.0f}" if row.frame_difference >= 0 else "-",
             f"{row.milliseconds:.0f}",
-            f"{row.real_time:.1f}",
+            f"{row.real_time:.0f}x",
         )
     console.print(table)
+    console.print(
+        "base: share of the commoner outcome; frames: median difference of first contact; "
+        "ms: processor time a trial; speed: times real time"
+    )
     unknown = ", ".join(f"{name} x{count}" for name, count in found.unknown.items()) or "none"
     console.print(f"duplicates left out: {copies}; unknown commands: {unknown}")
     notes = sum(len(trial.notes) for trial in found.trials)
     console.print(f"notes on imported trials: {notes}; failures: {len(failures)}")
-    for failure in failures:
-        console.print(f"  {failure}", markup=False)
+    for failure in failures[:SHOWN_FAILURES]:
+        console.print(f"  {failure}", markup=False, soft_wrap=True)
+    if len(failures) > SHOWN_FAILURES:
+        console.print(f"  ... and {len(failures) - SHOWN_FAILURES} more (--json lists all)")
 
 
 def _number(value: float) -> str:
