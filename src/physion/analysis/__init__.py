@@ -4,3 +4,13 @@ from physion.analysis.bootstrap import Bootstrap
 from physion.analysis.comparison import Comparison, compare
 from physion.analysis.predictions import read_predictions
 from physion.analysis.responses import read_human_zone, read_humans, read_labels
+
+__all__ = [
+    "Bootstrap",
+    "Comparison",
+    "compare",
+    "read_human_zone",
+    "read_humans",
+    "read_labels",
+    "read_predictions",
+]
