@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
+import os
+import signal
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from physion.errors import BadInputError
 from physion.physics.labels import Labels, label_contact
 from physion.physics.trajectory import Contacts, Trajectory
 from physion.scenes.scene import Body, Camera, Cloth, Roles, Scene
+from physion.trials.files import encode_png, write_files
+from physion.trials.plan import Job
 from physion.trials.trial_file import Metadata, TrialWriter
+from physion.trials.video import encode_movie
 
 FRAMES, SIZE = 60, 32
 
@@ -114,3 +123,35 @@ def make_parts(name: str = "tiny", *, cloth: bool = True, contact_frame: int | N
         digest=trajectory.digest(),
     )
     return Parts(metadata, scene, trajectory, label_contact(scene, trajectory), ids)
+
+
+def make_by_hand(job: Job) -> str:
+    """Write a trial without engine and renderer; what happens depends on the trial's name.
+
+    ``*bad*`` fails, ``*die*`` kills its process.
+    """
+    name = job.task.trial
+    if "bad" in name:
+        raise BadInputError(f"{name} cannot be made")
+    if "die" in name:
+        os.kill(os.getpid(), signal.SIGKILL)
+    parts = make_parts(name, contact_frame=50 if job.task.index % 2 else None)
+    split = dataclasses.replace(parts.metadata, split=job.task.split, index=job.task.index)
+    color = np.stack([images(frame)["color"] for frame in range(FRAMES)])
+    files = {
+        "movie": encode_movie(color),
+        "observed_movie": encode_movie(color[:45]),
+        "map": encode_png(np.zeros((SIZE, SIZE, 4), np.uint8)),
+        "trial_file": parts._replace(metadata=split).pack(),
+    }
+    write_files(job.paths, files)
+    return name
+
+
+def tree_digest(folder: Path) -> str:
+    """SHA-256 of the names and bytes of all files under a folder."""
+    sha = hashlib.sha256()
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        sha.update(f"{path.relative_to(folder)} {path.stat().st_size}\n".encode())
+        sha.update(path.read_bytes())
+    return sha.hexdigest()

@@ -85,13 +85,16 @@ def index_row(paths: TrialPaths) -> dict[str, Any]:
 
 def build_index(folder: Path) -> tuple[pd.DataFrame, dict[str, str]]:
     """The index of all trials under ``folder``, and what is wrong with the others, by name."""
-    rows, problems = [], {}
+    rows: dict[str, dict[str, Any]] = {}
+    problems = {}
     for paths in find_trials(folder):
         try:
-            rows.append(index_row(paths))
+            if paths.trial in rows:
+                raise BadInputError(f"{rows[paths.trial]['trial_file']} has the same trial name")
+            rows[paths.trial] = index_row(paths)
         except BadInputError as error:
-            problems[paths.trial] = str(error)
-    return as_table(rows), problems
+            problems[paths.trial] = f"{error}; delete {paths.trial_file} to have it made again"
+    return as_table(list(rows.values())), problems
 
 
 def as_table(rows: list[dict[str, Any]]) -> pd.DataFrame:

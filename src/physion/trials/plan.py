@@ -1,17 +1,20 @@
-"""What is to be made: a task for each trial of a dataset."""
+"""What is to be made, and how: a task for each trial of a dataset, and the settings of all."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from physion.errors import BadInputError, UnknownNameError
 from physion.scenes.scene import Scene
 from physion.seeds import trial_seed
-from physion.trials.layout import SAFE_NAME
+from physion.trials.layout import SAFE_NAME, TrialPaths
+from physion.trials.schema import PASSES
 
 SPLITS = ("training", "readout", "testing", "familiarization")
 """Trials for a model's own training, for its readout, for the test that people take too, and for
@@ -58,6 +61,50 @@ class Task:
     def seed(self) -> np.random.SeedSequence:
         """Where all randomness of the trial comes from."""
         return trial_seed(self.dataset, self.scenario, self.split, self.index)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How trials are rendered and stored. One folder has one of it.
+
+    - ``width``, ``height``: pixels, even.
+    - ``look``: ``redyellow`` paints the agent red and the patient yellow; ``free`` keeps the
+      colours of the scene, and only the map says who is who.
+    - ``passes``: image passes to keep in the trial files. None is needed: any pass can be
+      rendered again from the state.
+    - ``compatible``: gzip in place of zstd in the trial files.
+    """
+
+    width: int = 256
+    height: int = 256
+    look: Literal["redyellow", "free"] = "redyellow"
+    passes: tuple[str, ...] = ()
+    compatible: bool = False
+
+    def __post_init__(self) -> None:
+        if min(self.width, self.height) < 2 or self.width % 2 or self.height % 2:
+            raise BadInputError(
+                f"movies need an even width and height, not {self.width} x {self.height}"
+            )
+        unknown = sorted(set(self.passes) - set(PASSES))
+        if unknown:
+            raise BadInputError(f"unknown passes {unknown}; known: {sorted(PASSES)}")
+        if self.look not in ("redyellow", "free"):
+            raise BadInputError(f"unknown look {self.look!r}; known: redyellow, free")
+
+
+@dataclass(frozen=True)
+class Job:
+    """A task with where and how to do it: all that a worker needs."""
+
+    task: Task
+    folder: Path
+    settings: Settings
+
+    @property
+    def paths(self) -> TrialPaths:
+        """Where the files of the trial go."""
+        return TrialPaths(self.folder, self.task.split, self.task.scenario, self.task.trial)
 
 
 def plan_dataset(

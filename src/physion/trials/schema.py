@@ -91,7 +91,7 @@ def check_seal(data: bytes, where: str) -> None:
     """Raise `BadInputError` unless ``data`` is a whole, unchanged trial file of our version."""
     head = data[:SEAL_BYTES].rstrip(b"\0").split(b"\n")
     if not data:
-        raise BadInputError(f"{where} is empty; generate it again")
+        raise BadInputError(f"{where} is empty")
     if not head[0].startswith(_MAGIC) or len(head) < 3:
         raise BadInputError(f"{where} is not a trial file (field 'seal')")
     version = head[0].removeprefix(_MAGIC).strip()
@@ -102,13 +102,11 @@ def check_seal(data: bytes, where: str) -> None:
     if head[1] != b"length %d" % len(data):
         promised = head[1].removeprefix(b"length ").decode("ascii", "replace")
         raise BadInputError(
-            f"{where} is cut short or grown: {len(data)} bytes, not {promised} (field 'seal'); "
-            "generate it again"
+            f"{where} is cut short or grown: {len(data)} bytes, not {promised} (field 'seal')"
         )
     if head[2] != b"sha256 " + hashlib.sha256(data[SEAL_BYTES:]).hexdigest().encode():
         raise BadInputError(
-            f"{where} is damaged: its bytes do not fit their SHA-256 (field 'seal'); "
-            "generate it again"
+            f"{where} is damaged: its bytes do not fit their SHA-256 (field 'seal')"
         )
 
 

@@ -157,7 +157,7 @@ def _open(path: Path) -> Any:
     try:
         container = av.open(str(path), metadata_errors="replace")
     except (av.FFmpegError, ValueError) as error:
-        raise BadInputError(f"movie {path} cannot be read, generate it again: {error}") from error
+        raise BadInputError(f"movie {path} cannot be read: {error}") from error
     if not container.streams.video:
         container.close()
         raise BadInputError(f"movie {path} holds no pictures")
@@ -179,6 +179,4 @@ def _decode(path: Path) -> Iterator[tuple[int, av.VideoFrame]]:
         except av.FFmpegError as error:
             raise BadInputError(f"movie {path} is damaged at frame {index}: {error}") from error
         if index != promised:
-            raise BadInputError(
-                f"movie {path} is cut short: {index} of {promised} frames; generate it again"
-            )
+            raise BadInputError(f"movie {path} is cut short: {index} of {promised} frames")

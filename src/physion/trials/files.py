@@ -1,0 +1,27 @@
+"""The files of a trial as bytes, and how they reach the disk."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from physion.atomic import write_atomic
+from physion.trials.layout import TrialPaths
+
+
+def encode_png(picture: NDArray[np.uint8]) -> bytes:
+    """The bytes of a PNG file of ``picture`` (H, W, 3 or 4), sRGB and alpha, 0..255."""
+    buffer = io.BytesIO()
+    Image.fromarray(picture).save(buffer, format="png", compress_level=6)
+    return buffer.getvalue()
+
+
+def write_files(paths: TrialPaths, files: Mapping[str, bytes]) -> None:
+    """Write the files of a trial, named as in `TrialPaths.all`; the trial file last of all."""
+    paths.trial_file.parent.mkdir(parents=True, exist_ok=True)
+    for name in ("movie", "observed_movie", "map", "trial_file"):
+        write_atomic(paths.all()[name], files[name])
