@@ -76,7 +76,7 @@ def assemble(scene: Scene, room: Room) -> Assembly:
     moving = [i for i in range(len(scene.bodies)) if i not in set(still)]
     for i in still + moving:
         body = scene.bodies[i]
-        mesh = shape(body.shape)
+        mesh = shape(body.shape).mesh
         parts.append(
             (
                 solid(
@@ -212,30 +212,24 @@ def _move(
 @kernel
 def _sheet_normals(vertices: F64, faces: I32, out: F32) -> None:
     """Corner normals (T, 9) of a sheet: means over the triangles at a vertex, by area."""
-    total = np.zeros(vertices.shape)
+    total = np.zeros((vertices.shape[0], 3))
     for t in range(faces.shape[0]):
         i, j, k = faces[t, 0], faces[t, 1], faces[t, 2]
-        ax, ay, az = (
-            vertices[j, 0] - vertices[i, 0],
-            vertices[j, 1] - vertices[i, 1],
-            vertices[j, 2] - vertices[i, 2],
-        )
-        bx, by, bz = (
-            vertices[k, 0] - vertices[i, 0],
-            vertices[k, 1] - vertices[i, 1],
-            vertices[k, 2] - vertices[i, 2],
-        )
+        ax, bx = vertices[j, 0] - vertices[i, 0], vertices[k, 0] - vertices[i, 0]
+        ay, by = vertices[j, 1] - vertices[i, 1], vertices[k, 1] - vertices[i, 1]
+        az, bz = vertices[j, 2] - vertices[i, 2], vertices[k, 2] - vertices[i, 2]
         nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
         for c in range(3):
             total[faces[t, c], 0] += nx
             total[faces[t, c], 1] += ny
             total[faces[t, c], 2] += nz
-    for i in range(total.shape[0]):
-        length = np.sqrt(total[i, 0] ** 2 + total[i, 1] ** 2 + total[i, 2] ** 2)
-        if length == 0.0:
-            total[i, 2], length = 1.0, 1.0
-        total[i] /= length
     for t in range(faces.shape[0]):
         for c in range(3):
-            for k in range(3):
-                out[t, 3 * c + k] = total[faces[t, c], k]
+            i = faces[t, c]
+            nx, ny, nz = total[i, 0], total[i, 1], total[i, 2]
+            length = np.sqrt(nx * nx + ny * ny + nz * nz)
+            if length == 0.0:
+                nx, ny, nz, length = 0.0, 0.0, 1.0, 1.0
+            out[t, 3 * c] = nx / length
+            out[t, 3 * c + 1] = ny / length
+            out[t, 3 * c + 2] = nz / length

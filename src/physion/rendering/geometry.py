@@ -13,9 +13,8 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 
-CREASE = np.cos(np.radians(40.0))
-"""Edges sharper than this angle stay sharp on a smooth shape (rims of a cylinder, of a pipe)."""
-FLAT = np.cos(np.radians(1.0))
+FLAT = np.radians(1.0)
+"""Triangles that meet at a smaller angle than this lie in one face, in radians."""
 
 
 @dataclass(frozen=True)
@@ -49,16 +48,17 @@ def face_normals(vertices: F64, faces: I32) -> F64:
     return np.asarray(np.divide(cross, length, out=np.zeros_like(cross), where=length > 0))
 
 
-def solid(vertices: F64, faces: I32, scale: F64, smooth: bool, material: int) -> Part:
+def solid(vertices: F64, faces: I32, scale: F64, crease: float, material: int) -> Part:
     """A body's mesh at unit scale as a `Part` in metres.
 
+    Triangles that meet at an angle below ``crease`` (radians, at unit scale) are shaded round.
     Texture coordinates are taken before scaling, from the side of the unit box that a triangle
     faces: a texture stretches with its body, as it does in the original stimuli.
     """
     unit, faces = _merge(np.asarray(vertices, np.float64), np.asarray(faces, np.int32))
     scaled = unit * scale
+    surfaces = _surfaces(faces, face_normals(unit, faces), float(np.cos(max(crease, FLAT))))
     normals = face_normals(scaled, faces)
-    surfaces = _surfaces(faces, normals, CREASE if smooth else FLAT)
     key = faces.astype(np.int64) + len(unit) * surfaces[:, None].astype(np.int64)
     _, group = np.unique(key.ravel(), return_inverse=True)
     angles = _corner_angles(scaled, faces).reshape(-1, 1)

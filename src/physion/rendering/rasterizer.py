@@ -90,7 +90,8 @@ def rasterize(
     height, width, samples = ids.shape
     most, least = 1.0 / near, 1.0 / far
     for t in range(first, faces.shape[0]):
-        edges[t, :] = 0.0
+        for c in range(9):
+            edges[t, c] = 0.0
         i, j, k = faces[t, 0], faces[t, 1], faces[t, 2]
         x0, y0, w0 = points[i, 0], points[i, 1], points[i, 2]
         x1, y1, w1 = points[j, 0], points[j, 1], points[j, 2]

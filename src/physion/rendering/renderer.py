@@ -19,7 +19,7 @@ from physion.rendering.assembly import Assembly, assemble, place
 from physion.rendering.camera import View
 from physion.rendering.rasterizer import NOTHING, SAMPLES, measure, rasterize, rasterize_depth, transform
 from physion.rendering.rooms import Room, rooms
-from physion.rendering.shading import POINT, Light, Surfaces, shade, shade_still, to_linear, tone_table
+from physion.rendering.shading import POINT, Light, Surfaces, shade, to_linear, tone_table
 from physion.scenes.scene import Scene
 
 F32 = NDArray[np.float32]
@@ -199,14 +199,16 @@ class Renderer:
             maps.append(depth)
         light = self._light(maps[0], maps[1])
         surfaces = self._surfaces(normals)
+        background = to_linear(self.room.background)
+        out = np.empty((self.height, self.width, 3), np.uint8)
         if self._still_shading is None:
             still = np.zeros((self.height, self.width, POINT), np.float32)
             if self._first:
-                shade_still(self._ids, surfaces, light, still)
+                rest = (still, background, self._tones, out)
+                shade(self._ids, self._first, surfaces, light, True, *rest)
             self._still_shading = still
-        out = np.empty((self.height, self.width, 3), np.uint8)
-        background = to_linear(self.room.background)
-        shade(ids, self._first, surfaces, light, self._still_shading, background, self._tones, out)
+        rest = (self._still_shading, background, self._tones, out)
+        shade(ids, self._first, surfaces, light, False, *rest)
         return out
 
     def _measure(
@@ -266,6 +268,7 @@ class Renderer:
             lamp=np.stack([direction / np.linalg.norm(direction), room.lamp]),
             around=np.asarray(room.around),
             mirrored=np.asarray(room.mirrored),
+            window=np.asarray(room.window),
             bounds=np.asarray([room.low, room.high]),
             to_shadow=self._shadow.matrix,
             to_contact=self._contact.matrix,

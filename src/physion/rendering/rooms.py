@@ -47,6 +47,7 @@ class Room:
     around: tuple[Vec3, Vec3, Vec3, Vec3]
     mirrored: tuple[Vec3, Vec3, Vec3]
     exposure: float
+    window: tuple[Vec3, Vec3, Vec3] = ((0.0, 1e6, 0.0), (0.0, 1e6, 0.0), (0.0, 0.0, 0.0))
     background: Vec3 = (0.8, 0.85, 0.9)
     shadow: float = 0.8
     contact: float = 0.6
@@ -115,40 +116,51 @@ def _four_walls(half_x: float, half_y: float, height: float) -> list[tuple[Vec3,
 def _box_room() -> Room:
     """Grey plaster, dark blue carpet, small high windows; a coffered ceiling."""
     half, height = 6.5, 4.6
-    plaster = {"color": (0.69, 0.69, 0.735), "texture": "plaster", "tile": 3.0}
-    panels: list[Panel] = [
-        Panel((-half, -half, 0), (2 * half, 0, 0), (0, 2 * half, 0), (0.235, 0.30, 0.44), "carpet", 1.3),
-    ]
-    windows = {0: [(3.0, 4.3), (5.6, 6.9)], 2: [(6.2, 7.5), (8.8, 10.1)], 1: [], 3: [(2.9, 4.2)]}
+    floor = Panel(
+        (-half, -half, 0), (2 * half, 0, 0), (0, 2 * half, 0), (0.245, 0.335, 0.465), "carpet", 1.1
+    )
+    panels: list[Panel] = [floor]
+    windows = {0: [(3.0, 4.3), (5.6, 6.9)], 1: [(8.0, 9.3)], 2: [(6.2, 7.5), (8.8, 10.1)], 3: [(2.9, 4.2)]}
     for index, (corner, u, v) in enumerate(_four_walls(half, half, height)):
         openings = [(a, b, 2.75, 3.65) for a, b in windows[index]]
-        panels += _wall(corner, u, v, openings, **plaster)
+        panels += _wall(corner, u, v, openings, **PLASTER)
         for opening in openings:
-            panels += _reveal(corner, u, v, opening, 0.35, color=(0.66, 0.66, 0.68))
-            panels.append(_pane(corner, u, v, opening, 0.35, (0.88, 0.89, 0.93), 0.85))
-    beam = {"color": (0.42, 0.41, 0.40), "texture": "smooth_plaster"}
-    inner, rise = half - 1.1, 0.35
-    ceiling = height + rise
-    panels.append(
-        Panel((-inner, inner, ceiling), (2 * inner, 0, 0), (0, -2 * inner, 0), (0.75, 0.75, 0.74))
-    )
-    for corner, u, v in _four_walls(inner, inner, rise):
-        panels.append(Panel((corner[0], corner[1], height), u, v, (0.72, 0.72, 0.71)))
-    panels += _wall((-half, half, height), (2 * half, 0, 0), (0, -2 * half, 0),
-                    [(1.1, 2 * half - 1.1, 1.1, 2 * half - 1.1)], **beam)  # fmt: skip
-    for y in (-1.9, 1.9):
-        panels += _slab((-inner, y - 0.18, height), (inner, y + 0.18, ceiling), **beam)
+            panels += _reveal(corner, u, v, opening, 0.35, color=(0.72, 0.72, 0.74))
+            panels.append(_pane(corner, u, v, opening, 0.35, (0.84, 0.85, 0.90), 0.78))
+    panels += _coffers(half, height)
     return Room(
         panels=tuple(panels),
         low=(-half, -half, 0.0),
         high=(half, half, height),
-        lamp_direction=(0.30, 0.22, 0.93),
-        lamp=(0.42, 0.42, 0.42),
-        around=((0.62, 0.62, 0.64), (0.10, 0.10, 0.10), (-0.07, -0.07, -0.07), (0.16, 0.16, 0.15)),
-        mirrored=((0.06, 0.07, 0.10), (0.42, 0.42, 0.45), (0.55, 0.55, 0.56)),
-        exposure=0.80,
-        shadow=0.75,
+        lamp_direction=(0.30, 0.25, 0.92),
+        lamp=(0.27, 0.27, 0.27),
+        around=((0.36, 0.36, 0.365), (0.03, 0.03, 0.03), (-0.03, -0.03, -0.03), (0.20, 0.20, 0.20)),
+        mirrored=((0.03, 0.04, 0.06), (0.26, 0.27, 0.32), (0.40, 0.40, 0.42)),
+        exposure=1.0,
+        shadow=0.7,
+        contact=0.45,
     )
+
+
+PLASTER = {"color": (0.875, 0.88, 0.935), "texture": "plaster", "tile": 3.0}
+WHITE = {"color": (0.955, 0.96, 0.985), "texture": "smooth_plaster", "tile": 3.0}
+
+
+def _coffers(half: float, height: float) -> list[Panel]:
+    """A ceiling of pale fields between dark beams."""
+    beam = {"color": (0.36, 0.35, 0.33), "texture": "smooth_plaster", "glow": 0.05}
+    pale = {"color": (0.80, 0.80, 0.79), "texture": "smooth_plaster", "glow": 0.22}
+    inner, rise = half - 0.8, 0.30
+    across, back = (2 * inner, 0.0, 0.0), (0.0, -2 * inner, 0.0)
+    panels = [Panel((-inner, inner, height + rise), across, back, **pale)]  # type: ignore[arg-type]
+    for corner, u, v in _four_walls(inner, inner, rise):
+        panels.append(Panel((corner[0], corner[1], height), u, v, **pale))  # type: ignore[arg-type]
+    hole = [(0.8, 2 * half - 0.8, 0.8, 2 * half - 0.8)]
+    panels += _wall((-half, half, height), (2 * half, 0, 0), (0, -2 * half, 0), hole, **beam)
+    for at in (-1.9, 1.9):
+        panels += _slab((-inner, at - 0.2, height), (inner, at + 0.2, height + rise), **beam)
+        panels += _slab((at - 0.2, -inner, height), (at + 0.2, inner, height + rise), **beam)
+    return panels
 
 
 def _pane(
@@ -163,63 +175,77 @@ def _pane(
 
 
 def _bright_room() -> Room:
-    """Reddish stone tiles, white walls, glass doors on a yard."""
-    half_x, half_y, height = 6.5, 5.5, 3.3
-    white = {"color": (0.86, 0.86, 0.88), "texture": "smooth_plaster", "tile": 3.0}
-    panels: list[Panel] = [
-        Panel((-half_x, -half_y, 0), (2 * half_x, 0, 0), (0, 2 * half_y, 0), (1, 1, 1), "tiles", 2.4),
-        Panel((-half_x, half_y, height), (2 * half_x, 0, 0), (0, -2 * half_y, 0), (0.84, 0.84, 0.85)),
-    ]
+    """Reddish stone tiles, white walls, glass doors on a yard at -y."""
+    x, y, height = 6.5, 5.0, 3.4
+    floor = Panel((-x, -y, 0), (2 * x, 0, 0), (0, 2 * y, 0), (1, 1, 1), "tiles", 1.8)
+    ceiling = Panel((-x, y, height), (2 * x, 0, 0), (0, -2 * y, 0), (0.90, 0.90, 0.91), glow=0.20)
+    panels: list[Panel] = [floor, ceiling]
     doors: dict[int, list[Rect]] = {
-        0: [(2.2, 8.0, 0.0, 2.25), (9.0, 9.9, 0.5, 2.1)],
-        1: [],
-        2: [(2.5, 3.5, 0.0, 2.1), (8.6, 10.4, 0.9, 2.1)],
-        3: [(8.0, 9.0, 0.0, 2.1)],
+        0: [(2.0, 3.0, 0.0, 2.15), (6.0, 7.6, 0.9, 2.1)],
+        1: [(3.2, 4.2, 0.0, 2.15)],
+        2: [(2.1, 3.0, 0.25, 2.2), (3.7, 9.3, 0.0, 2.3), (10.0, 10.9, 0.25, 2.2)],
+        3: [(8.0, 9.0, 0.0, 2.15)],
     }
-    walls = _four_walls(half_x, half_y, height)
-    for index, (corner, u, v) in enumerate(walls):
-        panels += _wall(corner, u, v, doors[index], **white)
+    walls = _four_walls(x, y, height)
+    for index, wall in enumerate(walls):
+        panels += _wall(*wall, doors[index], **WHITE)
         for opening in doors[index]:
-            panels += _reveal(corner, u, v, opening, 0.25, color=(0.8, 0.8, 0.8))
-    for index, opening in ((2, doors[2][0]), (3, doors[3][0])):
-        panels.append(_pane(*walls[index], opening, 0.2, (0.66, 0.66, 0.68), 0.35))
-    panels.append(_pane(*walls[2], doors[2][1], 0.25, (0.80, 0.86, 0.90), 0.75))
-    x = -half_x - 0.25
-    frame = {"color": (0.82, 0.83, 0.84), "texture": "smooth_plaster", "shaded": False}
-    for y in (-3.3, -1.85, -0.4, 1.05, 2.42):
-        panels += _slab((x + 0.05, y - 0.05, 0.0), (x + 0.13, y + 0.05, 2.25), **frame)
-    panels += _slab((x + 0.05, -3.3, 2.15), (x + 0.13, 2.5, 2.25), **frame)
-    panels += _slab((x + 0.05, -3.3, 0.0), (x + 0.13, 2.5, 0.06), **frame)
-    panels += _yard(x)
-    panels += _slab((-half_x, -half_y, 2.75), (half_x, -half_y + 1.2, height), **white)
-    panels += _slab((2.6, half_y - 0.5, 0.0), (3.6, half_y, height), **white)
-    panels += _slab((half_x - 0.4, -1.2, 0.0), (half_x, 0.3, height), **white)
-    for x0 in (-3.0, 0.0, 3.0):
-        for y0 in (-2.0, 2.0):
-            panels.append(Panel((x0, y0 + 0.22, height - 0.005), (0.22, 0, 0), (0, -0.22, 0),
-                                (1, 0.97, 0.92), "glow", 2.0, 1.4, False))  # fmt: skip
+            panels += _reveal(*wall, opening, 0.25, color=(0.86, 0.86, 0.87))
+    for index, opening in ((0, doors[0][0]), (1, doors[1][0]), (3, doors[3][0])):
+        panels.append(_pane(*walls[index], opening, 0.25, (0.72, 0.72, 0.74), 0.7))
+    panels.append(_pane(*walls[0], doors[0][1], 0.25, (0.80, 0.85, 0.88), 0.9))
+    panels += _door_frames(-y - 0.12)
+    panels += _yard(-y - 0.25)
+    panels += _slab((-x, y - 0.9, 2.75), (x, y, height), **WHITE)
+    panels += _slab((-4.6, y - 0.45, 0.0), (-2.9, y, 2.75), **WHITE)
+    panels += _slab((x - 0.5, -1.0, 0.0), (x, 0.6, height), **WHITE)
+    panels += _slab((-x, 0.6, 0.0), (-x + 0.5, 2.2, height), **WHITE)
+    for at in ((-3.0, -2.2), (0.0, -2.2), (3.0, -2.2), (-3.0, 2.0), (0.0, 2.0), (3.0, 2.0)):
+        spot = (at[0], at[1] + 0.2, height - 0.005)
+        panels.append(Panel(spot, (0.2, 0, 0), (0, -0.2, 0), (1, 0.97, 0.92), "glow", 2.0, 1.4, False))
     return Room(
         panels=tuple(panels),
-        low=(-half_x, -half_y, 0.0),
-        high=(half_x, half_y, height),
-        lamp_direction=(-0.42, -0.10, 0.90),
-        lamp=(0.50, 0.49, 0.47),
-        around=((0.74, 0.74, 0.75), (-0.10, -0.10, -0.11), (-0.04, -0.04, -0.04), (0.10, 0.11, 0.12)),
-        mirrored=((0.12, 0.08, 0.07), (0.62, 0.62, 0.64), (0.75, 0.75, 0.76)),
-        exposure=0.84,
-        shadow=0.7,
+        low=(-x, -y, 0.0),
+        high=(x, y, height),
+        lamp_direction=(-0.25, -0.42, 0.87),
+        lamp=(0.30, 0.295, 0.285),
+        around=((0.53, 0.54, 0.56), (-0.02, -0.02, -0.02), (-0.06, -0.06, -0.06), (0.18, 0.18, 0.18)),
+        mirrored=((0.05, 0.03, 0.025), (0.40, 0.40, 0.41), (0.5, 0.5, 0.51)),
+        exposure=1.0,
+        window=((-2.8, -y, 0.0), (2.8, -y, 2.3), (1.5, 1.4, 1.25)),
+        shadow=0.65,
+        contact=0.45,
     )
 
 
-def _yard(x: float) -> list[Panel]:
-    """Paving, a low wall, a house front and the sky outside the glass doors."""
-    yard = {"glow": 0.75, "shaded": False}
+def _door_frames(y: float) -> list[Panel]:
+    """White posts and rails of the sliding doors and of the windows beside them."""
+    frame = {"color": (0.93, 0.94, 0.95), "texture": "smooth_plaster", "shaded": False}
+    bars: list[Rect] = [(a - 0.035, a + 0.035, 0.0, 2.3) for a in (-2.8, -1.4, 0.0, 1.4, 2.8)]
+    bars += [(-2.8, 2.8, 2.22, 2.3), (-2.8, 2.8, 0.0, 0.06)]
+    for a, b in ((-4.4, -3.5), (3.5, 4.4)):
+        bars += [(a, b, 0.9, 0.96), (a, a + 0.06, 0.25, 2.2), (b - 0.06, b, 0.25, 2.2)]
+    panels: list[Panel] = []
+    for a, b, c, d in bars:
+        panels += _slab((a, y - 0.04, c), (b, y + 0.04, d), **frame)
+    return panels
+
+
+def _yard(y: float) -> list[Panel]:
+    """A wooden terrace, paving, a low brick wall, houses and an overcast sky beyond the doors."""
+    out = {"shaded": False}
+    wood, stone, brick = (0.80, 0.66, 0.54), (0.62, 0.62, 0.63), (0.60, 0.52, 0.45)
     panels = [
-        Panel((x - 7, -12, -0.02), (7, 0, 0), (0, 24, 0), (0.78, 0.77, 0.75), "paving", 2.5, **yard),  # type: ignore[arg-type]
-        Panel((x - 7, -12, -0.02), (0, 24, 0), (0, 0, 1.1), (0.62, 0.52, 0.46), "paving", 1.6, **yard),  # type: ignore[arg-type]
-        Panel((x - 9, -4, 0.5), (0, 9, 0), (0, 0, 2.2), (0.80, 0.74, 0.55), "plaster", 4.0, **yard),  # type: ignore[arg-type]
-        Panel((x - 9.1, -40, -1), (0, 80, 0), (0, 0, 20), (0.78, 0.83, 0.88), "glow", 2.0, 0.95, False),
+        Panel((-12, y - 1.2, -0.02), (24, 0, 0), (0, 1.25, 0), wood, "planks", 3.0, **out),  # type: ignore[arg-type]
+        Panel((-14, y - 9, -0.10), (28, 0, 0), (0, 7.8, 0), stone, "paving", 1.6, **out),  # type: ignore[arg-type]
+        Panel((14, y - 9, -0.1), (-28, 0, 0), (0, 0, 1.3), brick, "paving", 1.3, **out),  # type: ignore[arg-type]
+        Panel((40, y - 16, -1), (-80, 0, 0), (0, 0, 22), (0.80, 0.83, 0.87), "glow", 2.0, 0.75, False),
     ]
+    for low, high, color in (
+        ((-7.5, y - 13, 0.0), (-4.5, y - 10.5, 2.9), (0.80, 0.76, 0.42)),
+        ((0.5, y - 14, 0.0), (8.5, y - 11, 2.3), (0.52, 0.51, 0.50)),
+    ):
+        panels += _slab(low, high, color=color, texture="plaster", tile=3.0, shaded=False)
     return panels
 
 

@@ -3,7 +3,7 @@
 Light is linear. A surface gets light from all around (``around``: a constant and a slope along
 each axis, so that walls differ), and from one soft lamp that throws shadows. Colour is shaded once
 for each surface that a pixel shows, at the first sample that shows it, and weighted by the number
-of samples. What never moves is shaded once (`shade_still`): only its shadows change.
+of samples. What never moves is shaded once: only the shadows on it change.
 """
 
 from __future__ import annotations
@@ -54,6 +54,8 @@ class Light(NamedTuple):
     - ``lamp`` (2, 3): unit vector to the lamp, its linear colour.
     - ``around`` (4, 3): linear light from all sides: constant, and slopes along x, y and z.
     - ``mirrored`` (3, 3): what glossy things reflect: from below, from the sides, from above.
+    - ``window`` (3, 3): lowest and highest corner of a bright rectangle in a plane of one y, and
+      its linear colour: glossy things reflect it with soft edges.
     - ``bounds`` (2, 3): lowest and highest corner of the room, darker near its edges.
     - ``to_shadow`` (3, 4): world to texel x, texel y, distance in metres from the lamp's side.
     - ``to_contact`` (3, 4): world to texel x, texel y, height in metres.
@@ -67,6 +69,7 @@ class Light(NamedTuple):
     lamp: F64
     around: F64
     mirrored: F64
+    window: F64
     bounds: F64
     to_shadow: F64
     to_contact: F64
@@ -153,7 +156,7 @@ def _shade_point(
         long, short = short, long
     # Between the blur of the longer side and the flicker of the shorter one.
     side = 1 << (surfaces.starts.shape[1] - 1)
-    footprint = side * (long * long * long * short) ** 0.125
+    footprint = side * 0.8 * np.sqrt(np.sqrt(long * short))
     tr, tg, tb, slope_u, slope_v = _texture(
         surfaces.texels, surfaces.starts, int(material[3]), u, v, footprint
     )
@@ -187,7 +190,10 @@ def _shade_point(
     toward = max(nx * vx + ny * vy + nz * vz, 0.0)
     graze = (1.0 - toward) ** 4
     mirror = material[6] * (1.0 + (3.0 - 2.0 * material[7]) * graze)
-    rz = 2.0 * toward * nz - vz
+    rx, ry, rz = 2.0 * toward * nx - vx, 2.0 * toward * ny - vy, 2.0 * toward * nz - vz
+    window = 0.0
+    if mirror > 0.0:
+        window = _window_share(px, py, pz, rx, ry, rz, light.window)
     room = 1.0
     if material[10] > 0.0:
         room = _room_shade(px, py, pz, nx, ny, nz, light.bounds)
@@ -204,10 +210,28 @@ def _shade_point(
             seen = light.mirrored[1, k] + min(1.0, -2.5 * rz) * (
                 light.mirrored[0, k] - light.mirrored[1, k]
             )
+        seen += window * (light.window[2, k] - seen)
         tint = 1.0 + metal * (albedo - 1.0)
         matte = albedo * (1.0 - 0.8 * metal)
         out[3 + k] = room * (matte * ambient + mirror * tint * seen) + material[9] * albedo
         out[6 + k] = room * lamp[1, k] * (matte * direct + tint * shine)
+
+
+@kernel
+def _window_share(
+    px: float, py: float, pz: float, rx: float, ry: float, rz: float, window: F64
+) -> float:
+    """How much of the window a rough reflection along (rx, ry, rz) sees, 0..1."""
+    gap = window[0, 1] - py
+    if gap * ry <= 1e-9:
+        return 0.0
+    along = gap / ry
+    x, z = px + along * rx, pz + along * rz
+    blur = 0.25 + 0.12 * along
+    u = min(x - window[0, 0], window[1, 0] - x) / blur + 0.5
+    v = min(z - window[0, 2], window[1, 2] - z) / blur + 0.5
+    u, v = min(max(u, 0.0), 1.0), min(max(v, 0.0), 1.0)
+    return float(u * u * (3.0 - 2.0 * u) * v * v * (3.0 - 2.0 * v))
 
 
 @kernel
@@ -281,7 +305,7 @@ def _open(point: F32, light: Light) -> float:
 
 
 @kernel
-def _finish(point: F32, light: Light, weight: float, total: F64) -> None:
+def _add_lit(point: F32, light: Light, weight: float, total: F64) -> None:
     """Add a shaded point, darkened by what stands around it, to ``total`` (3,)."""
     lit = _lit(point, light)
     opened = 1.0
@@ -292,23 +316,12 @@ def _finish(point: F32, light: Light, weight: float, total: F64) -> None:
 
 
 @kernel
-def shade_still(ids: I32, surfaces: Surfaces, light: Light, still: F32) -> None:
-    """Shade the pixels that show one single surface, into ``still`` (H, W, POINT)."""
-    height, width, samples = ids.shape
-    for row in range(height):
-        for column in range(width):
-            t = ids[row, column, 0]
-            if t < 0:
-                continue
-            _shade_point(t, column + 0.5, row + 0.5, surfaces, light, still[row, column])
-
-
-@kernel
 def shade(
     ids: I32,
     first: int,
     surfaces: Surfaces,
     light: Light,
+    fill: bool,
     still: F32,
     background: F64,
     tones: U8,
@@ -316,8 +329,9 @@ def shade(
 ) -> None:
     """Shade every pixel into ``out`` (H, W, 3), sRGB.
 
-    Triangles before ``first`` never move; where a pixel shows only one surface and it is one of
-    theirs, its shading is read from ``still`` - the same numbers that shading it again gives.
+    Triangles before ``first`` never move: where the centre of a pixel shows one of them, its
+    shading is read from ``still`` (H, W, POINT), the same numbers that shading it again gives.
+    With ``fill`` it is the other way round: ``still`` is written at every centre, ``out`` is not.
     """
     height, width, samples = ids.shape
     point = np.empty(POINT, np.float32)
@@ -325,9 +339,10 @@ def shade(
     scale = (TONES - 1) / WHITEST
     for row in range(height):
         for column in range(width):
-            total[:] = 0.0
+            for k in range(3):
+                total[k] = 0.0
             done = 0
-            for s in range(samples):
+            for s in range(1 if fill else samples):
                 if done >> s & 1:
                     continue
                 t = ids[row, column, s]
@@ -342,15 +357,22 @@ def shade(
                 if t < 0:
                     for k in range(3):
                         total[k] += weight * background[k]
-                elif s == 0 and t < first:
-                    _finish(still[row, column], light, weight, total)
+                    continue
+                if s == 0 and t < first and not fill:
+                    for k in range(POINT):
+                        point[k] = still[row, column, k]
                 else:
                     x, y = column + 0.5 + SAMPLES[s, 0], row + 0.5 + SAMPLES[s, 1]
                     _shade_point(t, x, y, surfaces, light, point)
-                    _finish(point, light, weight, total)
-            for k in range(3):
-                tone = min(total[k] * scale, TONES - 1.0)
-                out[row, column, k] = tones[int(tone)]
+                if fill:
+                    for k in range(POINT):
+                        still[row, column, k] = point[k]
+                else:
+                    _add_lit(point, light, weight, total)
+            if not fill:
+                for k in range(3):
+                    tone = min(total[k] * scale, TONES - 1.0)
+                    out[row, column, k] = tones[int(tone)]
 
 
 def tone_table(exposure: float) -> U8:

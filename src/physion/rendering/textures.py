@@ -14,10 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import irfft2
 
 from physion.errors import UnknownNameError
 
-F64 = NDArray[np.float64]
+F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
 
 SIZE = 512
@@ -49,11 +50,11 @@ FINISHES = {
     "wood_cedar": Finish("wood_cedar", gloss=0.06, sharpness=24.0, mirror=0.012),
     "metal": Finish("metal", gloss=0.5, sharpness=40.0, mirror=0.5, metal=1.0),
     "plastic": Finish("plain", gloss=0.30, sharpness=60.0, mirror=0.04),
-    "cloth": Finish("cloth", gloss=0.10, sharpness=12.0, mirror=0.02),
+    "cloth": Finish("cloth", gloss=0.35, sharpness=14.0, mirror=0.03),
     "carpet": Finish("carpet", relief=1.0),
     "plaster": Finish("plaster", relief=1.0),
     "smooth_plaster": Finish("smooth_plaster", relief=1.0),
-    "tiles": Finish("tiles", gloss=0.25, sharpness=50.0, mirror=0.06, relief=0.6),
+    "tiles": Finish("tiles", gloss=0.10, sharpness=60.0, mirror=0.028, relief=0.6),
     "planks": Finish("wood_ash", gloss=0.05),
     "paving": Finish("paving", relief=0.0),
     "glow": Finish("plain"),
@@ -96,9 +97,10 @@ def _levels(name: str) -> tuple[U8, ...]:
     slope_u = (np.roll(height, -1, 1) - np.roll(height, 1, 1)) * (SIZE / 2)
     slope_v = (np.roll(height, -1, 0) - np.roll(height, 1, 0)) * (SIZE / 2)
     image = np.concatenate([albedo, slope_u[..., None], slope_v[..., None]], axis=-1)
+    image = image.astype(np.float32)
     levels = []
     for _ in range(LEVELS):
-        stored = np.empty(image.shape, np.float64)
+        stored = np.empty_like(image)
         stored[..., :3] = np.sqrt(np.clip(image[..., :3], 0.0, 1.0)) * 255.0
         stored[..., 3:] = 128.0 + SLOPE_SCALE * image[..., 3:]
         levels.append(np.clip(np.round(stored), 0, 255).astype(np.uint8).reshape(-1, 5))
@@ -107,40 +109,45 @@ def _levels(name: str) -> tuple[U8, ...]:
     return tuple(levels)
 
 
-Painter = Callable[[np.random.Generator], tuple[F64, F64]]
+Painter = Callable[[np.random.Generator], tuple[F32, F32]]
 """Paints (SIZE, SIZE, 3) linear albedo and (SIZE, SIZE) height, in units of the texture's side."""
 
 
-def _noise(rng: np.random.Generator, u: float, v: float, sharp: float = 2.0) -> F64:
-    """Seamless noise of mean 0 and deviation 1 with about ``u`` x ``v`` waves over the texture."""
-    white = np.fft.rfft2(rng.standard_normal((SIZE, SIZE)))
-    fu = np.fft.rfftfreq(SIZE, 1 / SIZE)[None, :] / u
-    fv = np.fft.fftfreq(SIZE, 1 / SIZE)[:, None] / v
-    white *= np.exp(-((fu**2 + fv**2) ** (sharp / 2)))
-    white[0, 0] = 0.0
-    noise = np.fft.irfft2(white, s=(SIZE, SIZE))
-    return np.asarray(noise / noise.std())
+def _noise(rng: np.random.Generator, u: float, v: float) -> F32:
+    """Seamless noise of mean 0 and deviation 1 with about ``u`` x ``v`` waves over the texture.
+
+    The spectrum is drawn only where the Gaussian that shapes it is not negligible.
+    """
+    reach_u, reach_v = (min(int(2.2 * waves) + 1, SIZE // 2 - 1) for waves in (u, v))
+    fu, fv = np.arange(reach_u + 1), np.arange(-reach_v, reach_v + 1)
+    weight = np.outer(np.exp(-((fv / v) ** 2)), np.exp(-((fu / u) ** 2)))
+    drawn = rng.standard_normal((2, *weight.shape), np.float32)
+    spectrum = np.zeros((SIZE, SIZE // 2 + 1), np.complex64)
+    spectrum[fv, : reach_u + 1] = weight * (drawn[0] + 1j * drawn[1])
+    spectrum[0, 0] = 0.0
+    noise = irfft2(spectrum, s=(SIZE, SIZE))
+    return np.asarray(noise / noise.std(), np.float32)
 
 
-def _grid() -> tuple[F64, F64]:
-    at = (np.arange(SIZE) + 0.5) / SIZE
+def _grid() -> tuple[F32, F32]:
+    at = (np.arange(SIZE, dtype=np.float32) + np.float32(0.5)) / np.float32(SIZE)
     u, v = np.meshgrid(at, at)
     return u, v
 
 
-def _tint(value: F64, color: Sequence[float]) -> F64:
-    return np.asarray(value[..., None] * np.asarray(color))
+def _tint(value: F32, color: Sequence[float]) -> F32:
+    return np.asarray(value[..., None] * np.asarray(color, np.float32), np.float32)
 
 
-def _flat() -> F64:
-    return np.zeros((SIZE, SIZE))
+def _flat() -> F32:
+    return np.zeros((SIZE, SIZE), np.float32)
 
 
-def _plain(rng: np.random.Generator) -> tuple[F64, F64]:
-    return np.ones((SIZE, SIZE, 3)), _flat()
+def _plain(rng: np.random.Generator) -> tuple[F32, F32]:
+    return np.ones((SIZE, SIZE, 3), np.float32), _flat()
 
 
-def _ash(rng: np.random.Generator) -> tuple[F64, F64]:
+def _ash(rng: np.random.Generator) -> tuple[F32, F32]:
     """Sawn ash: the rings of a trunk cut lengthwise, with a pointed figure in the middle."""
     u, v = _grid()
     warp = 0.035 * _noise(rng, 2.5, 1.0) + 0.006 * _noise(rng, 10, 3)
@@ -150,11 +157,12 @@ def _ash(rng: np.random.Generator) -> tuple[F64, F64]:
     line = np.exp(-(((phase - 0.75) / 0.20) ** 2))
     pores = np.clip(_noise(rng, 220, 8) - 0.6, 0, None)
     fade = np.clip(0.75 + 0.25 * _noise(rng, 3, 2), 0.2, 1.2)
-    value = 0.95 - 0.50 * line * fade - 0.07 * pores + 0.02 * _noise(rng, 4, 2)
+    streak = np.clip(0.85 + 0.45 * _noise(rng, 200, 14), 0.1, 1.6)
+    value = 0.95 - 0.48 * line * fade * streak - 0.07 * pores + 0.02 * _noise(rng, 4, 2)
     return _tint(np.clip(value, 0.05, 1.0), (0.98, 0.90, 0.76)), _flat()
 
 
-def _cedar(rng: np.random.Generator) -> tuple[F64, F64]:
+def _cedar(rng: np.random.Generator) -> tuple[F32, F32]:
     """Red cedar glued from narrow staves, each cut from another board."""
     u, v = _grid()
     staves = 5
@@ -171,50 +179,47 @@ def _cedar(rng: np.random.Generator) -> tuple[F64, F64]:
     return np.clip(color, 0, 1), _flat()
 
 
-def _carpet(rng: np.random.Generator) -> tuple[F64, F64]:
+def _carpet(rng: np.random.Generator) -> tuple[F32, F32]:
     """Loops of wool in rows, some of them paler."""
     u, v = _grid()
-    rows = np.sin(2 * np.pi * 64 * v) * np.sin(2 * np.pi * (64 * u + 0.5 * np.floor(64 * v)))
-    fleck = _noise(rng, 90, 90)
-    patch = _noise(rng, 4, 4)
-    height = 0.5 * rows + 0.8 * fleck
-    value = 0.62 + 0.12 * height + 0.04 * patch
-    pale = np.clip(fleck - 1.1, 0, None) * 0.35
-    color = _tint(np.clip(value, 0.1, 1.2), (0.80, 0.80, 0.80)) + pale[..., None]
-    return np.clip(color, 0, 1), 0.0006 * height
+    rows = np.sin(2 * np.pi * 70 * v) * np.sin(2 * np.pi * (70 * u + 0.5 * np.floor(70 * v)))
+    fleck = _noise(rng, 110, 90)
+    height = 0.3 * rows + 0.7 * fleck + 0.7 * _noise(rng, 45, 36)
+    value = 0.52 * np.exp(0.48 * height + 0.03 * _noise(rng, 4, 4))
+    return np.clip(_tint(value, (1.0, 1.0, 1.0)), 0.02, 1), 0.0002 * height
 
 
-def _plaster(rng: np.random.Generator) -> tuple[F64, F64]:
+def _plaster(rng: np.random.Generator) -> tuple[F32, F32]:
     """Trowelled plaster: broad strokes and grit."""
     strokes = _noise(rng, 8, 26) + 0.6 * _noise(rng, 34, 16)
     grit = _noise(rng, 120, 120)
     value = 0.90 + 0.012 * strokes + 0.008 * grit + 0.015 * _noise(rng, 2, 2)
-    return _tint(np.clip(value, 0, 1), (1, 1, 1)), 0.0022 * strokes + 0.0003 * grit
+    return _tint(np.clip(value, 0, 1), (1, 1, 1)), 0.0003 * strokes * np.clip(0.5 + _noise(rng, 2, 2), 0, 2) + 0.00015 * grit
 
 
-def _smooth_plaster(rng: np.random.Generator) -> tuple[F64, F64]:
+def _smooth_plaster(rng: np.random.Generator) -> tuple[F32, F32]:
     """Painted wall with hardly a trace of the roller."""
     value = 0.95 + 0.004 * _noise(rng, 90, 90) + 0.006 * _noise(rng, 2, 2)
     return _tint(np.clip(value, 0, 1), (1, 1, 1)), 0.00012 * _noise(rng, 60, 60)
 
 
-def _tiles(rng: np.random.Generator) -> tuple[F64, F64]:
+def _tiles(rng: np.random.Generator) -> tuple[F32, F32]:
     """Four by four stoneware tiles, each mottled and of its own shade, with pale joints."""
     u, v = _grid()
     count = 4
     column, row = (u * count).astype(int), (v * count).astype(int)
     shade = rng.uniform(0.78, 1.15, (count, count))[row, column]
     clouds = 0.5 * _noise(rng, 9, 9) + 0.35 * _noise(rng, 26, 26) + 0.15 * _noise(rng, 80, 80)
-    value = shade * (1.0 + 0.26 * clouds)
-    color = np.stack([0.40 * value, 0.19 * value**1.1, 0.135 * value**1.15], -1)
+    value = shade * np.clip(1.0 + 0.42 * clouds, 0.2, None)
+    color = np.stack([0.150 * value, 0.058 * value**1.15, 0.040 * value**1.2], -1)
     du = np.abs(u * count - np.round(u * count))
     dv = np.abs(v * count - np.round(v * count))
-    joint = np.clip(1.4 - np.minimum(du, dv) / 0.014, 0.0, 1.0)[..., None]
-    color = color * (1 - joint) + joint * np.array([0.44, 0.38, 0.34])
+    joint = np.clip(1.5 - np.minimum(du, dv) / 0.010, 0.0, 1.0)[..., None]
+    color = color * (1 - joint) + joint * np.array([0.27, 0.225, 0.20])
     return np.clip(np.nan_to_num(color), 0, 1), 0.0009 * clouds - 0.002 * joint[..., 0]
 
 
-def _paving(rng: np.random.Generator) -> tuple[F64, F64]:
+def _paving(rng: np.random.Generator) -> tuple[F32, F32]:
     """Grey setts of a yard, in courses."""
     u, v = _grid()
     row = (v * 16).astype(int)
@@ -226,13 +231,13 @@ def _paving(rng: np.random.Generator) -> tuple[F64, F64]:
     return _tint(np.clip(value, 0, 1), (1.0, 0.98, 0.94)), _flat()
 
 
-def _metal(rng: np.random.Generator) -> tuple[F64, F64]:
+def _metal(rng: np.random.Generator) -> tuple[F32, F32]:
     """Brushed sheet."""
     value = 0.86 + 0.03 * _noise(rng, 4, 200) + 0.02 * _noise(rng, 3, 3)
     return _tint(np.clip(value, 0, 1), (1, 1, 1)), _flat()
 
 
-def _cloth(rng: np.random.Generator) -> tuple[F64, F64]:
+def _cloth(rng: np.random.Generator) -> tuple[F32, F32]:
     """Fine weave, visible from near only."""
     u, v = _grid()
     weave = np.sin(2 * np.pi * 128 * u) * np.sin(2 * np.pi * 128 * v)
