@@ -15,7 +15,7 @@ from physion.errors import UnknownNameError
 from physion.scenes.shapes import Shape, shape, shapes
 from physion.scenes.solids import Mesh, hull, solid_properties
 
-NAMES = shapes.names()
+NAMES = [name for name in shapes.names() if not name.startswith("prop:")]
 # (low, high) of our axes, from the official model records: x, y = their z, z = their y.
 BOUNDS = {
     "bowl": ((-0.4904, -0.4904, 0), (0.4904, 0.4904, 0.3789)),

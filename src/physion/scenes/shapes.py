@@ -156,7 +156,11 @@ class Shape:
 
 Outline = list[tuple[float, float]]
 Maker = Callable[[], Shape]
-shapes: Registry[Maker] = Registry("shape")
+_PROPS = """basket boat chair coffee_maker crate dog globe jug lamp person pillow plant rod
+sculpture slab stool table vase wineglass"""
+shapes: Registry[Maker] = Registry(
+    "shape", {f"prop:{name}": "physion.scenes.prop_shapes:shapes" for name in _PROPS.split()}
+)
 """Makers of shapes; call `shape` for the shape itself."""
 
 
