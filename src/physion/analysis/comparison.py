@@ -28,7 +28,8 @@ class Comparison:
     """Models beside people, as tables.
 
     - ``scores``: see `tables.score_table`.
-    - ``people``: see `tables.people_table`; empty when no people were given.
+    - ``people``: see `tables.people_table`, on the stimuli that any model predicts; empty when no
+      people were given.
     - ``stimuli``: one row a model and stimulus that both answered: ``agent``, ``model``,
       ``readout``, ``scenario``, ``stimulus``, ``p_contact``, ``predicted``, ``label`` (official),
       ``simulated``, ``human_accuracy``, ``count``, ``p_yes``, ``gap`` (p_contact - p_yes).
@@ -96,10 +97,10 @@ def compare(
             "no stimulus was both seen by people and predicted; people saw for instance "
             f"{seen!r}, the predictions name {rows['stimulus'].iloc[0]!r}"
         )
-    empty = people.iloc[:0]
+    answered = people[people["stimulus"].isin(stimuli["stimulus"])]
     return Comparison(
         scores=score_table(stimuli, draws),
-        people=empty if humans is None else people_table(people, zone, draws),
+        people=people.iloc[:0] if humans is None else people_table(answered, zone, draws),
         stimuli=stimuli,
         changed=_changed(stimuli),
         dropped=pd.concat(dropped, ignore_index=True),
@@ -202,7 +203,8 @@ def _settings(
         words["Human zone"] = (
             "not given: it needs the answers of single participants"
             if zone is None
-            else "2.5th to 97.5th percentile of participants' accuracies, official table"
+            else "2.5th to 97.5th percentile of participants' accuracies on all stimuli of a "
+            "scenario, official table"
         )
         words["Ceiling of r"] = (
             "expected r of a model that knows the true share of yes: square root of the "

@@ -111,7 +111,9 @@ def _record(
 def people_table(
     people: pd.DataFrame, zone: pd.DataFrame | None, bootstrap: Bootstrap
 ) -> pd.DataFrame:
-    """The people by scenario and, in row `MEAN`, averaged over scenarios, on all they saw.
+    """The people by scenario and, in row `MEAN`, averaged over scenarios.
+
+    ``people`` has a row a stimulus, from `responses.with_labels`.
 
     Columns: ``scenario``, ``stimuli``, ``people`` (median number a stimulus), ``base_rate`` (share
     of stimuli with contact), ``yes`` (mean share who say yes), ``accuracy`` with ``_low`` and

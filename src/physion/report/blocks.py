@@ -31,8 +31,11 @@ def plural(count: int, noun: str) -> str:
 
 
 def number(value: float, digits: int = 2) -> str:
-    """A number with so many decimals, a dash for NaN."""
-    return f"{value:.{digits}f}" if np.isfinite(value) else DASH
+    """A number with so many decimals, a minus that is one, no minus zero, a dash for NaN."""
+    if not np.isfinite(value):
+        return DASH
+    # Adding zero turns -0.0 into 0.0.
+    return f"{round(float(value), digits) + 0.0:.{digits}f}".replace("-", "−")
 
 
 def interval(row: pd.Series, key: str) -> str:
@@ -59,7 +62,7 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]], caption: str = "
     )
 
 
-def overall_table(comparison: Comparison, which: str, caption: str) -> str:
+def overall_table(comparison: Comparison, which: str, caption: str = "") -> str:
     """A row a model: accuracy against both outcomes, beside people; r with its ceiling; RMSD."""
     rows = comparison.scores[comparison.scores["scenario"] == which]
     header = ["model", "readout", "stimuli", "accuracy", "against simulated outcome"]

@@ -252,7 +252,8 @@ def _mark(place: int, theme: Theme) -> tuple[str, str]:
     return theme.palette[place % len(theme.palette)], _MARKERS[place % len(_MARKERS)]
 
 
-def _style(theme: Theme) -> dict[str, Any]:
+def _style(theme: Theme) -> Any:
+    """Settings for ``rc_context``; its type in matplotlib spells out every key."""
     return {
         "font.family": "DejaVu Sans",
         "font.size": 9,

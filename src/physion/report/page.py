@@ -99,9 +99,7 @@ def render_page(inputs: ReportInputs, pictures: Sequence[Picture]) -> str:
     parts = [
         _summary(inputs),
         blocks.section("Scores", blocks.overall_table(comparison, MEAN, "Mean over scenarios")),
-        blocks.details(
-            "All stimuli pooled", blocks.overall_table(comparison, POOLED, "All stimuli pooled")
-        ),
+        blocks.details("All stimuli pooled", blocks.overall_table(comparison, POOLED)),
         blocks.section("Accuracy by scenario", _figure(shown["accuracy"], _accuracy_words(inputs))),
         blocks.details("Accuracy as a table", blocks.matrix(comparison, "accuracy")),
     ]
@@ -184,9 +182,9 @@ def _methods(inputs: ReportInputs) -> str:
 def _accuracy_words(inputs: ReportInputs) -> str:
     words = "Share of answers that equal the official outcome, with bootstrap intervals."
     if inputs.comparison.has_people:
-        words += " Dashed: people on all stimuli that they saw."
+        words += " Dashed: people on the stimuli that any model predicts."
         if inputs.comparison.people["zone_low"].notna().any():
-            words += " Band: the middle 95 % of single participants."
+            words += " Band: the middle 95 % of participants, on all stimuli."
     return words + " Dotted: chance."
 
 
@@ -231,7 +229,8 @@ def _gaps(inputs: ReportInputs) -> str:
         "The stimuli of the largest difference between P(contact) and the share of people who say "
         "yes, models taking turns; only stimuli whose simulated outcome is the official one."
     )
-    return f'<p>{escape(words)}</p><div class="cards">{"".join(cards)}</div>'
+    kind = "cards" if left < inputs.movie_bytes else "cards bare"
+    return f'<p>{escape(words)}</p><div class="{kind}">{"".join(cards)}</div>'
 
 
 def _movie(path: Path | None, stimulus: str, budget: int) -> tuple[str, int]:

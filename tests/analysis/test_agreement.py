@@ -1,0 +1,138 @@
+"""Metrics: what they are on known answers, what no data may break, when they are undefined."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from scipy import stats
+
+from physion.analysis import agreement
+from physion.analysis.bootstrap import Bootstrap
+from physion.analysis.scores import scores, summands, why_no_r
+
+Array = npt.NDArray[np.float64]
+
+# Multiples of 1/1000: neither equal up to rounding nor too alike to tell from a constant.
+shares = st.integers(0, 1000).map(lambda k: k / 1000)
+pairs = st.integers(3, 40).flatmap(
+    lambda n: hnp.arrays(np.float64, (2, n), elements=shares, unique=False)
+)
+
+
+@given(pairs)
+def test_r_lies_between_minus_one_and_one(pair: Array) -> None:
+    r = agreement.pearson(*pair)
+    assert np.isnan(r) or -1 - 1e-9 <= r <= 1 + 1e-9
+
+
+@given(pairs)
+def test_r_is_that_of_scipy_and_symmetric(pair: Array) -> None:
+    x, y = pair
+    r = agreement.pearson(x, y)
+    if np.ptp(x) == 0 or np.ptp(y) == 0:
+        assert np.isnan(r)
+        return
+    assert r == pytest.approx(stats.pearsonr(x, y).statistic, abs=1e-9)
+    assert r == pytest.approx(agreement.pearson(y, x), abs=1e-12)
+
+
+@given(pairs, st.floats(0.1, 1), st.floats(0, 1))
+def test_r_ignores_scale_and_shift_and_rmsd_does_not(pair: Array, scale: float, by: float) -> None:
+    x, y = pair
+    moved = scale * x + by
+    assert agreement.pearson(moved, y) == pytest.approx(
+        agreement.pearson(x, y), abs=1e-7, nan_ok=True
+    )
+    assert agreement.rmsd(x + by, x) == pytest.approx(by, abs=1e-9)
+
+
+def test_r_of_what_is_undefined() -> None:
+    assert np.isnan(agreement.pearson([0.1, 0.9], [0.2, 0.8]))
+    assert np.isnan(agreement.pearson([0.3] * 5, [0.1, 0.2, 0.3, 0.4, 0.5]))
+    assert why_no_r([0.3] * 5, [0.1, 0.2, 0.3, 0.4, 0.5]) == "r: the model's P(contact) is constant"
+    assert why_no_r([0.1, 0.2, 0.4], [1.0] * 3) == "r: people's answers are constant"
+    assert "fewer than 3" in why_no_r([0.1, 0.2], [0.2, 0.4])
+    assert "no answers of people" in why_no_r([0.1], [np.nan])
+    assert why_no_r([0.1, 0.2, 0.4], [0.2, 0.4, 0.1]) == ""
+
+
+def test_accuracy_and_rmsd() -> None:
+    assert agreement.accuracy([True, False, True, True], [True, True, True, False]) == 0.5
+    assert np.isnan(agreement.accuracy([], [])) and np.isnan(agreement.rmsd([], []))
+    assert agreement.rmsd([0.0, 1.0], [0.3, 0.6]) == pytest.approx(np.sqrt((0.09 + 0.16) / 2))
+
+
+def test_ceiling_is_what_a_model_of_the_truth_reaches() -> None:
+    """Draw people from known shares: the predicted r, reliability and RMSD must come true."""
+    generator = np.random.default_rng(5)
+    true, people = generator.beta(1, 1, 4000), 12
+    first, second = (generator.binomial(people, true) / people for _ in range(2))
+    count = np.full(4000, people)
+    assert agreement.ceiling(first, count) == pytest.approx(agreement.pearson(true, first), abs=0.01)
+    reliability = agreement.reliability(first, count)
+    assert reliability == pytest.approx(agreement.pearson(first, second), abs=0.01)
+    assert agreement.rmsd_floor(first, count) == pytest.approx(agreement.rmsd(true, first), abs=0.005)
+    half = generator.binomial(6, true, size=(2, 4000)) / 6
+    expected = agreement.pearson(*half)
+    assert agreement.reliability(first, count, people=6) == pytest.approx(expected, abs=0.015)
+
+
+def test_ceiling_without_a_signal_is_undefined() -> None:
+    assert np.isnan(agreement.ceiling([0.5, 0.5, 0.5, 0.5], [10] * 4))
+    assert np.isnan(agreement.ceiling([0.1, 0.5, 0.9, 0.5], [1] * 4))
+    assert np.isnan(agreement.ceiling([0.1, 0.9], [10] * 2))
+
+
+# --- scores from sums ------------------------------------------------------------------------
+
+
+def rows_of(pair: Array, seed: int) -> pd.DataFrame:
+    generator = np.random.default_rng(seed)
+    n = pair.shape[1]
+    return pd.DataFrame(
+        {
+            "p_contact": pair[0],
+            "p_yes": pair[1],
+            "human_accuracy": generator.random(n),
+            "predicted": generator.random(n) > 0.5,
+            "label": generator.random(n) > 0.5,
+            "simulated": generator.random(n) > 0.5,
+        }
+    )
+
+
+@given(pairs, st.integers(0, 99))
+def test_scores_from_sums_are_the_plain_metrics(pair: Array, seed: int) -> None:
+    rows = rows_of(pair, seed)
+    found = {key: float(value) for key, value in scores(summands(rows).sum(axis=0)).items()}
+    same = rows[rows["label"] == rows["simulated"]]
+    expected = {
+        "accuracy": agreement.accuracy(rows["predicted"], rows["label"]),
+        "accuracy_simulated": agreement.accuracy(rows["predicted"], rows["simulated"]),
+        "human_accuracy": rows["human_accuracy"].mean(),
+        "r": agreement.pearson(rows["p_contact"], rows["p_yes"]),
+        "r_same": agreement.pearson(same["p_contact"], same["p_yes"]),
+        "rmsd": agreement.rmsd(rows["p_contact"], rows["p_yes"]),
+    }
+    expected["difference"] = expected["accuracy"] - expected["human_accuracy"]
+    assert found == pytest.approx(expected, abs=1e-7, nan_ok=True)
+
+
+@settings(max_examples=25)
+@given(pairs, st.integers(0, 99))
+def test_resamples_are_what_drawing_rows_gives(pair: Array, seed: int) -> None:
+    rows = rows_of(pair, seed)
+    weights = Bootstrap(resamples=3, seed=seed).weights("collide", len(rows))
+    found = scores(weights @ summands(rows))
+    for number, weight in enumerate(weights):
+        drawn = rows.loc[np.repeat(rows.index, weight.astype(int))]
+        plain = agreement.pearson(drawn["p_contact"], drawn["p_yes"])
+        assert found["r"][number] == pytest.approx(plain, abs=1e-7, nan_ok=True)
+        assert found["rmsd"][number] == pytest.approx(
+            agreement.rmsd(drawn["p_contact"], drawn["p_yes"]), abs=1e-9
+        )
