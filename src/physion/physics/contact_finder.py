@@ -23,9 +23,10 @@ MANIFOLD_SIZE = 4
 class ContactFinder:
     """Finds the contacts of a model at given poses."""
 
-    def __init__(self, model: RigidModel, settings: Settings) -> None:
+    def __init__(self, model: RigidModel, settings: Settings, floor: float) -> None:
         self.model = model
         self.reach = 2.0 * settings.contact_offset
+        self.floor = floor
         self.physics = model.mujoco_model
         self.data = mujoco.MjData(self.physics)
         # MuJoCo numbers geoms body by body; ours are in the order of the scene.
@@ -59,6 +60,7 @@ class ContactFinder:
             x,
             q,
             self.reach,
+            self.floor,
         )
         return ContactSet(*arrays), pairs
 
@@ -78,6 +80,7 @@ def _merge(
     x: Any,
     q: Any,
     reach: float,
+    height: float,
 ) -> Any:
     """Both kinds of contact, sorted by pair of geoms; the floor counts as a last geom."""
     total = len(geom_body)
@@ -112,7 +115,7 @@ def _merge(
         body = geom_body[g]
         a = actor_of[body]
         corners = vertices[first_vertex[g] : first_vertex[g + 1]]
-        points = touching_floor(corners, x[a], q[a], reach)
+        points = touching_floor(corners, x[a], q[a], height, reach)
         for k in range(len(points)):
             key[used] = g * (total + 1) + floor
             pair[used, 0], pair[used, 1] = body, -1
@@ -121,7 +124,7 @@ def _merge(
             for i in range(3):
                 point[used, i] = points[k, i]
                 rubbing[used, i] = 0.5 * (material[body, i] + material[-1, i])
-            separation[used] = points[k, 2]
+            separation[used] = points[k, 2] - height
             used += 1
     order = np.argsort(key[:used], kind="mergesort")
     contacts = (
@@ -136,8 +139,8 @@ def _merge(
 
 
 @njit(cache=True)
-def touching_floor(corners: Any, x: Any, q: Any, reach: float) -> Any:
-    """World positions of at most four corners that are closer than ``reach`` to the plane z = 0."""
+def touching_floor(corners: Any, x: Any, q: Any, height: float, reach: float) -> Any:
+    """World positions of at most four corners lower than ``reach`` above the floor."""
     rot = rotation_matrix(q)
     low = np.zeros((len(corners), 3))
     used = 0
@@ -145,7 +148,7 @@ def touching_floor(corners: Any, x: Any, q: Any, reach: float) -> Any:
         z = x[2]
         for j in range(3):
             z += rot[2, j] * corners[c, j]
-        if z < reach:
+        if z < height + reach:
             for i in range(3):
                 low[used, i] = x[i]
                 for j in range(3):

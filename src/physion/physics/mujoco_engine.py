@@ -24,7 +24,7 @@ from physion.physics.rigid_model import (
     rotate_vectors,
 )
 from physion.physics.settings import Settings
-from physion.physics.sleeping import update_sleep
+from physion.physics.sleeping import find_islands, update_sleep, wake_touched
 from physion.physics.trajectory import State, Trajectory
 from physion.scenes.scene import Scene
 
@@ -66,7 +66,7 @@ class RigidRun:
     def __init__(self, scene: Scene, settings: Settings, start: State | None = None) -> None:
         self.scene, self.settings = scene, settings
         self.model = build_model(scene, settings)
-        self.finder = ContactFinder(self.model, settings)
+        self.finder = ContactFinder(self.model, settings, scene.floor)
         actors = self.model.actors
         self.x, self.q = self.model.start_x.copy(), self.model.start_q.copy()
         self.v, self.w = np.zeros((actors + 1, 3)), np.zeros((actors + 1, 3))
@@ -89,6 +89,8 @@ class RigidRun:
         s, model = self.settings, self.model
         contacts, pairs = self.finder.find(self.x, self.q)
         self._push()
+        island = find_islands(contacts.bodies, model.actors)
+        wake_touched(island, self.asleep, self.counter, s.wake_time)
         awake = ~self.asleep
         self._free_motion(awake)
         move_v, move_w, load, *memory = solve_step(
@@ -102,7 +104,7 @@ class RigidRun:
         self.anchors = AnchorMemory(*memory)
         move_poses(self.x, self.q, move_v, move_w, s.dt)
         update_sleep(
-            contacts.bodies, move_v, move_w, self.q, model.inv_inertia, model.inv_mass,
+            contacts.bodies, island, move_v, move_w, self.q, model.inv_inertia, model.inv_mass,
             self.counter, self.still_v, self.still_w, self.asleep,
             s.sleep_threshold, s.wake_time, s.dt,
         )  # fmt: skip

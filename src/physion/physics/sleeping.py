@@ -9,8 +9,39 @@ from numba import njit
 
 
 @njit(cache=True)
+def find_islands(bodies: Any, actors: int) -> Any:
+    """(A,) for every actor the lowest actor that it touches, directly or through others.
+
+    ``bodies`` (C, 2) are the actors of the contacts of a step; numbers from ``actors`` on stand
+    for things that do not move and join nothing.
+    """
+    island = np.arange(actors)
+    for c in range(len(bodies)):
+        a, b = bodies[c, 0], bodies[c, 1]
+        if a < actors and b < actors and island[a] != island[b]:
+            low, high = min(island[a], island[b]), max(island[a], island[b])
+            for i in range(actors):
+                if island[i] == high:
+                    island[i] = low
+    return island
+
+
+@njit(cache=True)
+def wake_touched(island: Any, asleep: Any, counter: Any, wake_time: float) -> None:
+    """Wake every sleeping actor whose island holds one that is awake."""
+    for i in range(len(island)):
+        if asleep[i]:
+            continue
+        for j in range(len(island)):
+            if asleep[j] and island[j] == island[i]:
+                asleep[j] = False
+                counter[j] = wake_time
+
+
+@njit(cache=True)
 def update_sleep(
     bodies: Any,
+    island: Any,
     v: Any,
     w: Any,
     q: Any,
@@ -26,14 +57,12 @@ def update_sleep(
 ) -> None:
     """Advance the sleep clocks of all actors by a step.
 
-    ``bodies`` (C, 2) are the actors of the contacts of the step. ``v``, ``w`` are the velocities
-    that moved the poses. ``counter`` (A,) counts down from ``wake_time``; in its second half the
-    velocities add up in ``still_v``, ``still_w`` (A, 3), and a sum with more energy than
-    ``threshold`` times one plus the number of touching neighbours starts it anew. Touching actors
-    sleep together, when all their clocks are down, and wake together.
+    ``v``, ``w`` are the velocities that moved the poses. ``counter`` (A,) counts down from
+    ``wake_time``; in its second half the velocities add up in ``still_v``, ``still_w`` (A, 3), and
+    a sum with more energy than ``threshold`` times one plus the number of touching neighbours
+    starts it anew. An island falls asleep when all its clocks are down.
     """
     actors = len(counter)
-    island = np.arange(actors)
     touching = np.zeros((actors, actors + 1), np.bool_)
     for c in range(len(bodies)):
         a, b = bodies[c, 0], bodies[c, 1]
@@ -41,22 +70,16 @@ def update_sleep(
             touching[a, b] = True
         if b < actors:
             touching[b, a] = True
-        if a < actors and b < actors and island[a] != island[b]:
-            low, high = min(island[a], island[b]), max(island[a], island[b])
-            for i in range(actors):
-                if island[i] == high:
-                    island[i] = low
     for i in range(actors):
         if asleep[i]:
             continue
         if counter[i] < 0.5 * wake_time or counter[i] < dt:
-            # Principal axes are not needed: the energy of spin is w.I.w in any frame.
             energy = 0.0
             for j in range(3):
                 still_v[i, j] += v[i, j]
                 energy += still_v[i, j] ** 2
-            qc = q[i] * np.array([1.0, -1.0, -1.0, -1.0])
-            local = _rotate(qc, w[i])
+            # Spins add up in the body's own axes, so that a steady roll is not taken for rest.
+            local = _rotate(q[i] * np.array([1.0, -1.0, -1.0, -1.0]), w[i])
             for j in range(3):
                 still_w[i, j] += local[j]
             inertia = np.linalg.inv(inv_inertia[i])
@@ -77,13 +100,10 @@ def update_sleep(
         for j in range(actors):
             if island[j] == i and counter[j] > 0.0:
                 ready = False
+        if not ready:
+            continue
         for j in range(actors):
-            if island[j] != i:
-                continue
-            if not ready and asleep[j]:
-                counter[j] = wake_time
-                asleep[j] = False
-            elif ready and not asleep[j]:
+            if island[j] == i and not asleep[j]:
                 asleep[j] = True
                 still_v[j] = 0.0
                 still_w[j] = 0.0

@@ -152,6 +152,7 @@ class Roles:
 class Scene:
     """Everything that decides a trial. ``name`` is the stimulus name, unique in its set.
 
+    ``floor`` is the height of the room's floor in metres.
     ``settle_frames`` is how long bodies come to rest before frame 0, with the cloth held still
     (the official cloth trials let every solid settle for 100 steps).
     ``parameters`` keeps what the sampler or the importer drew, for the record: JSON values only.
@@ -166,6 +167,7 @@ class Scene:
     pushes: tuple[Push, ...] = ()
     joints: tuple[Joint, ...] = ()
     room: str = "box"
+    floor: float = 0.0
     ending: Ending = Ending()
     settle_frames: int = 0
     parameters: Mapping[str, Any] = field(default_factory=dict)
@@ -213,7 +215,7 @@ class Scene:
         cloths = [dataclasses.astuple(dataclasses.replace(c, look=Look())) for c in self.cloths]
         rest = [dataclasses.astuple(x) for x in (*self.pushes, *self.joints, self.ending)]
         roles = [self.roles.agent, self.roles.patient, self.settle_frames]
-        text = json.dumps([bodies, cloths, rest, roles])
+        text = json.dumps([bodies, cloths, rest, roles, self.floor])
         return hashlib.sha256(text.encode()).hexdigest()
 
     def to_json(self) -> str:

@@ -52,6 +52,10 @@ a folder whose name says ``rolling`` is Roll."""
 MAX_FRAMES = {"collide": 152, "contain": 452, "link": 452, "support": 602, "drape": 151}
 """Longest trial by scenario, frame 0 counted; 302 for the others (reference section 2.6)."""
 
+FLOORS = {"bright": 0.0043}
+"""Height in metres of a room's floor where it is not 0. In ``tdw_room`` everything that was put
+at 0 ends .004 or .005 higher than in ``box_room_2018`` (recorded displacements of the targets)."""
+
 FLEX_SETTLE_FRAMES = 100
 
 
@@ -190,6 +194,7 @@ class _SceneBuilder:
             roles=self._roles(kept, pushes),
             camera=Camera(self.commands.eye, self.commands.target, self.commands.fov),
             room=self.commands.room,
+            floor=FLOORS.get(self.commands.room, 0.0),
             ending=Ending(151, self._max_frames(scenario)),
             settle_frames=FLEX_SETTLE_FRAMES if self.commands.settles else 0,
             parameters={
