@@ -22,6 +22,28 @@ from physion.scenes.shapes import CURVED, Shape, ball_mesh, convex, shapes
 from physion.scenes.solids import Mesh, Points, box, hull, merge, revolve
 
 SIDES = 24
+NATURAL_SIZES: dict[str, Vec3] = {
+    "basket": (0.7, 0.7, 0.5),
+    "boat": (0.55, 2.8, 0.45),
+    "chair": (0.45, 0.5, 0.86),
+    "coffee_maker": (0.3, 0.36, 0.42),
+    "crate": (0.5, 0.5, 0.5),
+    "dog": (0.22, 0.72, 0.52),
+    "globe": (0.4, 0.36, 0.5),
+    "jug": (0.2, 0.26, 0.26),
+    "lamp": (0.42, 0.42, 0.62),
+    "person": (0.52, 0.35, 1.74),
+    "pillow": (0.16, 0.42, 0.42),
+    "plant": (0.5, 0.5, 0.6),
+    "rod": (0.07, 1.0, 0.07),
+    "sculpture": (0.6, 0.6, 0.66),
+    "slab": (0.4, 0.4, 0.03),
+    "stool": (0.44, 0.44, 0.5),
+    "table": (1.1, 1.1, 0.74),
+    "vase": (0.32, 0.32, 0.5),
+    "wineglass": (0.09, 0.09, 0.2),
+}
+"""Width, depth and height in metres that each prop looks right at."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,270 @@
+"""Where the camera stands, and what stands behind and before the scene.
+
+Rules of the official generator (reference/official-system.md, sections 2.4 and 2.5), with one
+addition: a camera that does not see agent and patient is drawn again.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from physion.errors import BadSceneError
+from physion.scenes.looks import prop_look
+from physion.scenes.prop_shapes import NATURAL_SIZES
+from physion.scenes.scene import Body, Camera, Look, Quat
+from physion.scenes.shapes import shape
+
+Range = tuple[float, float]
+"""Smallest and largest value of an even random draw."""
+
+CLEARANCE = 0.25
+"""Metres kept free between the scene and scenery."""
+CAMERA_TRIES = 200
+NEAREST_OCCLUDER = 0.85
+"""Largest share of the way to the camera at which scenery may stand."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraRule:
+    """How the camera is drawn.
+
+    - ``radius``: metres; the official rule moves the camera by (radius, radius), so that its
+      horizontal distance from the middle is radius times the square root of 2.
+    - ``angle_deg``: degrees; the azimuth is this plus 45.
+    - ``height``: metres above the floor.
+    """
+
+    radius: Range = (1.75, 1.75)
+    angle_deg: Range = (45.0, 225.0)
+    height: Range = (0.75, 2.0)
+
+
+@dataclass(frozen=True, slots=True)
+class SceneryRule:
+    """How many props stand behind (``distractors``) and before (``occluders``) the scene.
+
+    Distances are shares of the camera's radius, angles are degrees between neighbours, sizes are
+    metres of the largest side. ``occlusion`` is the share of the line of sight at which an
+    occluder's top ends.
+    """
+
+    distractors: int = 0
+    occluders: int = 0
+    distractor_props: tuple[str, ...] = ("chair", "vase", "dog", "globe", "stool", "coffee_maker")
+    occluder_props: tuple[str, ...] = ("vase", "plant", "jug", "lamp", "chair")
+    distractor_distance: Range = (0.4, 1.0)
+    occluder_distance: Range = (0.6, 0.8)
+    distractor_spacing_deg: float = 15.0
+    occluder_spacing_deg: float = 10.0
+    yaw_deg: float = 30.0
+    distractor_size: Range = (0.5, 1.5)
+    occluder_size: Range = (0.25, 1.5)
+    occlusion: float = 0.75
+
+
+def uniform(rng: np.random.Generator, interval: Range) -> float:
+    """An even draw from ``interval``; always one number of the stream, also if it is a point."""
+    return float(rng.uniform(*interval))
+
+
+def yaw(angle: float) -> Quat:
+    """The rotation by ``angle`` radians about z."""
+    return (math.cos(angle / 2), 0.0, 0.0, math.sin(angle / 2))
+
+
+def rotate(rotation: Quat, points: ArrayLike) -> NDArray[np.float64]:
+    """Turn ``points`` (..., 3) by a unit quaternion (w, x, y, z)."""
+    w, axis = rotation[0], np.array(rotation[1:])
+    vectors = np.asarray(points, np.float64)
+    across = 2.0 * np.cross(axis, vectors)
+    return np.asarray(vectors + w * across + np.cross(axis, across))
+
+
+def world_corners(body: Body) -> NDArray[np.float64]:
+    """(V, 3): the corners of a body's drawn mesh in the world, metres."""
+    corners = shape(body.shape).mesh.vertices * body.scale
+    return np.asarray(rotate(body.rotation, corners) + np.array(body.position))
+
+
+def world_bounds(body: Body) -> NDArray[np.float64]:
+    """(2, 3): smallest and largest coordinates of a body in the world, metres."""
+    corners = world_corners(body)
+    return np.stack([corners.min(axis=0), corners.max(axis=0)])
+
+
+def on_screen(camera: Camera, point: ArrayLike) -> tuple[float, float]:
+    """Where a square picture shows ``point``: right and up, from -1 to 1; infinite if behind."""
+    forward = np.subtract(camera.target, camera.position)
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right = right / np.linalg.norm(right)
+    ray = np.subtract(point, camera.position)
+    depth = float(ray @ forward)
+    if not camera.near < depth < camera.far:
+        return (math.inf, math.inf)
+    size = depth * math.tan(camera.fov / 2)
+    return (float(ray @ right) / size, float(ray @ np.cross(right, forward)) / size)
+
+
+def place_camera(
+    rng: np.random.Generator, rule: CameraRule, aim_height: float, seen: Sequence[Body]
+) -> Camera:
+    """A camera that looks at the middle of the scene and shows the centres of all of ``seen``.
+
+    Raises `BadSceneError` if `CAMERA_TRIES` draws show none such.
+    """
+    centers = [world_bounds(body).mean(axis=0) for body in seen]
+    for _ in range(CAMERA_TRIES):
+        distance = uniform(rng, rule.radius) * math.sqrt(2)
+        azimuth = math.radians(uniform(rng, rule.angle_deg) + 45.0)
+        x, y = distance * math.cos(azimuth), distance * math.sin(azimuth)
+        camera = Camera((x, y, uniform(rng, rule.height)), (0.0, 0.0, aim_height))
+        if all(max(map(abs, on_screen(camera, center))) < 0.98 for center in centers):
+            return camera
+    names = [body.name for body in seen]
+    raise BadSceneError(f"no camera of {rule} shows {names}; widen its ranges or move it away")
+
+
+def place_scenery(
+    rule: SceneryRule,
+    camera: Camera,
+    bodies: Sequence[Body],
+    distractors: np.random.Generator,
+    occluders: np.random.Generator,
+) -> tuple[Body, ...]:
+    """Props behind and before ``bodies``, drawn only, each kind on its own random stream."""
+    bounds = np.array([world_bounds(body) for body in bodies])
+    keep_out = np.stack([bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)])
+    placed: list[Body] = []
+    for i in range(rule.distractors):
+        props = rule.distractor_props, rule.distractor_size, rule.distractor_distance
+        drawn = _draw_prop(distractors, f"distractor_{i}", *props, rule.yaw_deg)
+        spacing = math.radians(rule.distractor_spacing_deg)
+        turn = math.pi + (i - (rule.distractors - 1) / 2) * spacing
+        placed.append(_first_free(drawn, camera, keep_out, turn, spacing, placed))
+    for i in range(rule.occluders):
+        props = rule.occluder_props, rule.occluder_size, rule.occluder_distance
+        drawn = _draw_prop(occluders, f"occluder_{i}", *props, rule.yaw_deg)
+        spacing = math.radians(rule.occluder_spacing_deg)
+        turn = (i - (rule.occluders - 1) / 2) * spacing
+        size = _occluding_size(drawn, camera, keep_out, turn, rule)
+        drawn = dataclasses.replace(drawn, size=size)
+        placed.append(_first_free(drawn, camera, keep_out, turn, spacing, placed))
+    return tuple(placed)
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """What chance decided about a prop; where it stands follows from the rest of the scene."""
+
+    name: str
+    shape: str
+    size: NDArray[np.float64]
+    yaw: float
+    share: float
+    look: Look
+
+
+def _draw_prop(
+    rng: np.random.Generator,
+    name: str,
+    props: Sequence[str],
+    limits: Range,
+    distance: Range,
+    yaw_deg: float,
+) -> _Drawn:
+    prop = props[int(rng.integers(len(props)))]
+    size = np.array(NATURAL_SIZES[prop])
+    largest = float(size.max())
+    size = size * float(np.clip(largest, *limits)) / largest
+    turn = math.radians(uniform(rng, (-yaw_deg, yaw_deg)))
+    return _Drawn(
+        name, f"prop:{prop}", size, turn, uniform(rng, distance), prop_look(rng, f"prop:{prop}")
+    )
+
+
+def _first_free(
+    drawn: _Drawn,
+    camera: Camera,
+    keep_out: NDArray[np.float64],
+    turn: float,
+    spacing: float,
+    placed: Sequence[Body],
+) -> Body:
+    """The prop at its angle or, where another prop is, a few steps of ``spacing`` beside it."""
+    for step in (0, 1, -1, 2, -2, 3, -3):
+        body = _standing(drawn, camera, keep_out, turn + step * spacing)
+        if not any(_footprints_meet(body, other) for other in placed):
+            break
+    return body
+
+
+def _standing(drawn: _Drawn, camera: Camera, keep_out: NDArray[np.float64], turn: float) -> Body:
+    place = _place(drawn, camera, keep_out, turn)
+    azimuth = math.atan2(camera.position[1], camera.position[0])
+    return Body(
+        name=drawn.name,
+        shape=drawn.shape,
+        position=(float(place[0]), float(place[1]), 0.0),
+        scale=(float(drawn.size[0]), float(drawn.size[1]), float(drawn.size[2])),
+        rotation=yaw(azimuth + turn + drawn.yaw),
+        kinematic=True,
+        scenery=True,
+        look=drawn.look,
+    )
+
+
+def _place(
+    drawn: _Drawn, camera: Camera, keep_out: NDArray[np.float64], turn: float
+) -> NDArray[np.float64]:
+    """Where (2,) a prop stands: clear of the scene, and not in the camera's face."""
+    x, y, _ = camera.position
+    azimuth, whole = math.atan2(y, x) + turn, math.hypot(x, y)
+    way = np.array([math.cos(azimuth), math.sin(azimuth)])
+    place = _clear(way, drawn.share * whole / math.sqrt(2), drawn.size, keep_out)
+    if math.cos(turn) > 0:
+        place *= min(1.0, NEAREST_OCCLUDER * whole / float(np.hypot(*place)))
+    return place
+
+
+def _occluding_size(
+    drawn: _Drawn,
+    camera: Camera,
+    keep_out: NDArray[np.float64],
+    turn: float,
+    rule: SceneryRule,
+) -> NDArray[np.float64]:
+    """A size whose top ends at its share of the line of sight; width grows along within limits."""
+    place = _place(drawn, camera, keep_out, turn)
+    along = float(np.hypot(*place)) / math.hypot(*camera.position[:2])
+    sight = camera.target[2] + (camera.position[2] - camera.target[2]) * along
+    top = max(rule.occlusion * sight, 0.05)
+    factor = min(top / drawn.size[2], rule.occluder_size[1] / max(drawn.size))
+    return np.array([drawn.size[0] * factor, drawn.size[1] * factor, top])
+
+
+def _footprints_meet(body: Body, other: Body) -> bool:
+    """Whether the circles round two props' floor plans meet."""
+    reach = (math.hypot(*body.scale[:2]) + math.hypot(*other.scale[:2])) / 2
+    return math.dist(body.position[:2], other.position[:2]) < reach
+
+
+def _clear(
+    way: NDArray[np.float64],
+    distance: float,
+    size: NDArray[np.float64],
+    keep_out: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """The first place along ``way`` from ``distance`` on that is clear of the scene's rectangle."""
+    room = CLEARANCE + math.hypot(size[0], size[1]) / 2
+    low, high = keep_out[0, :2] - room, keep_out[1, :2] + room
+    with np.errstate(divide="ignore"):
+        exits = np.where(way > 0, high / way, low / way)
+    inside = bool(((way * distance > low) & (way * distance < high)).all())
+    return np.asarray(way * (float(exits.min()) if inside else distance))

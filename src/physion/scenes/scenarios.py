@@ -1,0 +1,72 @@
+"""The scenarios by name: each draws scenes from its own parameters."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+
+from physion.registry import Registry
+from physion.scenes.scene import Scene
+from physion.seeds import stable_hash
+
+P = TypeVar("P")
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A kind of trial.
+
+    ``params`` is a frozen dataclass whose defaults are the official class defaults;
+    ``sample(params(), seed)`` draws a scene that depends on nothing else.
+    """
+
+    name: str
+    params: type[Any]
+    sample: Callable[[Any, np.random.SeedSequence], Scene]
+
+
+scenarios: Registry[Scenario] = Registry(
+    "scenario",
+    {name: f"physion.scenes.{name}:sample" for name in ("dominoes", "collide", "drop")},
+)
+
+
+def scenario(
+    name: str, params: type[P]
+) -> Callable[
+    [Callable[[P, np.random.SeedSequence], Scene]], Callable[[P, np.random.SeedSequence], Scene]
+]:
+    """Register the decorated sampler as the scenario ``name``."""
+
+    def add(
+        sample: Callable[[P, np.random.SeedSequence], Scene],
+    ) -> Callable[[P, np.random.SeedSequence], Scene]:
+        scenarios.register(name)(Scenario(name, params, sample))
+        return sample
+
+    return add
+
+
+def sample_scene(name: str, seed: np.random.SeedSequence, params: object | None = None) -> Scene:
+    """Draw a scene of the scenario ``name``, with its default parameters unless others are given.
+
+    `UnknownNameError` has the closest names.
+    """
+    found = scenarios.get(name)
+    return found.sample(found.params() if params is None else params, seed)
+
+
+def scene_name(scenario: str, seed: np.random.SeedSequence) -> str:
+    """A name for a scene that nobody has named yet: the same seed, the same name."""
+    return f"{scenario}_{stable_hash(str(seed.entropy)) & 0xFFFFFFFF:08x}"
+
+
+def as_record(params: Any) -> dict[str, Any]:
+    """A dataclass of parameters as plain JSON values, for `Scene.parameters`."""
+    record: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(params)))
+    return record
