@@ -1,0 +1,5 @@
+"""Models that look at trials or simulate them."""
+
+from physion.models.interface import Clip, Model, Provenance, Spec, build_model, models
+
+__all__ = ["Clip", "Model", "Provenance", "Spec", "build_model", "models"]

@@ -1,0 +1,6 @@
+"""From what a model sees or simulates to predictions."""
+
+from physion.readout.evaluate import Evaluation, EvaluationConfig, evaluate, evaluate_model
+from physion.readout.protocols import Readout
+
+__all__ = ["Evaluation", "EvaluationConfig", "Readout", "evaluate", "evaluate_model"]

@@ -1,0 +1,1 @@
+"""Clips, features, and the training of dynamics on them."""

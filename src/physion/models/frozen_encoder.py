@@ -1,0 +1,231 @@
+"""A frozen image encoder with dynamics on its features: pVGG, pDeIT, and any other timm network.
+
+Tensors (B clips, T frames, D features of one frame, c = ``spec.context``):
+
+- frames (B, T, H, W, 3): uint8, sRGB, H = W = ``image_size``.
+- features (B, T, D): float32, unbounded; D is 4096 for VGG, 768 for DeiT base.
+- context (B, c, D): features of the observed frames, the input of the dynamics.
+- next feature (B, D): their output.
+
+Source: reference/models.md, sections 1.1 and 1.2. Unlike the released code, Adam keeps its
+moments from step to step, and a rollout never overwrites the features that it started from.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import timm
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from physion.errors import BadInputError
+from physion.models.interface import Provenance, Spec, make_config
+from physion.models.weights import (
+    IMAGENET,
+    RANDOM,
+    EncoderWeights,
+    create_encoder,
+    feature_size,
+    input_statistics,
+)
+from physion.seeds import stable_hash
+
+_FAMILIES = {"vgg19": "pVGG", "vgg16_bn": "pVGG", "deit_base_patch16_224": "pDeIT"}
+"""Encoders whose trained versions have a name of their own in the paper."""
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """A frozen-encoder model.
+
+    - ``encoder``: any timm name. ``image_size``: pixels a side; 224 is what weights are made for.
+    - ``weights``: ``imagenet``, ``random``, or the path of a state dict.
+    - ``dynamics``: ``mlp`` (all context features at once) or ``lstm`` (one after the other).
+    - ``hidden``: units of the one hidden layer.
+    - ``residual``: predict the change from the last feature rather than the next feature itself,
+      starting at "no change"; the published models predict the feature itself.
+    - ``seed``: of random encoders and of the first weights of the dynamics.
+    - ``stride``, ``context``, ``total``: see `Spec`.
+    """
+
+    encoder: str = "resnet18"
+    image_size: int = 112
+    weights: str = IMAGENET
+    dynamics: Literal["mlp", "lstm"] = "mlp"
+    hidden: int = 1024
+    residual: bool = False
+    seed: int = 0
+    stride: int = 6
+    context: int = 7
+    total: int = 25
+
+    def __post_init__(self) -> None:
+        if self.dynamics not in ("mlp", "lstm"):
+            raise BadInputError(f"dynamics must be mlp or lstm, not {self.dynamics!r}")
+        if self.hidden < 1:
+            raise BadInputError(f"hidden must be at least 1, not {self.hidden}")
+
+
+class MlpDynamics(nn.Module):
+    """All context features through one hidden layer: (B, c, D) to (B, D)."""
+
+    def __init__(self, size: int, context: int, hidden: int) -> None:
+        super().__init__()
+        self.inner = nn.Linear(context * size, hidden)
+        self.outer = nn.Linear(hidden, size)
+
+    def forward(self, context: Tensor) -> Tensor:
+        """The next feature."""
+        out: Tensor = self.outer(torch.relu(self.inner(context.flatten(1))))
+        return out
+
+
+class LstmDynamics(nn.Module):
+    """One LSTM layer over the context features: (B, c, D) to (B, D)."""
+
+    def __init__(self, size: int, context: int, hidden: int) -> None:
+        super().__init__()
+        self.inner = nn.LSTM(size, hidden, batch_first=True)
+        self.outer = nn.Linear(hidden, size)
+
+    def forward(self, context: Tensor) -> Tensor:
+        """The next feature."""
+        states, _ = self.inner(context)
+        out: Tensor = self.outer(states[:, -1])
+        return out
+
+
+class FrozenEncoder(nn.Module):
+    """See the module. Only the dynamics are parameters; the encoder is loaded when first used."""
+
+    def __init__(self, config: Config) -> None:
+        super().__init__()
+        mean, std = input_statistics(config.encoder)
+        self.config = config
+        self.spec = Spec(config.image_size, mean, std, config.stride, config.context, config.total)
+        self.feature_size = feature_size(config.encoder, config.image_size)
+        self._weights = EncoderWeights(config.weights, config.seed)
+        # In a tuple, so that torch does not take the encoder for a part that is trained or saved.
+        self._encoder: tuple[nn.Module, ...] = ()
+        kind = MlpDynamics if config.dynamics == "mlp" else LstmDynamics
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(stable_hash("dynamics", config.dynamics, config.seed) % 2**63)
+            self.dynamics = kind(self.feature_size, config.context, config.hidden)
+        if config.residual:
+            nn.init.zeros_(self.dynamics.outer.weight)
+            nn.init.zeros_(self.dynamics.outer.bias)
+
+    @torch.no_grad()
+    def encode(self, frames: Tensor) -> Tensor:
+        """Features (B, T, D) of uint8 frames (B, T, H, W, 3), on the device of ``frames``."""
+        size = self.spec.image_size
+        if frames.dtype != torch.uint8 or frames.ndim != 5 or frames.shape[2:] != (size, size, 3):
+            raise BadInputError(
+                f"{self.name()}: frames must be uint8 (batch, time, {size}, {size}, 3), "
+                f"not {frames.dtype} {tuple(frames.shape)}"
+            )
+        encoder = self._encoder_on(frames.device)
+        mean = torch.tensor(self.spec.mean, device=frames.device).view(3, 1, 1)
+        std = torch.tensor(self.spec.std, device=frames.device).view(3, 1, 1)
+        flat = frames.flatten(0, 1).permute(0, 3, 1, 2).float() / 255
+        features: Tensor = encoder((flat - mean) / std)
+        return features.float().view(frames.shape[0], frames.shape[1], -1)
+
+    def simulate(self, context: Tensor, steps: int) -> Tensor:
+        """Roll the dynamics on from ``context`` (B, c, D): (B, steps, D), a sliding window."""
+        window, made = context, []
+        for _ in range(steps):
+            following = self._next(window)
+            made.append(following)
+            window = torch.cat([window[:, 1:], following[:, None]], dim=1)
+        return torch.stack(made, dim=1)
+
+    def loss(self, batch: Mapping[str, Tensor]) -> Tensor:
+        """Mean squared error of the next feature over every window of ``batch["features"]``."""
+        features = batch["features"]
+        count = self.config.context
+        windows = features.unfold(1, count + 1, 1).transpose(2, 3).flatten(0, 1)
+        return functional.mse_loss(self._next(windows[:, :count]), windows[:, count])
+
+    def forward(self, batch: Mapping[str, Tensor]) -> Tensor:
+        """The loss: what a training strategy wraps."""
+        return self.loss(batch)
+
+    def encoder_digest(self) -> str:
+        """Key of cached features; models that differ in their dynamics alone share it."""
+        parts = [self.config.encoder, self.config.image_size, self._weights.identity()]
+        parts += [self.spec.mean, self.spec.std, f"timm{timm.__version__}", "penultimate"]
+        return hashlib.sha256(repr(parts).encode()).hexdigest()
+
+    def name(self) -> str:
+        """``pVGG-mlp`` and its like only for trained weights, else ``random-<encoder>-mlp``."""
+        if self.config.weights == RANDOM:
+            return f"random-{self.config.encoder}-{self.config.dynamics}"
+        family = _FAMILIES.get(self.config.encoder, self.config.encoder)
+        return f"{family}-{self.config.dynamics}"
+
+    def provenance(self) -> Provenance:
+        """Name, weights and versions, for the tables."""
+        trained = self.config.weights == IMAGENET
+        return Provenance(
+            model=self.name(),
+            init=self._weights.init(),
+            encoder_type=self.config.encoder,
+            dynamics_type=self.config.dynamics.upper(),
+            encoder_pretraining_task="ImageNet classification" if trained else "",
+            encoder_pretraining_dataset="ImageNet" if trained else "",
+            encoder_pretraining_seed=str(self.config.seed) if self._is_random() else "",
+            dynamics_training_task="L2 on latent",
+            versions=f"torch {torch.__version__}, timm {timm.__version__}",
+        )
+
+    def _is_random(self) -> bool:
+        return self.config.weights == RANDOM
+
+    def _next(self, window: Tensor) -> Tensor:
+        out: Tensor = self.dynamics(window)
+        return window[:, -1] + out if self.config.residual else out
+
+    def _encoder_on(self, device: torch.device) -> nn.Module:
+        if not self._encoder:
+            config = self.config
+            self._encoder = (create_encoder(config.encoder, config.image_size, self._weights),)
+        return self._encoder[0].to(device)
+
+
+def frozen_encoder(**options: Any) -> FrozenEncoder:
+    """Any timm encoder with MLP or LSTM dynamics; options are the fields of `Config`."""
+    return FrozenEncoder(make_config(Config, "frozen-encoder", options))
+
+
+def pvgg_mlp(**options: Any) -> FrozenEncoder:
+    """VGG-19 with an MLP (the released code has vgg16_bn: ``encoder="vgg16_bn"``)."""
+    return _published("pVGG-mlp", "vgg19", "mlp", options)
+
+
+def pvgg_lstm(**options: Any) -> FrozenEncoder:
+    """VGG-19 with an LSTM."""
+    return _published("pVGG-lstm", "vgg19", "lstm", options)
+
+
+def pdeit_mlp(**options: Any) -> FrozenEncoder:
+    """DeiT base with an MLP."""
+    return _published("pDeIT-mlp", "deit_base_patch16_224", "mlp", options)
+
+
+def pdeit_lstm(**options: Any) -> FrozenEncoder:
+    """DeiT base with an LSTM."""
+    return _published("pDeIT-lstm", "deit_base_patch16_224", "lstm", options)
+
+
+def _published(
+    name: str, encoder: str, dynamics: Literal["mlp", "lstm"], options: Mapping[str, Any]
+) -> FrozenEncoder:
+    base = Config(encoder=encoder, image_size=224, dynamics=dynamics)
+    return FrozenEncoder(make_config(Config, name, {**dataclasses.asdict(base), **options}))

@@ -1,0 +1,255 @@
+"""L2 logistic regression on few trials with very many features, solved exactly.
+
+With d features and n trials, d >> n, the solution lies in the span of the trials. So all that is
+needed of the features is the n x n matrix of inner products; its eigenvectors turn the problem
+into one of at most n dimensions, without any approximation, and Newton's method solves that to the
+rounding error. The objective is that of scikit-learn, whose converged solution is the same:
+
+    C * sum(log(1 + exp(-y f))) + |w|^2 / 2,    f = w . x + b,  y in {-1, 1},  b not penalised.
+
+The released study stopped lbfgs after 200 iterations, which is not the optimum
+(reference/models.md, section 3.1); ``released=True`` does as they did.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+from sklearn.linear_model import LogisticRegression
+from sklearn.model_selection import StratifiedKFold
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
+
+from physion.errors import BadInputError
+
+Array = NDArray[np.float64]
+Booleans = NDArray[np.bool_]
+
+C_GRID: tuple[float, ...] = tuple(float(c) for c in np.logspace(-8, 8, 17))
+"""Inverse penalties that cross-validation chooses from."""
+FOLDS = 5
+_CHUNK = 4096
+"""Feature columns that are standardised at a time: bounds the memory."""
+_ITERATIONS = 200
+_TOLERANCE = 1e-9
+"""On the gradient, as a share of its two terms, which cancel at the optimum."""
+
+
+@dataclass(frozen=True)
+class ReadoutConfig:
+    """How a readout is fitted.
+
+    - ``grid``: inverse penalties C, ascending. ``folds``: of the cross-validation that chooses.
+    - ``seed``: of the folds and of undersampling.
+    - ``balance``: drop trials of the more frequent answer until both are equally frequent, as
+      the released code did for fitting (never for testing).
+    - ``released``: scikit-learn's lbfgs with 200 iterations instead of the exact optimum.
+    """
+
+    grid: tuple[float, ...] = C_GRID
+    folds: int = FOLDS
+    seed: int = 0
+    balance: bool = False
+    released: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.grid or min(self.grid) <= 0 or list(self.grid) != sorted(set(self.grid)):
+            raise BadInputError(f"grid of C must ascend and be above zero, not {self.grid}")
+        if self.folds < 2:
+            raise BadInputError(f"cross-validation needs at least 2 folds, not {self.folds}")
+
+
+@dataclass(frozen=True)
+class FittedReadout:
+    """What a readout found.
+
+    - ``probability`` (m,): P(contact) of the test trials, 0..1.
+    - ``train_accuracy``: on the trials it was fitted on, 0..1; ``cv_accuracy``: mean over folds at
+      the chosen C, NaN without cross-validation.
+    - ``c``: the chosen inverse penalty, NaN where nothing was fitted.
+    - ``note``: why a fit was not an ordinary one, else empty.
+    """
+
+    probability: Array
+    train_accuracy: float
+    cv_accuracy: float
+    c: float
+    note: str = ""
+
+
+def fit_readout(
+    train: NDArray[Any], labels: Booleans, test: NDArray[Any], config: ReadoutConfig | None = None
+) -> FittedReadout:
+    """Fit on ``train`` (n, d) with ``labels`` (n,) and answer for ``test`` (m, d).
+
+    Features are standardised by the mean and deviation of the trials that are fitted; a constant
+    feature counts nothing. With one answer only in ``labels`` there is nothing to fit, and the
+    probability is that of Laplace's rule of succession. With fewer than two trials of an answer
+    there is no cross-validation, and C is the middle of the grid. NaN or infinite features raise
+    `BadInputError`.
+    """
+    config = config if config is not None else ReadoutConfig()
+    labels = np.asarray(labels, bool)
+    _check(train, labels, test)
+    if config.balance:
+        kept = undersample(labels, config.seed)
+        train, labels = train[kept], labels[kept]
+    hits, count = int(labels.sum()), len(labels)
+    if hits in (0, count):
+        share = (hits + 1) / (count + 2)
+        note = "no trial to fit" if count == 0 else "one answer only"
+        accuracy = float("nan") if count == 0 else float(np.mean(labels == (share > 0.5)))
+        return FittedReadout(np.full(len(test), share), accuracy, float("nan"), float("nan"), note)
+    c, cv_accuracy, note = _choose(train, labels, config)
+    everything = np.concatenate([train, test])
+    grid = tuple(value for value in config.grid if value <= c)
+    scores = _decide(everything, np.arange(count), labels, grid, config)[:, -1]
+    probability = 1 / (1 + np.exp(-np.clip(scores, -700, 700)))
+    accuracy = float(np.mean((scores[:count] > 0) == labels))
+    return FittedReadout(probability[count:], accuracy, cv_accuracy, c, note)
+
+
+def undersample(labels: Booleans, seed: int) -> NDArray[np.int64]:
+    """Sorted rows that keep all trials of the rarer answer and as many of the other, at random.
+
+    All rows where one answer does not occur at all.
+    """
+    yes, no = np.flatnonzero(labels), np.flatnonzero(~labels)
+    count = min(len(yes), len(no))
+    if count == 0:
+        return np.arange(len(labels))
+    rng = np.random.default_rng(seed)
+    picked = [rng.choice(rows, count, replace=False) for rows in (yes, no)]
+    return np.sort(np.concatenate(picked))
+
+
+def gram(features: NDArray[Any], fitted: NDArray[np.int64]) -> Array:
+    """Inner products (n, k) of all rows with the ``fitted`` ones, standardised by the latter.
+
+    Works through the columns in chunks, so that d is bounded by the features themselves alone.
+    """
+    out = np.zeros((len(features), len(fitted)))
+    for start in range(0, features.shape[1], _CHUNK):
+        block = np.asarray(features[:, start : start + _CHUNK], np.float64)
+        mean, deviation = block[fitted].mean(0), block[fitted].std(0)
+        # Rounding leaves a constant column a deviation near, but not at, zero.
+        varies = deviation > 1e-9 * np.maximum(np.abs(mean), 1e-30)
+        block = (block[:, varies] - mean[varies]) / deviation[varies]
+        out += block @ block[fitted].T
+    return out
+
+
+def solve_path(kernel: Array, labels: Booleans, grid: tuple[float, ...]) -> tuple[Array, Array]:
+    """Weights (k, len(grid)) on the rows of ``kernel`` (k, k) and intercepts, one for each C.
+
+    The answer of a trial with inner products ``g`` (k,) is ``g @ weights + intercept``.
+    """
+    values, vectors = linalg.eigh(kernel)
+    kept = values > max(values[-1], 0.0) * 1e-12
+    roots = np.sqrt(values[kept])
+    rotated = vectors[:, kept] * roots
+    back = vectors[:, kept] / roots
+    design = np.column_stack([rotated, np.ones(len(labels))])
+    signs = np.where(labels, 1.0, -1.0)
+    share = labels.mean()
+    solution = np.zeros(design.shape[1])
+    solution[-1] = np.log(share / (1 - share))
+    weights, intercepts = [], []
+    for c in grid:
+        solution = _newton(design, signs, c, solution)
+        weights.append(back @ solution[:-1])
+        intercepts.append(solution[-1])
+    return np.column_stack(weights), np.array(intercepts)
+
+
+def _newton(design: Array, signs: Array, c: float, start: Array) -> Array:
+    """The optimum for one C, from the solution for the next smaller one."""
+    penalty = np.full(design.shape[1], 1.0 / (c * len(signs)))
+    penalty[-1] = 0.0
+    x = start
+    value, margins = _objective(design, signs, penalty, x)
+    for _ in range(_ITERATIONS):
+        miss = 1 / (1 + np.exp(np.clip(margins, -700, 700)))
+        gradient = penalty * x - design.T @ (signs * miss) / len(signs)
+        if 0 < np.abs(gradient).max() <= _TOLERANCE * np.abs(penalty * x).max():
+            break
+        curvature = miss * (1 - miss) / len(signs)
+        hessian = (design * curvature[:, None]).T @ design
+        # The tiny addition keeps the intercept solvable when every trial is far from the border.
+        hessian[np.diag_indices_from(hessian)] += penalty + 1e-15
+        step = -linalg.solve(hessian, gradient, assume_a="pos")
+        slope, length = float(gradient @ step), 1.0
+        while length > 1e-10:
+            trial, trial_margins = _objective(design, signs, penalty, x + length * step)
+            if trial <= value + 1e-4 * length * slope:
+                break
+            length /= 2
+        else:
+            break  # no more descent within the rounding error
+        gained, x, value, margins = value - trial, x + length * step, trial, trial_margins
+        if gained <= 1e-16 * abs(value):
+            break
+    return x
+
+
+def _objective(design: Array, signs: Array, penalty: Array, x: Array) -> tuple[float, Array]:
+    margins = signs * (design @ x)
+    loss = np.logaddexp(0, -margins).mean() + 0.5 * float(penalty @ (x * x))
+    return float(loss), margins
+
+
+def _choose(
+    train: NDArray[Any], labels: Booleans, config: ReadoutConfig
+) -> tuple[float, float, str]:
+    """The C of the highest mean accuracy over folds (the smallest of equals), and that accuracy."""
+    folds = min(config.folds, int(labels.sum()), int((~labels).sum()))
+    if len(config.grid) == 1 or folds < 2:
+        note = "" if len(config.grid) == 1 else "too few trials to choose C"
+        return config.grid[len(config.grid) // 2], float("nan"), note
+    splitter = StratifiedKFold(folds, shuffle=True, random_state=config.seed)
+    accuracies = []
+    for fitted, held in splitter.split(np.zeros(len(labels)), labels):
+        scores = _decide(train, fitted, labels[fitted], config.grid, config)
+        accuracies.append(np.mean((scores[held] > 0) == labels[held][:, None], axis=0))
+    mean = np.mean(accuracies, axis=0)
+    best = int(np.argmax(mean))
+    note = f"only {folds} folds" if folds < config.folds else ""
+    return config.grid[best], float(mean[best]), note
+
+
+def _decide(
+    features: NDArray[Any],
+    fitted: NDArray[np.int64],
+    labels: Booleans,
+    grid: tuple[float, ...],
+    config: ReadoutConfig,
+) -> Array:
+    """Answers (n, len(grid)) of all rows by readouts fitted on the ``fitted`` ones."""
+    if not config.released:
+        kernel = gram(features, fitted)
+        weights, intercepts = solve_path(kernel[fitted], labels, grid)
+        answers: Array = kernel @ weights + intercepts
+        return answers
+    columns = []
+    for c in grid:
+        model = make_pipeline(StandardScaler(), LogisticRegression(C=c, max_iter=200))
+        model.fit(features[fitted], labels)
+        columns.append(model.decision_function(features))
+    return np.column_stack(columns)
+
+
+def _check(train: NDArray[Any], labels: Booleans, test: NDArray[Any]) -> None:
+    if train.ndim != 2 or test.ndim != 2 or train.shape[1] != test.shape[1]:
+        raise BadInputError(
+            f"readout needs (n, d) features of one width, not {train.shape} and {test.shape}"
+        )
+    if labels.shape != (len(train),):
+        raise BadInputError(f"readout: {len(train)} trials but {labels.shape} labels")
+    for name, values in (("training", train), ("test", test)):
+        bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+        if len(bad):
+            raise BadInputError(f"readout: {name} trial {bad[0]} has a feature that is not finite")

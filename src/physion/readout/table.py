@@ -1,0 +1,157 @@
+"""The table of predictions, with the column names of the official result files."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from physion.atomic import write_atomic
+from physion.models.interface import Provenance
+from physion.readout.protocols import Readout
+
+OFFICIAL_COLUMNS = (
+    "Model",
+    "Readout Train Data",
+    "Readout Test Data",
+    "Train Accuracy",
+    "Test Accuracy",
+    "Readout Type",
+    "Predicted Prob_false",
+    "Predicted Prob_true",
+    "Predicted Outcome",
+    "Actual Outcome",
+    "Stimulus Name",
+    "Encoder Type",
+    "Dynamics Type",
+    "Encoder Pre-training Task",
+    "Encoder Pre-training Dataset",
+    "Encoder Pre-training Seed",
+    "Encoder Training Task",
+    "Encoder Training Dataset",
+    "Encoder Training Seed",
+    "Dynamics Training Task",
+    "Dynamics Training Dataset",
+    "Dynamics Training Seed",
+)
+"""Columns of the official files, in their order (reference/official-system.md, section 5.5)."""
+
+OWN_COLUMNS = (
+    "Protocol",
+    "Init",
+    "Recorded Outcome",
+    "Fit Labels",
+    "Fit Trials",
+    "Fold",
+    "Readout C",
+    "CV Accuracy",
+    "Noise Scale",
+    "Validation Loss",
+    "Copy-last Loss",
+    "Note",
+    "Versions",
+)
+"""What we add: the protocol by its name; ``Init``, what the weights were; the outcome in the
+official recording, empty where there is none (``Actual Outcome`` is that of the trial shown); which
+labels the readout was fitted on and on how many trials; -1 or the part of a cross-fit; the rest
+empty where it does not apply."""
+
+
+@dataclass(frozen=True)
+class Answers:
+    """Predictions of one scenario under one protocol in one round; arrays are over ``trials``."""
+
+    scenario: str
+    protocol: Readout
+    trials: tuple[str, ...]
+    probability: np.ndarray
+    train_accuracy: float
+    fit_trials: int
+    fold: int
+    training_set: str = ""
+    training_seed: str = ""
+    c: float = float("nan")
+    cv_accuracy: float = float("nan")
+    noise_scale: float = float("nan")
+    validation_loss: float = float("nan")
+    copy_last_loss: float = float("nan")
+    note: str = ""
+
+
+def make_table(answers: list[Answers], provenance: Provenance, index: pd.DataFrame) -> pd.DataFrame:
+    """One row a protocol and tested trial, sorted; the accuracy of testing is over all rounds."""
+    truth = index.set_index("trial")
+    rows = []
+    for part in answers:
+        for trial, p in zip(part.trials, part.probability, strict=True):
+            recorded = truth["recorded_contact"][trial]
+            rows.append(
+                {
+                    "Model": provenance.model,
+                    "Readout Train Data": part.scenario,
+                    "Readout Test Data": part.scenario,
+                    "Train Accuracy": part.train_accuracy,
+                    "Readout Type": part.protocol.letter,
+                    "Predicted Prob_false": 1 - float(p),
+                    "Predicted Prob_true": float(p),
+                    "Predicted Outcome": bool(p > 0.5),
+                    "Actual Outcome": bool(truth["contact"][trial]),
+                    "Stimulus Name": trial,
+                    "Encoder Type": provenance.encoder_type,
+                    "Dynamics Type": provenance.dynamics_type,
+                    "Encoder Pre-training Task": provenance.encoder_pretraining_task,
+                    "Encoder Pre-training Dataset": provenance.encoder_pretraining_dataset,
+                    "Encoder Pre-training Seed": provenance.encoder_pretraining_seed,
+                    "Encoder Training Task": provenance.encoder_training_task,
+                    "Dynamics Training Task": provenance.dynamics_training_task,
+                    "Dynamics Training Dataset": part.training_set,
+                    "Dynamics Training Seed": part.training_seed,
+                    "Protocol": part.protocol.value,
+                    "Init": provenance.init,
+                    "Recorded Outcome": "" if pd.isna(recorded) else bool(recorded),
+                    "Fit Labels": "simulated",
+                    "Fit Trials": part.fit_trials,
+                    "Fold": part.fold,
+                    "Readout C": part.c,
+                    "CV Accuracy": part.cv_accuracy,
+                    "Noise Scale": part.noise_scale,
+                    "Validation Loss": part.validation_loss,
+                    "Copy-last Loss": part.copy_last_loss,
+                    "Note": part.note,
+                    "Versions": provenance.versions,
+                }
+            )
+    table = pd.DataFrame(rows, columns=[*OFFICIAL_COLUMNS, *OWN_COLUMNS])
+    hits = (table["Predicted Outcome"] == table["Actual Outcome"]).astype(float)
+    cells = [table["Protocol"], table["Readout Test Data"]]
+    table["Test Accuracy"] = hits.groupby(cells).transform("mean")
+    table["Train Accuracy"] = table["Train Accuracy"].astype(float).groupby(cells).transform("mean")
+    order = ["Protocol", "Readout Test Data", "Stimulus Name"]
+    return table.sort_values(order, ignore_index=True)
+
+
+def write_table(table: pd.DataFrame, path: Path) -> None:
+    """Write a CSV file, atomically; the same table gives the same bytes."""
+    buffer = io.StringIO()
+    table.to_csv(buffer, index=False, lineterminator="\n")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(path, buffer.getvalue().encode())
+
+
+def read_table(path: Path) -> pd.DataFrame:
+    """A table that `write_table` wrote; words stay words, empty ones empty."""
+    numbers = {
+        "Train Accuracy", "Test Accuracy", "Predicted Prob_false", "Predicted Prob_true",
+        "Readout C", "CV Accuracy", "Noise Scale", "Validation Loss", "Copy-last Loss",
+    }  # fmt: skip
+    table = pd.read_csv(path, dtype=str, keep_default_na=False)
+    for name in numbers:
+        table[name] = pd.to_numeric(table[name].replace("", np.nan))
+    for name in ("Predicted Outcome", "Actual Outcome"):
+        table[name] = table[name] == "True"
+    for name in ("Fit Trials", "Fold"):
+        table[name] = table[name].astype(int)
+    return table

@@ -1,0 +1,54 @@
+"""On which scenarios dynamics are trained, and on which they are then asked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+from physion.errors import BadInputError, UnknownNameError
+
+
+class Training(Enum):
+    """A training protocol; the value is its name in the study."""
+
+    ALL = "all"
+    ALL_BUT = "all-but"
+    ONLY = "only"
+
+    @classmethod
+    def named(cls, name: str) -> Training:
+        """The protocol called ``name``; `UnknownNameError` with the closest names."""
+        try:
+            return cls(name)
+        except ValueError:
+            raise UnknownNameError("training protocol", name, [t.value for t in cls]) from None
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingSet:
+    """Dynamics trained on scenarios ``trained`` and asked about scenarios ``asked``.
+
+    ``name`` is what stands under *Dynamics Training Dataset*: ``all``, ``no_<scenario>`` or
+    ``<scenario>``.
+    """
+
+    name: str
+    trained: tuple[str, ...]
+    asked: tuple[str, ...]
+
+
+def training_sets(protocol: Training, scenarios: Sequence[str]) -> list[TrainingSet]:
+    """The trainings that a protocol needs for ``scenarios``: one, or one a scenario."""
+    names = tuple(sorted(set(scenarios)))
+    if not names:
+        raise BadInputError("there is no scenario to train on")
+    if protocol is Training.ALL:
+        return [TrainingSet("all", names, names)]
+    if protocol is Training.ONLY:
+        return [TrainingSet(name, (name,), (name,)) for name in names]
+    if len(names) < 2:
+        raise BadInputError(f"all-but needs two scenarios or more; there is only {names[0]!r}")
+    return [
+        TrainingSet(f"no_{name}", tuple(n for n in names if n != name), (name,)) for name in names
+    ]
