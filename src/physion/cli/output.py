@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -13,10 +12,14 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    ProgressColumn,
+    TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+
+from physion.atomic import write_atomic
 
 T = TypeVar("T")
 
@@ -24,9 +27,8 @@ console = Console(highlight=False)
 """Results. Progress goes to the error stream, so that output can be piped."""
 
 
-def track(items: Iterable[T], what: str, total: int) -> Iterator[T]:
-    """Pass ``items`` on while showing how many are done and how long the rest will take."""
-    columns = (
+def _columns() -> tuple[ProgressColumn, ...]:
+    return (
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
@@ -34,19 +36,37 @@ def track(items: Iterable[T], what: str, total: int) -> Iterator[T]:
         TextColumn("left"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=Console(file=sys.stderr), transient=True) as progress:
+
+
+def track(items: Iterable[T], what: str, total: int) -> Iterator[T]:
+    """Pass ``items`` on while showing how many are done and how long the rest will take."""
+    with Progress(*_columns(), console=Console(file=sys.stderr), transient=True) as progress:
         task = progress.add_task(what, total=total)
         for item in items:
             yield item
             progress.advance(task)
 
 
+class Stages:
+    """Shows the progress of work that reports itself as (what, done, total)."""
+
+    def __enter__(self) -> Stages:
+        self._progress = Progress(*_columns(), console=Console(file=sys.stderr), transient=True)
+        self._progress.start()
+        self._tasks: dict[str, TaskID] = {}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def __call__(self, what: str, done: int, total: int) -> None:
+        """Show that ``done`` of ``total`` are through."""
+        if what not in self._tasks:
+            self._tasks[what] = self._progress.add_task(what, total=total)
+        self._progress.update(self._tasks[what], completed=done, total=total)
+
+
 def write_text(path: Path, text: str) -> None:
-    """Write a text file under a temporary name, sync it, rename it."""
+    """Write a text file whole or not at all, making its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    with part.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    part.replace(path)
+    write_atomic(path, text.encode())

@@ -67,7 +67,17 @@ def main(options: Options) -> int:
 
 def _print(rows: Sequence[ReplayRow], copies: int, found: TrialSet, failures: list[str]) -> None:
     table = Table(title="Simulated outcome against the recorded one")
-    for column in ("scenario", "trials", "base", "agree", "ceiling", "AUC", "frames", "ms", "speed"):
+    for column in (
+        "scenario",
+        "trials",
+        "base",
+        "agree",
+        "ceiling",
+        "AUC",
+        "frames",
+        "ms",
+        "speed",
+    ):
         table.add_column(column, justify="left" if column == "scenario" else "right")
     for row in rows:
         table.add_row(

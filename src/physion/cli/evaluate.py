@@ -1,0 +1,76 @@
+"""Train a model's dynamics and readouts on a dataset and write its predictions."""
+
+from __future__ import annotations
+
+import json as json_module
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from physion.cli.output import Stages, console
+from physion.compute.local import LocalExecutor
+from physion.errors import BadInputError
+from physion.readout.evaluate import EvaluationConfig, evaluate
+from physion.trials.dataset import Dataset
+
+
+@dataclass(frozen=True)
+class Options:
+    """Which model on which trials."""
+
+    dataset: Annotated[Path, tyro.conf.Positional]
+    """Folder of a dataset."""
+    model: Annotated[str, tyro.conf.Positional]
+    """Name of a model; physion ls models lists them."""
+    out: Path = Path("runs/models")
+    """Folder for predictions, and for what makes a second run quick."""
+    option: tuple[str, ...] = ()
+    """Fields of the model's config as NAME=VALUE, such as encoder=resnet50 weights=imagenet."""
+    config: Annotated[EvaluationConfig, tyro.conf.arg(name="")] = field(
+        default_factory=EvaluationConfig
+    )
+    """Readouts, training protocol and solver."""
+    workers: int = os.cpu_count() or 1
+    """Processes that simulate."""
+    json: bool = False
+    """Print one JSON object."""
+
+
+def main(options: Options) -> int:
+    """Write the table of predictions; 1 if some trials have none."""
+    with Stages() as stages:
+        result = evaluate(
+            Dataset(options.dataset),
+            options.model,
+            options.out,
+            options=parse_options(options.option),
+            config=options.config,
+            executor=LocalExecutor(workers=options.workers),
+            progress=stages,
+        )
+    if options.json:
+        values = {"predictions": str(result.path), "problems": dict(result.problems)}
+        print(json_module.dumps(values))
+        return 1 if result.problems else 0
+    for trial, reason in result.problems.items():
+        console.print(f"no prediction: {trial}: {reason}", markup=False, soft_wrap=True)
+    count = len(result.predictions)
+    console.print(f"{count} predictions: {result.path}", markup=False, soft_wrap=True)
+    return 1 if result.problems else 0
+
+
+def parse_options(words: tuple[str, ...]) -> dict[str, Any]:
+    """NAME=VALUE pairs; a value that is JSON is taken as such, anything else as text."""
+    values: dict[str, Any] = {}
+    for word in words:
+        name, sign, text = word.partition("=")
+        if not sign or not name:
+            raise BadInputError(f"--option takes NAME=VALUE, not {word!r}")
+        try:
+            values[name] = json_module.loads(text)
+        except json_module.JSONDecodeError:
+            values[name] = text
+    return values
