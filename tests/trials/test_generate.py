@@ -364,6 +364,8 @@ def test_names_that_are_no_file_names_are_refused(name: str) -> None:
 def test_bad_plans_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match="closest: testing"):
         Task("d", "drop", "test", 0)
+    with pytest.raises(UnknownNameError, match="unknown scenario 'dropp'; closest: drop"):
+        plan_dataset("d", ["dropp"], {"testing": 1})
     with pytest.raises(BadInputError, match="two trials are called 'A'"):
         scenes_named("a", "A")
     with pytest.raises(BadInputError, match="one dataset"):

@@ -45,7 +45,9 @@ def test_round_trip_keeps_every_frame_and_its_place(movie: Path) -> None:
 def test_colours_survive(name: str, tmp_path: Path) -> None:
     source = np.full((3, 32, 32, 3), NAMED[name], np.uint8)
     (tmp_path / "c.mp4").write_bytes(encode_movie(source))
-    assert np.abs(read_frames(tmp_path / "c.mp4").astype(int) - NAMED[name]).max() <= 3
+    for size in (None, (32, 32), (16, 24), (64, 64)):
+        read = read_frames(tmp_path / "c.mp4", size=size)
+        assert np.abs(read.astype(int) - NAMED[name]).max() <= 3
 
 
 def test_start_count_and_stride_pick_the_same_frames_as_slicing(movie: Path) -> None:

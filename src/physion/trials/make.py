@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import physion
-from physion.errors import BadInputError
+from physion.errors import BadInputError, UnknownNameError
 from physion.physics.engine import simulate
 from physion.physics.labels import Labels, label_contact
 from physion.physics.trajectory import Trajectory
 from physion.rendering.renderer import Frame, Renderer, role_map
 from physion.scenes.looks import with_role_colors
+from physion.scenes.scenarios import sample_scene
 from physion.scenes.scene import FRAME_TIME, OBSERVED_FRAMES, PLAYBACK_RATE, Scene
 from physion.trials.files import encode_png, write_files
 from physion.trials.plan import Job, Task
@@ -47,9 +48,9 @@ def scene_of(task: Task, look: str) -> Scene:
     """The scene of a task in its final colours: the imported one, or one drawn by its seed."""
     scene = task.scene
     if scene is None:
-        from physion.scenes.scenarios import sample_scene
-
-        scene = sample_scene(task.scenario, task.seed(), preset=task.preset)
+        if task.preset is not None:
+            raise UnknownNameError("preset", task.preset, ())
+        scene = sample_scene(task.scenario, task.seed())
         scene = dataclasses.replace(scene, name=task.trial)
     return with_role_colors(scene) if look == "redyellow" else scene
 

@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 
 from physion.errors import BadInputError, UnknownNameError
+from physion.scenes.scenarios import scenarios as known_scenarios
 from physion.scenes.scene import Scene
 from physion.seeds import trial_seed
 from physion.trials.layout import SAFE_NAME, TrialPaths
@@ -116,11 +117,15 @@ def plan_dataset(
     """Tasks for ``counts[split]`` trials of each scenario in each split.
 
     ``presets`` names the presets of a scenario, which its trials take in turn. Raising a count
-    later adds trials and changes none.
+    later adds trials and changes none. `UnknownNameError` for a scenario that nobody registered.
     """
+    wanted = list(scenarios)
+    for name in wanted:
+        if name not in known_scenarios:
+            raise UnknownNameError("scenario", name, known_scenarios.names())
     tasks = []
     for split, count in counts.items():
-        for scenario in scenarios:
+        for scenario in wanted:
             names: Sequence[str | None] = (presets or {}).get(scenario) or (None,)
             tasks += [
                 Task(dataset, scenario, split, index, names[index % len(names)])

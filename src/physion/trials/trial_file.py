@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import h5py
 import numpy as np
@@ -37,6 +37,9 @@ from physion.trials.schema import (
     seal,
     storage,
 )
+
+if TYPE_CHECKING:
+    from physion.rendering.renderer import Frame, Renderer
 
 T = TypeVar("T")
 
@@ -129,7 +132,9 @@ class TrialWriter:
                 raise BadInputError(
                     f"pass {name!r}, frame {self._added}: {image.shape}, not {dataset.shape[1:]}"
                 )
-            dataset[self._added] = image.astype(dataset.dtype)
+            # A flow past 65504 pixels is as good as infinite, and becomes so.
+            with np.errstate(over="ignore"):
+                dataset[self._added] = image.astype(dataset.dtype)
         self._added += 1
 
     def finish(self) -> bytes:
@@ -278,6 +283,17 @@ class Trial:
         if not 0 <= frame < self.metadata.frames:
             raise BadInputError(f"{self._where} has no frame {frame} of {self.metadata.frames}")
         return {name: self._reader.image(name, frame) for name in self.pass_names}
+
+    def render(self, frame: int, passes: Sequence[str] = ("color",)) -> Frame:
+        """Any pass of any frame, rendered again from the stored state, stored or not."""
+        return self._renderer.render(frame, passes)
+
+    @cached_property
+    def _renderer(self) -> Renderer:
+        # Compiled code, which readers of numbers do not need to wait for.
+        from physion.rendering.renderer import Renderer
+
+        return Renderer(self.scene, self.trajectory, self.metadata.width, self.metadata.height)
 
 
 def _arrays(trajectory: Trajectory, ids: NDArray[Any], things: int) -> dict[str, NDArray[Any]]:

@@ -26,7 +26,7 @@ GROUP = 15
 _BT709 = 1
 """Number of ITU-R BT.709 in the H.264 tables for matrix, primaries and transfer alike."""
 _SCALING = Interpolation.AREA | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
-"""Without exact rounding swscale darkens a flat grey by 2 of 255."""
+"""Without exact rounding swscale, when it scales, darkens a flat grey by 2 of 255."""
 _INDEX_BYTES = (2048, 24)
 """Room for the movie's index at its start: bytes for the header, and for each frame."""
 
@@ -121,7 +121,8 @@ def read_frames(
     for index, picture in _decode(path):
         if index < start or (index - start) % stride:
             continue
-        height, width = size or (picture.height, picture.width)
+        own = (picture.height, picture.width)
+        height, width = size or own
         # Conversion costs three times the decoding, so it is done for kept frames alone.
         rgb = reformatter.reformat(
             picture,
@@ -131,7 +132,7 @@ def read_frames(
             src_colorspace=Colorspace.ITU709,
             src_color_range=ColorRange.MPEG,
             dst_color_range=ColorRange.JPEG,
-            interpolation=int(_SCALING),
+            interpolation=int(_SCALING) if (height, width) != own else None,
         )
         kept.append(rgb.to_ndarray())  # type: ignore[arg-type]
         if len(kept) == count:
