@@ -73,10 +73,14 @@ def test_ceiling_is_what_a_model_of_the_truth_reaches() -> None:
     true, people = generator.beta(1, 1, 4000), 12
     first, second = (generator.binomial(people, true) / people for _ in range(2))
     count = np.full(4000, people)
-    assert agreement.ceiling(first, count) == pytest.approx(agreement.pearson(true, first), abs=0.01)
+    assert agreement.ceiling(first, count) == pytest.approx(
+        agreement.pearson(true, first), abs=0.01
+    )
     reliability = agreement.reliability(first, count)
     assert reliability == pytest.approx(agreement.pearson(first, second), abs=0.01)
-    assert agreement.rmsd_floor(first, count) == pytest.approx(agreement.rmsd(true, first), abs=0.005)
+    assert agreement.rmsd_floor(first, count) == pytest.approx(
+        agreement.rmsd(true, first), abs=0.005
+    )
     half = generator.binomial(6, true, size=(2, 4000)) / 6
     expected = agreement.pearson(*half)
     assert agreement.reliability(first, count, people=6) == pytest.approx(expected, abs=0.015)

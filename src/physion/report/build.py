@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -21,7 +21,7 @@ from physion.analysis.stimuli import read_stimulus_list
 from physion.atomic import write_atomic
 from physion.errors import BadInputError
 from physion.report import figures
-from physion.report.page import Picture, ReportInputs, render_page
+from physion.report.page import Picture, ReportInputs, check_movies, page_kind, render_page
 
 LABELS_FILE = "stimulus_names_and_labels.csv"
 ZONE_FILE = "human_accuracy_by_scenario.csv"
@@ -31,10 +31,12 @@ def build_report(inputs: ReportInputs, folder: Path) -> Path:
     """Write ``report.html``, ``tables/*.csv`` and ``figures/*.{svg,png,csv}``; the page's path.
 
     The page needs none of the other files. Every file is whole or absent, the page comes last, and
-    the same inputs give the same bytes. Raises `BadInputError` where ``folder`` is a file.
+    the same inputs give the same bytes. Raises `BadInputError`, before anything is written, where
+    ``folder`` is a file or a movie is not one.
     """
     if folder.exists() and not folder.is_dir():
         raise BadInputError(f"{folder} is a file; give a folder for the report")
+    check_movies(inputs)
     tables, pictures = folder / "tables", folder / "figures"
     for place in (tables, pictures):
         place.mkdir(parents=True, exist_ok=True)
@@ -120,19 +122,23 @@ def _write_figures(inputs: ReportInputs, folder: Path) -> list[Picture]:
     shown = []
     for name in drawn:
         _write_csv(folder / f"{name}.csv", data[name](comparison))
-        light, dark = (_draw(name, inputs, theme) for theme in (figures.LIGHT, figures.DARK))
+        light = _draw(name, inputs, figures.LIGHT, ("svg", "png"))
+        # The dark figure is for the page alone, so it is drawn in the one kind that goes there.
+        dark = _draw(name, inputs, figures.DARK, (page_kind(light),))
         for kind, content in light.items():
             write_atomic(folder / f"{name}.{kind}", content)
         shown.append(Picture(name, light, dark))
     return shown
 
 
-def _draw(name: str, inputs: ReportInputs, theme: figures.Theme) -> dict[str, bytes]:
+def _draw(
+    name: str, inputs: ReportInputs, theme: figures.Theme, kinds: Sequence[str]
+) -> dict[str, bytes]:
     if name == "accuracy":
         figure = figures.accuracy_figure(inputs.comparison, theme)
     else:
         figure = figures.scatter_figure(inputs.comparison, inputs.scatter_agents(), theme)
-    return {kind: figures.figure_bytes(figure, kind) for kind in ("svg", "png")}
+    return {kind: figures.figure_bytes(figure, kind) for kind in kinds}
 
 
 def _write_csv(path: Path, table: pd.DataFrame) -> None:

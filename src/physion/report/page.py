@@ -33,7 +33,8 @@ _MIME = {
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure in two themes, each as bytes by kind (``svg``, ``png``)."""
+    """A figure in two themes, as bytes by kind: ``svg`` and ``png``, of the dark one that which
+    `page_kind` names."""
 
     name: str
     light: Mapping[str, bytes]
@@ -64,6 +65,11 @@ class ReportInputs:
     def scatter_agents(self) -> list[str]:
         """The models of the scatter figure: the first ones, in the order of the predictions."""
         return self.comparison.agents[: self.scatter_limit]
+
+
+def page_kind(figure: Mapping[str, bytes]) -> str:
+    """As what a figure is embedded: ``svg``, or ``png`` where the drawing would be too heavy."""
+    return "svg" if len(figure["svg"]) <= SVG_LIMIT else "png"
 
 
 def widest_gaps(comparison: Comparison, count: int) -> pd.DataFrame:
@@ -197,18 +203,14 @@ def _scatter_words(inputs: ReportInputs) -> str:
 
 
 def _figure(picture: Picture, words: str) -> str:
-    light, dark = _image(picture.light), _image(picture.dark)
+    kind = page_kind(picture.light)
+    mime = {"svg": "image/svg+xml", "png": "image/png"}[kind]
+    light, dark = (_data_uri(mime, theme[kind]) for theme in (picture.light, picture.dark))
     return (
         f'<figure><picture><source media="(prefers-color-scheme: dark)" srcset="{dark}">'
         f'<img src="{light}" alt="{escape(words)}"></picture>'
         f"<figcaption>{escape(words)}</figcaption></figure>"
     )
-
-
-def _image(kinds: Mapping[str, bytes]) -> str:
-    if len(kinds["svg"]) <= SVG_LIMIT:
-        return _data_uri("image/svg+xml", kinds["svg"])
-    return _data_uri("image/png", kinds["png"])
 
 
 def _data_uri(mime: str, data: bytes) -> str:
@@ -233,13 +235,28 @@ def _gaps(inputs: ReportInputs) -> str:
     return f'<p>{escape(words)}</p><div class="{kind}">{"".join(cards)}</div>'
 
 
+def check_movies(inputs: ReportInputs) -> None:
+    """Raise `BadInputError` for a movie that would be shown and is absent or of a wrong kind."""
+    if not inputs.comparison.has_people:
+        return
+    for stimulus in widest_gaps(inputs.comparison, inputs.movie_count)["stimulus"]:
+        path = inputs.movies.get(stimulus)
+        if path is not None and _mime(path) and not path.is_file():
+            raise BadInputError(f"the movie of {stimulus!r} is not there: {path}")
+
+
+def _mime(path: Path) -> str:
+    mime = _MIME.get(path.suffix.lower())
+    if mime is None:
+        raise BadInputError(f"{path} is no movie for a page; use one of {', '.join(_MIME)}")
+    return mime
+
+
 def _movie(path: Path | None, stimulus: str, budget: int) -> tuple[str, int]:
     """A movie or picture as HTML, and its bytes; words in its place where it cannot be shown."""
     if path is None:
         return '<p class="none">no movie given</p>', 0
-    mime = _MIME.get(path.suffix.lower())
-    if mime is None:
-        raise BadInputError(f"{path} is no movie for a page; use one of {', '.join(_MIME)}")
+    mime = _mime(path)
     try:
         data = path.read_bytes()
     except OSError as error:

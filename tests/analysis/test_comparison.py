@@ -1,0 +1,390 @@
+"""Predictions and people together: which trials count, both ways of scoring, invariances."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from physion.analysis import Bootstrap, compare, read_predictions
+from physion.analysis.comparison import EXCLUDED, LEDGE, NO_LABEL, NOT_PREDICTED, NOT_SEEN
+from physion.analysis.predictions import check_predictions, name_models
+from physion.analysis.responses import read_humans, read_labels
+from physion.analysis.tables import MEAN, POOLED
+from physion.errors import BadInputError
+
+QUICK = Bootstrap(resamples=200)
+SCENARIOS = {"collide": "pilot_it2_collision_simple_box", "drop": "pilot_it2_drop_simple_box"}
+
+
+def humans(n: int = 12, seed: int = 0) -> pd.DataFrame:
+    generator = np.random.default_rng(seed)
+    names = [(s, f"{stem}_{i:04d}") for s, stem in SCENARIOS.items() for i in range(n)]
+    return pd.DataFrame(
+        {
+            "stimulus": [name for _, name in names],
+            "scenario": [scenario for scenario, _ in names],
+            "accuracy": generator.integers(5, 20, len(names)) / 20,
+            "count": 20.0,
+        }
+    )
+
+
+def labels(table: pd.DataFrame) -> dict[str, bool]:
+    return {name: int(re.findall(r"\d{4}", name)[0]) % 2 == 0 for name in table["stimulus"]}
+
+
+def predictions(
+    people: pd.DataFrame,
+    model: str = "m",
+    readout: str = "C",
+    seed: int = 1,
+    changed: tuple[str, ...] = (),
+    **columns: object,
+) -> pd.DataFrame:
+    generator = np.random.default_rng(seed)
+    actual = [value ^ (name in changed) for name, value in labels(people).items()]
+    p = generator.random(len(people))
+    return pd.DataFrame(
+        {
+            "Model": model,
+            "Readout Type": readout,
+            "Predicted Prob_true": p,
+            "Predicted Outcome": p > 0.5,
+            "Actual Outcome": actual,
+            "Stimulus Name": people["stimulus"],
+            **columns,
+        }
+    )
+
+
+def score(table: pd.DataFrame, agent: str, scenario: str) -> pd.Series:
+    rows = table[(table["agent"] == agent) & (table["scenario"] == scenario)]
+    assert len(rows) == 1
+    return rows.iloc[0]
+
+
+# --- scores ------------------------------------------------------------------------------------
+
+
+def test_scores_are_those_of_the_joined_rows() -> None:
+    people = humans()
+    given = predictions(people)
+    found = compare(given, people, labels(people), bootstrap=QUICK)
+    truth = np.array(list(labels(people).values()))
+    p_yes = np.where(truth, people["accuracy"], 1 - people["accuracy"])
+    collide = (people["scenario"] == "collide").to_numpy()
+    row = score(found.scores, "m · observed", "collide")
+    answered = given["Predicted Outcome"].to_numpy()
+    assert row["accuracy"] == pytest.approx((answered == truth)[collide].mean())
+    assert row["human_accuracy"] == pytest.approx(people["accuracy"][collide].mean())
+    p = given["Predicted Prob_true"].to_numpy()
+    assert row["r"] == pytest.approx(np.corrcoef(p[collide], p_yes[collide])[0, 1])
+    pooled = score(found.scores, "m · observed", POOLED)
+    assert pooled["r"] == pytest.approx(np.corrcoef(p, p_yes)[0, 1])
+    assert pooled["rmsd"] == pytest.approx(np.sqrt(np.mean((p - p_yes) ** 2)))
+    mean = score(found.scores, "m · observed", MEAN)
+    by_scenario = found.scores[found.scores["scenario"].isin(SCENARIOS)]
+    for key in ("accuracy", "human_accuracy", "r", "rmsd", "ceiling"):
+        assert mean[key] == pytest.approx(by_scenario[key].mean())
+    intervals = found.scores[["accuracy_low", "accuracy", "accuracy_high"]].to_numpy()
+    assert (np.diff(intervals, axis=1) >= 0).all()
+
+
+def test_the_mean_counts_scenarios_and_the_pool_counts_stimuli() -> None:
+    people = pd.concat(
+        [humans(30).query("scenario == 'collide'"), humans(6).query("scenario == 'drop'")]
+    )
+    given = predictions(people)
+    right = people["scenario"].eq("collide").to_numpy() == given["Actual Outcome"].to_numpy()
+    given["Predicted Outcome"] = right  # accuracy 1 on collide, 0 on drop
+    found = compare(given, people, labels(people), bootstrap=QUICK).scores
+    assert score(found, "m · observed", MEAN)["accuracy"] == pytest.approx(0.5)
+    assert score(found, "m · observed", POOLED)["accuracy"] == pytest.approx(30 / 36)
+
+
+def test_trials_of_another_outcome_are_listed_and_scored_both_ways() -> None:
+    people = humans()
+    odd = tuple(people["stimulus"].iloc[:3])
+    given = predictions(people, changed=odd)
+    given["Predicted Outcome"] = given["Actual Outcome"]
+    found = compare(given, people, labels(people), bootstrap=QUICK)
+    assert list(found.changed["stimulus"]) == list(odd)
+    assert (found.changed["label"] != found.changed["simulated"]).all()
+    row = score(found.scores, "m · observed", "collide")
+    assert row["changed"] == 3
+    assert row["accuracy_simulated"] == 1
+    assert row["accuracy"] == pytest.approx(9 / 12)
+    kept = found.stimuli[found.stimuli["label"] == found.stimuli["simulated"]]
+    kept = kept[kept["scenario"] == "collide"]
+    assert row["r_same"] == pytest.approx(kept["p_contact"].corr(kept["p_yes"]))
+    assert row["r_same"] != pytest.approx(row["r"])
+
+
+def test_the_official_label_and_not_the_simulation_turns_accuracy_into_yes() -> None:
+    people = humans()
+    plain = compare(predictions(people), people, labels(people), bootstrap=QUICK)
+    odd = tuple(people["stimulus"].iloc[:3])
+    other = compare(predictions(people, changed=odd), people, labels(people), bootstrap=QUICK)
+    assert plain.stimuli["p_yes"].equals(other.stimuli["p_yes"])
+
+
+def test_people_as_their_own_model_agree_perfectly() -> None:
+    people = humans()
+    truth = np.array(list(labels(people).values()))
+    given = predictions(people)
+    given["Predicted Prob_true"] = np.where(truth, people["accuracy"], 1 - people["accuracy"])
+    row = score(compare(given, people, labels(people)).scores, "m · observed", POOLED)
+    assert row["r"] == pytest.approx(1) and row["rmsd"] == pytest.approx(0, abs=1e-12)
+    assert row["r_low"] == pytest.approx(1) and row["r_high"] == pytest.approx(1)
+    assert row["r"] > row["ceiling"]  # it has the noise of these very people
+
+
+# --- invariances -------------------------------------------------------------------------------
+
+
+def test_the_order_of_rows_changes_nothing_but_their_order() -> None:
+    people = humans()
+    given = pd.concat([predictions(people), predictions(people, "other", "B", seed=2)])
+    plain = compare(given, people, labels(people), bootstrap=QUICK)
+    mixed = compare(
+        given.sample(frac=1, random_state=3),
+        people.sample(frac=1, random_state=4),
+        labels(people),
+        bootstrap=QUICK,
+    )
+    keys = ["agent", "scenario"]
+    one, two = (c.scores.sort_values(keys).reset_index(drop=True) for c in (plain, mixed))
+    pd.testing.assert_frame_equal(one, two)
+    pd.testing.assert_frame_equal(plain.people, mixed.people)
+
+
+def test_a_model_scores_the_same_alone_and_beside_others() -> None:
+    people = humans()
+    both = pd.concat([predictions(people), predictions(people.iloc[::2], "half", seed=2)])
+    together = compare(both, people, labels(people), bootstrap=QUICK).scores
+    alone = compare(predictions(people), people, labels(people), bootstrap=QUICK).scores
+    pd.testing.assert_frame_equal(together[together["model"] == "m"], alone)
+
+
+def test_either_look_of_a_stimulus_joins() -> None:
+    people = humans()
+    given = predictions(people)
+    plain = compare(given, people, labels(people), bootstrap=QUICK).scores
+    red = given.assign(
+        **{
+            "Stimulus Name": given["Stimulus Name"].str[:-5]
+            + "-redyellow"
+            + given["Stimulus Name"].str[-5:]
+        }
+    )
+    pd.testing.assert_frame_equal(
+        compare(red, people, labels(people), bootstrap=QUICK).scores, plain
+    )
+
+
+# --- undefined ---------------------------------------------------------------------------------
+
+
+def test_constant_predictions_give_nan_with_a_reason() -> None:
+    people = humans()
+    given = predictions(people)
+    given["Predicted Prob_true"] = 0.5
+    scores = compare(given, people, labels(people), bootstrap=QUICK).scores
+    row = score(scores, "m · observed", "collide")
+    assert np.isnan(row[["r", "r_low", "r_high"]].astype(float)).all()
+    assert "P(contact) is constant" in row["reason"]
+    assert np.isfinite(row[["accuracy", "accuracy_low", "rmsd", "rmsd_high"]].astype(float)).all()
+    mean = score(scores, "m · observed", MEAN)
+    assert np.isnan(mean["r"]) and mean["reason"].startswith("r: undefined in collide, drop")
+
+
+def test_constant_in_one_scenario_leaves_no_silent_mean_of_the_rest() -> None:
+    people = humans()
+    given = predictions(people)
+    given.loc[people["scenario"] == "drop", "Predicted Prob_true"] = 0.5
+    scores = compare(given, people, labels(people), bootstrap=QUICK).scores
+    assert np.isnan(score(scores, "m · observed", MEAN)["r"])
+    assert np.isfinite(score(scores, "m · observed", POOLED)["r"])
+
+
+def test_one_stimulus_has_no_interval() -> None:
+    people = humans(1)
+    row = score(compare(predictions(people), people, labels(people)).scores, "m · observed", "drop")
+    assert np.isnan(row["accuracy_low"]) and "one stimulus" in row["reason"]
+    assert "fewer than 3" in row["reason"]
+
+
+# --- what is left out --------------------------------------------------------------------------
+
+
+def counts(dropped: pd.DataFrame) -> dict[tuple[str, str], int]:
+    return {
+        (a, r): int(n)
+        for a, r, n in dropped.groupby(["agent", "reason"])["stimuli"]
+        .sum()
+        .reset_index()
+        .to_numpy()
+    }
+
+
+def test_everything_left_out_is_counted() -> None:
+    people = humans()
+    ledge = "pilot_it2_rollingSliding_simple_ledge_box_0001"
+    extra = pd.DataFrame([{"stimulus": ledge, "scenario": "roll", "accuracy": 0.5, "count": 20}])
+    given = pd.concat([predictions(people.iloc[2:]), predictions(extra)])
+    unseen = predictions(extra).assign(**{"Stimulus Name": "pilot_it2_drop_new_0001"})
+    given = pd.concat([given, unseen])
+    known = labels(people) | {ledge: True}
+    del known[people["stimulus"].iloc[3]]
+    found = compare(
+        given,
+        pd.concat([people, extra]),
+        known,
+        exclude=[people["stimulus"].iloc[4] + "_img"],
+        bootstrap=QUICK,
+    )
+    agent = "m · observed"
+    assert counts(found.dropped) == {
+        ("", LEDGE): 1,
+        ("", NO_LABEL): 1,
+        ("", EXCLUDED): 1,
+        (agent, LEDGE): 1,
+        (agent, EXCLUDED): 1,
+        (agent, NOT_SEEN): 2,  # the new one, and the one without a label
+        (agent, NOT_PREDICTED): 2,
+    }
+    assert len(found.stimuli) == 24 - 4
+    assert found.people.set_index("scenario").loc[MEAN, "stimuli"] == 20
+
+
+def test_ledges_can_be_kept() -> None:
+    people = humans()
+    ledge = (
+        people["stimulus"]
+        .iloc[0]
+        .replace("pilot_it2_collision_simple_box", "pilot_it2_rollingSliding_simple_ledge_box")
+    )
+    people.loc[0, ["stimulus", "scenario"]] = [ledge, "roll"]
+    kept = compare(
+        predictions(people), people, labels(people), exclude_ledge=False, bootstrap=QUICK
+    )
+    assert "roll" in set(kept.scores["scenario"]) and kept.dropped.empty
+    left = compare(predictions(people), people, labels(people), bootstrap=QUICK)
+    assert "roll" not in set(left.scores["scenario"])
+
+
+def test_without_people_the_models_stand_alone() -> None:
+    people = humans()
+    found = compare(predictions(people), None, bootstrap=QUICK)
+    row = score(found.scores, "m · observed", "drop")
+    assert row["accuracy"] == row["accuracy_simulated"]
+    assert np.isnan(row["human_accuracy"]) and "no answers of people" in row["reason"]
+    assert not found.has_people and found.changed.empty
+
+
+def test_nothing_in_common_is_an_error() -> None:
+    people = humans()
+    other = people.assign(stimulus=people["stimulus"] + "_x")
+    with pytest.raises(BadInputError, match=r"people saw for instance .*_0000'.*_x'"):
+        compare(predictions(other), people, labels(people))
+    with pytest.raises(BadInputError, match="give the labels"):
+        compare(predictions(people), people)
+
+
+# --- predictions -------------------------------------------------------------------------------
+
+
+def test_readout_letters_get_their_names_and_seeds_tell_models_apart() -> None:
+    people = humans()
+    one = predictions(people, readout="B", **{"Dynamics Training Seed": 0.0})
+    two = predictions(people, readout="B", seed=2, **{"Dynamics Training Seed": 1.0})
+    alone = predictions(people, readout="A", **{"Dynamics Training Seed": 1.0})
+    named = name_models(check_predictions(pd.concat([one, two, alone])))
+    assert list(named["agent"].unique()) == [
+        "m · observed+simulated · dynamics training seed 0",
+        "m · observed+simulated · dynamics training seed 1",
+        "m · full",
+    ]
+
+
+@pytest.mark.parametrize("spelling", ["official", "ours"])
+def test_training_on_each_scenario_in_turn_is_one_model(spelling: str) -> None:
+    people = humans()
+    names = {"collide": "collision", "drop": "drop"}
+    own = people["scenario"].map(names) if spelling == "official" else people["scenario"]
+    same = predictions(people, **{"Dynamics Training Dataset": own})
+    others = predictions(people, seed=2, **{"Dynamics Training Dataset": "no_" + own})
+    everything = predictions(people, seed=3, **{"Dynamics Training Dataset": "all"})
+    found = compare(pd.concat([same, others, everything]), people, labels(people), bootstrap=QUICK)
+    suffixes = [agent.rsplit("dataset ")[1] for agent in found.agents]
+    assert suffixes == ["same", "all but this", "all"]
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "message"),
+    [
+        ("Predicted Prob_true", 1.5, "row 1 of column 'Predicted Prob_true'"),
+        ("Predicted Prob_true", float("nan"), "row 1 of column 'Predicted Prob_true'"),
+        ("Predicted Outcome", "perhaps", "expected True or False"),
+        ("Model", "", "names no model"),
+        ("Stimulus Name", " ", "no stimulus"),
+    ],
+)
+def test_bad_predictions_are_refused(column: str, value: object, message: str) -> None:
+    given = predictions(humans()).astype(object)
+    given.loc[0, column] = value
+    with pytest.raises(BadInputError, match=message):
+        check_predictions(given)
+
+
+def test_contradictions_are_refused() -> None:
+    people = humans()
+    given = predictions(people)
+    with pytest.raises(BadInputError, match="twice"):
+        compare(pd.concat([given, given]), people, labels(people))
+    other = predictions(people, "other", changed=(people["stimulus"].iloc[0],))
+    with pytest.raises(BadInputError, match="different outcomes"):
+        compare(pd.concat([given, other]), people, labels(people))
+    with pytest.raises(BadInputError, match=r"lacks the column\(s\) Actual Outcome"):
+        compare(given.drop(columns="Actual Outcome"), people, labels(people))
+
+
+def test_predictions_survive_their_files(tmp_path: Path) -> None:
+    people = humans()
+    paths = [tmp_path / "a.csv", tmp_path / "b.csv"]
+    tables = [predictions(people), predictions(people, "other", "B", seed=2)]
+    for path, table in zip(paths, tables, strict=True):
+        table.to_csv(path, index=False)
+    direct = compare(pd.concat(tables), people, labels(people), bootstrap=QUICK).scores
+    read = compare(read_predictions(paths), people, labels(people), bootstrap=QUICK).scores
+    pd.testing.assert_frame_equal(direct, read)
+    with pytest.raises(BadInputError, match="no file"):
+        read_predictions([])
+    with pytest.raises(BadInputError, match="not a file"):
+        read_predictions([tmp_path / "none.csv"])
+
+
+# --- official data -----------------------------------------------------------------------------
+
+
+def test_official_people_as_a_model_reach_the_official_accuracies(official: Path) -> None:
+    people = read_humans(official / "humans")
+    known = read_labels(official / "stimuli" / "stimulus_names_and_labels.csv")
+    truth = people["stimulus"].map(known).astype(bool).to_numpy()
+    p_yes = np.where(truth, people["accuracy"], 1 - people["accuracy"])
+    given = predictions(people)
+    given = given.assign(
+        **{"Actual Outcome": truth, "Predicted Prob_true": p_yes, "Predicted Outcome": p_yes > 0.5}
+    )
+    found = compare(given, people, known, bootstrap=QUICK)
+    assert found.dropped.empty and found.changed.empty
+    mean = score(found.scores, "m · observed", MEAN)
+    # The study: .747 over scenarios, of people after the stricter exclusion.
+    assert mean["human_accuracy"] == pytest.approx(0.747, abs=0.003)
+    assert mean["r"] == pytest.approx(1)
+    # The majority of people is right more often than a single person.
+    assert mean["accuracy"] > mean["human_accuracy"] + 0.05

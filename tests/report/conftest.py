@@ -1,0 +1,56 @@
+"""A small comparison with invented answers, for the tests of figures and page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from physion.analysis import Bootstrap, Comparison, compare
+
+Maker = Callable[..., Comparison]
+
+
+@pytest.fixture
+def make_comparison() -> Maker:
+    """Builds a comparison of two models on Collide and Drop; ``model`` names the first one."""
+
+    def make(
+        model: str = "simulation", with_people: bool = True, constant: bool = False
+    ) -> Comparison:
+        generator = np.random.default_rng(0)
+        stems = {"collide": "pilot_it2_collision_simple_box", "drop": "pilot_it2_drop_simple_box"}
+        names = [(s, f"{stem}_{i:04d}") for s, stem in stems.items() for i in range(12)]
+        people = pd.DataFrame(names, columns=["scenario", "stimulus"])
+        people["accuracy"] = generator.integers(5, 20, 24) / 20
+        people["count"] = 20.0
+        labels = {name: place % 2 == 0 for place, name in enumerate(people["stimulus"])}
+        actual = np.array(list(labels.values()))
+        actual[5] = not actual[5]
+        tables = []
+        for name, readout in ((model, "observed"), ("encoder", "observed+simulated")):
+            p = np.full(24, 0.5) if constant else generator.random(24)
+            tables.append(
+                pd.DataFrame(
+                    {
+                        "Model": name,
+                        "Readout Type": readout,
+                        "Predicted Prob_true": p,
+                        "Predicted Outcome": p > 0.5,
+                        "Actual Outcome": actual,
+                        "Stimulus Name": people["stimulus"],
+                    }
+                )
+            )
+        zone = pd.DataFrame({"scenario": ["collide"], "low": [0.6], "high": [0.8]})
+        return compare(
+            pd.concat(tables),
+            people if with_people else None,
+            labels if with_people else None,
+            zone=zone if with_people else None,
+            bootstrap=Bootstrap(resamples=100),
+        )
+
+    return make

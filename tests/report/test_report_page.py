@@ -1,0 +1,266 @@
+"""The page: whole, self-contained, the same bytes every time, and nobody's text becomes markup."""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from physion.analysis import Bootstrap, Comparison
+from physion.analysis.tables import MEAN
+from physion.errors import BadInputError
+from physion.report import ReportInputs, build_report, compare_files
+from physion.report.page import EXPECTED_METHODS, Picture, render_page, widest_gaps
+
+Maker = Callable[..., Comparison]
+VOID = {"meta", "img", "source", "br", "hr", "link", "input"}
+
+
+class Page(HTMLParser):
+    """Collects tags, attributes and text, and checks that every element is closed in turn."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.raw = text
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.open: list[str] = []
+        self.words: list[str] = []
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] != "style":
+            self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.words).split())
+
+    def sources(self) -> list[str]:
+        names = ("src", "srcset", "href", "poster", "data", "action")
+        return [value for _, attrs in self.tags for name in names if (value := attrs.get(name))]
+
+
+@pytest.fixture
+def movie(tmp_path: Path) -> Path:
+    path = tmp_path / "movie.mp4"
+    path.write_bytes(b"\x00\x00\x00\x18ftypisom" + bytes(1000))
+    return path
+
+
+BLANK = {"svg": b"<svg/>", "png": b""}
+
+
+def render(inputs: ReportInputs) -> Page:
+    """The page with blank figures, which are slow to draw and tested elsewhere."""
+    names = ("accuracy", "scatter") if inputs.comparison.has_people else ("accuracy",)
+    return Page(render_page(inputs, [Picture(name, BLANK, BLANK) for name in names]))
+
+
+def page_of(path: Path) -> Page:
+    return Page(path.read_text(encoding="utf-8"))
+
+
+def test_page_needs_nothing_from_elsewhere(make_comparison: Maker, movie: Path) -> None:
+    comparison = make_comparison()
+    movies = dict.fromkeys(comparison.stimuli["stimulus"], movie)
+    page = render(ReportInputs(comparison, movies=movies))
+    assert len(page.sources()) >= 2 * 2 + 8
+    assert all(source.startswith("data:") for source in page.sources())
+    raw = page.raw
+    assert not re.search(r"https?://|@import|url\(|<script|<link|<iframe", raw)
+    assert "default-src 'none'" in raw and "prefers-color-scheme: dark" in raw
+
+
+def test_bytes_repeat_in_any_folder(make_comparison: Maker, tmp_path: Path, movie: Path) -> None:
+    def build(name: str) -> dict[str, bytes]:
+        comparison = make_comparison()
+        movies = dict.fromkeys(comparison.stimuli["stimulus"], movie)
+        build_report(ReportInputs(comparison, movies=movies), tmp_path / name)
+        files = sorted(path for path in (tmp_path / name).rglob("*") if path.is_file())
+        return {str(path.relative_to(tmp_path / name)): path.read_bytes() for path in files}
+
+    first = build("one")
+    assert first == build("two")
+    assert set(first) == {
+        "report.html",
+        *(f"tables/{n}.csv" for n in ("comparison", "people", "stimuli", "changed_outcomes")),
+        "tables/left_out.csv",
+        *(f"figures/{n}.{k}" for n in ("accuracy", "scatter") for k in ("svg", "png", "csv")),
+    }
+
+
+def test_foreign_text_stays_text(make_comparison: Maker) -> None:
+    evil = "<script>alert(1)</script>\"'&amp;"
+    inputs = ReportInputs(
+        make_comparison(model=evil), title=evil, methods={"Engine": evil, evil: "x"}
+    )
+    page = render(inputs)
+    assert "script" not in {tag for tag, _ in page.tags}
+    assert page.text.count(evil) >= 5  # title, heading, methods and tables, as written
+
+
+def test_page_says_the_numbers_of_the_tables(make_comparison: Maker, tmp_path: Path) -> None:
+    comparison = make_comparison()
+    path = build_report(ReportInputs(comparison), tmp_path / "out")
+    text = page_of(path).text
+    table = pd.read_csv(tmp_path / "out" / "tables" / "comparison.csv")
+    mean = table[table["scenario"] == MEAN].iloc[0]
+    for key in ("accuracy", "r", "rmsd"):
+        low, high = (f"{mean[f'{key}_{end}']:.2f}".replace("-", "−") for end in ("low", "high"))
+        assert f"{mean[key]:.2f}".replace("-", "−") + f" {low} to {high}" in text
+    assert "In 1 of these stimuli the simulated outcome is not the official one" in text
+    assert comparison.changed["stimulus"].iloc[0] in text
+
+
+def test_choices_are_stated_or_said_to_be_missing(make_comparison: Maker) -> None:
+    inputs = ReportInputs(make_comparison(), methods={"Engine": "mujoco 4", "Extra": "a word"})
+    text = render(inputs).text
+    assert "Engine mujoco 4" in text and "Extra a word" in text
+    assert text.count("not stated") == len(EXPECTED_METHODS) - 1
+    assert "100 resamples, seed 0" in text and "left out, as in the study" in text
+
+
+def test_undefined_scores_come_with_their_reason(make_comparison: Maker) -> None:
+    page = render(ReportInputs(make_comparison(constant=True)))
+    assert "r: undefined in collide, drop" in page.text
+    assert "nan" not in page.text.lower()
+    titles = [attrs["title"] for _, attrs in page.tags if "title" in attrs]
+    assert any("constant" in str(title) for title in titles)
+
+
+def test_without_people_there_is_a_page_too(make_comparison: Maker, tmp_path: Path) -> None:
+    path = build_report(ReportInputs(make_comparison(with_people=False)), tmp_path / "out")
+    text = page_of(path).text
+    assert "No answers of people were given" in text
+    assert "Pearson r by scenario" not in text and "nan" not in text.lower()
+    assert not (tmp_path / "out" / "figures" / "scatter.svg").exists()
+
+
+# --- movies --------------------------------------------------------------------------------------
+
+
+def test_widest_gaps_take_turns_and_pass_over_changed_trials(make_comparison: Maker) -> None:
+    comparison = make_comparison()
+    chosen = widest_gaps(comparison, 6)
+    assert list(chosen["agent"]) == comparison.agents * 3
+    assert chosen["stimulus"].is_unique
+    assert not set(chosen["stimulus"]) & set(comparison.changed["stimulus"])
+    same = comparison.stimuli[comparison.stimuli["label"] == comparison.stimuli["simulated"]]
+    own = same[same["agent"] == comparison.agents[0]]
+    assert chosen["size"].iloc[0] == own["gap"].abs().max()
+    assert len(widest_gaps(comparison, 1000)) == 23
+    assert widest_gaps(comparison, 0).empty
+
+
+def test_movies_are_inside_and_within_their_budget(make_comparison: Maker, movie: Path) -> None:
+    comparison = make_comparison()
+    movies = dict.fromkeys(comparison.stimuli["stimulus"], movie)
+    budget = 3 * movie.stat().st_size + 5
+    inputs = ReportInputs(comparison, movies=movies, movie_bytes=budget)
+    page = render(inputs)
+    videos = [attrs["src"] for tag, attrs in page.tags if tag == "video"]
+    assert len(videos) == 3
+    prefix = "data:video/mp4;base64,"
+    assert base64.b64decode(str(videos[0]).removeprefix(prefix)) == movie.read_bytes()
+    assert page.text.count("the page would grow too large") == 5
+
+
+def test_bad_movies_are_refused_and_no_page_is_left(make_comparison: Maker, tmp_path: Path) -> None:
+    comparison = make_comparison()
+    for name, message in (("none.mp4", "is not there"), ("movie.exe", "no movie")):
+        movies = dict.fromkeys(comparison.stimuli["stimulus"], tmp_path / name)
+        with pytest.raises(BadInputError, match=message):
+            build_report(ReportInputs(comparison, movies=movies), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_file_in_the_place_of_the_folder_is_refused(
+    make_comparison: Maker, tmp_path: Path
+) -> None:
+    (tmp_path / "out").write_text("mine")
+    with pytest.raises(BadInputError, match="is a file"):
+        build_report(ReportInputs(make_comparison()), tmp_path / "out")
+
+
+# --- from files ----------------------------------------------------------------------------------
+
+
+def people_folder(folder: Path) -> Path:
+    humans = folder / "humans"
+    humans.mkdir(parents=True)
+    rows = "".join(f"s_{i},{0.5 + i / 40},20\n" for i in range(12))
+    name = "human_accuracy-collision_pilot-production_2_testing.csv"
+    (humans / name).write_text("stim_ID,correct,c\n" + rows)
+    return humans
+
+
+def predictions_file(path: Path) -> Path:
+    p = np.random.default_rng(0).random(12)
+    table = pd.DataFrame({"Model": "m", "Readout Type": "C", "Predicted Prob_true": p})
+    table["Predicted Outcome"] = p > 0.5
+    table["Actual Outcome"] = [i % 2 == 0 for i in range(12)]
+    table["Stimulus Name"] = [f"s_{i}" for i in range(12)]
+    table.to_csv(path, index=False)
+    return path
+
+
+def test_files_in_report_out(tmp_path: Path) -> None:
+    humans = people_folder(tmp_path)
+    predicted = predictions_file(tmp_path / "p.csv")
+    out = tmp_path / "out"
+    with pytest.raises(BadInputError, match="give the file with the labels"):
+        compare_files([predicted], humans, None, out)
+    assert not out.exists()
+    labels = {f"s_{i}": i % 2 == 0 for i in range(12)}
+    given = compare_files([predicted], humans, labels, out, bootstrap=Bootstrap(50))
+    assert "the recorded outcomes of the logs" in page_of(given).text
+    # The official layout: labels and zone lie in the folders beside the people's.
+    (tmp_path / "stimuli").mkdir()
+    text = "stim_ID,label\n" + "".join(f"{name},{value}\n" for name, value in labels.items())
+    (tmp_path / "stimuli" / "stimulus_names_and_labels.csv").write_text(text)
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "human_accuracy_by_scenario.csv").write_text(
+        "agent,scenario,pct_2.5,pct_97.5\nhuman,collision,.6,.9\n"
+    )
+    path = compare_files([predicted], humans, None, tmp_path / "two", bootstrap=Bootstrap(50))
+    found, before = (
+        pd.read_csv(folder / "tables" / "comparison.csv") for folder in (tmp_path / "two", out)
+    )
+    pd.testing.assert_frame_equal(found, before)
+    assert "Official outcomes stimulus_names_and_labels.csv" in page_of(path).text
+    people = pd.read_csv(tmp_path / "two" / "tables" / "people.csv").set_index("scenario")
+    assert people.loc["collide", "zone_high"] == 0.9
+
+
+def test_the_official_people_make_a_page(official: Path, tmp_path: Path) -> None:
+    names = pd.read_csv(official / "stimuli" / "stimulus_names_and_labels.csv")
+    p = np.random.default_rng(0).random(len(names))
+    table = pd.DataFrame({"Model": "coin", "Readout Type": "C", "Predicted Prob_true": p})
+    table["Predicted Outcome"], table["Actual Outcome"] = p > 0.5, names["label"]
+    table["Stimulus Name"] = names["stim_ID"]
+    table.to_csv(tmp_path / "p.csv", index=False)
+    path = compare_files([tmp_path / "p.csv"], official / "humans", None, tmp_path / "out")
+    left = pd.read_csv(tmp_path / "out" / "tables" / "left_out.csv")
+    assert dict(zip(left["reason"], left["stimuli"], strict=True)) == {
+        "Roll stimulus with a ledge": 56
+    }
+    scores = pd.read_csv(tmp_path / "out" / "tables" / "comparison.csv").set_index("scenario")
+    assert scores.loc[MEAN, "accuracy"] == pytest.approx(0.5, abs=0.06)
+    assert scores.loc[MEAN, "r_low"] < 0 < scores.loc[MEAN, "r_high"]
+    assert "coin" in page_of(path).text
+    assert path.stat().st_size < 3_000_000
