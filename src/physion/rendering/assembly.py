@@ -164,7 +164,14 @@ def place(
         elif is_moving == moving and index < bodies:
             rotation = rotation_matrix(trajectory.rotations[frame, index])
             at = trajectory.positions[frame, index].astype(np.float64)
-            _move(part.vertices, part.normals, rotation, at, vertices[piece.vertices], normals[piece.triangles])
+            _move(
+                part.vertices,
+                part.normals,
+                rotation,
+                at,
+                vertices[piece.vertices],
+                normals[piece.triangles],
+            )
         elif is_moving == moving:
             cloth = trajectory.cloth_vertices[frame, offset : offset + size].astype(np.float64)
             vertices[piece.vertices] = cloth

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -126,8 +124,24 @@ def _surfaces(faces: I32, normals: F64, threshold: float) -> I32:
     same = (edges[1:] == edges[:-1]).all(axis=1)
     a, b = owner[:-1][same], owner[1:][same]
     soft = (normals[a] * normals[b]).sum(axis=1) > threshold
-    graph = coo_array((np.ones(int(soft.sum())), (a[soft], b[soft])), shape=(count, count))
-    return np.asarray(connected_components(graph, directed=False)[1], np.int32)
+    return _components(count, a[soft], b[soft])
+
+
+def _components(count: int, a: NDArray[np.intp], b: NDArray[np.intp]) -> I32:
+    """Number the connected groups of ``count`` nodes that the pairs (a, b) join.
+
+    Every node takes the smallest label among its neighbours, then its label's label, until
+    nothing changes.
+    """
+    label = np.arange(count)
+    while True:
+        before = label.copy()
+        smaller = np.minimum(label[a], label[b])
+        np.minimum.at(label, label[a], smaller)
+        np.minimum.at(label, label[b], smaller)
+        label = label[label]
+        if (label == before).all():
+            return np.unique(label, return_inverse=True)[1].reshape(-1).astype(np.int32)
 
 
 def _corner_angles(vertices: F64, faces: I32) -> F64:

@@ -16,5 +16,17 @@ def kernel(function: Function) -> Function:
     One thread, and no reordering of sums (no ``fastmath``): equal input gives equal bytes.
     ``error_model="numpy"`` lets a division by zero give infinity, which the callers check.
     """
-    compiled = numba.njit(cache=True, error_model="numpy", nogil=True)(function)
-    return cast(Function, compiled)
+    return cast(Function, numba.njit(cache=True, no_cfunc_wrapper=True, **OPTIONS)(function))
+
+
+def step(function: Function) -> Function:
+    """Compile a part of a kernel: only kernels of the same file may call it.
+
+    Numba looks at a kernel's own file alone when it asks whether the code on disk is outdated.
+    """
+    return cast(
+        Function, numba.njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **OPTIONS)(function)
+    )
+
+
+OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True}

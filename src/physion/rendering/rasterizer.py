@@ -15,15 +15,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.rendering.kernel import kernel
+from physion.rendering.kernel import kernel, step
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 
-SAMPLES = np.array(
-    [[0.0, 0.0], [-0.125, -0.375], [0.375, -0.125], [-0.375, 0.125], [0.125, 0.375]]
-)
+SAMPLES = np.array([[0.0, 0.0], [-0.125, -0.375], [0.375, -0.125], [-0.375, 0.125], [0.125, 0.375]])
 """Offsets of the samples from the centre of a pixel. The first one alone makes the exact passes;
 colour is the mean of all five."""
 
@@ -45,7 +43,7 @@ def transform(points: F64, matrix: F64, out: F64) -> None:
             )
 
 
-@kernel
+@step
 def _bounds(points: F64, face: I32, near: float) -> tuple[float, float, float, float]:
     """Smallest box of pixels around the part of a triangle that lies beyond ``near``."""
     left, right, top, bottom = np.inf, -np.inf, np.inf, -np.inf
@@ -235,7 +233,7 @@ def measure(
                 flow[row, column, 1] = np.nan
 
 
-@kernel
+@step
 def _is_back(edges: F64, t: int) -> bool:
     """Whether the triangle shows its back: its corners run clockwise (y points down).
 

@@ -17,9 +17,25 @@ from physion.errors import BadInputError, UnknownNameError
 from physion.physics.trajectory import Trajectory
 from physion.rendering.assembly import Assembly, assemble, place
 from physion.rendering.camera import View
-from physion.rendering.rasterizer import NOTHING, SAMPLES, measure, rasterize, rasterize_depth, transform
+from physion.rendering.rasterizer import (
+    NOTHING,
+    SAMPLES,
+    measure,
+    rasterize,
+    rasterize_depth,
+    transform,
+)
 from physion.rendering.rooms import Room, rooms
-from physion.rendering.shading import POINT, Light, Surfaces, shade, to_linear, tone_table
+from physion.rendering.shading import (
+    BLOCK,
+    POINT,
+    Light,
+    busy_blocks,
+    pack_corners,
+    shade,
+    to_linear,
+    tone_table,
+)
 from physion.scenes.scene import Scene
 
 F32 = NDArray[np.float32]
@@ -86,7 +102,7 @@ class Renderer:
         trajectory: Trajectory,
         width: int = 256,
         height: int = 256,
-        settings: Settings = Settings(),  # noqa: B008 - frozen
+        settings: Settings = Settings(),
     ) -> None:
         if width < 1 or height < 1:
             raise BadInputError(f"a picture of {width} x {height} pixels cannot be rendered")
@@ -98,7 +114,11 @@ class Renderer:
         self._assembly = assembly = assemble(scene, self.room)
         self._first = assembly.first_triangle if settings.still_layer else 0
         self._tones = tone_table(self.room.exposure)
+        self._sight, self._light, self._settings = self._pack_light()
         self._still_vertices, self._still_normals = place(assembly, scene, trajectory, 0, False)
+        self._corners = pack_corners(
+            self._still_normals, assembly.uv, assembly.tangents, assembly.material
+        )
         self._edges = np.zeros((len(assembly.faces), 9))
         self._shadow, self._contact = self._still_maps()
         self._ids, self._inverse, self._points = self._still_picture()
@@ -157,7 +177,7 @@ class Renderer:
         )
 
     def render(self, frame: int, passes: Sequence[str] = ("color",)) -> Frame:
-        """Render the passes named, of `PASSES`, of frame ``frame`` (negative counts from the end)."""
+        """Render the passes named, of `PASSES`, of frame ``frame`` (-1 is the last)."""
         for name in passes:
             if name not in PASSES:
                 raise UnknownNameError("pass", name, PASSES)
@@ -192,23 +212,23 @@ class Renderer:
             yield self.render(frame, passes)
 
     def _color(self, ids: I32, vertices: F64, normals: F32) -> NDArray[np.uint8]:
-        maps = []
+        maps: list[NDArray[np.generic]] = []
         for matrix, still in (self._shadow, self._contact):
             depth = still.copy()
             self._draw_map(depth, matrix, vertices, True)
-            maps.append(depth)
-        light = self._light(maps[0], maps[1])
-        surfaces = self._surfaces(normals)
-        background = to_linear(self.room.background)
+            maps += [matrix, depth, busy_blocks(depth)]
+        assembly = self._assembly
+        corners = self._corners
+        corners[assembly.first_triangle :, :9] = normals[assembly.first_triangle :]
         out = np.empty((self.height, self.width, 3), np.uint8)
+        surfaces = (self._edges, corners, assembly.surface, assembly.materials, *assembly.atlas)
+        light = (self._sight, self._light, *maps, self._settings, self._tones)
         if self._still_shading is None:
-            still = np.zeros((self.height, self.width, POINT), np.float32)
+            still = np.zeros((self.height * self.width + 1, POINT), np.float32)
             if self._first:
-                rest = (still, background, self._tones, out)
-                shade(self._ids, self._first, surfaces, light, True, *rest)
+                shade(self._ids, self._first, True, *surfaces, *light, still, out)
             self._still_shading = still
-        rest = (self._still_shading, background, self._tones, out)
-        shade(ids, self._first, surfaces, light, False, *rest)
+        shade(ids, self._first, False, *surfaces, *light, self._still_shading, out)
         return out
 
     def _measure(
@@ -253,29 +273,21 @@ class Renderer:
         a = self._assembly
         measure(ids, self._edges, a.faces, a.objects, normals, a.two_sided, later, first, *out)
 
-    def _surfaces(self, normals: F32) -> Surfaces:
-        a = self._assembly
-        return Surfaces(
-            self._edges, normals, a.uv, a.tangents, a.surface, a.material, a.materials, *a.atlas
-        )
-
-    def _light(self, shadow: F32, contact: F32) -> Light:
-        room = self.room
+    def _pack_light(self) -> tuple[F64, F64, F64]:
+        """The camera, the light and its settings as `shade` reads them."""
+        room, camera = self.room, self.scene.camera
         direction = np.asarray(room.lamp_direction)
-        return Light(
-            eye=np.asarray(self.scene.camera.position, np.float64),
-            rays=self._view.ray_matrix,
+        light = Light(
             lamp=np.stack([direction / np.linalg.norm(direction), room.lamp]),
             around=np.asarray(room.around),
             mirrored=np.asarray(room.mirrored),
             window=np.asarray(room.window),
             bounds=np.asarray([room.low, room.high]),
-            to_shadow=self._shadow.matrix,
-            to_contact=self._contact.matrix,
-            shadow=shadow,
-            contact=contact,
-            settings=np.array([LIFT, room.shadow, room.contact, CONTACT_REACH]),
         )
+        background = to_linear(room.background)[None]
+        sight = np.concatenate([np.asarray(camera.position)[None], self._view.ray_matrix])
+        settings = np.array([LIFT, room.shadow, room.contact, CONTACT_REACH])
+        return sight, np.concatenate([*light, background]), settings
 
 
 def render_frames(
@@ -331,7 +343,7 @@ def _ground_matrix(center: F64, half: float) -> tuple[F64, int]:
 
 
 def _texel_matrix(rows: F64, center: F64, half: float, texel: float) -> tuple[F64, int]:
-    size = int(np.ceil(2.0 * half / texel))
+    size = BLOCK * int(np.ceil(2.0 * half / texel / BLOCK))
     matrix = np.zeros((3, 4))
     matrix[:2, :3] = rows[:2] / texel
     matrix[:2, 3] = 0.5 * size - matrix[:2, :3] @ center

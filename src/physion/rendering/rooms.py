@@ -7,7 +7,8 @@ nothing collides with its walls.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -65,12 +66,15 @@ def _wall(
     du, dv = du / width, dv / height
     across = sorted({0.0, float(width), *(x for o in openings for x in o[:2])})
     upward = sorted({0.0, float(height), *(y for o in openings for y in o[2:])})
-    for a, b in zip(across, across[1:], strict=False):
-        for c, d in zip(upward, upward[1:], strict=False):
+    for a, b in pairwise(across):
+        for c, d in pairwise(upward):
             if any(o[0] <= a and b <= o[1] and o[2] <= c and d <= o[3] for o in openings):
                 continue
             yield Panel(
-                _vec(start + a * du + c * dv), _vec((b - a) * du), _vec((d - c) * dv), **look  # type: ignore[arg-type]
+                _vec(start + a * du + c * dv),
+                _vec((b - a) * du),
+                _vec((d - c) * dv),
+                **look,  # type: ignore[arg-type]
             )
 
 
@@ -117,10 +121,15 @@ def _box_room() -> Room:
     """Grey plaster, dark blue carpet, small high windows; a coffered ceiling."""
     half, height = 6.5, 4.6
     floor = Panel(
-        (-half, -half, 0), (2 * half, 0, 0), (0, 2 * half, 0), (0.245, 0.335, 0.465), "carpet", 1.1
+        (-half, -half, 0), (2 * half, 0, 0), (0, 2 * half, 0), (0.25, 0.33, 0.445), "carpet", 1.1
     )
     panels: list[Panel] = [floor]
-    windows = {0: [(3.0, 4.3), (5.6, 6.9)], 1: [(8.0, 9.3)], 2: [(6.2, 7.5), (8.8, 10.1)], 3: [(2.9, 4.2)]}
+    windows = {
+        0: [(3.0, 4.3), (5.6, 6.9)],
+        1: [(8.0, 9.3)],
+        2: [(6.2, 7.5), (8.8, 10.1)],
+        3: [(2.9, 4.2)],
+    }
     for index, (corner, u, v) in enumerate(_four_walls(half, half, height)):
         openings = [(a, b, 2.75, 3.65) for a, b in windows[index]]
         panels += _wall(corner, u, v, openings, **PLASTER)
@@ -135,7 +144,7 @@ def _box_room() -> Room:
         lamp_direction=(0.30, 0.25, 0.92),
         lamp=(0.27, 0.27, 0.27),
         around=((0.36, 0.36, 0.365), (0.03, 0.03, 0.03), (-0.03, -0.03, -0.03), (0.20, 0.20, 0.20)),
-        mirrored=((0.03, 0.04, 0.06), (0.26, 0.27, 0.32), (0.40, 0.40, 0.42)),
+        mirrored=((0.26, 0.27, 0.32), (0.03, 0.04, 0.06), (0.40, 0.40, 0.42)),
         exposure=1.0,
         shadow=0.7,
         contact=0.45,
@@ -202,17 +211,24 @@ def _bright_room() -> Room:
     panels += _slab((-x, 0.6, 0.0), (-x + 0.5, 2.2, height), **WHITE)
     for at in ((-3.0, -2.2), (0.0, -2.2), (3.0, -2.2), (-3.0, 2.0), (0.0, 2.0), (3.0, 2.0)):
         spot = (at[0], at[1] + 0.2, height - 0.005)
-        panels.append(Panel(spot, (0.2, 0, 0), (0, -0.2, 0), (1, 0.97, 0.92), "glow", 2.0, 1.4, False))
+        panels.append(
+            Panel(spot, (0.2, 0, 0), (0, -0.2, 0), (1, 0.97, 0.92), "glow", 2.0, 1.4, False)
+        )
     return Room(
         panels=tuple(panels),
         low=(-x, -y, 0.0),
         high=(x, y, height),
         lamp_direction=(-0.25, -0.42, 0.87),
         lamp=(0.30, 0.295, 0.285),
-        around=((0.53, 0.54, 0.56), (-0.02, -0.02, -0.02), (-0.06, -0.06, -0.06), (0.18, 0.18, 0.18)),
-        mirrored=((0.05, 0.03, 0.025), (0.40, 0.40, 0.41), (0.5, 0.5, 0.51)),
+        around=(
+            (0.53, 0.54, 0.56),
+            (-0.02, -0.02, -0.02),
+            (-0.06, -0.06, -0.06),
+            (0.18, 0.18, 0.18),
+        ),
+        mirrored=((0.40, 0.40, 0.41), (0.05, 0.03, 0.025), (0.5, 0.5, 0.51)),
         exposure=1.0,
-        window=((-2.8, -y, 0.0), (2.8, -y, 2.3), (1.5, 1.4, 1.25)),
+        window=((-2.8, -y, 0.0), (2.8, -y, 2.3), (3.0, 2.8, 2.5)),
         shadow=0.65,
         contact=0.45,
     )
@@ -239,7 +255,9 @@ def _yard(y: float) -> list[Panel]:
         Panel((-12, y - 1.2, -0.02), (24, 0, 0), (0, 1.25, 0), wood, "planks", 3.0, **out),  # type: ignore[arg-type]
         Panel((-14, y - 9, -0.10), (28, 0, 0), (0, 7.8, 0), stone, "paving", 1.6, **out),  # type: ignore[arg-type]
         Panel((14, y - 9, -0.1), (-28, 0, 0), (0, 0, 1.3), brick, "paving", 1.3, **out),  # type: ignore[arg-type]
-        Panel((40, y - 16, -1), (-80, 0, 0), (0, 0, 22), (0.80, 0.83, 0.87), "glow", 2.0, 0.75, False),
+        Panel(
+            (40, y - 16, -1), (-80, 0, 0), (0, 0, 22), (0.80, 0.83, 0.87), "glow", 2.0, 0.75, False
+        ),
     ]
     for low, high, color in (
         ((-7.5, y - 13, 0.0), (-4.5, y - 10.5, 2.9), (0.80, 0.76, 0.42)),
@@ -251,7 +269,9 @@ def _yard(y: float) -> list[Panel]:
 
 def _empty_room() -> Room:
     """A plain grey floor and nothing else, under even light."""
-    floor = Panel((-50, -50, 0), (100, 0, 0), (0, 100, 0), (0.62, 0.62, 0.62), "plaster", 3.0, 0.0, False)
+    floor = Panel(
+        (-50, -50, 0), (100, 0, 0), (0, 100, 0), (0.62, 0.62, 0.62), "plaster", 3.0, 0.0, False
+    )
     return Room(
         panels=(floor,),
         low=(-50.0, -50.0, 0.0),
@@ -259,7 +279,7 @@ def _empty_room() -> Room:
         lamp_direction=(0.35, 0.25, 0.9),
         lamp=(0.45, 0.45, 0.45),
         around=((0.6, 0.6, 0.6), (0.05, 0.05, 0.05), (-0.05, -0.05, -0.05), (0.15, 0.15, 0.15)),
-        mirrored=((0.2, 0.2, 0.2), (0.5, 0.5, 0.5), (0.6, 0.6, 0.6)),
+        mirrored=((0.5, 0.5, 0.5), (0.2, 0.2, 0.2), (0.6, 0.6, 0.6)),
         exposure=0.85,
         background=(0.62, 0.66, 0.72),
     )

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.rendering.kernel import kernel
+from physion.rendering.kernel import kernel, step
 from physion.rendering.rasterizer import SAMPLES
 
 F32 = NDArray[np.float32]
@@ -24,61 +24,49 @@ U8 = NDArray[np.uint8]
 TONES = 16384
 POINT = 13
 """Numbers kept of a shaded point, see `_shade_point`."""
+BLOCK = 8
+MATERIAL = 21
+CORNERS = 22
+"""Numbers of a triangle: corner normals 0..8, texture coordinates 9..14, tangents 15..20, and the
+row of its material."""
+SHARPEN = 0.64
+"""Share of the area of a pixel over which textures are averaged: below 1 is crisper."""
 WHITEST = 4.0
 """Linear light beyond which the tone table is white."""
 
 
-class Surfaces(NamedTuple):
-    """What the shading loop knows about triangles (T) and materials (M).
-
-    ``edges`` (T, 9) as `rasterize` writes; ``normals`` (T, 9), ``uv`` (T, 6), ``tangents`` (T, 6)
-    as in `Part`, in the world; ``surface`` and ``material`` (T,); ``materials`` (M, 12): linear
-    colour, texture row, gloss, sharpness, mirror, metal, relief, glow, room, unused.
-    """
-
-    edges: F64
-    normals: F32
-    uv: F32
-    tangents: F32
-    surface: I32
-    material: I32
-    materials: F64
-    texels: U8
-    starts: NDArray[np.int64]
-
-
 class Light(NamedTuple):
-    """A room's light, and the maps of what stands in its way.
+    """A room's light; linear colours.
 
-    - ``eye`` (3,), ``rays`` (3, 3): where the camera is; (x, y, 1) in pixels to a world vector.
-    - ``lamp`` (2, 3): unit vector to the lamp, its linear colour.
-    - ``around`` (4, 3): linear light from all sides: constant, and slopes along x, y and z.
-    - ``mirrored`` (3, 3): what glossy things reflect: from below, from the sides, from above.
+    - ``lamp`` (2, 3): unit vector to the lamp, its colour.
+    - ``around`` (4, 3): light from all sides: constant, and slopes along x, y and z.
+    - ``mirrored`` (3, 3): what glossy things reflect: from the sides, from below, from above.
     - ``window`` (3, 3): lowest and highest corner of a bright rectangle in a plane of one y, and
-      its linear colour: glossy things reflect it with soft edges.
+      its colour: glossy things reflect it with soft edges.
     - ``bounds`` (2, 3): lowest and highest corner of the room, darker near its edges.
-    - ``to_shadow`` (3, 4): world to texel x, texel y, distance in metres from the lamp's side.
-    - ``to_contact`` (3, 4): world to texel x, texel y, height in metres.
-    - ``shadow``, ``contact``: the depth maps: what is nearest to the lamp; what is lowest.
-    - ``settings`` (4,): how far a point is lifted off its surface before it is looked up, share of the lamp that shadows take, strength of the
-      darkness under things, reach of that darkness in metres.
     """
 
-    eye: F64
-    rays: F64
     lamp: F64
     around: F64
     mirrored: F64
     window: F64
     bounds: F64
-    to_shadow: F64
-    to_contact: F64
-    shadow: F32
-    contact: F32
-    settings: F64
 
 
-@kernel
+class ShadeMap(NamedTuple):
+    """A depth map of what stands in the light's way.
+
+    ``matrix`` (3, 4): world to texel x, texel y, depth in metres. ``depth`` (H, W): the smallest
+    depth of anything there. ``busy``: for each `BLOCK` x `BLOCK` texels, whether there is anything
+    in them or in their neighbours; elsewhere nothing needs looking up.
+    """
+
+    matrix: F64
+    depth: F32
+    busy: NDArray[np.bool_]
+
+
+@step
 def _texel(
     texels: U8, start: int, side: int, u: float, v: float
 ) -> tuple[float, float, float, float, float]:
@@ -100,12 +88,11 @@ def _texel(
     return r, g, b, p, q
 
 
-@kernel
+@step
 def _texture(
-    texels: U8, starts: NDArray[np.int64], row: int, u: float, v: float, footprint: float
+    texels: U8, starts: NDArray[np.int64], row: int, u: float, v: float, level: float
 ) -> tuple[float, float, float, float, float]:
-    """Linear albedo and slopes of a texture where a pixel covers ``footprint`` texels across."""
-    level = np.log2(max(footprint, 1.0))
+    """Linear albedo and slopes of a texture between two of its levels."""
     low = min(int(level), starts.shape[1] - 1)
     share = level - low
     side = 1 << (starts.shape[1] - 1)
@@ -118,125 +105,128 @@ def _texture(
     return r * r * unit, g * g * unit, b * b * unit, (p - 128.0) / 64.0, (q - 128.0) / 64.0
 
 
-@kernel
+@step
 def _shade_point(
-    t: int, x: float, y: float, surfaces: Surfaces, light: Light, out: F32
+    t: int,
+    x: float,
+    y: float,
+    edges: F64,
+    corners: F32,
+    materials: F64,
+    texels: U8,
+    starts: NDArray[np.int64],
+    view: F64,
+    light: F64,
+    out: F32,
+    at: int,
 ) -> None:
-    """Shade triangle ``t`` at pixel coordinates into ``out`` (POINT,).
+    """Shade triangle ``t`` at pixel coordinates into row ``at`` of ``out`` (P, POINT).
 
     In order: the world point, the light from around, the lamp's light, how much the surface faces
     up (0..1), which is where things standing near darken it, and the normal without relief.
     """
-    edges = surfaces.edges
     e0 = edges[t, 0] * x + edges[t, 1] * y + edges[t, 2]
     e1 = edges[t, 3] * x + edges[t, 4] * y + edges[t, 5]
     e2 = edges[t, 6] * x + edges[t, 7] * y + edges[t, 8]
     w = 1.0 / (e0 + e1 + e2)
     b0, b1, b2 = e0 * w, e1 * w, e2 * w
-    rays = light.rays
-    vx = rays[0, 0] * x + rays[0, 1] * y + rays[0, 2]
-    vy = rays[1, 0] * x + rays[1, 1] * y + rays[1, 2]
-    vz = rays[2, 0] * x + rays[2, 1] * y + rays[2, 2]
-    px, py, pz = light.eye[0] + w * vx, light.eye[1] + w * vy, light.eye[2] + w * vz
+    vx = view[1, 0] * x + view[1, 1] * y + view[1, 2]
+    vy = view[2, 0] * x + view[2, 1] * y + view[2, 2]
+    vz = view[3, 0] * x + view[3, 1] * y + view[3, 2]
+    px, py, pz = view[0, 0] + w * vx, view[0, 1] + w * vy, view[0, 2] + w * vz
     scale = -1.0 / np.sqrt(vx * vx + vy * vy + vz * vz)
     vx, vy, vz = vx * scale, vy * scale, vz * scale
 
-    material = surfaces.materials[surfaces.material[t]]
-    uv = surfaces.uv[t]
-    u = b0 * uv[0] + b1 * uv[2] + b2 * uv[4]
-    v = b0 * uv[1] + b1 * uv[3] + b2 * uv[5]
+    m = int(corners[t, MATERIAL])
+    u0, u1, u2 = corners[t, 9], corners[t, 11], corners[t, 13]
+    v0, v1, v2 = corners[t, 10], corners[t, 12], corners[t, 14]
+    u = b0 * u0 + b1 * u1 + b2 * u2
+    v = b0 * v0 + b1 * v1 + b2 * v2
     da = edges[t, 0] + edges[t, 3] + edges[t, 6]
     db = edges[t, 1] + edges[t, 4] + edges[t, 7]
-    ux = w * (edges[t, 0] * uv[0] + edges[t, 3] * uv[2] + edges[t, 6] * uv[4] - u * da)
-    uy = w * (edges[t, 1] * uv[0] + edges[t, 4] * uv[2] + edges[t, 7] * uv[4] - u * db)
-    vx_ = w * (edges[t, 0] * uv[1] + edges[t, 3] * uv[3] + edges[t, 6] * uv[5] - v * da)
-    vy_ = w * (edges[t, 1] * uv[1] + edges[t, 4] * uv[3] + edges[t, 7] * uv[5] - v * db)
-    long, short = ux * ux + vx_ * vx_, uy * uy + vy_ * vy_
-    if long < short:
-        long, short = short, long
-    # Between the blur of the longer side and the flicker of the shorter one.
-    side = 1 << (surfaces.starts.shape[1] - 1)
-    footprint = side * 0.8 * np.sqrt(np.sqrt(long * short))
-    tr, tg, tb, slope_u, slope_v = _texture(
-        surfaces.texels, surfaces.starts, int(material[3]), u, v, footprint
-    )
-    ar, ag, ab = tr * material[0], tg * material[1], tb * material[2]
+    du_dx = edges[t, 0] * u0 + edges[t, 3] * u1 + edges[t, 6] * u2 - u * da
+    du_dy = edges[t, 1] * u0 + edges[t, 4] * u1 + edges[t, 7] * u2 - u * db
+    dv_dx = edges[t, 0] * v0 + edges[t, 3] * v1 + edges[t, 6] * v2 - v * da
+    dv_dy = edges[t, 1] * v0 + edges[t, 4] * v1 + edges[t, 7] * v2 - v * db
+    # The square of the mean of both sides' lengths (geometric: between blur and flicker).
+    square = np.sqrt((du_dx * du_dx + dv_dx * dv_dx) * (du_dy * du_dy + dv_dy * dv_dy))
+    side = 1 << (starts.shape[1] - 1)
+    level = 0.5 * np.log2(max(SHARPEN * side * side * w * w * square, 1.0))
+    ar, ag, ab, slope_u, slope_v = _texture(texels, starts, int(materials[m, 3]), u, v, level)
+    ar, ag, ab = ar * materials[m, 0], ag * materials[m, 1], ab * materials[m, 2]
 
-    n = surfaces.normals[t]
-    nx = b0 * n[0] + b1 * n[3] + b2 * n[6]
-    ny = b0 * n[1] + b1 * n[4] + b2 * n[7]
-    nz = b0 * n[2] + b1 * n[5] + b2 * n[8]
+    nx = b0 * corners[t, 0] + b1 * corners[t, 3] + b2 * corners[t, 6]
+    ny = b0 * corners[t, 1] + b1 * corners[t, 4] + b2 * corners[t, 7]
+    nz = b0 * corners[t, 2] + b1 * corners[t, 5] + b2 * corners[t, 8]
     scale = 1.0 / np.sqrt(nx * nx + ny * ny + nz * nz)
     if nx * vx + ny * vy + nz * vz < 0.0:
         scale = -scale
     nx, ny, nz = nx * scale, ny * scale, nz * scale
-    out[9] = min(max(2.0 * nz - 1.0, 0.0), 1.0)
-    out[10], out[11], out[12] = nx, ny, nz
-    if material[8] > 0.0:
-        tangent = surfaces.tangents[t]
-        slope_u, slope_v = slope_u * material[8], slope_v * material[8]
-        nx -= slope_u * tangent[0] + slope_v * tangent[3]
-        ny -= slope_u * tangent[1] + slope_v * tangent[4]
-        nz -= slope_u * tangent[2] + slope_v * tangent[5]
+    out[at, 9] = min(max(2.0 * nz - 1.0, 0.0), 1.0)
+    out[at, 10], out[at, 11], out[at, 12] = nx, ny, nz
+    if materials[m, 8] > 0.0:
+        slope_u, slope_v = slope_u * materials[m, 8], slope_v * materials[m, 8]
+        nx -= slope_u * corners[t, 15] + slope_v * corners[t, 18]
+        ny -= slope_u * corners[t, 16] + slope_v * corners[t, 19]
+        nz -= slope_u * corners[t, 17] + slope_v * corners[t, 20]
         scale = 1.0 / np.sqrt(nx * nx + ny * ny + nz * nz)
         nx, ny, nz = nx * scale, ny * scale, nz * scale
 
-    lamp, around = light.lamp, light.around
-    facing = nx * lamp[0, 0] + ny * lamp[0, 1] + nz * lamp[0, 2]
-    direct = max(facing, 0.0)
-    hx, hy, hz = lamp[0, 0] + vx, lamp[0, 1] + vy, lamp[0, 2] + vz
-    half = max((nx * hx + ny * hy + nz * hz) / np.sqrt(hx * hx + hy * hy + hz * hz), 0.0)
-    shine = material[4] * half ** material[5] if facing > 0.0 else 0.0
+    lx, ly, lz = light[0, 0], light[0, 1], light[0, 2]
+    direct = max(nx * lx + ny * ly + nz * lz, 0.0)
     toward = max(nx * vx + ny * vy + nz * vz, 0.0)
-    graze = (1.0 - toward) ** 4
-    mirror = material[6] * (1.0 + (3.0 - 2.0 * material[7]) * graze)
-    rx, ry, rz = 2.0 * toward * nx - vx, 2.0 * toward * ny - vy, 2.0 * toward * nz - vz
-    window = 0.0
+    shine = 0.0
+    if direct > 0.0 and materials[m, 4] > 0.0:
+        hx, hy, hz = lx + vx, ly + vy, lz + vz
+        half = (nx * hx + ny * hy + nz * hz) / np.sqrt(hx * hx + hy * hy + hz * hz)
+        if half > 0.5:
+            shine = materials[m, 4] * half ** materials[m, 5]
+    metal = materials[m, 7]
+    graze = (1.0 - toward) * (1.0 - toward)
+    mirror = materials[m, 6] * (1.0 + (3.0 - 2.0 * metal) * graze * graze)
+    window, high = 0.0, 0.0
     if mirror > 0.0:
-        window = _window_share(px, py, pz, rx, ry, rz, light.window)
+        rx, ry, rz = 2.0 * toward * nx - vx, 2.0 * toward * ny - vy, 2.0 * toward * nz - vz
+        window = _window_share(px, py, pz, rx, ry, rz, light)
+        high = min(max(2.0 * rz, -1.0), 1.0)
     room = 1.0
-    if material[10] > 0.0:
-        room = _room_shade(px, py, pz, nx, ny, nz, light.bounds)
-    out[0], out[1], out[2] = px, py, pz
-    metal = material[7]
+    if materials[m, 10] > 0.0:
+        room = _room_shade(px, py, pz, nx, ny, nz, light)
+    out[at, 0], out[at, 1], out[at, 2] = px, py, pz
+    end = 8 if high > 0.0 else 7
     for k in range(3):
         albedo = ar if k == 0 else (ag if k == 1 else ab)
-        ambient = around[0, k] + nx * around[1, k] + ny * around[2, k] + nz * around[3, k]
-        if rz > 0.0:
-            seen = light.mirrored[1, k] + min(1.0, 1.4 * rz) * (
-                light.mirrored[2, k] - light.mirrored[1, k]
-            )
-        else:
-            seen = light.mirrored[1, k] + min(1.0, -2.5 * rz) * (
-                light.mirrored[0, k] - light.mirrored[1, k]
-            )
-        seen += window * (light.window[2, k] - seen)
-        tint = 1.0 + metal * (albedo - 1.0)
+        ambient = light[2, k] + nx * light[3, k] + ny * light[4, k] + nz * light[5, k]
+        seen = light[6, k] + abs(high) * (light[end, k] - light[6, k])
+        seen += window * (light[11, k] - seen)
+        tint = mirror * (1.0 + metal * (albedo - 1.0))
         matte = albedo * (1.0 - 0.8 * metal)
-        out[3 + k] = room * (matte * ambient + mirror * tint * seen) + material[9] * albedo
-        out[6 + k] = room * lamp[1, k] * (matte * direct + tint * shine)
+        out[at, 3 + k] = room * (matte * ambient + tint * seen) + materials[m, 9] * albedo
+        out[at, 6 + k] = (
+            room * light[1, k] * (matte * direct + shine * (1.0 + metal * (albedo - 1.0)))
+        )
 
 
-@kernel
+@step
 def _window_share(
-    px: float, py: float, pz: float, rx: float, ry: float, rz: float, window: F64
+    px: float, py: float, pz: float, rx: float, ry: float, rz: float, light: F64
 ) -> float:
     """How much of the window a rough reflection along (rx, ry, rz) sees, 0..1."""
-    gap = window[0, 1] - py
+    gap = light[9, 1] - py
     if gap * ry <= 1e-9:
         return 0.0
     along = gap / ry
     x, z = px + along * rx, pz + along * rz
     blur = 0.25 + 0.12 * along
-    u = min(x - window[0, 0], window[1, 0] - x) / blur + 0.5
-    v = min(z - window[0, 2], window[1, 2] - z) / blur + 0.5
+    u = min(x - light[9, 0], light[10, 0] - x) / blur + 0.5
+    v = min(z - light[9, 2], light[10, 2] - z) / blur + 0.5
     u, v = min(max(u, 0.0), 1.0), min(max(v, 0.0), 1.0)
     return float(u * u * (3.0 - 2.0 * u) * v * v * (3.0 - 2.0 * v))
 
 
-@kernel
+@step
 def _room_shade(
-    px: float, py: float, pz: float, nx: float, ny: float, nz: float, bounds: F64
+    px: float, py: float, pz: float, nx: float, ny: float, nz: float, light: F64
 ) -> float:
     """Light that is left near the edges where walls, floor and ceiling meet, 0..1."""
     left = 1.0
@@ -244,135 +234,172 @@ def _room_shade(
         p = px if k == 0 else (py if k == 1 else pz)
         n = nx if k == 0 else (ny if k == 1 else nz)
         flat = 1.0 - abs(n)
-        low, high = max(p - bounds[0, k], 0.0), max(bounds[1, k] - p, 0.0)
+        low, high = max(p - light[12, k], 0.0), max(light[13, k] - p, 0.0)
         left *= 1.0 - 0.22 * flat * np.exp(-low / 0.6)
         left *= 1.0 - 0.22 * flat * np.exp(-high / 0.6)
     return float(left)
 
 
-@kernel
-def _lit(point: F32, light: Light) -> float:
+@step
+def _lit(px: float, py: float, pz: float, m: F64, shadow: F32, busy: NDArray[np.bool_]) -> float:
     """Share of the lamp that reaches a world point: a soft-edged look into the shadow map."""
-    m, lift = light.to_shadow, light.settings[0]
-    px = point[0] + lift * point[10]
-    py = point[1] + lift * point[11]
-    pz = point[2] + lift * point[12]
     x = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3] - 0.5
     y = m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3] - 0.5
-    z = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3] - 0.5 * lift
-    height, width = light.shadow.shape
-    fx, fy = np.floor(x), np.floor(y)
-    j, i = int(fx), int(fy)
-    if j < 2 or i < 2 or j >= width - 3 or i >= height - 3:
+    height, width = shadow.shape
+    if x < 2.0 or y < 2.0 or x >= width - 3.0 or y >= height - 3.0:
         return 1.0
-    ax, ay = x - fx, y - fy
+    j, i = int(x), int(y)
+    if not busy[i // BLOCK, j // BLOCK]:
+        return 1.0
+    z = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3]
+    ax, ay = x - j, y - i
     total = 0.0
     for row in range(-2, 4):
-        wy = 1.0 - ay if row == -2 else (ay if row == 3 else 1.0)
         line = 0.0
-        for column in range(-2, 4):
-            if light.shadow[i + row, j + column] >= z:
-                line += 1.0 - ax if column == -2 else (ax if column == 3 else 1.0)
-        total += wy * line
-    return float(1.0 - light.settings[1] * (1.0 - total / 25.0))
+        for column in range(-1, 3):
+            if shadow[i + row, j + column] >= z:
+                line += 1.0
+        if shadow[i + row, j - 2] >= z:
+            line += 1.0 - ax
+        if shadow[i + row, j + 3] >= z:
+            line += ax
+        total += line * (1.0 - ay if row == -2 else (ay if row == 3 else 1.0))
+    return float(total / 25.0)
 
 
-@kernel
-def _open(point: F32, light: Light) -> float:
-    """Share of the light from around that reaches a point beside or under things, 0..1."""
-    m = light.to_contact
-    x = m[0, 0] * point[0] + m[0, 1] * point[1] + m[0, 2] * point[2] + m[0, 3] - 0.5
-    y = m[1, 0] * point[0] + m[1, 1] * point[1] + m[1, 2] * point[2] + m[1, 3] - 0.5
-    height, width = light.contact.shape
-    fx, fy = np.floor(x), np.floor(y)
-    j, i = int(fx), int(fy)
-    if j < 3 or i < 3 or j >= width - 4 or i >= height - 4:
-        return 1.0
-    ax, ay = x - fx, y - fy
+@step
+def _crowded(
+    px: float, py: float, pz: float, m: F64, contact: F32, busy: NDArray[np.bool_], reach: float
+) -> float:
+    """How much of the surroundings of a point is taken by things that stand low over it, 0..1."""
+    x = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3] - 0.5
+    y = m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3] - 0.5
+    height, width = contact.shape
+    if x < 3.0 or y < 3.0 or x >= width - 4.0 or y >= height - 4.0:
+        return 0.0
+    j, i = int(x), int(y)
+    if not busy[i // BLOCK, j // BLOCK]:
+        return 0.0
+    ax, ay = x - j, y - i
     total = 0.0
-    reach = light.settings[3]
     for row in range(-3, 5):
-        wy = 1.0 - ay if row == -3 else (ay if row == 4 else 1.0)
         line = 0.0
         for column in range(-3, 5):
-            gap = light.contact[i + row, j + column] - point[2]
+            gap = contact[i + row, j + column] - pz
             if -0.004 < gap < reach:
-                line += (1.0 - gap / reach) * (
-                    1.0 - ax if column == -3 else (ax if column == 4 else 1.0)
-                )
-        total += wy * line
-    return float(1.0 - light.settings[2] * total / 49.0)
-
-
-@kernel
-def _add_lit(point: F32, light: Light, weight: float, total: F64) -> None:
-    """Add a shaded point, darkened by what stands around it, to ``total`` (3,)."""
-    lit = _lit(point, light)
-    opened = 1.0
-    if point[9] > 0.0:
-        opened = 1.0 - point[9] * (1.0 - _open(point, light))
-    for k in range(3):
-        total[k] += weight * opened * (point[3 + k] + lit * point[6 + k])
+                share = 1.0 - gap / reach
+                line += share * (1.0 - ax if column == -3 else (ax if column == 4 else 1.0))
+        total += line * (1.0 - ay if row == -3 else (ay if row == 4 else 1.0))
+    return float(total / 49.0)
 
 
 @kernel
 def shade(
     ids: I32,
     first: int,
-    surfaces: Surfaces,
-    light: Light,
     fill: bool,
-    still: F32,
-    background: F64,
+    edges: F64,
+    corners: F32,
+    surface: I32,
+    materials: F64,
+    texels: U8,
+    starts: NDArray[np.int64],
+    view: F64,
+    light: F64,
+    to_shadow: F64,
+    shadow: F32,
+    shadow_busy: NDArray[np.bool_],
+    to_contact: F64,
+    contact: F32,
+    contact_busy: NDArray[np.bool_],
+    settings: F64,
     tones: U8,
+    still: F32,
     out: U8,
 ) -> None:
-    """Shade every pixel into ``out`` (H, W, 3), sRGB.
+    """Shade every pixel of ``ids`` (H, W, S) into ``out`` (H, W, 3), sRGB.
 
     Triangles before ``first`` never move: where the centre of a pixel shows one of them, its
-    shading is read from ``still`` (H, W, POINT), the same numbers that shading it again gives.
-    With ``fill`` it is the other way round: ``still`` is written at every centre, ``out`` is not.
+    shading is read from ``still`` (H * W + 1, POINT), the same numbers that shading it again
+    gives. With ``fill`` it is the other way round: ``still`` is written at every centre and
+    ``out`` is not. The last row of ``still`` is room to work in.
+
+    - ``edges`` (T, 9) as `rasterize` writes; ``corners`` (T, CORNERS) as `pack_corners` gives;
+      ``surface`` (T,): triangles of one number are shaded as one.
+    - ``materials`` (M, 12): linear colour, texture row, gloss, sharpness, mirror, metal, relief,
+      glow, whether the room's edges darken it, unused.
+    - ``texels``, ``starts``: an `Atlas`. ``view`` (4, 3): the camera's place; then the rows that
+      take (x, y, 1) in pixels to a world vector. ``light`` (15, 3): a `Light`, row by row, then
+      the linear colour where nothing is seen.
+    - ``to_shadow``, ``shadow``, ``shadow_busy``: the `ShadeMap` of the lamp; ``to_contact``, ...:
+      that of what hangs low over the ground.
+    - ``settings`` (4,): how far a point is lifted off its surface before it is looked up, share of
+      the lamp that shadows take, strength and reach in metres of the darkness under things.
     """
     height, width, samples = ids.shape
-    point = np.empty(POINT, np.float32)
-    total = np.empty(3, np.float64)
+    lift, dark, strength, reach = settings[0], settings[1], settings[2], settings[3]
     scale = (TONES - 1) / WHITEST
     for row in range(height):
         for column in range(width):
-            for k in range(3):
-                total[k] = 0.0
-            done = 0
-            for s in range(1 if fill else samples):
-                if done >> s & 1:
+            red, green, blue = 0.0, 0.0, 0.0
+            todo = (1 << samples) - 1
+            for s in range(samples):
+                if not todo >> s & 1:
                     continue
                 t = ids[row, column, s]
-                surface = surfaces.surface[t] if t >= 0 else -1
-                count = 0
-                for other in range(s, samples):
+                count = 1
+                for other in range(s + 1, samples):
                     o = ids[row, column, other]
-                    if (surfaces.surface[o] if o >= 0 else -1) == surface:
-                        done |= 1 << other
+                    if o == t or (o >= 0 and t >= 0 and surface[o] == surface[t]):
+                        todo &= ~(1 << other)
                         count += 1
                 weight = count / samples
                 if t < 0:
-                    for k in range(3):
-                        total[k] += weight * background[k]
+                    red += weight * light[14, 0]
+                    green += weight * light[14, 1]
+                    blue += weight * light[14, 2]
                     continue
-                if s == 0 and t < first and not fill:
-                    for k in range(POINT):
-                        point[k] = still[row, column, k]
-                else:
+                kept = s == 0 and t < first
+                p = row * width + column if kept else height * width
+                if fill or not kept:
                     x, y = column + 0.5 + SAMPLES[s, 0], row + 0.5 + SAMPLES[s, 1]
-                    _shade_point(t, x, y, surfaces, light, point)
+                    _shade_point(
+                        t, x, y, edges, corners, materials, texels, starts, view, light, still, p
+                    )
                 if fill:
-                    for k in range(POINT):
-                        still[row, column, k] = point[k]
-                else:
-                    _add_lit(point, light, weight, total)
+                    break
+                px, py, pz = still[p, 0], still[p, 1], still[p, 2]
+                lx, ly, lz = (
+                    px + lift * still[p, 10],
+                    py + lift * still[p, 11],
+                    pz + lift * still[p, 12],
+                )
+                lit = _lit(lx, ly, lz, to_shadow, shadow, shadow_busy)
+                lit = 1.0 - dark * (1.0 - lit)
+                if still[p, 9] > 0.0:
+                    crowd = _crowded(px, py, pz, to_contact, contact, contact_busy, reach)
+                    weight *= 1.0 - still[p, 9] * strength * crowd
+                red += weight * (still[p, 3] + lit * still[p, 6])
+                green += weight * (still[p, 4] + lit * still[p, 7])
+                blue += weight * (still[p, 5] + lit * still[p, 8])
             if not fill:
-                for k in range(3):
-                    tone = min(total[k] * scale, TONES - 1.0)
-                    out[row, column, k] = tones[int(tone)]
+                out[row, column, 0] = tones[int(min(red * scale, TONES - 1.0))]
+                out[row, column, 1] = tones[int(min(green * scale, TONES - 1.0))]
+                out[row, column, 2] = tones[int(min(blue * scale, TONES - 1.0))]
+
+
+def pack_corners(normals: F32, uv: F32, tangents: F32, material: I32) -> F32:
+    """What the shading loop reads of each triangle, side by side: (T, CORNERS)."""
+    return np.concatenate([normals, uv, tangents, material[:, None].astype(np.float32)], axis=1)
+
+
+def busy_blocks(depth: F32) -> NDArray[np.bool_]:
+    """Which blocks of a depth map hold something, they or one of their eight neighbours."""
+    rows, columns = (size // BLOCK for size in depth.shape)
+    used = np.isfinite(depth).reshape(rows, BLOCK, columns, BLOCK).any(axis=(1, 3))
+    wide = np.pad(used, 1)
+    wide = wide[:-2] | wide[1:-1] | wide[2:]
+    return np.asarray(wide[:, :-2] | wide[:, 1:-1] | wide[:, 2:])
 
 
 def tone_table(exposure: float) -> U8:

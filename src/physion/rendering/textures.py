@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import irfft2
 
 from physion.errors import UnknownNameError
 
@@ -54,7 +53,7 @@ FINISHES = {
     "carpet": Finish("carpet", relief=1.0),
     "plaster": Finish("plaster", relief=1.0),
     "smooth_plaster": Finish("smooth_plaster", relief=1.0),
-    "tiles": Finish("tiles", gloss=0.10, sharpness=60.0, mirror=0.028, relief=0.6),
+    "tiles": Finish("tiles", gloss=0.08, sharpness=60.0, mirror=0.014, relief=0.6),
     "planks": Finish("wood_ash", gloss=0.05),
     "paving": Finish("paving", relief=0.0),
     "glow": Finish("plain"),
@@ -105,7 +104,9 @@ def _levels(name: str) -> tuple[U8, ...]:
         stored[..., 3:] = 128.0 + SLOPE_SCALE * image[..., 3:]
         levels.append(np.clip(np.round(stored), 0, 255).astype(np.uint8).reshape(-1, 5))
         if len(image) > 1:
-            image = 0.25 * (image[::2, ::2] + image[1::2, ::2] + image[::2, 1::2] + image[1::2, 1::2])
+            image = 0.25 * (
+                image[::2, ::2] + image[1::2, ::2] + image[::2, 1::2] + image[1::2, 1::2]
+            )
     return tuple(levels)
 
 
@@ -125,7 +126,7 @@ def _noise(rng: np.random.Generator, u: float, v: float) -> F32:
     spectrum = np.zeros((SIZE, SIZE // 2 + 1), np.complex64)
     spectrum[fv, : reach_u + 1] = weight * (drawn[0] + 1j * drawn[1])
     spectrum[0, 0] = 0.0
-    noise = irfft2(spectrum, s=(SIZE, SIZE))
+    noise = np.fft.irfft2(spectrum, s=(SIZE, SIZE))
     return np.asarray(noise / noise.std(), np.float32)
 
 
@@ -150,7 +151,7 @@ def _plain(rng: np.random.Generator) -> tuple[F32, F32]:
 def _ash(rng: np.random.Generator) -> tuple[F32, F32]:
     """Sawn ash: the rings of a trunk cut lengthwise, with a pointed figure in the middle."""
     u, v = _grid()
-    warp = 0.035 * _noise(rng, 2.5, 1.0) + 0.006 * _noise(rng, 10, 3)
+    warp = 0.026 * _noise(rng, 2.5, 0.8) + 0.003 * _noise(rng, 10, 2)
     depth = 0.10 + 0.16 * np.sin(2 * np.pi * (v + 0.1)) + 0.02 * _noise(rng, 1.5, 2)
     rings = np.sqrt((u - 0.56 + warp) ** 2 + depth**2) * 58.0
     phase = rings - np.floor(rings)
@@ -184,7 +185,7 @@ def _carpet(rng: np.random.Generator) -> tuple[F32, F32]:
     u, v = _grid()
     rows = np.sin(2 * np.pi * 70 * v) * np.sin(2 * np.pi * (70 * u + 0.5 * np.floor(70 * v)))
     fleck = _noise(rng, 110, 90)
-    height = 0.3 * rows + 0.7 * fleck + 0.7 * _noise(rng, 45, 36)
+    height = 0.3 * rows + 0.8 * fleck + 0.4 * _noise(rng, 45, 36)
     value = 0.52 * np.exp(0.48 * height + 0.03 * _noise(rng, 4, 4))
     return np.clip(_tint(value, (1.0, 1.0, 1.0)), 0.02, 1), 0.0002 * height
 
@@ -194,7 +195,9 @@ def _plaster(rng: np.random.Generator) -> tuple[F32, F32]:
     strokes = _noise(rng, 8, 26) + 0.6 * _noise(rng, 34, 16)
     grit = _noise(rng, 120, 120)
     value = 0.90 + 0.012 * strokes + 0.008 * grit + 0.015 * _noise(rng, 2, 2)
-    return _tint(np.clip(value, 0, 1), (1, 1, 1)), 0.0003 * strokes * np.clip(0.5 + _noise(rng, 2, 2), 0, 2) + 0.00015 * grit
+    return _tint(np.clip(value, 0, 1), (1, 1, 1)), 0.0003 * strokes * np.clip(
+        0.5 + _noise(rng, 2, 2), 0, 2
+    ) + 0.00015 * grit
 
 
 def _smooth_plaster(rng: np.random.Generator) -> tuple[F32, F32]:
@@ -214,8 +217,8 @@ def _tiles(rng: np.random.Generator) -> tuple[F32, F32]:
     color = np.stack([0.150 * value, 0.058 * value**1.15, 0.040 * value**1.2], -1)
     du = np.abs(u * count - np.round(u * count))
     dv = np.abs(v * count - np.round(v * count))
-    joint = np.clip(1.5 - np.minimum(du, dv) / 0.010, 0.0, 1.0)[..., None]
-    color = color * (1 - joint) + joint * np.array([0.27, 0.225, 0.20])
+    joint = np.clip(1.5 - np.minimum(du, dv) / 0.008, 0.0, 1.0)[..., None]
+    color = color * (1 - joint) + joint * np.array([0.24, 0.20, 0.18])
     return np.clip(np.nan_to_num(color), 0, 1), 0.0009 * clouds - 0.002 * joint[..., 0]
 
 

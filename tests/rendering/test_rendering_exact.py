@@ -1,0 +1,243 @@
+"""Depth, ids, normals and flow against values from geometry, not from the renderer."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from physion.rendering.assembly import rotation_matrix
+from physion.rendering.camera import View
+from physion.rendering.rasterizer import NOTHING, SAMPLES, rasterize
+from physion.rendering.renderer import Frame, Renderer
+from physion.scenes.scene import Camera, Cloth, Scene
+from physion.scenes.shapes import shape, shapes
+
+from .scenes import CAMERA, body, flat_sheet, resting, scene_of, trajectory_of, tumbling
+
+EXACT = ("depth", "normals", "ids", "flow")
+Array = NDArray[np.float64]
+
+
+def pixel_centers(width: int, height: int) -> Array:
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    return np.stack([x, y], axis=-1)
+
+
+def rays(scene: Scene, size: int = 256) -> tuple[Array, Array]:
+    """Eye (3,) and vectors (H, W, 3) that reach a depth of one metre."""
+    eye = np.asarray(scene.camera.position)
+    view = View(scene.camera, size, size)
+    return eye, view.unproject(pixel_centers(size, size), np.ones((size, size))) - eye
+
+
+def inner(mask: NDArray[np.generic]) -> NDArray[np.bool_]:
+    """Pixels whose eight neighbours are of the same kind: all but the border."""
+    padded = np.pad(mask, 1, mode="edge")
+    height, width = mask.shape
+    around = [padded[i : i + height, j : j + width] == mask for i in range(3) for j in range(3)]
+    return np.all(around, axis=0)
+
+
+def render(scene: Scene, size: int = 256) -> Frame:
+    return Renderer(scene, resting(scene), size, size).render(0, EXACT)
+
+
+def ball_hits(scene: Scene, center: Array, radius: float) -> Array:
+    """Depth of a sphere at each pixel, NaN where the ray misses it."""
+    eye, ray = rays(scene)
+    a = (ray**2).sum(-1)
+    b = ray @ (eye - center)
+    c = ((eye - center) ** 2).sum() - radius**2
+    with np.errstate(invalid="ignore"):
+        return np.asarray((-b - np.sqrt(b * b - a * c)) / a)
+
+
+def test_plane_depth_and_normal_even_where_it_passes_under_the_camera() -> None:
+    camera = Camera((0.3, 0.2, 0.8), (1.0, 0.4, 0.0), fov=math.radians(80))
+    scene = scene_of(body("far", at=(30.0, 30.0, 0.0)), camera=camera)
+    frame = render(scene)
+    eye, ray = rays(scene)
+    assert frame.depth is not None and frame.normals is not None and frame.ids is not None
+    expected = -eye[2] / ray[..., 2]
+    floor = (expected > 0) & (frame.ids == 0)
+    assert floor.mean() > 0.9
+    assert floor[-1].all()
+    np.testing.assert_allclose(frame.depth[floor], expected[floor], atol=1e-3)
+    np.testing.assert_allclose(frame.normals[floor], [[0, 0, 1]] * floor.sum(), atol=1e-6)
+
+
+def test_sphere_depth_silhouette_and_normals() -> None:
+    scene = scene_of(body("ball", "test:fine_sphere", (0.2, -0.1, 0.3), scale=(0.8, 0.8, 0.8)))
+    frame = render(scene)
+    assert frame.depth is not None and frame.normals is not None and frame.ids is not None
+    center = np.array([0.2, -0.1, 0.7])
+    expected = ball_hits(scene, center, 0.4)
+    hit = np.isfinite(expected)
+    sure = inner(hit)
+    assert hit.sum() > 2500
+    np.testing.assert_array_equal((frame.ids == 1)[sure], hit[sure])
+    both = hit & sure
+    np.testing.assert_allclose(frame.depth[both], expected[both], atol=1e-3)
+    eye, ray = rays(scene)
+    normal = (eye + ray * expected[..., None] - center) / 0.4
+    angle = np.degrees(np.arccos(np.clip((normal * frame.normals).sum(-1)[both], -1, 1)))
+    assert angle.max() < 1.0
+
+
+def test_box_silhouette_and_normals() -> None:
+    scale, at = np.array([0.5, 0.7, 0.9]), np.array([-0.1, 0.2, 0.1])
+    scene = scene_of(body("box", "cube", tuple(at), scale=tuple(scale)))
+    frame = render(scene)
+    assert frame.depth is not None and frame.normals is not None and frame.ids is not None
+    eye, ray = rays(scene)
+    low = at - [0.5, 0.5, 0.0] * scale
+    near = (low - eye) / ray
+    far = (low + scale - eye) / ray
+    enter = np.minimum(near, far).max(-1)
+    hit = enter < np.maximum(near, far).min(-1)
+    sure = inner(hit)
+    assert hit.sum() > 2500
+    np.testing.assert_array_equal((frame.ids == 1)[sure], hit[sure])
+    both = hit & sure
+    np.testing.assert_allclose(frame.depth[both], enter[both], atol=1e-4)
+    axis = np.minimum(near, far).argmax(-1)[both]
+    normal = np.eye(3)[axis] * -np.sign(ray[both][np.arange(len(axis)), axis])[:, None]
+    assert (np.abs(frame.normals[both] - normal).max(-1) < 1e-5).mean() > 0.99
+
+
+def expected_flow(scene: Scene, frame: Frame, moved: Array) -> Array:
+    """Flow (K, 2) of pixels whose surface points move to ``moved`` (H, W, 3)."""
+    pixels, _ = View(scene.camera, 256, 256).project(moved)
+    return pixels - pixel_centers(256, 256)
+
+
+def seen_points(scene: Scene, frame: Frame) -> Array:
+    assert frame.depth is not None
+    return View(scene.camera, 256, 256).unproject(pixel_centers(256, 256), frame.depth)
+
+
+def test_flow_of_rigid_bodies_is_their_motion() -> None:
+    scene, trajectory = tumbling()
+    frame = Renderer(scene, trajectory).render(1, EXACT)
+    assert frame.ids is not None and frame.flow is not None
+    points = seen_points(scene, frame)
+    for i in (0, 1):
+        now, later = (rotation_matrix(trajectory.rotations[f, i]) for f in (1, 2))
+        local = (points - trajectory.positions[1, i].astype(np.float64)) @ now
+        moved = local @ later.T + trajectory.positions[2, i].astype(np.float64)
+        mask = frame.ids == i + 1
+        assert mask.sum() > 500
+        expected = expected_flow(scene, frame, moved)[mask]
+        assert np.abs(expected).max() > 1.0
+        np.testing.assert_allclose(frame.flow[mask], expected, atol=2e-3)
+
+
+def test_flow_of_cloth_is_its_motion() -> None:
+    cloth = Cloth("sheet", (0.0, 0.0, 0.4), (1.4, 1.2, 0.0), resolution=9)
+    scene = scene_of(body("box", at=(9.0, 9.0, 0.0)), cloths=[cloth])
+    sheet = flat_sheet(cloth)
+    matrix = np.eye(3) + 0.1 * np.random.default_rng(5).standard_normal((3, 3))
+    shift = np.array([0.03, -0.05, 0.04])
+    places = np.repeat([[scene.bodies[0].position]], 2, axis=0)
+    trajectory = trajectory_of(places, None, np.array([sheet, sheet @ matrix.T + shift]))
+    frame = Renderer(scene, trajectory).render(0, EXACT)
+    assert frame.ids is not None and frame.flow is not None
+    mask = frame.ids == 2
+    assert mask.sum() > 2500
+    expected = expected_flow(scene, frame, seen_points(scene, frame) @ matrix.T + shift)[mask]
+    assert np.abs(expected).max() > 3.0
+    np.testing.assert_allclose(frame.flow[mask], expected, atol=2e-3)
+
+
+def test_flow_leads_to_the_same_thing_in_the_next_frame() -> None:
+    scene, trajectory = tumbling()
+    renderer = Renderer(scene, trajectory)
+    now, later = renderer.render(0, EXACT), renderer.render(1, EXACT)
+    assert now.ids is not None and now.flow is not None and later.ids is not None
+    target = np.floor(pixel_centers(256, 256) + now.flow).astype(int)
+    inside = ((target >= 0) & (target < 256)).all(-1) & (now.ids > 0) & inner(now.ids)
+    there = later.ids[target[inside][:, 1], target[inside][:, 0]]
+    assert (there == now.ids[inside]).mean() > 0.98
+    unmoved = later.ids[inside]
+    assert (unmoved == now.ids[inside]).mean() < 0.95
+
+
+def test_flow_of_what_rests_and_of_the_last_frame_is_zero() -> None:
+    scene, trajectory = tumbling()
+    renderer = Renderer(scene, trajectory)
+    first, last = renderer.render(0, EXACT), renderer.render(-1, EXACT)
+    assert first.ids is not None and first.flow is not None and last.flow is not None
+    still = (first.ids == 0) | (first.ids == 3)
+    assert still.any() and not still.all()
+    assert not first.flow[still].any()
+    assert first.flow[~still].any()
+    assert not last.flow.any()
+
+
+@pytest.mark.parametrize("height", [1.3, 0.1])
+def test_cloth_is_seen_from_both_sides_and_faces_the_camera(height: float) -> None:
+    camera = Camera((2.0, 0.3, height), (0.0, 0.0, 0.5))
+    cloth = Cloth("sheet", (0.0, 0.0, 0.6), (1.0, 1.0, 0.0), resolution=5)
+    scene = scene_of(body("box", at=(9.0, 9.0, 0.0)), cloths=[cloth], camera=camera)
+    frame = render(scene)
+    assert frame.ids is not None and frame.normals is not None
+    mask = frame.ids == 2
+    assert mask.sum() > 1000
+    up = 1.0 if height > 0.6 else -1.0
+    np.testing.assert_allclose(frame.normals[mask], [[0, 0, up]] * mask.sum(), atol=1e-6)
+
+
+def test_faces_seen_from_behind_are_culled() -> None:
+    around = body("around", "cube", (2.4, 1.9, 0.8), scale=(1.0, 1.0, 1.0))
+    frame = render(scene_of(around, body("other", at=(0.0, 0.0, 0.0))))
+    assert frame.ids is not None
+    assert not (frame.ids == 1).any()
+    assert (frame.ids == 2).any()
+
+
+@pytest.mark.parametrize("name", [n for n in shapes.names() if not n.startswith("test:")])
+def test_every_shape_is_closed_to_the_eye(name: str) -> None:
+    """Culling the back faces of a closed mesh that is wound outwards takes nothing away."""
+    mesh = shape(name).mesh
+    view = View(Camera((2.2, 1.4, 1.6), (0.0, 0.0, 0.4)), 128, 128)
+    homogeneous = mesh.vertices @ view.to_pixels[:, :3].T + view.to_pixels[:, 3]
+    faces = np.asarray(mesh.faces, np.int32)
+    pictures = []
+    for two_sided in (False, True):
+        ids = np.full((128, 128, len(SAMPLES)), NOTHING, np.int32)
+        inverse = np.zeros(ids.shape, np.float32)
+        sides = np.full(len(faces), two_sided)
+        rasterize(homogeneous, faces, sides, 0, 0.1, 100.0, np.zeros((len(faces), 9)), ids, inverse)
+        pictures.append(inverse)
+    assert (pictures[0] > 0).sum() > 2000
+    np.testing.assert_allclose(pictures[0], pictures[1], atol=1e-6)
+    scene = scene_of(body("it", name), camera=CAMERA)
+    frame = render(scene)
+    assert frame.ids is not None and frame.normals is not None
+    assert (frame.ids == 1).sum() > 1000
+    np.testing.assert_allclose(np.linalg.norm(frame.normals[frame.ids == 1], axis=-1), 1, atol=1e-5)
+
+
+def test_a_triangle_through_the_camera_plane_hides_what_is_behind_it() -> None:
+    """One corner behind the camera: the visible part still has the depth of its plane."""
+    view = View(Camera((0.0, 0.0, 1.0), (1.0, 0.0, 1.0)), 64, 64)
+    corners = np.array([[-3.0, 0.0, 0.5], [5.0, -4.0, 0.5], [5.0, 4.0, 0.5]])
+    homogeneous = corners @ view.to_pixels[:, :3].T + view.to_pixels[:, 3]
+    ids = np.full((64, 64, 1), NOTHING, np.int32)
+    inverse = np.zeros(ids.shape, np.float32)
+    edges = np.zeros((1, 9))
+    faces = np.array([[0, 1, 2]], np.int32)
+    rasterize(homogeneous, faces, np.ones(1, bool), 0, 0.1, 100.0, edges, ids, inverse)
+    eye = np.array([0.0, 0.0, 1.0])
+    ray = view.unproject(pixel_centers(64, 64), np.ones((64, 64))) - eye
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = -0.5 / ray[..., 2]
+        hit = eye + ray * depth[..., None]
+    inside = (depth > 0.1) & (hit[..., 0] < 5) & (np.abs(hit[..., 1]) < (hit[..., 0] + 3) / 2)
+    sure = inner(inside)
+    np.testing.assert_array_equal((ids[..., 0] == 0)[sure], inside[sure])
+    assert inside[-1].all()
+    np.testing.assert_allclose(1 / inverse[inside & sure, 0], depth[inside & sure], atol=1e-4)

@@ -1,0 +1,210 @@
+"""Frames as users get them: repeatable, independent of each other, in sane colours."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from physion.errors import BadInputError, UnknownNameError
+from physion.rendering.camera import View
+from physion.rendering.renderer import (
+    PASSES,
+    Frame,
+    Renderer,
+    Settings,
+    render_frames,
+    role_map,
+)
+from physion.rendering.rooms import rooms
+from physion.rendering.textures import FINISHES, SIZE, build_atlas, finish
+from physion.scenes.scene import Camera, Look
+
+from .scenes import ALL, body, resting, scene_of, tumbling
+
+
+def digest(frame: Frame) -> str:
+    sha = hashlib.sha256()
+    for name in PASSES:
+        value = getattr(frame, name)
+        sha.update(b"" if value is None else value.tobytes())
+    return sha.hexdigest()
+
+
+def test_shapes_and_types_of_the_passes() -> None:
+    scene, trajectory = tumbling()
+    frame = Renderer(scene, trajectory, 96, 64).render(0, ALL)
+    found = {name: (getattr(frame, name).shape, getattr(frame, name).dtype.name) for name in ALL}
+    assert found == {
+        "color": ((64, 96, 3), "uint8"),
+        "depth": ((64, 96), "float32"),
+        "normals": ((64, 96, 3), "float32"),
+        "ids": ((64, 96), "int16"),
+        "flow": ((64, 96, 2), "float32"),
+    }
+
+
+def test_only_the_passes_asked_for_are_made_and_they_do_not_depend_on_each_other() -> None:
+    scene, trajectory = tumbling()
+    together = Renderer(scene, trajectory, 64, 64).render(1, ALL)
+    for name in PASSES:
+        alone = Renderer(scene, trajectory, 64, 64).render(1, (name,))
+        np.testing.assert_array_equal(getattr(alone, name), getattr(together, name))
+        assert all(getattr(alone, other) is None for other in PASSES if other != name)
+
+
+def test_a_frame_does_not_depend_on_the_frames_rendered_before_it() -> None:
+    scene, trajectory = tumbling()
+    fresh = [digest(Renderer(scene, trajectory, 128, 128).render(i, ALL)) for i in range(3)]
+    one = Renderer(scene, trajectory, 128, 128)
+    assert [digest(one.render(i, ALL)) for i in (2, 0, 1, 0)] == [fresh[i] for i in (2, 0, 1, 0)]
+    assert len(set(fresh)) == 3
+    assert [
+        digest(f) for f in render_frames(scene, trajectory, width=128, height=128, passes=ALL)
+    ] == fresh
+
+
+def test_a_frame_does_not_depend_on_the_frames_after_the_next() -> None:
+    scene, trajectory = tumbling(4)
+    arrays = ("positions", "rotations", "velocities", "angular_velocities", "cloth_vertices")
+    cut = dataclasses.replace(
+        trajectory,
+        cloth_distance=trajectory.cloth_distance[:2],
+        **{name: getattr(trajectory, name)[:2] for name in arrays},
+    )
+    whole, part = Renderer(scene, trajectory, 64, 64), Renderer(scene, cut, 64, 64)
+    assert digest(whole.render(0, ALL)) == digest(part.render(0, ALL))
+
+
+def test_drawing_still_things_once_changes_no_byte() -> None:
+    scene, trajectory = tumbling()
+    once = Renderer(scene, trajectory).render(1, ALL)
+    always = Renderer(scene, trajectory, settings=Settings(still_layer=False)).render(1, ALL)
+    assert digest(once) == digest(always)
+
+
+def test_a_fresh_process_gives_the_same_bytes() -> None:
+    scene, trajectory = tumbling()
+    code = (
+        "from tests.rendering.scenes import tumbling, ALL\n"
+        "from tests.rendering.test_rendering_frames import digest\n"
+        "from physion.rendering.renderer import Renderer\n"
+        "print(digest(Renderer(*tumbling()).render(1, ALL)))"
+    )
+    root = Path(__file__).parents[2]
+    run = subprocess.run(
+        [sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True
+    )
+    assert run.stdout.strip() == digest(Renderer(scene, trajectory).render(1, ALL))
+
+
+@pytest.mark.parametrize("room", ["box", "bright"])
+@pytest.mark.parametrize("turn", range(8))
+def test_rooms_have_no_holes_and_are_not_over_exposed(room: str, turn: int) -> None:
+    angle = turn * np.pi / 4
+    camera = Camera((2.5 * np.cos(angle), 2.5 * np.sin(angle), 1.2), (0.0, 0.0, 1.0))
+    scene = scene_of(
+        body("box", at=(0.0, 0.0, 0.0), scale=(0.2, 0.2, 0.2)), camera=camera, room=room
+    )
+    frame = Renderer(scene, resting(scene), 128, 128).render(0, ("color", "depth"))
+    assert frame.color is not None and frame.depth is not None
+    assert np.isfinite(frame.depth).all()
+    assert (frame.color.min(-1) >= 253).mean() < 0.01
+    assert 30 < frame.color.mean() < 190
+
+
+def test_room_panels_face_inwards() -> None:
+    for name in ("box", "bright"):
+        room = rooms.get(name)
+        floor = room.panels[0]
+        assert np.cross(floor.u, floor.v)[2] > 0
+        assert floor.corner[2] == 0.0
+
+
+def floor_color(frame: Frame, view: View, point: tuple[float, float, float]) -> float:
+    assert frame.color is not None
+    (x, y), _ = view.project(point)
+    return float(frame.color[int(y) - 1 : int(y) + 2, int(x) - 1 : int(x) + 2].mean())
+
+
+def test_things_throw_soft_shadows_and_darken_the_ground_they_stand_on() -> None:
+    camera = Camera((0.0, 3.0, 2.5), (0.0, 0.0, 0.0))
+    view = View(camera, 256, 256)
+    far = body("far", at=(2.0, -2.0, 0.0), scale=(0.1, 0.1, 0.1))
+    empty = scene_of(far, camera=camera)
+    plain = Renderer(empty, resting(empty)).render(0)
+    high = scene_of(far, body("lid", at=(0.0, 0.0, 1.0), scale=(0.8, 0.8, 0.02)), camera=camera)
+    shaded = Renderer(high, resting(high)).render(0)
+    direction = np.asarray(rooms.get("empty").lamp_direction)
+    under = (-direction[0] / direction[2], -direction[1] / direction[2], 0.0)
+    assert floor_color(shaded, view, under) < 0.95 * floor_color(plain, view, under)
+    # Inside the edge, on it, and outside of it.
+    x, y = under[0], under[1]
+    steps = [floor_color(shaded, view, (x + dx, y, 0.0)) for dx in (0.2, 0.4, 0.6)]
+    assert steps[0] < steps[1] < steps[2]
+    low = scene_of(far, body("box", at=(0.0, 0.0, 0.0), scale=(0.4, 0.4, 0.4)), camera=camera)
+    beside = Renderer(low, resting(low)).render(0)
+    spot = (0.27, 0.0, 0.0)  # towards the lamp, where no shadow falls
+    assert floor_color(beside, view, spot) < 0.98 * floor_color(plain, view, spot)
+
+
+def test_color_is_anti_aliased() -> None:
+    camera = Camera((0.0, 3.0, 0.8), (0.0, 0.0, 0.8))
+    ball = body("ball", "sphere", (0.0, 0.0, 0.3), look=Look((0.0, 0.0, 0.0), "plain"))
+    scene = scene_of(ball, camera=camera)
+    frame = Renderer(scene, resting(scene), 128, 128).render(0, ("color", "ids"))
+    assert frame.color is not None and frame.ids is not None
+    row = frame.color[64].astype(int).sum(-1)
+    dark, light = row[64], row[5]
+    edges = np.flatnonzero(np.diff((frame.ids[64] == 1).astype(int)))
+    between = [v for e in edges for v in row[e : e + 2] if dark + 60 < v < light - 60]
+    assert light - dark > 200
+    assert between
+
+
+def test_textures_keep_their_mean_over_the_levels_and_their_bytes() -> None:
+    names = tuple(sorted({f.texture for f in FINISHES.values()}))
+    atlas = build_atlas(names)
+    assert (np.diff(atlas.starts.ravel()) > 0).all()
+    for row, name in enumerate(names):
+        start = atlas.starts[row]
+        full = (atlas.texels[start[0] : start[1], :3] / 255.0) ** 2
+        last = (atlas.texels[start[-1], :3] / 255.0) ** 2
+        assert start[1] - start[0] == SIZE**2
+        np.testing.assert_allclose(full.mean(0), last, atol=0.01, err_msg=name)
+    build_atlas.cache_clear()
+    np.testing.assert_array_equal(build_atlas(names).texels, atlas.texels)
+
+
+def test_role_map_points_out_agent_and_patient() -> None:
+    scene, trajectory = tumbling()
+    ids = Renderer(scene, trajectory, 128, 128).render(0, ("ids",)).ids
+    assert ids is not None
+    colors = role_map(ids, scene)
+    assert colors.shape == (128, 128, 4) and colors.dtype == np.uint8
+    assert set(map(tuple, colors[ids == 1])) == {(255, 0, 0, 255)}
+    assert set(map(tuple, colors[ids == 4])) == {(255, 255, 0, 255)}
+    assert set(colors[(ids != 1) & (ids != 4)][:, 3]) == {0}
+
+
+def test_bad_requests_say_what_is_wrong() -> None:
+    scene, trajectory = tumbling()
+    renderer = Renderer(scene, trajectory, 32, 32)
+    with pytest.raises(UnknownNameError, match="closest: color"):
+        renderer.render(0, ("colour",))
+    with pytest.raises(BadInputError, match="frame 3 of a trajectory of 3 frames"):
+        renderer.render(3)
+    with pytest.raises(BadInputError, match="0 x 32 pixels"):
+        Renderer(scene, trajectory, 0, 32)
+    other = scene_of(body("alone"))
+    with pytest.raises(BadInputError, match="trajectory of 3 bodies"):
+        Renderer(other, trajectory)
+    with pytest.raises(UnknownNameError, match="unknown room"):
+        Renderer(dataclasses.replace(scene, room="attic"), trajectory)
+    with pytest.raises(UnknownNameError, match="wood_ash"):
+        finish("wood_ahs")
