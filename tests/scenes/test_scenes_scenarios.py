@@ -11,7 +11,7 @@ import pytest
 from scipy.optimize import linprog
 
 from physion.errors import BadSceneError, UnknownNameError
-from physion.scenes.looks import RED, ROLE_MARGIN, TEXTURES, YELLOW, too_near, with_role_colors
+from physion.scenes.looks import RED, TEXTURES, YELLOW, mistakable, with_role_colors
 from physion.scenes.placement import (
     CameraRule,
     SceneryRule,
@@ -163,9 +163,16 @@ def test_role_colors(scenario: Scenario) -> None:
         assert after.look.texture == before.look.texture
         if before.name in (scene.roles.agent, scene.roles.patient):
             continue
-        near = any(too_near(before.look.color, c, ROLE_MARGIN) for c in (RED, YELLOW))
+        near = any(mistakable(before.look.color, c) for c in (RED, YELLOW))
         assert near == (before.look.color != after.look.color)
-        assert not any(too_near(after.look.color, c, ROLE_MARGIN) for c in (RED, YELLOW))
+        assert not any(mistakable(after.look.color, c) for c in (RED, YELLOW))
+
+
+def test_what_passes_for_red_or_yellow() -> None:
+    assert mistakable((0.9, 0.2, 0.1), RED) and mistakable((0.45, 0.05, 0.05), RED)
+    assert mistakable((0.8, 0.8, 0.1), YELLOW) and mistakable((0.5, 0.48, 0.05), YELLOW)
+    for fine in [(0.45, 0.3, 0.18), (0.1, 0.1, 0.9), (0.1, 0.0, 0.0), (0.85, 0.84, 0.8)]:
+        assert not mistakable(fine, RED) and not mistakable(fine, YELLOW)
 
 
 def test_unknown_scenario_gives_the_closest() -> None:

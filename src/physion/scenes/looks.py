@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import colorsys
 import dataclasses
 from collections.abc import Sequence
 
@@ -26,8 +27,12 @@ RED: Vec3 = (1.0, 0.0, 0.0)
 YELLOW: Vec3 = (1.0, 1.0, 0.0)
 MARGIN = 0.25
 """Two colours are too near if no channel differs by more (official-system.md, section 2.3)."""
-ROLE_MARGIN = 0.5
-"""The widest of the official margins: nothing else may pass for red or yellow."""
+ROLE_MARGIN = 0.33
+"""The middle one of the official margins, for what may pass for red or yellow."""
+ROLE_HUE = 15 / 360
+"""Beyond the official rule: a strong colour of this hue or nearer passes for red or yellow, however
+dark it is. The browns of furniture and dogs are further off."""
+STRONG_SATURATION, STRONG_VALUE = 0.6, 0.3
 
 _PALETTES: dict[str, tuple[Vec3, ...]] = {
     "wood": ((0.45, 0.3, 0.18), (0.62, 0.46, 0.3), (0.3, 0.2, 0.13)),
@@ -53,6 +58,15 @@ _PROP_PALETTE = {
 def too_near(color: Vec3, other: Vec3, margin: float = MARGIN) -> bool:
     """Whether every channel of two colours is within ``margin``."""
     return all(abs(a - b) <= margin for a, b in zip(color, other, strict=True))
+
+
+def mistakable(color: Vec3, role: Vec3) -> bool:
+    """Whether people may take ``color`` for the colour of a role."""
+    hue, saturation, value = colorsys.rgb_to_hsv(*color)
+    away = abs(hue - colorsys.rgb_to_hsv(*role)[0])
+    same_hue = min(away, 1 - away) <= ROLE_HUE
+    strong = saturation >= STRONG_SATURATION and value >= STRONG_VALUE
+    return too_near(color, role, ROLE_MARGIN) or (same_hue and strong)
 
 
 def random_color(
@@ -90,9 +104,10 @@ def with_role_colors(scene: Scene) -> Scene:
             return RED
         if thing.name == scene.roles.patient:
             return YELLOW
-        if any(too_near(thing.look.color, role, ROLE_MARGIN) for role in (RED, YELLOW)):
-            return random_color(rng, (RED, YELLOW), ROLE_MARGIN)
-        return thing.look.color
+        color = thing.look.color
+        while any(mistakable(color, role) for role in (RED, YELLOW)):
+            color = random_color(rng)
+        return color
 
     bodies = tuple(_colored(body, color_of(body)) for body in scene.bodies)
     cloths = tuple(

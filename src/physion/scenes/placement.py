@@ -57,7 +57,7 @@ class SceneryRule:
     distractors: int = 0
     occluders: int = 0
     distractor_props: tuple[str, ...] = ("chair", "vase", "dog", "globe", "stool", "coffee_maker")
-    occluder_props: tuple[str, ...] = ("vase", "plant", "jug", "lamp", "chair")
+    occluder_props: tuple[str, ...] = ("vase", "plant", "lamp", "globe")
     distractor_distance: Range = (0.4, 1.0)
     occluder_distance: Range = (0.6, 0.8)
     distractor_spacing_deg: float = 15.0
