@@ -286,6 +286,37 @@ def test_without_people_the_models_stand_alone() -> None:
     assert not found.has_people and found.changed.empty
 
 
+def test_recorded_outcomes_stand_in_for_labels() -> None:
+    people = humans()
+    odd = tuple(people["stimulus"].iloc[:2])
+    given = predictions(people, changed=odd)
+    given["Recorded Outcome"] = [str(value) for value in labels(people).values()]
+    with_labels = compare(predictions(people, changed=odd), people, labels(people), bootstrap=QUICK)
+    found = compare(given, people, bootstrap=QUICK)
+    pd.testing.assert_frame_equal(found.scores, with_labels.scores)
+    assert list(found.changed["stimulus"]) == list(odd)
+    given.loc[0, "Recorded Outcome"] = ""
+    assert counts(compare(given, people, bootstrap=QUICK).dropped)["", NO_LABEL] == 1
+
+
+def test_the_zone_is_for_whole_scenarios_alone() -> None:
+    people = humans()
+    zone = pd.DataFrame({"scenario": ["collide", "drop"], "low": 0.6, "high": 0.8})
+    given = predictions(people.iloc[:-1])
+    table = compare(given, people, labels(people), zone=zone, bootstrap=QUICK).people
+    table = table.set_index("scenario")
+    assert table.loc["collide", "zone_low"] == 0.6
+    assert np.isnan(table.loc["drop", "zone_low"]) and np.isnan(table.loc[MEAN, "zone_low"])
+
+
+def test_an_interval_without_width_says_so() -> None:
+    people = humans()
+    given = predictions(people)
+    given["Predicted Outcome"] = given["Actual Outcome"]
+    row = score(compare(given, people, labels(people)).scores, "m · observed", "drop")
+    assert row["accuracy_low"] == row["accuracy_high"] == 1 and "no width" in row["reason"]
+
+
 def test_nothing_in_common_is_an_error() -> None:
     people = humans()
     other = people.assign(stimulus=people["stimulus"] + "_x")

@@ -228,7 +228,7 @@ def test_files_in_report_out(tmp_path: Path) -> None:
     assert not out.exists()
     labels = {f"s_{i}": i % 2 == 0 for i in range(12)}
     given = compare_files([predicted], humans, labels, out, bootstrap=Bootstrap(50))
-    assert "the recorded outcomes of the logs" in page_of(given).text
+    assert "those recorded with the trials" in page_of(given).text
     # The official layout: labels and zone lie in the folders beside the people's.
     (tmp_path / "stimuli").mkdir()
     text = "stim_ID,label\n" + "".join(f"{name},{value}\n" for name, value in labels.items())

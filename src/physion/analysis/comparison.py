@@ -70,8 +70,9 @@ def compare(
 
     ``predictions``: official column names (`predictions.check_predictions`); *Actual Outcome* is
     the outcome of the trial that the model was shown. ``humans``: from `responses.read_humans`, or
-    None to have the models' accuracies alone. ``labels``: official outcome by stimulus, needed with
-    people; without people it defaults to the simulated outcome. ``zone``: from
+    None to have the models' accuracies alone. ``labels``: official outcome by stimulus; where it is
+    silent the column *Recorded Outcome* of the predictions speaks, and without people the simulated
+    outcome. ``zone``: from
     `responses.read_human_zone`. ``exclude``: stimuli to leave out. ``exclude_ledge``: leave out the
     Roll stimuli with a ledge, as the study does.
 
@@ -81,7 +82,8 @@ def compare(
     draws = bootstrap or Bootstrap()
     rows = predictions if "agent" in predictions else name_models(check_predictions(predictions))
     unwanted = {canonical_name(name) for name in exclude}
-    known = {canonical_name(name): bool(value) for name, value in (labels or {}).items()}
+    known = _recorded(rows)
+    known |= {canonical_name(name): bool(value) for name, value in (labels or {}).items()}
     if humans is None:
         people = _nobody(rows, known)
     elif known:
@@ -100,12 +102,21 @@ def compare(
     answered = people[people["stimulus"].isin(stimuli["stimulus"])]
     return Comparison(
         scores=score_table(stimuli, draws),
-        people=people.iloc[:0] if humans is None else people_table(answered, zone, draws),
+        people=people.iloc[:0]
+        if humans is None
+        else people_table(answered, _whole(zone, people, stimuli), draws),
         stimuli=stimuli,
         changed=_changed(stimuli),
         dropped=pd.concat(dropped, ignore_index=True),
         settings=_settings(humans is not None, unwanted, exclude_ledge, zone, draws),
     )
+
+
+def _recorded(rows: pd.DataFrame) -> dict[str, bool]:
+    """The official outcomes that the predictions themselves carry."""
+    given = rows[rows["recorded"].notna()].drop_duplicates("stimulus")
+    pairs = zip(given["stimulus"], given["recorded"], strict=True)
+    return {str(stimulus): bool(value) for stimulus, value in pairs}
 
 
 def _nobody(rows: pd.DataFrame, known: Mapping[str, bool]) -> pd.DataFrame:
@@ -174,6 +185,14 @@ def _count(rows: pd.DataFrame) -> pd.DataFrame:
     return filled.groupby(keys, sort=False).size().rename("stimuli").reset_index()
 
 
+def _whole(
+    zone: pd.DataFrame | None, people: pd.DataFrame, stimuli: pd.DataFrame
+) -> pd.DataFrame | None:
+    """``zone`` of the scenarios that are there in full: it says nothing about a part of them."""
+    missing = people[~people["stimulus"].isin(stimuli["stimulus"])]["scenario"]
+    return zone if zone is None else zone[~zone["scenario"].isin(missing)]
+
+
 def _changed(stimuli: pd.DataFrame) -> pd.DataFrame:
     rows = stimuli[stimuli["label"] != stimuli["simulated"]].drop_duplicates("stimulus")
     columns = ["scenario", "stimulus", "label", "simulated", "human_accuracy", "p_yes"]
@@ -203,8 +222,8 @@ def _settings(
         words["Human zone"] = (
             "not given: it needs the answers of single participants"
             if zone is None
-            else "2.5th to 97.5th percentile of participants' accuracies on all stimuli of a "
-            "scenario, official table"
+            else "2.5th to 97.5th percentile of participants' accuracies, official table; only for "
+            "scenarios of which all stimuli that people saw are predicted"
         )
         words["Ceiling of r"] = (
             "expected r of a model that knows the true share of yes: square root of the "

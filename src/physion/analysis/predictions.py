@@ -40,6 +40,7 @@ DATASETS = (
 name apart only after it is put in relation to the scenario that is tested."""
 
 DISTINGUISHING = (
+    "Init",
     "Encoder Type",
     "Dynamics Type",
     "Encoder Pre-training Task",
@@ -71,7 +72,8 @@ def check_predictions(table: pd.DataFrame, where: str = "predictions") -> pd.Dat
     stands there), ``stimulus`` (canonical), ``scenario`` (None where nothing tells it),
     ``p_contact`` (0 to 1), ``predicted`` and ``actual`` (bool), and those of `DISTINGUISHING`
     that are there, as text. ``actual`` is the outcome of the trial that the model was shown, so
-    for our own simulations the simulated outcome. Raises `BadInputError`.
+    for our own simulations the simulated outcome; ``recorded`` is the official one where a column
+    *Recorded Outcome* gives it (bool), else None. Raises `BadInputError`.
     """
     require_columns(table, REQUIRED, where)
     table = table.reset_index(drop=True)
@@ -85,6 +87,7 @@ def check_predictions(table: pd.DataFrame, where: str = "predictions") -> pd.Dat
             "p_contact": as_numbers(table["Predicted Prob_true"], 0, 1, where),
             "predicted": as_booleans(table["Predicted Outcome"], where),
             "actual": as_booleans(table["Actual Outcome"], where),
+            "recorded": _recorded(table, where),
         }
     )
     blank = (checked["model"] == "") | (checked["stimulus"] == "")
@@ -144,6 +147,16 @@ def _scenarios(table: pd.DataFrame, stimulus: pd.Series) -> pd.Series:
         for name, test in zip(stimulus, tested, strict=True)
     ]
     return pd.Series(found, index=table.index, dtype=object)
+
+
+def _recorded(table: pd.DataFrame, where: str) -> pd.Series:
+    found = pd.Series(None, index=table.index, dtype=object)
+    if "Recorded Outcome" not in table.columns:
+        return found
+    words = _text(table["Recorded Outcome"])
+    given = words != ""
+    found[given] = as_booleans(words[given], where).tolist()
+    return found
 
 
 def _relative(trained: pd.Series, scenario: pd.Series) -> pd.Series:

@@ -96,6 +96,8 @@ def _record(
         if known and np.isnan(low):
             reasons.append(f"{key}: undefined in most resamples, no interval")
         record |= {key: value, f"{key}_low": low, f"{key}_high": high}
+    if len(rows) > 1 and record["accuracy_low"] == record["accuracy_high"]:
+        reasons.append("accuracy: all answers alike, so the bootstrap interval has no width")
     if len(rows) == 1:
         reasons.append("intervals: one stimulus")
     if np.isfinite(found["r"][0]) and np.isnan(found["r_same"][0]):

@@ -178,8 +178,8 @@ def changed(comparison: Comparison) -> str:
     listing = details(f"{plural(len(rows), 'trial')}, one by one", table(header, cells))
     return (
         f"<p>{len(rows)} of {comparison.stimuli['stimulus'].nunique()} stimuli: {escape(words)}. "
-        "Their models saw another event than the people did, so both scores are given above.</p>"
-        + listing
+        "There the models were shown another event than people saw, so accuracy is given against "
+        "both outcomes and r also without them.</p>" + listing
     )
 
 

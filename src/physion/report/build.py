@@ -26,6 +26,12 @@ from physion.report.page import Picture, ReportInputs, check_movies, page_kind, 
 LABELS_FILE = "stimulus_names_and_labels.csv"
 ZONE_FILE = "human_accuracy_by_scenario.csv"
 
+_LOOKS = {
+    "plain": "those who saw free colours with flashing overlays, as in the paper",
+    "redyellow": "those who saw a red agent and a yellow patient",
+    "pooled": "those of both looks, weighted by their number",
+}
+
 
 def build_report(inputs: ReportInputs, folder: Path) -> Path:
     """Write ``report.html``, ``tables/*.csv`` and ``figures/*.{svg,png,csv}``; the page's path.
@@ -78,18 +84,19 @@ def compare_files(
 
     ``humans``: folder of ``human_accuracy-*.csv``, or None. ``labels``: a CSV file with ``stim_ID``
     and ``label``, or outcomes by stimulus; None looks for the official file in ``humans``, beside
-    it, and in ``stimuli`` beside it. ``zone``: the official table of participants' percentiles;
-    None looks for it likewise, in ``results``, and goes on without. ``exclude``: a file of stimuli
-    to leave out, one a line. ``methods``: see `ReportInputs`. Raises `BadInputError`, before
-    anything is written.
+    it, and in ``stimuli`` beside it, then goes by *Recorded Outcome* of the predictions.
+    ``zone``: the official table of participants' percentiles; None looks for it likewise, in
+    ``results``, and goes on without. ``exclude``: a file of stimuli to leave out, one a line.
+    ``methods``: see `ReportInputs`. Raises `BadInputError`, before anything is written.
     """
     people = None if humans is None else read_humans(humans, dominoes)
     labels = labels if labels is not None else _beside(humans, "stimuli", LABELS_FILE)
     zone = zone if zone is not None else _beside(humans, "results", ZONE_FILE)
-    if people is not None and labels is None:
+    rows = read_predictions(predictions)
+    if people is not None and labels is None and rows["recorded"].isna().all():
         raise BadInputError(f"no {LABELS_FILE} lies near {humans}; give the file with the labels")
     comparison = compare(
-        read_predictions(predictions),
+        rows,
         people,
         read_labels(labels) if isinstance(labels, Path) else labels,
         zone=read_human_zone(zone) if zone is not None and people is not None else None,
@@ -99,9 +106,9 @@ def compare_files(
     )
     choices = dict(methods or {})
     if people is not None:
-        origin = labels.name if isinstance(labels, Path) else "the recorded outcomes of the logs"
+        origin = labels.name if isinstance(labels, Path) else "those recorded with the trials"
         choices.setdefault("Official outcomes", origin)
-        choices.setdefault("People who saw Dominoes", dominoes)
+        choices.setdefault("People for Dominoes", _LOOKS[dominoes])
     return build_report(ReportInputs(comparison, methods=choices, movies=movies or {}), folder)
 
 

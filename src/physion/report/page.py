@@ -172,7 +172,7 @@ def _summary(inputs: ReportInputs) -> str:
     if len(comparison.changed):
         words.append(
             f"In {len(comparison.changed)} of these stimuli the simulated outcome is not the "
-            "official one; every score is given against both."
+            "official one; accuracy is given against both."
         )
     return f'<p class="lead">{escape(" ".join(words))}</p>'
 
@@ -190,7 +190,7 @@ def _accuracy_words(inputs: ReportInputs) -> str:
     if inputs.comparison.has_people:
         words += " Dashed: people on the stimuli that any model predicts."
         if inputs.comparison.people["zone_low"].notna().any():
-            words += " Band: the middle 95 % of participants, on all stimuli."
+            words += " Band: the middle 95 % of participants."
     return words + " Dotted: chance."
 
 
