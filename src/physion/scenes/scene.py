@@ -8,6 +8,7 @@ bottom face. Everything is frozen and serialises to JSON and back without loss.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 import math
@@ -234,13 +235,19 @@ class Scene:
         return built
 
 
+@functools.cache
+def _type_hints(kind: Any) -> dict[str, Any]:
+    """Declared types of a dataclass; resolving them anew for each body would take the most time."""
+    return typing.get_type_hints(kind)
+
+
 def _build(kind: Any, data: Any, where: str) -> Any:
     """Turn parsed JSON into a value of the type ``kind``, checking every field on the way."""
     origin = typing.get_origin(kind)
     if dataclasses.is_dataclass(kind):
         if not isinstance(data, dict):
             raise BadSceneError(f"{where} must be an object, not {type(data).__name__}")
-        hints = typing.get_type_hints(kind)
+        hints = _type_hints(kind)  # type: ignore[arg-type]  # a class can be hashed
         unknown = sorted(data.keys() - hints.keys())
         if unknown:
             raise BadSceneError(f"{where} has unknown fields {unknown}; known: {sorted(hints)}")

@@ -139,6 +139,8 @@ class FieldReader:
         self.where = where
         self._file = file
         self._lengths: dict[str, int] = {}
+        self._known: dict[str, h5py.Dataset] = {}
+        self._groups: dict[str, Any] = {}
 
     def text(self, path: str) -> str:
         """The text at ``path``."""
@@ -171,14 +173,21 @@ class FieldReader:
         self._checked(path, FIELDS[path] if path in FIELDS else PASSES[path.split("/")[1]])
 
     def _checked(self, path: str, field: Field) -> h5py.Dataset:
-        dataset: Any = self._file
-        for part in path.split("/"):
-            dataset = self._member(dataset, part, path)
+        if path in self._known:
+            return self._known[path]
+        *groups, name = path.split("/")
+        parent: Any = self._file
+        for group in groups:
+            if group not in self._groups:
+                self._groups[group] = self._member(parent, group, path)
+            parent = self._groups[group]
+        dataset = self._member(parent, name, path)
         if not isinstance(dataset, h5py.Dataset):
             raise self._bad(path, "is not an array")
         self._guard(path, lambda: self._check_storage(path, dataset))
         self._guard(path, lambda: self._check_type(path, dataset, field))
         self._check_shape(path, dataset.shape, field)
+        self._known[path] = dataset
         return dataset
 
     def _member(self, group: Any, name: str, path: str, optional: bool = False) -> Any:

@@ -7,6 +7,7 @@ the disk is full, and leaves files that look whole when it is killed.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import io
 import json
 import types
@@ -313,13 +314,18 @@ def _to_json(value: Any) -> str:
     return json.dumps(dataclasses.asdict(value), separators=(",", ":"), sort_keys=True)
 
 
+@functools.cache
+def _hints(kind: Any) -> dict[str, Any]:
+    return typing.get_type_hints(kind)
+
+
 def _from_json(kind: type[T], text: str, where: str) -> T:
     """A flat dataclass from its JSON, every value checked against its declared type."""
     try:
         data = json.loads(text)
     except ValueError as error:
         raise BadInputError(f"{where} is not JSON: {error}") from error
-    hints = typing.get_type_hints(kind)
+    hints = _hints(kind)  # type: ignore[arg-type]  # a class can be hashed
     if not isinstance(data, dict) or not data.keys() <= hints.keys():
         keys = sorted(data) if isinstance(data, dict) else type(data).__name__
         raise BadInputError(f"{where} has {keys}, known are {sorted(hints)}")
