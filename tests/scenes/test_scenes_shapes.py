@@ -16,7 +16,8 @@ from physion.scenes.shapes import Shape, shape, shapes
 from physion.scenes.solids import Mesh, hull, solid_properties
 
 NAMES = [name for name in shapes.names() if not name.startswith("prop:")]
-# (low, high) of our axes, from the official model records: x, y = their z, z = their y.
+# (low, high) of our axes, from the official model records: x, y = their z, z = their y. The x of
+# ramps is mirrored there.
 BOUNDS = {
     "bowl": ((-0.4904, -0.4904, 0), (0.4904, 0.4904, 0.3789)),
     "cone": ((-0.4949, -0.5, 0), (0.4949, 0.5, 1)),
@@ -31,8 +32,8 @@ BOUNDS = {
     "sphere": ((-0.5, -0.5, 0), (0.5, 0.5, 1)),
     "torus": ((-0.625, -0.625, 0), (0.625, 0.625, 0.25)),
     "triangular_prism": ((-0.5, -0.5, 0), (0.5, 0.5, 0.933)),
-    "ramp_with_platform_30": ((-3.324, -1, 0), (1.629, 1, 1.0007)),
-    "ramp_with_platform_60": ((-1.650, -1, 0), (1.629, 1, 1.0003)),
+    "ramp_with_platform_30": ((-1.629, -1, 0), (3.324, 1, 1.0007)),
+    "ramp_with_platform_60": ((-1.629, -1, 0), (1.650, 1, 1.0003)),
 }
 VOLUMES = {
     "cube": 1.0,
@@ -178,8 +179,8 @@ def test_torus_agrees_with_the_record_of_its_colliders() -> None:
     assert sum(map(np.prod, boxes)) == pytest.approx(0.51461, rel=0.02)
 
 
-def test_ramp_falls_towards_minus_x() -> None:
-    points = np.array([[1.0, 0, 0.99], [-1.662, 0, 0.49], [-1.662, 0, 0.52]])
+def test_ramp_rises_towards_plus_x() -> None:
+    points = np.array([[3.2, 0, 0.99], [0.033, 0, 0.49], [0.033, 0, 0.52]])
     inside = contains(shape("ramp_with_platform_30").mesh, points)
     assert inside.tolist() == [True, True, False]
 

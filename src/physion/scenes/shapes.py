@@ -60,9 +60,10 @@ its chords, and with this corner thickness the pieces have the volume of the dra
 DUMBBELL_HEAD, DUMBBELL_BAR, DUMBBELL_HALF = 0.375, 0.12, 1.125
 """Radii of a dumbbell's two balls and of its bar, and half its length. Only the bounds are known;
 boxes round two balls and a bar of this radius add up to the record's 0.8873."""
-RAMP_PLATFORM, RAMP_DEPTH = 1.629, 2.0
-"""Length of the ramps' platform. The slope starts at the pivot and falls towards -x: its lengths
-3.324 and 1.650 are then those of slopes of 30 and 60 per cent."""
+RAMP_FOOT, RAMP_DEPTH = 1.629, 2.0
+"""Distance of the pivot from the foot of a ramp, and its width. The lengths in the records are
+those of slopes of 30 and 60 per cent and one platform of 1.61. The records put the foot at +x, but
+what comes to rest in front of the official ramps shows that it lies at -x."""
 BOWL_SEGMENTS = 24
 PIPE_SECTORS, BOWL_SECTORS, BOWL_BANDS = 16, 12, 3
 """Convex sectors that stand for a hollow shape in contacts, and bands of the bowl's wall."""
@@ -345,22 +346,20 @@ def _inside_bowl(wall: float, points: int) -> Outline:
 
 @shapes.register("ramp_with_platform_30")
 def _ramp_30() -> Shape:
-    return _ramp("ramp_with_platform_30", 4.9529 - RAMP_PLATFORM, 1.0007)
+    return _ramp("ramp_with_platform_30", 0.3, 4.9529, 1.0007)
 
 
 @shapes.register("ramp_with_platform_60")
 def _ramp_60() -> Shape:
-    return _ramp("ramp_with_platform_60", 3.2789 - RAMP_PLATFORM, 1.0003)
+    return _ramp("ramp_with_platform_60", 0.6, 3.2789, 1.0003)
 
 
-def _ramp(name: str, slope: float, height: float) -> Shape:
-    """A wedge that rises from x = -``slope`` to the pivot, then a level platform."""
-    side = [(-slope, 0.0), (0.0, 0.0), (RAMP_PLATFORM, 0.0), (RAMP_PLATFORM, height), (0.0, height)]
-    both = np.array([(x, y, z) for x, z in side for y in (-RAMP_DEPTH / 2, RAMP_DEPTH / 2)])
-    wedge = both[[0, 1, 2, 3, 8, 9]]
-    block_center = (RAMP_PLATFORM / 2, 0.0, height / 2)
-    block = primitive("box", block_center, (RAMP_PLATFORM / 2, RAMP_DEPTH / 2, height / 2))
-    return Shape(name, hull(both), (convex(wedge), block))
+def _ramp(name: str, grade: float, length: float, height: float) -> Shape:
+    """A slope that rises from its foot towards +x by ``grade``, then a level platform."""
+    foot, top, end = -RAMP_FOOT, height / grade - RAMP_FOOT, length - RAMP_FOOT
+    side = [(foot, 0.0), (top, height), (end, height), (end, 0.0)]
+    corners = [(x, y, z) for x, z in side for y in (-RAMP_DEPTH / 2, RAMP_DEPTH / 2)]
+    return _solid(name, hull(corners))
 
 
 def _solid(name: str, mesh: Mesh) -> Shape:
