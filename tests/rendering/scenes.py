@@ -22,7 +22,7 @@ ALL = ("color", "depth", "normals", "ids", "flow")
 @cache
 def _fine_sphere() -> Shape:
     ball = trimesh.creation.icosphere(subdivisions=5, radius=0.5)
-    vertices = np.asarray(ball.vertices) + (0.0, 0.0, 0.5)
+    vertices = np.asarray(ball.vertices) + np.array([0.0, 0.0, 0.5])
     mesh = Mesh(vertices, np.asarray(ball.faces, np.int32), math.radians(40))
     return Shape("test:fine_sphere", mesh, ())
 

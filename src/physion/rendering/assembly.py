@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from physion.physics.trajectory import Trajectory
 from physion.rendering.geometry import F32, F64, I32, Part, sheet, solid
-from physion.rendering.kernel import kernel
 from physion.rendering.rooms import Panel, Room
 from physion.rendering.shading import to_linear
 from physion.rendering.textures import Atlas, build_atlas, finish
@@ -164,18 +163,13 @@ def place(
         elif is_moving == moving and index < bodies:
             rotation = rotation_matrix(trajectory.rotations[frame, index])
             at = trajectory.positions[frame, index].astype(np.float64)
-            _move(
-                part.vertices,
-                part.normals,
-                rotation,
-                at,
-                vertices[piece.vertices],
-                normals[piece.triangles],
-            )
+            vertices[piece.vertices] = transform(part.vertices, rotation, at)
+            turned = transform(part.normals.reshape(-1, 3), rotation, np.zeros(3))
+            normals[piece.triangles] = turned.reshape(-1, 9)
         elif is_moving == moving:
             cloth = trajectory.cloth_vertices[frame, offset : offset + size].astype(np.float64)
             vertices[piece.vertices] = cloth
-            _sheet_normals(cloth, part.faces, normals[piece.triangles])
+            normals[piece.triangles] = _sheet_normals(cloth)
         if index >= bodies:
             offset += size
     return vertices, normals
@@ -193,50 +187,31 @@ def rotation_matrix(quaternion: NDArray[np.floating]) -> F64:
     )
 
 
-@kernel
-def _move(
-    vertices: F64, normals: F32, rotation: F64, position: F64, out: F64, out_normals: F32
-) -> None:
-    """Rotate and move vertices (V, 3); rotate corner normals (T, 9)."""
-    for i in range(vertices.shape[0]):
-        for k in range(3):
-            out[i, k] = (
-                rotation[k, 0] * vertices[i, 0]
-                + rotation[k, 1] * vertices[i, 1]
-                + rotation[k, 2] * vertices[i, 2]
-                + position[k]
-            )
-    for i in range(normals.shape[0]):
-        for c in range(0, 9, 3):
-            for k in range(3):
-                out_normals[i, c + k] = (
-                    rotation[k, 0] * normals[i, c]
-                    + rotation[k, 1] * normals[i, c + 1]
-                    + rotation[k, 2] * normals[i, c + 2]
-                )
+def transform(points: NDArray[np.floating], matrix: F64, shift: F64) -> F64:
+    """Apply a (3, 3) matrix and a shift (3,) to points (V, 3).
+
+    Written as sums of columns: a matrix product may round differently with the number of points.
+    """
+    x, y, z = (points[:, k : k + 1] for k in range(3))
+    return np.asarray(x * matrix[:, 0] + y * matrix[:, 1] + z * matrix[:, 2] + shift)
 
 
-@kernel
-def _sheet_normals(vertices: F64, faces: I32, out: F32) -> None:
-    """Corner normals (T, 9) of a sheet: means over the triangles at a vertex, by area."""
-    total = np.zeros((vertices.shape[0], 3))
-    for t in range(faces.shape[0]):
-        i, j, k = faces[t, 0], faces[t, 1], faces[t, 2]
-        ax, bx = vertices[j, 0] - vertices[i, 0], vertices[k, 0] - vertices[i, 0]
-        ay, by = vertices[j, 1] - vertices[i, 1], vertices[k, 1] - vertices[i, 1]
-        az, bz = vertices[j, 2] - vertices[i, 2], vertices[k, 2] - vertices[i, 2]
-        nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-        for c in range(3):
-            total[faces[t, c], 0] += nx
-            total[faces[t, c], 1] += ny
-            total[faces[t, c], 2] += nz
-    for t in range(faces.shape[0]):
-        for c in range(3):
-            i = faces[t, c]
-            nx, ny, nz = total[i, 0], total[i, 1], total[i, 2]
-            length = np.sqrt(nx * nx + ny * ny + nz * nz)
-            if length == 0.0:
-                nx, ny, nz, length = 0.0, 0.0, 1.0, 1.0
-            out[t, 3 * c] = nx / length
-            out[t, 3 * c + 1] = ny / length
-            out[t, 3 * c + 2] = nz / length
+def _sheet_normals(vertices: F64) -> F32:
+    """Corner normals (T, 9) of a square sheet: means over the triangles at a vertex, by area.
+
+    The triangles are those of `sheet`: all that lie left of the diagonals, then all others.
+    """
+    side = round(len(vertices) ** 0.5)
+    p = vertices.reshape(side, side, 3)
+    a, b, c, d = p[:-1, :-1], p[1:, :-1], p[1:, 1:], p[:-1, 1:]
+    left, right = np.cross(b - a, c - a), np.cross(c - a, d - a)
+    total = np.zeros_like(p)
+    total[:-1, :-1] += left + right
+    total[1:, :-1] += left
+    total[1:, 1:] += left + right
+    total[:-1, 1:] += right
+    length = np.linalg.norm(total, axis=-1, keepdims=True)
+    n = np.where(length > 0, total / np.where(length > 0, length, 1.0), (0.0, 0.0, 1.0))
+    a, b, c, d = n[:-1, :-1], n[1:, :-1], n[1:, 1:], n[:-1, 1:]
+    corners = [np.concatenate([a, b, c], -1), np.concatenate([a, c, d], -1)]
+    return np.concatenate([x.reshape(-1, 9) for x in corners]).astype(np.float32)

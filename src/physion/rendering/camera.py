@@ -102,7 +102,7 @@ class View:
         """World points (..., 3) seen at pixel coordinates (..., 2) at a planar depth (...)."""
         at = np.asarray(pixels, np.float64)
         rays = np.concatenate([at, np.ones_like(at[..., :1])], axis=-1) @ self.ray_matrix.T
-        return np.asarray(self.camera.position) + rays * np.asarray(depth)[..., None]
+        return np.asarray(np.asarray(self.camera.position) + rays * np.asarray(depth)[..., None])
 
     @property
     def ray_matrix(self) -> Floats:

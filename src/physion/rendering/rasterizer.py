@@ -30,19 +30,6 @@ NOTHING = -1
 """Triangle index of a sample where nothing is seen."""
 
 
-@kernel
-def transform(points: F64, matrix: F64, out: F64) -> None:
-    """Apply a (3, 4) matrix to points (V, 3)."""
-    for i in range(points.shape[0]):
-        for k in range(3):
-            out[i, k] = (
-                matrix[k, 0] * points[i, 0]
-                + matrix[k, 1] * points[i, 1]
-                + matrix[k, 2] * points[i, 2]
-                + matrix[k, 3]
-            )
-
-
 @step
 def _bounds(points: F64, face: I32, near: float) -> tuple[float, float, float, float]:
     """Smallest box of pixels around the part of a triangle that lies beyond ``near``."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from physion.errors import BadInputError, UnknownNameError
 from physion.physics.trajectory import Trajectory
-from physion.rendering.assembly import Assembly, assemble, place
+from physion.rendering.assembly import Assembly, assemble, place, transform
 from physion.rendering.camera import View
 from physion.rendering.rasterizer import (
     NOTHING,
@@ -23,13 +23,13 @@ from physion.rendering.rasterizer import (
     measure,
     rasterize,
     rasterize_depth,
-    transform,
 )
 from physion.rendering.rooms import Room, rooms
 from physion.rendering.shading import (
     BLOCK,
     POINT,
     Light,
+    ShadeMap,
     busy_blocks,
     pack_corners,
     shade,
@@ -86,11 +86,11 @@ class Settings:
     still_layer: bool = True
 
 
-class _Maps(NamedTuple):
+class _StillMap(NamedTuple):
     """World to texels (3, 4), and the map of what never moves (H, W)."""
 
     matrix: F64
-    still: F32
+    depth: F32
 
 
 class Renderer:
@@ -125,6 +125,11 @@ class Renderer:
         self._still_shading: F32 | None = None
         self._still_passes: tuple[F32, F32, NDArray[np.int16], F32] | None = None
 
+    @property
+    def triangles(self) -> int:
+        """How many triangles there are, the room's among them."""
+        return len(self._assembly.faces)
+
     def _check(self) -> None:
         scene, trajectory = self.scene, self.trajectory
         cloth = sum(c.resolution**2 for c in scene.cloths)
@@ -136,7 +141,7 @@ class Renderer:
                 f"{cloth} cloth vertices"
             )
 
-    def _still_maps(self) -> tuple[_Maps, _Maps]:
+    def _still_maps(self) -> tuple[_StillMap, _StillMap]:
         """Shadow and contact map over the region where the trial begins, with what never moves."""
         center, half = _region(self.scene)
         maps = []
@@ -146,14 +151,13 @@ class Renderer:
         ):
             still = np.full((size, size), np.inf, np.float32)
             self._draw_map(still, matrix, self._still_vertices, False)
-            maps.append(_Maps(matrix, still))
+            maps.append(_StillMap(matrix, still))
         return maps[0], maps[1]
 
     def _draw_map(self, depth: F32, matrix: F64, vertices: F64, moving: bool) -> None:
         """Add the moving bodies, or the others without the room, to a depth map."""
         assembly = self._assembly
-        points = np.empty_like(vertices)
-        transform(vertices, matrix, points)
+        points = transform(vertices, matrix[:, :3], matrix[:, 3])
         first, last = assembly.room_triangles, assembly.first_triangle
         if moving:
             first, last = assembly.first_triangle, len(assembly.faces)
@@ -164,11 +168,14 @@ class Renderer:
         assembly = self._assembly
         ids = np.full((self.height, self.width, len(SAMPLES)), NOTHING, np.int32)
         inverse = np.zeros(ids.shape, np.float32)
-        points = np.empty((assembly.vertex_count, 3))
-        transform(self._still_vertices, self._view.to_pixels, points)
+        points = self._to_pixels(self._still_vertices)
         still = assembly.faces[: assembly.first_triangle]
         self._draw(points, still, 0, ids, inverse)
         return ids, inverse, points
+
+    def _to_pixels(self, vertices: F64) -> F64:
+        matrix = self._view.to_pixels
+        return transform(vertices, matrix[:, :3], matrix[:, 3])
 
     def _draw(self, points: F64, faces: I32, first: int, ids: I32, inverse: F32) -> None:
         camera, two_sided = self.scene.camera, self._assembly.two_sided
@@ -191,7 +198,7 @@ class Renderer:
         normals += self._still_normals
         points = self._points.copy()
         first = assembly.first_vertex
-        transform(vertices[first:], self._view.to_pixels, points[first:])
+        points[first:] = self._to_pixels(vertices[first:])
         ids, inverse = self._ids.copy(), self._inverse.copy()
         self._draw(points, assembly.faces, assembly.first_triangle, ids, inverse)
         color = self._color(ids, vertices, normals) if "color" in passes else None
@@ -212,24 +219,27 @@ class Renderer:
             yield self.render(frame, passes)
 
     def _color(self, ids: I32, vertices: F64, normals: F32) -> NDArray[np.uint8]:
-        maps: list[NDArray[np.generic]] = []
-        for matrix, still in (self._shadow, self._contact):
-            depth = still.copy()
-            self._draw_map(depth, matrix, vertices, True)
-            maps += [matrix, depth, busy_blocks(depth)]
-        assembly = self._assembly
+        assembly, first = self._assembly, self._assembly.first_triangle
         corners = self._corners
-        corners[assembly.first_triangle :, :9] = normals[assembly.first_triangle :]
+        corners[first:, :9] = normals[first:]
+        surfaces = (self._edges, corners, assembly.surface, assembly.materials)
+        light = (self._sight, self._light, *self._map(self._shadow, vertices))
+        rest = (*self._map(self._contact, vertices), self._settings, self._tones)
         out = np.empty((self.height, self.width, 3), np.uint8)
-        surfaces = (self._edges, corners, assembly.surface, assembly.materials, *assembly.atlas)
-        light = (self._sight, self._light, *maps, self._settings, self._tones)
+        arrays = (*surfaces, *assembly.atlas, *light, *rest)
         if self._still_shading is None:
             still = np.zeros((self.height * self.width + 1, POINT), np.float32)
             if self._first:
-                shade(self._ids, self._first, True, *surfaces, *light, still, out)
+                shade(self._ids, self._first, True, *arrays, still, out)
             self._still_shading = still
-        shade(ids, self._first, False, *surfaces, *light, self._still_shading, out)
+        shade(ids, self._first, False, *arrays, self._still_shading, out)
         return out
+
+    def _map(self, still: _StillMap, vertices: F64) -> ShadeMap:
+        """The map of one instant: what never moves, and the moving bodies on top."""
+        depth = still.depth.copy()
+        self._draw_map(depth, still.matrix, vertices, True)
+        return ShadeMap(still.matrix, depth, busy_blocks(depth))
 
     def _measure(
         self, ids: I32, points: F64, normals: F32, frame: int, flow: bool
@@ -250,7 +260,7 @@ class Renderer:
             later = points.copy()
             vertices, _ = place(self._assembly, self.scene, self.trajectory, following, True)
             first = self._assembly.first_vertex
-            transform(vertices[first:], self._view.to_pixels, later[first:])
+            later[first:] = self._to_pixels(vertices[first:])
         out = (
             self._still_passes[0].copy(),
             self._still_passes[1].copy(),
@@ -310,7 +320,7 @@ def role_map(ids: NDArray[np.integer], scene: Scene) -> NDArray[np.uint8]:
     colors = np.zeros((len(scene.names()) + 1, 4), np.uint8)
     colors[scene.index(scene.roles.agent) + 1] = (255, 0, 0, 255)
     colors[scene.index(scene.roles.patient) + 1] = (255, 255, 0, 255)
-    return colors[ids]
+    return np.asarray(colors[ids])
 
 
 def _region(scene: Scene) -> tuple[F64, float]:

@@ -197,7 +197,7 @@ def _bright_room() -> Room:
     }
     walls = _four_walls(x, y, height)
     for index, wall in enumerate(walls):
-        panels += _wall(*wall, doors[index], **WHITE)
+        panels += _wall(wall[0], wall[1], wall[2], doors[index], **WHITE)
         for opening in doors[index]:
             panels += _reveal(*wall, opening, 0.25, color=(0.86, 0.86, 0.87))
     for index, opening in ((0, doors[0][0]), (1, doors[1][0]), (3, doors[3][0])):

@@ -93,20 +93,22 @@ def build_atlas(names: tuple[str, ...]) -> Atlas:
 def _levels(name: str) -> tuple[U8, ...]:
     """Mip levels of one texture, each (side * side, 5) bytes, averaged in linear light."""
     albedo, height = PAINTERS[name](np.random.default_rng(list(name.encode())))
-    slope_u = (np.roll(height, -1, 1) - np.roll(height, 1, 1)) * (SIZE / 2)
-    slope_v = (np.roll(height, -1, 0) - np.roll(height, 1, 0)) * (SIZE / 2)
-    image = np.concatenate([albedo, slope_u[..., None], slope_v[..., None]], axis=-1)
-    image = image.astype(np.float32)
+    image = np.empty((5, SIZE, SIZE), np.float32)
+    image[:3] = np.moveaxis(albedo, -1, 0)
+    image[3] = (np.roll(height, -1, 1) - np.roll(height, 1, 1)) * (SIZE / 2)
+    image[4] = (np.roll(height, -1, 0) - np.roll(height, 1, 0)) * (SIZE / 2)
     levels = []
     for _ in range(LEVELS):
         stored = np.empty_like(image)
-        stored[..., :3] = np.sqrt(np.clip(image[..., :3], 0.0, 1.0)) * 255.0
-        stored[..., 3:] = 128.0 + SLOPE_SCALE * image[..., 3:]
-        levels.append(np.clip(np.round(stored), 0, 255).astype(np.uint8).reshape(-1, 5))
-        if len(image) > 1:
-            image = 0.25 * (
-                image[::2, ::2] + image[1::2, ::2] + image[::2, 1::2] + image[1::2, 1::2]
-            )
+        np.multiply(np.sqrt(image[:3]), 255.0, out=stored[:3])
+        np.multiply(image[3:], SLOPE_SCALE, out=stored[3:])
+        stored[3:] += 128.0
+        stored += 0.5
+        np.clip(stored, 0.0, 255.0, out=stored)
+        levels.append(np.moveaxis(stored.astype(np.uint8), 0, -1).reshape(-1, 5))
+        if image.shape[1] > 1:
+            rows = image[:, ::2] + image[:, 1::2]
+            image = np.float32(0.25) * (rows[:, :, ::2] + rows[:, :, 1::2])
     return tuple(levels)
 
 
