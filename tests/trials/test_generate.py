@@ -210,6 +210,40 @@ def test_a_full_disk_stops_the_run_at_once(tmp_path: Path, monkeypatch: pytest.M
     assert counter.calls == 8, "no later trial is tried"
 
 
+LIMITED = """
+import resource, sys
+sys.path.insert(0, sys.argv[2])
+from pathlib import Path
+from hand_made import make_by_hand, make_scene
+from physion.compute.local import SerialExecutor
+from physion.errors import PhysionError
+from physion.trials.generate import generate
+from physion.trials.plan import plan_scenes
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+tasks = plan_scenes("tests", [make_scene("a")])
+try:
+    generate(Path(sys.argv[1]), tasks, make=make_by_hand, executor=SerialExecutor())
+except PhysionError as error:
+    print(error)
+    sys.exit(error.exit_code)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs resource limits")
+def test_the_system_refusing_to_write_more_is_an_error_and_not_a_crash(
+    finished: Path, tmp_path: Path
+) -> None:
+    """A real refusal in the middle of a file: libraries that write by themselves crash here."""
+    arguments = [str(tmp_path / "s"), str(Path(__file__).parent)]
+    done = subprocess.run(
+        [sys.executable, "-c", LIMITED, *arguments], capture_output=True, text=True
+    )
+    assert done.returncode == 2 and "File too large" in done.stdout, done.stderr
+    check_only_whole_files(tmp_path / "s")
+    run(tmp_path / "s", scenes_named("a", "b", "c", "d"))
+    assert tree_digest(tmp_path / "s") == tree_digest(finished)
+
+
 KILLED = """
 import sys
 from pathlib import Path

@@ -25,7 +25,7 @@ from physion.trials.plan import Job, Settings, Task, check_names
 Track = Callable[[Iterable[Outcome[Any]], str, int], Iterator[Outcome[Any]]]
 """Passes outcomes on and shows how far it is, as `physion.cli.output.track` does."""
 
-_HOPELESS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EIO}
+_HOPELESS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EIO}
 """System errors that every later trial would meet too."""
 
 
