@@ -53,8 +53,8 @@ class MujocoEngine:
             raise BadInputError(f"frames must be at least 1, not {frames}")
         run = RigidRun(scene, self.settings, start)
         limit = scene.ending.max_frames if frames is None else frames
-        while len(run.positions) < limit:
-            if frames is None and len(run.positions) >= scene.ending.min_frames and run.all_asleep():
+        while len(run.history) < limit:
+            if frames is None and len(run.history) >= scene.ending.min_frames and run.all_asleep():
                 break
             run.step()
         return run.trajectory(self.name)
@@ -77,16 +77,16 @@ class RigidRun:
         self.counter = np.full(actors, settings.wake_time)
         self.still_v, self.still_w = np.zeros((actors, 3)), np.zeros((actors, 3))
         self.asleep = np.zeros(actors, np.bool_)
-        self.positions: list[Array] = []
-        self.rotations: list[Array] = []
-        self.velocities: list[Array] = []
-        self.spins: list[Array] = []
+        self.history: list[Array] = [self._actors()]
         self.record = ContactRecord()
-        self._note()
 
     def step(self) -> None:
         """Move by one frame."""
         s, model = self.settings, self.model
+        if self.asleep.all() and all(push.frame != self.frame for push in self.scene.pushes):
+            self.frame += 1
+            self.history.append(self.history[-1])
+            return
         contacts, pairs = self.finder.find(self.x, self.q)
         self._push()
         island = find_islands(contacts.bodies, model.actors)
@@ -111,34 +111,39 @@ class RigidRun:
         self.v[:-1][self.asleep] = 0.0
         self.w[:-1][self.asleep] = 0.0
         self.frame += 1
-        self.record.add(len(self.positions), contacts, pairs, load)
-        self._note()
+        self.record.add(len(self.history), contacts, pairs, load)
+        self.history.append(self._actors())
 
     def all_asleep(self) -> bool:
         """Every body sleeps that has not fallen below the floor of the ending."""
-        above = self.pivots()[:, 2] >= self.scene.ending.floor
-        counted = np.unique(self.model.actor_of[above])
-        return bool(np.append(self.asleep, True)[counted].all())
-
-    def pivots(self) -> Array:
-        """World positions of all bodies (N, 3)."""
+        if self.asleep.all():
+            return True
         own = self.model.actor_of
-        return self.x[own] + rotate_vectors(self.q[own], self.model.pivot)
+        height = (self.x[own] + rotate_vectors(self.q[own], self.model.pivot))[:, 2]
+        counted = np.unique(own[height >= self.scene.ending.floor])
+        return bool(np.append(self.asleep, True)[counted].all())
 
     def trajectory(self, engine: str) -> Trajectory:
         """All frames so far."""
-        frames = len(self.positions)
+        model = self.model
+        frames = len(self.history)
+        of_body = np.asarray(self.history)[:, model.actor_of]
+        x, q, v, w = np.split(of_body, [3, 7, 10], axis=2)
+        arm = rotate_vectors(q, model.center)
         return Trajectory(
-            positions=np.asarray(self.positions, np.float32),
-            rotations=np.asarray(self.rotations, np.float32),
-            velocities=np.asarray(self.velocities, np.float32),
-            angular_velocities=np.asarray(self.spins, np.float32),
+            positions=(x + rotate_vectors(q, model.pivot)).astype(np.float32),
+            rotations=multiply_quaternions(q, model.turn).astype(np.float32),
+            velocities=(v + np.cross(w, arm)).astype(np.float32),
+            angular_velocities=w.astype(np.float32),
             cloth_vertices=np.zeros((frames, 0, 3), np.float32),
             cloth_distance=np.full(frames, np.nan, np.float32),
             contacts=self.record.contacts(),
             completed=self.all_asleep(),
             engine=engine,
         )
+
+    def _actors(self) -> Array:
+        return np.concatenate([self.x, self.q, self.v, self.w], axis=1)
 
     def _push(self) -> None:
         for push in self.scene.pushes:
@@ -166,15 +171,6 @@ class RigidRun:
         self.w[:-1] *= keep[:, 1:]
         speed = np.linalg.norm(self.w, axis=1, keepdims=True)
         self.w *= np.minimum(1.0, s.max_angular_velocity / np.maximum(speed, 1e-12))
-
-    def _note(self) -> None:
-        own, model = self.model.actor_of, self.model
-        turned = self.q[own]
-        arm = rotate_vectors(turned, model.center)
-        self.positions.append(self.pivots())
-        self.rotations.append(multiply_quaternions(turned, model.turn))
-        self.velocities.append(self.v[own] + np.cross(self.w[own], arm))
-        self.spins.append(self.w[own])
 
     def _take(self, start: State) -> None:
         """Set the actors from the state of the first body of each."""
