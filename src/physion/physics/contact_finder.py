@@ -10,14 +10,15 @@ from numba import njit
 from numpy.typing import NDArray
 
 from physion.physics.contact_solver import ContactSet, rotation_matrix
+from physion.physics.manifold import MANIFOLD_SIZE, WITNESS, face_contacts, spread_points
 from physion.physics.rigid_model import RigidModel
 from physion.physics.settings import Settings
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-MANIFOLD_SIZE = 4
-"""Points that PhysX keeps of a pair of convex shapes."""
+PARALLEL = 0.9
+"""Cosine between a face and the contact normal above which faces are clipped."""
 
 
 class ContactFinder:
@@ -46,7 +47,7 @@ class ContactFinder:
         mujoco.mj_collision(self.physics, self.data)
         found = self.data.contact
         geoms = self.geom_of[found.geom] if self.data.ncon else np.zeros((0, 2), np.int64)
-        arrays, pairs = _merge(
+        arrays, pairs = _collect(
             geoms,
             np.asarray(found.dist).reshape(-1),
             np.asarray(found.pos).reshape(-1, 3),
@@ -56,17 +57,21 @@ class ContactFinder:
             model.actor_of,
             model.vertices,
             model.first_vertex,
+            model.loops,
+            model.first_loop,
+            model.first_face,
             model.material,
             x,
             q,
             self.reach,
             self.floor,
+            PARALLEL,
         )
         return ContactSet(*arrays), pairs
 
 
 @njit(cache=True)
-def _merge(
+def _collect(
     geoms: Any,
     distance: Any,
     position: Any,
@@ -76,72 +81,98 @@ def _merge(
     actor_of: Any,
     vertices: Any,
     first_vertex: Any,
+    loops: Any,
+    first_loop: Any,
+    first_face: Any,
     material: Any,
     x: Any,
     q: Any,
     reach: float,
     height: float,
+    parallel: float,
 ) -> Any:
-    """Both kinds of contact, sorted by pair of geoms; the floor counts as a last geom."""
+    """Contacts between geoms and with the floor, sorted by pair; the floor is the last geom."""
     total = len(geom_body)
-    floor = np.int64(total)
-    room = len(geoms) + MANIFOLD_SIZE * len(moving_geoms)
-    key = np.zeros(room, np.int64)
-    pair = np.zeros((room, 2), np.int64)
-    actor = np.zeros((room, 2), np.int64)
-    normal, point = np.zeros((room, 3)), np.zeros((room, 3))
-    separation, rubbing = np.zeros(room), np.zeros((room, 3))
-    used = 0
-    for c in range(len(geoms)):
-        if distance[c] >= reach:
-            continue
-        g, h = geoms[c, 0], geoms[c, 1]
-        sign = 1.0
-        if g > h:
-            g, h = h, g
-            sign = -1.0
-        a, b = geom_body[g], geom_body[h]
-        key[used] = g * (total + 1) + h
-        pair[used, 0], pair[used, 1] = a, b
-        actor[used, 0], actor[used, 1] = actor_of[a], actor_of[b]
-        for i in range(3):
-            normal[used, i] = sign * frame[c, i]
-            point[used, i] = position[c, i]
-            rubbing[used, i] = 0.5 * (material[a, i] + material[b, i])
-        separation[used] = distance[c]
-        used += 1
     still = len(x) - 1
+    rot = np.zeros((still + 1, 3, 3))
+    for a in range(still + 1):
+        rot[a] = rotation_matrix(q[a])
+    room = MANIFOLD_SIZE * (len(geoms) + len(moving_geoms)) + len(geoms)
+    pair = np.zeros((room, 2), np.int64)
+    normal, point, separation = np.zeros((room, 3)), np.zeros((room, 3)), np.zeros(room)
+    used = 0
+    start = 0
+    while start < len(geoms):
+        g, h = geoms[start, 0], geoms[start, 1]
+        stop = start
+        deepest = start
+        while stop < len(geoms) and geoms[stop, 0] == g and geoms[stop, 1] == h:
+            if distance[stop] < distance[deepest]:
+                deepest = stop
+            stop += 1
+        sign = 1.0 if g < h else -1.0
+        low, high = min(g, h), max(g, h)
+        n = sign * frame[deepest, :3]
+        half = 0.5 * distance[deepest] * n
+        a, b = actor_of[geom_body[low]], actor_of[geom_body[high]]
+        if distance[deepest] < reach:
+            along, points, gaps = face_contacts(
+                vertices,
+                loops,
+                first_loop,
+                first_face[low : low + 2],
+                first_face[high : high + 2],
+                rot[a],
+                x[a],
+                rot[b],
+                x[b],
+                n,
+                position[deepest] - half,
+                position[deepest] + half,
+                reach,
+                WITNESS,
+                parallel,
+            )
+            for k in range(len(points)):
+                pair[used, 0], pair[used, 1] = low, high
+                normal[used], point[used], separation[used] = along, points[k], gaps[k]
+                used += 1
+            if len(points) == 0:
+                for c in range(start, stop):
+                    if distance[c] < reach:
+                        pair[used, 0], pair[used, 1] = low, high
+                        normal[used] = sign * frame[c, :3]
+                        point[used], separation[used] = position[c], distance[c]
+                        used += 1
+        start = stop
     for g in moving_geoms:
-        body = geom_body[g]
-        a = actor_of[body]
+        a = actor_of[geom_body[g]]
         corners = vertices[first_vertex[g] : first_vertex[g + 1]]
-        points = touching_floor(corners, x[a], q[a], height, reach)
+        points = touching_floor(corners, x[a], rot[a], height, reach)
         for k in range(len(points)):
-            key[used] = g * (total + 1) + floor
-            pair[used, 0], pair[used, 1] = body, -1
-            actor[used, 0], actor[used, 1] = a, still
+            pair[used, 0], pair[used, 1] = g, total
             normal[used, 2] = -1.0
-            for i in range(3):
-                point[used, i] = points[k, i]
-                rubbing[used, i] = 0.5 * (material[body, i] + material[-1, i])
-            separation[used] = points[k, 2] - height
+            point[used], separation[used] = points[k], points[k, 2] - height
             used += 1
-    order = np.argsort(key[:used], kind="mergesort")
-    contacts = (
-        key[order],
-        actor[order],
-        normal[order],
-        point[order],
-        separation[order],
-        rubbing[order],
-    )
-    return contacts, pair[order]
+    key = pair[:used, 0] * (total + 1) + pair[:used, 1]
+    order = np.argsort(key, kind="mergesort")
+    bodies, actor = np.zeros((used, 2), np.int64), np.zeros((used, 2), np.int64)
+    rubbing = np.zeros((used, 3))
+    for k in range(used):
+        for side in range(2):
+            g = pair[order[k], side]
+            body = geom_body[g] if g < total else np.int64(-1)
+            bodies[k, side] = body
+            actor[k, side] = actor_of[body] if g < total else still
+            for i in range(3):
+                rubbing[k, i] += 0.5 * material[body, i]
+    contacts = (key[order], actor, normal[order], point[order], separation[order], rubbing)
+    return contacts, bodies
 
 
 @njit(cache=True)
-def touching_floor(corners: Any, x: Any, q: Any, height: float, reach: float) -> Any:
+def touching_floor(corners: Any, x: Any, rot: Any, height: float, reach: float) -> Any:
     """World positions of at most four corners lower than ``reach`` above the floor."""
-    rot = rotation_matrix(q)
     low = np.zeros((len(corners), 3))
     used = 0
     for c in range(len(corners)):
@@ -157,40 +188,3 @@ def touching_floor(corners: Any, x: Any, q: Any, height: float, reach: float) ->
     if used <= MANIFOLD_SIZE:
         return low[:used]
     return low[spread_points(low[:used], low[:used, 2])]
-
-
-@njit(cache=True)
-def spread_points(points: Any, separation: Any) -> Any:
-    """Indices of four points that represent all: the deepest, then the ones farthest apart."""
-    chosen = np.zeros(4, np.int64)
-    chosen[0] = np.argmin(separation)
-    best = -1.0
-    for i in range(len(points)):
-        d = np.sum((points[i] - points[chosen[0]]) ** 2)
-        if d > best:
-            best = d
-            chosen[1] = i
-    a, b = points[chosen[0]], points[chosen[1]]
-    along = b - a
-    length = max(np.sum(along**2), 1e-20)
-    # Third and fourth: farthest from the line through the first two, on either side.
-    reference = np.zeros(3)
-    best = -1.0
-    for i in range(len(points)):
-        p = points[i] - a
-        off = p - along * (np.sum(p * along) / length)
-        d = np.sum(off**2)
-        if d > best:
-            best = d
-            chosen[2] = i
-            reference = off
-    best = -np.inf
-    for i in range(len(points)):
-        p = points[i] - a
-        off = p - along * (np.sum(p * along) / length)
-        d = -np.sum(off * reference)
-        if d > best:
-            best = d
-            chosen[3] = i
-    unique = np.unique(chosen)
-    return unique

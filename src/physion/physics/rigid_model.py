@@ -39,6 +39,8 @@ class RigidModel:
       mass in its actor's frame (the world frame for kinematic bodies).
     - ``geom_body`` (G,): body of each geom.
     - ``vertices`` (V, 3): corners in the actor's frame; ``first_vertex`` (G + 1,) says whose.
+    - ``loops`` (L,): corner numbers round every face; ``first_loop`` (F + 1,) says whose;
+      ``first_face`` (G + 1,) says which faces a geom has.
     - ``material`` (N + 1, 3): static and dynamic friction, restitution; the last is the floor.
     - ``start_x`` (A + 1, 3), ``start_q`` (A + 1, 4): poses of the actors in the scene.
     """
@@ -53,6 +55,9 @@ class RigidModel:
     geom_body: Index
     vertices: Array
     first_vertex: Index
+    loops: Index
+    first_loop: Index
+    first_face: Index
     material: Array
     start_x: Array
     start_q: Array
@@ -111,11 +116,6 @@ def group_bodies(scene: Scene) -> list[list[int]]:
     return list(groups.values())
 
 
-def body_hulls(body: Body) -> list[Array]:
-    """Corners of the convex pieces of a body, scaled, in its own axes about its pivot."""
-    return [np.asarray(hull, dtype=np.float64) for hull in collision_hulls(body.shape, body.scale)]
-
-
 def build_model(scene: Scene, settings: Settings) -> RigidModel:
     """Work out masses, frames and geoms of a scene and compile MuJoCo's collision model."""
     groups = group_bodies(scene)
@@ -123,8 +123,11 @@ def build_model(scene: Scene, settings: Settings) -> RigidModel:
     positions = np.array([b.position for b in scene.bodies], dtype=np.float64).reshape(-1, 3)
     turns = np.array([b.rotation for b in scene.bodies], dtype=np.float64).reshape(-1, 4)
     turns = turns / np.linalg.norm(turns, axis=1, keepdims=True)
-    hulls = [[] if body.scenery else body_hulls(body) for body in scene.bodies]
-    masses = [hull_mass(pieces, b.mass) for pieces, b in zip(hulls, scene.bodies, strict=True)]
+    hulls = [[] if b.scenery else collision_hulls(b.shape, b.scale) for b in scene.bodies]
+    masses = [
+        hull_mass([piece.corners for piece in pieces], body.mass)
+        for pieces, body in zip(hulls, scene.bodies, strict=True)
+    ]
     actor_of = np.full(count, actors, np.int64)
     pivot, turn = positions.copy(), turns.copy()
     center = positions + rotate_vectors(turns, np.array([m.center for m in masses]))
@@ -151,9 +154,13 @@ def build_model(scene: Scene, settings: Settings) -> RigidModel:
     ).reshape(-1, 2)
     geom_body = [i for i, pieces in enumerate(hulls) for _ in pieces]
     corners = [
-        pivot[i] + rotate_vectors(turn[i], piece) for i, pieces in enumerate(hulls) for piece in pieces
+        pivot[i] + rotate_vectors(turn[i], piece.corners)
+        for i, pieces in enumerate(hulls)
+        for piece in pieces
     ]
-    sizes = np.array([0, *(len(c) for c in corners)], np.int64)
+    geoms = [piece for pieces in hulls for piece in pieces]
+    first_vertex = np.cumsum([0, *(len(c) for c in corners)])
+    loops = [face + start for g, start in zip(geoms, first_vertex, strict=False) for face in g.faces]
     contacts = [b.contact for b in scene.bodies] + [settings.floor]
     return RigidModel(
         inv_mass=inv_mass,
@@ -165,7 +172,10 @@ def build_model(scene: Scene, settings: Settings) -> RigidModel:
         center=center,
         geom_body=np.array(geom_body, np.int64),
         vertices=np.concatenate(corners) if corners else np.zeros((0, 3)),
-        first_vertex=np.cumsum(sizes),
+        first_vertex=first_vertex,
+        loops=np.concatenate(loops) if loops else np.zeros(0, np.int64),
+        first_loop=np.cumsum([0, *(len(loop) for loop in loops)]),
+        first_face=np.cumsum([0, *(len(geom.faces) for geom in geoms)]),
         material=np.array([[c.static_friction, c.dynamic_friction, c.restitution] for c in contacts]),
         start_x=start_x,
         start_q=start_q,

@@ -1,0 +1,307 @@
+"""Contact manifolds of two convex hulls, built from the faces that look at each other.
+
+MuJoCo says which pieces are close and along which normal. PhysX then takes the face of each hull
+that looks along the normal, clips one against the other, and keeps up to four points; where two
+faces are nearly parallel this finds more of the touching area than MuJoCo does, in particular the
+corners of a facet of a ball that rests on a box.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+MANIFOLD_SIZE = 4
+"""Points that PhysX keeps of a pair of convex shapes."""
+MAX_POINTS = 128
+WITNESS = 0.01
+"""Metres: a face is considered only if its plane passes this close to the closest point (PhysX)."""
+
+
+def hull_faces(corners: Array) -> list[Index]:
+    """Corner numbers of every flat face of a convex hull, in order round the face."""
+    hull = ConvexHull(corners)
+    size = float(np.ptp(corners, axis=0).max())
+    normals, offsets = hull.equations[:, :3], hull.equations[:, 3]
+    face_of = np.full(len(normals), -1)
+    faces: list[Index] = []
+    for t in range(len(normals)):
+        if face_of[t] >= 0:
+            continue
+        same = (normals @ normals[t] > 1 - 1e-7) & (np.abs(offsets - offsets[t]) < 1e-5 * size)
+        # Triangles of one plane are one face.
+        same &= face_of < 0
+        face_of[same] = len(faces)
+        used = np.unique(hull.simplices[same])
+        points = corners[used] - corners[used].mean(axis=0)
+        normal = normals[t]
+        first = points[0] - normal * (points[0] @ normal)
+        first /= np.linalg.norm(first)
+        second = np.cross(normal, first)
+        faces.append(used[np.argsort(np.arctan2(points @ second, points @ first))].astype(np.int64))
+    return faces
+
+
+@njit(cache=True)
+def facing(
+    corners: Any,
+    loops: Any,
+    first_loop: Any,
+    start: int,
+    stop: int,
+    rot: Any,
+    x: Any,
+    normal: Any,
+    witness: Any,
+    tolerance: float,
+) -> Any:
+    """The face (of ``start``..``stop``) that looks most along ``normal`` near ``witness``.
+
+    Returns its number, its world normal, and how well it looks that way (cosine). Faces whose
+    plane is farther than ``tolerance`` from the witness are taken only if no face is closer.
+    """
+    local = np.zeros(3)
+    seen = np.zeros(3)
+    for i in range(3):
+        for j in range(3):
+            local[i] += rot[j, i] * normal[j]
+            seen[i] += rot[j, i] * (witness[j] - x[j])
+    best = -2.0
+    chosen = start
+    chosen_normal = np.zeros(3)
+    for strict in range(2):
+        for f in range(start, stop):
+            p = corners[loops[first_loop[f]]]
+            n = face_normal(corners, loops, first_loop, f)
+            away = 0.0
+            cosine = 0.0
+            for i in range(3):
+                away += (seen[i] - p[i]) * n[i]
+                cosine += n[i] * local[i]
+            if strict == 0 and abs(away) > tolerance:
+                continue
+            if cosine > best:
+                best = cosine
+                chosen = f
+                chosen_normal = n
+        if best > -2.0:
+            break
+    return chosen, rot @ chosen_normal, best
+
+
+@njit(cache=True)
+def face_normal(corners: Any, loops: Any, first_loop: Any, f: int) -> Any:
+    """Unit normal of a face, outward, from its first corner and the two that span most."""
+    a = corners[loops[first_loop[f]]]
+    total = np.zeros(3)
+    for k in range(first_loop[f] + 1, first_loop[f + 1] - 1):
+        u = corners[loops[k]] - a
+        w = corners[loops[k + 1]] - a
+        total[0] += u[1] * w[2] - u[2] * w[1]
+        total[1] += u[2] * w[0] - u[0] * w[2]
+        total[2] += u[0] * w[1] - u[1] * w[0]
+    return total / np.sqrt(np.sum(total**2))
+
+
+@njit(cache=True)
+def _flatten(
+    corners: Any, loops: Any, start: int, stop: int, rot: Any, x: Any, axes: Any
+) -> Any:
+    """Corners of a face as (u, v, height) along the three ``axes``."""
+    out = np.zeros((stop - start, 3))
+    for k in range(start, stop):
+        c = corners[loops[k]]
+        world = np.zeros(3)
+        for i in range(3):
+            world[i] = x[i]
+            for j in range(3):
+                world[i] += rot[i, j] * c[j]
+        for i in range(3):
+            out[k - start, i] = axes[i, 0] * world[0] + axes[i, 1] * world[1] + axes[i, 2] * world[2]
+    return out
+
+
+@njit(cache=True)
+def _inside(polygon: Any, u: float, v: float, slack: float) -> Any:
+    """Whether (u, v) lies in a convex polygon of either winding."""
+    sign = 0.0
+    n = len(polygon)
+    for i in range(n):
+        a, b = polygon[i], polygon[(i + 1) % n]
+        area = (b[0] - a[0]) * (v - a[1]) - (b[1] - a[1]) * (u - a[0])
+        if abs(area) <= slack:
+            continue
+        if sign == 0.0:
+            sign = area
+        elif sign * area < 0:
+            return False
+    return True
+
+
+@njit(cache=True)
+def clip_faces(reference: Any, incident: Any, reach: float) -> Any:
+    """Points (K, 4) where two flattened faces come closer than ``reach``.
+
+    Columns: u, v, the height of the incident face there, and its height above the reference face.
+    """
+    out = np.zeros((MAX_POINTS, 4))
+    used = 0
+    height = reference[0, 2]
+    slack = 1e-12
+    m, n = len(incident), len(reference)
+    low = np.zeros(m, np.bool_)
+    inside = 0
+    for i in range(m):
+        p = incident[i]
+        low[i] = p[2] - height < reach
+        if low[i] and _inside(reference, p[0], p[1], slack) and used < MAX_POINTS:
+            inside += 1
+            out[used, 0], out[used, 1], out[used, 2], out[used, 3] = p[0], p[1], p[2], p[2] - height
+            used += 1
+    if inside == m:
+        return out[:used]
+    # The incident plane as height = h0 + gu u + gv v.
+    nu = nv = nw = 0.0
+    for i in range(1, m - 1):
+        a0, a1, a2 = incident[i] - incident[0]
+        b0, b1, b2 = incident[i + 1] - incident[0]
+        nu += a1 * b2 - a2 * b1
+        nv += a2 * b0 - a0 * b2
+        nw += a0 * b1 - a1 * b0
+    inside = 0
+    if abs(nw) > 1e-12:
+        for i in range(n):
+            u, v = reference[i, 0], reference[i, 1]
+            if not _inside(incident, u, v, slack):
+                continue
+            z = incident[0, 2] - (nu * (u - incident[0, 0]) + nv * (v - incident[0, 1])) / nw
+            if z - height < reach and used < MAX_POINTS:
+                inside += 1
+                out[used, 0], out[used, 1], out[used, 2], out[used, 3] = u, v, z, z - height
+                used += 1
+        if inside == n:
+            return out[:used]
+    for i in range(m):
+        a, b = incident[i - 1], incident[i]
+        if not (low[i - 1] or low[i]):
+            continue
+        for j in range(n):
+            c, d = reference[j - 1], reference[j]
+            a1 = (d[0] - c[0]) * (a[1] - c[1]) - (d[1] - c[1]) * (a[0] - c[0])
+            a2 = (d[0] - c[0]) * (b[1] - c[1]) - (d[1] - c[1]) * (b[0] - c[0])
+            if a1 * a2 >= 0:
+                continue
+            a3 = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+            a4 = (b[0] - a[0]) * (d[1] - a[1]) - (b[1] - a[1]) * (d[0] - a[0])
+            if a3 * a4 >= 0:
+                continue
+            t = a1 / (a1 - a2)
+            z = a[2] + t * (b[2] - a[2])
+            if z - height < reach and used < MAX_POINTS:
+                out[used, 0] = a[0] + t * (b[0] - a[0])
+                out[used, 1] = a[1] + t * (b[1] - a[1])
+                out[used, 2] = z
+                out[used, 3] = z - height
+                used += 1
+    return out[:used]
+
+
+@njit(cache=True)
+def face_contacts(
+    corners: Any,
+    loops: Any,
+    first_loop: Any,
+    faces_a: Any,
+    faces_b: Any,
+    rot_a: Any,
+    x_a: Any,
+    rot_b: Any,
+    x_b: Any,
+    normal: Any,
+    point_a: Any,
+    point_b: Any,
+    reach: float,
+    tolerance: float,
+    parallel: float,
+) -> Any:
+    """Manifold of two hulls whose closest points are ``point_a``, ``point_b`` along ``normal``.
+
+    Returns normal (from a to b), points (K, 3) and separations (K,); K is 0 where the faces do
+    not look along the normal well enough (cosine below ``parallel``) or do not overlap.
+    """
+    face_a, na, look_a = facing(
+        corners, loops, first_loop, faces_a[0], faces_a[1], rot_a, x_a, normal, point_a, tolerance
+    )
+    face_b, nb, look_b = facing(
+        corners, loops, first_loop, faces_b[0], faces_b[1], rot_b, x_b, -normal, point_b, tolerance
+    )
+    b_leads = look_b >= look_a
+    lead = nb if b_leads else na
+    if max(look_a, look_b) < parallel:
+        return normal, np.zeros((0, 3)), np.zeros(0)
+    axes = np.zeros((3, 3))
+    axes[2] = lead
+    i = np.argmin(np.abs(lead))
+    axes[0, i] = 1.0
+    axes[0] -= lead * lead[i]
+    axes[0] /= np.sqrt(np.sum(axes[0] ** 2))
+    axes[1, 0] = lead[1] * axes[0, 2] - lead[2] * axes[0, 1]
+    axes[1, 1] = lead[2] * axes[0, 0] - lead[0] * axes[0, 2]
+    axes[1, 2] = lead[0] * axes[0, 1] - lead[1] * axes[0, 0]
+    flat_a = _flatten(corners, loops, first_loop[face_a], first_loop[face_a + 1], rot_a, x_a, axes)
+    flat_b = _flatten(corners, loops, first_loop[face_b], first_loop[face_b + 1], rot_b, x_b, axes)
+    found = clip_faces(flat_b, flat_a, reach) if b_leads else clip_faces(flat_a, flat_b, reach)
+    points = np.zeros((len(found), 3))
+    for k in range(len(found)):
+        # Half way between both surfaces.
+        middle = found[k, 2] - 0.5 * found[k, 3]
+        for i in range(3):
+            points[k, i] = found[k, 0] * axes[0, i] + found[k, 1] * axes[1, i] + middle * axes[2, i]
+    separation = found[:, 3].copy()
+    if len(found) > MANIFOLD_SIZE:
+        chosen = spread_points(points, separation)
+        points, separation = points[chosen], separation[chosen]
+    return (-lead if b_leads else lead), points, separation
+
+
+@njit(cache=True)
+def spread_points(points: Any, separation: Any) -> Any:
+    """Indices of up to four points that stand for all: the deepest, then the farthest apart."""
+    chosen = np.zeros(4, np.int64)
+    chosen[0] = np.argmin(separation)
+    best = -1.0
+    for i in range(len(points)):
+        d = np.sum((points[i] - points[chosen[0]]) ** 2)
+        if d > best:
+            best = d
+            chosen[1] = i
+    a, b = points[chosen[0]], points[chosen[1]]
+    along = b - a
+    length = max(np.sum(along**2), 1e-20)
+    reference = np.zeros(3)
+    best = -1.0
+    for i in range(len(points)):
+        p = points[i] - a
+        off = p - along * (np.sum(p * along) / length)
+        d = np.sum(off**2)
+        if d > best:
+            best = d
+            chosen[2] = i
+            reference = off
+    # The fourth lies on the other side of the line through the first two.
+    best = -np.inf
+    for i in range(len(points)):
+        p = points[i] - a
+        off = p - along * (np.sum(p * along) / length)
+        d = -np.sum(off * reference)
+        if d > best:
+            best = d
+            chosen[3] = i
+    return np.unique(chosen)
