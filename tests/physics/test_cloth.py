@@ -245,11 +245,17 @@ def test_a_state_can_be_gone_on_from() -> None:
         simulate_cloth(scene, positions[:, 0], rotations)
 
 
+def test_triangles_face_up() -> None:
+    vertices = sheet_vertices(Cloth("c", (0.0, 0.0, 0.0), resolution=4))
+    a, b, c = (vertices[corner] for corner in sheet_triangles(4).T)
+    assert (np.cross(b - a, c - a)[:, 2] > 0).all()
+
+
 def test_rows_run_along_x_then_y() -> None:
     vertices = sheet_vertices(Cloth("c", (1.0, 2.0, 3.0), (2.0, 4.0, 0.0), resolution=3))
     assert vertices[0].tolist() == [0, 0, 3]
-    assert vertices[1].tolist() == [1, 0, 3]
-    assert vertices[3].tolist() == [0, 2, 3]
+    assert vertices[1].tolist() == [0, 2, 3]
+    assert vertices[3].tolist() == [1, 0, 3]
     with pytest.raises(BadInputError, match="2 vertices a side"):
         sheet_vertices(Cloth("c", (0, 0, 0), resolution=1))
 

@@ -16,11 +16,14 @@ Indices = NDArray[np.int32]
 
 
 def sheet_vertices(cloth: Cloth) -> Points:
-    """Where the vertices (V, 3) of an undeformed cloth are, in metres."""
+    """Where the vertices (V, 3) of an undeformed cloth are, in metres.
+
+    Row by row along x, then y: the first ``resolution`` vertices share the lowest x.
+    """
     if cloth.resolution < 2:
         raise BadInputError(f"cloth {cloth.name!r} needs 2 vertices a side, not {cloth.resolution}")
     along_x, along_y = (np.linspace(-s / 2, s / 2, cloth.resolution) for s in cloth.size[:2])
-    y, x = np.meshgrid(along_y, along_x, indexing="ij")
+    x, y = np.meshgrid(along_x, along_y, indexing="ij")
     flat = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
     return rotate(cloth.rotation, flat) + np.asarray(cloth.position)
 
@@ -35,14 +38,14 @@ def rotate(rotation: Quat, points: Points) -> Points:
 def sheet_triangles(resolution: int) -> Indices:
     """Triangles (T, 3) of a sheet: two for each square, cut along the same diagonal."""
     index = np.arange(resolution**2, dtype=np.int32).reshape(resolution, resolution)
-    a, b, c, d = (index[y, x].ravel() for y, x in _CORNERS)
+    a, b, c, d = (index[x, y].ravel() for x, y in _CORNERS)
     return np.stack([np.stack([a, b, d], 1), np.stack([a, d, c], 1)], 1).reshape(-1, 3)
 
 
 _CORNERS = (
     (slice(None, -1), slice(None, -1)),
-    (slice(None, -1), slice(1, None)),
     (slice(1, None), slice(None, -1)),
+    (slice(None, -1), slice(1, None)),
     (slice(1, None), slice(1, None)),
 )
 

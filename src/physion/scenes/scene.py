@@ -78,7 +78,8 @@ class Cloth:
     """A square sheet, ``size`` metres a side, flat at ``position`` (its centre) when released.
 
     ``stretch``, ``bend`` and ``tether`` are stiffnesses in 0..1, as NVIDIA Flex takes them.
-    ``resolution`` counts the vertices along a side.
+    ``resolution`` counts the vertices along a side; the solver's finer sheets stretch more. Of 41
+    to 61 vertices, 51 tell the outcomes of the official trials apart best (2 m a side).
     """
 
     name: str
@@ -86,7 +87,7 @@ class Cloth:
     size: Vec3 = (2.0, 2.0, 0.0)
     rotation: Quat = (1.0, 0.0, 0.0, 0.0)
     mass: float = 0.5
-    resolution: int = 41
+    resolution: int = 51
     stretch: float = 0.5
     bend: float = 0.5
     tether: float = 0.5
