@@ -57,9 +57,10 @@ the rim in pictures looks no thicker."""
 BOWL_PIECE_WALL = 0.035
 """Thickness at the corners of the bowl's pieces: the hull of a sector also fills the hollow behind
 its chords, and with this corner thickness the pieces have the volume of the drawn wall."""
-DUMBBELL_HEAD, DUMBBELL_BAR, DUMBBELL_HALF = 0.375, 0.12, 1.125
-"""Radii of a dumbbell's two balls and of its bar, and half its length. Only the bounds are known;
-boxes round two balls and a bar of this radius add up to the record's 0.8873."""
+DUMBBELL_HEAD, DUMBBELL_BAR = 0.375, 0.1206
+"""Half sizes of a dumbbell's two cubes and of the square bar between them, each a third of its
+length. Official ones come to rest on four sides and stand on narrow ones, so the heads are flat;
+boxes of these sizes add up to the record's 0.8873."""
 RAMP_FOOT, RAMP_DEPTH = 1.629, 2.0
 """Distance of the pivot from the foot of a ramp, and its width. The lengths in the records are
 those of slopes of 30 and 60 per cent and one platform of 1.61. The records put the foot at +x, but
@@ -274,21 +275,16 @@ def _triangular_prism() -> Shape:
 
 @shapes.register("dumbbell")
 def _dumbbell() -> Shape:
-    head, bar, half = DUMBBELL_HEAD, DUMBBELL_BAR, DUMBBELL_HALF
-    # Turned about z and then laid along y. Corners where the bar meets the balls come from the
-    # ball's own circle, so that the drawn solid has no hidden walls.
-    meet = math.asin(bar / head)
-    turns = [*np.linspace(-math.pi / 2, 0, 9)[1:], *np.linspace(0, math.pi / 2 - meet, 7)[1:]]
-    lower = [(head * math.cos(t), head - half + head * math.sin(t)) for t in turns]
-    upper = [(r, -z) for r, z in reversed(lower)]
-    profile = [(0.0, -half), *lower, *upper, (0.0, half)]
+    head, bar = DUMBBELL_HEAD, DUMBBELL_BAR
+    # Four segments of a lathe make a square solid; it is then laid along y.
+    corner, neck, end = head * math.sqrt(2), bar * math.sqrt(2), 3 * head
+    half = [(0.0, -end), (corner, -end), (corner, -head), (neck, -head)]
+    profile = [*half, *((r, -z) for r, z in reversed(half))]
     lay = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-    mesh = revolve(profile, ROUND_SEGMENTS, smooth=CURVED).turned(lay)
-    far = half - head
-    length = far - head * math.cos(meet)
-    rod = Piece("cylinder", (0.0, 0.0, head), (bar, bar, length), np.zeros((0, 3)), lay)
-    balls = (primitive("sphere", (0.0, y, head), (head, head, head)) for y in (-far, far))
-    return Shape("dumbbell", mesh.moved(offset=(0, 0, head)), (*balls, rod))
+    mesh = revolve(profile, 4, phase=math.pi / 4).turned(lay).moved(offset=(0, 0, head))
+    heads = (primitive("box", (0.0, y, head), (head, head, head)) for y in (-2 * head, 2 * head))
+    rod = primitive("box", (0.0, 0.0, head), (bar, head, bar))
+    return Shape("dumbbell", mesh, (*heads, rod))
 
 
 @shapes.register("torus")
