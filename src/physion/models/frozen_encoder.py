@@ -48,8 +48,6 @@ class Config:
     - ``weights``: ``imagenet``, ``random``, or the path of a state dict.
     - ``dynamics``: ``mlp`` (all context features at once) or ``lstm`` (one after the other).
     - ``hidden``: units of the one hidden layer.
-    - ``residual``: predict the change from the last feature rather than the next feature itself,
-      starting at "no change"; the published models predict the feature itself.
     - ``seed``: of random encoders and of the first weights of the dynamics.
     - ``stride``, ``context``, ``total``: see `Spec`.
     """
@@ -59,7 +57,6 @@ class Config:
     weights: str = IMAGENET
     dynamics: Literal["mlp", "lstm"] = "mlp"
     hidden: int = 1024
-    residual: bool = False
     seed: int = 0
     stride: int = 6
     context: int = 7
@@ -117,9 +114,8 @@ class FrozenEncoder(nn.Module):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(stable_hash("dynamics", config.dynamics, config.seed) % 2**63)
             self.dynamics = kind(self.feature_size, config.context, config.hidden)
-        if config.residual:
-            nn.init.zeros_(self.dynamics.outer.weight)
-            nn.init.zeros_(self.dynamics.outer.bias)
+        self.center = nn.Buffer(torch.zeros(self.feature_size))
+        self.scale = nn.Buffer(torch.ones(()))
 
     @torch.no_grad()
     def encode(self, frames: Tensor) -> Tensor:
@@ -146,12 +142,27 @@ class FrozenEncoder(nn.Module):
             window = torch.cat([window[:, 1:], following[:, None]], dim=1)
         return torch.stack(made, dim=1)
 
+    def adapt(self, features: Tensor) -> None:
+        """Take the mean (D,) and the one scale of training features (trials, time, D).
+
+        The dynamics then work on numbers of order one whatever the encoder's units. One scale for
+        all features leaves the relative weights in the loss as they are.
+        """
+        flat = features.flatten(0, 1).double()
+        self.center.copy_(flat.mean(0))
+        deviation = float((flat - flat.mean(0)).pow(2).mean().sqrt())
+        self.scale.fill_(deviation if deviation > 0 else 1.0)
+
     def loss(self, batch: Mapping[str, Tensor]) -> Tensor:
-        """Mean squared error of the next feature over every window of ``batch["features"]``."""
+        """Mean squared error of the next feature over every window of ``batch["features"]``.
+
+        In units of the squared scale of the training features (see `adapt`).
+        """
         features = batch["features"]
         count = self.config.context
         windows = features.unfold(1, count + 1, 1).transpose(2, 3).flatten(0, 1)
-        return functional.mse_loss(self._next(windows[:, :count]), windows[:, count])
+        target = (windows[:, count] - self.center) / self.scale
+        return functional.mse_loss(self._step(windows[:, :count]), target)
 
     def forward(self, batch: Mapping[str, Tensor]) -> Tensor:
         """The loss: what a training strategy wraps."""
@@ -188,9 +199,14 @@ class FrozenEncoder(nn.Module):
     def _is_random(self) -> bool:
         return self.config.weights == RANDOM
 
+    def _step(self, window: Tensor) -> Tensor:
+        """The next feature, centred and scaled."""
+        given = (window - self.center) / self.scale
+        out: Tensor = self.dynamics(given)
+        return out
+
     def _next(self, window: Tensor) -> Tensor:
-        out: Tensor = self.dynamics(window)
-        return window[:, -1] + out if self.config.residual else out
+        return self._step(window) * self.scale + self.center
 
     def _encoder_on(self, device: torch.device) -> nn.Module:
         if not self._encoder:

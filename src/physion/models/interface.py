@@ -168,6 +168,10 @@ class Simulates(Protocol):
 class Learns(Protocol):
     """A model whose dynamics train on clips, without any label; a torch ``Module`` as well."""
 
+    def adapt(self, features: Tensor) -> None:
+        """Look once at all training features (trials, time, features) before training starts."""
+        ...
+
     def loss(self, batch: Mapping[str, Tensor]) -> Tensor:
         """Scalar loss of ``batch["features"]`` (batch, time, features), float32."""
         ...

@@ -60,10 +60,11 @@ def train_dynamics(
     identity: dict[str, Any] = {"data": batches.digest(), "model": _describe(model)}
     settings = {**dataclasses.asdict(config), **identity}
     own = folder / hash_config(settings)[:16] if folder is not None else None
+    model.adapt(torch.from_numpy(features[rows]))
     result = train(model, batches, config, fabric, folder=own, identity=identity, progress=progress)
     return DynamicsReport(
         result,
-        _validation_loss(model, features[held], fabric),
+        one_step_loss(model, features[held], fabric),
         copy_last_loss(features[held], context),
     )
 
@@ -83,14 +84,18 @@ def simulate_features(
     return np.concatenate(made).astype(np.float32) if made else empty
 
 
-def _validation_loss(model: Learns, features: Floats, fabric: Fabric) -> float:
+def one_step_loss(model: Model, features: Floats, fabric: Fabric) -> float:
+    """Mean squared error of the next feature over all windows of ``features``, in their own units.
+
+    The counterpart of `copy_last_loss`; NaN without a window.
+    """
+    context = model.spec.context
     total, count = 0.0, 0
-    with torch.inference_mode():
-        for start in range(0, len(features), 16):
-            some = features[start : start + 16]
-            batch = {"features": fabric.to_device(torch.from_numpy(some.copy()))}
-            total += float(model.loss(batch)) * len(some)
-            count += len(some)
+    for start in range(features.shape[1] - context):
+        given, following = features[:, start : start + context], features[:, start + context]
+        made = simulate_features(model, given, 1, fabric)[:, 0]
+        total += float(np.square(made.astype(np.float64) - following).sum())
+        count += following.size
     return total / count if count else float("nan")
 
 

@@ -1,0 +1,272 @@
+"""The noisy simulator, with an engine made by hand and with the real one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from physion.compute.local import LocalExecutor
+from physion.errors import BadInputError
+from physion.models import build_model
+from physion.models.noisy_simulation import (
+    Config,
+    NoisySimulation,
+    add_noise,
+    ask,
+    fit_scale,
+    log_likelihood,
+    run_task,
+)
+from physion.physics.engine import simulate
+from physion.physics.trajectory import Contacts, State, Trajectory
+from physion.scenes.scene import Body, Camera, Cloth, Joint, Push, Roles, Scene
+
+FRAMES = 120
+
+
+def scene(offset: float = 0.0, name: str = "pair", **more: Any) -> Scene:
+    """A ball that flies past a box, ``offset`` metres beside its middle, 0.5 m beyond it."""
+    bodies = (
+        Body("ball", "sphere", (0.0, offset, 0.0)),
+        Body("box", "cube", (2.0, 0.0, 0.0), mass=3.0),
+        Body("wall", "cube", (9.0, 9.0, 0.0), kinematic=True),
+    )
+    return Scene(name, "collide", bodies, Roles("ball", "box"), Camera((3.0, 0.0, 1.0)), **more)
+
+
+class StraightEngine:
+    """Everything flies on in a straight line; ball and box touch closer than 0.5 m."""
+
+    name = "straight 1"
+
+    def __init__(self) -> None:
+        self.starts: list[State] = []
+        self.scenes: list[Scene] = []
+
+    def simulate(
+        self, scene: Scene, *, start: State | None = None, frames: int | None = None
+    ) -> Trajectory:
+        count = len(scene.bodies)
+        if start is None:
+            velocities = np.zeros((count, 3))
+            velocities[0, 0] = 2.0
+            places = np.array([body.position for body in scene.bodies])
+        else:
+            self.starts.append(start)
+            self.scenes.append(scene)
+            places, velocities = start.positions, start.velocities
+        length = FRAMES if start is None else FRAMES - start.frame
+        times = np.arange(length)[:, None, None] * 0.01
+        positions = (places + times * velocities).astype(np.float32)
+        near = np.linalg.norm(positions[:, 0] - positions[:, 1], axis=1) < 0.5
+        touched = np.flatnonzero(near).astype(np.int32)
+        n = len(touched)
+        return Trajectory(
+            positions,
+            np.tile(np.array([1, 0, 0, 0], np.float32), (length, count, 1)),
+            np.tile(velocities.astype(np.float32), (length, 1, 1)),
+            np.zeros((length, count, 3), np.float32),
+            np.zeros((length, 0, 3), np.float32),
+            np.full(length, np.nan, np.float32),
+            replace(
+                Contacts.empty(),
+                frame=touched,
+                bodies=np.tile(np.array([[0, 1]], np.int32), (n, 1)),
+                point=np.zeros((n, 3), np.float32),
+                normal=np.zeros((n, 3), np.float32),
+                impulse=np.ones(n, np.float32),
+            ),
+            False,
+            self.name,
+        )
+
+
+def model(**options: Any) -> NoisySimulation:
+    return NoisySimulation(Config(**options), StraightEngine())
+
+
+def test_without_noise_it_says_what_happens() -> None:
+    for offset, expected in ((0.0, 1.0), (0.4, 1.0), (0.6, 0.0), (3.0, 0.0)):
+        trial = scene(offset)
+        truth = StraightEngine().simulate(trial)
+        sure = model(scale=0.0)
+        assert sure.predict_contact(trial, truth) == expected
+
+
+def test_noise_makes_close_calls_uncertain_and_clear_ones_not() -> None:
+    shares = {}
+    for offset in (0.0, 0.5, 3.0):
+        trial = scene(offset)
+        truth = StraightEngine().simulate(trial)
+        shares[offset] = model(samples=200).predict_contact(trial, truth)
+    assert shares[0.0] == 1.0 and shares[3.0] == 0.0
+    assert 0.2 < shares[0.5] < 0.8
+
+
+def test_contact_that_was_seen_needs_no_simulation() -> None:
+    trial = replace(scene(), bodies=(*scene().bodies[:1], Body("box", "cube", (0.7, 0.0, 0.0))))
+    engine = StraightEngine()
+    truth = engine.simulate(trial)
+    assert truth.contacts.frame[0] < 45
+    # It flies out on the other side, so simulating on from frame 44 could find nothing.
+    truth = replace(truth, velocities=truth.velocities * -1)
+    assert NoisySimulation(Config(), engine).predict_contact(trial, truth) == 1.0
+    assert engine.starts == []
+
+
+def test_nothing_after_the_observed_part_can_change_the_answer() -> None:
+    trial = scene(0.5)
+    truth = StraightEngine().simulate(trial)
+    rng = np.random.default_rng(0)
+    changed = {}
+    for name in ("positions", "velocities", "angular_velocities", "rotations"):
+        array = getattr(truth, name).copy()
+        array[45:] = rng.normal(size=array[45:].shape)
+        changed[name] = array
+    forged = replace(truth, **changed, contacts=Contacts.empty(), completed=True)
+    names = (*changed, "cloth_vertices", "cloth_distance")
+    shorter = replace(forged, **{name: getattr(forged, name)[:45] for name in names})
+    expected = model().predict_contact(trial, truth)
+    assert 0 < expected < 1
+    assert model().predict_contact(trial, forged) == expected
+    assert model().predict_contact(trial, shorter) == expected
+
+
+def test_it_goes_on_from_the_last_observed_frame_under_the_trials_own_ending() -> None:
+    trial = scene(0.5)
+    engine = StraightEngine()
+    truth = engine.simulate(trial)
+    NoisySimulation(Config(samples=2), engine).predict_contact(trial, truth)
+    assert [start.frame for start in engine.starts] == [44, 44]
+    ending = engine.scenes[0].ending
+    assert (ending.min_frames, ending.max_frames) == (151 - 44, 302 - 44)
+
+
+def test_noise_has_the_stated_size_and_spares_what_cannot_move() -> None:
+    trial = scene()
+    question = ask(trial, StraightEngine().simulate(trial))
+    config = Config(position=0.1, velocity=0.3, mass=0.2)
+    pairs = [add_noise(question, config, 2.0, sample) for sample in range(400)]
+    places = np.array([state.positions for _, state in pairs]) - question.state.positions
+    speeds = np.array([state.velocities for _, state in pairs]) - question.state.velocities
+    masses = np.log([[body.mass for body in noisy.bodies] for noisy, _ in pairs])
+    assert places[:, :2, :2].std(0) == pytest.approx(np.full((2, 2), 0.2), rel=0.15)
+    assert speeds[:, :2].std(0) == pytest.approx(np.full((2, 3), 0.6), rel=0.15)
+    assert masses[:, :2].std(0) == pytest.approx(np.full(2, 0.4), rel=0.15)
+    assert not places[:, :, 2].any() and not places[:, 2].any() and not speeds[:, 2].any()
+    assert (masses[:, 2] == 0).all()
+    first, second = places[:, 0, 0], places[:, 1, 0]
+    assert abs(np.corrcoef(first, second)[0, 1]) < 0.2
+
+
+def test_joined_bodies_move_together_and_a_cloth_moves_whole() -> None:
+    trial = scene(joints=(Joint("ball", "box"),), cloths=(Cloth("sheet", (0, 0, 2), resolution=3),))
+    base = StraightEngine().simulate(replace(trial, cloths=()))
+    truth = replace(base, cloth_vertices=np.zeros((FRAMES, 9, 3), np.float32))
+    question = ask(trial, truth)
+    _, state = add_noise(question, Config(), 1.0, 0)
+    moved = state.positions - question.state.positions
+    assert moved[0] == pytest.approx(moved[1]) and moved[0].any()
+    cloth = state.cloth_vertices - question.state.cloth_vertices
+    assert cloth == pytest.approx(np.tile(cloth[0], (9, 1))) and cloth[0, :2].any()
+    assert not np.isclose(cloth[0, :2], moved[0, :2]).any()
+
+
+def test_noise_depends_on_seed_trial_and_sample_alone() -> None:
+    truth = StraightEngine().simulate(scene())
+
+    def state(seed: int, name: str, sample: int) -> list[float]:
+        question = ask(scene(name=name), truth)
+        _, noisy = add_noise(question, Config(seed=seed), 1.0, sample)
+        return noisy.positions.ravel().tolist()
+
+    assert state(0, "a", 0) == state(0, "a", 0)
+    assert (
+        len({tuple(state(*key)) for key in ((0, "a", 0), (1, "a", 0), (0, "b", 0), (0, "a", 1))})
+        == 4
+    )
+
+
+def test_tasks_are_told_apart_by_all_that_decides_them() -> None:
+    trial = scene(0.5)
+    question = ask(trial, StraightEngine().simulate(trial))
+    base = model().task(question, 1.0)
+    others = [
+        model().task(question, 2.0),
+        model(samples=3).task(question, 1.0),
+        model(velocity=0.2).task(question, 1.0),
+        model().task(replace(question, state=replace(question.state, frame=43)), 1.0),
+        model().task(ask(scene(0.4), StraightEngine().simulate(scene(0.4))), 1.0),
+    ]
+    assert model().task(question, 1.0).digest() == base.digest()
+    assert len({base.digest(), *(task.digest() for task in others)}) == 6
+
+
+def test_the_scale_is_the_one_under_which_outcomes_are_likeliest() -> None:
+    outcomes = np.array([True, True, False, True])
+    shares = {
+        0.5: np.array([1.0, 0, 1, 0]),
+        1.0: np.array([0.9, 0.8, 0.3, 0.9]),
+        2.0: np.full(4, 0.5),
+    }
+    assert fit_scale(shares, 20, outcomes, 9.0) == 1.0
+    assert fit_scale({2.0: shares[2.0]}, 20, outcomes, 9.0) == 2.0
+    nothing = {s: v[:0] for s, v in shares.items()}
+    assert fit_scale(nothing, 20, outcomes[:0], 9.0) == 9.0
+    assert np.isnan(log_likelihood(np.zeros(0), 20, np.zeros(0)))
+    assert log_likelihood(np.array([1.0]), 1, np.array([True])) == pytest.approx(np.log(0.75))
+    assert np.isfinite(log_likelihood(np.array([1.0]), 20, np.array([False])))
+
+
+@pytest.mark.parametrize("wrong", [{"samples": 0}, {"position": -1.0}, {"scales": ()}])
+def test_impossible_settings_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(BadInputError):
+        Config(**wrong)
+    with pytest.raises(BadInputError, match="fewer than the 45"):
+        ask(scene(), replace_length(StraightEngine().simulate(scene()), 44))
+
+
+def replace_length(trajectory: Trajectory, frames: int) -> Trajectory:
+    names = ("positions", "rotations", "velocities", "angular_velocities", "cloth_vertices")
+    return replace(trajectory, **{name: getattr(trajectory, name)[:frames] for name in names})
+
+
+def rolling(offset: float) -> Scene:
+    """A real ball pushed towards a cube two metres away."""
+    return Scene(
+        f"rolling {offset}",
+        "collide",
+        (
+            Body("ball", "sphere", (-1.0, offset, 0.0), (0.3, 0.3, 0.3)),
+            Body("box", "cube", (1.0, 0.0, 0.0), (0.4, 0.4, 0.4)),
+        ),
+        Roles("ball", "box"),
+        Camera((3.0, 0.0, 1.0)),
+        pushes=(Push("ball", (4.0, 0.0, 0.0)),),
+    )
+
+
+def test_with_the_real_engine_hit_and_miss_are_told_apart() -> None:
+    real = build_model("noisy-simulation", samples=4, velocity=0.05)
+    hit, miss = rolling(0.0), rolling(1.5)
+    answers = []
+    for trial in (hit, miss):
+        truth = simulate(trial)
+        assert len(truth.contacts.frames_of(0, 1)[:1]) == (trial is hit)
+        answers.append(real.predict_contact(trial, truth))  # type: ignore[attr-defined]
+    assert answers[0] >= 0.75 and answers[1] == 0.0
+
+
+@pytest.mark.slow
+def test_other_processes_give_the_same_answers() -> None:
+    real = build_model("noisy-simulation", samples=4)
+    assert isinstance(real, NoisySimulation)
+    tasks = {}
+    for offset in (0.25, 0.35):
+        trial = rolling(offset)
+        tasks[trial.name] = real.task(ask(trial, simulate(trial)), 1.0)
+    outcomes = {o.key: o.value for o in LocalExecutor(2).map(run_task, tasks)}
+    assert outcomes == {key: run_task(task) for key, task in tasks.items()}

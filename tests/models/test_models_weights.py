@@ -1,0 +1,164 @@
+"""Encoder weights: seeded, recorded, and never executed."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import pickle
+from pathlib import Path
+from typing import Any
+
+import pytest
+import timm
+import torch
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+import physion
+from physion.errors import BadInputError
+from physion.models import build_model
+from physion.models.weights import EncoderWeights, create_encoder, read_state_dict
+
+NAME, SIZE = "test_resnet", 64
+
+
+@pytest.fixture(scope="module")
+def picture() -> Tensor:
+    return torch.randn(2, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.fixture(scope="module")
+def trained() -> nn.Module:
+    """An encoder with a classifier, as a training script would save it."""
+    torch.manual_seed(5)
+    model: nn.Module = timm.create_model(NAME, pretrained=False)
+    return model.eval()
+
+
+def test_random_encoders_depend_on_their_seed_alone(picture: Tensor) -> None:
+    torch.manual_seed(1)
+    first = create_encoder(NAME, SIZE, EncoderWeights("random", 3))(picture)
+    torch.manual_seed(2)
+    before = torch.random.get_rng_state()
+    again = create_encoder(NAME, SIZE, EncoderWeights("random", 3))(picture)
+    other = create_encoder(NAME, SIZE, EncoderWeights("random", 4))(picture)
+    assert torch.equal(first, again) and not torch.equal(first, other)
+    assert torch.equal(torch.random.get_rng_state(), before), "the caller's randomness is its own"
+
+
+@pytest.mark.parametrize("kind", ["safetensors", "pth", "wrapped"])
+def test_local_files_give_the_network_that_was_saved(
+    kind: str, tmp_path: Path, trained: nn.Module, picture: Tensor
+) -> None:
+    path = tmp_path / ("weights.safetensors" if kind == "safetensors" else "weights.pth")
+    if kind == "safetensors":
+        save_file(trained.state_dict(), path)
+    else:
+        state: dict[str, Any] = trained.state_dict()
+        torch.save({"state_dict": state, "epoch": 3} if kind == "wrapped" else state, path)
+    encoder = create_encoder(NAME, SIZE, EncoderWeights(str(path)))
+    with torch.no_grad():
+        expected = trained.forward_head(trained.forward_features(picture), pre_logits=True)  # type: ignore[operator]
+        assert torch.allclose(encoder(picture), expected, atol=1e-6)
+    assert not any(parameter.requires_grad for parameter in encoder.parameters())
+    model = build_model("frozen-encoder", encoder=NAME, image_size=SIZE, weights=str(path))
+    sha = hashlib.sha256(path.read_bytes()).hexdigest()
+    assert model.provenance().init == f"local:{sha[:12]}"
+    assert model.provenance().model == f"{NAME}-mlp"
+
+
+def test_another_file_of_the_same_name_is_another_encoder(
+    tmp_path: Path, trained: nn.Module
+) -> None:
+    path = tmp_path / "w.safetensors"
+    digests = []
+    for shift in (0.0, 1.0):
+        save_file({k: v + shift for k, v in trained.state_dict().items()}, path)
+        model = build_model("frozen-encoder", encoder=NAME, image_size=SIZE, weights=str(path))
+        digests.append(model.encoder_digest())  # type: ignore[attr-defined]
+    assert digests[0] != digests[1]
+
+
+class _Evil:
+    """Runs a command when it is unpickled."""
+
+    def __init__(self, target: Path) -> None:
+        self.target = target
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (Path.touch, (self.target,))
+
+
+@pytest.mark.parametrize("how", ["torch", "pickle"])
+def test_malicious_pickle_is_refused_and_never_run(how: str, tmp_path: Path) -> None:
+    target, path = tmp_path / "pwned", tmp_path / "weights.pth"
+    if how == "torch":
+        torch.save({"state_dict": {"a": torch.zeros(1)}, "x": _Evil(target)}, path)
+    else:
+        path.write_bytes(pickle.dumps(_Evil(target)))
+    with pytest.raises(BadInputError, match=r"refused|cannot be read"):
+        read_state_dict(path)
+    assert not target.exists()
+
+
+@pytest.mark.parametrize("name", ["w.pth", "w.safetensors"])
+def test_damaged_missing_and_foreign_files_are_one_clear_error(
+    name: str, tmp_path: Path, trained: nn.Module
+) -> None:
+    path = tmp_path / name
+    with pytest.raises(BadInputError, match="no such file"):
+        create_encoder(NAME, SIZE, EncoderWeights(str(path)))
+    path.write_bytes(b"\x00" * 100)
+    with pytest.raises(BadInputError, match=r"w\."):
+        create_encoder(NAME, SIZE, EncoderWeights(str(path)))
+    state = trained.state_dict()
+    state.pop(next(iter(state)))
+    saver = save_file if name.endswith("tensors") else torch.save
+    saver(state, path)
+    with pytest.raises(BadInputError, match="lacks 1 tensors"):
+        create_encoder(NAME, SIZE, EncoderWeights(str(path)))
+    saver({"a": torch.zeros(3)}, path)
+    with pytest.raises(BadInputError, match="another network"):
+        create_encoder(NAME, SIZE, EncoderWeights(str(path)))
+
+
+def test_unreachable_imagenet_weights_name_the_alternatives(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    real = timm.create_model
+
+    def offline(name: str, pretrained: bool = False, **options: Any) -> nn.Module:
+        if pretrained:
+            raise OSError("Name or service not known")
+        return real(name, pretrained=False, **options)
+
+    monkeypatch.setattr(timm, "create_model", offline)
+    with pytest.raises(BadInputError, match="weights=random") as caught:
+        create_encoder(NAME, SIZE, EncoderWeights("imagenet"))
+    assert "Name or service not known" in str(caught.value)
+
+
+@pytest.mark.slow
+def test_vgg_features_come_before_the_last_relu() -> None:
+    encoder = create_encoder("vgg11", 32, EncoderWeights("random"))
+    features = encoder(torch.randn(2, 3, 32, 32))
+    assert features.shape == (2, 4096)
+    assert (features < 0).any() and (features > 0).any()
+
+
+def test_no_module_reads_anything_that_could_run_code() -> None:
+    """Of all modules of the package, seen as syntax trees."""
+    found = []
+    for path in Path(physion.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(node, ast.Call):
+                continue
+            name = ast.unparse(node.func)
+            words = {k.arg: ast.unparse(k.value) for k in node.keywords}
+            bad = name in {"eval", "exec", "pickle.load", "pickle.loads", "joblib.load"}
+            bad |= name in {"yaml.load", "yaml.unsafe_load", "dill.load", "os.system"}
+            bad |= name == "torch.load" and words.get("weights_only") != "True"
+            bad |= words.get("allow_pickle") == "True" or words.get("shell") == "True"
+            if bad:
+                found.append(f"{path.name}:{node.lineno} {name}")
+    assert found == []
