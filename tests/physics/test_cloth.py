@@ -16,6 +16,7 @@ from physion.physics.cloth import ClothMotion, ClothSettings, settle_solids, sim
 from physion.physics.cloth_sheet import sheet_springs, sheet_triangles, sheet_vertices
 from physion.physics.cloth_solids import fill_shape, particles_of, surface_particles
 from physion.physics.cloth_solver import smallest_distance
+from physion.physics.engine import simulate
 from physion.physics.labels import CLOTH_CONTACT_GAP, label_contact
 from physion.physics.replay import area_under_curve
 from physion.physics.trajectory import ENVIRONMENT, Contacts, Trajectory
@@ -302,3 +303,16 @@ def test_official_trials_are_told_apart_above_chance(official: Path) -> None:
         distances.append(float(still(scene, 151).distance.min()))
         contacts.append(trial.outcome.contact)
     assert area_under_curve(-np.array(distances), np.array(contacts)) > 0.6
+
+
+def test_the_engine_lays_cloth_over_bodies_and_goes_on_from_a_state() -> None:
+    solid = replace(ball(), kinematic=True)
+    scene = replace(draped(solid), settle_frames=100)
+    whole = simulate(scene, frames=61)
+    assert whole.cloth_vertices.shape == (61, 21 * 21, 3)
+    # A ball of radius 0.25 stands so that its lowest particle is the floor gap above the floor.
+    assert 0.0 <= whole.positions[0, 0, 2] < ClothSettings().floor_gap
+    assert len(whole.contacts.frames_of(0, 1))
+    later = simulate(scene, start=whole.state(40), frames=21)
+    assert np.abs(later.cloth_vertices[0] - whole.cloth_vertices[40]).max() < 1e-6
+    assert np.abs(later.cloth_vertices[20] - whole.cloth_vertices[60]).max() < 0.05

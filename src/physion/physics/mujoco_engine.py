@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.errors import BadInputError
+from physion.physics.cloth import ClothSettings, add_cloth, settle_solids
 from physion.physics.contact_finder import ContactFinder
 from physion.physics.contact_record import ContactRecord
 from physion.physics.contact_solver import AnchorMemory, move_poses, no_anchors, solve_step
@@ -35,15 +36,19 @@ VERSION = 1
 
 
 class MujocoEngine:
-    """Simulates rigid scenes; scenes with cloth go on to `physion.physics.cloth`."""
+    """Simulates rigid bodies, then what `physion.physics.cloth` lays over them."""
 
-    def __init__(self, settings: Settings | None = None) -> None:
+    def __init__(
+        self, settings: Settings | None = None, cloth: ClothSettings | None = None
+    ) -> None:
         self.settings = settings if settings is not None else Settings()
+        self.cloth = cloth if cloth is not None else ClothSettings()
 
     @property
     def name(self) -> str:
-        """``mujoco-<version>+physion-<version of this engine>.<settings>``."""
-        return f"mujoco-{mujoco.__version__}+physion-{VERSION}.{self.settings.tag()}"
+        """``mujoco-<version>+physion-<version of this engine>.<settings>.<cloth settings>``."""
+        tags = f"{self.settings.tag()}.{self.cloth.tag()}"
+        return f"mujoco-{mujoco.__version__}+physion-{VERSION}.{tags}"
 
     def simulate(
         self, scene: Scene, *, start: State | None = None, frames: int | None = None
@@ -51,13 +56,15 @@ class MujocoEngine:
         """Move ``scene`` until it ends; see `physion.physics.engine.Engine.simulate`."""
         if frames is not None and frames < 1:
             raise BadInputError(f"frames must be at least 1, not {frames}")
+        scene = settle_solids(scene, self.cloth)
         run = RigidRun(scene, self.settings, start)
         limit = scene.ending.max_frames if frames is None else frames
         while len(run.history) < limit:
             if frames is None and len(run.history) >= scene.ending.min_frames and run.all_asleep():
                 break
             run.step()
-        return run.trajectory(self.name)
+        rigid = run.trajectory(self.name)
+        return add_cloth(scene, rigid, self.cloth, start=start) if scene.cloths else rigid
 
 
 class RigidRun:
