@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from physion.physics.trajectory import Trajectory
 from physion.rendering.geometry import F32, F64, I32, Part, sheet, solid
+from physion.rendering.light import to_linear
 from physion.rendering.rooms import Panel, Room
-from physion.rendering.shading import to_linear
 from physion.rendering.textures import Atlas, build_atlas, finish
 from physion.scenes.scene import Look, Scene
 from physion.scenes.shapes import shape

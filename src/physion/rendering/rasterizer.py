@@ -202,7 +202,7 @@ def measure(
             n0 = e0 * normals[t, 0] + e1 * normals[t, 3] + e2 * normals[t, 6]
             n1 = e0 * normals[t, 1] + e1 * normals[t, 4] + e2 * normals[t, 7]
             n2 = e0 * normals[t, 2] + e1 * normals[t, 5] + e2 * normals[t, 8]
-            length = np.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
+            length = max(np.sqrt(n0 * n0 + n1 * n1 + n2 * n2), 1e-12)
             if two_sided[t] and _is_back(edges, t):
                 length = -length
             normal[row, column, 0] = n0 / length

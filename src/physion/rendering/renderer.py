@@ -8,15 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from physion.errors import BadInputError, UnknownNameError
 from physion.physics.trajectory import Trajectory
-from physion.rendering.assembly import Assembly, assemble, place, transform
+from physion.rendering.assembly import assemble, place, transform
 from physion.rendering.camera import View
+from physion.rendering.light import ShadeMap, StillMap, pack_light, still_maps, tone_table
 from physion.rendering.rasterizer import (
     NOTHING,
     SAMPLES,
@@ -25,17 +25,7 @@ from physion.rendering.rasterizer import (
     rasterize_depth,
 )
 from physion.rendering.rooms import Room, rooms
-from physion.rendering.shading import (
-    BLOCK,
-    POINT,
-    Light,
-    ShadeMap,
-    busy_blocks,
-    pack_corners,
-    shade,
-    to_linear,
-    tone_table,
-)
+from physion.rendering.shading import POINT, pack_corners, shade
 from physion.scenes.scene import Scene
 
 F32 = NDArray[np.float32]
@@ -43,14 +33,6 @@ F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 
 PASSES = ("color", "depth", "normals", "ids", "flow")
-
-SHADOW_TEXEL = 0.016
-CONTACT_TEXEL = 0.03
-"""Metres that a texel of the shadow map and of the contact map spans."""
-LIFT = 0.03
-"""Metres off its surface at which a point asks whether it is in shadow."""
-CONTACT_REACH = 0.25
-"""Metres above the ground below which a thing darkens it."""
 
 
 @dataclass(frozen=True)
@@ -86,15 +68,11 @@ class Settings:
     still_layer: bool = True
 
 
-class _StillMap(NamedTuple):
-    """World to texels (3, 4), and the map of what never moves (H, W)."""
-
-    matrix: F64
-    depth: F32
-
-
 class Renderer:
-    """Renders any frame of one trial at ``width`` x ``height`` pixels."""
+    """Renders any frame of one trial at ``width`` x ``height`` pixels.
+
+    It keeps arrays to work in: use one renderer for each thread.
+    """
 
     def __init__(
         self,
@@ -114,7 +92,7 @@ class Renderer:
         self._assembly = assembly = assemble(scene, self.room)
         self._first = assembly.first_triangle if settings.still_layer else 0
         self._tones = tone_table(self.room.exposure)
-        self._sight, self._light, self._settings = self._pack_light()
+        self._sight, self._light, self._settings = pack_light(self.room, self._view)
         self._still_vertices, self._still_normals = place(assembly, scene, trajectory, 0, False)
         self._corners = pack_corners(
             self._still_normals, assembly.uv, assembly.tangents, assembly.material
@@ -141,18 +119,12 @@ class Renderer:
                 f"{cloth} cloth vertices"
             )
 
-    def _still_maps(self) -> tuple[_StillMap, _StillMap]:
-        """Shadow and contact map over the region where the trial begins, with what never moves."""
-        center, half = _region(self.scene)
-        maps = []
-        for matrix, size in (
-            _lamp_matrix(np.asarray(self.room.lamp_direction), center, half),
-            _ground_matrix(center, half),
-        ):
-            still = np.full((size, size), np.inf, np.float32)
-            self._draw_map(still, matrix, self._still_vertices, False)
-            maps.append(_StillMap(matrix, still))
-        return maps[0], maps[1]
+    def _still_maps(self) -> tuple[StillMap, StillMap]:
+        """Shadow and contact map with what never moves."""
+        maps = still_maps(self.scene, self.room)
+        for still in maps:
+            self._draw_map(still.depth, still.matrix, self._still_vertices, False)
+        return maps
 
     def _draw_map(self, depth: F32, matrix: F64, vertices: F64, moving: bool) -> None:
         """Add the moving bodies, or the others without the room, to a depth map."""
@@ -235,11 +207,11 @@ class Renderer:
         shade(ids, self._first, False, *arrays, self._still_shading, out)
         return out
 
-    def _map(self, still: _StillMap, vertices: F64) -> ShadeMap:
+    def _map(self, still: StillMap, vertices: F64) -> ShadeMap:
         """The map of one instant: what never moves, and the moving bodies on top."""
         depth = still.depth.copy()
         self._draw_map(depth, still.matrix, vertices, True)
-        return ShadeMap(still.matrix, depth, busy_blocks(depth))
+        return still.with_moving(depth)
 
     def _measure(
         self, ids: I32, points: F64, normals: F32, frame: int, flow: bool
@@ -283,22 +255,6 @@ class Renderer:
         a = self._assembly
         measure(ids, self._edges, a.faces, a.objects, normals, a.two_sided, later, first, *out)
 
-    def _pack_light(self) -> tuple[F64, F64, F64]:
-        """The camera, the light and its settings as `shade` reads them."""
-        room, camera = self.room, self.scene.camera
-        direction = np.asarray(room.lamp_direction)
-        light = Light(
-            lamp=np.stack([direction / np.linalg.norm(direction), room.lamp]),
-            around=np.asarray(room.around),
-            mirrored=np.asarray(room.mirrored),
-            window=np.asarray(room.window),
-            bounds=np.asarray([room.low, room.high]),
-        )
-        background = to_linear(room.background)[None]
-        sight = np.concatenate([np.asarray(camera.position)[None], self._view.ray_matrix])
-        settings = np.array([LIFT, room.shadow, room.contact, CONTACT_REACH])
-        return sight, np.concatenate([*light, background]), settings
-
 
 def render_frames(
     scene: Scene,
@@ -321,44 +277,3 @@ def role_map(ids: NDArray[np.integer], scene: Scene) -> NDArray[np.uint8]:
     colors[scene.index(scene.roles.agent) + 1] = (255, 0, 0, 255)
     colors[scene.index(scene.roles.patient) + 1] = (255, 255, 0, 255)
     return np.asarray(colors[ids])
-
-
-def _region(scene: Scene) -> tuple[F64, float]:
-    """Centre on the ground and half size in metres of where shadows fall.
-
-    It depends on the scene alone, so that a frame does not depend on the frames after it.
-    """
-    at = [(*body.position[:2], max(body.scale)) for body in scene.bodies]
-    at += [(*cloth.position[:2], max(cloth.size)) for cloth in scene.cloths]
-    x = np.array(at)
-    low = (x[:, :2] - x[:, 2:]).min(axis=0)
-    high = (x[:, :2] + x[:, 2:]).max(axis=0)
-    center = 0.5 * (low + high)
-    half = float(np.clip(0.5 * (high - low).max() + 1.0, 2.5, 6.0))
-    return np.array([*center, 0.0]), half
-
-
-def _lamp_matrix(direction: F64, center: F64, half: float) -> tuple[F64, int]:
-    """World to (texel, texel, distance) as the lamp sees the region, and the map's size."""
-    toward = direction / np.linalg.norm(direction)
-    right = np.cross((0.0, 1.0, 0.0), toward)
-    right /= np.linalg.norm(right)
-    rows = np.stack([right, np.cross(toward, right), -toward])
-    return _texel_matrix(rows, center, half, SHADOW_TEXEL)
-
-
-def _ground_matrix(center: F64, half: float) -> tuple[F64, int]:
-    """World to (texel, texel, height), and the map's size."""
-    return _texel_matrix(np.eye(3), center, half, CONTACT_TEXEL)
-
-
-def _texel_matrix(rows: F64, center: F64, half: float, texel: float) -> tuple[F64, int]:
-    size = BLOCK * int(np.ceil(2.0 * half / texel / BLOCK))
-    matrix = np.zeros((3, 4))
-    matrix[:2, :3] = rows[:2] / texel
-    matrix[:2, 3] = 0.5 * size - matrix[:2, :3] @ center
-    matrix[2, :3] = rows[2]
-    return matrix, size
-
-
-__all__ = ["PASSES", "Assembly", "Frame", "Renderer", "Settings", "render_frames", "role_map"]

@@ -8,8 +8,6 @@ of samples. What never moves is shaded once: only the shadows on it change.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,37 +31,6 @@ SHARPEN = 0.64
 """Share of the area of a pixel over which textures are averaged: below 1 is crisper."""
 WHITEST = 4.0
 """Linear light beyond which the tone table is white."""
-
-
-class Light(NamedTuple):
-    """A room's light; linear colours.
-
-    - ``lamp`` (2, 3): unit vector to the lamp, its colour.
-    - ``around`` (4, 3): light from all sides: constant, and slopes along x, y and z.
-    - ``mirrored`` (3, 3): what glossy things reflect: from the sides, from below, from above.
-    - ``window`` (3, 3): lowest and highest corner of a bright rectangle in a plane of one y, and
-      its colour: glossy things reflect it with soft edges.
-    - ``bounds`` (2, 3): lowest and highest corner of the room, darker near its edges.
-    """
-
-    lamp: F64
-    around: F64
-    mirrored: F64
-    window: F64
-    bounds: F64
-
-
-class ShadeMap(NamedTuple):
-    """A depth map of what stands in the light's way.
-
-    ``matrix`` (3, 4): world to texel x, texel y, depth in metres. ``depth`` (H, W): the smallest
-    depth of anything there. ``busy``: for each `BLOCK` x `BLOCK` texels, whether there is anything
-    in them or in their neighbours; elsewhere nothing needs looking up.
-    """
-
-    matrix: F64
-    depth: F32
-    busy: NDArray[np.bool_]
 
 
 @step
@@ -293,6 +260,15 @@ def _crowded(
     return float(total / 49.0)
 
 
+@step
+def _tone(tones: U8, light: float) -> int:
+    """The byte of a linear light; black for what is no number (a normal of no length)."""
+    at = light * ((TONES - 1) / WHITEST)
+    if not at > 0.0:
+        return int(tones[0])
+    return int(tones[int(min(at, TONES - 1.0))])
+
+
 @kernel
 def shade(
     ids: I32,
@@ -338,7 +314,6 @@ def shade(
     """
     height, width, samples = ids.shape
     lift, dark, strength, reach = settings[0], settings[1], settings[2], settings[3]
-    scale = (TONES - 1) / WHITEST
     for row in range(height):
         for column in range(width):
             red, green, blue = 0.0, 0.0, 0.0
@@ -383,37 +358,11 @@ def shade(
                 green += weight * (still[p, 4] + lit * still[p, 7])
                 blue += weight * (still[p, 5] + lit * still[p, 8])
             if not fill:
-                out[row, column, 0] = tones[int(min(red * scale, TONES - 1.0))]
-                out[row, column, 1] = tones[int(min(green * scale, TONES - 1.0))]
-                out[row, column, 2] = tones[int(min(blue * scale, TONES - 1.0))]
+                out[row, column, 0] = _tone(tones, red)
+                out[row, column, 1] = _tone(tones, green)
+                out[row, column, 2] = _tone(tones, blue)
 
 
 def pack_corners(normals: F32, uv: F32, tangents: F32, material: I32) -> F32:
     """What the shading loop reads of each triangle, side by side: (T, CORNERS)."""
     return np.concatenate([normals, uv, tangents, material[:, None].astype(np.float32)], axis=1)
-
-
-def busy_blocks(depth: F32) -> NDArray[np.bool_]:
-    """Which blocks of a depth map hold something, they or one of their eight neighbours."""
-    rows, columns = (size // BLOCK for size in depth.shape)
-    used = np.isfinite(depth).reshape(rows, BLOCK, columns, BLOCK).any(axis=(1, 3))
-    wide = np.pad(used, 1)
-    wide = wide[:-2] | wide[1:-1] | wide[2:]
-    return np.asarray(wide[:, :-2] | wide[:, 1:-1] | wide[:, 2:])
-
-
-def tone_table(exposure: float) -> U8:
-    """Bytes of the picture for linear light 0..WHITEST: filmic shoulder, then the sRGB curve."""
-    x = np.linspace(0.0, WHITEST, TONES) * exposure
-    # Straight below the knee, then bending towards white without ever reaching it.
-    knee = 0.55
-    bent = knee + (1.0 - knee) * (1.0 - np.exp(-(x - knee) / (1.0 - knee)))
-    y = np.where(x < knee, x, bent)
-    curve = np.where(y <= 0.0031308, 12.92 * y, 1.055 * np.maximum(y, 1e-9) ** (1 / 2.4) - 0.055)
-    return np.clip(np.round(255.0 * curve), 0, 255).astype(np.uint8)
-
-
-def to_linear(color: tuple[float, float, float]) -> F64:
-    """Linear light of an sRGB colour in 0..1, (3,)."""
-    value = np.asarray(color, np.float64)
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)

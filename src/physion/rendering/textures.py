@@ -45,7 +45,7 @@ class Finish:
 
 FINISHES = {
     "plain": Finish("plain", gloss=0.05, sharpness=20.0, mirror=0.01),
-    "wood_ash": Finish("wood_ash", gloss=0.04, sharpness=24.0, mirror=0.012),
+    "wood_ash": Finish("wood_ash", gloss=0.04, sharpness=24.0, mirror=0.008),
     "wood_cedar": Finish("wood_cedar", gloss=0.06, sharpness=24.0, mirror=0.012),
     "metal": Finish("metal", gloss=0.5, sharpness=40.0, mirror=0.5, metal=1.0),
     "plastic": Finish("plain", gloss=0.30, sharpness=60.0, mirror=0.04),
@@ -53,7 +53,7 @@ FINISHES = {
     "carpet": Finish("carpet", relief=1.0),
     "plaster": Finish("plaster", relief=1.0),
     "smooth_plaster": Finish("smooth_plaster", relief=1.0),
-    "tiles": Finish("tiles", gloss=0.08, sharpness=60.0, mirror=0.014, relief=0.6),
+    "tiles": Finish("tiles", gloss=0.08, sharpness=60.0, mirror=0.014, relief=0.2),
     "planks": Finish("wood_ash", gloss=0.05),
     "paving": Finish("paving", relief=0.0),
     "glow": Finish("plain"),
@@ -161,7 +161,7 @@ def _ash(rng: np.random.Generator) -> tuple[F32, F32]:
     pores = np.clip(_noise(rng, 220, 8) - 0.6, 0, None)
     fade = np.clip(0.75 + 0.25 * _noise(rng, 3, 2), 0.2, 1.2)
     streak = np.clip(0.85 + 0.45 * _noise(rng, 200, 14), 0.1, 1.6)
-    value = 0.95 - 0.48 * line * fade * streak - 0.07 * pores + 0.02 * _noise(rng, 4, 2)
+    value = 0.95 - 0.40 * line * fade * streak - 0.07 * pores + 0.02 * _noise(rng, 4, 2)
     return _tint(np.clip(value, 0.05, 1.0), (0.98, 0.90, 0.76)), _flat()
 
 
@@ -213,9 +213,9 @@ def _tiles(rng: np.random.Generator) -> tuple[F32, F32]:
     u, v = _grid()
     count = 4
     column, row = (u * count).astype(int), (v * count).astype(int)
-    shade = rng.uniform(0.78, 1.15, (count, count))[row, column]
+    shade = rng.uniform(0.74, 1.2, (count, count))[row, column]
     clouds = 0.5 * _noise(rng, 9, 9) + 0.35 * _noise(rng, 26, 26) + 0.15 * _noise(rng, 80, 80)
-    value = shade * np.clip(1.0 + 0.42 * clouds, 0.2, None)
+    value = shade * np.clip(1.0 + 0.30 * clouds, 0.2, None)
     color = np.stack([0.150 * value, 0.058 * value**1.15, 0.040 * value**1.2], -1)
     du = np.abs(u * count - np.round(u * count))
     dv = np.abs(v * count - np.round(v * count))
