@@ -1,6 +1,6 @@
 """How long a frame takes: ``python benchmarks/rendering.py [--write]``.
 
-The reference scene has about 12,000 triangles in the box room: a still zone, twelve bodies that
+The reference scene has about 12,000 triangles in the box room: a still zone, fourteen bodies that
 fly and turn, and a 40 x 40 cloth that waves, all of which move in every frame. Times are process
 CPU time on one core; each measured frame is another instant. ``start`` is a whole process from
 nothing to its first frame with all passes, without and with numba's machine code on disk (Python's
@@ -28,8 +28,8 @@ from physion.scenes.scene import Body, Camera, Cloth, Look, Roles, Scene
 
 RESULTS = Path(__file__).parent / "results"
 SHAPES = (
-    *("sphere", "bowl", "dumbbell", "torus", "pipe", "cone", "dumbbell"),
-    *("cylinder", "sphere", "bowl", "cube", "octahedron"),
+    *("sphere", "bowl", "sphere", "torus", "pipe", "sphere", "cone"),
+    *("sphere", "cylinder", "sphere", "cube", "sphere", "dumbbell", "sphere"),
 )
 FRAMES = 24
 
@@ -108,22 +108,28 @@ def milliseconds(size: int, passes: tuple[str, ...], still_layer: bool = True) -
 
 
 def start_seconds() -> dict[str, dict[str, float]]:
-    """Seconds of a whole process with one frame, without and with compiled code on disk."""
+    """Seconds of a whole process with one frame, without and with compiled code on disk.
+
+    The least of three, since other work on the machine only adds to them.
+    """
     code = "import benchmark_rendering as b; b.first_frame()"
-    result = {}
+    result: dict[str, dict[str, float]] = {}
     with tempfile.TemporaryDirectory() as folder:
         Path(folder, "benchmark_rendering.py").write_text(Path(__file__).read_text())
         environment = {**os.environ, "PYTHONPATH": folder, "OMP_NUM_THREADS": "1"}
         environment["PYTHONPYCACHEPREFIX"] = str(Path(folder, "bytecode"))
         environment.pop("PYTHONDONTWRITEBYTECODE", None)
-        for name, cache in (("warm up", "a"), ("cold", "b"), ("cached", "b")):
-            environment["NUMBA_CACHE_DIR"] = str(Path(folder, cache))
+        runs = [("warm up", 0)] + [(name, i) for i in range(1, 4) for name in ("cold", "cached")]
+        for name, cache in runs:
+            environment["NUMBA_CACHE_DIR"] = str(Path(folder, str(cache)))
             before, wall = os.times(), time.perf_counter()
             subprocess.run([sys.executable, "-c", code], env=environment, check=True)
             after = os.times()
             cpu = after.children_user + after.children_system
             cpu -= before.children_user + before.children_system
-            result[name] = {"cpu": round(cpu, 2), "wall": round(time.perf_counter() - wall, 2)}
+            best = result.setdefault(name, {"cpu": np.inf, "wall": np.inf})
+            best["cpu"] = min(best["cpu"], round(cpu, 2))
+            best["wall"] = min(best["wall"], round(time.perf_counter() - wall, 2))
     del result["warm up"]
     return result
 

@@ -157,7 +157,7 @@ WHITE = {"color": (0.955, 0.96, 0.985), "texture": "smooth_plaster", "tile": 3.0
 
 def _coffers(half: float, height: float) -> list[Panel]:
     """A ceiling of pale fields between dark beams."""
-    beam = {"color": (0.36, 0.35, 0.33), "texture": "smooth_plaster", "glow": 0.05}
+    beam = {"color": (0.36, 0.35, 0.33), "texture": "smooth_plaster", "glow": 0.14}
     pale = {"color": (0.80, 0.80, 0.79), "texture": "smooth_plaster", "glow": 0.22}
     inner, rise = half - 0.8, 0.30
     across, back = (2 * inner, 0.0, 0.0), (0.0, -2 * inner, 0.0)

@@ -92,11 +92,13 @@ def _shade_point(
     In order: the world point, the light from around, the lamp's light, how much the surface faces
     up (0..1), which is where things standing near darken it, and the normal without relief.
     """
-    e0 = edges[t, 0] * x + edges[t, 1] * y + edges[t, 2]
-    e1 = edges[t, 3] * x + edges[t, 4] * y + edges[t, 5]
-    e2 = edges[t, 6] * x + edges[t, 7] * y + edges[t, 8]
+    a0, a1, a2 = edges[t, 0], edges[t, 3], edges[t, 6]
+    b0, b1, b2 = edges[t, 1], edges[t, 4], edges[t, 7]
+    e0 = a0 * x + b0 * y + edges[t, 2]
+    e1 = a1 * x + b1 * y + edges[t, 5]
+    e2 = a2 * x + b2 * y + edges[t, 8]
     w = 1.0 / (e0 + e1 + e2)
-    b0, b1, b2 = e0 * w, e1 * w, e2 * w
+    e0, e1, e2 = e0 * w, e1 * w, e2 * w
     vx = view[1, 0] * x + view[1, 1] * y + view[1, 2]
     vy = view[2, 0] * x + view[2, 1] * y + view[2, 2]
     vz = view[3, 0] * x + view[3, 1] * y + view[3, 2]
@@ -107,14 +109,13 @@ def _shade_point(
     m = int(corners[t, MATERIAL])
     u0, u1, u2 = corners[t, 9], corners[t, 11], corners[t, 13]
     v0, v1, v2 = corners[t, 10], corners[t, 12], corners[t, 14]
-    u = b0 * u0 + b1 * u1 + b2 * u2
-    v = b0 * v0 + b1 * v1 + b2 * v2
-    da = edges[t, 0] + edges[t, 3] + edges[t, 6]
-    db = edges[t, 1] + edges[t, 4] + edges[t, 7]
-    du_dx = edges[t, 0] * u0 + edges[t, 3] * u1 + edges[t, 6] * u2 - u * da
-    du_dy = edges[t, 1] * u0 + edges[t, 4] * u1 + edges[t, 7] * u2 - u * db
-    dv_dx = edges[t, 0] * v0 + edges[t, 3] * v1 + edges[t, 6] * v2 - v * da
-    dv_dy = edges[t, 1] * v0 + edges[t, 4] * v1 + edges[t, 7] * v2 - v * db
+    u = e0 * u0 + e1 * u1 + e2 * u2
+    v = e0 * v0 + e1 * v1 + e2 * v2
+    da, db = a0 + a1 + a2, b0 + b1 + b2
+    du_dx = a0 * u0 + a1 * u1 + a2 * u2 - u * da
+    du_dy = b0 * u0 + b1 * u1 + b2 * u2 - u * db
+    dv_dx = a0 * v0 + a1 * v1 + a2 * v2 - v * da
+    dv_dy = b0 * v0 + b1 * v1 + b2 * v2 - v * db
     # The square of the mean of both sides' lengths (geometric: between blur and flicker).
     square = np.sqrt((du_dx * du_dx + dv_dx * dv_dx) * (du_dy * du_dy + dv_dy * dv_dy))
     side = 1 << (starts.shape[1] - 1)
@@ -122,9 +123,9 @@ def _shade_point(
     ar, ag, ab, slope_u, slope_v = _texture(texels, starts, int(materials[m, 3]), u, v, level)
     ar, ag, ab = ar * materials[m, 0], ag * materials[m, 1], ab * materials[m, 2]
 
-    nx = b0 * corners[t, 0] + b1 * corners[t, 3] + b2 * corners[t, 6]
-    ny = b0 * corners[t, 1] + b1 * corners[t, 4] + b2 * corners[t, 7]
-    nz = b0 * corners[t, 2] + b1 * corners[t, 5] + b2 * corners[t, 8]
+    nx = e0 * corners[t, 0] + e1 * corners[t, 3] + e2 * corners[t, 6]
+    ny = e0 * corners[t, 1] + e1 * corners[t, 4] + e2 * corners[t, 7]
+    nz = e0 * corners[t, 2] + e1 * corners[t, 5] + e2 * corners[t, 8]
     scale = 1.0 / np.sqrt(nx * nx + ny * ny + nz * nz)
     if nx * vx + ny * vy + nz * vz < 0.0:
         scale = -scale
@@ -166,12 +167,10 @@ def _shade_point(
         ambient = light[2, k] + nx * light[3, k] + ny * light[4, k] + nz * light[5, k]
         seen = light[6, k] + abs(high) * (light[end, k] - light[6, k])
         seen += window * (light[11, k] - seen)
-        tint = mirror * (1.0 + metal * (albedo - 1.0))
+        tint = 1.0 + metal * (albedo - 1.0)
         matte = albedo * (1.0 - 0.8 * metal)
-        out[at, 3 + k] = room * (matte * ambient + tint * seen) + materials[m, 9] * albedo
-        out[at, 6 + k] = (
-            room * light[1, k] * (matte * direct + shine * (1.0 + metal * (albedo - 1.0)))
-        )
+        out[at, 3 + k] = room * (matte * ambient + mirror * tint * seen) + materials[m, 9] * albedo
+        out[at, 6 + k] = room * light[1, k] * (matte * direct + tint * shine)
 
 
 @step
