@@ -63,7 +63,7 @@ def write_log(folder: Path, trials: list[list[list[Command]]], packed: bool = Fa
     lines = [f"{json.dumps(setup)} trial None"]
     for number, frames in enumerate(trials):
         lines += [f"{json.dumps(frame)} trial {number}" for frame in frames]
-        lines.append(f'{json.dumps([{"$type": "destroy_object", "id": 2}])} trial {number}')
+        lines.append(f"{json.dumps([{'$type': 'destroy_object', 'id': 2}])} trial {number}")
     text = "\n".join(lines) + "\n"
     records = [
         {
@@ -219,9 +219,7 @@ def test_a_broken_line_costs_its_trial_alone(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_bad_commands_name_line_and_trial(
-    tmp_path: Path, command: Command, complaint: str
-) -> None:
+def test_bad_commands_name_line_and_trial(tmp_path: Path, command: Command, complaint: str) -> None:
     write_log(tmp_path / "config", [[two_cubes()], [[*two_cubes(), command]]])
     found = read_scenes(tmp_path)
     assert len(found.trials) == 1
