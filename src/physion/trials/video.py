@@ -159,7 +159,8 @@ def _open(path: Path) -> Any:
         container = av.open(str(path), metadata_errors="replace")
     except (av.FFmpegError, ValueError) as error:
         raise BadInputError(f"movie {path} cannot be read: {error}") from error
-    if not container.streams.video:
+    # A damaged header can leave a stream that names no codec.
+    if not container.streams.video or container.streams.video[0].codec_context is None:
         container.close()
         raise BadInputError(f"movie {path} holds no pictures")
     return container

@@ -1,0 +1,193 @@
+"""The exact readout against scikit-learn, and where there is nothing to fit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from sklearn.linear_model import LogisticRegression
+from sklearn.model_selection import GridSearchCV, StratifiedKFold
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
+
+from physion.errors import BadInputError, UnknownNameError
+from physion.readout.logistic import (
+    C_GRID,
+    ReadoutConfig,
+    fit_readout,
+    gram,
+    solve_path,
+    undersample,
+)
+from physion.readout.protocols import Readout, flatten_time
+
+
+def problem(n: int, d: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Noisy answers that two of d features tell; features of many scales and offsets."""
+    rng = np.random.default_rng(seed)
+    plain = rng.normal(size=(n, d))
+    answers = plain[:, 0] + plain[:, 1] + rng.normal(size=n) > 0
+    return plain * rng.uniform(0.1, 10, d) + rng.normal(size=d) * 5, answers
+
+
+@pytest.mark.parametrize(("n", "d"), [(60, 20), (80, 2000)])
+def test_the_solution_is_that_of_converged_scikit_learn(n: int, d: int) -> None:
+    features, labels = problem(n, d)
+    kernel = gram(features, np.arange(n))
+    weights, intercepts = solve_path(kernel, labels, C_GRID)
+    answers = kernel @ weights + intercepts
+    scaled = StandardScaler().fit_transform(features)
+    for i, c in enumerate(C_GRID):
+        oracle = LogisticRegression(C=c, tol=1e-12, max_iter=100_000).fit(scaled, labels)
+        expected = oracle.decision_function(scaled)
+        worst = np.abs(expected - answers[:, i]).max() / max(1, np.abs(expected).max())
+        if c <= 1e5:
+            assert worst < 1e-4, f"C = {c}"
+        # Beyond that lbfgs itself stops early: ours must be at least as good as the oracle.
+        signs = np.where(labels, 1.0, -1.0)
+
+        def objective(f: np.ndarray, square: float, c: float = c, s: Any = signs) -> float:
+            return float(c * np.logaddexp(0, -s * f).sum() + square / 2)
+
+        ours = objective(answers[:, i], float(weights[:, i] @ kernel @ weights[:, i]))
+        theirs = objective(expected, float((oracle.coef_**2).sum()))
+        assert ours <= theirs * (1 + 1e-7) + 1e-9
+
+
+def test_the_whole_readout_is_that_of_a_converged_grid_search() -> None:
+    features, labels = problem(70, 300, seed=2)
+    train, test, answers = features[:50], features[50:], labels[:50]
+    grid = tuple(float(c) for c in np.logspace(-6, 2, 9))
+    fitted = fit_readout(train, answers, test, ReadoutConfig(grid=grid, seed=4))
+    search = GridSearchCV(
+        make_pipeline(StandardScaler(), LogisticRegression(tol=1e-10, max_iter=100_000)),
+        {"logisticregression__C": grid},
+        cv=StratifiedKFold(5, shuffle=True, random_state=4),
+    ).fit(train, answers)
+    assert fitted.c == search.best_params_["logisticregression__C"]
+    assert fitted.cv_accuracy == pytest.approx(search.best_score_)
+    assert fitted.probability == pytest.approx(search.predict_proba(test)[:, 1], abs=1e-5)
+    assert fitted.train_accuracy == search.score(train, answers)
+
+
+def test_the_released_setting_is_scikit_learns_early_stop() -> None:
+    features, labels = problem(60, 400, seed=3)
+    config = ReadoutConfig(grid=(1.0,), released=True)
+    released = fit_readout(features[:40], labels[:40], features[40:], config)
+    pipe = make_pipeline(StandardScaler(), LogisticRegression(C=1.0, max_iter=200))
+    pipe.fit(features[:40], labels[:40])
+    assert released.probability == pytest.approx(pipe.predict_proba(features[40:])[:, 1])
+    exact = fit_readout(features[:40], labels[:40], features[40:], ReadoutConfig(grid=(1.0,)))
+    assert not np.allclose(exact.probability, released.probability, atol=1e-9)
+
+
+def test_it_learns_what_is_there_and_not_what_is_not() -> None:
+    features, labels = problem(400, 10)
+    fitted = fit_readout(features[:200], labels[:200], features[200:])
+    assert np.mean((fitted.probability > 0.5) == labels[200:]) > 0.7
+    noise = np.random.default_rng(1).normal(size=features.shape)
+    blind = fit_readout(noise[:200], labels[:200], noise[200:])
+    assert np.mean((blind.probability > 0.5) == labels[200:]) < 0.62
+
+
+@pytest.mark.parametrize("value", [True, False])
+def test_one_answer_only_is_the_rule_of_succession(value: bool) -> None:
+    features, _ = problem(8, 5)
+    fitted = fit_readout(features, np.full(8, value), features[:3])
+    assert fitted.probability == pytest.approx([0.9 if value else 0.1] * 3)
+    assert fitted.train_accuracy == 1.0 and np.isnan(fitted.c) and fitted.note == "one answer only"
+
+
+def test_no_trial_to_fit_is_a_coin() -> None:
+    fitted = fit_readout(np.zeros((0, 4)), np.zeros(0, bool), np.ones((2, 4)))
+    assert list(fitted.probability) == [0.5, 0.5] and np.isnan(fitted.train_accuracy)
+
+
+@pytest.mark.parametrize("released", [False, True])
+def test_constant_features_say_the_share_of_contacts(released: bool) -> None:
+    labels = np.array([True] * 6 + [False] * 4)
+    config = ReadoutConfig(released=released)
+    fitted = fit_readout(np.full((10, 3), 7.7), labels, np.full((2, 3), 7.7), config)
+    assert fitted.probability == pytest.approx([0.6, 0.6], abs=1e-3)
+
+
+def test_a_constant_feature_beside_others_counts_nothing() -> None:
+    features, labels = problem(40, 10)
+    more = np.column_stack([features, np.full(40, 0.1)])
+    plain, added = (fit_readout(x[:30], labels[:30], x[30:]) for x in (features, more))
+    assert added.probability == pytest.approx(plain.probability, abs=1e-9)
+
+
+def test_too_few_trials_of_an_answer_are_said() -> None:
+    features, _ = problem(12, 5)
+    rare = np.zeros(12, bool)
+    rare[0] = True
+    alone = fit_readout(features, rare, features)
+    assert alone.note == "too few trials to choose C" and alone.c == C_GRID[8]
+    rare[1:3] = True
+    assert fit_readout(features, rare, features).note == "only 3 folds"
+
+
+def test_separable_answers_stay_finite_at_every_c() -> None:
+    features = np.array([[-2.0], [-1.0], [1.0], [2.0]])
+    labels = np.array([False, False, True, True])
+    kernel = gram(features, np.arange(4))
+    weights, intercepts = solve_path(kernel, labels, C_GRID)
+    assert np.isfinite(weights).all() and np.isfinite(intercepts).all()
+    margins = kernel @ weights + intercepts
+    assert (np.diff(margins[3]) > 0).all(), "a weaker penalty gives a larger margin"
+    assert margins[:, -1] == pytest.approx(-margins[::-1, -1], rel=1e-6)
+
+
+def test_undersampling_keeps_the_rarer_answer_whole() -> None:
+    labels = np.array([True] * 3 + [False] * 20)
+    kept = undersample(labels, 0)
+    assert labels[kept].sum() == 3 and len(kept) == 6 and set(kept) >= {0, 1, 2}
+    assert list(undersample(labels, 0)) == list(kept) != list(undersample(labels, 1))
+    features, _ = problem(23, 4)
+    config = ReadoutConfig(balance=True)
+    balanced = fit_readout(np.zeros((23, 4)), labels, features, config)
+    assert balanced.probability == pytest.approx([0.5] * 23)
+
+
+def test_seeds_are_explicit() -> None:
+    features, labels = problem(60, 100, seed=9)
+    first, second = (
+        fit_readout(features[:40], labels[:40], features[40:], ReadoutConfig(seed=1))
+        for _ in range(2)
+    )
+    assert (first.probability == second.probability).all()
+
+
+def test_bad_features_labels_and_settings_are_refused() -> None:
+    features, labels = problem(20, 5)
+    broken = features.copy()
+    broken[7, 2] = np.nan
+    with pytest.raises(BadInputError, match="training trial 7"):
+        fit_readout(broken, labels, features)
+    with pytest.raises(BadInputError, match="test trial 7"):
+        fit_readout(features, labels, broken)
+    with pytest.raises(BadInputError, match="one width"):
+        fit_readout(features, labels, features[:, :4])
+    with pytest.raises(BadInputError, match="labels"):
+        fit_readout(features, labels[:4], features)
+    for wrong in ({"grid": ()}, {"grid": (1.0, 0.1)}, {"grid": (-1.0, 1.0)}, {"folds": 1}):
+        with pytest.raises(BadInputError):
+            ReadoutConfig(**wrong)  # type: ignore[arg-type]
+
+
+def test_protocols_have_their_official_letters() -> None:
+    letters = {readout.value: readout.letter for readout in Readout}
+    assert letters == {"observed": "C", "observed+simulated": "B", "full": "A"}
+    assert [readout for readout in Readout if readout.sees_future] == [Readout.FULL]
+    with pytest.raises(UnknownNameError, match="observed"):
+        Readout.named("observd")
+
+
+def test_time_is_flattened_trial_by_trial() -> None:
+    first, second = np.arange(12).reshape(2, 2, 3), np.arange(6).reshape(2, 1, 3)
+    flat = flatten_time(first, second)
+    assert flat.shape == (2, 9) and list(flat[1]) == [6, 7, 8, 9, 10, 11, 3, 4, 5]
+    with pytest.raises(BadInputError):
+        flatten_time(np.zeros((2, 3)))

@@ -1,0 +1,223 @@
+"""Simulators in the road: fitted on readout trials, stored, and never shown the future."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from physion.errors import BadInputError
+from physion.models import Provenance, Spec
+from physion.models.noisy_simulation import Config, NoisySimulation
+from physion.physics.trajectory import Contacts, State, Trajectory
+from physion.readout import EvaluationConfig, evaluate, evaluate_model
+from physion.readout.rounds import plan_rounds
+from physion.readout.simulations import SimulationReadout
+from physion.scenes.scene import Body, Camera, Roles, Scene
+from physion.training.protocols import Training
+
+FRAMES = 100
+CONFIG = Config(position=0.05, velocity=0.0, mass=0.0, scales=(0.0, 1.0, 40.0), samples=20)
+
+
+class Flight:
+    """The ball flies on along x; it touches the box if it passes within 0.5 m of it."""
+
+    name = "flight 1"
+
+    def __init__(self, fail: str = "") -> None:
+        self.calls, self.fail = 0, fail
+
+    def simulate(
+        self, scene: Scene, *, start: State | None = None, frames: int | None = None
+    ) -> Trajectory:
+        self.calls += 1
+        if scene.name == self.fail:
+            raise ValueError("the solver diverged")
+        given = start.positions if start else np.array([b.position for b in scene.bodies])
+        length = FRAMES - (start.frame if start else 0)
+        positions = np.tile(given.astype(np.float32), (length, 1, 1))
+        positions[:, 0, 0] += 0.02 * np.arange(length)
+        near = np.linalg.norm(positions[:, 0] - positions[:, 1], axis=1) < 0.5
+        touched = np.flatnonzero(near).astype(np.int32)
+        zeros = np.zeros((length, 2, 3), np.float32)
+        contacts = replace(
+            Contacts.empty(),
+            frame=touched,
+            bodies=np.tile(np.array([[0, 1]], np.int32), (len(touched), 1)),
+            point=np.zeros((len(touched), 3), np.float32),
+            normal=np.zeros((len(touched), 3), np.float32),
+            impulse=np.ones(len(touched), np.float32),
+        )
+        turned = np.tile(np.array([1, 0, 0, 0], np.float32), (length, 2, 1))
+        return Trajectory(
+            positions, turned, zeros, zeros, np.zeros((length, 0, 3), np.float32),
+            np.full(length, np.nan, np.float32), contacts, False, self.name,
+        )  # fmt: skip
+
+
+class Shelf:
+    """As much of a `Dataset` as simulators use: an index, and trials with scene and trajectory."""
+
+    def __init__(self, readout: int = 12, testing: int = 10) -> None:
+        rng = np.random.default_rng(0)
+        rows, self.trials = [], {}
+        for split, count in (("readout", readout), ("testing", testing)):
+            for i in range(count):
+                name = f"collide_{split}_{i}"
+                beside = float(rng.uniform(0.2, 0.8))
+                bodies = (
+                    Body("ball", "sphere", (0.0, beside, 0.0)),
+                    Body("box", "cube", (1.8, 0.0, 0.0)),
+                )
+                scene = Scene(
+                    name, "collide", bodies, Roles("ball", "box"), Camera((3.0, 0.0, 1.0))
+                )
+                path = Flight().simulate(scene)
+                self.trials[name] = SimpleNamespace(scene=scene, trajectory=path)
+                rows.append(
+                    {
+                        "trial": name, "scenario": "collide", "split": split, "digest": name,
+                        "contact": len(path.contacts.frame) > 0, "recorded_contact": i % 2 == 0,
+                        "movie_sha256": "", "observed_movie_sha256": "",
+                    }
+                )  # fmt: skip
+        self.index = pd.DataFrame(rows)
+
+    def trial(self, name: str) -> Any:
+        return self.trials[name]
+
+
+def test_the_noise_is_fitted_on_readout_trials_alone(tmp_path: Path) -> None:
+    shelf: Any = Shelf()
+    (round_,) = plan_rounds(shelf.index, Training.ALL, 5, 0)
+
+    def fitted(labels: pd.Series) -> tuple[float, np.ndarray]:
+        shelf.index["contact"] = labels
+        reader = SimulationReadout(shelf, NoisySimulation(CONFIG, Flight()), tmp_path)
+        reader.prepare([round_])
+        (answers,) = reader.answers(round_)
+        return answers.noise_scale, answers.probability
+
+    truth = shelf.index["contact"].copy()
+    tested = shelf.index["split"] == "testing"
+    scale, probability = fitted(truth)
+    assert scale == 0.0
+    assert fitted(truth ^ tested)[0] == scale, "labels of tested trials must not matter"
+    assert (fitted(truth ^ tested)[1] == probability).all()
+    assert fitted(truth ^ ~tested)[0] != scale, "labels of readout trials must matter"
+
+
+def test_predictions_are_shares_and_say_their_scale(tmp_path: Path) -> None:
+    shelf: Any = Shelf()
+    model = NoisySimulation(replace(CONFIG, scales=(1.0,)), Flight())
+    evaluation = evaluate_model(shelf, model, tmp_path, config=EvaluationConfig())
+    table = evaluation.predictions
+    assert len(table) == 10 and evaluation.problems == {}
+    shares = table["Predicted Prob_true"].to_numpy() * 20
+    assert np.allclose(shares, shares.round()) and (shares % 20 != 0).sum() > 0
+    assert (table["Noise Scale"] == 1.0).all() and set(table["Readout Type"]) == {"B"}
+    assert table["Test Accuracy"].iloc[0] > 0.7
+    assert set(table["Recorded Outcome"]) == {"True", "False"}
+    assert (table["Init"] == "none").all()
+
+
+def test_simulations_are_stored_and_not_made_again(tmp_path: Path) -> None:
+    shelf: Any = Shelf(4, 3)
+    engines = [Flight(), Flight(), Flight()]
+    (round_,) = plan_rounds(shelf.index, Training.ALL, 5, 0)
+    found = []
+    for engine, config in zip(engines, (CONFIG, CONFIG, replace(CONFIG, seed=1)), strict=True):
+        reader = SimulationReadout(shelf, NoisySimulation(config, engine), tmp_path)
+        reader.prepare([round_])
+        found.append(reader.answers(round_)[0].probability)
+    assert engines[0].calls > 0 and engines[1].calls == 0
+    assert engines[2].calls == engines[0].calls
+    assert (found[0] == found[1]).all()
+    next(tmp_path.rglob("*.json")).write_text('{"contacts": 3}')
+    reader = SimulationReadout(shelf, NoisySimulation(CONFIG, engines[1]), tmp_path)
+    reader.prepare([round_])
+    assert engines[1].calls == 20
+
+
+def test_a_trial_that_fails_is_named_and_the_others_go_on(tmp_path: Path) -> None:
+    shelf: Any = Shelf(4, 3)
+    broken = NoisySimulation(CONFIG, Flight(fail="collide_testing_1"))
+    evaluation = evaluate_model(shelf, broken, tmp_path, config=EvaluationConfig())
+    assert set(evaluation.predictions["Stimulus Name"]) == {
+        "collide_testing_0",
+        "collide_testing_2",
+    }
+    assert "diverged" in evaluation.problems["collide_testing_1"]
+    assert evaluation.path.name.endswith(".partial.csv")
+    whole = NoisySimulation(CONFIG, Flight())
+    again = evaluate_model(shelf, whole, tmp_path, config=EvaluationConfig())
+    assert len(again.predictions) == 3 and not again.problems
+
+
+def test_without_readout_trials_the_tested_ones_are_cross_fitted(tmp_path: Path) -> None:
+    shelf: Any = Shelf(0, 10)
+    model = NoisySimulation(CONFIG, Flight())
+    table = evaluate_model(shelf, model, tmp_path, config=EvaluationConfig()).predictions
+    assert len(table) == 10 and set(table["Fold"]) == {0, 1, 2, 3, 4}
+    assert (table["Fit Trials"] == 8).all()
+
+
+class Oracle:
+    """A state model of another package: it answers by the contacts that it is shown."""
+
+    spec = Spec(modalities=("state",))
+
+    def __init__(self, answer: float | None = None) -> None:
+        self.answer, self.shown = answer, []  # type: ignore[var-annotated]
+
+    def provenance(self) -> Provenance:
+        return Provenance("oracle", "none")
+
+    def predict_contact(self, scene: Scene, trajectory: Trajectory) -> float:
+        self.shown.append((len(trajectory), len(trajectory.contacts.frame)))
+        return self.answer if self.answer is not None else float(len(trajectory.contacts.frame) > 0)
+
+
+def test_other_state_models_are_shown_the_observed_part_alone(tmp_path: Path) -> None:
+    shelf: Any = Shelf()
+    assert shelf.index["contact"].any()
+    oracle = Oracle()
+    table = evaluate_model(shelf, oracle, tmp_path, config=EvaluationConfig()).predictions
+    assert set(oracle.shown) == {(45, 0)}, "neither later frames nor later contacts"
+    assert len(table) == 10 and (table["Predicted Prob_true"] == 0).all()
+    with pytest.raises(BadInputError, match="no probability"):
+        evaluate_model(shelf, Oracle(1.5), tmp_path / "b", config=EvaluationConfig())
+
+
+@pytest.mark.slow
+def test_the_road_on_real_trials(tmp_path: Path) -> None:
+    """Sampled, simulated, rendered; seen by an encoder, and simulated again."""
+    from physion.compute.local import LocalExecutor, SerialExecutor
+    from physion.trials.dataset import Dataset
+    from physion.trials.generate import generate
+    from physion.trials.plan import Settings, plan_dataset
+
+    tasks = plan_dataset("road", ("drop",), {"readout": 4, "testing": 3})
+    report = generate(
+        tmp_path / "data", tasks, Settings(width=64, height=64), executor=SerialExecutor()
+    )
+    assert not report.failed
+    dataset = Dataset(tmp_path / "data")
+    options: dict[str, Any] = {
+        "encoder": "test_vit", "image_size": 64, "weights": "random", "hidden": 16,
+    }  # fmt: skip
+    config = EvaluationConfig(steps=10, accelerator="cpu")
+    seen = evaluate(dataset, "frozen-encoder", tmp_path / "out", options=options, config=config)
+    assert len(seen.predictions) == 9
+    simulated = evaluate(
+        dataset, "noisy-simulation", tmp_path / "out",
+        options={"samples": 5, "scales": (0.2, 1.0)}, executor=LocalExecutor(2),
+    )  # fmt: skip
+    assert simulated.problems == {} and len(simulated.predictions) == 3
+    assert simulated.predictions["Predicted Prob_true"].between(0, 1).all()
