@@ -268,8 +268,10 @@ def _pentagon() -> Shape:
 
 @shapes.register("triangular_prism")
 def _triangular_prism() -> Shape:
+    # The ridge runs along x: with it along y the official falls of prisms are missed by 0.33 m
+    # (median of 20 trials), with it along x by 0.07 m.
     ends = [(x, y, 0.0) for x in (-0.5, 0.5) for y in (-0.5, 0.5)]
-    ridge = [(0.0, y, 0.5 + math.sqrt(3) / 4) for y in (-0.5, 0.5)]
+    ridge = [(x, 0.0, 0.5 + math.sqrt(3) / 4) for x in (-0.5, 0.5)]
     return _solid("triangular_prism", hull([*ends, *ridge]))
 
 
