@@ -134,6 +134,14 @@ def start_seconds() -> dict[str, dict[str, float]]:
     return result
 
 
+def loop_seconds() -> float:
+    """CPU seconds that Python takes to add up ten million numbers: how busy the machine is."""
+    start, total = time.process_time(), 0
+    for i in range(10_000_000):
+        total += i
+    return round(time.process_time() - start, 2)
+
+
 def first_frame() -> None:
     """What a new process does in the measurement of its start."""
     scene, trajectory = reference_scene()
@@ -154,6 +162,7 @@ def main() -> None:
         "command": "python benchmarks/rendering.py --write",
         "triangles": renderer.triangles,
         "load_average": round(os.getloadavg()[0], 1),
+        "cpu_s_of_10_million_additions": loop_seconds(),
         "cpu_ms_a_frame": {
             "256 all five passes": milliseconds(256, PASSES),
             "256 color": milliseconds(256, ("color",)),
