@@ -13,7 +13,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from physion.errors import BadInputError, PhysionError
+from physion.scenes.looks import prop_look
 from physion.scenes.props import ModelBounds, prop_for, read_model_bounds
 from physion.scenes.scene import (
     Body,
@@ -35,6 +38,7 @@ from physion.scenes.tdw_log import (
     read_command_log,
     read_metadata,
 )
+from physion.seeds import stable_hash
 
 SCENARIOS = {
     "MultiDominoes": "dominoes",
@@ -237,6 +241,10 @@ class _SceneBuilder:
         return Roles(agent=agent.name, patient=zone.name, probe=probe)
 
     def _look(self, thing: LoggedObject) -> Look:
+        if thing.color is None and thing.model not in shapes:
+            # Library models bring their own pictures: a model looks the same in every trial.
+            chance = np.random.default_rng(stable_hash("library model", thing.model))
+            return prop_look(chance, prop_for(thing.category))
         return Look(thing.color or (0.8, 0.8, 0.8), thing.texture)
 
     def _body(self, thing: LoggedObject) -> Body:
