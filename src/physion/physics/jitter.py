@@ -31,8 +31,7 @@ def jitter_scene(scene: Scene, distance: float, generator: np.random.Generator) 
         bodies=tuple(replace(b, position=moved(b.name, b.position)) for b in scene.bodies),
         cloths=tuple(replace(c, position=moved(c.name, c.position)) for c in scene.cloths),
         pushes=tuple(
-            p if p.point is None else replace(p, point=moved(p.body, p.point))
-            for p in scene.pushes
+            p if p.point is None else replace(p, point=moved(p.body, p.point)) for p in scene.pushes
         ),
     )
 
