@@ -5,12 +5,14 @@ from __future__ import annotations
 import ast
 import hashlib
 import pickle
+import socket
 from pathlib import Path
 from typing import Any
 
 import pytest
 import timm
 import torch
+from huggingface_hub import constants as hub
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
@@ -136,6 +138,33 @@ def test_unreachable_imagenet_weights_name_the_alternatives(
     with pytest.raises(BadInputError, match="weights=random") as caught:
         create_encoder(NAME, SIZE, EncoderWeights("imagenet"))
     assert "Name or service not known" in str(caught.value)
+
+
+@pytest.mark.parametrize("reachable", [True, False])
+def test_without_a_network_only_the_local_cache_is_asked(
+    reachable: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, seen = timm.create_model, []
+
+    class Connection:
+        def close(self) -> None: ...
+
+    def connect(*where: Any, timeout: float) -> Connection:
+        if not reachable:
+            raise OSError("Name or service not known")
+        return Connection()
+
+    def create(name: str, pretrained: bool = False, **options: Any) -> nn.Module:
+        seen.append(hub.HF_HUB_OFFLINE)
+        return real(name, pretrained=False, **options)
+
+    monkeypatch.setattr(timm, "create_model", create)
+    monkeypatch.setattr(socket, "create_connection", connect)
+    monkeypatch.setattr(hub, "HF_HUB_OFFLINE", False)
+    for name in ("https_proxy", "HTTPS_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+    create_encoder(NAME, SIZE, EncoderWeights("imagenet"))
+    assert seen == [not reachable] and hub.HF_HUB_OFFLINE is False
 
 
 @pytest.mark.slow

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import os
 import pickle
+import socket
 import sys
 import zipfile
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import timm
 import torch
+from huggingface_hub import constants as hub
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
@@ -103,8 +109,12 @@ def _create(name: str, image_size: int, *, pretrained: bool) -> nn.Module:
     fixed: dict[str, Any] = (
         {"img_size": image_size} if known is not None and known.fixed_input_size else {}
     )
+    offline = _no_way_to_hub() if pretrained else contextlib.nullcontext()
     try:
-        model: nn.Module = timm.create_model(name, pretrained=pretrained, num_classes=0, **fixed)
+        with offline:
+            model: nn.Module = timm.create_model(
+                name, pretrained=pretrained, num_classes=0, **fixed
+            )
     except Exception as error:
         if not pretrained:
             raise
@@ -115,6 +125,23 @@ def _create(name: str, image_size: int, *, pretrained: bool) -> nn.Module:
             "that you have, or weights=random, which the tables will say"
         ) from error
     return model
+
+
+@contextlib.contextmanager
+def _no_way_to_hub() -> Iterator[None]:
+    """Without a network, look in the local cache alone: the hub's retries take most of a minute."""
+    host = urlsplit(hub.ENDPOINT).hostname or ""
+    proxied = any(name.lower().endswith("s_proxy") for name in os.environ)
+    before = hub.HF_HUB_OFFLINE
+    if not proxied:
+        try:
+            socket.create_connection((host, 443), timeout=5).close()
+        except OSError:
+            hub.HF_HUB_OFFLINE = True
+    try:
+        yield
+    finally:
+        hub.HF_HUB_OFFLINE = before
 
 
 def _load_local(encoder: nn.Module, name: str, path: Path) -> None:

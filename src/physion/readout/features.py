@@ -51,6 +51,7 @@ class FeatureReadout:
         features = self.folder / "features" if self.folder is not None else None
         self._store = FeatureStore(self.model, features, self.fabric)
         if isinstance(self.model, nn.Module):
+            self.fabric.to_device(self.model)
             self._fresh = copy.deepcopy(self.model.state_dict())
         self._observed = observed_clips(self.dataset, self.model.spec)
         self._labels = dict(
