@@ -53,12 +53,12 @@ class ContactSet(NamedTuple):
 class AnchorMemory(NamedTuple):
     """Friction anchors that held in the last step.
 
-    ``key`` (A,) and ``count`` (A,) of anchors; ``normals`` (A, 2, 3) and ``points``
+    ``key`` (A,) and number of ``anchors`` (A,) of every patch; ``normals`` (A, 2, 3) and ``points``
     (A, 2, 2, 3) in the frames of both bodies: [patch, body, anchor, axis].
     """
 
     key: Index
-    count: Index
+    anchors: Index
     normals: Array
     points: Array
 
@@ -205,7 +205,7 @@ def find_patches(
             if na[0] * nb[0] + na[1] * nb[1] + na[2] * nb[2] <= patch_cosine:
                 continue
             keep = True
-            for k in range(memory.count[m]):
+            for k in range(memory.anchors[m]):
                 _to_world(rot[a], x[a], memory.points[m, 0, k], pa)
                 _to_world(rot[b], x[b], memory.points[m, 1, k], pb)
                 gap = 0.0
@@ -216,7 +216,7 @@ def find_patches(
                 first[used] = -1
                 bodies[used, 0], bodies[used, 1] = a, b
                 normals[used] = na
-                count[used] = memory.count[m]
+                count[used] = memory.anchors[m]
                 anchors[used] = memory.points[m]
                 used += 1
         for c in range(start, stop):

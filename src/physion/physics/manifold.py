@@ -111,9 +111,7 @@ def face_normal(corners: Any, loops: Any, first_loop: Any, f: int) -> Any:
 
 
 @njit(cache=True)
-def _flatten(
-    corners: Any, loops: Any, start: int, stop: int, rot: Any, x: Any, axes: Any
-) -> Any:
+def _flatten(corners: Any, loops: Any, start: int, stop: int, rot: Any, x: Any, axes: Any) -> Any:
     """Corners of a face as (u, v, height) along the three ``axes``."""
     out = np.zeros((stop - start, 3))
     for k in range(start, stop):
@@ -124,7 +122,9 @@ def _flatten(
             for j in range(3):
                 world[i] += rot[i, j] * c[j]
         for i in range(3):
-            out[k - start, i] = axes[i, 0] * world[0] + axes[i, 1] * world[1] + axes[i, 2] * world[2]
+            out[k - start, i] = (
+                axes[i, 0] * world[0] + axes[i, 1] * world[1] + axes[i, 2] * world[2]
+            )
     return out
 
 
@@ -248,9 +248,9 @@ def face_contacts(
         return normal, np.zeros((0, 3)), np.zeros(0)
     axes = np.zeros((3, 3))
     axes[2] = lead
-    i = np.argmin(np.abs(lead))
-    axes[0, i] = 1.0
-    axes[0] -= lead * lead[i]
+    least = np.argmin(np.abs(lead))
+    axes[0, least] = 1.0
+    axes[0] -= lead * lead[least]
     axes[0] /= np.sqrt(np.sum(axes[0] ** 2))
     axes[1, 0] = lead[1] * axes[0, 2] - lead[2] * axes[0, 1]
     axes[1, 1] = lead[2] * axes[0, 0] - lead[0] * axes[0, 2]

@@ -18,7 +18,6 @@ from physion.physics.contact_finder import ContactFinder
 from physion.physics.contact_record import ContactRecord
 from physion.physics.contact_solver import AnchorMemory, move_poses, no_anchors, solve_step
 from physion.physics.rigid_model import (
-    RigidModel,
     build_model,
     conjugate,
     multiply_quaternions,
@@ -59,9 +58,9 @@ class MujocoEngine:
         scene = settle_solids(scene, self.cloth)
         run = RigidRun(scene, self.settings, start)
         limit = scene.ending.max_frames if frames is None else frames
-        while len(run.history) < limit:
-            if frames is None and len(run.history) >= scene.ending.min_frames and run.all_asleep():
-                break
+        # Cloth does not sleep: with it a trial takes its whole time.
+        least = limit if frames is not None or scene.cloths else scene.ending.min_frames
+        while len(run.history) < limit and not (len(run.history) >= least and run.all_asleep()):
             run.step()
         rigid = run.trajectory(self.name)
         return add_cloth(scene, rigid, self.cloth, start=start) if scene.cloths else rigid

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.errors import BadSceneError
+from physion.physics.collision_hulls import collision_hulls
 from physion.physics.mass_properties import MassProperties, hull_mass, merge_masses
 from physion.physics.settings import Settings
-from physion.scenes.scene import Body, Scene
-from physion.physics.collision_hulls import collision_hulls
+from physion.scenes.scene import Scene
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -93,7 +93,7 @@ def rotate_vectors(q: Array, v: Array) -> Array:
 
 def conjugate(q: Array) -> Array:
     """The opposite turn."""
-    return q * np.array([1.0, -1.0, -1.0, -1.0])
+    return np.asarray(q * np.array([1.0, -1.0, -1.0, -1.0]))
 
 
 def group_bodies(scene: Scene) -> list[list[int]]:
@@ -160,7 +160,9 @@ def build_model(scene: Scene, settings: Settings) -> RigidModel:
     ]
     geoms = [piece for pieces in hulls for piece in pieces]
     first_vertex = np.cumsum([0, *(len(c) for c in corners)])
-    loops = [face + start for g, start in zip(geoms, first_vertex, strict=False) for face in g.faces]
+    loops = [
+        face + start for g, start in zip(geoms, first_vertex, strict=False) for face in g.faces
+    ]
     contacts = [b.contact for b in scene.bodies] + [settings.floor]
     return RigidModel(
         inv_mass=inv_mass,
@@ -176,7 +178,9 @@ def build_model(scene: Scene, settings: Settings) -> RigidModel:
         loops=np.concatenate(loops) if loops else np.zeros(0, np.int64),
         first_loop=np.cumsum([0, *(len(loop) for loop in loops)]),
         first_face=np.cumsum([0, *(len(geom.faces) for geom in geoms)]),
-        material=np.array([[c.static_friction, c.dynamic_friction, c.restitution] for c in contacts]),
+        material=np.array(
+            [[c.static_friction, c.dynamic_friction, c.restitution] for c in contacts]
+        ),
         start_x=start_x,
         start_q=start_q,
         mujoco_model=_compile(actors, actor_of[geom_body], corners, settings),

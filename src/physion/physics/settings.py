@@ -8,6 +8,9 @@ from dataclasses import asdict, dataclass
 
 from physion.scenes.scene import FRAME_TIME, GRAVITY, Contact
 
+FLOOR_MATERIAL = Contact(static_friction=0.6, dynamic_friction=0.6, restitution=0.0)
+"""Unity's default material; the official scenes never set one for the floor."""
+
 
 @dataclass(frozen=True, slots=True)
 class Settings:
@@ -36,7 +39,7 @@ class Settings:
     - ``max_angular_velocity``: radians per second, about the centre of mass (Unity: 7).
     - ``sleep_threshold``: kinetic energy by mass in m²/s² (official: .01).
     - ``wake_time``: seconds of stillness before a body may sleep (PhysX: .4).
-    - ``floor``: friction of the floor (Unity's default material).
+    - ``floor``: how the floor rubs and bounces (Unity's default material).
     """
 
     dt: float = FRAME_TIME
@@ -56,7 +59,7 @@ class Settings:
     max_angular_velocity: float = 7.0
     sleep_threshold: float = 0.01
     wake_time: float = 0.4
-    floor: Contact = Contact(0.6, 0.6, 0.0)
+    floor: Contact = FLOOR_MATERIAL
 
     def tag(self) -> str:
         """Eight hexadecimal digits that change whenever a setting does."""
