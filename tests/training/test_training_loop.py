@@ -167,12 +167,14 @@ def test_a_pickle_in_place_of_a_checkpoint_is_not_run(cpu: Fabric, tmp_path: Pat
 
 
 @pytest.mark.parametrize("dynamics", ["mlp", "lstm"])
-@pytest.mark.parametrize("scale", [1.0, 1e-4, 1e3])
-def test_dynamics_learn_and_beat_standing_still(dynamics: str, scale: float, cpu: Fabric) -> None:
+@pytest.mark.parametrize(("scale", "residual"), [(1.0, True), (1e-4, False), (1e3, False)])
+def test_dynamics_learn_and_beat_standing_still(
+    dynamics: str, scale: float, residual: bool, cpu: Fabric
+) -> None:
     """Whatever the units of the features, the loss falls and the rollout is better than a copy."""
     model = build_model(
         "frozen-encoder", encoder="test_vit", image_size=32, weights="random", hidden=64,
-        dynamics=dynamics,
+        dynamics=dynamics, residual=residual,
     )  # fmt: skip
     mixing = np.random.default_rng(1).normal(size=(2, 64)).astype(np.float32)
     features = ((waves(trials=100, size=2) @ mixing + 3) * scale).astype(np.float32)
@@ -185,6 +187,12 @@ def test_dynamics_learn_and_beat_standing_still(dynamics: str, scale: float, cpu
     copied = np.repeat(features[held][:, 6:7], 6, axis=1)
     truth = features[held][:, 7:13]
     assert np.square(rollout - truth).mean() < 0.7 * np.square(copied - truth).mean()
+
+
+def test_residual_dynamics_start_at_standing_still(cpu: Fabric) -> None:
+    model = build_model("frozen-encoder", encoder="test_vit", image_size=32, weights="random")
+    features = waves(trials=4, size=64)
+    assert one_step_loss(model, features, cpu) == pytest.approx(copy_last_loss(features, 7))
 
 
 def test_losses_of_copying_and_of_a_perfect_model_are_what_they_say(cpu: Fabric) -> None:

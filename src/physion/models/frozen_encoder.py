@@ -48,6 +48,8 @@ class Config:
     - ``weights``: ``imagenet``, ``random``, or the path of a state dict.
     - ``dynamics``: ``mlp`` (all context features at once) or ``lstm`` (one after the other).
     - ``hidden``: units of the one hidden layer.
+    - ``residual``: predict the change from the last feature, starting at "no change", rather than
+      the feature itself as the published models do. On few trials only the former is any good.
     - ``seed``: of random encoders and of the first weights of the dynamics.
     - ``stride``, ``context``, ``total``: see `Spec`.
     """
@@ -57,6 +59,7 @@ class Config:
     weights: str = IMAGENET
     dynamics: Literal["mlp", "lstm"] = "mlp"
     hidden: int = 1024
+    residual: bool = True
     seed: int = 0
     stride: int = 6
     context: int = 7
@@ -114,6 +117,9 @@ class FrozenEncoder(nn.Module):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(stable_hash("dynamics", config.dynamics, config.seed) % 2**63)
             self.dynamics = kind(self.feature_size, config.context, config.hidden)
+        if config.residual:
+            nn.init.zeros_(self.dynamics.outer.weight)
+            nn.init.zeros_(self.dynamics.outer.bias)
         self.center = nn.Buffer(torch.zeros(self.feature_size))
         self.scale = nn.Buffer(torch.ones(()))
 
@@ -188,7 +194,7 @@ class FrozenEncoder(nn.Module):
             model=self.name(),
             init=self._weights.init(),
             encoder_type=self.config.encoder,
-            dynamics_type=self.config.dynamics.upper(),
+            dynamics_type=self.config.dynamics.upper() + " residual" * self.config.residual,
             encoder_pretraining_task="ImageNet classification" if trained else "",
             encoder_pretraining_dataset="ImageNet" if trained else "",
             encoder_pretraining_seed=str(self.config.seed) if self._is_random() else "",
@@ -203,7 +209,7 @@ class FrozenEncoder(nn.Module):
         """The next feature, centred and scaled."""
         given = (window - self.center) / self.scale
         out: Tensor = self.dynamics(given)
-        return out
+        return given[:, -1] + out if self.config.residual else out
 
     def _next(self, window: Tensor) -> Tensor:
         return self._step(window) * self.scale + self.center
@@ -243,5 +249,5 @@ def pdeit_lstm(**options: Any) -> FrozenEncoder:
 def _published(
     name: str, encoder: str, dynamics: Literal["mlp", "lstm"], options: Mapping[str, Any]
 ) -> FrozenEncoder:
-    base = Config(encoder=encoder, image_size=224, dynamics=dynamics)
+    base = Config(encoder=encoder, image_size=224, dynamics=dynamics, residual=False)
     return FrozenEncoder(make_config(Config, name, {**dataclasses.asdict(base), **options}))
