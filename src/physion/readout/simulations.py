@@ -51,9 +51,11 @@ class SimulationReadout:
     def __post_init__(self) -> None:
         self.problems: dict[str, str] = {}
         self._shares: dict[Cell, float] = {}
-        self._labels = dict(
-            zip(self.dataset.index["trial"], self.dataset.index["contact"], strict=True)
-        )
+        index = self.dataset.index
+        # An outcome recorded elsewhere is fitted first: against its own engine's outcomes the
+        # model would always do best without noise.
+        truth = index["recorded_contact"].fillna(index["contact"])
+        self._labels = dict(zip(index["trial"], truth.astype(bool), strict=True))
 
     def prepare(self, rounds: Sequence[Round]) -> None:
         """Simulate all trials of ``rounds`` at all levels that they need."""
