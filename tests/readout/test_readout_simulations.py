@@ -93,12 +93,15 @@ class Shelf:
         return self.trials[name]
 
 
-def test_the_noise_is_fitted_on_readout_trials_alone(tmp_path: Path) -> None:
+@pytest.mark.parametrize("column", ["contact", "recorded_contact"])
+def test_the_noise_is_fitted_on_readout_trials_alone(tmp_path: Path, column: str) -> None:
+    """Fitted to the outcome recorded elsewhere, or to our own where there is none."""
     shelf: Any = Shelf()
+    shelf.index["recorded_contact"] = pd.array([pd.NA] * len(shelf.index), "boolean")
     (round_,) = plan_rounds(shelf.index, Training.ALL, 5, 0)
 
     def fitted(labels: pd.Series) -> tuple[float, np.ndarray]:
-        shelf.index["contact"] = labels
+        shelf.index[column] = labels.astype(bool)
         reader = SimulationReadout(shelf, NoisySimulation(CONFIG, Flight()), tmp_path)
         reader.prepare([round_])
         (answers,) = reader.answers(round_)
