@@ -15,7 +15,8 @@ VERBS = {
     "replay": "simulate official command logs and compare with the recorded outcomes",
     "evaluate": "train models and readouts on trials and write their predictions",
     "compare": "compare predictions with people",
-    "ls": "list scenarios, shapes, models, encoders, metrics",
+    "verify": "check every byte, label and motion of a dataset",
+    "ls": "list scenarios, shapes, models, engines",
     "doctor": "check this machine and say what to install",
 }
 
