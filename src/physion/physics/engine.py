@@ -29,11 +29,17 @@ class Engine(Protocol):
         ...
 
 
-engines: Registry[type] = Registry("engine", {"mujoco": "physion.physics.mujoco_engine:MujocoEngine"})
+engines: Registry[type] = Registry(
+    "engine", {"mujoco": "physion.physics.mujoco_engine:MujocoEngine"}
+)
 
 
 def simulate(
-    scene: Scene, *, engine: Engine | None = None, start: State | None = None, frames: int | None = None
+    scene: Scene,
+    *,
+    engine: Engine | None = None,
+    start: State | None = None,
+    frames: int | None = None,
 ) -> Trajectory:
     """Simulate with ``engine``, or with MuJoCo in its default settings."""
     chosen = engine if engine is not None else engines.get("mujoco")()
