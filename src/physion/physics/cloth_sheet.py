@@ -25,7 +25,7 @@ def sheet_vertices(cloth: Cloth) -> Points:
     along_x, along_y = (np.linspace(-s / 2, s / 2, cloth.resolution) for s in cloth.size[:2])
     x, y = np.meshgrid(along_x, along_y, indexing="ij")
     flat = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
-    return rotate(cloth.rotation, flat) + np.asarray(cloth.position)
+    return np.asarray(rotate(cloth.rotation, flat) + np.asarray(cloth.position))
 
 
 def rotate(rotation: Quat, points: Points) -> Points:

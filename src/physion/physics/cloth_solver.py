@@ -53,11 +53,11 @@ class Poses(NamedTuple):
 class Near(NamedTuple):
     """The solid particles near each cloth particle, K at most.
 
-    ``count`` (V,) how many, ``owner`` (V, K) body, ``spot`` (V, K, 3) world position, ``moved``
+    ``counts`` (V,) how many, ``owner`` (V, K) body, ``spot`` (V, K, 3) world position, ``moved``
     (V, K, 3) metres that the particle went during the step.
     """
 
-    count: Array
+    counts: Array
     owner: Array
     spot: Array
     moved: Array
@@ -147,7 +147,7 @@ def find_neighbours(
     low, high = np.empty(3, np.int64), np.empty(3, np.int64)
     spacing, square = solids.spacing, reach * reach
     for v in range(len(points)):
-        near.count[v] = 0
+        near.counts[v] = 0
         for body in range(len(solids.origins)):
             to_local(points[v], poses.place[body], poses.turn[body], local)
             far = False
@@ -180,10 +180,10 @@ def find_neighbours(
 
 @njit(cache=True)
 def _add_neighbour(v: int, body: int, spot: Array, poses: Poses, old: Poses, near: Near) -> None:
-    found = near.count[v]
+    found = near.counts[v]
     if found == near.owner.shape[1]:
         return
-    near.count[v] = found + 1
+    near.counts[v] = found + 1
     near.owner[v, found] = body
     for m in range(3):
         now, then = poses.place[body, m], old.place[body, m]
@@ -209,7 +209,7 @@ def push_out(
     constraints.
     """
     for v in range(len(points)):
-        for c in range(near.count[v]):
+        for c in range(near.counts[v]):
             dx = points[v, 0] - near.spot[v, c, 0]
             dy = points[v, 1] - near.spot[v, c, 1]
             dz = points[v, 2] - near.spot[v, c, 2]
@@ -247,7 +247,7 @@ def add_load(points: Array, near: Near, rules: Rules, shares: Array, pushed: Arr
     To be called when ``shares`` (V,) counts all constraints, before they are applied.
     """
     for v in range(len(points)):
-        for c in range(near.count[v]):
+        for c in range(near.counts[v]):
             dx = points[v, 0] - near.spot[v, c, 0]
             dy = points[v, 1] - near.spot[v, c, 1]
             dz = points[v, 2] - near.spot[v, c, 2]
@@ -299,7 +299,7 @@ def keep_closest(points: Array, near: Near, rules: Rules, gap: Array, contact: A
     ``contact`` (N + 1, 2, 3) keeps the point on the cloth's underside and the normal towards it.
     """
     for v in range(len(points)):
-        for c in range(near.count[v]):
+        for c in range(near.counts[v]):
             dx = points[v, 0] - near.spot[v, c, 0]
             dy = points[v, 1] - near.spot[v, c, 1]
             dz = points[v, 2] - near.spot[v, c, 2]
