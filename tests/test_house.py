@@ -50,3 +50,31 @@ def test_untrusted_files_stay_data(path: Path) -> None:
 def test_modules_have_names_that_say_something() -> None:
     vague = {"utils", "util", "helpers", "helper", "common", "misc"}
     assert not [path for path in SOURCES if {path.stem, path.parent.name} & vague]
+
+
+def _compiled(path: Path) -> set[str]:
+    """Names of the functions of a file that numba compiles."""
+    return {
+        node.name
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.FunctionDef)
+        and any("njit" in (text := ast.unparse(d)) or text in {"kernel", "step"}
+                for d in node.decorator_list)
+    }  # fmt: skip
+
+
+def test_compiled_code_calls_its_own_file_alone() -> None:
+    """Numba asks only a kernel's own file whether the machine code on disk is outdated."""
+    owners = {name: path for path in SOURCES for name in _compiled(path)}
+    strangers = []
+    for path in SOURCES:
+        mine = _compiled(path)
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef) and node.name in mine:
+                called = {name for name, _ in _calls(node)}
+                strangers += [
+                    f"{path.name}: {node.name} calls {name} of {owners[name].name}"
+                    for name in called
+                    if name in owners and name not in mine
+                ]
+    assert owners and not strangers

@@ -91,6 +91,15 @@ def rotation_matrix(q: Any) -> Any:
 
 
 @njit(cache=True)
+def rotation_matrices(q: Any) -> Any:
+    """Rotation matrices (B, 3, 3) of unit quaternions (B, 4)."""
+    turns = np.empty((len(q), 3, 3))
+    for b in range(len(q)):
+        turns[b] = rotation_matrix(q[b])
+    return turns
+
+
+@njit(cache=True)
 def _to_world(rot: Any, x: Any, local: Any, out: Any) -> None:
     for i in range(3):
         out[i] = x[i] + rot[i, 0] * local[0] + rot[i, 1] * local[1] + rot[i, 2] * local[2]
