@@ -36,7 +36,13 @@ def test_outcomes_agree_with_the_recorded_ones(
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("folder", "limit", "floor"),
-    [("drop", 200, 0.84), ("roll", 200, 0.78), ("support", 240, 0.75), ("contain", 205, 0.66)],
+    [
+        ("drop", 200, 0.84),
+        ("roll", 200, 0.78),
+        ("support", 240, 0.75),
+        ("contain", 205, 0.66),
+        ("link", 100, 0.62),
+    ],
 )
 def test_outcomes_agree_in_whole_scenarios(
     official: Path, folder: str, limit: int, floor: float
