@@ -35,7 +35,8 @@ class Options:
     out: Path = Path("runs/sampled")
     """Folder for trials, predictions and the report. A second run goes on from what is there."""
     limit: int | None = None
-    """Testing trials a scenario, and as many for the readout. Sampled scenes: 20 by default."""
+    """Testing trials a scenario, and at most as many for the readout. Sampled scenes: 12 by default, and
+    twice as many for the readout."""
     size: int = 128
     """Pixels a side of the movies."""
     encoder: str = "resnet18"
@@ -88,7 +89,7 @@ def plan_sampled(options: Options) -> Plan:
     """A small set of sampled trials: testing, and as many again for the readout."""
     from physion.trials.plan import plan_dataset
 
-    count = 20 if options.limit is None else options.limit
+    count = 12 if options.limit is None else options.limit
     tasks = plan_dataset("sampled", SAMPLED_SCENARIOS, {"readout": 2 * count, "testing": count})
     return Plan(tasks, {}, [])
 
