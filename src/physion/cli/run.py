@@ -35,8 +35,8 @@ class Options:
     out: Path = Path("runs/sampled")
     """Folder for trials, predictions and the report. A second run goes on from what is there."""
     limit: int | None = None
-    """Testing trials a scenario, and at most as many for the readout. Sampled scenes: 12 by default, and
-    twice as many for the readout."""
+    """Testing trials a scenario. Official scenes: all by default, and as many for the readout;
+    sampled ones: 12 by default, and twice as many for the readout."""
     size: int = 128
     """Pixels a side of the movies."""
     encoder: str = "resnet18"
