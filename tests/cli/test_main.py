@@ -63,3 +63,16 @@ def test_doctor_refuses_a_folder_that_is_not_there(
 ) -> None:
     assert main(["doctor", "--folder", str(tmp_path / "nowhere")]) == 1
     assert "--folder" in capsys.readouterr().out
+
+
+def test_unknown_scenarios_get_the_closest(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for command in (
+        ["replay", str(tmp_path), "--scenario", "colide"],
+        ["generate", str(tmp_path / "out"), "--scenario", "colide"],
+    ):
+        assert main(command) == 2
+        message = capsys.readouterr().err
+        assert message.count("\n") == 1 and "collide" in message
+    assert not (tmp_path / "out").exists()

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from physion.errors import BadInputError, PhysionError
+from physion.errors import BadInputError, PhysionError, UnknownNameError
 from physion.scenes.looks import prop_look
 from physion.scenes.props import ModelBounds, prop_for, read_model_bounds
 from physion.scenes.scene import (
@@ -112,8 +112,13 @@ def read_scenes(root: Path, scenario: str | None = None, limit: int | None = Non
     """Import every log under ``root``; ``limit`` keeps the first trials of each scenario.
 
     A broken log or trial becomes a failure of the result and the others go on;
-    `BadInputError` only where there is no log at all.
+    `BadInputError` only where there is no log at all, `UnknownNameError` for a scenario that no
+    log can have.
     """
+    if scenario is not None and scenario not in SCENARIOS.values():
+        raise UnknownNameError("scenario", scenario, SCENARIOS.values())
+    if limit is not None and limit < 1:
+        raise BadInputError(f"the limit of trials must be 1 or more, not {limit}")
     found = TrialSet()
     bounds = _bounds_beside(root)
     taken: Counter[str] = Counter()
