@@ -38,5 +38,7 @@ class MissingExtraError(PhysionError):
     """A part of the package whose optional dependencies are not installed."""
 
     def __init__(self, what: str, extra: str) -> None:
-        super().__init__(f"{what} needs the extra {extra!r}: pip install 'physion[{extra}]'")
+        super().__init__(
+            f"{what} needs the extra {extra!r}: pip install -e '.[{extra}]' in the clone"
+        )
         self.extra = extra

@@ -170,7 +170,7 @@ except MissingExtraError as error:
     print(error)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "pip install 'physion[models]'" in done.stdout
+    assert "pip install -e '.[models]'" in done.stdout
 
 
 def test_missing_libraries_of_other_kinds_are_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,7 +18,7 @@ EXTRAS = {
     "experiment": ("fastapi", "uvicorn", "sqlalchemy", "alembic", "argon2-cffi"),
     "ray": ("ray",),
     "slurm": ("submitit",),
-    "dev": ("pytest", "hypothesis", "ruff", "mypy", "import-linter"),
+    "dev": ("pytest", "pytest-xdist", "hypothesis", "ruff", "mypy", "import-linter"),
 }
 CORE = (
     *("numpy", "scipy", "mujoco", "numba", "trimesh", "h5py", "hdf5plugin", "av", "pillow"),
@@ -106,7 +106,7 @@ def extras() -> list[Check]:
         missing = [package for package in packages if _version(package) is None]
         there = [f"{package} {_version(package)}" for package in packages if _version(package)]
         value = ", ".join(there) if not missing else f"without {', '.join(missing)}"
-        remedy = f"pip install 'physion[{extra}]'" if missing else ""
+        remedy = f"pip install -e '.[{extra}]'" if missing else ""
         checks.append(Check(f"extra {extra}", value, not missing, needed=False, remedy=remedy))
     return checks
 

@@ -12,6 +12,7 @@ import tyro
 
 from physion.cli.output import console, track
 from physion.compute.local import LocalExecutor
+from physion.errors import BadInputError
 from physion.scenes.scenarios import scenarios
 from physion.trials.generate import generate
 from physion.trials.plan import Settings, plan_dataset
@@ -48,6 +49,8 @@ class Options:
 def main(options: Options) -> int:
     """Make the missing trials; 1 if one failed."""
     names = scenarios.names() if options.scenario == "all" else [options.scenario]
+    if options.count < 1:
+        raise BadInputError(f"--count must be 1 or more, not {options.count}")
     for name in names:
         scenarios.get(name)
     report = generate(

@@ -60,6 +60,9 @@ def main(argv: list[str] | None = None) -> int:
         message = " ".join(str(error).split())
         print(f"physion: {message}", file=sys.stderr)
         return error.exit_code
+    except OSError as error:
+        print(f"physion: {error.filename or 'a file'}: {error.strerror or error}", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         print("physion: interrupted; the same command goes on from here", file=sys.stderr)
         return 130

@@ -15,6 +15,7 @@ from rich.table import Table
 
 from physion.cli.output import console, track, write_text
 from physion.compute.local import LocalExecutor
+from physion.errors import BadInputError
 from physion.physics.replay import Replay, ReplayRow, ReplayTask, replay_trial, summarise
 from physion.scenes.tdw import TrialSet, read_scenes
 
@@ -43,7 +44,12 @@ class Options:
 
 def main(options: Options) -> int:
     """Replay, print the table; 1 if a trial could not be imported or simulated."""
+    if options.repeats < 0 or options.jitter < 0:
+        raise BadInputError("--repeats and --jitter must not be below 0")
+    if options.json is not None and options.json.is_dir():
+        raise BadInputError(f"--json {options.json} is a folder; give a file")
     found = read_scenes(options.folder, options.scenario, options.limit)
+    found.require_trials()
     trials, copies = found.unique()
     tasks = [ReplayTask(trial, options.jitter / 1000, options.repeats) for trial in trials]
     executor = LocalExecutor(workers=options.workers)

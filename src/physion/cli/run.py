@@ -10,7 +10,7 @@ import json as json_module
 import os
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,8 +32,9 @@ class Options:
     """Folder with official command logs; without it scenes are sampled."""
     humans: Path | None = None
     """Folder with human_accuracy-*.csv: people's answers to those scenes."""
-    out: Path = Path("runs/sampled")
-    """Folder for trials, predictions and the report. A second run goes on from what is there."""
+    out: Path | None = None
+    """Folder for trials, predictions and the report; runs/sampled or runs/official by default.
+    A second run goes on from what is there."""
     limit: int | None = None
     """Testing trials a scenario. Official scenes: all by default, and as many for the readout;
     sampled ones: 12 by default, and twice as many for the readout."""
@@ -66,10 +67,14 @@ class Plan:
 
 def main(options: Options) -> int:
     """Go the road; 1 if some trials failed on the way."""
+    if options.out is None:
+        name = "sampled" if options.scenes is None else "official"
+        options = replace(options, out=Path("runs") / name)
     if options.humans is not None and options.scenes is None:
         raise BadInputError("--humans needs --scenes: people saw the official scenes only")
     if options.limit is not None and options.limit < 1:
         raise BadInputError(f"--limit must be 1 or more, not {options.limit}")
+    check_models(options)
     plan = plan_sampled(options) if options.scenes is None else plan_official(options)
     failures = [*plan.failures, *make_trials(options, plan.tasks)]
     predictions, problems = ask_models(options)
@@ -83,6 +88,12 @@ def main(options: Options) -> int:
             console.print(f"failed: {failure}", markup=False, soft_wrap=True)
         console.print(f"report of {len(predictions)} models: {page}", markup=False, soft_wrap=True)
     return 1 if failures else 0
+
+
+def folder(options: Options) -> Path:
+    """Where everything of this run goes."""
+    assert options.out is not None, "main chooses a folder"
+    return options.out
 
 
 def plan_sampled(options: Options) -> Plan:
@@ -104,6 +115,7 @@ def plan_official(options: Options) -> Plan:
     assert options.scenes is not None
     seen = set(read_humans(options.humans)["stimulus"]) if options.humans is not None else None
     found = read_scenes(options.scenes)
+    found.require_trials()
     recorded = {trial.scene.name: trial.outcome.contact for trial in found.trials}
     parts: dict[str, list[ImportedTrial]] = {"testing": [], "readout": []}
     for trial in found.trials:
@@ -111,12 +123,15 @@ def plan_official(options: Options) -> Plan:
         if "familiarization" not in trial.scene.name:
             tested = seen is None or canonical_name(trial.scene.name) in seen
             parts["testing" if tested else "readout"].append(trial)
+    # A scene that only looks different is no new scene to fit on.
+    known = {trial.scene.physics_digest() for trial in parts["testing"]}
+    parts["readout"] = [t for t in parts["readout"] if t.scene.physics_digest() not in known]
     tasks: list[Task] = []
     for split, trials in parts.items():
         scenes = [trial.scene for trial in few(trials, options.limit)]
         tasks += plan_scenes("official", scenes, split, recorded)
     if not any(task.split == "testing" for task in tasks):
-        raise BadInputError(f"none of the scenes in {options.scenes} was seen by {options.humans}")
+        raise BadInputError(f"none of the scenes in {options.scenes} is in {options.humans}")
     check_names(tasks)
     return Plan(tasks, recorded, [str(failure) for failure in found.failures])
 
@@ -141,7 +156,7 @@ def make_trials(options: Options, tasks: list[Task]) -> list[str]:
     from physion.trials.plan import Settings
 
     report = generate(
-        options.out / "trials",
+        folder(options) / "trials",
         tasks,
         Settings(width=options.size, height=options.size),
         executor=LocalExecutor(workers=options.workers),
@@ -150,14 +165,9 @@ def make_trials(options: Options, tasks: list[Task]) -> list[str]:
     return [f"{name}: {reason}" for name, reason in report.failed.items()]
 
 
-def ask_models(options: Options) -> tuple[list[Path], list[str]]:
-    """Predictions of a frozen encoder and of noisy simulation; why some trials have none."""
-    from physion.compute.local import LocalExecutor
-    from physion.readout.evaluate import EvaluationConfig, evaluate
-    from physion.trials.dataset import Dataset
-
-    dataset = Dataset(options.out / "trials")
-    models: dict[str, dict[str, Any]] = {
+def chosen_models(options: Options) -> dict[str, dict[str, Any]]:
+    """The models of this run with the fields of their configs."""
+    return {
         "frozen-encoder": {
             "encoder": options.encoder,
             "weights": options.weights,
@@ -165,14 +175,31 @@ def ask_models(options: Options) -> tuple[list[Path], list[str]]:
         },
         "noisy-simulation": {"samples": options.samples},
     }
+
+
+def check_models(options: Options) -> None:
+    """Build every model once: a wrong name or a missing extra is said before hours of work."""
+    from physion.models.interface import build_model
+
+    for model, settings in chosen_models(options).items():
+        build_model(model, **settings)
+
+
+def ask_models(options: Options) -> tuple[list[Path], list[str]]:
+    """Predictions of a frozen encoder and of noisy simulation; why some trials have none."""
+    from physion.compute.local import LocalExecutor
+    from physion.readout.evaluate import EvaluationConfig, evaluate
+    from physion.trials.dataset import Dataset
+
+    dataset = Dataset(folder(options) / "trials")
     paths: list[Path] = []
     problems: list[str] = []
-    for model, settings in models.items():
+    for model, settings in chosen_models(options).items():
         with Stages() as stages:
             evaluation = evaluate(
                 dataset,
                 model,
-                options.out / "models",
+                folder(options) / "models",
                 options=settings,
                 config=EvaluationConfig(steps=options.steps),
                 executor=LocalExecutor(workers=options.workers),
@@ -193,7 +220,7 @@ def write_report(
     from physion.report.build import compare_files
     from physion.trials.dataset import Dataset
 
-    dataset = Dataset(options.out / "trials")
+    dataset = Dataset(folder(options) / "trials")
     movies = {
         canonical_name(trial): dataset.paths(trial).movie for trial in dataset.trials("testing")
     }
@@ -201,7 +228,7 @@ def write_report(
         predictions,
         options.humans,
         {canonical_name(name): contact for name, contact in plan.recorded.items()} or None,
-        options.out / "report",
+        folder(options) / "report",
         methods=methods(options, dataset.index),
         movies=movies,
     )

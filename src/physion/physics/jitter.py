@@ -21,8 +21,11 @@ def jitter_scene(scene: Scene, distance: float, generator: np.random.Generator) 
     shifts = {name: (*generator.normal(0.0, distance, 2).tolist(), 0.0) for name in moving}
 
     def moved(name: str, position: Vec3) -> Vec3:
-        while name in leaders:
+        passed = {name}
+        # Joints may close a ring; then whoever comes first leads it.
+        while name in leaders and leaders[name] not in passed:
             name = leaders[name]
+            passed.add(name)
         dx, dy, dz = shifts.get(name, (0.0, 0.0, 0.0))
         return (position[0] + dx, position[1] + dy, position[2] + dz)
 

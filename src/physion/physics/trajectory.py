@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.errors import BadInputError
+from physion.scenes.scene import FRAME_TIME
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
@@ -114,7 +115,7 @@ class Trajectory:
             self.velocities[frame].astype(np.float64),
             self.angular_velocities[frame].astype(np.float64),
             cloth[frame],
-            (cloth[frame] - cloth[before]) / 0.01,
+            (cloth[frame] - cloth[before]) / FRAME_TIME,
         )
 
     def digest(self) -> str:
@@ -127,6 +128,7 @@ class Trajectory:
             self.velocities,
             self.angular_velocities,
             self.cloth_vertices,
+            self.cloth_distance,
             contacts.frame,
             contacts.bodies,
             contacts.point,

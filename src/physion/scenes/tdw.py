@@ -100,6 +100,12 @@ class TrialSet:
     unknown: Counter[str] = field(default_factory=Counter)
     unrecorded: int = 0
 
+    def require_trials(self) -> None:
+        """Raise `BadInputError` with the first failure where nothing could be imported."""
+        if not self.trials:
+            why = str(self.failures[0]) if self.failures else "no trial fits the choice"
+            raise BadInputError(f"no trial could be imported: {why}")
+
     def unique(self) -> tuple[list[ImportedTrial], int]:
         """Trials with different physics, and how many were left out as copies of another."""
         first: dict[str, ImportedTrial] = {}

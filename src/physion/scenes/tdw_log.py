@@ -79,7 +79,7 @@ def read_metadata(path: Path) -> dict[str, dict[str, Any]]:
 
 def read_command_log(path: Path) -> CommandLog:
     """Read a log, packed or not; `BadInputError` if it cannot be read to its end."""
-    log, broken, size = CommandLog(), set(), 0
+    log, broken, size, last = CommandLog(), set(), 0, ""
     opener: Callable[..., Any] = gzip.open if path.suffix == ".gz" else open
     try:
         with opener(path, "rt", encoding="utf-8") as lines:
@@ -89,7 +89,9 @@ def read_command_log(path: Path) -> CommandLog:
                     raise BadInputError(f"{path} is larger than {MAX_LOG_BYTES} bytes unpacked")
                 if not line.strip():
                     continue
-                tag = _tag(line)
+                # A line that lost its end belongs to the trial it stands in.
+                tag = _tag(line) or last
+                last = tag
                 try:
                     commands = _parse_line(line)
                 except BadInputError as error:

@@ -8,6 +8,7 @@ from typing import Any
 import pandas as pd
 
 from physion.errors import BadInputError
+from physion.physics.labels import label_contact
 from physion.trials.index import COLUMNS, as_table, index_row, read_index
 from physion.trials.layout import TrialPaths, find_trials
 from physion.trials.trial_file import Trial
@@ -67,6 +68,13 @@ def _check_trial(paths: TrialPaths, simulate_again: bool) -> list[str]:
             faults.append(f"{path} has {count_frames(path)} frames, not {expected}")
     if trial.trajectory.digest() != meta.digest:
         faults.append(f"{paths.trial_file}: the trajectory does not fit its digest")
+    labels = label_contact(trial.scene, trial.trajectory)
+    for field in ("contact", "first_frame", "observed", "min_distance"):
+        found, stored = getattr(labels, field), getattr(trial.labels, field)
+        if found != stored:
+            faults.append(
+                f"{paths.trial_file}: labels/{field} is {stored}, the contacts say {found}"
+            )
     if simulate_again:
         from physion.physics.engine import simulate
 
