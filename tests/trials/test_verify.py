@@ -12,7 +12,7 @@ from physion.compute.local import SerialExecutor
 from physion.errors import BadInputError
 from physion.trials.dataset import Dataset
 from physion.trials.generate import generate
-from physion.trials.index import write_index
+from physion.trials.index import build_index, write_index
 from physion.trials.layout import TrialPaths
 from physion.trials.make import make_trial
 from physion.trials.plan import Job, Settings, Task, plan_scenes
@@ -80,3 +80,14 @@ def test_simulating_again_finds_another_motion(folder: Path, tmp_path: Path) -> 
 def test_a_folder_without_index_is_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="has no index"):
         verify_dataset(tmp_path)
+
+
+def test_a_label_that_the_contacts_contradict_is_found(folder: Path) -> None:
+    """A whole trial file with a wrong label, and an index that repeats it."""
+    paths = Dataset(folder).paths("b")
+    parts = make_parts("b")
+    wrong = dataclasses.replace(parts.labels, contact=not parts.labels.contact, first_frame=None)
+    paths.trial_file.write_bytes(parts._replace(labels=wrong).pack())
+    table, _ = build_index(folder)
+    write_index(folder, table)
+    assert any("labels/contact" in fault for fault in verify_dataset(folder))

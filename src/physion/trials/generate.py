@@ -138,9 +138,10 @@ def _note_failure(folder: Path, outcome: Outcome[str], job: Job) -> None:
 
 def _update_index(folder: Path) -> dict[str, str]:
     """Write the index unless it names exactly the trials that are there; what is wrong, by name."""
-    there = {paths.trial for paths in find_trials(folder)}
+    there = {(paths.split, paths.trial) for paths in find_trials(folder)}
     try:
-        if set(read_index(folder)["trial"]) == there:
+        index = read_index(folder)
+        if set(zip(index["split"], index["trial"], strict=True)) == there:
             return {}
     except BadInputError:
         pass
