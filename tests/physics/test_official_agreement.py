@@ -38,7 +38,7 @@ def test_outcomes_agree_with_the_recorded_ones(
     ("folder", "limit", "floor"),
     [
         ("drop", 200, 0.84),
-        ("roll", 200, 0.78),
+        ("roll", 100, 0.78),
         ("support", 240, 0.75),
         ("contain", 205, 0.66),
         ("link", 100, 0.62),

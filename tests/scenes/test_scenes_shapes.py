@@ -15,7 +15,8 @@ from physion.errors import UnknownNameError
 from physion.scenes.shapes import Shape, shape, shapes
 from physion.scenes.solids import Mesh, hull, solid_properties
 
-NAMES = [name for name in shapes.names() if not name.startswith("prop:")]
+NAMES = [name for name in shapes.names() if ":" not in name]
+"""The official shapes; props and shapes of other tests have a prefix."""
 # (low, high) of our axes, from the official model records: x, y = their z, z = their y. The x of
 # ramps is mirrored there.
 BOUNDS = {
