@@ -38,24 +38,26 @@ _VERSION = 1
 
 @dataclass(frozen=True)
 class EvaluationConfig:
-    """How models are evaluated.
-
-    - ``readouts``: protocols by name; empty for all that the model can do.
-    - ``training``: ``all``, ``all-but`` or ``only`` (see `physion.training.protocols`).
-    - ``steps``, ``batch``, ``learning_rate``: of the dynamics, see `TrainingConfig`.
-    - ``readout``: see `ReadoutConfig`. ``folds``: of the cross-fit of a dataset without a readout
-      split. ``seed``: of folds and training. ``accelerator``: by Lightning's name.
-    """
+    """How models are evaluated."""
 
     readouts: tuple[str, ...] = ()
+    """Protocols by name (observed, observed+simulated, full); empty: all that the model can do."""
     training: str = "all"
+    """Which scenarios train the dynamics: all, all-but, or only."""
     steps: int = 1000
+    """Training steps of the dynamics."""
     batch: int = 32
+    """Clips a training step."""
     learning_rate: float = 1e-3
+    """Learning rate of Adam; the released code had 1e-2."""
     readout: ReadoutConfig = field(default_factory=ReadoutConfig)
+    """How a readout is fitted."""
     folds: int = 5
+    """Parts of the cross-fit of a dataset without a readout split."""
     seed: int = 0
+    """Seed of folds and training."""
     accelerator: str = "auto"
+    """Where networks run, by Lightning's name: auto, cpu, cuda, ..."""
 
 
 @dataclass(frozen=True)
