@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from physion.errors import UnknownNameError
 from physion.scenes.scene import Body, Cloth, Look, Scene, Vec3
 from physion.seeds import child_generator, stable_hash
 
@@ -53,6 +54,30 @@ _PROP_PALETTE = {
     "pillow": ("fabric", "cloth"),
     "basket": ("wood", "plain"),
 }
+
+
+MATERIALS: dict[str, tuple[str, ...]] = {
+    "wood": ("wood_cedar", "wood_ash"),
+    "metal": ("metal",),
+    "plastic": ("plastic",),
+}
+"""Materials by family."""
+
+
+def expand_materials(names: Sequence[str]) -> tuple[str, ...]:
+    """Material names, with each family name replaced by its members."""
+    found: list[str] = []
+    for name in names:
+        if name not in MATERIALS and name not in TEXTURES:
+            raise UnknownNameError("material", name, (*MATERIALS, *TEXTURES))
+        found += MATERIALS.get(name, (name,))
+    return tuple(dict.fromkeys(found))
+
+
+def pick_material(rng: np.random.Generator, names: Sequence[str]) -> str:
+    """One of the materials, each as likely; a family counts as its members."""
+    known = expand_materials(names)
+    return known[int(rng.integers(len(known)))]
 
 
 def too_near(color: Vec3, other: Vec3, margin: float = MARGIN) -> bool:

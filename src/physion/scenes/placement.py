@@ -16,12 +16,21 @@ from numpy.typing import ArrayLike, NDArray
 
 from physion.errors import BadSceneError
 from physion.scenes.looks import prop_look
+from physion.scenes.parameters import (
+    Angle,
+    Angles,
+    Count,
+    Lengths,
+    Props,
+    Range,
+    Share,
+    Shares,
+    uniform,
+    yaw,
+)
 from physion.scenes.prop_shapes import NATURAL_SIZES
 from physion.scenes.scene import Body, Camera, Look, Quat
 from physion.scenes.shapes import shape
-
-Range = tuple[float, float]
-"""Smallest and largest value of an even random draw."""
 
 CLEARANCE = 0.25
 """Metres kept free between the scene and scenery."""
@@ -37,12 +46,14 @@ class CameraRule:
     - ``radius``: metres; the official rule moves the camera by (radius, radius), so that its
       horizontal distance from the middle is radius times the square root of 2.
     - ``angle_deg``: degrees; the azimuth is this plus 45.
-    - ``height``: metres above the floor.
+    - ``height``: metres above the floor. Officially it may be 2 cm, where nobody can see a zone.
+    - ``mirror``: chance that left and right (the signs of x) are swapped.
     """
 
-    radius: Range = (1.75, 1.75)
-    angle_deg: Range = (45.0, 225.0)
-    height: Range = (0.75, 2.0)
+    radius: Lengths = (1.75, 1.75)
+    angle_deg: Angles = (45.0, 225.0)
+    height: Lengths = (0.75, 2.0)
+    mirror: Share = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,28 +65,18 @@ class SceneryRule:
     occluder's top ends.
     """
 
-    distractors: int = 0
-    occluders: int = 0
-    distractor_props: tuple[str, ...] = ("chair", "vase", "dog", "globe", "stool", "coffee_maker")
-    occluder_props: tuple[str, ...] = ("vase", "plant", "lamp", "globe")
-    distractor_distance: Range = (0.4, 1.0)
-    occluder_distance: Range = (0.6, 0.8)
-    distractor_spacing_deg: float = 15.0
-    occluder_spacing_deg: float = 10.0
-    yaw_deg: float = 30.0
-    distractor_size: Range = (0.5, 1.5)
-    occluder_size: Range = (0.25, 1.5)
-    occlusion: float = 0.75
-
-
-def uniform(rng: np.random.Generator, interval: Range) -> float:
-    """An even draw from ``interval``; always one number of the stream, also if it is a point."""
-    return float(rng.uniform(*interval))
-
-
-def yaw(angle: float) -> Quat:
-    """The rotation by ``angle`` radians about z."""
-    return (math.cos(angle / 2), 0.0, 0.0, math.sin(angle / 2))
+    distractors: Count = 0
+    occluders: Count = 0
+    distractor_props: Props = ("chair", "vase", "dog", "globe", "stool", "coffee_maker")
+    occluder_props: Props = ("vase", "plant", "lamp", "globe")
+    distractor_distance: Shares = (0.4, 1.0)
+    occluder_distance: Shares = (0.6, 0.8)
+    distractor_spacing_deg: Angle = 15.0
+    occluder_spacing_deg: Angle = 10.0
+    yaw_deg: Angle = 30.0
+    distractor_size: Lengths = (0.5, 1.5)
+    occluder_size: Lengths = (0.25, 1.5)
+    occlusion: Share = 0.75
 
 
 def rotate(rotation: Quat, points: ArrayLike) -> NDArray[np.float64]:
@@ -124,6 +125,8 @@ def place_camera(
         distance = uniform(rng, rule.radius) * math.sqrt(2)
         azimuth = math.radians(uniform(rng, rule.angle_deg) + 45.0)
         x, y = distance * math.cos(azimuth), distance * math.sin(azimuth)
+        if rule.mirror and rng.random() < rule.mirror:
+            x = -x
         camera = Camera((x, y, uniform(rng, rule.height)), (0.0, 0.0, aim_height))
         if all(max(map(abs, on_screen(camera, center))) < 0.98 for center in centers):
             return camera

@@ -10,7 +10,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from physion.errors import BadInputError
 from physion.registry import Registry
+from physion.scenes.parameters import check_params
 from physion.scenes.scene import Scene
 from physion.seeds import stable_hash
 
@@ -32,7 +34,19 @@ class Scenario:
 
 scenarios: Registry[Scenario] = Registry(
     "scenario",
-    {name: f"physion.scenes.{name}:sample" for name in ("dominoes", "collide", "drop")},
+    {
+        name: f"physion.scenes.{name}:sample"
+        for name in (
+            "dominoes",
+            "support",
+            "collide",
+            "contain",
+            "drop",
+            "link",
+            "roll",
+            "drape",
+        )
+    },
 )
 
 
@@ -58,7 +72,15 @@ def sample_scene(name: str, seed: np.random.SeedSequence, params: object | None 
     `UnknownNameError` has the closest names.
     """
     found = scenarios.get(name)
-    return found.sample(found.params() if params is None else params, seed)
+    if params is None:
+        params = found.params()
+    elif not isinstance(params, found.params):
+        raise BadInputError(
+            f"scenario {name!r} takes {found.params.__module__}.Params, not {type(params).__name__}"
+        )
+    else:
+        check_params(params, f"parameters of {name}")
+    return found.sample(params, seed)
 
 
 def scene_name(scenario: str, seed: np.random.SeedSequence) -> str:

@@ -1,0 +1,150 @@
+"""What is drawn for the bodies and pushes of a scenario, said in the same words in all of them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from physion.scenes.parameters import (
+    Angles,
+    FrameRange,
+    Frictions,
+    Length,
+    Masses,
+    Materials,
+    Multiple,
+    Multiples,
+    Place,
+    Shapes,
+    Shares,
+    Sizes,
+    Speeds,
+    Turns,
+    draw_axes,
+    draw_frame,
+    draw_turn,
+    pick,
+    uniform,
+)
+from physion.scenes.scene import Body, Contact, Look, Push, Vec3
+from physion.scenes.shapes import shape
+
+STATIC_OVER_DYNAMIC = 10.0
+"""Static over dynamic friction of a zone (reference/official-system.md, section 1)."""
+
+
+@dataclass(frozen=True)
+class BodyRule:
+    """How a body that moves is drawn (defaults: section 2.1 of reference/official-system.md).
+
+    - ``shapes``: one of these, each as likely. ``scale``: metres at unit size.
+    - ``turn_deg``: about the upright, or about three axes. ``mass``: kg.
+    - ``static_friction``, ``dynamic_friction``: drawn apart, but static is never below dynamic
+      (officially it may be). ``restitution``: 0 to 1.
+    - ``textures``: material names or families.
+    """
+
+    shapes: Shapes = ("cube",)
+    scale: Sizes = (1.0, 1.0)
+    turn_deg: Turns = (0.0, 0.0)
+    mass: Masses = (2.0, 2.0)
+    static_friction: Frictions = (0.5, 0.5)
+    dynamic_friction: Frictions = (0.5, 0.5)
+    restitution: Shares = (0.0, 0.0)
+    textures: Materials = ("wood_cedar",)
+
+
+@dataclass(frozen=True)
+class ZoneRule:
+    """How the patient, a flat body that never moves, is drawn.
+
+    ``center`` is where its middle stands, metres, relative to the place that the scenario gives
+    it. ``friction`` is the dynamic one; static friction is ten times as large.
+    """
+
+    shapes: Shapes = ("cube",)
+    scale: Sizes = ((0.5, 0.5), (2.0, 2.0), (0.01, 0.01))
+    center: Place = (0.0, 0.0)
+    friction: Frictions = (0.1, 0.1)
+    mass: Masses = (500.0, 500.0)
+    textures: Materials = ("wood_ash",)
+
+
+@dataclass(frozen=True)
+class PushRule:
+    """How the probe is pushed.
+
+    - ``speed``: metres per second that the push would give a free body: impulse over mass.
+    - ``heading_deg``: away from +x, towards +y. ``rise``: vertical over horizontal part.
+    - ``height``: where it acts, as a share of the probe's scale above its pivot.
+    - ``point_jitter``: metres by which that point is off in each direction, at most. Officially
+      it may lie outside the body, which gives it a spin that nobody controls.
+    - ``frame``: when; the last is left out.
+    """
+
+    speed: Speeds = (1.0, 1.0)
+    heading_deg: Angles = (0.0, 0.0)
+    rise: Multiples = (0.0, 0.0)
+    height: Multiple = 0.8
+    point_jitter: Length = 0.0
+    frame: FrameRange = (0.0, 0.0)
+
+
+def draw_body(
+    rng: np.random.Generator,
+    rule: BodyRule,
+    name: str,
+    position: Vec3,
+    look: Look,
+    *,
+    angular_drag: float = 0.05,
+) -> Body:
+    """A body of ``rule`` with its pivot at ``position``."""
+    kind, scale = pick(rng, rule.shapes), draw_axes(rng, rule.scale)
+    turn, mass = draw_turn(rng, rule.turn_deg), uniform(rng, rule.mass)
+    dynamic = uniform(rng, rule.dynamic_friction)
+    static = max(uniform(rng, rule.static_friction), dynamic)
+    contact = Contact(static, dynamic, uniform(rng, rule.restitution))
+    return Body(
+        name, kind, position, scale, turn, mass, contact, angular_drag=angular_drag, look=look
+    )
+
+
+def draw_zone(
+    rng: np.random.Generator, rule: ZoneRule, look: Look, place: tuple[float, float] = (0.0, 0.0)
+) -> Body:
+    """The patient called ``zone``, on the floor at ``place`` plus the rule's own centre."""
+    kind, scale = pick(rng, rule.shapes), draw_axes(rng, rule.scale)
+    friction = uniform(rng, rule.friction)
+    return Body(
+        "zone",
+        kind,
+        (place[0] + rule.center[0], place[1] + rule.center[1], 0.0),
+        scale,
+        mass=uniform(rng, rule.mass),
+        contact=Contact(STATIC_OVER_DYNAMIC * friction, friction, 0.0),
+        kinematic=True,
+        look=look,
+    )
+
+
+def draw_push(rng: np.random.Generator, rule: PushRule, body: Body, turn: float = 0.0) -> Push:
+    """A push on ``body``; its heading is turned by ``turn`` radians.
+
+    The point is at most as high as the body's own top: flat shapes are not pushed in the air.
+    """
+    speed, rise = uniform(rng, rule.speed), uniform(rng, rule.rise)
+    heading = math.radians(uniform(rng, rule.heading_deg)) + turn
+    jitter = rng.uniform(-rule.point_jitter, rule.point_jitter, 3)
+    frame = draw_frame(rng, rule.frame)
+    height = min(rule.height, float(shape(body.shape).bounds[1, 2])) * body.scale[2]
+    impulse = speed * body.mass
+    x, y, z = body.position
+    return Push(
+        body.name,
+        (impulse * math.cos(heading), impulse * math.sin(heading), impulse * rise),
+        (x + float(jitter[0]), y + float(jitter[1]), z + height + float(jitter[2])),
+        frame,
+    )
