@@ -1,0 +1,229 @@
+"""Bodies as clouds of particles, the way particle models see them.
+
+Unlike `physion.physics.cloth_solids`, which packs the collision pieces as NVIDIA Flex does, this
+fills the drawn solid: bowls, tori, pipes and vases keep their hollows, and thin walls stay closed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from physion.errors import BadInputError
+from physion.physics.rigid_model import rotate_vectors
+from physion.physics.trajectory import Trajectory
+from physion.scenes.scene import Scene, Vec3
+from physion.scenes.shapes import shape
+from physion.scenes.solids import Mesh
+from physion.seeds import child_generator, stable_hash
+
+SPACING, CLOTH_SPACING = 0.05, 0.035
+"""Metres between particles, and those of scenes with cloth (official-system.md, section 6)."""
+LIMIT = 3000
+"""Most particles of one object (official-system.md, section 6)."""
+FINE = 4
+"""Each particle's cube is cut into this many cells a side to see how full it is."""
+REACH = 1.12
+"""Spacings from any matter to the nearest particle, measured on cells: what sticks out of a full
+cube by less than half a cube is nearer than that."""
+MAX_LATTICE = 2**21
+"""Most lattice points of one object, filled or not: 128 times as many cells fit into memory."""
+
+Floats = NDArray[np.float32]
+Filled = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Particles:
+    """Particles of a scene over time. T frames, P particles.
+
+    - ``positions`` (T, P, 3): metres, world.
+    - ``things`` (P,): which of `Scene.names` a particle belongs to; each has its rows together.
+    - ``frames`` (T,): frames of the trial that the rows show.
+    """
+
+    positions: Floats
+    things: NDArray[np.int32]
+    frames: NDArray[np.int64]
+
+
+def default_spacing(scene: Scene) -> float:
+    """Metres between particles that the original study's particle models used for such a scene."""
+    return CLOTH_SPACING if scene.cloths else SPACING
+
+
+def sample_particles(
+    shape_name: str, scale: Vec3, spacing: float = SPACING, limit: int | None = LIMIT
+) -> Floats:
+    """Fill a shape with particles (P, 3): metres in the body's frame, scaled, pose not applied.
+
+    Particles lie on a cubic lattice that is centred in the bounds. A lattice point is filled where
+    at least half of its cube is solid, so that volume is kept where bodies are thick; where matter
+    would still be far (`REACH`) from every particle, the fullest cubes are filled, so that thin
+    walls stay closed. Bodies with more than ``limit`` particles (None for all) keep that many,
+    drawn without replacement; the same arguments give the same particles. Raises
+    `UnknownNameError` for a shape that does not exist, and `BadInputError` for a spacing that is
+    not above zero or too fine for the body.
+    """
+    if not spacing > 0:
+        raise BadInputError(f"particle spacing {spacing} is not above 0 metres")
+    points = _fill(shape_name, tuple(scale), float(spacing))
+    if limit is not None and len(points) > limit:
+        # A thinned lattice would keep planes of the body and lose others.
+        seed = np.random.SeedSequence(stable_hash(shape_name, repr(scale), repr(spacing), limit))
+        kept = child_generator(seed, "particles").choice(len(points), limit, replace=False)
+        points = points[np.sort(kept)]
+    return points.copy()
+
+
+def particles_over_time(
+    scene: Scene,
+    trajectory: Trajectory,
+    spacing: float | None = None,
+    frames: Sequence[int] | None = None,
+    limit: int | None = LIMIT,
+) -> Particles:
+    """Particles of all bodies moved by their poses, then every cloth's vertices.
+
+    ``spacing`` is by default the study's (`default_spacing`), ``frames`` all of them; see
+    `sample_particles` for ``limit``. Scenery takes no part in the motion and is left out.
+    """
+    wanted = np.arange(len(trajectory)) if frames is None else np.asarray(frames, np.int64)
+    if wanted.size and not (wanted.min() >= 0 and wanted.max() < len(trajectory)):
+        raise BadInputError(f"frames {wanted.tolist()} leave 0..{len(trajectory) - 1}")
+    clouds, things = [], []
+    for index, body in enumerate(scene.bodies):
+        if body.scenery:
+            continue
+        step = default_spacing(scene) if spacing is None else spacing
+        points = sample_particles(body.shape, body.scale, step, limit).astype(np.float64)
+        turns = trajectory.rotations[wanted, index].astype(np.float64)
+        turned = rotate_vectors(turns[:, None], points[None])
+        clouds.append(turned + trajectory.positions[wanted, index, None])
+        things.append(np.full(len(points), index, np.int32))
+    clouds.append(trajectory.cloth_vertices[wanted].astype(np.float64))
+    things += [
+        np.full(cloth.resolution**2, len(scene.bodies) + index, np.int32)
+        for index, cloth in enumerate(scene.cloths)
+    ]
+    positions = np.concatenate(clouds, axis=1).astype(np.float32)
+    return Particles(positions, np.concatenate(things or [np.zeros(0, np.int32)]), wanted)
+
+
+@lru_cache(maxsize=256)
+def _fill(shape_name: str, scale: Vec3, spacing: float) -> Floats:
+    mesh = shape(shape_name).mesh.moved(scale)
+    low, high = mesh.bounds
+    # Rounded, so that on average the cubes fill the bounds; points stay inside them.
+    counts = np.maximum(np.rint((high - low) / spacing), 1)
+    if np.prod(counts) > MAX_LATTICE:
+        raise BadInputError(
+            f"{shape_name!r} of {np.round(high - low, 3).tolist()} m needs {counts.prod():.0f} "
+            f"lattice points at a spacing of {spacing} m; at most {MAX_LATTICE}: widen it"
+        )
+    sizes = counts.astype(int)
+    corner = (low + high) / 2 - sizes * spacing / 2
+    grid = (mesh, corner, (int(sizes[0]) * FINE, int(sizes[1]) * FINE, int(sizes[2]) * FINE))
+    solid = _by_cube(inside_cells(*grid, spacing / FINE))
+    filled = _close_thin(solid, solid | _by_cube(_surface_cells(*grid, spacing / FINE)))
+    if not filled.any():
+        filled[tuple(sizes // 2)] = True
+    return np.asarray(corner + spacing * (np.argwhere(filled) + 0.5), np.float32)
+
+
+def _by_cube(fine: Filled) -> Filled:
+    """Cells of a grid, gathered by the particle's cube that they lie in: (I, J, K, cells)."""
+    i, j, k = (count // FINE for count in fine.shape)
+    return fine.reshape(i, FINE, j, FINE, k, FINE).transpose(0, 2, 4, 1, 3, 5).reshape(i, j, k, -1)
+
+
+def _close_thin(solid: Filled, matter: Filled) -> Filled:
+    """Which cubes to fill, from their cells (I, J, K, cells).
+
+    ``solid`` cells have their centre inside; ``matter`` also holds those that a surface crosses,
+    as walls thinner than a cell may miss all centres.
+    """
+    share = solid.mean(axis=-1)
+    filled = np.pad(share >= 0.5, 1)
+    offsets = (np.indices((FINE,) * 3).reshape(3, -1).T + 0.5) / FINE - 0.5
+    near = np.indices((3, 3, 3)).reshape(3, -1).T - 1
+    covers = np.linalg.norm(offsets[:, None] - near, axis=-1) <= REACH
+    thin = np.argwhere(matter.any(axis=-1) & (share < 0.5))
+    fullness = (share + matter.mean(axis=-1))[tuple(thin.T)]
+    for i, j, k in thin[np.argsort(-fullness, kind="stable")]:
+        around = filled[i : i + 3, j : j + 3, k : k + 3].ravel()
+        if not covers[matter[i, j, k]][:, around].any(axis=1).all():
+            filled[i + 1, j + 1, k + 1] = True
+    return np.asarray(filled[1:-1, 1:-1, 1:-1])
+
+
+def _surface_cells(
+    mesh: Mesh, corner: NDArray[np.float64], counts: tuple[int, int, int], size: float
+) -> Filled:
+    """Which cells of a grid (see `inside_cells`) the surface passes through, by points on it."""
+    cells = np.zeros(counts, np.bool_)
+    points = (mesh.vertices - corner) / size
+    for a, b, c in points[mesh.faces]:
+        longest = max(np.linalg.norm(b - a), np.linalg.norm(c - a), np.linalg.norm(c - b))
+        steps = int(np.ceil(longest)) + 1
+        u, v = (np.indices((steps + 1, steps + 1)) / steps).reshape(2, -1, 1)
+        on = (a + u * (b - a) + v * (c - a))[u[:, 0] + v[:, 0] <= 1 + 1e-9]
+        cells[tuple(np.clip(on.astype(int), 0, np.array(counts) - 1).T)] = True
+    return cells
+
+
+def inside_cells(
+    mesh: Mesh, corner: NDArray[np.float64], counts: tuple[int, int, int], size: float
+) -> Filled:
+    """Which cells of a grid have their centre inside a closed mesh; parts of it may overlap.
+
+    ``counts`` cells of ``size`` metres along each axis, from ``corner`` on. A cell is inside where
+    the faces above it, up minus down, do not cancel: its winding number is above zero.
+    """
+    nx, ny, nz = counts
+    changes = np.zeros((nx, ny, nz + 1), np.int32)
+    # In cells; the odd shift keeps columns off the corners and edges of well-made shapes.
+    points = (mesh.vertices - corner) / size - 0.5 + np.array([1.1e-6, 1.7e-6, 0.0])
+    for face in mesh.faces:
+        a, b, c = points[face]
+        area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+        low = np.maximum(np.ceil(np.minimum(np.minimum(a, b), c)[:2]), 0).astype(int)
+        high = np.minimum(np.floor(np.maximum(np.maximum(a, b), c)[:2]), (nx - 1, ny - 1))
+        if area == 0 or (high < low).any():
+            continue
+        x = np.arange(low[0], int(high[0]) + 1)[:, None]
+        y = np.arange(low[1], int(high[1]) + 1)[None, :]
+        sides = (face[[1, 2]], face[[2, 0]], face[[0, 1]])
+        weights = [_edge(points, p, q, x, y) for p, q in sides]
+        # An edge belongs to one of its two faces, whichever way each of them runs along it.
+        hit = np.ones((x.size, y.size), np.bool_)
+        for value, (p, q) in zip(weights, sides, strict=True):
+            left = value >= 0 if p < q else value > 0
+            hit &= left if area > 0 else ~left
+        at_x, at_y = np.nonzero(hit)
+        height = sum(w[hit] * z for w, z in zip(weights, (a[2], b[2], c[2]), strict=True)) / area
+        below = np.clip(np.ceil(height), 0, nz).astype(int)
+        np.add.at(changes, (at_x + low[0], at_y + low[1], below), 1 if area > 0 else -1)
+    # A face counts for all cells below it: `below` of them.
+    above = changes[:, :, ::-1].cumsum(axis=2)[:, :, ::-1]
+    return np.asarray(above[:, :, 1:] > 0)
+
+
+def _edge(
+    points: NDArray[np.float64],
+    p: np.int32,
+    q: np.int32,
+    x: NDArray[np.int64],
+    y: NDArray[np.int64],
+) -> NDArray[np.float64]:
+    """How far left of the edge from corner ``p`` to ``q`` the columns lie, times its length.
+
+    Computed in one order of the corners, so that both faces of an edge get the same number.
+    """
+    first, last, sign = (p, q, 1.0) if p < q else (q, p, -1.0)
+    (ax, ay, _), (bx, by, _) = points[first], points[last]
+    return np.asarray(sign * ((bx - ax) * (y - ay) - (by - ay) * (x - ax)))
