@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from physion.physics.trajectory import Trajectory
+from physion.physics.trajectory import Ints, Trajectory
 from physion.scenes.scene import OBSERVED_FRAMES, Scene
 
 CLOTH_CONTACT_GAP = -0.0055
@@ -37,20 +37,25 @@ class Labels:
     robust: float | None = None
 
 
-def label_contact(scene: Scene, trajectory: Trajectory) -> Labels:
-    """Label a trajectory by its contacts; by one physical gap where agent or patient is cloth."""
+def contact_frames(scene: Scene, trajectory: Trajectory) -> Ints:
+    """Sorted frames in which agent and patient touch: by contacts, or by the gap of the cloth."""
     agent, patient = scene.index(scene.roles.agent), scene.index(scene.roles.patient)
     if max(agent, patient) < len(scene.bodies):
-        frames = trajectory.contacts.frames_of(agent, patient)
-        distance = None
-    else:
-        gaps = trajectory.cloth_distance
-        frames = np.flatnonzero(gaps < CLOTH_CONTACT_GAP).astype(np.int32)
-        distance = float(np.nanmin(gaps)) if np.isfinite(gaps).any() else None
+        return trajectory.contacts.frames_of(agent, patient)
+    return np.flatnonzero(trajectory.cloth_distance < CLOTH_CONTACT_GAP).astype(np.int32)
+
+
+def label_contact(scene: Scene, trajectory: Trajectory) -> Labels:
+    """Label a trajectory by its contacts; by one physical gap where agent or patient is cloth."""
+    frames = contact_frames(scene, trajectory)
+    agent, patient = scene.index(scene.roles.agent), scene.index(scene.roles.patient)
+    gaps = trajectory.cloth_distance
+    with_cloth = max(agent, patient) >= len(scene.bodies)
+    measured = with_cloth and bool(np.isfinite(gaps).any())
     first = int(frames[0]) if len(frames) else None
     return Labels(
         contact=first is not None,
         first_frame=first,
         observed=first is not None and first < OBSERVED_FRAMES,
-        min_distance=distance,
+        min_distance=float(np.nanmin(gaps)) if measured else None,
     )
