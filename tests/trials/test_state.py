@@ -1,0 +1,314 @@
+"""State outputs: what a trial file says about motion, contacts, looks, camera and roles."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+from hand_made import make_parts
+from numpy.typing import NDArray
+
+from physion.errors import BadInputError, BadSceneError
+from physion.physics.engine import simulate
+from physion.physics.labels import label_contact
+from physion.rendering.renderer import Renderer
+from physion.scenes.scene import (
+    Body,
+    Camera,
+    Cloth,
+    Contact,
+    Ending,
+    Look,
+    Push,
+    Roles,
+    Scene,
+)
+from physion.trials import state
+from physion.trials.trial_file import Trial, TrialWriter
+
+WIDTH, HEIGHT = 96, 64
+
+
+def _pack(scene: Scene) -> Trial:
+    """The trial of a scene, simulated and stored."""
+    trajectory = simulate(scene)
+    frame = Renderer(scene, trajectory, WIDTH, HEIGHT).render(0, ("ids",))
+    assert frame.ids is not None
+    changes = {
+        "trial": scene.name,
+        "scenario": scene.scenario,
+        "width": WIDTH,
+        "height": HEIGHT,
+        "frames": len(trajectory),
+        "look": "redyellow",
+        "engine": trajectory.engine,
+        "completed": trajectory.completed,
+        "digest": trajectory.digest(),
+    }
+    meta = dataclasses.replace(make_parts().metadata, **changes)
+    labels = label_contact(scene, trajectory)
+    return Trial(TrialWriter(meta, scene, trajectory, labels, frame.ids).finish(), "the trial")
+
+
+@pytest.fixture(scope="module")
+def collision() -> Trial:
+    """A ball that is pushed off centre into a box, beside a vase that is only drawn."""
+    scene = Scene(
+        name="collision",
+        scenario="collide",
+        bodies=(
+            Body("box", "cube", (0.5, 0.0, 0.0), scale=(0.3, 0.3, 0.5), mass=2.0),
+            Body(
+                "ball",
+                "sphere",
+                (-0.5, 0.0, 0.0),
+                scale=(0.3, 0.3, 0.3),
+                mass=0.5,
+                contact=Contact(0.4, 0.3, 0.2),
+                look=Look((0.1, 0.2, 0.3), "metal"),
+            ),
+            Body("cone", "cone", (0.0, 0.8, 0.0), (0.4, 0.4, 0.8), kinematic=True),
+            Body("vase", "prop:vase", (-0.5, 1.0, 0.0), scale=(0.3, 0.3, 0.5), scenery=True),
+        ),
+        roles=Roles("ball", "box", probe="ball"),
+        camera=Camera((0.2, -3.0, 1.6), (0.0, 0.0, 0.25), math.radians(45)),
+        pushes=(
+            Push("ball", (1.5, 0.0, 0.0), (-0.65, 0.0, 0.15), frame=4),
+            Push("box", (0.0, 0.2, 0.0), frame=50),
+        ),
+        room="empty",
+        ending=Ending(min_frames=60, max_frames=60),
+        parameters={"speed": 3.0, "list": [1, {"a": None}]},
+    )
+    return _pack(scene)
+
+
+@pytest.fixture(scope="module")
+def hanging() -> Trial:
+    """The hand-made trial with a cloth of 3 x 3 vertices in the air."""
+    return Trial(make_parts().pack(), "the hand-made trial")
+
+
+def test_centres_of_mass_move_as_fast_as_the_engine_says(collision: Trial) -> None:
+    centers = state.centroids(collision)
+    linear = state.velocities(collision).linear
+    assert centers.shape == (60, 4, 3) and linear.shape == (60, 4, 3)
+
+    def error(places: NDArray[np.float32]) -> float:
+        # On average: where bodies collide, the last sweep changes speeds after they have moved.
+        steps = np.diff(places[:, 1].astype(np.float64), axis=0) / 0.01
+        return float(np.abs(steps - linear[1:, 1]).mean())
+
+    assert np.ptp(linear[:, 1, 0]) > 2
+    assert error(centers) < 0.02
+    assert error(state.poses(collision).positions) > 0.2, "the ball rolls, and its pivot with it"
+
+
+def test_centres_of_mass_are_those_of_solids(collision: Trial) -> None:
+    first = state.centroids(collision)[0]
+    np.testing.assert_allclose(first[0], [0.5, 0.0, 0.25], atol=1e-3)
+    np.testing.assert_allclose(first[1], [-0.5, 0.0, 0.15], atol=1e-3)
+    np.testing.assert_allclose(first[2], [0.0, 0.8, 0.2], atol=1e-3)  # a quarter of its height
+
+
+def test_a_cloth_is_where_its_vertices_are(hanging: Trial) -> None:
+    centers = state.centroids(hanging)
+    vertices = hanging.trajectory.cloth_vertices
+    assert centers.shape[1] == 3
+    np.testing.assert_allclose(centers[:, 2], vertices.mean(axis=1), atol=1e-5)
+
+
+def test_poses_and_velocities_are_the_trajectory(collision: Trial) -> None:
+    pose, motion = state.poses(collision), collision.trajectory
+    np.testing.assert_array_equal(pose.positions, motion.positions)
+    np.testing.assert_array_equal(pose.rotations, motion.rotations)
+    np.testing.assert_array_equal(state.velocities(collision).angular, motion.angular_velocities)
+
+
+def test_normals_go_from_the_first_thing_to_the_second(collision: Trial) -> None:
+    there = state.contacts_between(collision, "ball", "box")
+    back = state.contacts_between(collision, "box", "ball")
+    assert len(there.frame) and there.frame[0] == collision.labels.first_frame
+    np.testing.assert_allclose(there.normal[0], [1, 0, 0], atol=0.2)
+    np.testing.assert_array_equal(there.normal, -back.normal)
+    np.testing.assert_array_equal(there.point, back.point)
+    np.testing.assert_array_equal(there.impulse, back.impulse)
+    assert there.point[0, 0] == pytest.approx(0.35, abs=0.05), "the box's side"
+    assert there.impulse.max() > 0.1
+    assert not len(state.contacts_between(collision, "ball", "cone").frame)
+    with pytest.raises(BadSceneError, match="bell"):
+        state.contacts_between(collision, "bell", "box")
+
+
+def test_contacts_with_the_floor_point_up(collision: Trial) -> None:
+    found = state.environment_contacts(collision)
+    assert set(found) == {"box", "ball"}
+    for touches in found.values():
+        assert len(touches.frame) and touches.normal[:, 2].min() > 0.99
+        np.testing.assert_allclose(touches.point[:, 2], 0, atol=0.01)
+    under = state.contacts_between(collision, "box", state.FLOOR)
+    np.testing.assert_array_equal(under.normal, -found["box"].normal)
+
+
+def test_the_contact_table_holds_every_contact(collision: Trial) -> None:
+    table = state.contact_table(collision)
+    assert len(table) == len(collision.trajectory.contacts.frame)
+    pair = table[(table["first"] == "box") & (table["second"] == "ball")]
+    normals = pair[["normal_x", "normal_y", "normal_z"]].to_numpy(np.float32)
+    np.testing.assert_array_equal(normals, state.contacts_between(collision, "box", "ball").normal)
+    assert set(table["first"]) == {"floor", "box"}
+    np.testing.assert_allclose(table["time"], table["frame"] * 0.01)
+
+
+def test_nothing_touches_in_a_trial_without_contacts() -> None:
+    trial = Trial(make_parts(contact_frame=None).pack(), "apart")
+    assert state.contact_table(trial).empty and state.environment_contacts(trial) == {}
+
+
+def test_meshes_scaled_and_unscaled(collision: Trial, hanging: Trial) -> None:
+    found = state.meshes(collision)
+    assert list(found) == collision.scene.names()
+    np.testing.assert_allclose(np.ptp(found["box"].vertices, axis=0), [1, 1, 1])
+    np.testing.assert_allclose(np.ptp(found["box"].scaled, axis=0), [0.3, 0.3, 0.5])
+    np.testing.assert_allclose(np.ptp(found["vase"].scaled, axis=0), [0.3, 0.3, 0.5])
+    sheet = state.meshes(hanging)["sheet"]
+    np.testing.assert_allclose(np.ptp(sheet.vertices, axis=0), [2, 2, 0])
+    assert sheet.faces.shape == (8, 3) and sheet.faces.max() == 8
+
+
+def test_world_vertices_rest_where_the_bodies_are(collision: Trial, hanging: Trial) -> None:
+    start = state.world_vertices(collision, 0)
+    np.testing.assert_allclose(start["box"].min(axis=0), [0.35, -0.15, 0], atol=1e-4)
+    np.testing.assert_allclose(start["cone"].max(axis=0)[2], 0.8, atol=1e-4)
+    end = state.world_vertices(collision, 59)
+    middle = (end["ball"].min(axis=0) + end["ball"].max(axis=0)) / 2
+    np.testing.assert_allclose(middle, state.centroids(collision)[59, 1], atol=0.01)
+    cloth = state.world_vertices(hanging, 7)["sheet"]
+    np.testing.assert_array_equal(cloth, hanging.trajectory.cloth_vertices[7])
+    with pytest.raises(BadInputError, match="no frame 60"):
+        state.world_vertices(collision, 60)
+
+
+def test_particles_lie_inside_the_drawn_bodies(collision: Trial) -> None:
+    cloud = state.particles(collision, frames=[59])
+    for index in (0, 1, 2):
+        mine = cloud.positions[0, cloud.things == index]
+        name = collision.scene.names()[index]
+        drawn = state.world_vertices(collision, 59)[name]
+        assert len(mine) > 20
+        assert (mine >= drawn.min(axis=0) - 1e-5).all()
+        assert (mine <= drawn.max(axis=0) + 1e-5).all()
+    assert not (cloud.things == 3).any(), "scenery"
+
+
+def test_the_object_table_says_what_everything_is(collision: Trial) -> None:
+    table = state.object_table(collision).set_index("name")
+    ball = table.loc["ball"]
+    assert (ball["shape"], ball["mass"], ball["role"]) == ("sphere", 0.5, "agent+probe")
+    assert (ball["static_friction"], ball["dynamic_friction"], ball["restitution"]) == (
+        0.4,
+        0.3,
+        0.2,
+    )
+    assert tuple(table.loc["box", ["scale_x", "scale_y", "scale_z"]]) == (0.3, 0.3, 0.5)
+    assert table["role"].tolist() == ["patient", "agent+probe", "", ""]
+    assert table["kinematic"].tolist() == [False, False, True, False]
+    assert table["scenery"].tolist() == [False, False, False, True]
+
+
+def test_colours_are_those_of_the_look(collision: Trial) -> None:
+    def color(look: str | None) -> tuple[float, ...]:
+        row = state.object_table(collision, look).set_index("name").loc["ball"]
+        return tuple(row[["red", "green", "blue"]])
+
+    assert color(None) == color("redyellow") == (1.0, 0.0, 0.0)
+    assert color("free") == (0.1, 0.2, 0.3)
+
+
+def test_a_cloth_has_a_row_too(hanging: Trial) -> None:
+    row = state.object_table(hanging).iloc[-1]
+    assert (row["name"], row["kind"], row["shape"], row["scale_x"]) == (
+        "sheet",
+        "cloth",
+        "sheet",
+        2,
+    )
+    assert pd.isna(row["static_friction"])
+
+
+def test_the_camera_agrees_with_the_renderer(collision: Trial) -> None:
+    """A ball's centre is projected onto the middle of the pixels that show it, in every frame."""
+    inside, outside = state.camera_intrinsics(collision), state.camera_extrinsics(collision)
+    centers = state.centroids(collision)
+    for frame in (0, 20, 59):
+        ids = collision.render(frame, ("ids", "depth"))
+        assert ids.ids is not None and ids.depth is not None
+        for index in (0, 1, 2):
+            seen = outside @ np.append(centers[frame, index], 1.0)
+            u, v, w = inside @ seen[:3]
+            u, v = u / w, v / w
+            assert ids.ids[int(v), int(u)] == index + 1
+            assert 0 < w - ids.depth[int(v), int(u)] < 0.5, "the surface is in front of the centre"
+        rows, columns = np.nonzero(ids.ids == 2)
+        seen = outside @ np.append(centers[frame, 1], 1.0)
+        u, v, w = inside @ seen[:3]
+        assert abs(columns.mean() + 0.5 - u / w) < 0.7
+        assert abs(rows.mean() + 0.5 - v / w) < 0.7
+
+
+def test_the_camera_scales_with_the_picture(collision: Trial) -> None:
+    small, large = state.camera_intrinsics(collision), state.camera_intrinsics(collision, 192, 128)
+    np.testing.assert_allclose(large[:2], 2 * small[:2])
+    np.testing.assert_allclose(small[:2, 2], [48, 32])
+    pose = np.linalg.inv(state.camera_extrinsics(collision))
+    np.testing.assert_allclose(pose[:3, 3], collision.scene.camera.position)
+
+
+def test_masks_show_agent_and_patient(collision: Trial) -> None:
+    ball, box = state.role_masks(collision, 0)
+    assert ball.shape == (HEIGHT, WIDTH) and ball.dtype == np.bool_
+    np.testing.assert_array_equal(ball, collision.ids == 2)
+    np.testing.assert_array_equal(box, collision.ids == 1)
+    later, _ = state.role_masks(collision, 30)
+    assert np.nonzero(later)[1].mean() > np.nonzero(ball)[1].mean() + 5, "the ball goes right"
+    assert not (ball & box).any()
+    with pytest.raises(BadInputError, match="no frame -1"):
+        state.role_masks(collision, -1)
+
+
+def test_pushes_say_when_and_how_hard(collision: Trial) -> None:
+    table = state.pushes(collision)
+    assert table["body"].tolist() == ["ball", "box"] and table["frame"].tolist() == [4, 50]
+    np.testing.assert_allclose(table["time"], [0.04, 0.5])
+    np.testing.assert_allclose(table["speed"], [3.0, 0.1])
+    assert table.loc[0, ["point_x", "point_y", "point_z"]].tolist() == [-0.65, 0.0, 0.15]
+    assert table.loc[1, ["point_x", "point_y", "point_z"]].isna().all()
+    linear = state.velocities(collision).linear
+    assert abs(linear[4, 1, 0]) < 0.01 and linear[5, 1, 0] == pytest.approx(3.0, abs=0.1)
+
+
+def test_scenario_parameters_are_a_copy(collision: Trial) -> None:
+    found = state.scenario_parameters(collision)
+    assert found == {"speed": 3.0, "list": [1, {"a": None}]}
+    found["list"].append(2)
+    assert state.scenario_parameters(collision)["list"] == [1, {"a": None}]
+
+
+def test_cloths_are_told_apart() -> None:
+    parts = make_parts()
+    scene = parts.scene
+    two = dataclasses.replace(
+        scene, cloths=(*scene.cloths, Cloth("second", (0.0, 0.0, 3.0), resolution=2))
+    )
+    vertices = np.concatenate(
+        [parts.trajectory.cloth_vertices, np.full((60, 4, 3), 7.0, np.float32)], axis=1
+    )
+    motion = dataclasses.replace(parts.trajectory, cloth_vertices=vertices)
+    meta = dataclasses.replace(parts.metadata, digest=motion.digest())
+    stored = parts._replace(scene=two, trajectory=motion, metadata=meta)
+    trial = Trial(stored.pack(), "two cloths")
+    np.testing.assert_array_equal(state.centroids(trial)[:, 3], np.full((60, 3), 7.0))
+    assert (state.world_vertices(trial, 3)["second"] == 7).all()
