@@ -13,9 +13,15 @@ def stable_hash(*parts: str | int) -> int:
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=16).digest(), "little")
 
 
-def trial_seed(dataset: str | int, scenario: str, split: str, index: int) -> np.random.SeedSequence:
-    """The seed of one trial, a function of what names it and nothing else."""
-    return np.random.SeedSequence(stable_hash(dataset, scenario, split, index))
+def trial_seed(
+    dataset: str | int, scenario: str, split: str, index: int, attempt: int = 0
+) -> np.random.SeedSequence:
+    """The seed of one trial, a function of what names it and nothing else.
+
+    ``attempt`` counts the draws that were refused before: each has a seed of its own.
+    """
+    parts = (dataset, scenario, split, index)
+    return np.random.SeedSequence(stable_hash(*parts, attempt) if attempt else stable_hash(*parts))
 
 
 def child_generator(seed: np.random.SeedSequence, name: str) -> np.random.Generator:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json as json_module
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,8 +14,8 @@ from physion.cli.output import console, track
 from physion.compute.local import LocalExecutor
 from physion.errors import BadInputError
 from physion.scenes.scenarios import scenarios
-from physion.trials.generate import generate
-from physion.trials.plan import Settings, plan_dataset
+from physion.trials.generate import Report, generate
+from physion.trials.plan import FULL_COUNTS, SPLITS, Settings, plan_dataset
 
 
 @dataclass(frozen=True)
@@ -26,20 +26,20 @@ class Options:
     """Folder of the dataset; new, empty, or one to go on with."""
     scenario: str = "all"
     """A scenario, or all."""
-    split: Literal["training", "readout", "testing", "familiarization"] = "testing"
-    """Which part of the dataset."""
+    split: Literal["training", "readout", "testing", "familiarization", "all"] = "testing"
+    """Which part of the dataset; all with --full makes everything."""
     count: int = 10
     """Trials a scenario."""
+    full: bool = False
+    """The sizes of the study in place of --count: training 2000, readout 1000, testing 150,
+    familiarization 10 a scenario."""
+    presets: tuple[str, ...] = ()
+    """Presets that the trials take in turn (physion ls presets), or FILE.toml:NAME; by default the
+    published configurations. Needs one --scenario."""
     name: str = "physion"
     """Name of the dataset: another name draws other trials."""
-    size: int = 256
-    """Pixels a side."""
-    look: Literal["redyellow", "free"] = "redyellow"
-    """Red agent and yellow patient, or free colours with the map."""
-    passes: tuple[str, ...] = ()
-    """Image passes to store: color depth normals ids flow. Any can be rendered again later."""
-    compatible: bool = False
-    """Compress with gzip, which every HDF5 reader knows, in place of zstd."""
+    settings: Annotated[Settings, tyro.conf.arg(name="")] = field(default_factory=Settings)
+    """How trials are chosen, rendered and stored."""
     workers: int = os.cpu_count() or 1
     """Processes."""
     json: bool = False
@@ -53,19 +53,28 @@ def main(options: Options) -> int:
         raise BadInputError(f"--count must be 1 or more, not {options.count}")
     for name in names:
         scenarios.get(name)
+    if options.presets and options.scenario == "all":
+        raise BadInputError("--presets needs one --scenario: each scenario has its own presets")
+    splits = SPLITS if options.split == "all" else (options.split,)
+    counts = {split: FULL_COUNTS[split] if options.full else options.count for split in splits}
+    presets = {options.scenario: options.presets} if options.presets else None
     report = generate(
         options.folder,
-        plan_dataset(options.name, names, {options.split: options.count}),
-        Settings(options.size, options.size, options.look, options.passes, options.compatible),
+        plan_dataset(options.name, names, counts, presets),
+        options.settings,
         executor=LocalExecutor(workers=options.workers),
         track=track,
     )
-    if options.json:
+    _print(report, options.json)
+    return report.exit_code
+
+
+def _print(report: Report, json: bool) -> None:
+    if json:
         values = {"made": report.made, "kept": report.kept, "failed": dict(report.failed)}
         print(json_module.dumps(values | {"index": str(report.index)}, default=list))
-        return report.exit_code
+        return
     for name, reason in report.failed.items():
         console.print(f"failed: {name}: {reason}", markup=False, soft_wrap=True)
     done = f"{len(report.made)} made, {len(report.kept)} kept, {len(report.failed)} failed"
     console.print(f"{done}: {report.index}", markup=False, soft_wrap=True)
-    return report.exit_code

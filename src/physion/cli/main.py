@@ -15,10 +15,16 @@ VERBS = {
     "replay": "simulate official command logs and compare with the recorded outcomes",
     "evaluate": "train models and readouts on trials and write their predictions",
     "compare": "compare predictions with people",
+    "view": "one page of a dataset: movies, passes, motion to turn by hand",
+    "export": "write the official layout, webdataset shards, or a dataset card",
+    "import": "read official HDF5 and movie folders into trials",
     "verify": "check every byte, label and motion of a dataset",
     "ls": "list scenarios, shapes, models, engines",
     "doctor": "check this machine and say what to install",
 }
+
+MODULES = {"import": "import_trials"}
+"""Modules of verbs whose names Python keeps for itself."""
 
 
 def _usage() -> str:
@@ -48,7 +54,7 @@ def main(argv: list[str] | None = None) -> int:
             raise UnknownNameError("verb", words[0], VERBS)
         import tyro
 
-        module = importlib.import_module(f"physion.cli.{words[0]}")
+        module = importlib.import_module(f"physion.cli.{MODULES.get(words[0], words[0])}")
         options = tyro.cli(
             module.Options,
             args=words[1:],

@@ -9,8 +9,8 @@ from typing import Annotated
 
 import tyro
 
-from physion.cli.output import console
-from physion.trials.verify import verify_dataset
+from physion.cli.output import console, track
+from physion.trials.verify import SAMPLE, verify_dataset
 
 
 @dataclass(frozen=True)
@@ -19,15 +19,15 @@ class Options:
 
     folder: Annotated[Path, tyro.conf.Positional]
     """Folder of a dataset."""
-    simulate: bool = False
-    """Also simulate every scene again and compare the motion to the bit."""
+    again: int = SAMPLE
+    """Trials to simulate and render again and compare to the bit; -1 takes all."""
     json: bool = False
     """Print the faults as one JSON list."""
 
 
 def main(options: Options) -> int:
     """Print the faults; 1 if there is one."""
-    faults = verify_dataset(options.folder, simulate_again=options.simulate)
+    faults = verify_dataset(options.folder, again=options.again, track=track)
     if options.json:
         print(json_module.dumps(faults, indent=1))
         return 1 if faults else 0

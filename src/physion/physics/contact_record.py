@@ -36,6 +36,14 @@ class ContactRecord:
             np.column_stack([contacts.point, contacts.normal, load, contacts.separation])[touch]
         )
 
+    def touches(self, pair: set[int]) -> bool:
+        """Whether the two bodies of ``pair`` touch in the last frame that had a contact."""
+        if not self._pairs:
+            return False
+        low, high = min(pair), max(pair)
+        last = np.sort(self._pairs[-1], axis=1)
+        return bool(((last[:, 0] == low) & (last[:, 1] == high)).any())
+
     def contacts(self) -> Contacts:
         """One row for each touching pair and frame, at its deepest point."""
         if not self._frames:

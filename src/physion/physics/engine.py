@@ -18,13 +18,19 @@ class Engine(Protocol):
         ...
 
     def simulate(
-        self, scene: Scene, *, start: State | None = None, frames: int | None = None
+        self,
+        scene: Scene,
+        *,
+        start: State | None = None,
+        frames: int | None = None,
+        until_contact: bool = False,
     ) -> Trajectory:
         """Move ``scene`` until it ends.
 
         With ``start`` the motion goes on from that instant: frame 0 of the result is ``start``,
         and pushes at later frames of the trial still come. ``frames`` replaces the scene's own
-        ending by a fixed number of frames, frame 0 counted.
+        ending by a fixed number of frames, frame 0 counted. ``until_contact`` lets the engine
+        stop after the first frame in which agent and patient touch: the label is then known.
         """
         ...
 
@@ -40,7 +46,10 @@ def simulate(
     engine: Engine | None = None,
     start: State | None = None,
     frames: int | None = None,
+    until_contact: bool = False,
 ) -> Trajectory:
     """Simulate with ``engine``, or with MuJoCo in its default settings."""
     chosen = engine if engine is not None else engines.get("mujoco")()
-    return chosen.simulate(scene, start=start, frames=frames)  # type: ignore[no-any-return]
+    return chosen.simulate(  # type: ignore[no-any-return]
+        scene, start=start, frames=frames, until_contact=until_contact
+    )

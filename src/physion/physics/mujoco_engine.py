@@ -50,7 +50,12 @@ class MujocoEngine:
         return f"mujoco-{mujoco.__version__}+physion-{VERSION}.{tags}"
 
     def simulate(
-        self, scene: Scene, *, start: State | None = None, frames: int | None = None
+        self,
+        scene: Scene,
+        *,
+        start: State | None = None,
+        frames: int | None = None,
+        until_contact: bool = False,
     ) -> Trajectory:
         """Move ``scene`` until it ends; see `physion.physics.engine.Engine.simulate`."""
         if frames is not None and frames < 1:
@@ -60,8 +65,11 @@ class MujocoEngine:
         limit = scene.ending.max_frames if frames is None else frames
         # Cloth does not sleep: with it a trial takes its whole time.
         least = limit if frames is not None or scene.cloths else scene.ending.min_frames
+        asked = {scene.index(scene.roles.agent), scene.index(scene.roles.patient)}
         while len(run.history) < limit and not (len(run.history) >= least and run.all_asleep()):
             run.step()
+            if until_contact and run.record.touches(asked):
+                break
         rigid = run.trajectory(self.name)
         return add_cloth(scene, rigid, self.cloth, start=start) if scene.cloths else rigid
 

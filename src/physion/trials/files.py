@@ -23,5 +23,6 @@ def encode_png(picture: NDArray[np.uint8]) -> bytes:
 def write_files(paths: TrialPaths, files: Mapping[str, bytes]) -> None:
     """Write the files of a trial, named as in `TrialPaths.all`; the trial file last of all."""
     paths.trial_file.parent.mkdir(parents=True, exist_ok=True)
-    for name in ("movie", "observed_movie", "map", "trial_file"):
-        write_atomic(paths.all()[name], files[name])
+    for name, path in paths.all(free=True).items():
+        if name in files:
+            write_atomic(path, files[name])

@@ -18,12 +18,18 @@ from typing import Any
 from physion.atomic import folder_lock, remove_leftovers, write_atomic
 from physion.compute.executor import Executor, Outcome
 from physion.errors import BadInputError, PhysionError
+from physion.scenes.preset import get_preset
+from physion.scenes.scenarios import as_record
+from physion.seeds import stable_hash
 from physion.trials.index import build_index, read_index, write_index
 from physion.trials.layout import FAILURES, INDEX, SETTINGS, find_trials
 from physion.trials.plan import Job, Settings, Task, check_names
 
 Track = Callable[[Iterable[Outcome[Any]], str, int], Iterator[Outcome[Any]]]
 """Passes outcomes on and shows how far it is, as `physion.cli.output.track` does."""
+
+CHOICES = "choices"
+"""Folder with the draws that were chosen for the trials of each split and scenario."""
 
 _HOPELESS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EIO}
 """System errors that every later trial would meet too."""
@@ -85,15 +91,50 @@ def generate(
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with folder_lock(folder):
-            _fix_settings(folder, datasets.pop(), settings)
+            _fix_settings(folder, datasets.pop(), settings, tasks)
             remove_leftovers(folder)
-            missing = {name: job for name, job in jobs.items() if not job.paths.complete()}
-            made, failed = _run(folder, missing, executor, track, make)
+            missing = {name: job for name, job in jobs.items() if not job.complete()}
+            chosen, unchosen = _choose(folder, jobs, missing, settings, executor, track)
+            made, failed = _run(folder, chosen, executor, track, make)
             problems = _update_index(folder)
     except OSError as error:
         raise BadInputError(f"cannot write into {folder}: {error.strerror or error}") from error
     kept = [name for name in jobs if name not in missing]
-    return Report(made, kept, {**failed, **problems}, folder / INDEX)
+    return Report(made, kept, {**unchosen, **failed, **problems}, folder / INDEX)
+
+
+def _choose(
+    folder: Path,
+    jobs: Mapping[str, Job],
+    missing: Mapping[str, Job],
+    settings: Settings,
+    executor: Executor,
+    track: Track | None,
+) -> tuple[dict[str, Job], dict[str, str]]:
+    """The missing jobs with their draws chosen, and why some could not be chosen."""
+    groups: dict[tuple[str, str], list[Task]] = {}
+    for job in jobs.values():
+        if job.task.presets:
+            groups.setdefault((job.task.split, job.task.scenario), []).append(job.task)
+    chosen, failed = dict(missing), dict[str, str]()
+    for (split, scenario), tasks in groups.items():
+        names = {task.trial for task in tasks} & missing.keys()
+        if not names:
+            continue
+        from physion.trials.choose import choose_all
+
+        path = folder / CHOICES / f"{split}_{scenario}.json"
+        choices, outcomes = choose_all(tasks, settings, path, executor, track)
+        for name, outcome in outcomes.items():
+            if outcome.errno in _HOPELESS:
+                raise PhysionError(f"cannot write into {folder}: {outcome.error}")
+            if name in names:
+                failed[name] = str(outcome.error)
+                _note_failure(folder, outcome, chosen.pop(name))
+        for name in names - failed.keys():
+            job = chosen[name]
+            chosen[name] = dataclasses.replace(job, task=choices[name].fill(job.task))
+    return chosen, failed
 
 
 def _run(
@@ -127,7 +168,7 @@ def _run(
     return [name for name in jobs if name in made], failed
 
 
-def _note_failure(folder: Path, outcome: Outcome[str], job: Job) -> None:
+def _note_failure(folder: Path, outcome: Outcome[Any], job: Job) -> None:
     """Leave the traceback and the scene, if it came from outside, where one can look at them."""
     text = f"{outcome.error}\ntries: {outcome.tries}\n\n{outcome.traceback}\n"
     if job.task.scene is not None:
@@ -150,17 +191,30 @@ def _update_index(folder: Path) -> dict[str, str]:
     return problems
 
 
-def _fix_settings(folder: Path, dataset: str, settings: Settings) -> None:
-    """Write how the folder's trials are made, or raise where it was made another way."""
+def _fix_settings(folder: Path, dataset: str, settings: Settings, tasks: Sequence[Task]) -> None:
+    """Write how the folder's trials are made, or raise where it was made another way.
+
+    Each split of a scenario keeps the presets, with all their values, that it began with.
+    """
     path = folder / SETTINGS
-    wanted = {"dataset": dataset, "settings": dataclasses.asdict(settings)}
-    text = json.dumps(wanted, indent=1, sort_keys=True) + "\n"
+    wanted = json.loads(json.dumps({"dataset": dataset, "settings": dataclasses.asdict(settings)}))
+    presets = _presets_in_use(tasks)
     if path.is_file():
-        if path.read_text(encoding="utf-8", errors="replace") != text:
+        known = _read_settings(path)
+        before = known.pop("presets", {})
+        differs = [name for name in wanted if known.get(name) != wanted[name]]
+        differs += [name for name in presets if before.get(name, presets[name]) != presets[name]]
+        if differs or known.keys() != wanted.keys():
             raise BadInputError(
-                f"{folder} was made with another dataset name or other settings, see {path}; "
-                "choose another folder"
+                f"{folder} was made with another dataset name or other settings "
+                f"({', '.join(differs)}), see {path}; choose another folder"
             )
+        presets = {**before, **presets}
+        if presets == before:
+            return
+    text = json.dumps({**wanted, "presets": presets}, indent=1, sort_keys=True) + "\n"
+    if path.is_file():
+        write_atomic(path, text.encode())
         return
     strangers = [item.name for item in folder.iterdir() if not item.name.startswith(".")]
     if strangers:
@@ -169,3 +223,24 @@ def _fix_settings(folder: Path, dataset: str, settings: Settings) -> None:
             "empty or new folder"
         )
     write_atomic(path, text.encode())
+
+
+def _read_settings(path: Path) -> dict[str, Any]:
+    try:
+        known = json.loads(path.read_text(encoding="utf-8", errors="replace"))
+    except ValueError as error:
+        raise BadInputError(f"{path} is damaged: {error}; choose another folder") from error
+    if not isinstance(known, dict):
+        raise BadInputError(f"{path} is damaged: it holds no settings; choose another folder")
+    return known
+
+
+def _presets_in_use(tasks: Sequence[Task]) -> dict[str, dict[str, str]]:
+    """A digest of the values of every preset, by split and scenario."""
+    found: dict[str, dict[str, str]] = {}
+    for key, names in {(f"{t.split}/{t.scenario}", t.presets): t for t in tasks if t.presets}:
+        for name in names:
+            preset = get_preset(key.rpartition("/")[2], name)
+            digest = stable_hash(json.dumps(as_record(preset.params), sort_keys=True))
+            found.setdefault(key, {})[preset.name] = f"{digest:032x}"
+    return found

@@ -15,6 +15,8 @@ from physion.errors import BadInputError
 from physion.trials.layout import INDEX, SAFE_NAME, TrialPaths, find_trials
 from physion.trials.trial_file import Trial
 
+FILES = ("trial_file", "movie", "observed_movie", "map", "free_movie", "free_observed_movie")
+"""Files that a trial may have, by the names of their columns."""
 COLUMNS = {
     "trial": "string",
     "dataset": "string",
@@ -23,6 +25,8 @@ COLUMNS = {
     "index": "int64",
     "preset": "string",
     "seed": "string",
+    "attempt": "Int64",
+    "scene_digest": "string",
     "contact": "bool",
     "first_frame": "Int64",
     "observed_contact": "bool",
@@ -32,6 +36,8 @@ COLUMNS = {
     "frames": "int64",
     "observed_frames": "int64",
     "completed": "bool",
+    "physics_seconds": "float64",
+    "playback_seconds": "float64",
     "agent_share": "float64",
     "patient_share": "float64",
     "look": "string",
@@ -43,19 +49,21 @@ COLUMNS = {
     "digest": "string",
     **{
         f"{file}{what}": kind
-        for file in ("trial_file", "movie", "observed_movie", "map")
-        for what, kind in (("", "string"), ("_bytes", "int64"), ("_sha256", "string"))
+        for file in FILES
+        for what, kind in (("", "string"), ("_bytes", "Int64"), ("_sha256", "string"))
     },
 }
 """Columns and their pandas types. ``trial`` is unique; ``*_share`` are shares of frame 0;
-``digest`` is the trajectory's; paths are relative to the dataset's folder, with forward slashes;
-the rest is as in `Labels` and `Metadata`."""
+``digest`` is the trajectory's; paths are relative to the dataset's folder, with forward slashes,
+and missing where a trial has no such file; the rest is as in `Labels` and `Metadata`."""
 
 
 def index_row(paths: TrialPaths) -> dict[str, Any]:
     """The row of one trial, from its files; `BadInputError` where one is missing or broken."""
-    row: dict[str, Any] = {}
-    for name, path in paths.all().items():
+    row: dict[str, Any] = dict.fromkeys(COLUMNS)
+    trial = Trial.open(paths.trial_file)
+    meta, labels, scene = trial.metadata, trial.labels, trial.scene
+    for name, path in paths.all(meta.movies, meta.free_movies).items():
         try:
             content = path.read_bytes()
         except OSError as error:
@@ -63,8 +71,6 @@ def index_row(paths: TrialPaths) -> dict[str, Any]:
         row[name] = path.relative_to(paths.folder).as_posix()
         row[f"{name}_bytes"] = len(content)
         row[f"{name}_sha256"] = hashlib.sha256(content).hexdigest()
-    trial = Trial.open(paths.trial_file)
-    meta, labels, scene = trial.metadata, trial.labels, trial.scene
     if (meta.trial, meta.scenario, meta.split) != (paths.trial, paths.scenario, paths.split):
         raise BadInputError(
             f"{paths.trial_file} is trial {meta.trial!r} of {meta.split}/{meta.scenario}: "

@@ -18,7 +18,7 @@ SAFE_NAME = r"[A-Za-z0-9][A-Za-z0-9._+-]{0,199}"
 
 @dataclass(frozen=True, slots=True)
 class TrialPaths:
-    """The four files of a trial, in ``folder/split/scenario``.
+    """The files of a trial, in ``folder/split/scenario``.
 
     The trial file is written last, so that where it is, the others are.
     """
@@ -48,18 +48,36 @@ class TrialPaths:
         """Agent red, patient yellow, the rest transparent (PNG)."""
         return self._named("_map.png")
 
-    def all(self) -> dict[str, Path]:
-        """The files by the name of their columns in the index."""
-        return {
-            "trial_file": self.trial_file,
-            "movie": self.movie,
-            "observed_movie": self.observed_movie,
-            "map": self.map,
-        }
+    @property
+    def free_movie(self) -> Path:
+        """All frames in free colours (MP4), where the trial's own look is another."""
+        return self._named("_free_img.mp4")
 
-    def complete(self) -> bool:
-        """All four are there."""
-        return all(path.is_file() for path in self.all().values())
+    @property
+    def free_observed_movie(self) -> Path:
+        """The observed frames alone in free colours (MP4)."""
+        return self._named("_free_observed.mp4")
+
+    def all(self, movies: bool = True, free: bool = False) -> dict[str, Path]:
+        """The files by the name of their columns in the index, the trial file last.
+
+        Without ``movies`` the trial file alone; with ``free`` also the movies in free colours.
+        """
+        files = {}
+        if movies:
+            files = {
+                "movie": self.movie,
+                "observed_movie": self.observed_movie,
+                "map": self.map,
+            }
+        if movies and free:
+            files["free_movie"] = self.free_movie
+            files["free_observed_movie"] = self.free_observed_movie
+        return {**files, "trial_file": self.trial_file}
+
+    def complete(self, movies: bool = True, free: bool = False) -> bool:
+        """All of them are there."""
+        return all(path.is_file() for path in self.all(movies, free).values())
 
     def _named(self, ending: str) -> Path:
         return self.folder / self.split / self.scenario / (self.trial + ending)

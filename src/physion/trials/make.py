@@ -1,4 +1,4 @@
-"""One trial: from its task to its four files."""
+"""One trial: from its task to its files."""
 
 from __future__ import annotations
 
@@ -10,27 +10,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 import physion
-from physion.errors import BadInputError, UnknownNameError
+from physion.errors import BadInputError
 from physion.physics.engine import simulate
 from physion.physics.labels import Labels, label_contact
 from physion.physics.trajectory import Trajectory
 from physion.rendering.renderer import Frame, Renderer, role_map
-from physion.scenes.looks import with_role_colors
+from physion.scenes.preset import get_preset
 from physion.scenes.scenarios import sample_scene
-from physion.scenes.scene import FRAME_TIME, OBSERVED_FRAMES, PLAYBACK_RATE, Scene
+from physion.scenes.scene import FRAME_TIME, OBSERVED_FRAMES, Scene
 from physion.trials.files import encode_png, write_files
 from physion.trials.plan import Job, Task
-from physion.trials.trial_file import Metadata, TrialWriter
+from physion.trials.trial_file import Metadata, TrialWriter, in_look
 from physion.trials.video import MovieEncoder
+
+RENDERER = f"physion {physion.__version__}, numba {version('numba')}, av {version('av')}"
+"""Name and versions of what renders, as stored with every trial."""
 
 
 def make_trial(job: Job) -> str:
-    """Make one trial and write its four files; its name. A pure function of the job.
+    """Make one trial and write its files; its name. A pure function of the job.
 
     The trial file comes last, so that a trial with a trial file is complete.
     """
-    task, settings = job.task, job.settings
-    scene = scene_of(task, settings.look)
+    task = job.task
+    scene = scene_of(task)
     trajectory = simulate(scene)
     if len(trajectory) <= OBSERVED_FRAMES:
         raise BadInputError(
@@ -38,35 +41,28 @@ def make_trial(job: Job) -> str:
             f"the {OBSERVED_FRAMES} observed ones"
         )
     labels = label_contact(scene, trajectory)
-    renderer = Renderer(scene, trajectory, settings.width, settings.height)
-    files = _render(job, scene, trajectory, labels, renderer)
-    write_files(job.paths, files)
+    labels = dataclasses.replace(labels, robust=task.robust)
+    write_files(job.paths, _files(job, scene, trajectory, labels))
     return task.trial
 
 
-def scene_of(task: Task, look: str) -> Scene:
-    """The scene of a task in its final colours: the imported one, or one drawn by its seed."""
-    scene = task.scene
-    if scene is None:
-        if task.preset is not None:
-            raise UnknownNameError("preset", task.preset, ())
-        scene = sample_scene(task.scenario, task.seed())
-        scene = dataclasses.replace(scene, name=task.trial)
-    return with_role_colors(scene) if look == "redyellow" else scene
+def scene_of(task: Task) -> Scene:
+    """The scene of a task in its free colours: the imported one, or one drawn by its seed."""
+    if task.scene is not None:
+        return task.scene
+    params = None if task.preset is None else get_preset(task.scenario, task.preset).params
+    scene = sample_scene(task.scenario, task.seed(), params)
+    return dataclasses.replace(scene, name=task.trial)
 
 
-def _render(
-    job: Job, scene: Scene, trajectory: Trajectory, labels: Labels, renderer: Renderer
-) -> dict[str, bytes]:
-    """The bytes of the four files, each frame being rendered once."""
-    settings, frames = job.settings, len(trajectory)
-    movie = MovieEncoder(settings.width, settings.height, frames)
-    observed = MovieEncoder(settings.width, settings.height, OBSERVED_FRAMES)
-    first = renderer.render(0, ("ids",))
-    ids = _image(first, "ids")
-    metadata = _metadata(job, trajectory)
+def _files(job: Job, scene: Scene, trajectory: Trajectory, labels: Labels) -> dict[str, bytes]:
+    """The bytes of the trial's files, each frame of each look being rendered once."""
+    settings = job.settings
+    size = settings.width, settings.height
+    renderer = Renderer(in_look(scene, job.looks[0]), trajectory, *size)
+    ids = _image(renderer.render(0, ("ids",)), "ids")
     writer = TrialWriter(
-        metadata,
+        _metadata(job, scene, trajectory),
         scene,
         trajectory,
         labels,
@@ -74,21 +70,41 @@ def _render(
         passes=settings.passes,
         compatible=settings.compatible,
     )
-    passes = tuple(dict.fromkeys(("color", *settings.passes)))
+    files = {}
+    if settings.movies:
+        rate = settings.playback_rate
+        files["map"] = encode_png(role_map(ids, scene))
+        files["movie"], files["observed_movie"] = make_movies(
+            renderer, rate, writer if settings.passes else None
+        )
+        for look in job.looks[1:]:
+            other = Renderer(in_look(scene, look), trajectory, *size)
+            files[f"{look}_movie"], files[f"{look}_observed_movie"] = make_movies(other, rate)
+    return {**files, "trial_file": writer.finish()}
+
+
+def make_movies(
+    renderer: Renderer, rate: int, writer: TrialWriter | None = None
+) -> tuple[bytes, bytes]:
+    """The full and the observed movie at ``rate`` frames a second.
+
+    ``writer`` gets the passes that it stores, frame by frame. The same trial, the same bytes.
+    """
+    frames = len(renderer.trajectory)
+    movie, observed = (
+        MovieEncoder(renderer.width, renderer.height, count, rate=rate)
+        for count in (frames, OBSERVED_FRAMES)
+    )
+    kept = writer.passes if writer else ()
     for index in range(frames):
-        frame = renderer.render(index, passes)
+        frame = renderer.render(index, tuple(dict.fromkeys(("color", *kept))))
         color = _image(frame, "color")
         movie.add(color)
         if index < OBSERVED_FRAMES:
             observed.add(color)
-        if settings.passes:
-            writer.add_frame({name: _image(frame, name) for name in settings.passes})
-    return {
-        "movie": movie.finish(),
-        "observed_movie": observed.finish(),
-        "map": encode_png(role_map(ids, scene)),
-        "trial_file": writer.finish(),
-    }
+        if writer:
+            writer.add_frame({name: _image(frame, name) for name in kept})
+    return movie.finish(), observed.finish()
 
 
 def _image(frame: Frame, name: str) -> NDArray[Any]:
@@ -97,7 +113,7 @@ def _image(frame: Frame, name: str) -> NDArray[Any]:
     return image
 
 
-def _metadata(job: Job, trajectory: Trajectory) -> Metadata:
+def _metadata(job: Job, scene: Scene, trajectory: Trajectory) -> Metadata:
     task, settings = job.task, job.settings
     sampled = task.scene is None
     return Metadata(
@@ -106,18 +122,22 @@ def _metadata(job: Job, trajectory: Trajectory) -> Metadata:
         scenario=task.scenario,
         split=task.split,
         index=task.index,
-        preset=task.preset,
+        preset=get_preset(task.scenario, task.preset).name if task.preset else None,
         seed=f"{task.seed().entropy:x}" if sampled else None,
-        look=settings.look,
+        attempt=task.attempt if sampled else None,
+        scene_digest=scene.physics_digest(),
+        look=job.looks[0],
+        movies=settings.movies,
+        free_movies=settings.movies and len(job.looks) > 1,
         width=settings.width,
         height=settings.height,
         frames=len(trajectory),
         observed_frames=OBSERVED_FRAMES,
         frame_time=FRAME_TIME,
-        playback_rate=PLAYBACK_RATE,
+        playback_rate=settings.playback_rate,
         completed=bool(trajectory.completed),
         engine=trajectory.engine,
-        renderer=f"physion {physion.__version__}, numba {version('numba')}",
+        renderer=RENDERER,
         package=f"physion {physion.__version__}",
         digest=trajectory.digest(),
         recorded_contact=task.recorded_contact,

@@ -11,8 +11,9 @@ from typing import Literal
 import numpy as np
 
 from physion.errors import BadInputError, UnknownNameError
+from physion.scenes.preset import default_presets, get_preset
 from physion.scenes.scenarios import scenarios as known_scenarios
-from physion.scenes.scene import Scene
+from physion.scenes.scene import FRAME_TIME, PLAYBACK_RATE, Scene
 from physion.seeds import trial_seed
 from physion.trials.layout import SAFE_NAME, TrialPaths
 from physion.trials.schema import PASSES
@@ -21,15 +22,28 @@ SPLITS = ("training", "readout", "testing", "familiarization")
 """Trials for a model's own training, for its readout, for the test that people take too, and for
 people to practise on."""
 
+SPLIT_LOOKS: Mapping[str, tuple[str, ...]] = {
+    "training": ("free",),
+    "readout": ("redyellow",),
+    "testing": ("redyellow", "free"),
+    "familiarization": ("redyellow", "free"),
+}
+"""Looks of each split: no cues to train on, cues to read out, and both for the tests that models
+and people take (people see free colours and a map of who is who)."""
+FULL_COUNTS = {"training": 2000, "readout": 1000, "testing": 150, "familiarization": 10}
+"""Trials a scenario, as in the study."""
+PLAYBACK_RATES = {"slow": PLAYBACK_RATE, "real": round(1 / FRAME_TIME)}
+
 
 @dataclass(frozen=True)
 class Task:
     """One trial to make: what names it is all that decides it.
 
     A task without ``scene`` draws its scene from its scenario and ``preset`` (None for the
-    scenario's own parameters) with a seed of (dataset, scenario, split, index). A task with an
-    imported ``scene`` takes it as it is, and ``recorded_contact`` is the outcome that it came
-    with.
+    scenario's own parameters) with a seed of (dataset, scenario, split, index, attempt).
+    ``presets`` are those that it may take: `physion.trials.choose` fills in ``preset``,
+    ``attempt`` and ``robust``. A task with an imported ``scene`` takes it as it is, and
+    ``recorded_contact`` is the outcome that it came with.
     """
 
     dataset: str
@@ -39,6 +53,9 @@ class Task:
     preset: str | None = None
     scene: Scene | None = None
     recorded_contact: bool | None = None
+    presets: tuple[str, ...] = ()
+    attempt: int = 0
+    robust: float | None = None
 
     def __post_init__(self) -> None:
         if self.split not in SPLITS:
@@ -56,31 +73,42 @@ class Task:
         """Name of the trial, unique in its dataset."""
         if self.scene is not None:
             return self.scene.name
-        preset = f"_{self.preset}" if self.preset else ""
-        return f"{self.scenario}{preset}_{self.split}_{self.index:04d}"
+        return f"{self.scenario}_{self.split}_{self.index:04d}"
 
     def seed(self) -> np.random.SeedSequence:
         """Where all randomness of the trial comes from."""
-        return trial_seed(self.dataset, self.scenario, self.split, self.index)
+        return trial_seed(self.dataset, self.scenario, self.split, self.index, self.attempt)
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How trials are rendered and stored. One folder has one of it.
-
-    - ``width``, ``height``: pixels, even.
-    - ``look``: ``redyellow`` paints the agent red and the patient yellow; ``free`` keeps the
-      colours of the scene, and only the map says who is who.
-    - ``passes``: image passes to keep in the trial files. None is needed: any pass can be
-      rendered again from the state.
-    - ``compatible``: gzip in place of zstd in the trial files.
-    """
+    """How trials are chosen, rendered and stored. One folder has one of it."""
 
     width: int = 256
+    """Pixels, even."""
     height: int = 256
-    look: Literal["redyellow", "free"] = "redyellow"
+    """Pixels, even."""
+    look: Literal["redyellow", "free", "split"] = "split"
+    """Red agent and yellow patient, or the free colours of the scene with a map of who is who.
+    By split: training free, readout red and yellow, testing and familiarization both."""
+    movies: bool = True
+    """Make movies and maps; without them trials are states alone."""
+    playback: Literal["slow", "real"] = "slow"
+    """Slow movies show 0.01 s of physics as one frame of 30 a second, as the official ones, 3.33
+    times slower than life. Real ones show 100 frames a second."""
     passes: tuple[str, ...] = ()
+    """Image passes to store (color depth normals ids flow). Any can be rendered again later."""
     compatible: bool = False
+    """Compress with gzip, which every HDF5 reader knows, in place of zstd."""
+    jitters: int = 8
+    """Jittered simulations that measure how robust each label is; 0 for none."""
+    robust: float = 0.0
+    """Least share of the jittered simulations that must end as the trial does."""
+    min_visible: float = 0.0005
+    """Least share of the first frame that agent and patient must each cover."""
+    observed_contact: bool = False
+    """Take trials for readout, testing and familiarization also if agent and patient touch inside
+    the observed part, as the official sets do."""
 
     def __post_init__(self) -> None:
         if min(self.width, self.height) < 2 or self.width % 2 or self.height % 2:
@@ -90,8 +118,28 @@ class Settings:
         unknown = sorted(set(self.passes) - set(PASSES))
         if unknown:
             raise BadInputError(f"unknown passes {unknown}; known: {sorted(PASSES)}")
-        if self.look not in ("redyellow", "free"):
-            raise BadInputError(f"unknown look {self.look!r}; known: redyellow, free")
+        if self.look not in ("redyellow", "free", "split"):
+            raise BadInputError(f"unknown look {self.look!r}; known: redyellow, free, split")
+        if self.playback not in PLAYBACK_RATES:
+            raise BadInputError(f"unknown playback {self.playback!r}; known: slow, real")
+        if self.jitters < 0 or not 0 <= self.robust <= 1 or not 0 <= self.min_visible < 1:
+            raise BadInputError(
+                f"jitters {self.jitters} must not be below 0, robust {self.robust} and least "
+                f"visible share {self.min_visible} must lie in 0..1"
+            )
+        if self.robust and not self.jitters:
+            raise BadInputError("a least robustness needs jittered simulations; jitters is 0")
+        if self.passes and not self.movies:
+            raise BadInputError("image passes are stored with movies only; leave one of them out")
+
+    def looks(self, split: str) -> tuple[str, ...]:
+        """Looks of the movies of a split; the first is the trial's own."""
+        return SPLIT_LOOKS[split] if self.look == "split" else (self.look,)
+
+    @property
+    def playback_rate(self) -> int:
+        """Movie frames a second."""
+        return PLAYBACK_RATES[self.playback]
 
 
 @dataclass(frozen=True)
@@ -107,6 +155,15 @@ class Job:
         """Where the files of the trial go."""
         return TrialPaths(self.folder, self.task.split, self.task.scenario, self.task.trial)
 
+    @property
+    def looks(self) -> tuple[str, ...]:
+        """Looks of the movies to make; the first is the trial's own."""
+        return self.settings.looks(self.task.split)
+
+    def complete(self) -> bool:
+        """All files of the trial are there."""
+        return self.paths.complete(self.settings.movies, free=len(self.looks) > 1)
+
 
 def plan_dataset(
     dataset: str,
@@ -116,8 +173,9 @@ def plan_dataset(
 ) -> list[Task]:
     """Tasks for ``counts[split]`` trials of each scenario in each split.
 
-    ``presets`` names the presets of a scenario, which its trials take in turn. Raising a count
-    later adds trials and changes none. `UnknownNameError` for a scenario that nobody registered.
+    ``presets`` names the presets of a scenario, which its trials take in turn, by default those
+    of `default_presets`. Raising a count later adds trials and changes none. `UnknownNameError`
+    for a scenario or a preset that there is not.
     """
     wanted = list(scenarios)
     for name in wanted:
@@ -126,9 +184,11 @@ def plan_dataset(
     tasks = []
     for split, count in counts.items():
         for scenario in wanted:
-            names: Sequence[str | None] = (presets or {}).get(scenario) or (None,)
+            names = (presets or {}).get(scenario) or default_presets(scenario, split)
+            for name in names:
+                get_preset(scenario, name)
             tasks += [
-                Task(dataset, scenario, split, index, names[index % len(names)])
+                Task(dataset, scenario, split, index, presets=tuple(names))
                 for index in range(count)
             ]
     return tasks

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from physion.errors import BadInputError
 
-SCHEMA = 1
+SCHEMA = 2
 """Version of the layout; it rises when a reader of the old one could misread the new one."""
 SEAL_BYTES = 512
 MAX_FIELD_BYTES = 2**31
@@ -50,7 +50,7 @@ class Field:
 
 
 FIELDS: Mapping[str, Field] = {
-    "scene": Field("text", (1,), "Scene.to_json"),
+    "scene": Field("text", (1,), "Scene.to_json, in its free colours"),
     "labels": Field("text", (1,), "Labels as JSON"),
     "metadata": Field("text", (1,), "Metadata as JSON"),
     "trajectory/positions": Field("<f4", ("frame", "body", 3), "pivots, m"),

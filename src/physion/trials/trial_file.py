@@ -26,6 +26,7 @@ from physion.atomic import write_atomic
 from physion.errors import BadInputError
 from physion.physics.labels import Labels
 from physion.physics.trajectory import Contacts, Trajectory
+from physion.scenes.looks import with_role_colors
 from physion.scenes.scene import Scene
 from physion.trials.schema import (
     FIELDS,
@@ -44,6 +45,9 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+LOOKS = ("redyellow", "free")
+"""Red agent and yellow patient, or the colours that the scene was drawn with."""
+
 _STATE = ("positions", "rotations", "velocities", "angular_velocities")
 _CONTACTS = ("frame", "bodies", "point", "normal", "impulse")
 
@@ -55,7 +59,11 @@ class Metadata:
     - ``trial``: its name, unique in the dataset. ``index``: its place in its split, from 0.
     - ``preset``: name of the scenario's parameter set; None for an imported scene.
     - ``seed``: entropy of its `SeedSequence` in hexadecimal; None for an imported scene.
-    - ``look``: ``redyellow`` or ``free``. ``width``, ``height``: pixels.
+      ``attempt``: how many draws of this trial were refused before, None for an imported scene.
+    - ``scene_digest``: of all that decides the motion (`Scene.physics_digest`).
+    - ``look``: ``redyellow`` or ``free``. ``movies``: there are movies and a map, and
+      ``free_movies``: also movies in free colours.
+      ``width``, ``height``: pixels.
     - ``frames``: of the whole trial; ``observed_frames``: those that may be seen by who predicts.
     - ``frame_time``: seconds of physics in a frame. ``playback_rate``: movie frames a second.
     - ``completed``: everything came to rest, rather than the time being over.
@@ -82,11 +90,27 @@ class Metadata:
     renderer: str
     package: str
     digest: str
+    scene_digest: str
+    attempt: int | None = None
+    movies: bool = True
+    free_movies: bool = False
     recorded_contact: bool | None = None
+
+    @property
+    def physics_seconds(self) -> float:
+        """How long the trial lasts in the world."""
+        return (self.frames - 1) * self.frame_time
+
+    @property
+    def playback_seconds(self) -> float:
+        """How long its movie lasts."""
+        return self.frames / self.playback_rate
 
 
 class TrialWriter:
     """Builds the bytes of a trial file; image passes come frame by frame, if there are any.
+
+    ``scene`` comes in its free colours, whatever look the trial's movies have.
 
     ``ids`` (H, W) says what each pixel of frame 0 shows: 0 the room, i + 1 the i-th of
     `Scene.names`, as the renderer has it. ``passes`` are the names that every `add_frame` brings.
@@ -124,6 +148,11 @@ class TrialWriter:
         self._passes = {
             name: self._pass(name, len(trajectory), ids.shape) for name in sorted(set(passes))
         }
+
+    @property
+    def passes(self) -> tuple[str, ...]:
+        """Names of the image passes that every `add_frame` brings."""
+        return tuple(self._passes)
 
     def add_frame(self, images: Mapping[str, NDArray[Any]]) -> None:
         """Append one frame of every pass; shapes as in `physion.trials.schema.PASSES`."""
@@ -202,6 +231,7 @@ class Trial:
         """Open the bytes of a trial file; ``where`` names it in errors. See `Trial.open`."""
         check_seal(data, where)
         self._where = where
+        self._renderers: dict[tuple[int, int, str], Renderer] = {}
         self._reader = FieldReader(open_image(data, where), where)
         for path in FIELDS:
             self._reader.check(path)
@@ -229,11 +259,15 @@ class Trial:
 
     @cached_property
     def scene(self) -> Scene:
-        """What is in the trial."""
+        """What is in the trial, in its free colours."""
         try:
             return Scene.from_json(self._reader.text("scene"))
         except BadInputError as error:
             raise BadInputError(f"{self._where}: field 'scene': {error}") from error
+
+    def shown(self, look: str | None = None) -> Scene:
+        """The scene in the colours of a look: ``redyellow``, ``free``, or the trial's own."""
+        return in_look(self.scene, self.metadata.look if look is None else look)
 
     @cached_property
     def trajectory(self) -> Trajectory:
@@ -285,16 +319,34 @@ class Trial:
             raise BadInputError(f"{self._where} has no frame {frame} of {self.metadata.frames}")
         return {name: self._reader.image(name, frame) for name in self.pass_names}
 
-    def render(self, frame: int, passes: Sequence[str] = ("color",)) -> Frame:
-        """Any pass of any frame, rendered again from the stored state, stored or not."""
-        return self._renderer.render(frame, passes)
+    def render(
+        self, frame: int, passes: Sequence[str] = ("color",), look: str | None = None
+    ) -> Frame:
+        """Any pass of any frame, rendered again from the stored state, stored or not.
 
-    @cached_property
-    def _renderer(self) -> Renderer:
+        ``look`` is ``redyellow`` or ``free``, by default the trial's own.
+        """
+        return self.renderer(look=look).render(frame, passes)
+
+    def renderer(
+        self, width: int | None = None, height: int | None = None, look: str | None = None
+    ) -> Renderer:
+        """A renderer of the trial, by default in its own size and look; kept for the next call."""
         # Compiled code, which readers of numbers do not need to wait for.
         from physion.rendering.renderer import Renderer
 
-        return Renderer(self.scene, self.trajectory, self.metadata.width, self.metadata.height)
+        meta = self.metadata
+        key = (width or meta.width, height or meta.height, look or meta.look)
+        if key not in self._renderers:
+            self._renderers[key] = Renderer(self.shown(key[2]), self.trajectory, *key[:2])
+        return self._renderers[key]
+
+
+def in_look(scene: Scene, look: str) -> Scene:
+    """The scene in the colours of a look; `BadInputError` for an unknown one."""
+    if look not in LOOKS:
+        raise BadInputError(f"unknown look {look!r}; known: {', '.join(LOOKS)}")
+    return with_role_colors(scene) if look == "redyellow" else scene
 
 
 def _arrays(trajectory: Trajectory, ids: NDArray[Any], things: int) -> dict[str, NDArray[Any]]:
