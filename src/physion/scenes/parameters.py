@@ -43,9 +43,13 @@ class Quantity:
 
 @dataclass(frozen=True)
 class NamesOf:
-    """What the names in a parameter name: shapes, materials (or their families), props, rooms."""
+    """What the names in a parameter name: shapes, materials (or their families), props, rooms.
+
+    ``names`` are those to choose from where they belong to one scenario.
+    """
 
     kind: str
+    names: tuple[str, ...] = ()
 
 
 Length = Annotated[float, Quantity("m", 0.0, 50.0)]
@@ -118,10 +122,14 @@ def draw_turn(rng: np.random.Generator, turn: Axes) -> Quat:
     """
     if is_range(turn):
         return yaw(math.radians(uniform(rng, typing.cast(Range, turn))))
-    about_x, about_y, about_z = (math.radians(angle) for angle in draw_axes(rng, turn))
-    return multiply(
-        yaw(about_z), multiply(axis_turn((1, 0, 0), about_x), axis_turn((0, 1, 0), about_y))
-    )
+    return three_turns(*draw_axes(rng, turn))
+
+
+def three_turns(x_deg: float, y_deg: float, z_deg: float) -> Quat:
+    """The rotation by degrees about y, then about x, then about z: Unity's order."""
+    about_x = axis_turn((1.0, 0.0, 0.0), math.radians(x_deg))
+    about_y = axis_turn((0.0, 1.0, 0.0), math.radians(y_deg))
+    return multiply(yaw(math.radians(z_deg)), multiply(about_x, about_y))
 
 
 def yaw(angle: float) -> Quat:
@@ -221,17 +229,18 @@ def _read(hint: Any, value: Any, where: str, base: Any) -> Any:
     if isinstance(note, Quantity):
         return _read_quantity(typing.get_args(hint)[0], value, where, note)
     if isinstance(note, NamesOf):
-        return _read_names(typing.get_args(hint)[0] is str, value, where, note.kind)
+        return _read_names(typing.get_args(hint)[0] is str, value, where, note)
     if type(value) is not hint:
         raise BadInputError(f"{where} must be {_word(hint)}, not {value!r}")
     return value
 
 
-def _read_names(single: bool, value: Any, where: str, kind: str) -> Any:
+def _read_names(single: bool, value: Any, where: str, note: NamesOf) -> Any:
+    kind = note.kind
     names = [value] if isinstance(value, str) else value
     if not isinstance(names, list | tuple) or not names or (single and len(names) > 1):
         raise BadInputError(f"{where} must name a {kind}, not {value!r}")
-    known = _known_names(kind)
+    known = note.names or _known_names(kind)
     for name in names:
         if name not in known:
             raise BadInputError(f"{where}: {UnknownNameError(kind, str(name), known)}")

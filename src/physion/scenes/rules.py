@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,9 +25,12 @@ from physion.scenes.parameters import (
     draw_axes,
     draw_frame,
     draw_turn,
+    is_range,
     pick,
+    three_turns,
     uniform,
 )
+from physion.scenes.placement import world_bounds
 from physion.scenes.scene import Body, Contact, Look, Push, Vec3
 from physion.scenes.shapes import shape
 
@@ -40,7 +43,8 @@ class BodyRule:
     """How a body that moves is drawn (defaults: section 2.1 of reference/official-system.md).
 
     - ``shapes``: one of these, each as likely. ``scale``: metres at unit size.
-    - ``turn_deg``: about the upright, or about three axes. ``mass``: kg.
+    - ``turn_deg``: about the upright, or about three axes. ``mass``: kg. With ``tumbled`` a single
+      range gives one angle for all three axes, as the probes of the official Roll have.
     - ``static_friction``, ``dynamic_friction``: drawn apart, but static is never below dynamic
       (officially it may be). ``restitution``: 0 to 1.
     - ``textures``: material names or families.
@@ -49,6 +53,7 @@ class BodyRule:
     shapes: Shapes = ("cube",)
     scale: Sizes = (1.0, 1.0)
     turn_deg: Turns = (0.0, 0.0)
+    tumbled: bool = False
     mass: Masses = (2.0, 2.0)
     static_friction: Frictions = (0.5, 0.5)
     dynamic_friction: Frictions = (0.5, 0.5)
@@ -103,13 +108,24 @@ def draw_body(
 ) -> Body:
     """A body of ``rule`` with its pivot at ``position``."""
     kind, scale = pick(rng, rule.shapes), draw_axes(rng, rule.scale)
-    turn, mass = draw_turn(rng, rule.turn_deg), uniform(rng, rule.mass)
+    if rule.tumbled and is_range(rule.turn_deg):
+        turn = three_turns(*draw_axes(rng, rule.turn_deg))
+    else:
+        turn = draw_turn(rng, rule.turn_deg)
+    mass = uniform(rng, rule.mass)
     dynamic = uniform(rng, rule.dynamic_friction)
     static = max(uniform(rng, rule.static_friction), dynamic)
     contact = Contact(static, dynamic, uniform(rng, rule.restitution))
     return Body(
         name, kind, position, scale, turn, mass, contact, angular_drag=angular_drag, look=look
     )
+
+
+def above_floor(body: Body) -> Body:
+    """The body, raised if any of it is under the floor: turned ones reach below their pivot."""
+    missing = max(0.0, -float(world_bounds(body)[0, 2]))
+    x, y, z = body.position
+    return replace(body, position=(x, y, z + missing))
 
 
 def draw_zone(
