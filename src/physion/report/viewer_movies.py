@@ -1,0 +1,80 @@
+"""The movies of the page: small ones for the grid, and one with all passes side by side."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from physion.rendering.renderer import PASSES, Renderer
+from physion.report.viewer_passes import Ranges, paint, ranges_of
+from physion.scenes.scene import Scene
+from physion.trials.trial_file import Trial
+from physion.trials.video import encode_movie, read_frames
+
+CRF = 27
+"""x264's quality: small movies that are looked at, not measured."""
+
+
+@dataclass(frozen=True)
+class Strip:
+    """A movie whose every picture shows ``tiles`` side by side, each ``width`` x ``height``.
+
+    It shows every ``stride``-th frame of the trial at ``rate`` pictures a second.
+    """
+
+    data: bytes
+    tiles: tuple[str, ...]
+    width: int
+    height: int
+    stride: int
+    rate: int
+
+    def as_record(self) -> dict[str, Any]:
+        """As the page's script reads it."""
+        return {
+            "data": base64.b64encode(self.data).decode("ascii"),
+            "tiles": list(self.tiles),
+            "width": self.width,
+            "height": self.height,
+            "stride": self.stride,
+            "rate": self.rate,
+        }
+
+
+def fitted(width: int, height: int, longest: int) -> tuple[int, int]:
+    """Width and height, both even, of a picture whose longer side is about ``longest``."""
+    scale = min(1.0, longest / max(width, height))
+    even = [max(2, 2 * round(side * scale / 2)) for side in (width, height)]
+    return even[0], even[1]
+
+
+def small_movie(path: Path, trial: Trial, longest: int) -> Strip:
+    """The movie at ``path`` at ``longest`` pixels along its longer side, all frames of it."""
+    meta = trial.metadata
+    width, height = fitted(meta.width, meta.height, longest)
+    frames = read_frames(path, size=(height, width))
+    data = encode_movie(frames, rate=meta.playback_rate, crf=CRF)
+    return Strip(data, ("color",), width, height, 1, meta.playback_rate)
+
+
+def passes_movie(trial: Trial, scene: Scene, longest: int, stride: int) -> tuple[Strip, Ranges]:
+    """All passes of every ``stride``-th frame, rendered from the state, and their scales.
+
+    ``scene`` is the trial's in the colours to be shown.
+    """
+    meta = trial.metadata
+    width, height = fitted(meta.width, meta.height, longest)
+    renderer = Renderer(scene, trial.trajectory, width, height)
+    frames = [renderer.render(index, PASSES) for index in range(0, meta.frames, stride)]
+    ranges = ranges_of(frames)
+    pictures: NDArray[np.uint8] = np.stack(
+        [np.concatenate(paint(frame, scene, ranges), axis=1) for frame in frames]
+    )
+    rate = max(1, round(meta.playback_rate / stride))
+    data = encode_movie(pictures, rate=rate, crf=CRF)
+    return Strip(data, PASSES, width, height, stride, rate), ranges

@@ -1,0 +1,129 @@
+"""Image passes as colours: depth, normals, ids and flow turned into pictures for the eye."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import hsv_to_rgb
+from numpy.typing import NDArray
+
+from physion.rendering.renderer import PASSES, Frame
+from physion.scenes.scene import Scene
+
+Picture = NDArray[np.uint8]
+
+ROOM: tuple[int, int, int] = (38, 40, 44)
+"""What the ids show where no thing is."""
+AGENT: tuple[int, int, int] = (230, 40, 40)
+PATIENT: tuple[int, int, int] = (245, 205, 30)
+OTHERS: tuple[tuple[int, int, int], ...] = (
+    (78, 121, 167),
+    (89, 161, 79),
+    (176, 122, 161),
+    (118, 183, 178),
+    (156, 117, 95),
+    (160, 203, 232),
+    (140, 209, 125),
+    (121, 112, 110),
+    (212, 166, 200),
+    (72, 96, 192),
+)
+"""Colours of all other things in turn; none passes for the red or the yellow of the roles."""
+NOWHERE: tuple[int, int, int] = (128, 128, 128)
+"""Flow that is not defined: the point passes behind the camera."""
+
+
+@dataclass(frozen=True)
+class Ranges:
+    """What the ends of the colour scales stand for in all frames of one trial.
+
+    ``near``, ``far``: metres, ``far`` above ``near``. ``flow``: pixels a frame, above zero.
+    """
+
+    near: float
+    far: float
+    flow: float
+
+
+def ranges_of(frames: Sequence[Frame]) -> Ranges:
+    """Scales that fit all ``frames``, which hold depth and flow.
+
+    The most distant hundredth of the depths is left out, so that a window in a wall does not
+    take all the colours; so is the fastest two-hundredth of what moves.
+    """
+    depths = [f.depth[np.isfinite(f.depth)] for f in frames if f.depth is not None]
+    depth = np.concatenate(depths) if depths else np.zeros(0)
+    near, far = (float(depth.min()), float(np.percentile(depth, 99))) if depth.size else (0.0, 1.0)
+    speeds = [
+        np.hypot(f.flow[..., 0], f.flow[..., 1]).ravel() for f in frames if f.flow is not None
+    ]
+    speed = np.concatenate(speeds) if speeds else np.zeros(0)
+    speed = speed[np.isfinite(speed) & (speed > 1e-3)]
+    flow = float(np.percentile(speed, 99.5)) if speed.size else 1.0
+    return Ranges(near, max(far, near + 1e-3), max(flow, 1e-3))
+
+
+def paint(frame: Frame, scene: Scene, ranges: Ranges) -> list[Picture]:
+    """All passes of a frame as pictures (H, W, 3) uint8, in the order of `PASSES`."""
+    assert frame.color is not None and frame.depth is not None and frame.normals is not None
+    assert frame.ids is not None and frame.flow is not None
+    painted = {
+        "color": frame.color,
+        "depth": paint_depth(frame.depth, ranges.near, ranges.far),
+        "normals": paint_normals(frame.normals),
+        "ids": paint_ids(frame.ids, scene),
+        "flow": paint_flow(frame.flow, ranges.flow),
+    }
+    return [painted[name] for name in PASSES]
+
+
+def paint_depth(depth: NDArray[np.floating], near: float, far: float) -> Picture:
+    """Depth (H, W) in metres: bright at ``near``, dark at ``far`` and where nothing is seen."""
+    share = 1.0 - np.clip((np.asarray(depth, np.float64) - near) / (far - near), 0.0, 1.0)
+    colors = colormaps["magma"](np.nan_to_num(share), bytes=True)
+    return np.ascontiguousarray(colors[..., :3])
+
+
+def paint_normals(normals: NDArray[np.floating]) -> Picture:
+    """Normals (H, W, 3), world axes: -1..1 along x, y, z as red, green, blue.
+
+    Mid grey, which no unit normal has, stands where nothing is seen.
+    """
+    return _bytes(np.asarray(normals, np.float64) * 0.5 + 0.5)
+
+
+def thing_colors(scene: Scene) -> list[tuple[int, int, int]]:
+    """The colour of each of `Scene.names` in the picture of ids: agent red, patient yellow."""
+    names = scene.names()
+    roles = {scene.roles.agent: AGENT, scene.roles.patient: PATIENT}
+    return [roles.get(name, OTHERS[i % len(OTHERS)]) for i, name in enumerate(names)]
+
+
+def paint_ids(ids: NDArray[np.integer], scene: Scene) -> Picture:
+    """Ids (H, W), 0 the room and i + 1 the i-th of `Scene.names`, in the colours of the things."""
+    table = np.array([ROOM, *thing_colors(scene)], np.uint8)
+    return np.asarray(table[ids])
+
+
+def paint_flow(flow: NDArray[np.floating], scale: float) -> Picture:
+    """Flow (H, W, 2), pixels right and down: direction as hue, speed as brightness.
+
+    Red goes right, and the hue runs through yellow (down), cyan (left) to violet (up). Full
+    brightness is ``scale`` pixels or more; black is rest; grey is undefined.
+    """
+    x, y = (np.asarray(flow[..., k], np.float64) for k in (0, 1))
+    known = np.isfinite(x) & np.isfinite(y)
+    x, y = np.where(known, x, 0.0), np.where(known, y, 0.0)
+    hue = np.arctan2(y, x) / (2 * np.pi) % 1.0
+    speed = np.clip(np.hypot(x, y) / scale, 0.0, 1.0)
+    picture = _bytes(hsv_to_rgb(np.stack([hue, np.ones_like(hue), speed], axis=-1)))
+    picture[~known] = NOWHERE
+    return picture
+
+
+def _bytes(values: NDArray[np.floating]) -> Picture:
+    """Values 0..1 as 0..255, rounded; others are brought to the nearer end."""
+    return np.asarray(np.rint(np.clip(np.nan_to_num(values), 0.0, 1.0) * 255), np.uint8)
