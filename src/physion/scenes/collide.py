@@ -8,7 +8,16 @@ import numpy as np
 
 from physion.scenes.parameters import Length, Room, uniform
 from physion.scenes.placement import CameraRule, SceneryRule
-from physion.scenes.rules import BodyRule, PushRule, ZoneRule, draw_body, draw_push, draw_zone
+from physion.scenes.rules import (
+    BodyRule,
+    PushRule,
+    ZoneRule,
+    above_floor,
+    draw_body,
+    draw_push,
+    draw_zone,
+    require_apart,
+)
 from physion.scenes.scenarios import scenario
 from physion.scenes.scene import Roles, Scene
 from physion.scenes.stage import Palette, build_scene
@@ -63,22 +72,15 @@ def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
     zone = draw_zone(
         placement, params.zone, palette.look(params.zone.textures), (params.length, aside)
     )
-    target = draw_body(
-        placement,
-        params.target,
-        "target",
-        (params.length / 2, 0.0, 0.0),
-        palette.agent_look(params.target.textures),
-    )
+    look = palette.agent_look(params.target.textures)
+    place = (params.length / 2, 0.0, 0.0)
+    target = above_floor(draw_body(placement, params.target, "target", place, look))
     chance = child_generator(seed, "push")
-    probe = draw_body(
-        chance,
-        params.probe,
-        "probe",
-        (-params.length / 2, 0.0, params.lift),
-        palette.look(params.probe.textures, params.monochrome),
-        angular_drag=0.0,
-    )
+    look = palette.look(params.probe.textures, params.monochrome)
+    place = (-params.length / 2, 0.0, params.lift)
+    probe = above_floor(draw_body(chance, params.probe, "probe", place, look, angular_drag=0.0))
+    require_apart(probe, target)
+    require_apart(target, zone)
     return build_scene(
         "collide",
         seed,

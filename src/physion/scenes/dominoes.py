@@ -3,67 +3,72 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from physion.scenes.looks import random_color
-from physion.scenes.placement import (
-    CameraRule,
-    Range,
-    SceneryRule,
-    place_camera,
-    place_scenery,
-    uniform,
-    yaw,
+from physion.scenes.parameters import Count, Length, Room, Share, place, uniform
+from physion.scenes.placement import CameraRule, SceneryRule, rotate, world_bounds
+from physion.scenes.rules import (
+    BodyRule,
+    PushRule,
+    ZoneRule,
+    above_floor,
+    draw_body,
+    draw_push,
+    draw_zone,
+    require_apart,
 )
-from physion.scenes.scenarios import as_record, scenario, scene_name
-from physion.scenes.scene import Body, Contact, Ending, Look, Push, Roles, Scene, Vec3
+from physion.scenes.scenarios import scenario
+from physion.scenes.scene import Body, Look, Roles, Scene
+from physion.scenes.stage import Palette, build_scene
 from physion.seeds import child_generator
 
+MAX_FRAMES = 302
 ZONE_GAP = 0.1
 """Metres added between zone and target (official-system.md, section 3.1)."""
-PUSH_HEIGHT = 0.8
-"""Where the probe is pushed, as a share of its height."""
-AIM_HEIGHT = 0.5
-"""Metres above the floor at which the camera looks."""
 BODY_GAP = 0.01
 """Metres kept free between neighbours, which officially may start inside each other."""
+ROW_TRIES = 100
 
+DOMINO = ((0.1, 0.1), (0.25, 0.25), (0.5, 0.5))
+"""Width along the row, width across, height: metres."""
+TARGET = BodyRule(scale=DOMINO)
+MIDDLE = BodyRule(scale=DOMINO, turn_deg=(-30.0, 30.0))
+PROBE = BodyRule(scale=DOMINO, static_friction=(0.01, 0.01), dynamic_friction=(0.01, 0.01))
+ZONE = ZoneRule()
+PUSH = PushRule(speed=(0.75, 0.75), frame=(0.0, 15.0))
 CAMERA, SCENERY = CameraRule(), SceneryRule()
 
 
 @dataclass(frozen=True)
 class Params:
-    """What is drawn for a trial of dominoes.
+    """What is drawn for a trial of dominoes (reference/official-system.md, 2.1, 3.0 and 3.1).
 
     Defaults are the official configuration `pilot_dominoes_2mid_J025R30`, in which every second
-    trial ends in contact (sections 2.1, 3.0 and 3.1 of reference/official-system.md).
+    trial ends in contact; those of the official class are the preset `default_boxroom`.
 
-    - ``length``: metres from probe to target. ``middle``: how many dominoes between.
-    - ``domino``: width along the row, width across, height, metres. ``mass``: kg.
-    - ``spacing_jitter``, ``lateral_jitter``: shares of the spacing and of the width across.
-    - ``middle_yaw_deg``, ``probe_yaw_deg``: degrees.
-    - ``remove_middle``: one of the middle dominoes is left out.
-    - ``push_speed``: metres per second that the push would give. ``push_frame``: when.
-      ``push_angle_deg``: heading of the push away from the row.
+    - ``length``: metres from probe to target. ``middles``: how many stand between them.
+    - ``spacing_jitter``: share by which each step along the row is longer or shorter; it adds up.
+      ``lateral_jitter``: share of its width by which a middle one stands aside.
+    - ``remove_middle``: one of the middle ones is left out, so that there is a gap.
+    - ``turned_push``: the push turns with the probe, as officially.
+    - ``monochrome``: the middle ones share a colour.
     """
 
-    length: float = 1.5
-    middle: int = 2
-    domino: Vec3 = (0.1, 0.25, 0.5)
-    mass: float = 2.0
-    zone: Vec3 = (0.5, 2.0, 0.01)
-    spacing_jitter: float = 0.25
-    lateral_jitter: float = 0.25
-    middle_yaw_deg: Range = (-30.0, 30.0)
-    probe_yaw_deg: Range = (0.0, 0.0)
+    length: Length = 1.5
+    middles: Count = 2
+    target: BodyRule = TARGET
+    middle: BodyRule = MIDDLE
+    probe: BodyRule = PROBE
+    zone: ZoneRule = ZONE
+    spacing_jitter: Share = 0.25
+    lateral_jitter: Share = 0.25
     remove_middle: bool = False
-    push_speed: Range = (0.75, 0.75)
-    push_frame: Range = (0.0, 15.0)
-    push_angle_deg: Range = (0.0, 0.0)
+    push: PushRule = PUSH
+    turned_push: bool = True
     monochrome: bool = True
-    room: str = "box"
+    room: Room = "box"
     camera: CameraRule = CAMERA
     scenery: SceneryRule = SCENERY
 
@@ -71,112 +76,74 @@ class Params:
 @scenario("dominoes", Params)
 def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
     """Draw a row of dominoes along x, the probe at its negative end, the zone beyond the target."""
-    looks = child_generator(seed, "looks")
-    target_color = random_color(looks)
-    zone = Body(
-        "zone",
-        "cube",
-        (params.length / 2 + params.zone[0] + ZONE_GAP, 0.0, 0.0),
-        params.zone,
-        mass=500.0,
-        contact=Contact(1.0, 0.1, 0.0),
-        kinematic=True,
-        look=Look(random_color(looks, (target_color,)), "wood_ash"),
+    rng, palette = child_generator(seed, "placement"), Palette.of(seed)
+    half = params.length / 2
+    zone = draw_zone(rng, params.zone, palette.look(params.zone.textures), (half + ZONE_GAP, 0.0))
+    x, y, _ = zone.position
+    zone = replace(zone, position=(x + zone.scale[0], y, 0.0))
+    look = palette.agent_look(params.target.textures)
+    target = above_floor(draw_body(rng, params.target, "target", (half, 0.0, 0.0), look))
+    chance = child_generator(seed, "push")
+    look = palette.look(params.probe.textures)
+    probe = above_floor(
+        draw_body(chance, params.probe, "probe", (-half, 0.0, 0.0), look, angular_drag=0.0)
     )
-    target = Body(
-        "target",
-        "cube",
-        (params.length / 2, 0.0, 0.0),
-        params.domino,
-        mass=params.mass,
-        look=Look(target_color, "wood_cedar"),
-    )
-    probe, push = _probe(params, seed, Look(random_color(looks, (target_color,)), "wood_cedar"))
-    bodies = (zone, target, probe, *_middle(params, seed, looks, target_color))
-    camera = place_camera(
-        child_generator(seed, "camera"), params.camera, AIM_HEIGHT, (target, zone)
-    )
-    scenery = place_scenery(
-        params.scenery,
-        camera,
-        bodies,
-        child_generator(seed, "distractors"),
-        child_generator(seed, "occluders"),
-    )
-    return Scene(
-        name=scene_name("dominoes", seed),
-        scenario="dominoes",
-        bodies=(*bodies, *scenery),
+    require_apart(probe, target)
+    require_apart(target, zone)
+    row = _row(params, rng, palette, probe, target)
+    push = draw_push(chance, params.push, probe, heading(probe) if params.turned_push else 0.0)
+    return build_scene(
+        "dominoes",
+        seed,
+        params,
+        bodies=(zone, target, probe, *row),
         roles=Roles("target", "zone", "probe"),
-        camera=camera,
+        max_frames=MAX_FRAMES,
         pushes=(push,),
-        room=params.room,
-        ending=Ending(max_frames=302),
-        parameters=as_record(params),
     )
 
 
-def _probe(params: Params, seed: np.random.SeedSequence, look: Look) -> tuple[Body, Push]:
-    rng = child_generator(seed, "push")
-    turn = math.radians(uniform(rng, params.probe_yaw_deg))
-    heading = math.radians(uniform(rng, params.push_angle_deg))
-    impulse = uniform(rng, params.push_speed) * params.mass
-    place = (-params.length / 2, 0.0, 0.0)
-    probe = Body(
-        "probe",
-        "cube",
-        place,
-        params.domino,
-        yaw(turn),
-        mass=params.mass,
-        contact=Contact(0.01, 0.01, 0.0),
-        angular_drag=0.0,
-        look=look,
-    )
-    push = Push(
-        "probe",
-        (impulse * math.cos(heading), impulse * math.sin(heading), 0.0),
-        (place[0], place[1], PUSH_HEIGHT * params.domino[2]),
-        int(uniform(rng, params.push_frame)),
-    )
-    return probe, push
+def heading(body: Body) -> float:
+    """Radians from +x, towards +y, of where the body's own x axis points."""
+    x, y, _ = rotate(body.rotation, (1.0, 0.0, 0.0))
+    return math.atan2(float(y), float(x))
 
 
-def _middle(
-    params: Params, seed: np.random.SeedSequence, looks: np.random.Generator, avoid: Vec3
+def _row(
+    params: Params, rng: np.random.Generator, palette: Palette, probe: Body, target: Body
 ) -> list[Body]:
-    """The dominoes between; their jitter adds up, and the row stops short of the target."""
-    rng = child_generator(seed, "placement")
-    wide, deep, _ = params.domino
-    spacing = params.length / (params.middle + 1)
-    removed = int(rng.integers(max(params.middle, 1))) if params.remove_middle else -1
-    last = params.length / 2 - wide / 2
-    probe_turn = max(map(abs, params.probe_yaw_deg))
-    taken = -params.length / 2 + _reach(wide, deep, math.radians(probe_turn))
-    shared = random_color(looks, (avoid,))
-    x = -params.length / 2
-    bodies = []
-    for i in range(params.middle):
+    """The dominoes between probe and target, drawn anew as a whole where they do not fit."""
+    removed = int(rng.integers(max(params.middles, 1))) if params.remove_middle else -1
+    looks = [palette.look(params.middle.textures, params.monochrome) for _ in range(params.middles)]
+    free = float(world_bounds(probe)[1, 0]), float(world_bounds(target)[0, 0])
+    row: list[Body] = []
+
+    def attempt() -> str | None:
+        row[:] = _draw_row(params, rng, looks, *free)
+        if len(row) < params.middles:
+            return f"no room left for number {len(row) + 1} of {params.middles}"
+        return None
+
+    place(ROW_TRIES, f"a row of dominoes {params.length:g} m long", attempt)
+    return [body for i, body in enumerate(row) if i != removed]
+
+
+def _draw_row(
+    params: Params, rng: np.random.Generator, looks: list[Look], start: float, end: float
+) -> list[Body]:
+    """As many as fit between ``start`` and ``end`` (metres along x); their jitter adds up."""
+    spacing = params.length / (params.middles + 1)
+    x, taken, row = -params.length / 2, start, []
+    for i, look in enumerate(looks):
         share = params.spacing_jitter
         x += spacing * uniform(rng, (1 - share, 1 + share))
-        y = deep * uniform(rng, (-params.lateral_jitter, params.lateral_jitter))
-        turn = math.radians(uniform(rng, params.middle_yaw_deg))
-        color = shared if params.monochrome else random_color(looks, (avoid,))
-        reach = _reach(wide, deep, turn) + BODY_GAP
-        place = max(min(x, last - reach), taken + reach)
-        if place > last - reach:
+        aside = uniform(rng, (-params.lateral_jitter, params.lateral_jitter))
+        body = above_floor(draw_body(rng, params.middle, f"middle_{i}", (0.0, 0.0, 0.0), look))
+        low, high = (float(bound) for bound in world_bounds(body)[:, 0])
+        first, last = taken + BODY_GAP - low, end - BODY_GAP - high
+        if first > last:
             break
-        taken = place + reach
-        if i != removed:
-            look = Look(color, "wood_cedar")
-            at = (place, y, 0.0)
-            rest = (params.domino, yaw(turn), params.mass)
-            bodies.append(Body(f"middle_{i}", "cube", at, *rest, look=look))
-        if x > last - reach:
-            break
-    return bodies
-
-
-def _reach(wide: float, deep: float, turn: float) -> float:
-    """Half of what a turned domino takes up along the row."""
-    return (abs(math.cos(turn)) * wide + abs(math.sin(turn)) * deep) / 2
+        at = max(min(x, last), first)
+        taken = at + high
+        row.append(replace(body, position=(at, aside * body.scale[1], body.position[2])))
+    return row

@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from physion.scenes.looks import random_color
-from physion.scenes.placement import (
-    CameraRule,
-    Range,
-    SceneryRule,
-    place_camera,
-    place_scenery,
-    uniform,
-    world_bounds,
-)
-from physion.scenes.scenarios import as_record, scenario, scene_name
-from physion.scenes.scene import Body, Contact, Ending, Look, Quat, Roles, Scene, Vec3
+from physion.scenes.parameters import Length, Lengths, Multiples, Room, uniform
+from physion.scenes.placement import CameraRule, SceneryRule, world_bounds
+from physion.scenes.rules import BodyRule, ZoneRule, above_floor, draw_body, draw_zone
+from physion.scenes.scenarios import scenario
+from physion.scenes.scene import Body, Quat, Roles, Scene
+from physion.scenes.stage import Palette, build_scene
 from physion.seeds import child_generator
 
 PRIMITIVES = (
@@ -36,12 +29,29 @@ PRIMITIVES = (
     "torus",
     "triangular_prism",
 )
+MAX_FRAMES = 302
 FALL = 0.1
 """Least free fall in metres: long objects that hang down start higher than drawn."""
-LOWEST_CAMERA = 0.25
-"""Metres. The official camera may be 2 cm above the floor, where nobody can see the zone."""
+WHOLE_TURN = ((0.0, 360.0), (0.0, 360.0), (0.0, 360.0))
 
-CAMERA = CameraRule((2.0, 2.0), (45.0, 225.0), (0.0, 2.0))
+DROPPED = BodyRule(
+    PRIMITIVES,
+    (0.1, 0.4),
+    WHOLE_TURN,
+    mass=(2.0, 7.0),
+    static_friction=(0.4, 0.4),
+    dynamic_friction=(0.4, 0.4),
+)
+LOWER = BodyRule(
+    ("bowl", "cube", "cylinder", "pipe"),
+    (0.3, 1.0),
+    mass=(10.0, 11.0),
+    static_friction=(0.4, 0.4),
+    dynamic_friction=(0.4, 0.4),
+)
+ZONE = ZoneRule(scale=((2.0, 2.0), (2.0, 2.0), (0.01, 0.01)))
+CAMERA = CameraRule((2.0, 2.0), (45.0, 225.0), (0.25, 4.0))
+"""The official camera may be 2 cm above the floor, where nobody can see the zone."""
 SCENERY = SceneryRule()
 
 
@@ -49,107 +59,77 @@ SCENERY = SceneryRule()
 class Params:
     """What is drawn for a trial of drop (reference/official-system.md, 2.1, 3.0 and 3.5).
 
-    - ``dropped`` and ``lower``: which shapes fall, and onto which; their scales, and masses in kg
-      (the official mass arguments had no effect; these are the values in use).
-    - ``height``: metres of the pivot above the floor. ``jitter``: metres along x and y.
-    - ``camera``: its heights are multiples of the height of the fall.
+    Defaults are those of the official `simple` configurations, but for ``even_turn``. Masses are
+    the values in use: the official mass arguments had no effect.
+
+    - ``dropped``: what falls. ``lower``: what stands below, on the zone where that reaches there.
+    - ``even_turn``: every orientation of what falls is as likely; otherwise it is turned by
+      ``dropped.turn_deg``, officially by three even angles, which prefer the poles.
+    - ``height``: metres of the falling pivot above the floor; ``jitter``: metres aside along x
+      and y. What would start in or just above the lower body starts higher.
+    - ``camera_height``: times the height of the fall, within the metres of ``camera.height``.
     """
 
-    dropped: tuple[str, ...] = PRIMITIVES
-    dropped_scale: Range = (0.1, 0.4)
-    dropped_mass: Range = (2.0, 7.0)
-    lower: tuple[str, ...] = ("bowl", "cube", "cylinder", "pipe")
-    lower_scale: Range = (0.3, 1.0)
-    lower_mass: Range = (10.0, 11.0)
-    height: Range = (1.25, 1.5)
-    jitter: float = 0.2
-    zone: Vec3 = (2.0, 2.0, 0.01)
-    zone_center: tuple[float, float] = (0.0, 0.0)
-    zone_friction: float = 0.1
-    room: str = "box"
+    dropped: BodyRule = DROPPED
+    lower: BodyRule = LOWER
+    zone: ZoneRule = ZONE
+    even_turn: bool = True
+    height: Lengths = (1.25, 1.5)
+    jitter: Length = 0.2
+    camera_height: Multiples = (0.0, 2.0)
+    monochrome: bool = True
+    room: Room = "box"
     camera: CameraRule = CAMERA
     scenery: SceneryRule = SCENERY
 
 
 @scenario("drop", Params)
 def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
-    """Draw an object in the air, turned at random, above one that stands on the zone."""
-    rng, looks = child_generator(seed, "placement"), child_generator(seed, "looks")
-    target_color = random_color(looks)
-    zone = Body(
-        "zone",
-        "cube",
-        (*params.zone_center, 0.0),
-        params.zone,
-        mass=500.0,
-        contact=Contact(10 * params.zone_friction, params.zone_friction, 0.0),
-        kinematic=True,
-        look=Look(random_color(looks, (target_color,)), "wood_ash"),
-    )
-    lower_look = Look(random_color(looks, (target_color,)), "wood_cedar")
-    lower = _lower(params, rng, lower_look)
-    target = _target(params, rng, lower, Look(target_color, "wood_cedar"))
+    """Draw an object in the air, turned at random, above one that stands at the origin."""
+    rng, palette = child_generator(seed, "placement"), Palette.of(seed)
+    zone = draw_zone(rng, params.zone, palette.look(params.zone.textures))
+    look = palette.look(params.lower.textures)
+    lower = _standing(draw_body(rng, params.lower, "lower", (0.0, 0.0, 0.0), look), zone)
+    target = _hung(params, rng, palette, lower)
     fall = target.position[2]
-    low, high = params.camera.height
-    rule = dataclasses.replace(
-        params.camera, height=(max(low * fall, LOWEST_CAMERA), max(high * fall, LOWEST_CAMERA))
-    )
-    bodies = (zone, target, lower)
-    camera = place_camera(child_generator(seed, "camera"), rule, fall / 2, (target, zone))
-    scenery = place_scenery(
-        params.scenery,
-        camera,
-        bodies,
-        child_generator(seed, "distractors"),
-        child_generator(seed, "occluders"),
-    )
-    return Scene(
-        name=scene_name("drop", seed),
-        scenario="drop",
-        bodies=(*bodies, *scenery),
+    lowest, highest = params.camera.height
+    low, high = (min(max(times * fall, lowest), highest) for times in params.camera_height)
+    return build_scene(
+        "drop",
+        seed,
+        params,
+        bodies=(zone, target, lower),
         roles=Roles("target", "zone"),
-        camera=camera,
-        room=params.room,
-        ending=Ending(max_frames=302),
-        parameters=as_record(params),
+        max_frames=MAX_FRAMES,
+        aim_height=fall / 2,
+        camera=replace(params.camera, height=(low, high)),
     )
 
 
-def _lower(params: Params, rng: np.random.Generator, look: Look) -> Body:
-    kind = params.lower[int(rng.integers(len(params.lower)))]
-    size = uniform(rng, params.lower_scale)
-    return Body(
-        "lower",
-        kind,
-        (0.0, 0.0, params.zone[2]),  # on the zone, where the official one starts inside it
-        (size, size, size),
-        mass=uniform(rng, params.lower_mass),
-        contact=Contact(0.4, 0.4, 0.0),
-        look=look,
-    )
+def _standing(lower: Body, zone: Body) -> Body:
+    """The lower body on the zone, where the official one starts inside it, or on the floor."""
+    lower = above_floor(lower)
+    below, body = world_bounds(zone), world_bounds(lower)
+    apart = (below[1, :2] <= body[0, :2]).any() or (body[1, :2] <= below[0, :2]).any()
+    x, y, z = lower.position
+    return lower if apart else replace(lower, position=(x, y, z + float(below[1, 2])))
 
 
-def _target(params: Params, rng: np.random.Generator, lower: Body, look: Look) -> Body:
-    kind = params.dropped[int(rng.integers(len(params.dropped)))]
-    size = uniform(rng, params.dropped_scale)
-    x, y = (float(d) for d in rng.uniform(-params.jitter, params.jitter, 2))
-    target = Body(
-        "target",
-        kind,
-        (x, y, uniform(rng, params.height)),
-        (size, size, size),
-        random_rotation(rng),
-        uniform(rng, params.dropped_mass),
-        Contact(0.4, 0.4, 0.0),
-        look=look,
-    )
-    missing = world_bounds(lower)[1, 2] + FALL - world_bounds(target)[0, 2]
-    lifted = (x, y, target.position[2] + max(0.0, float(missing)))
-    return dataclasses.replace(target, position=lifted)
+def _hung(params: Params, rng: np.random.Generator, palette: Palette, lower: Body) -> Body:
+    """What falls, high enough to fall at least `FALL` metres."""
+    x, y = (float(aside) for aside in rng.uniform(-params.jitter, params.jitter, 2))
+    place = (x, y, uniform(rng, params.height))
+    look = palette.agent_look(params.dropped.textures)
+    target = draw_body(rng, params.dropped, "target", place, look)
+    turn = random_rotation(rng)
+    if params.even_turn:
+        target = replace(target, rotation=turn)
+    missing = float(world_bounds(lower)[1, 2] + FALL - world_bounds(target)[0, 2])
+    return replace(target, position=(x, y, place[2] + max(0.0, missing)))
 
 
 def random_rotation(rng: np.random.Generator) -> Quat:
-    """An even random rotation; three even Euler angles, as officially, would prefer the poles."""
+    """An even random rotation."""
     parts = rng.standard_normal(4)
     w, x, y, z = (float(part) for part in parts / np.linalg.norm(parts))
     return (w, x, y, z)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from physion.errors import BadSceneError
 from physion.scenes.parameters import (
     Angles,
     FrameRange,
@@ -126,6 +127,16 @@ def above_floor(body: Body) -> Body:
     missing = max(0.0, -float(world_bounds(body)[0, 2]))
     x, y, z = body.position
     return replace(body, position=(x, y, z + missing))
+
+
+def require_apart(one: Body, other: Body) -> None:
+    """Raise `BadSceneError` where the boxes round two bodies share room at the start."""
+    low, high = np.array([world_bounds(body) for body in (one, other)]).transpose(1, 0, 2)
+    if (low.max(axis=0) < high.min(axis=0)).all():
+        raise BadSceneError(
+            f"{one.name} and {other.name} would start inside each other, at {one.position} and "
+            f"{other.position} m: make the scene longer or the bodies smaller"
+        )
 
 
 def draw_zone(
