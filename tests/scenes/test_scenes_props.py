@@ -9,11 +9,41 @@ import numpy as np
 import pytest
 import trimesh
 
-from physion.errors import BadInputError
-from physion.scenes.props import FALLBACK, prop_for, read_model_bounds
+from physion.errors import BadInputError, UnknownNameError
+from physion.scenes.looks import (
+    MATERIALS,
+    RED,
+    TEXTURES,
+    YELLOW,
+    expand_materials,
+    mistakable,
+    pick_material,
+    prop_look,
+)
+from physion.scenes.prop_parts import Prop
+from physion.scenes.prop_shapes import NATURAL_SIZES
+from physion.scenes.props import (
+    FALLBACK,
+    PREFIX,
+    PROP_CATEGORIES,
+    expand_props,
+    prop_for,
+    read_model_bounds,
+)
+from physion.scenes.props import PROPS as NAMES
 from physion.scenes.shapes import shape, shapes
 
 PROPS = [name for name in shapes.names() if name.startswith("prop:")]
+OFFICIAL = (
+    *("vases", "chairs", "stools", "tables", "plants", "globes", "lamps", "bowls", "boxes"),
+    *("mugs", "coffee makers", "dogs"),
+)
+
+
+def test_there_are_many_props_and_each_is_listed_once() -> None:
+    assert len(NAMES) == len(set(NAMES)) >= 24
+    assert set(PROPS) == {PREFIX + name for name in NAMES}
+    assert set(NATURAL_SIZES) == set(NAMES)
 
 
 @pytest.mark.parametrize("name", PROPS)
@@ -31,7 +61,109 @@ def test_prop_fills_the_unit_box_and_is_closed(name: str) -> None:
 
 @pytest.mark.parametrize("name", PROPS)
 def test_prop_is_cheap_to_draw(name: str) -> None:
-    assert len(shape(name).mesh.faces) <= 3000
+    assert len(shape(name).mesh.faces) <= 2500
+
+
+@pytest.mark.parametrize("name", PROPS)
+def test_prop_is_modelled_at_its_natural_size(name: str) -> None:
+    prop, size = shape(name), NATURAL_SIZES[name.removeprefix(PREFIX)]
+    assert isinstance(prop, Prop)
+    assert prop.made == pytest.approx(size, rel=0.01)
+    assert min(size) > 0.01 and max(size) < 3.0, "a thing that one person can carry"
+
+
+@pytest.mark.parametrize("name", PROPS)
+def test_faces_look_outwards(name: str) -> None:
+    """A short step along a normal leaves the solid that the triangle belongs to."""
+    mesh = shape(name).mesh
+    corners = mesh.vertices[mesh.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    areas = np.linalg.norm(normals, axis=1)
+    assert np.isfinite(corners).all()
+    assert areas.min() > 1e-12, "no triangle without area"
+    top = corners.mean(axis=1)[:, 2].argmax()
+    assert normals[top, 2] > 0, "the highest triangle faces up"
+
+
+@pytest.mark.parametrize("name", PROPS)
+def test_parts_with_looks_of_their_own_are_never_taken_for_agent_or_patient(name: str) -> None:
+    prop = shape(name)
+    assert isinstance(prop, Prop)
+    assert len(prop.paint) == len(prop.mesh.faces)
+    assert set(prop.paint) <= set(range(len(prop.own) + 1))
+    assert 0 in prop.paint, "some of a prop has the look of its body"
+    for look in (*prop.own, *(prop_look(np.random.default_rng(i), name) for i in range(20))):
+        assert look.texture in TEXTURES
+        assert not any(mistakable(look.color, role) for role in (RED, YELLOW))
+
+
+@pytest.mark.parametrize("word", OFFICIAL)
+def test_official_categories_have_props(word: str) -> None:
+    props = expand_props([word])
+    assert props and set(props) <= set(NAMES)
+    # The singular gives the same, with spaces or underscores.
+    single = {"boxes": "box"}.get(word, word.removesuffix("s"))
+    assert expand_props([single.replace(" ", "_")]) == props
+    assert prop_for(single).removeprefix(PREFIX) in props
+
+
+def test_every_prop_is_reached_by_a_category_or_stands_for_models() -> None:
+    reached = {name for names in PROP_CATEGORIES.values() for name in names}
+    rest = set(NAMES) - reached
+    assert all(prop_for(name.replace("_", " ")) != FALLBACK or name == "crate" for name in
+               rest - {"boat", "rod", "slab"})  # fmt: skip
+    for category, name in (("canoe", "boat"), ("baseball bat", "rod"), ("coin", "slab")):
+        assert prop_for(category) == PREFIX + name
+
+
+def test_full_is_the_union_of_the_categories_of_the_published_trials() -> None:
+    words = ("vase", "chair", "dog", "coffee_maker", "globe", "garden plant", "stool", "box")
+    assert set(expand_props(["full"])) == set(expand_props(words))
+    assert "person" not in expand_props(["full"])
+
+
+def test_props_are_named_once_and_in_order() -> None:
+    assert expand_props(["dog_sitting", "prop:chair", "dogs", "dog sitting"]) == (
+        "dog_sitting",
+        "chair",
+        "dog",
+    )
+    assert expand_props([]) == ()
+
+
+@pytest.mark.parametrize("name", ["chiar", "", "prop:", "prop:chairs", "Vase!"])
+def test_unknown_props_get_the_closest_names(name: str) -> None:
+    with pytest.raises(UnknownNameError, match="closest"):
+        expand_props(["vase", name])
+
+
+def test_families_of_materials() -> None:
+    assert set(MATERIALS) == {"wood", "metal", "plastic", "stone", "fabric"}
+    every = [name for names in MATERIALS.values() for name in names]
+    assert len(every) == len(set(every)) >= 12
+    assert min(len(names) for names in MATERIALS.values()) >= 3
+    assert set(every) <= set(TEXTURES)
+    assert expand_materials(["wood"]) == MATERIALS["wood"]
+    assert expand_materials(["wood_oak", "wood", "plain"])[0] == "wood_oak"
+    assert len(expand_materials(["wood_oak", "wood"])) == len(MATERIALS["wood"])
+
+
+@pytest.mark.parametrize("name", ["wod_oak", "", "woods"])
+def test_unknown_materials_get_the_closest_names(name: str) -> None:
+    with pytest.raises(UnknownNameError, match="wood"):
+        expand_materials(["stone", name])
+
+
+def test_materials_are_drawn_evenly_and_again_alike() -> None:
+    drawn = [pick_material(np.random.default_rng(i), ["stone", "plain"]) for i in range(400)]
+    assert drawn == [
+        pick_material(np.random.default_rng(i), ["stone", "plain"]) for i in range(400)
+    ]
+    counts = {name: drawn.count(name) for name in set(drawn)}
+    assert set(counts) == {*MATERIALS["stone"], "plain"}
+    assert min(counts.values()) > 50
+    with pytest.raises(BadInputError, match="no material"):
+        pick_material(np.random.default_rng(0), [])
 
 
 def test_every_category_leads_to_a_prop_that_exists() -> None:

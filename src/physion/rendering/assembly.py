@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from physion.physics.trajectory import Trajectory
 from physion.rendering.geometry import F32, F64, I32, Part, sheet, solid
 from physion.rendering.light import to_linear
+from physion.rendering.paint import painted
 from physion.rendering.rooms import Panel, Room
 from physion.rendering.textures import Atlas, build_atlas, finish
 from physion.scenes.scene import Look, Scene
@@ -75,19 +76,18 @@ def assemble(scene: Scene, room: Room) -> Assembly:
     moving = [i for i in range(len(scene.bodies)) if i not in set(still)]
     for i in still + moving:
         body = scene.bodies[i]
-        mesh = shape(body.shape).mesh
-        parts.append(
-            (
-                solid(
-                    np.asarray(mesh.vertices, np.float64),
-                    np.asarray(mesh.faces, np.int32),
-                    np.asarray(body.scale),
-                    mesh.smooth,
-                    materials.add(body.look),
-                ),
-                i,
-            )
+        form = shape(body.shape)
+        mesh = form.mesh
+        part = solid(
+            np.asarray(mesh.vertices, np.float64),
+            np.asarray(mesh.faces, np.int32),
+            np.asarray(body.scale),
+            mesh.smooth,
+            materials.add(body.look),
         )
+        if body.name not in (scene.roles.agent, scene.roles.patient):
+            part = painted(part, form, materials.add)
+        parts.append((part, i))
     for i, cloth in enumerate(scene.cloths):
         parts.append((sheet(cloth.resolution, materials.add(cloth.look)), len(scene.bodies) + i))
     return _concatenate(parts, 1 + len(still), materials)

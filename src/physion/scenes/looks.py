@@ -4,24 +4,28 @@ from __future__ import annotations
 
 import colorsys
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 import numpy as np
 
-from physion.errors import UnknownNameError
+from physion.errors import BadInputError, UnknownNameError
 from physion.scenes.scene import Body, Cloth, Look, Scene, Vec3
 from physion.seeds import child_generator, stable_hash
 
+MATERIALS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "wood": ("wood_ash", "wood_cedar", "wood_oak", "wood_pine", "wood_walnut"),
+        "metal": ("metal", "metal_brushed", "metal_cast", "metal_hammered", "metal_polished"),
+        "plastic": ("plastic", "plastic_glossy", "plastic_matte", "plastic_speckled"),
+        "stone": ("stone_granite", "stone_marble", "stone_sandstone", "stone_slate"),
+        "fabric": ("fabric_canvas", "fabric_denim", "fabric_linen", "fabric_wool"),
+    }
+)
+"""Names of materials by family; the official library has the same families."""
 TEXTURES = (
-    "plain",
-    "wood_cedar",
-    "wood_ash",
-    "carpet",
-    "plaster",
-    "tiles",
-    "metal",
-    "plastic",
-    "cloth",
+    *(name for names in MATERIALS.values() for name in names),
+    *("plain", "cloth", "carpet", "plaster", "tiles", "wicker", "fur", "moon"),
 )
 """Names that a renderer knows; it tints them by the look's colour."""
 RED: Vec3 = (1.0, 0.0, 0.0)
@@ -36,48 +40,64 @@ dark it is. The browns of furniture and dogs are further off."""
 STRONG_SATURATION, STRONG_VALUE = 0.6, 0.3
 
 _PALETTES: dict[str, tuple[Vec3, ...]] = {
-    "wood": ((0.45, 0.3, 0.18), (0.62, 0.46, 0.3), (0.3, 0.2, 0.13)),
-    "glaze": ((0.85, 0.84, 0.8), (0.65, 0.42, 0.3), (0.3, 0.42, 0.5), (0.5, 0.52, 0.48)),
-    "fur": ((0.35, 0.22, 0.13), (0.12, 0.1, 0.09), (0.7, 0.6, 0.48)),
-    "leaf": ((0.16, 0.32, 0.14), (0.24, 0.4, 0.2)),
+    "wood": ((0.72, 0.56, 0.4), (0.85, 0.72, 0.55), (0.5, 0.37, 0.27), (0.6, 0.42, 0.3)),
+    "glaze": ((0.9, 0.89, 0.86), (0.62, 0.72, 0.74), (0.3, 0.42, 0.5), (0.5, 0.55, 0.48)),
+    "clay": ((0.72, 0.47, 0.35), (0.6, 0.45, 0.36), (0.8, 0.64, 0.5)),
+    "fur": ((0.5, 0.34, 0.22), (0.3, 0.2, 0.14), (0.7, 0.56, 0.4)),
+    "leaf": ((0.22, 0.42, 0.18), (0.32, 0.5, 0.24), (0.2, 0.36, 0.22)),
+    "dark": ((0.1, 0.1, 0.11), (0.2, 0.2, 0.22), (0.32, 0.33, 0.35)),
     "grey": ((0.2, 0.2, 0.22), (0.55, 0.55, 0.57), (0.82, 0.82, 0.82)),
-    "fabric": ((0.35, 0.4, 0.5), (0.6, 0.55, 0.5), (0.3, 0.4, 0.33)),
+    "bright": ((0.9, 0.9, 0.9), (0.25, 0.38, 0.55), (0.3, 0.5, 0.42), (0.16, 0.16, 0.18)),
+    "steel": ((0.75, 0.76, 0.78), (0.66, 0.67, 0.7)),
+    "fabric": ((0.35, 0.42, 0.55), (0.66, 0.6, 0.52), (0.34, 0.45, 0.37), (0.5, 0.42, 0.5)),
+    "card": ((0.7, 0.55, 0.4), (0.63, 0.5, 0.38)),
+    "moon": ((0.72, 0.72, 0.7),),
 }
-_PROP_PALETTE = {
-    **dict.fromkeys(["chair", "stool", "table", "crate", "rod", "boat"], ("wood", "wood_ash")),
-    **dict.fromkeys(["vase", "jug", "sculpture"], ("glaze", "plain")),
-    **dict.fromkeys(["dog", "person"], ("fur", "plain")),
-    **dict.fromkeys(["coffee_maker", "wineglass", "slab"], ("grey", "plastic")),
-    "lamp": ("grey", "metal"),
-    "plant": ("leaf", "plain"),
-    "globe": ("glaze", "plastic"),
-    "pillow": ("fabric", "cloth"),
-    "basket": ("wood", "plain"),
+_WOODS = ("wood_ash", "wood_oak", "wood_pine", "wood_walnut")
+_PROP_STYLES: dict[tuple[str, tuple[str, ...]], str] = {
+    ("wood", _WOODS): "chair stool table coffee_table side_table desk globe rod",
+    ("wood", ("wood_pine", "wood_oak")): "crate",
+    ("wood", ("wicker",)): "basket",
+    ("glaze", ("plastic_glossy", "stone_marble", "plastic_speckled")): "vase vase_bottle lamp",
+    ("glaze", ("plastic_glossy", "plain")): "vase_beaker jug bowl",
+    ("clay", ("plain", "stone_sandstone")): "vase_amphora",
+    ("bright", ("plastic_glossy",)): "mug boat",
+    ("bright", ("metal_cast", "plastic_glossy")): "cafe_chair desk_lamp",
+    ("fur", ("fur",)): "dog dog_sitting",
+    ("leaf", ("plain",)): "plant houseplant cactus",
+    ("dark", ("plastic_matte", "plastic_glossy", "metal_brushed")): "coffee_maker",
+    ("dark", ("metal_cast",)): "floor_lamp",
+    ("steel", ("metal_polished", "metal_brushed")): "moka_pot slab",
+    ("glaze", ("plastic_glossy",)): "wineglass",
+    ("grey", ("stone_granite", "stone_sandstone", "metal_cast")): "sculpture",
+    ("fabric", ("fabric_linen", "fabric_wool")): "armchair bar_stool pillow person",
+    ("card", ("plain",)): "carton",
+    ("moon", ("moon",)): "moon_globe",
 }
-
-
-MATERIALS: dict[str, tuple[str, ...]] = {
-    "wood": ("wood_cedar", "wood_ash"),
-    "metal": ("metal",),
-    "plastic": ("plastic",),
-}
-"""Materials by family."""
+_STYLE_OF = {prop: style for style, props in _PROP_STYLES.items() for prop in props.split()}
 
 
 def expand_materials(names: Sequence[str]) -> tuple[str, ...]:
-    """Material names, with each family name replaced by its members."""
+    """Names of materials for names of materials and of families, in the order given, each once.
+
+    `UnknownNameError` with the closest names for any other.
+    """
     found: list[str] = []
     for name in names:
-        if name not in MATERIALS and name not in TEXTURES:
-            raise UnknownNameError("material", name, (*MATERIALS, *TEXTURES))
-        found += MATERIALS.get(name, (name,))
+        # A family wins over a material of its name: "metal" is any metal.
+        family = MATERIALS.get(name.lower())
+        if family is None and name not in TEXTURES:
+            raise UnknownNameError("material or family of materials", name, (*TEXTURES, *MATERIALS))
+        found += family or (name,)
     return tuple(dict.fromkeys(found))
 
 
 def pick_material(rng: np.random.Generator, names: Sequence[str]) -> str:
-    """One of the materials, each as likely; a family counts as its members."""
-    known = expand_materials(names)
-    return known[int(rng.integers(len(known)))]
+    """One of the materials that ``names`` of materials and families stand for, evenly drawn."""
+    choice = expand_materials(names)
+    if not choice:
+        raise BadInputError("no material to pick from: name a material or a family of them")
+    return choice[int(rng.integers(len(choice)))]
 
 
 def too_near(color: Vec3, other: Vec3, margin: float = MARGIN) -> bool:
@@ -109,9 +129,10 @@ def random_color(
 
 def prop_look(rng: np.random.Generator, shape: str) -> Look:
     """A natural, dull colour and texture for a prop (``prop:vase``)."""
-    palette, texture = _PROP_PALETTE.get(shape.removeprefix("prop:"), ("grey", "plain"))
+    palette, textures = _STYLE_OF.get(shape.removeprefix("prop:"), ("grey", ("plain",)))
     colors = _PALETTES[palette]
-    return Look(colors[int(rng.integers(len(colors)))], texture)
+    color, texture = int(rng.integers(len(colors))), int(rng.integers(len(textures)))
+    return Look(colors[color], textures[texture])
 
 
 def with_role_colors(scene: Scene) -> Scene:

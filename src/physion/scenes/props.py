@@ -3,35 +3,56 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
-from physion.errors import BadInputError
+from physion.errors import BadInputError, UnknownNameError
 from physion.scenes.scene import Vec3
 
 PREFIX = "prop:"
 FALLBACK = "prop:crate"
 
+_NAMES = """
+    armchair bar_stool basket boat bowl cactus cafe_chair carton chair coffee_maker coffee_table
+    crate desk desk_lamp dog dog_sitting floor_lamp globe houseplant jug lamp moka_pot moon_globe
+    mug person pillow plant rod sculpture side_table slab stool table vase vase_amphora vase_beaker
+    vase_bottle wineglass
+"""
+PROPS = tuple(_NAMES.split())
+"""Names of all props; their shapes are called ``prop:`` and the name."""
+
 _STANDS_FOR = {
+    "armchair": "armchair sofa",
     "basket": "basket box",
     "boat": "canoe boat kayak",
-    "chair": "chair armchair",
+    "bowl": "bowl fruit-bowl",
+    "carton": "carton cardboard-box",
+    "chair": "chair",
     "coffee_maker": "coffee-maker microwave toaster",
+    "coffee_table": "coffee-table",
     "crate": "crate dog-house suitcase radiator bread money soap cookie-sheet toy",
+    "desk": "desk",
     "dog": "dog cat horse rodent animal",
+    "floor_lamp": "floor-lamp",
     "globe": "globe ball fruit orange apple",
-    "jug": "jug pitcher teapot kettle cup mug coffee-cup",
-    "lamp": "table-lamp floor-lamp lamp",
+    "houseplant": "houseplant",
+    "jug": "jug pitcher teapot kettle",
+    "lamp": "table-lamp lamp",
+    "moka_pot": "moka-pot",
+    "mug": "mug cup coffee-cup",
     "person": "person man woman",
     "pillow": "throw-pillow pillow cushion",
-    "plant": "garden-plant houseplant plant flower tree",
+    "plant": "garden-plant plant flower tree",
     "rod": "baseball-bat knife kitchen-utensil snake pen spoon fork bottle-cork",
     "sculpture": "sculpture statue",
+    "side_table": "side-table",
     "slab": "coin shirt-button plate tray",
     "stool": "stool bench ottoman",
-    "table": "table desk coffee-table",
+    "table": "table",
     "vase": "vase bottle pot urn",
     "wineglass": "wineglass glass beer",
 }
@@ -40,6 +61,56 @@ _PROP_OF = {
     for prop, categories in _STANDS_FOR.items()
     for category in categories.split()
 }
+
+_CATEGORIES: dict[str, tuple[str, ...]] = {
+    "armchair": ("armchair",),
+    "bowl": ("bowl",),
+    "box": ("basket", "carton", "crate"),
+    "chair": ("armchair", "cafe_chair", "chair"),
+    "coffee maker": ("coffee_maker", "moka_pot"),
+    "dog": ("dog", "dog_sitting"),
+    "garden plant": ("plant",),
+    "globe": ("globe", "moon_globe"),
+    "houseplant": ("cactus", "houseplant"),
+    "lamp": ("desk_lamp", "floor_lamp", "lamp"),
+    "mug": ("mug",),
+    "plant": ("cactus", "houseplant", "plant"),
+    "stool": ("bar_stool", "stool"),
+    "table": ("coffee_table", "desk", "side_table", "table"),
+    "vase": ("vase", "vase_amphora", "vase_beaker", "vase_bottle"),
+}
+_OFFICIAL = ("vase", "chair", "dog", "coffee maker", "globe", "garden plant", "stool", "box")
+_FULL = tuple(dict.fromkeys(name for kind in _OFFICIAL for name in _CATEGORIES[kind]))
+_PLURALS = {"box": "boxes", "coffee maker": "coffee makers"}
+
+PROP_CATEGORIES: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        **_CATEGORIES,
+        **{_PLURALS.get(word, word + "s"): names for word, names in _CATEGORIES.items()},
+        "full": _FULL,
+    }
+)
+"""Props by the words of the official scenery: a category in the singular or plural, or ``full``,
+which is all that occur in the published trials (reference/official-system.md, section 1.2)."""
+
+
+def expand_props(names: Sequence[str]) -> tuple[str, ...]:
+    """Names of props for names of props and of categories, in the order given, each once.
+
+    Underscores and spaces are alike. `UnknownNameError` with the closest names for others.
+    """
+    found: list[str] = []
+    for name in names:
+        bare = name.removeprefix(PREFIX)
+        spaced, joined = bare.lower().replace("_", " "), bare.lower().replace(" ", "_")
+        # A category wins over a prop of its name: "chair" is any chair, "prop:chair" that one.
+        if not name.startswith(PREFIX) and spaced in PROP_CATEGORIES:
+            found += PROP_CATEGORIES[spaced]
+        elif joined in PROPS:
+            found.append(joined)
+        else:
+            raise UnknownNameError("prop or category of props", name, (*PROPS, *PROP_CATEGORIES))
+    return tuple(dict.fromkeys(found))
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.registry import Registry
+from physion.scenes.props import PREFIX, PROPS
 from physion.scenes.scene import Vec3
 from physion.scenes.solids import (
     Mesh,
@@ -159,10 +160,8 @@ class Shape:
 
 Outline = list[tuple[float, float]]
 Maker = Callable[[], Shape]
-_PROPS = """basket boat chair coffee_maker crate dog globe jug lamp person pillow plant rod
-sculpture slab stool table vase wineglass"""
 shapes: Registry[Maker] = Registry(
-    "shape", {f"prop:{name}": "physion.scenes.prop_shapes:shapes" for name in _PROPS.split()}
+    "shape", {PREFIX + name: "physion.scenes.prop_shapes:shapes" for name in PROPS}
 )
 """Makers of shapes; call `shape` for the shape itself."""
 
@@ -229,6 +228,14 @@ def _cylinder() -> Shape:
     profile = [(0.0, 0.0), (0.5, 0.0), (0.5, 1.0), (0.0, 1.0)]
     mesh = revolve(profile, ROUND_SEGMENTS, smooth=CURVED)
     return Shape("cylinder", mesh, (primitive("cylinder", (0.0, 0.0, 0.5), (0.5, 0.5, 0.5)),))
+
+
+@shapes.register("half:cylinder")
+def _half_cylinder() -> Shape:
+    # Not an official shape: the official ledge is a stretched ball, sunk by half into the floor.
+    turns = np.linspace(0, math.pi, 9)
+    points = [(math.cos(t) / 2, y, math.sin(t) / 2) for t in turns for y in (-0.5, 0.5)]
+    return _solid("half:cylinder", hull(points, CURVED))
 
 
 @shapes.register("cone")

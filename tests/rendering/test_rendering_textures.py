@@ -1,0 +1,143 @@
+"""Textures: seamless, in range, told apart, alike at every size, and painted parts of props."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+
+import numpy as np
+import pytest
+
+from physion.rendering.assembly import assemble
+from physion.rendering.renderer import Renderer
+from physion.rendering.rooms import rooms
+from physion.rendering.textures import FINISHES, LEVELS, PAINTERS, SIZE, build_atlas, finish
+from physion.scenes.looks import MATERIALS, RED, TEXTURES
+from physion.scenes.prop_parts import Prop
+from physion.scenes.scene import Camera, Look, Scene
+from physion.scenes.shapes import shape
+
+from .scenes import body, resting, scene_of
+
+NEAR = Camera((1.3, 1.0, 0.9), (0.0, 0.0, 0.35))
+
+
+def level(name: str, index: int) -> np.ndarray:
+    """Linear albedo (side, side, 3) of one level of a texture."""
+    atlas = build_atlas((name,))
+    start, side = atlas.starts[0, index], SIZE >> index
+    texels = atlas.texels[start : start + side * side, :3]
+    return (texels.reshape(side, side, 3) / 255.0) ** 2
+
+
+@pytest.mark.parametrize("name", PAINTERS)
+def test_texture_is_in_range_and_keeps_its_mean(name: str) -> None:
+    full = level(name, 0)
+    assert full.min() >= 0 and full.max() <= 1
+    assert full.mean() > 0.03
+    for index in range(1, LEVELS):
+        np.testing.assert_allclose(level(name, index).mean((0, 1)), full.mean((0, 1)), atol=0.01)
+
+
+@pytest.mark.parametrize("name", sorted(PAINTERS))
+@pytest.mark.parametrize("axis", [0, 1])
+def test_texture_repeats_without_a_seam(name: str, axis: int) -> None:
+    """Over the edge it changes no more than where it changes most inside."""
+    image = level(name, 1)
+    steps = np.abs(np.diff(image, axis=axis)).mean(axis=(1 - axis, 2))
+    over = np.abs(image.take(0, axis) - image.take(-1, axis)).mean()
+    assert over <= 1.25 * steps.max() + 0.004
+
+
+@pytest.mark.parametrize("name", TEXTURES)
+def test_every_look_has_a_finish(name: str) -> None:
+    kind = finish(name)
+    assert kind.texture in PAINTERS
+    assert 0 <= kind.mirror < 1 and 0 <= kind.metal <= 1 and kind.gloss >= 0
+
+
+def test_materials_differ_in_texture_or_in_shine() -> None:
+    finishes = [FINISHES[name] for names in MATERIALS.values() for name in names]
+    assert len(set(finishes)) == len(finishes)
+
+
+def picture(texture: str, size: int) -> np.ndarray:
+    """A ball and a cube of a grey of this texture, linear in 0..1."""
+    look = Look((0.7, 0.7, 0.7), texture)
+    scene = scene_of(
+        body("cube", "cube", (0.3, -0.2, 0.0), scale=(0.5, 0.5, 0.5), look=look, kinematic=True),
+        body("ball", "sphere", (-0.2, 0.3, 0.0), scale=(0.5, 0.5, 0.5), look=look, kinematic=True),
+        camera=NEAR,
+    )
+    frame = Renderer(scene, resting(scene), size, size).render(0, ("color",))
+    assert frame.color is not None
+    return frame.color.astype(float) / 255.0
+
+
+def test_materials_are_told_apart_in_a_small_picture() -> None:
+    names = [name for names in MATERIALS.values() for name in names]
+    shots = {name: picture(name, 128) for name in names}
+    for a, b in itertools.combinations(names, 2):
+        assert np.abs(shots[a] - shots[b]).mean() > 0.002, f"{a} looks like {b}"
+
+
+@pytest.mark.parametrize("name", ["wood_oak", "fabric_denim", "fabric_linen", "stone_granite"])
+def test_small_pictures_are_large_ones_seen_from_afar(name: str) -> None:
+    """Without aliasing a picture is the mean of one of four times its pixels."""
+    small, large = picture(name, 64), picture(name, 128)
+    mean = large.reshape(64, 2, 64, 2, 3).mean((1, 3))
+    inside = slice(4, -4)
+    assert np.abs(small - mean)[inside, inside].mean() < 0.02
+
+
+def test_textures_are_painted_when_used_and_kept() -> None:
+    name = "stone_granite"
+    build_atlas.cache_clear()
+    build_atlas((name, "plain"))
+    start = time.perf_counter()
+    for other in ("wood_oak", "wood_pine", "wood_ash"):
+        build_atlas.cache_clear()
+        assert build_atlas((name,)).texels.shape[1] == 5
+        assert other not in (name,)
+    assert time.perf_counter() - start < 5.0
+
+
+def lamp_scene(role: bool) -> Scene:
+    look = Look(RED if role else (0.3, 0.3, 0.4), "plain")
+    lamp = body("lamp", "prop:lamp", (0, 0, 0), scale=(0.4, 0.4, 0.6), look=look, kinematic=True)
+    cube = body("cube", "cube", (0.0, -9.0, 0.0))
+    ends = [cube, lamp, body("end", "cube", (2.0, -9.0, 0.0))]
+    return scene_of(*(ends[1:] if role else ends), camera=NEAR)
+
+
+def test_parts_of_props_have_their_own_colours_unless_they_play_a_role() -> None:
+    prop = shape("prop:lamp")
+    assert isinstance(prop, Prop)
+    free, role = (assemble(scene, rooms.get("empty")) for scene in map(lamp_scene, (False, True)))
+    painted = free.material[free.objects == 2]
+    assert len(set(painted)) == 1 + len(prop.own)
+    # Triangles of two colours are two surfaces.
+    surfaces = free.surface[free.objects == 2]
+    pairs = set(zip(surfaces.tolist(), painted.tolist(), strict=True))
+    assert len(pairs) == len(set(surfaces.tolist()))
+    assert len(set(role.material[role.objects == 1])) == 1
+
+
+def test_paint_follows_the_mesh_of_every_prop() -> None:
+    from physion.scenes.props import PREFIX, PROPS
+
+    bodies = [
+        body(name, PREFIX + name, (3.0 * i, 0.0, 0.0), kinematic=True)
+        for i, name in enumerate(PROPS)
+    ]
+    ends = body("a", "cube"), body("z", "cube")
+    made = assemble(scene_of(ends[0], *bodies, ends[1]), rooms.get("empty"))
+    for i, name in enumerate(PROPS):
+        prop = shape(PREFIX + name)
+        assert isinstance(prop, Prop)
+        rows = made.material[made.objects == i + 2]
+        assert len(rows) == len(prop.paint)
+        for slot in set(prop.paint.tolist()):
+            assert len(set(rows[prop.paint == slot])) == 1
+    assert math.isfinite(float(made.uv.sum()))
