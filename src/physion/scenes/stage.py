@@ -79,11 +79,13 @@ def build_scene(
     pushes: Sequence[Push] = (),
     joints: Sequence[Joint] = (),
     seen: Sequence[Body] | None = None,
+    around: Sequence[Body] | None = None,
     settle_frames: int = 0,
 ) -> Scene:
     """The scene of ``bodies``, with the camera and the scenery that ``params`` draw around them.
 
     ``seen`` are the bodies that the camera must show: agent and patient, where they are bodies.
+    Scenery keeps clear of the bodies ``around`` which it stands: all, but for those without end.
     ``camera`` replaces the rule of ``params``. Everything stands on the floor of its room.
     """
     by_name = {body.name: body for body in bodies}
@@ -94,7 +96,7 @@ def build_scene(
     scenery = place_scenery(
         params.scenery,
         eye,
-        bodies,
+        bodies if around is None else around,
         child_generator(seed, "distractors"),
         child_generator(seed, "occluders"),
     )
