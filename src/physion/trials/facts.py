@@ -1,0 +1,199 @@
+"""What is true of a dataset, for its card and its metadata.
+
+Every statement is counted from the index, read from the settings that lie beside it, or holds for
+all datasets that this package makes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from physion.errors import BadInputError
+from physion.trials.index import COLUMNS, FILES, read_index
+from physion.trials.layout import INDEX, SETTINGS
+
+SPLITS = {
+    "training": "for a model's own training",
+    "readout": "for fitting a readout on a model's features",
+    "testing": "for the test that models and people take",
+    "familiarization": "for people to practise on",
+}
+SCENARIOS = {
+    "collide": "one object is thrown at another",
+    "contain": "objects lie in a bowl or round a post, and something is thrown at them",
+    "dominoes": "a row of upright objects topples",
+    "drape": "a cloth falls over things that stand in its way",
+    "drop": "one object falls on another",
+    "link": "rings hang on a post, and something is thrown at them",
+    "roll": "an object rolls or slides down a ramp or off a ledge",
+    "support": "a stack of objects stands or falls",
+}
+MEANINGS = {
+    "trial": "name of the trial, unique in the dataset",
+    "dataset": "name of the dataset, from which the seeds come",
+    "scenario": "kind of scene",
+    "split": "what the trial is for",
+    "index": "place of the trial in its split and scenario, from 0",
+    "preset": "parameter set of the scenario; missing for an imported scene",
+    "seed": "entropy of the trial's random numbers, hexadecimal; missing for an imported scene",
+    "attempt": "draws of this trial that were refused before; missing for an imported scene",
+    "scene_digest": "SHA-256 of all that decides the motion",
+    "contact": "the label: agent and patient touch at some time of the trial",
+    "first_frame": "first frame in which they touch; missing without contact",
+    "observed_contact": "they touch already in the observed part: nothing is left to predict",
+    "min_distance": "smallest gap between cloth and the other thing, m; missing without cloth",
+    "robust": "share of jittered simulations with the same outcome; missing if not measured",
+    "recorded_contact": "outcome that an imported scene came with, else missing",
+    "frames": "frames of the whole trial",
+    "observed_frames": "frames that may be seen by who predicts",
+    "completed": "everything came to rest, rather than the time being over",
+    "physics_seconds": "how long the trial lasts in the simulated world",
+    "playback_seconds": "how long the full movie lasts",
+    "agent_share": "share of the first picture that the agent covers",
+    "patient_share": "share of the first picture that the patient covers",
+    "look": "redyellow (agent red, patient yellow) or free (colours of the scene)",
+    "width": "pixels",
+    "height": "pixels",
+    "engine": "physics engine and version",
+    "renderer": "renderer and version",
+    "package": "package and version",
+    "digest": "SHA-256 of the motion",
+    "trial_file": "scene, motion, contacts, label, first-frame ids (HDF5): holds the future",
+    "movie": "all frames (MP4): holds the future",
+    "observed_movie": "the observed frames alone (MP4)",
+    "map": "agent in red and patient in yellow in the first frame (PNG)",
+    "free_movie": "all frames in free colours (MP4): holds the future",
+    "free_observed_movie": "the observed frames alone in free colours (MP4)",
+}
+"""What each column of the index means; for a file, the path. Its size and hash follow from it."""
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What is known of the dataset in a folder: its index, and the settings that it was made with.
+
+    ``settings`` is empty where the folder has none.
+    """
+
+    index: pd.DataFrame
+    index_bytes: int
+    index_sha256: str
+    settings: dict[str, Any]
+
+    @property
+    def name(self) -> str:
+        """Name of the dataset; several are joined by ``+``."""
+        return "+".join(sorted(set(self.index["dataset"])))
+
+    @property
+    def imported(self) -> int:
+        """Trials whose scenes were not drawn by a seed but came from outside."""
+        return int(self.index["seed"].isna().sum())
+
+    def versions(self, column: str) -> str:
+        """The different values of a column as one text."""
+        return ", ".join(sorted({str(value) for value in self.index[column].dropna()}))
+
+    def total_bytes(self) -> int:
+        """Size of all files that the index lists."""
+        return int(self.index[[f"{name}_bytes" for name in FILES]].sum().sum())
+
+
+def read_facts(folder: Path) -> Facts:
+    """The facts of a dataset; `BadInputError` where there is no index, or not one trial in it."""
+    index = read_index(folder)
+    if index.empty:
+        raise BadInputError(f"{folder} holds no trial to describe")
+    data = (folder / INDEX).read_bytes()
+    path, settings = folder / SETTINGS, {}
+    if path.is_file():
+        try:
+            settings = dict(json.loads(path.read_text(encoding="utf-8"))["settings"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise BadInputError(f"{path} is damaged: {error}") from error
+    return Facts(index, len(data), hashlib.sha256(data).hexdigest(), settings)
+
+
+def meaning(column: str) -> str:
+    """What a column of the index means."""
+    for ending, what in (("_bytes", "size in bytes of"), ("_sha256", "SHA-256 of")):
+        if column.endswith(ending):
+            return f"{what} the file named in {column.removesuffix(ending)}"
+    return MEANINGS[column]
+
+
+def collection(facts: Facts) -> str:
+    """How the trials came to be."""
+    drawn = len(facts.index) - facts.imported
+    parts = []
+    if drawn:
+        parts.append(
+            f"{drawn} scenes were drawn at random by the samplers of {facts.versions('package')}."
+        )
+    if facts.imported:
+        parts.append(
+            f"{facts.imported} scenes were imported from records of scenes made elsewhere."
+        )
+    parts.append(
+        f"All were simulated by {facts.versions('engine')} and rendered by "
+        f"{facts.versions('renderer')}."
+    )
+    return " ".join(parts)
+
+
+def missing(facts: Facts) -> str:
+    """Cells of the index without a value, by column."""
+    counts = facts.index[[name for name in COLUMNS if name in MEANINGS]].isna().sum()
+    gaps = [f"{name} ({count})" for name, count in counts.items() if count]
+    return f"Missing cells by column, of {len(facts.index)}: {', '.join(gaps) or 'none'}."
+
+
+def biases(facts: Facts) -> list[str]:
+    """Imbalances, counted."""
+    index = facts.index
+    rates = index.groupby("split", observed=True)["contact"].agg(["mean", "size"])
+    said = [
+        f"Agent and patient touch in {row['mean']:.3f} of the {row['size']:.0f} {split} trials."
+        for split, row in rates.iterrows()
+    ]
+    chosen = {
+        name: facts.settings[name]
+        for name in ("min_visible", "robust", "observed_contact")
+        if name in facts.settings
+    }
+    if chosen and facts.imported < len(index):
+        told = ", ".join(f"{name} = {value}" for name, value in chosen.items())
+        said.append(f"Drawn trials were chosen with these settings of the package: {told}.")
+    said.append(
+        "Shapes, sizes, colours, rooms and cameras follow the package's samplers or the imported "
+        "scenes, not the statistics of any real place."
+    )
+    return said
+
+
+def limitations(facts: Facts) -> list[str]:
+    """What the data cannot show, with counts where something was counted."""
+    index, n = facts.index, len(facts.index)
+    said = [
+        "Rigid bodies and cloth are simulated; another engine may decide some trials otherwise.",
+        "The camera never moves, and there is no sound.",
+        f"In {int(index['observed_contact'].sum())} of {n} trials agent and patient touch already "
+        "in the observed part.",
+    ]
+    robust = index["robust"].dropna()
+    if len(robust):
+        said.append(
+            f"Jittered simulations agree with the label in {float(robust.mean()):.3f} of cases, "
+            f"measured on {len(robust)} of {n} trials."
+        )
+    else:
+        said.append("How far labels depend on tiny changes of the scene was not measured.")
+    unfinished = int((~index["completed"]).sum())
+    said.append(f"In {unfinished} of {n} trials something still moved when the time was over.")
+    return said
