@@ -8,8 +8,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from physion.scenes.prop_parts import (
-    Part,
+from physion.scenes.prop_parts import Part, prop
+from physion.scenes.prop_solids import (
     arc,
     ball,
     board,
@@ -17,7 +17,6 @@ from physion.scenes.prop_parts import (
     cushion,
     limb,
     outline,
-    prop,
     sleeve,
     tube,
     turned,

@@ -8,17 +8,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from physion.scenes.prop_parts import (
-    Part,
-    ball,
-    curve,
-    limb,
-    loft,
-    prop,
-    ring,
-    tube,
-    turned,
-)
+from physion.scenes.prop_parts import Part, prop
+from physion.scenes.prop_solids import ball, curve, limb, loft, ring, tube, turned
 from physion.scenes.scene import Look
 from physion.scenes.solids import Points
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from physion.scenes.prop_parts import (
-    Part,
+from physion.scenes.prop_parts import Part, prop
+from physion.scenes.prop_solids import (
     arc,
     ball,
     block,
@@ -18,7 +18,6 @@ from physion.scenes.prop_parts import (
     cushion,
     limb,
     loft,
-    prop,
     solid,
     tube,
     turned,

@@ -7,19 +7,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from physion.scenes.prop_parts import (
-    Part,
-    arc,
-    ball,
-    block,
-    board,
-    cushion,
-    limb,
-    outline,
-    prop,
-    tube,
-    turned,
-)
+from physion.scenes.prop_parts import Part, prop
+from physion.scenes.prop_solids import arc, ball, block, board, cushion, limb, outline, tube, turned
 from physion.scenes.scene import Look
 
 COFFEE = Look((0.16, 0.09, 0.06), "plastic_glossy")
@@ -76,14 +65,14 @@ def _jug() -> Iterable[Part]:
     yield tube(path, 0.011)
 
 
-@prop("mug", (0.085, 0.124, 0.1))
+@prop("mug", (0.102, 0.102, 0.1))
 def _mug() -> Iterable[Part]:
-    """A mug of coffee, its handle behind."""
+    """A mug of coffee; its handle is seen from the front and from the side."""
     wall = [(0.038, 0.0), (0.0415, 0.006), (0.0425, 0.05), (0.0425, 0.1)]
     yield turned(wall, wall=0.004)
     yield turned([(0.0375, 0.07), (0.0375, 0.084)], look=COFFEE)
     path = arc((0, -0.04, 0.052), (0, -0.0355, 0), (0, 0, 0.03), -0.5 * math.pi, 0.5 * math.pi, 8)
-    yield tube(path, 0.007)
+    yield tube(path, 0.007).turned((0, 0, 1), math.pi / 4)
 
 
 @prop("bowl", (0.34, 0.34, 0.15))
