@@ -108,7 +108,7 @@ def make_parts(name: str = "tiny", *, cloth: bool = True, contact_frame: int | N
         split="testing",
         index=0,
         preset=None,
-        seed="ff",
+        seed=None,
         look="free",
         width=SIZE,
         height=SIZE,
@@ -120,6 +120,7 @@ def make_parts(name: str = "tiny", *, cloth: bool = True, contact_frame: int | N
         engine=trajectory.engine,
         renderer="none",
         package="0",
+        scene_digest=scene.physics_digest(),
         digest=trajectory.digest(),
     )
     return Parts(metadata, scene, trajectory, label_contact(scene, trajectory), ids)
@@ -136,7 +137,10 @@ def make_by_hand(job: Job) -> str:
     if "die" in name:
         os.kill(os.getpid(), signal.SIGKILL)
     parts = make_parts(name, contact_frame=50 if job.task.index % 2 else None)
-    split = dataclasses.replace(parts.metadata, split=job.task.split, index=job.task.index)
+    both = len(job.looks) > 1
+    split = dataclasses.replace(
+        parts.metadata, split=job.task.split, index=job.task.index, free_movies=both
+    )
     color = np.stack([images(frame)["color"] for frame in range(FRAMES)])
     files = {
         "movie": encode_movie(color),
@@ -144,6 +148,8 @@ def make_by_hand(job: Job) -> str:
         "map": encode_png(np.zeros((SIZE, SIZE, 4), np.uint8)),
         "trial_file": parts._replace(metadata=split).pack(),
     }
+    if both:
+        files |= {f"free_{kind}": files[kind] for kind in ("movie", "observed_movie")}
     write_files(job.paths, files)
     return name
 

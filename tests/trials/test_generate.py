@@ -190,8 +190,8 @@ def test_a_fault_at_every_step_leaves_only_whole_files(
     with monkeypatch.context() as patch:
         counter = Fault(patch, name, 0, code)
         run(clean, scenes_named("a"))
-    # Settings, four files of the trial, index; fsync also for each folder.
-    assert counter.calls == {"write": 6, "replace": 6, "fsync": 12}[name]
+    # Settings, six files of the trial, index; fsync also for each folder.
+    assert counter.calls == {"write": 8, "replace": 8, "fsync": 16}[name]
     for number in range(1, counter.calls + 1):
         folder = tmp_path / f"{number}"
         with monkeypatch.context() as patch:
@@ -204,10 +204,10 @@ def test_a_fault_at_every_step_leaves_only_whole_files(
 
 
 def test_a_full_disk_stops_the_run_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    counter = Fault(monkeypatch, "write", 8, errno.ENOSPC)
+    counter = Fault(monkeypatch, "write", 10, errno.ENOSPC)
     with pytest.raises(PhysionError, match=r"No space left.*1 new trials are whole"):
         run(tmp_path / "s", scenes_named("a", "b", "c"))
-    assert counter.calls == 8, "no later trial is tried"
+    assert counter.calls == 10, "no later trial is tried"
 
 
 LIMITED = """
@@ -381,11 +381,14 @@ def test_missing_and_broken_indexes_are_refused(finished: Path, tmp_path: Path) 
 
 def test_plan_gives_every_trial_its_own_seed_and_name() -> None:
     counts = {"training": 5, "readout": 4, "testing": 3, "familiarization": 1}
-    tasks = plan_dataset("d", ["drop", "collide"], counts, {"drop": ["one", "two"]})
+    presets = {"drop": ["default", "debug"]}
+    tasks = plan_dataset("d", ["drop", "collide"], counts, presets)
     assert len({task.trial for task in tasks}) == len(tasks) == 26
     assert len({task.seed().entropy for task in tasks}) == 26
-    assert [t.preset for t in tasks if t.scenario == "drop"][:4] == ["one", "two", "one", "two"]
-    longer = plan_dataset("d", ["drop"], {"training": 9}, {"drop": ["one", "two"]})
+    assert {t.presets for t in tasks if t.scenario == "drop"} == {("default", "debug")}
+    practice = next(t for t in tasks if (t.scenario, t.split) == ("collide", "familiarization"))
+    assert practice.presets == ("familiarization",)
+    longer = plan_dataset("d", ["drop"], {"training": 9}, presets)
     assert longer[:5] == [t for t in tasks if (t.scenario, t.split) == ("drop", "training")]
 
 
@@ -400,6 +403,8 @@ def test_bad_plans_are_refused(tmp_path: Path) -> None:
         Task("d", "drop", "test", 0)
     with pytest.raises(UnknownNameError, match="unknown scenario 'dropp'; closest: drop"):
         plan_dataset("d", ["dropp"], {"testing": 1})
+    with pytest.raises(UnknownNameError, match="preset of drop 'defaultt'; closest: default"):
+        plan_dataset("d", ["drop"], {"testing": 1}, {"drop": ["defaultt"]})
     with pytest.raises(BadInputError, match="two trials are called 'A'"):
         scenes_named("a", "A")
     with pytest.raises(BadInputError, match="one dataset"):

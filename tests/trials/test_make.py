@@ -30,7 +30,7 @@ from physion.trials.trial_file import Trial
 from physion.trials.video import read_frames
 
 PASSES = ("color", "depth", "flow", "ids", "normals")
-SMALL = Settings(width=64, height=64, passes=PASSES)
+SMALL = Settings(width=64, height=64, look="redyellow", passes=PASSES)
 TASK = Task("tests", "collide", "testing", 3)
 
 
@@ -94,7 +94,9 @@ def test_looks_change_colours_and_nothing_else(job: Job, tmp_path: Path) -> None
     red, other = Trial.open(job.paths.trial_file), Trial.open(free.paths.trial_file)
     assert red.metadata.digest == other.metadata.digest and red.labels == other.labels
     assert job.paths.map.read_bytes() == free.paths.map.read_bytes()
-    looks = [{b.name: b.look.color for b in t.scene.bodies} for t in (red, other)]
+    assert red.scene == other.scene, "stored scenes keep their free colours"
+    looks = [{b.name: b.look.color for b in t.shown().bodies} for t in (red, other)]
+    assert red.shown("free") == other.shown() and red.shown() == other.shown("redyellow")
     assert looks[0][red.scene.roles.agent] == (1.0, 0.0, 0.0)
     assert looks[0][red.scene.roles.patient] == (1.0, 1.0, 0.0)
     assert looks[1][red.scene.roles.agent] != (1.0, 0.0, 0.0)
@@ -105,7 +107,7 @@ def test_looks_change_colours_and_nothing_else(job: Job, tmp_path: Path) -> None
 def test_state_alone_is_small_and_passes_are_only_kept_when_asked_for(
     job: Job, tmp_path: Path
 ) -> None:
-    bare = Job(TASK, tmp_path, Settings(width=64, height=64))
+    bare = Job(TASK, tmp_path, Settings(width=64, height=64, look="redyellow"))
     make_trial(bare)
     assert Trial.open(bare.paths.trial_file).pass_names == ()
     assert bare.paths.movie.read_bytes() == job.paths.movie.read_bytes()
@@ -119,7 +121,7 @@ def test_short_trials_and_unknown_presets_are_refused(tmp_path: Path) -> None:
     )
     with pytest.raises(BadInputError, match=r"'short' has .* frames; nothing is left to predict"):
         make_trial(Job(Task("d", "drop", "testing", 0, scene=scene), tmp_path, SMALL))
-    with pytest.raises(UnknownNameError, match="preset 'hard'"):
+    with pytest.raises(UnknownNameError, match="preset of drop 'hard'"):
         make_trial(Job(Task("d", "drop", "testing", 0, "hard"), tmp_path, SMALL))
     assert list(tmp_path.iterdir()) == []
 
@@ -152,7 +154,10 @@ def test_fresh_processes_make_the_same_bytes_whatever_their_environment(
 def test_dataset_of_every_scenario_with_real_workers(tmp_path: Path) -> None:
     tasks = plan_dataset("tests", scenarios.names(), {"training": 1, "testing": 1})
     report = generate(
-        tmp_path / "two", tasks, Settings(width=64, height=64), executor=LocalExecutor(2)
+        tmp_path / "two",
+        tasks,
+        Settings(width=64, height=64, look="redyellow"),
+        executor=LocalExecutor(2),
     )
     assert report.exit_code == 0 and len(report.made) == len(tasks)
     dataset = Dataset(tmp_path / "two")
@@ -161,7 +166,7 @@ def test_dataset_of_every_scenario_with_real_workers(tmp_path: Path) -> None:
     serial = generate(
         tmp_path / "one",
         tasks[::-1],
-        Settings(width=64, height=64),
+        Settings(width=64, height=64, look="redyellow"),
         executor=SerialExecutor(),
     )
     assert serial.exit_code == 0
@@ -176,7 +181,10 @@ def test_official_scenes_become_trials(official: Path, tmp_path: Path) -> None:
         for i, trial in enumerate(found.trials)
     ]
     report = generate(
-        tmp_path / "s", tasks, Settings(width=64, height=64), executor=SerialExecutor()
+        tmp_path / "s",
+        tasks,
+        Settings(width=64, height=64, look="redyellow"),
+        executor=SerialExecutor(),
     )
     assert report.exit_code == 0
     dataset = Dataset(tmp_path / "s")

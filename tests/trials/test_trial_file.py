@@ -137,8 +137,8 @@ def test_missing_and_foreign_files_are_refused(tmp_path: Path) -> None:
 
 
 def test_newer_schema_says_so(parts: Parts) -> None:
-    data = parts.pack().replace(b"PHYSION TRIAL 1", b"PHYSION TRIAL 9", 1)
-    with pytest.raises(BadInputError, match="schema 9, this physion reads 1"):
+    data = parts.pack().replace(b"PHYSION TRIAL 2", b"PHYSION TRIAL 9", 1)
+    with pytest.raises(BadInputError, match="schema 9, this physion reads 2"):
         Trial(data, "t")
 
 

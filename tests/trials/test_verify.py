@@ -28,7 +28,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_an_untouched_dataset_has_no_fault(folder: Path) -> None:
-    assert verify_dataset(folder) == []
+    assert verify_dataset(folder, again=0) == []
 
 
 @pytest.mark.parametrize("name", ["trial_file", "movie", "observed_movie", "map"])
@@ -37,7 +37,7 @@ def test_one_changed_byte_in_any_file_is_found(name: str, folder: Path) -> None:
     data = bytearray(path.read_bytes())
     data[-20] ^= 1
     path.write_bytes(data)
-    faults = verify_dataset(folder)
+    faults = verify_dataset(folder, again=0)
     assert faults and all("b" in fault for fault in faults)
     if name != "trial_file":
         assert any(f"b: {name}_sha256 is" in fault for fault in faults)
@@ -50,7 +50,7 @@ def test_missing_unlisted_and_relabelled_trials_are_found(folder: Path) -> None:
     table = Dataset(folder).index
     table.loc[table["trial"] == "b", "contact"] = False
     write_index(folder, table)
-    faults = "\n".join(verify_dataset(folder))
+    faults = "\n".join(verify_dataset(folder, again=0))
     assert "c.h5 is not in the index" in faults
     assert "a_map.png cannot be read" in faults
     assert "b: contact is True, the index says False" in faults
@@ -59,7 +59,7 @@ def test_missing_unlisted_and_relabelled_trials_are_found(folder: Path) -> None:
 def test_movies_of_a_wrong_length_are_found(folder: Path) -> None:
     paths = Dataset(folder).paths("a")
     paths.observed_movie.write_bytes(encode_movie(read_frames(paths.movie, count=50)))
-    assert any("has 50 frames, not 45" in fault for fault in verify_dataset(folder))
+    assert any("has 50 frames, not 45" in fault for fault in verify_dataset(folder, again=0))
 
 
 def test_simulating_again_finds_another_motion(folder: Path, tmp_path: Path) -> None:
@@ -69,12 +69,12 @@ def test_simulating_again_finds_another_motion(folder: Path, tmp_path: Path) -> 
     from physion.trials.index import build_index
 
     write_index(tmp_path / "r", build_index(tmp_path / "r")[0])
-    assert verify_dataset(tmp_path / "r", simulate_again=True) == []
+    assert verify_dataset(tmp_path / "r", again=-1) == []
     parts = make_parts("a")
     lie = dataclasses.replace(parts.metadata, digest="0" * 64)
     paths = Dataset(folder).paths("a")
     paths.trial_file.write_bytes(parts._replace(metadata=lie).pack())
-    assert any("does not fit its digest" in fault for fault in verify_dataset(folder))
+    assert any("does not fit its digest" in fault for fault in verify_dataset(folder, again=0))
 
 
 def test_a_folder_without_index_is_refused(tmp_path: Path) -> None:
@@ -90,4 +90,4 @@ def test_a_label_that_the_contacts_contradict_is_found(folder: Path) -> None:
     paths.trial_file.write_bytes(parts._replace(labels=wrong).pack())
     table, _ = build_index(folder)
     write_index(folder, table)
-    assert any("labels/contact" in fault for fault in verify_dataset(folder))
+    assert any("labels/contact" in fault for fault in verify_dataset(folder, again=0))

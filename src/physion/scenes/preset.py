@@ -62,10 +62,15 @@ class Preset:
 
 @cache
 def load_presets(scenario: str) -> Mapping[str, Preset]:
-    """All presets that come with the scenario, in the order of their file."""
-    scenarios.get(scenario)  # for the closest names
-    text = resources.files("physion.scenes").joinpath("presets", f"{scenario}.toml").read_text()
-    return parse_presets(text, f"presets/{scenario}.toml")
+    """All presets that come with the scenario, in the order of their file.
+
+    A scenario of another package has none, but for ``default``: its parameters as they are.
+    """
+    kind = scenarios.get(scenario).params
+    file = resources.files("physion.scenes").joinpath("presets", f"{scenario}.toml")
+    if not file.is_file():
+        return {DEFAULT: Preset(DEFAULT, scenario, kind())}
+    return parse_presets(file.read_text(encoding="utf-8"), f"presets/{scenario}.toml")
 
 
 def get_preset(scenario: str, name: str) -> Preset:
@@ -89,10 +94,11 @@ def default_presets(scenario: str, split: str) -> tuple[str, ...]:
     The familiarization split has its own; every other split takes the published configurations,
     but for those that people practised on.
     """
-    if split == FAMILIARIZATION:
+    known = load_presets(scenario)
+    if split == FAMILIARIZATION and FAMILIARIZATION in known:
         return (FAMILIARIZATION,)
-    published = (p for p in load_presets(scenario).values() if p.published)
-    return tuple(p.name for p in published if FAMILIARIZATION not in p.name)
+    published = (preset.name for preset in known.values() if preset.published)
+    return tuple(name for name in published if FAMILIARIZATION not in name) or (DEFAULT,)
 
 
 def read_preset_file(path: Path) -> Mapping[str, Preset]:

@@ -63,6 +63,11 @@ def index_row(paths: TrialPaths) -> dict[str, Any]:
     row: dict[str, Any] = dict.fromkeys(COLUMNS)
     trial = Trial.open(paths.trial_file)
     meta, labels, scene = trial.metadata, trial.labels, trial.scene
+    if (meta.trial, meta.scenario, meta.split) != (paths.trial, paths.scenario, paths.split):
+        raise BadInputError(
+            f"{paths.trial_file} is trial {meta.trial!r} of {meta.split}/{meta.scenario}: "
+            "it was moved or renamed"
+        )
     for name, path in paths.all(meta.movies, meta.free_movies).items():
         try:
             content = path.read_bytes()
@@ -71,11 +76,6 @@ def index_row(paths: TrialPaths) -> dict[str, Any]:
         row[name] = path.relative_to(paths.folder).as_posix()
         row[f"{name}_bytes"] = len(content)
         row[f"{name}_sha256"] = hashlib.sha256(content).hexdigest()
-    if (meta.trial, meta.scenario, meta.split) != (paths.trial, paths.scenario, paths.split):
-        raise BadInputError(
-            f"{paths.trial_file} is trial {meta.trial!r} of {meta.split}/{meta.scenario}: "
-            "it was moved or renamed"
-        )
     row |= {name: getattr(meta, name) for name in COLUMNS if hasattr(meta, name)}
     row |= {
         "contact": labels.contact,

@@ -1,0 +1,191 @@
+"""Which draws become trials: balanced, unseen, robust, visible, and never twice."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+
+from physion.compute.local import SerialExecutor
+from physion.errors import BadInputError, PhysionError
+from physion.physics.engine import simulate
+from physion.physics.labels import label_contact
+from physion.scenes.scenarios import sample_scene
+from physion.seeds import trial_seed
+from physion.trials import choose as choosing
+from physion.trials.choose import (
+    Choice,
+    Choices,
+    Slot,
+    choose,
+    choose_all,
+    judge,
+    robustness,
+    split_of,
+    wanted_contact,
+)
+from physion.trials.dataset import Dataset
+from physion.trials.generate import generate
+from physion.trials.make import scene_of
+from physion.trials.plan import SPLITS, Settings, Task, plan_dataset
+
+QUICK = Settings(width=64, height=64, jitters=0, min_visible=0.0, movies=False)
+
+
+def slots(split: str, count: int, scenario: str = "collide") -> list[Task]:
+    return plan_dataset("choose", [scenario], {split: count}, {scenario: ["default"]})
+
+
+def test_half_of_the_slots_want_contact_in_an_order_that_gives_nothing_away() -> None:
+    for split in ("readout", "testing", "familiarization"):
+        wanted = [wanted_contact(task) for task in slots(split, 150)]
+        assert wanted.count(True) == wanted.count(False) == 75
+        odd = wanted[::2].count(True)
+        assert 20 < odd < 55, "neither even nor odd numbers tell the answer"
+    assert {wanted_contact(task) for task in slots("training", 10)} == {None}
+
+
+def test_every_physics_belongs_to_one_split() -> None:
+    digests = [
+        sample_scene("collide", trial_seed("c", "collide", "x", i)).physics_digest()
+        for i in range(320)
+    ]
+    counts = {split: sum(split_of(d) == split for d in digests) for split in SPLITS}
+    assert sum(counts.values()) == 320
+    assert counts["training"] > counts["readout"] > counts["familiarization"] > 0
+
+
+@pytest.mark.parametrize("split", ["testing", "training"])
+def test_chosen_draws_are_what_their_split_takes(split: str, tmp_path: Path) -> None:
+    tasks = slots(split, 8)
+    choices, failed = choose_all(tasks, QUICK, tmp_path / "c.json", SerialExecutor())
+    assert not failed
+    contacts = []
+    for task in tasks:
+        scene = scene_of(choices[task.trial].fill(task))
+        assert split_of(scene.physics_digest()) == split
+        labels = label_contact(scene, simulate(scene))
+        contacts.append(labels.contact)
+        if split == "testing":
+            assert labels.contact == wanted_contact(task)
+            assert not labels.observed
+    if split == "testing":
+        assert sum(contacts) == 4
+
+
+def test_choices_do_not_depend_on_order_or_on_what_else_is_asked(tmp_path: Path) -> None:
+    tasks = slots("testing", 6)
+    whole, _ = choose_all(tasks, QUICK, tmp_path / "a.json", SerialExecutor())
+    part, _ = choose_all(tasks[:2], QUICK, tmp_path / "b.json", SerialExecutor())
+    rest, _ = choose_all(tasks[::-1], QUICK, tmp_path / "b.json", SerialExecutor())
+    assert {**rest, **part} == whole
+    assert json.loads((tmp_path / "a.json").read_text()) == json.loads(
+        (tmp_path / "b.json").read_text()
+    )
+
+
+def few_scenes(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
+    """Let every draw be one of ``count`` scenes, as presets without chance do."""
+    real = choosing.sample_scene
+
+    def draw(name: str, seed: object, params: object = None) -> object:
+        number = int(seed.entropy % count)  # type: ignore[attr-defined]
+        return real(name, trial_seed("few", name, "x", number), params)
+
+    monkeypatch.setattr(choosing, "sample_scene", draw)
+
+
+def test_copies_are_refused_and_scarce_physics_is_said(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    few_scenes(monkeypatch, 12)
+    monkeypatch.setattr(choosing, "MAX_TRIES", 60)
+    tasks = slots("training", 12)
+    choices, failed = choose_all(tasks, QUICK, tmp_path / "c.json", SerialExecutor())
+    digests = [choice.digest for choice in choices.values()]
+    assert len(set(digests)) == len(digests) > 2
+    assert failed, "twelve scenes, of which some belong to other splits, cannot fill twelve slots"
+    for outcome in failed.values():
+        assert "another trial has the same physics: 60" in str(outcome.error)
+
+
+def test_reasons_are_counted_and_settings_are_heeded() -> None:
+    task = slots("testing", 1)[0]
+    wants = wanted_contact(task)
+    seen, robust = {}, []
+    for index in range(60):
+        seed = trial_seed("reasons", "collide", "x", index)
+        scene = sample_scene("collide", seed)
+        reason, _ = judge(scene, seed, task, QUICK)
+        seen.setdefault(reason, (scene, seed))
+        if reason is None and len(robust) < 3:
+            robust.append(robustness(scene, bool(wants), seed, 8))
+    assert None in seen and ("no contact" if wants else "contact") in seen
+    assert all(share * 8 == int(share * 8) and 0 <= share <= 1 for share in robust)
+    scene, seed = seen[None]
+    hidden = dataclasses.replace(QUICK, min_visible=0.9)
+    assert (
+        judge(scene, seed, task, hidden)[0] == "agent or patient hardly visible in the first frame"
+    )
+    picky = dataclasses.replace(QUICK, jitters=8, robust=1.0)
+    reason, share = judge(scene, seed, task, picky)
+    assert (reason, share) == (None, 1.0) or reason == "outcome not robust"
+    early = seen.get("contact inside the observed part")
+    if wants:
+        assert early, "of 60 draws of collide some touch early"
+        official = dataclasses.replace(QUICK, observed_contact=True)
+        assert judge(*early, task, official)[0] is None
+
+
+def test_robustness_counts_the_runs_that_agree() -> None:
+    seed = trial_seed("robust", "collide", "x", 0)
+    scene = sample_scene("collide", seed)
+    contact = label_contact(scene, simulate(scene)).contact
+    share = robustness(scene, contact, seed, 8)
+    assert robustness(scene, not contact, seed, 8) == pytest.approx(1 - share)
+    assert share >= 0.5
+
+
+def test_a_damaged_record_of_choices_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "c.json"
+    for text in ("{", "[1]", '{"0": {"presets": 1}}', '{"a": {}}'):
+        path.write_text(text)
+        with pytest.raises(BadInputError, match=r"c\.json is no record of choices"):
+            Choices(path)
+
+
+def test_a_killed_search_goes_on(tmp_path: Path) -> None:
+    path = tmp_path / "c.json"
+    before = Choices(path)
+    before.by_index = {0: Choice("default", 3, "a" * 64, 0.5), 1: Choice("debug", 0, "a" * 64, 1)}
+    before.save()
+    after = Choices(path)
+    assert [task.index for task in after.missing(slots("testing", 3))] == [1, 2], "1 repeats 0"
+    assert after.by_index == {0: before.by_index[0]}
+
+
+def test_no_draw_says_why() -> None:
+    slot = Slot(slots("testing", 1)[0], dataclasses.replace(QUICK, min_visible=0.99))
+    original, choosing.MAX_TRIES = choosing.MAX_TRIES, 4
+    try:
+        with pytest.raises(PhysionError, match=r"none of 4 draws of default can be taken \("):
+            choose(slot)
+    finally:
+        choosing.MAX_TRIES = original
+
+
+def test_a_dataset_of_states_alone(tmp_path: Path) -> None:
+    settings = Settings(width=64, height=64, movies=False, jitters=2, playback="real")
+    tasks = slots("readout", 2)
+    report = generate(tmp_path / "d", tasks, settings, executor=SerialExecutor())
+    assert not report.failed
+    index = Dataset(tmp_path / "d").index
+    assert sorted(index["contact"]) == [False, True]
+    assert index["movie"].isna().all() and index["robust"].isin([0.0, 0.5, 1.0]).all()
+    assert (index["physics_seconds"] == (index["frames"] - 1) * 0.01).all()
+    assert (index["playback_seconds"] == index["frames"] / 100).all()
+    other = plan_dataset("choose", ["collide"], {"readout": 2}, {"collide": ["debug"]})
+    with pytest.raises(BadInputError, match="readout/collide"):
+        generate(tmp_path / "d", other, settings, executor=SerialExecutor())
