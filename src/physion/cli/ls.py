@@ -1,26 +1,36 @@
-"""List what can be named: scenarios, shapes, models, engines, executors."""
+"""List what can be named: scenarios, presets, shapes, props, materials, models, engines."""
 
 from __future__ import annotations
 
 import json as json_module
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
+from physion.cli.output import console
 from physion.compute.executor import executors
+from physion.errors import BadInputError
 from physion.models.interface import models
 from physion.physics.engine import engines
-from physion.registry import Registry
-from physion.scenes.scenarios import scenarios
+from physion.scenes.looks import MATERIALS
+from physion.scenes.parameters import drawn_limits
+from physion.scenes.preset import Preset, get_preset, load_presets
+from physion.scenes.prop_shapes import NATURAL_SIZES
+from physion.scenes.scenarios import as_record, scenarios
 from physion.scenes.shapes import shapes
 
-LISTS: dict[str, Registry] = {  # type: ignore[type-arg]
-    "scenarios": scenarios,
-    "shapes": shapes,
-    "models": models,
-    "engines": engines,
-    "executors": executors,
+Names = list[str] | dict[str, list[str]]
+LISTS: Mapping[str, Callable[[], Names]] = {
+    "scenarios": scenarios.names,
+    "presets": lambda: {name: list(load_presets(name)) for name in scenarios.names()},
+    "shapes": shapes.names,
+    "props": lambda: sorted(NATURAL_SIZES),
+    "materials": lambda: {family: list(names) for family, names in MATERIALS.items()},
+    "models": models.names,
+    "engines": engines.names,
+    "executors": executors.names,
 }
 
 
@@ -29,21 +39,96 @@ class Options:
     """Which list."""
 
     what: Annotated[
-        Literal["all", "scenarios", "shapes", "models", "engines", "executors"],
+        Literal[
+            "all",
+            "scenarios",
+            "presets",
+            "shapes",
+            "props",
+            "materials",
+            "models",
+            "engines",
+            "executors",
+        ],
         tyro.conf.Positional,
     ] = "all"
     """One list, or all."""
+    scenario: Annotated[str | None, tyro.conf.Positional] = None
+    """With presets: a scenario, whose presets are described."""
+    preset: Annotated[str | None, tyro.conf.Positional] = None
+    """With presets and a scenario: a preset, all values of which are printed with what each may
+    be."""
     json: bool = False
     """Print one JSON object."""
 
 
 def main(options: Options) -> int:
-    """Print names, one list a line."""
+    """Print names, one list a line, or the presets of a scenario, or the values of a preset."""
+    if options.scenario is not None:
+        if options.what != "presets":
+            raise BadInputError("a scenario can be named after 'presets' only")
+        if options.preset is not None:
+            return _print_preset(get_preset(options.scenario, options.preset), options.json)
+        return _print_presets(options.scenario, options.json)
     chosen = LISTS if options.what == "all" else {options.what: LISTS[options.what]}
-    names = {kind: registry.names() for kind, registry in chosen.items()}
+    names = {kind: listed() for kind, listed in chosen.items()}
     if options.json:
         print(json_module.dumps(names))
         return 0
     for kind, found in names.items():
-        print(f"{kind}: {', '.join(found)}")
+        if isinstance(found, list):
+            print(f"{kind}: {', '.join(found)}")
+        elif options.what == "all":
+            print(f"{kind}: {sum(map(len, found.values()))} (physion ls {kind})")
+        else:
+            for group, members in found.items():
+                print(f"{group} ({len(members)}): {', '.join(members)}")
     return 0
+
+
+def _print_presets(scenario: str, as_json: bool) -> int:
+    presets = load_presets(scenario).values()
+    if as_json:
+        print(json_module.dumps([_facts(preset) for preset in presets]))
+        return 0
+    for preset in presets:
+        told = preset.about or preset.official or ""
+        if preset.published:
+            told += f" (published: {preset.published.contact} of {preset.published.trials} contact)"
+        console.print(f"{preset.name}: {told}", markup=False, soft_wrap=True)
+    return 0
+
+
+def _print_preset(preset: Preset, as_json: bool) -> int:
+    if as_json:
+        print(json_module.dumps(_facts(preset)))
+        return 0
+    limits = drawn_limits(preset.params)
+    for key, value in _flat(as_record(preset.params)).items():
+        told = f"{key} = {json_module.dumps(value)}   # {limits.get(key, '')}"
+        console.print(told, markup=False, soft_wrap=True)
+    return 0
+
+
+def _facts(preset: Preset) -> dict[str, Any]:
+    published = preset.published
+    return {
+        "name": preset.name,
+        "scenario": preset.scenario,
+        "about": preset.about,
+        "official": preset.official,
+        "seed": preset.seed,
+        "published": None if published is None else vars(published),
+        "params": as_record(preset.params),
+    }
+
+
+def _flat(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested keys joined by dots, as preset files may write them."""
+    flat: dict[str, Any] = {}
+    for key, value in record.items():
+        if isinstance(value, Mapping):
+            flat |= {f"{key}.{name}": part for name, part in _flat(value).items()}
+        else:
+            flat[key] = value
+    return flat
