@@ -99,14 +99,14 @@ def responsible(facts: Facts) -> dict[str, Any]:
     return {
         "rai:dataCollection": collection(facts),
         "rai:dataCollectionType": ["Software Collection"]
-        + (["Secondary Data Analysis"] if facts.imported else []),
+        + (["Secondary Data analysis"] if facts.imported else []),
         "rai:dataCollectionRawData": "Scenes (bodies, poses, pushes, camera) and their simulated "
         "motion are kept in every trial file; pictures can be rendered from them again.",
         "rai:dataCollectionMissingData": missing(facts),
         "rai:dataAnnotationProtocol": "Labels are computed, not judged: whether the simulation "
         "made agent and patient touch, at any time of the trial, the unseen part included.",
         "rai:machineAnnotationTools": [facts.versions("engine"), facts.versions("package")],
-        "rai:annotationsPerItem": "1",
+        "rai:annotationsPerItem": "0 by people; one label is computed",
         "rai:dataBiases": biases(facts),
         "rai:dataLimitations": limitations(facts),
         "rai:dataUseCases": [
