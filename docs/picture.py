@@ -1,31 +1,45 @@
-"""Draw docs/picture.png: three sampled trials in colour, and all passes of one frame of each.
+"""Draw docs/picture.jpg: one trial of each scenario, and every pass of one of them.
 
-python docs/picture.py
+    python docs/picture.py [OFFICIAL_FRAME.png]
+
+With the published picture of the eight official scenarios, that stands on the right.
 """
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib import pyplot as plt
 from numpy.typing import NDArray
+from PIL import Image
 
 from physion.physics.engine import simulate
-from physion.rendering.renderer import Frame, Renderer
+from physion.rendering.renderer import Frame, Renderer, role_map
 from physion.scenes.looks import with_role_colors
+from physion.scenes.preset import get_preset
 from physion.scenes.scenarios import sample_scene
 from physion.seeds import trial_seed
 
-SCENARIOS = {"dominoes": 2, "collide": 0, "drop": 0}
-"""Scenario and index of its trial."""
-COLUMNS = ("frame 0", "moving", "last frame", "depth", "normals", "ids", "flow")
-SIZE = 256
+TRIALS = {
+    "dominoes": ("2mid_J020R15_d3chairs_o1plants_tdwroom", 0, 60),
+    "drop": ("all_bowls_box_1_dis_1_occ", 0, 45),
+    "roll": ("ledge_box", 0, 45),
+    "contain": ("torus", 0, 40),
+    "collide": ("simple_box_1_dis_1_occ", 0, 40),
+    "support": ("nb4_fr015_SJ000_gr01_mono0_dis1_occ1_tdwroom", 0, 30),
+    "link": ("nl1-8_mg000_aCylcap_bCyl_tdwroom", 0, 45),
+    "drape": ("test15", 0, 60),
+}
+"""Preset, index and frame of each scenario, in the order of the official picture."""
+PASSES = ("contain", ("color", "depth", "normals", "ids", "flow"))
+SIZE, GAP = 256, 6
 
 
-def painted(frame: Frame) -> list[NDArray[np.float64]]:
-    """Depth, normals, ids and flow of a frame as colours in 0..1."""
+def painted(frame: Frame) -> list[NDArray[np.uint8]]:
+    """Depth, normals, ids and flow of a frame as pictures."""
     assert frame.depth is not None and frame.normals is not None
     assert frame.ids is not None and frame.flow is not None
     depth = plt.get_cmap("magma")(np.clip(1 - frame.depth / 10, 0, 1))[..., :3]
@@ -33,29 +47,52 @@ def painted(frame: Frame) -> list[NDArray[np.float64]]:
     strength = np.hypot(frame.flow[..., 0], frame.flow[..., 1])
     angle = np.arctan2(frame.flow[..., 1], frame.flow[..., 0]) / (2 * np.pi) % 1
     hue = np.stack([angle, np.ones_like(angle), np.clip(strength / 4, 0, 1)], -1)
-    return [depth, frame.normals / 2 + 0.5, ids, mpl.colors.hsv_to_rgb(hue)]
+    pictures = (depth, frame.normals / 2 + 0.5, ids, mpl.colors.hsv_to_rgb(hue))
+    return [(np.clip(picture, 0, 1) * 255).astype(np.uint8) for picture in pictures]
+
+
+def renderer_of(name: str, cues: bool = False) -> Renderer:
+    """The renderer of the trial that stands for a scenario, in free colours or with cues."""
+    preset, index, _ = TRIALS[name]
+    seed = trial_seed("picture", name, "testing", index)
+    scene = sample_scene(name, seed, get_preset(name, preset).params)
+    return Renderer(with_role_colors(scene) if cues else scene, simulate(scene), SIZE, SIZE)
+
+
+def grid(tiles: list[NDArray[np.uint8]], columns: int) -> NDArray[np.uint8]:
+    """Square tiles in rows, with black between them."""
+    rows = -(-len(tiles) // columns)
+    side = SIZE + GAP
+    sheet = np.zeros((rows * side + GAP, columns * side + GAP, 3), np.uint8)
+    for number, tile in enumerate(tiles):
+        top, left = (GAP + side * part for part in divmod(number, columns))
+        sheet[top : top + SIZE, left : left + SIZE] = tile
+    return sheet
 
 
 def main() -> None:
-    """Sample, simulate, render, draw."""
-    plt.style.use("dark_background")
-    figure, axes = plt.subplots(len(SCENARIOS), len(COLUMNS), figsize=(14, 6.1))
-    for number, (name, index) in enumerate(SCENARIOS.items()):
-        scene = with_role_colors(sample_scene(name, trial_seed("picture", name, "testing", index)))
-        trajectory = simulate(scene)
-        renderer = Renderer(scene, trajectory, SIZE, SIZE)
-        speeds = np.linalg.norm(trajectory.velocities, axis=2).max(axis=1)
-        busy = int(np.argmax(speeds[10:] * (np.arange(10, len(speeds)) < 120))) + 10
-        moving = renderer.render(busy, ("color", "depth", "normals", "ids", "flow"))
-        ends = [renderer.render(at, ("color",)).color for at in (0, len(trajectory) - 1)]
-        pictures = [ends[0], moving.color, ends[1], *painted(moving)]
-        for axis, title, picture in zip(axes[number], COLUMNS, pictures, strict=True):
-            axis.imshow(picture)
-            axis.set_axis_off()
-            if number == 0:
-                axis.set_title(title, fontsize=10)
-    figure.subplots_adjust(0.005, 0.005, 0.995, 0.95, wspace=0.02, hspace=0.02)
-    figure.savefig(Path(__file__).with_suffix(".png"), dpi=90)
+    """Sample, simulate, render, put together."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("official", nargs="?", type=Path)
+    official = parser.parse_args().official
+    frames = [renderer_of(name).render(at).color for name, (_, _, at) in TRIALS.items()]
+    ours = grid([frame for frame in frames if frame is not None], 4)
+    name, passes = PASSES
+    trial = renderer_of(name, cues=True)
+    first = trial.render(0, ("color", "ids"))
+    moving = trial.render(TRIALS[name][2], passes)
+    assert first.color is not None and first.ids is not None and moving.color is not None
+    roles = role_map(first.ids, trial.scene)
+    cues = np.where(roles[..., 3:] > 0, roles[..., :3], first.color // 3)
+    strip = [first.color, cues.astype(np.uint8), moving.color, *painted(moving)]
+    top = ours
+    if official is not None:
+        picture = Image.open(official).convert("RGB").resize((ours.shape[1], ours.shape[0]))
+        top = np.concatenate([ours, np.full((len(ours), GAP, 3), 255, np.uint8), picture], axis=1)
+    below = Image.fromarray(grid(strip, len(strip)))
+    height = round(below.height * top.shape[1] / below.width)
+    whole = np.concatenate([top, np.asarray(below.resize((top.shape[1], height)))])
+    Image.fromarray(whole).save(Path(__file__).with_suffix(".jpg"), quality=88)
 
 
 if __name__ == "__main__":
