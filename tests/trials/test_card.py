@@ -107,9 +107,9 @@ def test_counts_and_rates_are_those_of_the_index(dataset: Path, tmp_path: Path) 
     lines = text.splitlines()
     assert "| training | drop | 4 | 0.250 | 0 | 60 | - | free |" in lines
     assert "| testing | drop | 2 | 1.000 | 0 | 60 | 0.875 | redyellow |" in lines
-    assert "6 simulated physical scenes" in text
+    assert "6 simulated physical scenes, 6 of them with movies" in text
     assert "- Agent and patient touch in 0.250 of the 4 training trials." in lines
-    assert "5 scenes were drawn at random" in text and "1 scenes were imported" in text
+    assert "5 scenes were drawn at random" in text and "1 scene was imported" in text
     assert "In 1 of 6 trials something still moved" in text
     assert "0.875 of cases, measured on 2 of 6 trials" in text
     assert "min_visible = 0.0005, robust = 0.5, observed_contact = False" in text
@@ -122,8 +122,23 @@ def test_the_card_follows_the_index(dataset: Path, tmp_path: Path) -> None:
     write_index(tmp_path, table)
     text = write_card(tmp_path).readme.read_text()
     assert "| training | drop | 1 | 0.000 | 0 | 60 | - | free |" in text
-    assert "imported from records" not in text and "settings of the package" not in text
+    assert "imported from records" not in text and "were chosen with" not in text
     assert "was not measured" in text
+
+
+def test_states_alone_have_no_movies_to_describe(tmp_path: Path) -> None:
+    _make(tmp_path, "training", "only", movies=False)
+    paths = find_trials(tmp_path)[0]
+    for path in (paths.movie, paths.observed_movie, paths.map):
+        path.unlink()
+    table, problems = build_index(tmp_path)
+    assert not problems
+    write_index(tmp_path, table)
+    card = write_card(tmp_path)
+    metadata = json.loads(card.metadata.read_text())
+    assert [item["@id"] for item in metadata["distribution"]] == ["index.parquet", "trial-files"]
+    assert "none of them with movies" in metadata["description"]
+    assert "H.264" not in card.metadata.read_text()
 
 
 def test_every_column_has_a_meaning() -> None:

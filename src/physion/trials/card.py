@@ -84,11 +84,11 @@ def write_card(
 
 def description(facts: Facts) -> str:
     """What the dataset is, in a few sentences."""
-    n = len(facts.index)
     return (
-        f"{n} simulated physical scenes with their movies. Each movie is stopped after its first "
-        "part; the question is whether one thing, the agent, touches another, the patient, before "
-        "everything is over. Made with the package physion after the study of Bear et al. (2021)."
+        f"{len(facts.index)} simulated physical scenes, {facts.movies or 'none'} of them with "
+        "movies. Who predicts sees the first part of a trial; the question is whether one thing, "
+        "the agent, touches another, the patient, at any time of it. Made with the package physion "
+        "after the study of Bear et al. (2021)."
     )
 
 

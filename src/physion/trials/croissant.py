@@ -95,7 +95,7 @@ def croissant(facts: Facts, terms: Terms, description: str, citation: str) -> di
 
 def responsible(facts: Facts) -> dict[str, Any]:
     """Properties of the responsible-AI vocabulary."""
-    index, n = facts.index, len(facts.index)
+    n = len(facts.index)
     return {
         "rai:dataCollection": collection(facts),
         "rai:dataCollectionType": ["Software Collection"]
@@ -123,12 +123,18 @@ def responsible(facts: Facts) -> dict[str, Any]:
         "rai:dataReleaseMaintenancePlan": f"The {n - facts.imported} trials with a seed can be "
         f"made again by {facts.versions('package')}; every file's SHA-256 is in the index, and "
         "`physion verify` compares them. A version of other pictures or labels gets a new number.",
-        "rai:dataPreprocessingProtocol": [
-            f"Movies are H.264 of {size}; the observed part is a file of its own."
-            for size in sorted({f"{w} x {h} pixels" for w, h in zip(index["width"], index["height"],
-                                                                    strict=True)})
-        ],
-    }  # fmt: skip
+        "rai:dataPreprocessingProtocol": preprocessing(facts),
+    }
+
+
+def preprocessing(facts: Facts) -> list[str]:
+    """What became of the simulation before it was stored."""
+    sizes = facts.index[["width", "height"]].drop_duplicates().sort_values(["width", "height"])
+    text = ", ".join(f"{row.width} x {row.height}" for row in sizes.itertuples())
+    said = ["States are stored as the engine computed them, in single precision."]
+    if facts.movies:
+        said.append(f"Movies are H.264 ({text} pixels); the observed part is a file of its own.")
+    return said
 
 
 def _distribution(facts: Facts) -> list[dict[str, Any]]:

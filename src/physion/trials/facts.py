@@ -96,6 +96,11 @@ class Facts:
         """Trials whose scenes were not drawn by a seed but came from outside."""
         return int(self.index["seed"].isna().sum())
 
+    @property
+    def movies(self) -> int:
+        """Trials with movies; the others are states alone."""
+        return int(self.index["movie"].notna().sum())
+
     def versions(self, column: str) -> str:
         """The different values of a column as one text."""
         return ", ".join(sorted({str(value) for value in self.index[column].dropna()}))
@@ -134,17 +139,22 @@ def collection(facts: Facts) -> str:
     parts = []
     if drawn:
         parts.append(
-            f"{drawn} scenes were drawn at random by the samplers of {facts.versions('package')}."
+            f"{drawn} {_scenes(drawn)} drawn at random by the samplers of "
+            f"{facts.versions('package')}."
         )
     if facts.imported:
         parts.append(
-            f"{facts.imported} scenes were imported from records of scenes made elsewhere."
+            f"{facts.imported} {_scenes(facts.imported)} imported from records made elsewhere."
         )
     parts.append(
         f"All were simulated by {facts.versions('engine')} and rendered by "
         f"{facts.versions('renderer')}."
     )
     return " ".join(parts)
+
+
+def _scenes(count: int) -> str:
+    return "scene was" if count == 1 else "scenes were"
 
 
 def missing(facts: Facts) -> str:
@@ -169,7 +179,7 @@ def biases(facts: Facts) -> list[str]:
     }
     if chosen and facts.imported < len(index):
         told = ", ".join(f"{name} = {value}" for name, value in chosen.items())
-        said.append(f"Drawn trials were chosen with these settings of the package: {told}.")
+        said.append(f"Drawn trials were chosen with these settings of `physion generate`: {told}.")
     said.append(
         "Shapes, sizes, colours, rooms and cameras follow the package's samplers or the imported "
         "scenes, not the statistics of any real place."
