@@ -198,9 +198,9 @@ def _above_ramp(target: Body, ramp: Body) -> Body:
     corners = world_corners(ramp)
     top, bottom = corners[:, 2].max(), corners[:, 2].min()
     ridge, foot = corners[corners[:, 2] > top - 1e-9, 0].max(), corners[:, 0].max()
-    tilts = np.linspace(0.0, math.atan2(top - bottom, foot - ridge), 64)[:, None]
+    grades = np.linspace(0.0, (top - bottom) / (foot - ridge), 256)[:, None]
     along, up = world_corners(target)[:, 0] - ridge, world_corners(target)[:, 2] - top
-    missing = float((-up - along * np.tan(tilts)).max(axis=1).min())
+    missing = float((-up - along * grades).max(axis=1).min())
     x, y, z = target.position
     return replace(target, position=(x, y, z + missing + HAIR)) if missing > 0 else target
 
