@@ -23,6 +23,7 @@ from physion.scenes.looks import (
 from physion.scenes.prop_parts import Prop
 from physion.scenes.prop_shapes import NATURAL_SIZES
 from physion.scenes.props import (
+    _MODELS,
     FALLBACK,
     PREFIX,
     PROP_CATEGORIES,
@@ -168,6 +169,8 @@ def test_every_category_leads_to_a_prop_that_exists() -> None:
         assert prop_for(category) in PROPS
         assert prop_for(category) != FALLBACK
     assert prop_for("zeppelin") == FALLBACK
+    assert prop_for("vase", "amphora_jar_vase") == "prop:vase_amphora"
+    assert prop_for("vase", "vase_99") == "prop:vase"
 
 
 def record(**changes: object) -> dict[str, object]:
@@ -231,8 +234,9 @@ def test_missing_file_is_a_clear_error(tmp_path: Path) -> None:
 
 def test_official_bounds_are_read_and_agree_with_our_primitives(official: Path) -> None:
     bounds = read_model_bounds(official / "model_bounds.json")
+    assert {model for models in _MODELS.values() for model in models.split()} <= set(bounds)
     for name, found in bounds.items():
-        assert prop_for(found.category) in PROPS
+        assert prop_for(found.category, name) in PROPS
         assert min(found.size) > 0
         if name in shapes and name != "ramp_with_platform_30":
             assert np.ptp(shape(name).bounds, axis=0) == pytest.approx(found.size, abs=1e-3)

@@ -62,6 +62,22 @@ _PROP_OF = {
     for category in categories.split()
 }
 
+_MODELS = {
+    "armchair": "linbrazil_diz_armchair adirondack_chair",
+    "cafe_chair": "chair_thonet_marshall",
+    "carton": "box_24inx18inx12in_cherry",
+    "dog_sitting": "animal_dog_rtsit_1280 animal_dog_rtsit_1282",
+    "moon_globe": "lunar_globe_art_auctor",
+    "vase_amphora": "amphora_jar_vase",
+    "vase_beaker": "vase_02 vase_05 vase_laura_deko_vase_set",
+    "vase_bottle": "vase_01 vase_03 vase_06",
+}
+"""Models of the published trials that another prop than that of their category is more like, by
+their names and proportions."""
+_PROP_OF_MODEL = {
+    model: PREFIX + prop for prop, models in _MODELS.items() for model in models.split()
+}
+
 _CATEGORIES: dict[str, tuple[str, ...]] = {
     "armchair": ("armchair",),
     "bowl": ("bowl",),
@@ -125,8 +141,10 @@ class ModelBounds:
     category: str = ""
 
 
-def prop_for(category: str) -> str:
-    """The shape that stands for library models of ``category``; a crate for unknown ones."""
+def prop_for(category: str, model: str = "") -> str:
+    """The shape that stands for a library ``model`` of ``category``; a crate for unknown ones."""
+    if model in _PROP_OF_MODEL:
+        return _PROP_OF_MODEL[model]
     return _PROP_OF.get(category.lower().replace("_", " "), FALLBACK)
 
 

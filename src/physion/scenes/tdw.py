@@ -255,7 +255,7 @@ class _SceneBuilder:
         if thing.color is None and thing.model not in shapes:
             # Library models bring their own pictures: a model looks the same in every trial.
             chance = np.random.default_rng(stable_hash("library model", thing.model))
-            return prop_look(chance, prop_for(thing.category))
+            return prop_look(chance, prop_for(thing.category, thing.model))
         return Look(thing.color or (0.8, 0.8, 0.8), thing.texture)
 
     def _body(self, thing: LoggedObject) -> Body:
@@ -289,7 +289,7 @@ class _SceneBuilder:
         shift = tuple(a * b for a, b in zip(bounds.bottom, thing.scale, strict=True))
         x, y, z = rotate(thing.rotation, shift)  # type: ignore[arg-type]
         px, py, pz = thing.position
-        return prop_for(thing.category), size, (px + x, py + y, pz + z)  # type: ignore[return-value]
+        return prop_for(thing.category, thing.model), size, (px + x, py + y, pz + z)  # type: ignore[return-value]
 
     def _cloth(self, thing: LoggedObject) -> Cloth:
         assert thing.cloth is not None
