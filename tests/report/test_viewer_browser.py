@@ -11,6 +11,7 @@ import os
 import select
 import shutil
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,15 +20,32 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from viewer_dataset import EVIL, Plan, make_dataset
+
+from physion.report.viewer import ViewerOptions, build_viewer
+from physion.trials.video import read_frames
 
 CHROMIUM = next(
-    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))),
+    (
+        path
+        for name in ("chromium", "chromium-browser", "google-chrome")
+        if (path := shutil.which(name))
+    ),
     None,
 )
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(CHROMIUM is None, reason="no chromium is installed"),
 ]
+
+LAUNCH = """
+import fcntl, os, sys
+ends = [fcntl.fcntl(int(end), fcntl.F_DUPFD, 10) for end in sys.argv[1:3]]
+for place, end in zip((3, 4), ends):
+    os.dup2(end, place)
+os.execvp(sys.argv[3], sys.argv[3:])
+"""
+"""Chromium speaks its protocol on descriptors 3 and 4, whatever the pipes are called here."""
 
 
 class Browser:
@@ -39,11 +57,11 @@ class Browser:
         self._read, from_child = os.pipe()
         flags = ["--headless", "--no-sandbox", "--remote-debugging-pipe", "--no-first-run"]
         flags += ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-extensions"]
-        # The protocol is spoken on descriptors 3 and 4.
-        shell = f'exec "$0" "$@" 3<&{to_child} 4>&{from_child}'
-        command = ["sh", "-c", shell, CHROMIUM, *flags, f"--user-data-dir={profile}", "about:blank"]
+        command = [CHROMIUM, *flags, f"--user-data-dir={profile}", "about:blank"]
         self._process = subprocess.Popen(
-            command, pass_fds=(to_child, from_child), stderr=subprocess.DEVNULL
+            [sys.executable, "-c", LAUNCH, str(to_child), str(from_child), *command],
+            pass_fds=(to_child, from_child),
+            stderr=subprocess.DEVNULL,
         )
         os.close(to_child)
         os.close(from_child)
@@ -52,9 +70,7 @@ class Browser:
         self.events: list[dict[str, Any]] = []
         self._session: str | None = None
         page = next(
-            info
-            for info in self.send("Target.getTargets")["targetInfos"]
-            if info["type"] == "page"
+            info for info in self.send("Target.getTargets")["targetInfos"] if info["type"] == "page"
         )
         attached = self.send("Target.attachToTarget", targetId=page["targetId"], flatten=True)
         self._session = attached["sessionId"]
@@ -175,3 +191,265 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     found = Browser(tmp_path_factory.mktemp("profile"))
     yield found
     found.close()
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A page of the dataset made by hand, drop_1 without details."""
+    folder = tmp_path_factory.mktemp("viewer")
+    make_dataset(folder / "set")
+    options = ViewerOptions(details=2, card_size=64, pass_size=64, stride=2)
+    return build_viewer(folder / "set", folder / "view.html", options).page
+
+
+def shown(browser: Browser) -> list[str]:
+    """Names on the cards that can be seen."""
+    found = browser.ask(
+        "[...document.querySelectorAll('.card')].filter(c => c.checkVisibility())"
+        ".map(c => c.querySelector('b').textContent)"
+    )
+    return list(found)
+
+
+def choose(browser: Browser, name: str, value: str) -> None:
+    browser.ask(
+        f"document.getElementById('{name}').value = {json.dumps(value)};"
+        f"document.getElementById('{name}').dispatchEvent(new Event('input', {{bubbles: true}}))"
+    )
+
+
+def click(browser: Browser, name: str) -> None:
+    browser.ask(f"document.getElementById('{name}').click()")
+
+
+def seek(browser: Browser, frame: int) -> None:
+    """Move the time line, and wait until the movie stands there."""
+    choose(browser, "scrub", str(frame))
+    browser.until(f"document.getElementById('now').textContent.startsWith('frame {frame} of')")
+    browser.ask("new Promise(done => setTimeout(done, 300))")
+
+
+def canvas(browser: Browser, name: str) -> np.ndarray:
+    """What a pass shows, pixel by pixel."""
+    uri = browser.ask(f"document.querySelector('[aria-label=\"{name} pass\"]').toDataURL()")
+    image = Image.open(io.BytesIO(base64.b64decode(uri.split(",")[1])))
+    return np.asarray(image.convert("RGB")).astype(int)
+
+
+def test_grid_plays_and_asks_for_nothing_else(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    browser.until(
+        "[...document.querySelectorAll('video')].filter(v => v.currentTime > 0.1).length >= 3"
+    )
+    assert shown(browser) == ["drape_0", "drop_0", "drop_1", "drop_2"]
+    assert browser.picture(".card video").mean() > 30
+    click(browser, "movies")
+    assert browser.ask("[...document.querySelectorAll('video')].every(v => v.paused)")
+    assert browser.complaints() == []
+    assert browser.requests() == [page.resolve().as_uri()]
+
+
+def test_filters_and_search(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    for name, value, expected in (
+        ("search", "DROP plate", ["drop_0", "drop_1", "drop_2"]),
+        ("search", "no such thing", []),
+        ("scenario", "drape", ["drape_0"]),
+        ("split", "training", ["drop_2"]),
+        ("preset", "other", ["drop_1"]),
+        ("contact", "no", ["drop_1"]),
+        ("observed", "yes", ["drop_2"]),
+        ("observed", "no", ["drape_0", "drop_0", "drop_1"]),
+        ("robust", "0.5", ["drape_0", "drop_0", "drop_1"]),
+        ("robust", "0.625", ["drape_0", "drop_0"]),
+    ):
+        choose(browser, name, value)
+        assert shown(browser) == expected, (name, value)
+        assert browser.ask("document.getElementById('count').textContent").startswith(
+            f"{len(expected)} of 4 trials shown"
+        )
+        browser.ask("document.querySelector('[type=reset]').click()")
+        browser.until("document.getElementById('count').textContent.startsWith('4 of 4')")
+
+
+def test_hidden_labels_tell_nothing(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    assert "contact at 50" in browser.ask("document.body.innerText")
+    click(browser, "labels")
+    assert "contact" not in browser.ask("document.body.innerText").lower()
+    browser.ask("document.querySelectorAll('.card')[1].click()")
+    text = browser.ask("document.getElementById('detail').innerText").lower()
+    assert "contact" not in text and "touch in" not in text and "seed" in text
+    assert not browser.ask("document.querySelector('#track .first').checkVisibility()")
+    click(browser, "play")
+    browser.key("End", 35)
+    assert browser.ask("document.getElementById('now').textContent").startswith("frame 44 of 60")
+    latest = browser.ask(
+        "Math.max(...[...document.querySelectorAll('.card video')].map(v => v.currentTime))"
+    )
+    assert latest <= 45 / 30
+
+
+def test_every_pass_and_the_scene_show_the_frame_of_the_time_line(
+    browser: Browser, page: Path, tmp_path: Path
+) -> None:
+    browser.open(page, "#trial=drop_0")
+    click(browser, "play")
+    strip = json.loads(browser.ask("document.getElementById('detail-1').textContent"))["passes"]
+    movie = tmp_path / "strip.mp4"
+    movie.write_bytes(base64.b64decode(strip["data"]))
+    pictures = read_frames(movie).astype(int)
+    for frame in (0, 31, 48, 59):
+        seek(browser, frame)
+        for place, name in enumerate(("color", "depth", "normals", "ids", "flow")):
+            # Pictures differ from their neighbours where the ball moves, and hardly elsewhere.
+            seen = canvas(browser, name)
+            gaps = np.abs(pictures[:, :, 64 * place : 64 * place + 64] - seen).mean(axis=(1, 2, 3))
+            assert gaps[frame // 2] <= gaps.min() + 0.01, (frame, name)
+            if name == "color":
+                assert gaps.argmin() == frame // 2, frame
+    ids = canvas(browser, "ids")
+    assert ((ids[..., 0] > 150) & (ids[..., 1] < 90)).sum() > 20
+    assert canvas(browser, "depth").std() > 10 and canvas(browser, "normals").std() > 10
+    assert browser.complaints() == []
+
+
+def colored(picture: np.ndarray) -> tuple[float, float, int]:
+    """Mean row and column of what is red, and how much is yellow."""
+    red, green, blue = (picture[..., k].astype(int) for k in range(3))
+    rows, columns = np.nonzero((red > 90) & (green < 60) & (blue < 60))
+    assert len(rows) > 50
+    return rows.mean(), columns.mean(), int(((red > 120) & (green > 110) & (blue < 80)).sum())
+
+
+def test_scene_in_3d_moves_with_the_time_line_and_turns(browser: Browser, page: Path) -> None:
+    browser.open(page, "#trial=drop_0")
+    click(browser, "play")
+    browser.ask("document.querySelector('#solid input').click()")  # without ways and touches
+    seek(browser, 0)
+    first = colored(browser.picture("#scene3d"))
+    assert first[2] > 500
+    seek(browser, 50)
+    assert colored(browser.picture("#scene3d"))[0] > first[0] + 15
+    before = browser.picture("#scene3d").astype(int)
+    browser.ask("document.getElementById('scene3d').focus()")
+    changes = [("ArrowLeft", 37, ""), ("ArrowUp", 38, ""), ("+", 187, "+"), ("-", 189, "-")]
+    for key, code, text in changes:
+        browser.key(key, code, text)
+        browser.ask("new Promise(done => setTimeout(done, 100))")
+        now = browser.picture("#scene3d").astype(int)
+        assert (np.abs(now - before).max(axis=2) > 30).sum() > 200, key
+        before = now
+    assert browser.ask("document.getElementById('now').textContent").startswith("frame 50 of")
+    x, y = browser.ask(
+        "(({x, y, width, height}) => [x + width / 2, y + height / 2])"
+        "(document.getElementById('scene3d').getBoundingClientRect())"
+    )
+    mouse = {"button": "left", "buttons": 1, "clickCount": 1}
+    browser.send("Input.dispatchMouseEvent", type="mousePressed", x=x, y=y, **mouse)
+    browser.send("Input.dispatchMouseEvent", type="mouseMoved", x=x + 80, y=y + 30, **mouse)
+    browser.send("Input.dispatchMouseEvent", type="mouseReleased", x=x + 80, y=y + 30, **mouse)
+    browser.ask("new Promise(done => setTimeout(done, 100))")
+    assert (np.abs(browser.picture("#scene3d") - before).max(axis=2) > 30).sum() > 200
+
+
+def test_cloth_falls_in_3d(browser: Browser, page: Path) -> None:
+    browser.open(page, "#trial=drape_0")
+    click(browser, "play")
+    browser.ask("document.querySelector('#solid input').click()")
+    seek(browser, 2)
+    first = colored(browser.picture("#scene3d"))
+    seek(browser, 50)
+    assert colored(browser.picture("#scene3d"))[0] > first[0] + 20
+
+
+def test_time_line_marks_observed_part_and_every_contact(browser: Browser, page: Path) -> None:
+    browser.open(page, "#trial=drop_2")
+    marks = browser.ask(
+        "[...document.querySelectorAll('#track i')].map(i => [i.className.split(' ')[0],"
+        "parseFloat(i.style.left), parseFloat(i.style.width) || 0])"
+    )
+    shares = [(kind, left * 59 / 100, width * 59 / 100) for kind, left, width in marks]
+    assert [kind for kind, _, _ in shares] == ["seen", "touch", "touch", "first"]
+    expected = [(0, 44.5), (19.5, 2), (29.5, 1), (20, 0)]
+    for (_, left, width), (at, length) in zip(shares, expected, strict=True):
+        assert left == pytest.approx(at, abs=1e-3) and width == pytest.approx(length, abs=1e-3)
+    words = browser.ask("document.getElementById('marks').textContent")
+    assert "45 observed frames" in words and "touch in: 20–21, 30." in words
+
+
+def test_keys_alone_are_enough(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    browser.ask("document.querySelector('.card').focus()")
+    browser.key("Enter", 13, "\r")
+    browser.until("document.getElementById('detail').open")
+    assert browser.ask("document.getElementById('detail-title').textContent") == "drape_0"
+    assert browser.ask("location.hash") == "#trial=drape_0"
+    browser.until("document.getElementById('play').textContent === 'Pause'")
+    browser.until("!document.getElementById('now').textContent.startsWith('frame 0 ')")
+    browser.ask("document.getElementById('scrub').focus()")
+    browser.key(" ", 32, " ")
+    assert browser.ask("document.getElementById('play').textContent") == "Play"
+    browser.key("Home", 36)
+    for key, code, modifiers, frame in (
+        *(("ArrowRight", 39, 0, 1), ("ArrowRight", 39, 8, 11), ("ArrowLeft", 37, 0, 10)),
+        ("End", 35, 0, 59),
+    ):
+        browser.key(key, code, modifiers=modifiers)
+        words = browser.ask("document.getElementById('scrub').getAttribute('aria-valuetext')")
+        assert words.startswith(f"frame {frame} of 60"), key
+    browser.key("n", 78, "n")
+    assert browser.ask("document.getElementById('detail-title').textContent") == "drop_0"
+    browser.key("Escape", 27)
+    browser.until("!document.getElementById('detail').open")
+    assert browser.ask("document.activeElement.querySelector('b').textContent") == "drop_0"
+    assert browser.ask("location.hash") == ""
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_small_screens_hold_everything_in_both_themes(
+    browser: Browser, page: Path, dark: bool
+) -> None:
+    for fragment in ("", "#trial=drop_0", "#trial=drop_2"):
+        browser.open(page, fragment, size=(1024, 600), dark=dark)
+        assert browser.ask("document.documentElement.scrollWidth") <= 1024
+        if fragment:
+            place = browser.ask("document.getElementById('detail').scrollWidth")
+            assert place <= 1024
+            low = browser.ask("document.getElementById('time').getBoundingClientRect().bottom")
+            assert low <= 600, "the time line is seen without scrolling"
+        light = browser.picture()[-3:, :3].mean()
+        assert light < 60 if dark else light > 200
+    names = browser.ask(
+        "[...document.querySelectorAll('button, input, select, canvas, [tabindex]')].filter("
+        "e => !e.labels?.length && !e.textContent.trim() && !e.ariaLabel && e.tabIndex >= 0)"
+        ".map(e => e.outerHTML)"
+    )
+    assert names == []
+
+
+def test_hostile_text_stays_text(browser: Browser, tmp_path: Path) -> None:
+    make_dataset(tmp_path / "set", (Plan("evil", foreign=EVIL),))
+    options = ViewerOptions(card_size=32, pass_size=32, stride=6)
+    page = build_viewer(tmp_path / "set", tmp_path / "v.html", options).page
+    browser.open(page, "#trial=evil")
+    browser.until("document.getElementById('detail').open")
+    text = browser.ask("document.getElementById('detail').textContent")
+    assert text.count(EVIL) >= 6
+    assert browser.ask("document.images.length") == 0
+    assert browser.ask("typeof window.harmed") == "undefined"
+    assert browser.ask("document.title").count(EVIL) == 1
+    assert browser.complaints() == []
+
+
+def test_policy_stops_what_gets_in_all_the_same(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    browser.ask(
+        "document.body.append(Object.assign(document.createElement('script'),"
+        "{textContent: 'window.harmed = 1'}))"
+    )
+    assert browser.ask("typeof window.harmed") == "undefined"
+    assert browser.ask("fetch('http://127.0.0.1:9/').then(() => 'sent', () => 'stopped')") == (
+        "stopped"
+    )
+    assert len([text for text in browser.complaints() if "Content Security Policy" in text]) >= 2

@@ -13,10 +13,7 @@ from physion.atomic import write_atomic
 from physion.errors import BadInputError, UnknownNameError
 from physion.report import viewer_facts, viewer_motion, viewer_movies
 from physion.report.viewer_page import TrialData, render_viewer
-from physion.scenes.looks import with_role_colors
-from physion.scenes.scene import Scene
 from physion.trials.dataset import Dataset
-from physion.trials.trial_file import Trial
 
 Track = Callable[[Iterable[Any], str, int], Iterator[Any]]
 """Passes items on and shows how far it is, as `physion.cli.output.track` does."""
@@ -119,24 +116,20 @@ def _trial_data(
     """What the page holds of one trial, and the shapes that its 3D view needs."""
     paths = dataset.paths(row["trial"])
     trial = dataset.trial(row["trial"])
+    if trial.metadata.playback_rate < 1:
+        raise BadInputError(f"{paths.trial_file}: a movie of {trial.metadata.playback_rate} Hz")
     detail: dict[str, Any] = {
-        "tables": viewer_facts.tables(trial, row),
+        "tables": viewer_facts.tables(trial),
         "runs": viewer_facts.contact_runs(trial),
         "legend": viewer_facts.legend(trial.scene),
     }
     shapes: set[str] = set()
     if row["detailed"]:
-        own = _shown(trial, trial.metadata.look)
-        strip, ranges = viewer_movies.passes_movie(trial, own, options.pass_size, options.stride)
+        strip, ranges = viewer_movies.passes_movie(trial, options.pass_size, options.stride)
         detail["passes"] = strip.as_record()
         detail["ranges"] = {"near": ranges.near, "far": ranges.far, "flow": ranges.flow}
-        detail["motion"] = viewer_motion.pack_motion(_shown(trial, "redyellow"), trial.trajectory)
+        detail["motion"] = viewer_motion.pack_motion(trial.shown("redyellow"), trial.trajectory)
         shapes = {body.shape for body in trial.scene.bodies}
     movie = viewer_movies.small_movie(paths.movie, trial, options.card_size)
     size = {"width": movie.width, "height": movie.height}
-    return TrialData(viewer_facts.card(trial, row) | size, movie.as_record(), detail), shapes
-
-
-def _shown(trial: Trial, look: str) -> Scene:
-    """The scene in the colours of a look."""
-    return with_role_colors(trial.scene) if look == "redyellow" else trial.scene
+    return TrialData(viewer_facts.card(trial) | size, movie.as_record(), detail), shapes

@@ -7,8 +7,6 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-import pandas as pd
-
 from physion.physics.labels import contact_frames
 from physion.report.viewer_motion import role_of
 from physion.report.viewer_passes import thing_colors
@@ -19,11 +17,25 @@ Table = dict[str, Any]
 """``title``; ``header`` or none; ``rows`` of text; ``outcome`` lists rows that give the answer
 away, by number."""
 
+_NAMES = {
+    "physics_seconds": "seconds of physics",
+    "playback_seconds": "seconds of playback",
+    "first_frame": "first frame of contact",
+    "observed": "contact while observed",
+    "min_distance": "smallest gap to the cloth (m)",
+    "robust": "share of jittered runs that agree",
+    "frame_time": "seconds of physics a frame",
+    "playback_rate": "frames of movie a second",
+    "completed": "everything came to rest",
+    "digest": "digest of the motion",
+    "scene_digest": "digest of the scene",
+}
+"""What fields are called where their own names would not do."""
 _OUTCOME = ("contact", "first_frame", "observed", "min_distance", "robust", "recorded_contact")
 
 
-def card(trial: Trial, row: pd.Series) -> dict[str, Any]:
-    """What the grid shows and filters by; ``row`` is the trial's of the index."""
+def card(trial: Trial) -> dict[str, Any]:
+    """What the grid shows and filters by."""
     meta, labels = trial.metadata, trial.labels
     robust = labels.robust
     return {
@@ -39,15 +51,15 @@ def card(trial: Trial, row: pd.Series) -> dict[str, Any]:
         "observedFrames": meta.observed_frames,
         "rate": meta.playback_rate,
         "frameTime": meta.frame_time,
-        "words": _words(trial, row),
+        "words": _words(trial),
     }
 
 
-def _words(trial: Trial, row: pd.Series) -> str:
+def _words(trial: Trial) -> str:
     """All that the search looks through, in small letters."""
     meta, scene = trial.metadata, trial.scene
     parts = [meta.trial, meta.dataset, meta.scenario, meta.split, meta.preset, meta.seed]
-    parts += [meta.digest, meta.look, scene.room, row.get("scene_digest")]
+    parts += [meta.digest, meta.scene_digest, meta.look, scene.room]
     parts += [text for body in scene.bodies for text in (body.name, body.shape, body.look.texture)]
     parts += [cloth.name for cloth in scene.cloths]
     kept = dict.fromkeys(str(part) for part in parts if not _absent(part))
@@ -74,16 +86,16 @@ def legend(scene: Scene) -> list[dict[str, Any]]:
     ]
 
 
-def tables(trial: Trial, row: pd.Series) -> list[Table]:
+def tables(trial: Trial) -> list[Table]:
     """Everything that decides a trial, and what came of it."""
     scene = trial.scene
     found = [
-        _trial_table(trial, row),
         _bodies_table(scene),
         _cloths_table(scene),
         _pushes_table(scene),
         _table("Joints", ("parent", "child"), [(j.parent, j.child) for j in scene.joints]),
-        _parameters_table(scene),
+        _trial_table(trial),
+        _table("Parameters of the scenario", None, _flat("", scene.parameters)),
         _stage_table(scene),
     ]
     return [table for table in found if table["rows"]]
@@ -94,18 +106,17 @@ def _table(title: str, header: Sequence[str] | None, rows: Iterable[Sequence[obj
     return {"title": title, "header": list(header) if header else None, "rows": texts}
 
 
-def _trial_table(trial: Trial, row: pd.Series) -> Table:
+def _trial_table(trial: Trial) -> Table:
     """Times and labels first, then the rest of the metadata as it stands in the file."""
     meta, labels = trial.metadata, trial.labels
-    seconds = meta.frames * meta.frame_time
     facts: dict[str, object] = {
-        "seconds of physics": row.get("physics_seconds", seconds),
-        "seconds of playback": row.get("playback_seconds", meta.frames / meta.playback_rate),
+        "physics_seconds": meta.physics_seconds,
+        "playback_seconds": meta.playback_seconds,
     }
     facts |= {f.name: getattr(labels, f.name) for f in dataclasses.fields(labels)}
     facts |= {f.name: getattr(meta, f.name) for f in dataclasses.fields(meta)}
-    facts.setdefault("scene_digest", trial.scene.physics_digest())
-    table = _table("Trial", None, [(name.replace("_", " "), v) for name, v in facts.items()])
+    rows = [(_NAMES.get(name, name.replace("_", " ")), value) for name, value in facts.items()]
+    table = _table("Trial", None, rows)
     return table | {"outcome": [i for i, name in enumerate(facts) if name in _OUTCOME]}
 
 
@@ -117,9 +128,11 @@ def _bodies_table(scene: Scene) -> Table:
         kind = "scenery" if body.scenery else "fixed" if body.kinematic else "free"
         touch = body.contact
         rows.append(
-            [body.name, role_of(scene, body.name), body.shape, body.mass, touch.static_friction]
-            + [touch.dynamic_friction, touch.restitution, body.scale, body.position, kind]
-            + [_hex(body.look.color), body.look.texture]
+            [
+                *(body.name, role_of(scene, body.name), body.shape, body.mass),
+                *(touch.static_friction, touch.dynamic_friction, touch.restitution),
+                *(body.scale, body.position, kind, _hex(body.look.color), body.look.texture),
+            ]
         )
     return _table("Bodies", header, rows)
 
@@ -128,8 +141,10 @@ def _cloths_table(scene: Scene) -> Table:
     header = ["cloth", "role", "mass (kg)", "size (m)", "position (m)", "resolution"]
     header += ["stretch", "bend", "tether", "colour", "texture"]
     rows = [
-        [c.name, role_of(scene, c.name), c.mass, c.size, c.position, c.resolution]
-        + [c.stretch, c.bend, c.tether, _hex(c.look.color), c.look.texture]
+        [
+            *(c.name, role_of(scene, c.name), c.mass, c.size, c.position, c.resolution),
+            *(c.stretch, c.bend, c.tether, _hex(c.look.color), c.look.texture),
+        ]
         for c in scene.cloths
     ]
     return _table("Cloths", header, rows)
@@ -142,10 +157,6 @@ def _pushes_table(scene: Scene) -> Table:
         for p in scene.pushes
     ]
     return _table("Pushes", header, rows)
-
-
-def _parameters_table(scene: Scene) -> Table:
-    return _table("Parameters of the scenario", None, _flat("", scene.parameters))
 
 
 def _stage_table(scene: Scene) -> Table:
@@ -188,7 +199,7 @@ def text(value: object) -> str:
 
 
 def _absent(value: object) -> bool:
-    return value is None or value is pd.NA or (isinstance(value, float) and math.isnan(value))
+    return value is None or (isinstance(value, float) and math.isnan(value))
 
 
 def _hex(color: Sequence[float]) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.errors import BadInputError
+from physion.physics.labels import contact_frames
 from physion.physics.trajectory import Trajectory
 from physion.rendering.geometry import solid
 from physion.scenes.scene import Scene
@@ -145,13 +146,16 @@ def _cloths(scene: Scene, trajectory: Trajectory) -> list[dict[str, Any]]:
 
 
 def _touches(scene: Scene, trajectory: Trajectory) -> list[list[float]]:
-    """Where agent and patient touch: rows of frame, x, y, z; empty where one of them is cloth."""
+    """Where agent and patient touch in the frames that count as contact: rows of frame, x, y, z."""
     agent, patient = (scene.index(name) for name in (scene.roles.agent, scene.roles.patient))
     contacts = trajectory.contacts
-    pair = np.array([min(agent, patient), max(agent, patient)])
-    rows = np.flatnonzero((contacts.bodies == pair).all(axis=1))
+    pair = (contacts.bodies == sorted((agent, patient))).all(axis=1)
+    counted = np.isin(contacts.frame, contact_frames(scene, trajectory))
+    rows = np.flatnonzero(pair & counted)
     points = np.round(np.nan_to_num(contacts.point[rows].astype(np.float64)), 4)
-    return [
+    found: list[list[float]] = [
         [int(contacts.frame[row]), *(float(v) for v in point)]
         for row, point in zip(rows, points, strict=True)
     ]
+    # The page counts those up to a frame, and a file may hold them in any order.
+    return sorted(found)

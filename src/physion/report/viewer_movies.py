@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.rendering.renderer import PASSES, Renderer
+from physion.errors import BadInputError
+from physion.rendering.renderer import PASSES, Frame
 from physion.report.viewer_passes import Ranges, paint, ranges_of
-from physion.scenes.scene import Scene
 from physion.trials.trial_file import Trial
 from physion.trials.video import encode_movie, read_frames
 
-CRF = 27
+CRF = 25
 """x264's quality: small movies that are looked at, not measured."""
 
 
@@ -54,26 +54,37 @@ def fitted(width: int, height: int, longest: int) -> tuple[int, int]:
 
 
 def small_movie(path: Path, trial: Trial, longest: int) -> Strip:
-    """The movie at ``path`` at ``longest`` pixels along its longer side, all frames of it."""
+    """The movie at ``path`` at ``longest`` pixels along its longer side, all frames of it.
+
+    A trial that was made without movies is rendered from its state instead.
+    """
     meta = trial.metadata
     width, height = fitted(meta.width, meta.height, longest)
-    frames = read_frames(path, size=(height, width))
+    if meta.movies:
+        frames = read_frames(path, size=(height, width))
+        if len(frames) != meta.frames:
+            raise BadInputError(f"{path} has {len(frames)} frames, its trial {meta.frames}")
+    else:
+        renderer = trial.renderer(width, height)
+        frames = np.stack([_color(renderer.render(index)) for index in range(meta.frames)])
     data = encode_movie(frames, rate=meta.playback_rate, crf=CRF)
     return Strip(data, ("color",), width, height, 1, meta.playback_rate)
 
 
-def passes_movie(trial: Trial, scene: Scene, longest: int, stride: int) -> tuple[Strip, Ranges]:
-    """All passes of every ``stride``-th frame, rendered from the state, and their scales.
+def _color(frame: Frame) -> NDArray[np.uint8]:
+    assert frame.color is not None
+    return frame.color
 
-    ``scene`` is the trial's in the colours to be shown.
-    """
+
+def passes_movie(trial: Trial, longest: int, stride: int) -> tuple[Strip, Ranges]:
+    """All passes of every ``stride``-th frame, rendered from the state, and their scales."""
     meta = trial.metadata
     width, height = fitted(meta.width, meta.height, longest)
-    renderer = Renderer(scene, trial.trajectory, width, height)
+    renderer = trial.renderer(width, height)
     frames = [renderer.render(index, PASSES) for index in range(0, meta.frames, stride)]
     ranges = ranges_of(frames)
     pictures: NDArray[np.uint8] = np.stack(
-        [np.concatenate(paint(frame, scene, ranges), axis=1) for frame in frames]
+        [np.concatenate(paint(frame, trial.scene, ranges), axis=1) for frame in frames]
     )
     rate = max(1, round(meta.playback_rate / stride))
     data = encode_movie(pictures, rate=rate, crf=CRF)

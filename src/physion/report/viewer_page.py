@@ -18,7 +18,18 @@ from typing import Any
 
 from physion.errors import BadInputError
 
-SCRIPTS = ("dom", "player", "timeline", "matrix", "scene3d", "grid", "detail", "main")
+SCRIPTS = (
+    "dom",
+    "player",
+    "timeline",
+    "matrix",
+    "webgl",
+    "motion",
+    "scene3d",
+    "grid",
+    "detail",
+    "main",
+)
 """Parts of the script in the order in which they need each other."""
 
 

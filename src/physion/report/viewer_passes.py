@@ -112,14 +112,16 @@ def paint_flow(flow: NDArray[np.floating], scale: float) -> Picture:
     """Flow (H, W, 2), pixels right and down: direction as hue, speed as brightness.
 
     Red goes right, and the hue runs through yellow (down), cyan (left) to violet (up). Full
-    brightness is ``scale`` pixels or more; black is rest; grey is undefined.
+    brightness is ``scale`` pixels or more, half of it a quarter of that, so that slow motion is
+    seen too; black is rest; grey is undefined.
     """
     x, y = (np.asarray(flow[..., k], np.float64) for k in (0, 1))
     known = np.isfinite(x) & np.isfinite(y)
     x, y = np.where(known, x, 0.0), np.where(known, y, 0.0)
     hue = np.arctan2(y, x) / (2 * np.pi) % 1.0
     speed = np.clip(np.hypot(x, y) / scale, 0.0, 1.0)
-    picture = _bytes(hsv_to_rgb(np.stack([hue, np.ones_like(hue), speed], axis=-1)))
+    colors = np.stack([hue, np.ones_like(hue), np.sqrt(speed)], axis=-1)
+    picture = _bytes(hsv_to_rgb(colors))
     picture[~known] = NOWHERE
     return picture
 

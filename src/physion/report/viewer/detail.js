@@ -74,10 +74,11 @@ class Detail {
       }
       swatch.setAttribute("aria-hidden", "true");
       swatch.append(square);
-      return make("li", {}, swatch, role ? `${name} (${role})` : name);
+      const words = role ? `${name} (${role})` : name;
+      return detail.passes ? make("li", {}, swatch, words) : make("li", {}, words);
     });
     this.note = make("p", { class: "note", hidden: true, role: "status" });
-    const legend = make("ul", { class: "legend", tabindex: 0, "aria-label": "Things by the colour of their ids" }, ...things);
+    const legend = make("ul", { class: "legend", tabindex: 0, "aria-label": "Things in the scene" }, ...things);
     byId("passes").className = detail.passes ? "" : "alone";
     byId("passes").replaceChildren(...figures, legend, this.note);
   }

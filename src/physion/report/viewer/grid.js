@@ -38,8 +38,7 @@ class Grid {
   item(card, number) {
     const video = make("video", { playsinline: true, loop: true, "aria-hidden": true, tabindex: -1 });
     video.muted = true;
-    const [width, height] = [card.width, card.height];
-    Object.assign(video, { width, height });
+    Object.assign(video, { width: card.width, height: card.height });
     const words = make("span", { class: "words" }, ...badges(card));
     const button = make("button", { type: "button", class: "card" }, video, make("b", {}, card.trial), words);
     button.onclick = () => this.open(number);
@@ -107,9 +106,7 @@ class Grid {
 
   setPlaying(playing) {
     this.playing = playing;
-    const button = byId("movies");
-    button.textContent = playing ? "Movies play" : "Movies stand";
-    button.setAttribute("aria-pressed", playing);
+    byId("movies").textContent = playing ? "Movies play" : "Movies stand";
     for (const video of this.visible) this.run(video);
   }
 

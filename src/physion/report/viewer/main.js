@@ -48,7 +48,6 @@ byId("labels").onclick = () => {
   const labelled = !grid.labelled;
   document.body.classList.toggle("unlabelled", !labelled);
   byId("labels").textContent = labelled ? "Labels shown" : "Labels hidden";
-  byId("labels").setAttribute("aria-pressed", labelled);
   grid.setLabelled(labelled);
   detail.setLabelled(labelled);
 };

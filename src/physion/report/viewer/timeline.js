@@ -38,14 +38,13 @@ class TimeLine {
   }
 
   show(frame, frameTime) {
-    const part = frame < this.card.observedFrames ? "observed" : "to be predicted";
+    const part = frame < this.card.observedFrames ? "observed" : "unobserved";
     const physics = (frame * frameTime).toFixed(2);
     const movie = (frame / this.card.rate).toFixed(2);
     this.scrub.value = frame;
     this.scrub.setAttribute("aria-valuetext", `frame ${frame} of ${this.card.frames}, ${part}`);
-    const now = byId("now");
-    now.replaceChildren(
-      `frame ${frame} of ${this.card.frames} (${part})`, make("br"),
+    byId("now").replaceChildren(
+      `frame ${frame} of ${this.card.frames}, ${part}`, make("br"),
       `${physics} s physics, ${movie} s movie`,
     );
   }

@@ -1,0 +1,353 @@
+"""The viewer's page without a browser: what it holds, what it refuses, that nothing escapes."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import hashlib
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from viewer_dataset import EVIL, FRAMES, PLANS, Plan, make_dataset, make_scene, make_trajectory
+
+from physion.cli import view
+from physion.errors import BadInputError, UnknownNameError
+from physion.report import viewer_facts
+from physion.report.viewer import ViewerOptions, build_viewer, choose_trials
+from physion.report.viewer_motion import STEPS, pack_grid, pack_motion, pack_shapes
+from physion.report.viewer_movies import fitted
+from physion.report.viewer_page import embed_json
+from physion.scenes.shapes import shape
+from physion.scenes.solids import Mesh, solid_properties
+from physion.trials.dataset import Dataset
+from physion.trials.video import read_frames
+
+SMALL = ViewerOptions(card_size=32, pass_size=32, stride=6)
+
+
+class Page(HTMLParser):
+    """The blocks of a page by name, and its other elements."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.raw = path.read_text(encoding="utf-8")
+        self.blocks: dict[str, str] = {}
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self._in: str | None = None
+        self.feed(self.raw)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag in ("script", "style", "title"):
+            self._in = str(dict(attrs).get("id") or tag)
+            self.blocks[self._in] = ""
+
+    def handle_endtag(self, tag: str) -> None:
+        self._in = None
+
+    def handle_data(self, data: str) -> None:
+        if self._in:
+            self.blocks[self._in] += data
+
+    def json(self, name: str) -> Any:
+        return json.loads(self.blocks[name])
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_dataset(tmp_path_factory.mktemp("data") / "set")
+
+
+@pytest.fixture(scope="module")
+def page(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Page:
+    out = tmp_path_factory.mktemp("page") / "view.html"
+    report = build_viewer(dataset, out, SMALL)
+    assert (report.page, report.size, report.shown, report.left_out) == (
+        *(out, out.stat().st_size, 4, 0),
+    )
+    return Page(out)
+
+
+# --- the whole page ------------------------------------------------------------------------------
+
+
+def test_page_holds_every_trial_with_its_label(page: Page) -> None:
+    cards = {card["trial"]: card for card in page.json("cards")}
+    assert list(cards) == ["drape_0", "drop_0", "drop_1", "drop_2"]
+    assert [cards[n]["contact"] for n in cards] == [True, True, False, True]
+    assert [cards[n]["first"] for n in cards] == [55, 50, None, 20]
+    assert [cards[n]["observed"] for n in cards] == [False, False, False, True]
+    assert [cards[n]["robust"] for n in cards] == [1.0, 1.0, 0.5, None]
+    assert page.json("totals") == {"drop": 3, "drape": 1}
+    assert page.json("detail-3")["runs"] == [[20, 21], [30, 30]]
+    assert page.json("detail-0")["runs"] == [[55, 55]]
+    assert page.blocks["title"] == "by-hand"
+
+
+def test_movies_are_those_of_the_trials(page: Page, tmp_path: Path) -> None:
+    movie = page.json("movie-1")
+    assert (movie["width"], movie["height"], movie["stride"], movie["rate"]) == (32, 32, 1, 30)
+    path = tmp_path / "m.mp4"
+    path.write_bytes(base64.b64decode(movie["data"]))
+    grey = read_frames(path).mean(axis=(1, 2, 3))
+    assert np.abs(grey - (np.arange(FRAMES) * 3 + 40)).max() < 4
+
+
+def test_passes_lie_side_by_side(page: Page, tmp_path: Path) -> None:
+    strip = page.json("detail-1")["passes"]
+    assert strip["tiles"] == ["color", "depth", "normals", "ids", "flow"]
+    path = tmp_path / "m.mp4"
+    path.write_bytes(base64.b64decode(strip["data"]))
+    frames = read_frames(path)
+    assert frames.shape == (FRAMES // 6, 32, 5 * 32, 3)
+    assert strip["rate"] * strip["stride"] == 30
+    ids = frames[0, :, 96:128].astype(int)
+    red = (ids[..., 0] > 150) & (ids[..., 1] < 90)
+    yellow = (ids[..., 0] > 170) & (ids[..., 1] > 140) & (ids[..., 2] < 110)
+    assert red.sum() > 5 and yellow.sum() > 20
+    # The ball comes down, and with it the red of the ids.
+    last = frames[-1, :, 96:128].astype(int)
+    later = (last[..., 0] > 150) & (last[..., 1] < 90)
+    assert np.nonzero(later)[0].mean() > np.nonzero(red)[0].mean() + 2
+
+
+def test_trials_without_movies_are_rendered(tmp_path: Path) -> None:
+    folder = make_dataset(tmp_path / "set", (Plan("state", movies=False),))
+    build_viewer(folder, tmp_path / "v.html", dataclasses.replace(SMALL, details=0))
+    path = tmp_path / "m.mp4"
+    path.write_bytes(base64.b64decode(Page(tmp_path / "v.html").json("movie-0")["data"]))
+    frames = read_frames(path)
+    assert frames.shape == (FRAMES, 32, 32, 3) and frames.std() > 10
+
+
+def test_same_trials_same_bytes_in_any_folder(dataset: Path, page: Page, tmp_path: Path) -> None:
+    other = make_dataset(tmp_path / "elsewhere")
+    build_viewer(other, tmp_path / "v.html", SMALL)
+    assert (tmp_path / "v.html").read_text(encoding="utf-8") == page.raw
+
+
+def test_policy_allows_its_own_script_and_style_and_no_network(page: Page) -> None:
+    policy = next(a["content"] for t, a in page.tags if t == "meta" and "http-equiv" in a)
+    assert policy is not None
+    rules = dict(rule.split(" ", 1) for rule in policy.split("; "))
+    for name, kind in (("script-src", "script"), ("style-src", "style")):
+        digest = hashlib.sha256(page.blocks[kind].encode()).digest()
+        assert rules.pop(name) == f"'sha256-{base64.b64encode(digest).decode()}'"
+    assert rules.pop("media-src") == "blob:"
+    assert set(rules.values()) == {"'none'"} and "default-src" in rules
+    assert not re.search(r"https?://(?!www\.w3\.org/2000/svg)|@import|url\(|<link", page.raw)
+    names = ("src", "href", "srcset", "poster", "data", "action", "style")
+    assert not [name for _, a in page.tags for name in names if name in a]
+    assert not [name for _, a in page.tags for name in a if name.startswith("on")]
+
+
+def test_foreign_text_cannot_leave_its_block(tmp_path: Path) -> None:
+    folder = make_dataset(tmp_path / "set", (Plan("evil", foreign=EVIL),))
+    build_viewer(folder, tmp_path / "v.html", SMALL)
+    page = Page(tmp_path / "v.html")
+    assert "img" not in {tag for tag, _ in page.tags}
+    assert [a.get("id") for t, a in page.tags if t == "script"] == [
+        *("cards", "totals", "shapes", "movie-0", "detail-0"),
+        None,
+    ]
+    assert page.blocks["title"] == "by-hand" + EVIL
+    detail = page.json("detail-0")
+    tables = {table["title"]: table["rows"] for table in detail["tables"]}
+    assert tables["Bodies"][0][0] == "ball" + EVIL
+    assert {("nested.evil", EVIL), (EVIL, "1")} <= {
+        tuple(row) for row in tables["Parameters of the scenario"]
+    }
+    assert detail["legend"][0]["name"] == "ball" + EVIL
+
+
+def test_embedded_json_has_no_markup_and_no_numbers_that_are_none() -> None:
+    text = embed_json({EVIL: ["<!--", "<script>"]})
+    assert not set("<>&") & set(text)
+    assert json.loads(text) == {EVIL: ["<!--", "<script>"]}
+    with pytest.raises(BadInputError, match="number that is none"):
+        embed_json([float("nan")])
+
+
+# --- which trials --------------------------------------------------------------------------------
+
+
+def _index(rows: list[tuple[str, str]]) -> pd.DataFrame:
+    table = pd.DataFrame(rows, columns=["scenario", "split"])
+    return table.assign(trial=[f"t{i:02d}" for i in range(len(rows))])
+
+
+def test_splits_take_turns_and_the_rest_is_counted() -> None:
+    index = _index([("drop", "testing")] * 5 + [("drop", "training")] * 2 + [("roll", "testing")])
+    chosen, totals = choose_trials(index, ViewerOptions(trials=4, details=1))
+    assert totals == {"drop": 7, "roll": 1}
+    assert chosen["trial"].tolist() == ["t00", "t01", "t05", "t06", "t07"]
+    assert chosen["detailed"].tolist() == [True, False, False, False, True]
+
+
+def test_one_scenario_or_split_can_be_asked_for() -> None:
+    index = _index([("drop", "testing")] * 2 + [("drop", "training"), ("roll", "training")])
+    chosen, totals = choose_trials(index, ViewerOptions(scenario="drop", split="training"))
+    assert chosen["trial"].tolist() == ["t02"] and totals == {"drop": 1}
+    with pytest.raises(UnknownNameError, match="roll"):
+        choose_trials(index, ViewerOptions(scenario="rol"))
+    with pytest.raises(UnknownNameError, match="closest: testing"):
+        choose_trials(index, ViewerOptions(split="testin"))
+
+
+def test_details_only_where_asked(dataset: Path, tmp_path: Path) -> None:
+    options = dataclasses.replace(SMALL, trials=1, details=0, scenario="drop")
+    report = build_viewer(dataset, tmp_path / "v.html", options)
+    assert (report.shown, report.left_out) == (1, 2)
+    page = Page(tmp_path / "v.html")
+    assert not {"passes", "motion"} & page.json("detail-0").keys()
+    assert page.json("shapes") == {}
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"trials": 0}, {"details": -1}, {"stride": 0}, {"card_size": 8}, {"pass_size": 5000}],
+)
+def test_impossible_options_are_refused(wrong: dict[str, int]) -> None:
+    with pytest.raises(BadInputError, match=next(iter(wrong))):
+        ViewerOptions(**wrong)  # type: ignore[arg-type]
+
+
+def test_bad_places_and_broken_trials_leave_no_page(dataset: Path, tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="is a folder"):
+        build_viewer(dataset, tmp_path)
+    with pytest.raises(BadInputError, match="does not exist"):
+        build_viewer(dataset, tmp_path / "none" / "v.html")
+    with pytest.raises(BadInputError, match="no index"):
+        build_viewer(tmp_path, tmp_path / "v.html")
+    broken = make_dataset(tmp_path / "set", PLANS[:1])
+    path = broken / "testing" / "drop" / "drop_0.h5"
+    data = bytearray(path.read_bytes())
+    data[-100] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(BadInputError, match=r"drop_0\.h5 is damaged"):
+        build_viewer(broken, tmp_path / "v.html", SMALL)
+    assert not (tmp_path / "v.html").exists()
+
+
+def test_movie_of_another_length_is_refused(tmp_path: Path) -> None:
+    folder = make_dataset(tmp_path / "set", PLANS[:1])
+    stem = folder / "testing" / "drop" / "drop_0"
+    Path(f"{stem}_img.mp4").write_bytes(Path(f"{stem}_observed.mp4").read_bytes())
+    with pytest.raises(BadInputError, match="45 frames, its trial 60"):
+        build_viewer(folder, tmp_path / "v.html", SMALL)
+
+
+def test_verb_writes_and_says_where(dataset: Path, tmp_path: Path, capsys: Any) -> None:
+    out = tmp_path / "v.html"
+    assert view.main(view.Options(dataset, out, trials=1, details=0)) == 0
+    assert re.fullmatch(
+        rf"2 trials, 2 left out, \d\.\d MB: {re.escape(str(out))}\n", capsys.readouterr().out
+    )
+    assert view.main(view.Options(dataset, out, trials=1, details=0, json=True)) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed == {"page": str(out), "bytes": out.stat().st_size, "shown": 2, "left_out": 2}
+
+
+# --- tables --------------------------------------------------------------------------------------
+
+
+def test_tables_say_what_is_in_the_trial(dataset: Path) -> None:
+    trial = Dataset(dataset).trial("drop_0")
+    tables = {table["title"]: table for table in viewer_facts.tables(trial)}
+    assert list(tables) == [
+        *("Bodies", "Pushes", "Trial", "Parameters of the scenario", "Camera, room, ending"),
+    ]
+    ball = dict(zip(tables["Bodies"]["header"], tables["Bodies"]["rows"][0], strict=True))
+    assert ball["role"] == "agent" and ball["mass (kg)"] == "1.25"
+    assert ball["scale"] == "0.5, 0.5, 0.5" and ball["static friction"] == "0.5"
+    assert [row[9] for row in tables["Bodies"]["rows"]] == ["free", "fixed", "scenery"]
+    assert tables["Pushes"]["rows"] == [["ball", "3, 4, 0", "5", "centre of mass", "7"]]
+    facts = {row[0]: row[1] for row in tables["Trial"]["rows"]}
+    assert facts["seconds of physics"] == "0.59" and facts["seconds of playback"] == "2"
+    assert facts["seed"] == "ff01" and facts["digest of the motion"] == trial.metadata.digest
+    hidden = {tables["Trial"]["rows"][i][0] for i in tables["Trial"]["outcome"]}
+    assert {"contact", "first frame of contact", "contact while observed"} <= hidden
+    assert tables["Parameters of the scenario"]["rows"][:2] == [
+        *(["height", "1"], ["key", "1"]),
+    ]
+
+
+def test_values_as_people_read_them() -> None:
+    assert viewer_facts.text(None) == viewer_facts.text(float("nan")) == "–"
+    assert viewer_facts.text(True) == "yes" and viewer_facts.text(()) == "none"
+    assert viewer_facts.text((0.123456, 2)) == "0.1235, 2" and viewer_facts.text(7) == "7"
+
+
+def test_search_knows_objects_but_not_outcomes(page: Page) -> None:
+    words = next(card for card in page.json("cards") if card["trial"] == "drop_0")["words"]
+    assert {"drop_0", "ball", "sphere", "prop:vase", "plain", "ff01"} <= set(words.split())
+    assert "contact" not in words and words == words.lower()
+
+
+# --- motion --------------------------------------------------------------------------------------
+
+
+def _unpack(text: str, kind: str) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(text), kind)
+
+
+def _points(grid: dict[str, Any]) -> np.ndarray:
+    steps = _unpack(grid["data"], "<u2").reshape(-1, 3)
+    return np.array(grid["low"]) + steps / STEPS * np.array(grid["size"])
+
+
+def test_points_come_back_to_half_a_step() -> None:
+    points = np.random.default_rng(0).normal(size=(50, 3)) * (1, 10, 0)
+    back = _points(pack_grid(points))
+    assert (np.abs(back - points) <= np.ptp(points, axis=0) / STEPS * 0.51 + 1e-12).all()
+    assert _points(pack_grid(np.zeros((0, 3)))).shape == (0, 3)
+
+
+@pytest.mark.parametrize("name", ["cube", "bowl", "prop:vase"])
+def test_meshes_come_back_whole(name: str) -> None:
+    packed = pack_shapes([name, name])[name]
+    points, mesh = _points(packed["points"]), shape(name).mesh
+    faces = _unpack(packed["faces"], "<u2").reshape(-1, 3).astype(np.int32)
+    normals = _unpack(packed["normals"], "<i1").reshape(-1, 3)
+    assert len(points) == len(normals) and faces.max() == len(points) - 1
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 127, atol=2)
+    volume = solid_properties(Mesh(points, faces))[0]
+    assert volume == pytest.approx(solid_properties(mesh)[0], rel=1e-3)
+
+
+def test_motion_keeps_what_moves_frame_by_frame() -> None:
+    scene = make_scene(PLANS[0])
+    trajectory = make_trajectory(scene, PLANS[0])
+    motion = pack_motion(scene, trajectory)
+    assert motion["moving"] == [0]
+    positions = _unpack(motion["positions"], "<f4").reshape(FRAMES, 1, 3)
+    np.testing.assert_array_equal(positions, trajectory.positions[:, :1])
+    turns = _unpack(motion["rotations"], "<i2").reshape(FRAMES, 1, 4) / 32767
+    np.testing.assert_allclose(turns, trajectory.rotations[:, :1], atol=2e-5)
+    assert len(_unpack(motion["start"]["positions"], "<f4")) == 9
+    assert [body["role"] for body in motion["bodies"]] == ["agent", "patient", None]
+    assert motion["touches"][0] == pytest.approx([50, 0.1, 0.2, 0.2])
+    assert [touch[0] for touch in motion["touches"]] == list(PLANS[0].touch)
+
+
+def test_cloth_keeps_its_corners_and_its_ends() -> None:
+    scene = make_scene(PLANS[3])
+    trajectory = make_trajectory(scene, PLANS[3])
+    cloth = pack_motion(scene, trajectory)["cloths"][0]
+    assert (cloth["side"], cloth["role"], cloth["instants"]) == (26, "agent", list(range(FRAMES)))
+    points = _points(cloth["points"]).reshape(FRAMES, 26, 26, 3)
+    corners = trajectory.cloth_vertices.reshape(FRAMES, 31, 31, 3)[:, ::30, ::30]
+    np.testing.assert_allclose(points[:, ::25, ::25], corners, atol=1e-4)
+
+
+def test_sizes_are_even_and_keep_the_shape() -> None:
+    assert fitted(256, 256, 128) == (128, 128)
+    assert fitted(640, 480, 128) == (128, 96)
+    assert fitted(1000, 3, 160) == (160, 2)
+    assert fitted(64, 32, 128) == (64, 32)
