@@ -54,8 +54,8 @@ CLOTH_DISTANCE = CLOTH_THRESHOLD - CLOTH_CONTACT_GAP
 official threshold tells our outcomes, and our threshold the official ones."""
 MAX_SIDE = 4096
 """Pixels; larger pictures are refused."""
-FLOW_FULL = 16.0
-"""Pixels a frame at which the colour of ``_flow`` is brightest."""
+FLOW_FULL = 0.02
+"""Share of the picture's width that a point moves in a frame where ``_flow`` is brightest."""
 
 _DEPTH_RANGE = 100.0 - 0.1
 _NUMBERED = re.compile(r"(?P<config>.+)_(?P<number>\d{4})$")
@@ -182,11 +182,11 @@ def encode_flow(flow: NDArray[np.floating[Any]]) -> Bytes:
     """Flow (H, W, 2) in pixels as colours (H, W, 3): hue its direction, brightness its size.
 
     Red is to the right, then by the colour wheel clockwise; black is still; full brightness is
-    `FLOW_FULL` pixels a frame or more. A picture, not a measurement, as in the official files.
+    `FLOW_FULL` of the picture's width or more. A picture, not a measurement, as in the official files.
     """
     x, y = np.moveaxis(np.nan_to_num(flow.astype(np.float64), posinf=0.0, neginf=0.0), -1, 0)
     hue = np.arctan2(y, x) / (2 * np.pi) % 1.0
-    value = np.minimum(np.hypot(x, y) / FLOW_FULL, 1.0)
+    value = np.minimum(np.hypot(x, y) / (FLOW_FULL * flow.shape[1]), 1.0)
     # Full saturation: each channel is a trapezoid over the hue, a third of a turn apart.
     thirds = np.array([0.0, 2.0, 4.0]) / 6
     wave = np.abs((hue[..., None] - thirds) % 1.0 - 0.5) * 6 - 1

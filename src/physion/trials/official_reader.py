@@ -47,6 +47,7 @@ class OfficialFile(AbstractContextManager["OfficialFile"]):
     def __init__(self, file: h5py.File, where: str) -> None:
         self.where = where
         self._file = file
+        self._groups: dict[str, h5py.Group] = {}
 
     @classmethod
     def open(cls, path: Path) -> OfficialFile:
@@ -167,17 +168,21 @@ class OfficialFile(AbstractContextManager["OfficialFile"]):
 
     def _find(self, path: str) -> Any:
         """The group or array at ``path``, None where there is none; links are refused."""
-        place: Any = self._file
-        for name in path.split("/"):
-            if not isinstance(place, h5py.Group):
-                return None
-            link = self._guard(path, partial(place.get, name, getlink=True))
-            if link is None:
-                return None
-            if not isinstance(link, h5py.HardLink):
-                raise self.bad(path, f"is a {type(link).__name__}, which is not followed")
-            place = self._guard(path, partial(place.__getitem__, name))
-        return place
+        if path in self._groups:
+            return self._groups[path]
+        *parents, name = path.split("/")
+        parent = self._find("/".join(parents)) if parents else self._file
+        if not isinstance(parent, h5py.Group):
+            return None
+        link = self._guard(path, partial(parent.get, name, getlink=True))
+        if link is None:
+            return None
+        if not isinstance(link, h5py.HardLink):
+            raise self.bad(path, f"is a {type(link).__name__}, which is not followed")
+        found = self._guard(path, partial(parent.__getitem__, name))
+        if isinstance(found, h5py.Group):
+            self._groups[path] = found
+        return found
 
     def _check(self, path: str, dataset: h5py.Dataset) -> None:
         if dataset.shape is None:
