@@ -8,18 +8,14 @@ import math
 
 import numpy as np
 import pytest
-from scipy.optimize import linprog
+from sound_scenes import assert_seen, assert_valid, body, bounds, overlap, overlapping, thing
 
 from physion.errors import BadSceneError, UnknownNameError
-from physion.scenes.looks import RED, TEXTURES, YELLOW, mistakable, with_role_colors
-from physion.scenes.placement import (
-    CameraRule,
-    SceneryRule,
-    on_screen,
-    place_camera,
-    rotate,
-    world_bounds,
-)
+from physion.scenes.collide import Params as Collide
+from physion.scenes.dominoes import Params as Dominoes
+from physion.scenes.drop import Params as Drop
+from physion.scenes.looks import RED, YELLOW, mistakable, with_role_colors
+from physion.scenes.placement import CameraRule, SceneryRule, place_camera, rotate, world_bounds
 from physion.scenes.scenarios import Scenario, sample_scene, scenarios
 from physion.scenes.scene import Body, Scene
 from physion.scenes.shapes import shape
@@ -41,30 +37,6 @@ def draw(scenario: Scenario, index: int, distractors: int = 2, occluders: int = 
     return scenario.sample(params, trial_seed("test", scenario.name, "train", index))
 
 
-def body(scene: Scene, name: str) -> Body:
-    return scene.bodies[scene.index(name)]
-
-
-def hulls(thing: Body) -> list[np.ndarray]:
-    """World corners of a body's pieces, a hair smaller so that touching is not overlapping."""
-    corners = [
-        rotate(thing.rotation, p.mesh.vertices * thing.scale) for p in shape(thing.shape).pieces
-    ]
-    return [c.mean(axis=0) + 0.998 * (c - c.mean(axis=0)) + thing.position for c in corners]
-
-
-def overlap(a: np.ndarray, b: np.ndarray) -> bool:
-    """Whether two convex hulls share a point: boxes first, then a linear program."""
-    if (a.max(axis=0) < b.min(axis=0)).any() or (b.max(axis=0) < a.min(axis=0)).any():
-        return False
-    # A point of both hulls: weights of a's corners and of b's corners that give the same point.
-    equal = np.zeros((5, len(a) + len(b)))
-    equal[:3, : len(a)], equal[:3, len(a) :] = a.T, -b.T
-    equal[3, : len(a)] = equal[4, len(a) :] = 1
-    found = linprog(np.zeros(equal.shape[1]), A_eq=equal, b_eq=[0, 0, 0, 1, 1], method="highs")
-    return bool(found.status == 0)
-
-
 def test_overlap_tells_apart() -> None:
     cube = shape("cube").mesh.vertices
     assert overlap(cube, cube + np.array([0.9, 0.9, 0.9]))
@@ -78,15 +50,8 @@ def test_scene_is_valid_and_says_who_is_who(scenario: Scenario) -> None:
     for index in TRIALS:
         scene = draw(scenario, index)
         assert scene.scenario == scenario.name
-        agent, patient = body(scene, scene.roles.agent), body(scene, scene.roles.patient)
-        assert patient.kinematic and not agent.kinematic
-        assert not agent.scenery and not patient.scenery
         assert scene.ending.min_frames == 151
-        for thing in scene.bodies:
-            assert shape(thing.shape).mesh.faces.size
-            assert thing.look.texture in TEXTURES
-            assert math.isclose(math.hypot(*thing.rotation), 1.0)
-            assert world_bounds(thing)[0, 2] > -1e-9, "nothing starts under the floor"
+        assert_valid(scene)
 
 
 def test_same_seed_same_scene_other_seed_other_scene(scenario: Scenario) -> None:
@@ -103,28 +68,33 @@ def test_json_round_trip(scenario: Scenario) -> None:
 
 def test_agent_and_patient_are_in_the_picture(scenario: Scenario) -> None:
     for index in TRIALS:
-        scene = draw(scenario, index)
-        for name in (scene.roles.agent, scene.roles.patient):
-            center = world_bounds(body(scene, name)).mean(axis=0)
-            assert max(map(abs, on_screen(scene.camera, center))) < 1
+        assert_seen(draw(scenario, index))
 
 
 def test_nothing_overlaps_at_the_start(scenario: Scenario) -> None:
     for index in TRIALS:
-        solids = [thing for thing in draw(scenario, index).bodies if not thing.scenery]
-        for one, other in itertools.combinations(solids, 2):
-            for a, b in itertools.product(hulls(one), hulls(other)):
-                assert not overlap(a, b), (index, one.name, other.name)
+        assert not overlapping(draw(scenario, index)), index
 
 
 def test_scenery_stands_clear_of_the_scene(scenario: Scenario) -> None:
     for index in TRIALS:
         scene = draw(scenario, index, distractors=2, occluders=2)
-        solids = [world_bounds(thing) for thing in scene.bodies if not thing.scenery]
-        scenery = [world_bounds(thing) for thing in scene.bodies if thing.scenery]
+        scenery = [bounds(one) for one in scene.bodies if one.scenery]
         assert len(scenery) == 4
-        for a, b in itertools.product(solids, scenery):
+        for a, b in itertools.product(map(bounds, stands(scene)), scenery):
             assert (a[1, :2] < b[0, :2]).any() or (b[1, :2] < a[0, :2]).any()
+
+
+def stands(scene: Scene) -> list[Body]:
+    """Solids, without a plate that reaches so near to the camera that occluders stand on it."""
+    near = math.hypot(*scene.camera.position[:2]) / 2
+    flat = {
+        one.name
+        for one in scene.bodies
+        if one.kinematic and one.scale[2] < 0.05 and math.hypot(*one.scale[:2]) / 2 > near
+    }
+    assert len(flat) <= 1
+    return [one for one in scene.bodies if not one.scenery and one.name not in flat]
 
 
 def test_scenery_changes_neither_motion_nor_camera_nor_looks(scenario: Scenario) -> None:
@@ -156,16 +126,17 @@ def test_role_colors(scenario: Scenario) -> None:
     scene = dataclasses.replace(scene, bodies=tuple(bodies))
     painted = with_role_colors(scene)
     assert painted == with_role_colors(scene)
-    assert body(painted, scene.roles.agent).look.color == RED
-    assert body(painted, scene.roles.patient).look.color == YELLOW
+    assert thing(painted, scene.roles.agent).look.color == RED
+    assert thing(painted, scene.roles.patient).look.color == YELLOW
     assert painted.physics_digest() == scene.physics_digest()
-    for before, after in zip(scene.bodies, painted.bodies, strict=True):
-        assert after.look.texture == before.look.texture
-        if before.name in (scene.roles.agent, scene.roles.patient):
+    for name in scene.names():
+        before, after = thing(scene, name).look, thing(painted, name).look
+        assert after.texture == before.texture
+        if name in (scene.roles.agent, scene.roles.patient):
             continue
-        near = any(mistakable(before.look.color, c) for c in (RED, YELLOW))
-        assert near == (before.look.color != after.look.color)
-        assert not any(mistakable(after.look.color, c) for c in (RED, YELLOW))
+        near = any(mistakable(before.color, c) for c in (RED, YELLOW))
+        assert near == (before.color != after.color)
+        assert not any(mistakable(after.color, c) for c in (RED, YELLOW))
 
 
 def test_what_passes_for_red_or_yellow() -> None:
@@ -202,22 +173,98 @@ def test_camera_follows_the_official_rule() -> None:
         assert 1.5 <= z <= 2.5 and camera.target == (0, 0, 0.7)
 
 
+def still_row(**changed: object) -> Dominoes:
+    """Two metres of upright dominoes that stand where they should."""
+    middle = dataclasses.replace(Dominoes().middle, turn_deg=(0.0, 0.0))
+    values = {"length": 2.0, "middle": middle, "spacing_jitter": 0.0, "lateral_jitter": 0.0}
+    return dataclasses.replace(Dominoes(), **(values | changed))
+
+
 def test_dominoes_rows() -> None:
-    kind = scenarios.get("dominoes")
     seed = trial_seed("test", "dominoes", "train", 0)
     for count in (0, 1, 4, 8):
-        still = kind.params(
-            length=2.0,
-            middle=count,
-            spacing_jitter=0.0,
-            lateral_jitter=0.0,
-            middle_yaw_deg=(0.0, 0.0),
-        )
-        scene = kind.sample(still, seed)
+        scene = sample_scene("dominoes", seed, still_row(middles=count))
         row = [b.position[0] for b in scene.bodies if b.name.startswith("middle")]
         assert row == pytest.approx(np.linspace(-1, 1, count + 2)[1:-1])
-    gap = kind.sample(dataclasses.replace(still, remove_middle=True), seed)
-    assert sum(b.name.startswith("middle") for b in gap.bodies) == 7
+    gaps = set()
+    for index in range(30):
+        seed = trial_seed("test", "dominoes", "train", index)
+        scene = sample_scene("dominoes", seed, still_row(middles=4, remove_middle=True))
+        gaps |= {f"middle_{i}" for i in range(4)} - {b.name for b in scene.bodies}
+        assert sum(b.name.startswith("middle") for b in scene.bodies) == 3
+    assert len(gaps) == 4, "any of them may be left out"
+
+
+def test_dominoes_say_what_does_not_fit() -> None:
+    seed = trial_seed("test", "dominoes", "train", 0)
+    with pytest.raises(BadSceneError, match=r"2 m long .*100 tries: no room left for number \d+"):
+        sample_scene("dominoes", seed, still_row(middles=30))
+    with pytest.raises(BadSceneError, match="probe and target would start inside"):
+        sample_scene("dominoes", seed, still_row(middles=0, length=0.05))
+    with pytest.raises(BadSceneError, match="probe and target would start inside"):
+        sample_scene("collide", seed, dataclasses.replace(Collide(), length=0.2))
+
+
+def test_pushes_turn_with_the_probe() -> None:
+    probe = dataclasses.replace(Dominoes().probe, turn_deg=(40.0, 60.0))
+    for index in TRIALS:
+        seed = trial_seed("test", "dominoes", "train", index)
+        for turned in (True, False):
+            scene = sample_scene("dominoes", seed, still_row(probe=probe, turned_push=turned))
+            x, y, _ = scene.pushes[0].impulse
+            w, *_, z = body(scene, "probe").rotation
+            expected = 2 * math.atan2(z, w) if turned else 0.0
+            assert math.atan2(y, x) == pytest.approx(expected)
+        assert 40 <= math.degrees(2 * math.atan2(z, w)) <= 60
+
+
+def test_drop_stands_on_what_is_below() -> None:
+    zone = Drop().zone
+    for center, height in (((0.0, 0.0), 0.01), ((0.0, 1.0), 0.01), ((0.0, 3.0), 0.0)):
+        params = dataclasses.replace(Drop(), zone=dataclasses.replace(zone, center=center))
+        scene = sample_scene("drop", trial_seed("test", "drop", "train", 1), params)
+        assert bounds(body(scene, "lower"))[0, 2] == pytest.approx(height)
+        assert body(scene, "zone").position == (*center, 0.0)
+
+
+def test_drop_falls_free_and_is_looked_at() -> None:
+    large = dataclasses.replace(Drop().dropped, scale=(0.9, 1.0))
+    for index in TRIALS:
+        seed = trial_seed("test", "drop", "train", index)
+        params = dataclasses.replace(Drop(), dropped=large, camera_height=(0.5, 1.5))
+        scene = sample_scene("drop", seed, params)
+        target, lower = body(scene, "target"), body(scene, "lower")
+        assert bounds(target)[0, 2] - bounds(lower)[1, 2] >= 0.1 - 1e-9
+        fall = target.position[2]
+        assert scene.camera.target == pytest.approx((0, 0, fall / 2))
+        assert 0.5 * fall <= scene.camera.position[2] <= 1.5 * fall
+        low = sample_scene("drop", seed, dataclasses.replace(params, camera_height=(0.0, 0.0)))
+        assert low.camera.position[2] == low.floor + 0.25, "not lower than the rule allows"
+
+
+def test_drop_turns_as_it_is_told() -> None:
+    upright = dataclasses.replace(Drop().dropped, turn_deg=(0.0, 0.0))
+    params = dataclasses.replace(Drop(), dropped=upright, even_turn=False)
+    seed = trial_seed("test", "drop", "train", 0)
+    assert body(sample_scene("drop", seed, params), "target").rotation == (1, 0, 0, 0)
+    even = dataclasses.replace(params, even_turn=True)
+    ups = []
+    for index in range(300):
+        scene = sample_scene("drop", trial_seed("test", "drop", "train", index), even)
+        ups.append(rotate(body(scene, "target").rotation, (0, 0, 1))[2])
+    # On a ball every height is as likely; three even angles give a variance of 1/4.
+    assert np.var(ups) == pytest.approx(1 / 3, abs=0.05) and abs(np.mean(ups)) < 0.1
+
+
+def test_collide_places() -> None:
+    lifted = dataclasses.replace(Collide(), lift=0.2, zone_jitter=0.3)
+    asides = []
+    for index in range(40):
+        scene = sample_scene("collide", trial_seed("test", "collide", "train", index), lifted)
+        assert body(scene, "probe").position == (-1.0, 0.0, 0.2)
+        assert body(scene, "target").position == (1.0, 0.0, 0.0)
+        asides.append(body(scene, "zone").position[1])
+    assert -0.3 <= min(asides) < -0.15 < 0.15 < max(asides) <= 0.3
 
 
 def test_push_has_the_speed_that_was_drawn() -> None:
