@@ -34,9 +34,12 @@ MARGIN = 0.25
 """Two colours are too near if no channel differs by more (official-system.md, section 2.3)."""
 ROLE_MARGIN = 0.33
 """The middle one of the official margins, for what may pass for red or yellow."""
-ROLE_HUE = 15 / 360
-"""Beyond the official rule: a strong colour of this hue or nearer passes for red or yellow, however
-dark it is. The browns of furniture and dogs are further off."""
+ROLE_HUES: dict[Vec3, tuple[float, float]] = {
+    RED: (-35 / 360, 15 / 360),
+    YELLOW: (45 / 360, 80 / 360),
+}
+"""Beyond the official rule: a strong colour between these hues passes for the role's, however dark
+it is: crimson for red, lime for yellow. The browns of furniture and dogs lie between the two."""
 STRONG_SATURATION, STRONG_VALUE = 0.6, 0.3
 
 _PALETTES: dict[str, tuple[Vec3, ...]] = {
@@ -108,8 +111,8 @@ def too_near(color: Vec3, other: Vec3, margin: float = MARGIN) -> bool:
 def mistakable(color: Vec3, role: Vec3) -> bool:
     """Whether people may take ``color`` for the colour of a role."""
     hue, saturation, value = colorsys.rgb_to_hsv(*color)
-    away = abs(hue - colorsys.rgb_to_hsv(*role)[0])
-    same_hue = min(away, 1 - away) <= ROLE_HUE
+    low, high = ROLE_HUES[role]
+    same_hue = low <= hue <= high or low <= hue - 1 <= high
     strong = saturation >= STRONG_SATURATION and value >= STRONG_VALUE
     return too_near(color, role, ROLE_MARGIN) or (same_hue and strong)
 

@@ -242,7 +242,7 @@ def _read_names(single: bool, value: Any, where: str, note: NamesOf) -> Any:
         raise BadInputError(f"{where} must name a {kind}, not {value!r}")
     known = note.names or _known_names(kind)
     for name in names:
-        if name not in known:
+        if not isinstance(name, str) or name not in known:
             raise BadInputError(f"{where}: {UnknownNameError(kind, str(name), known)}")
     return names[0] if single else tuple(names)
 
@@ -250,14 +250,14 @@ def _read_names(single: bool, value: Any, where: str, note: NamesOf) -> Any:
 @functools.cache
 def _known_names(kind: str) -> frozenset[str]:
     from physion.scenes.looks import MATERIALS, TEXTURES
-    from physion.scenes.prop_shapes import NATURAL_SIZES
+    from physion.scenes.props import PROP_CATEGORIES, PROPS
     from physion.scenes.shapes import shapes
 
     return frozenset(
         {
             "shape": shapes.names(),
             "material": (*MATERIALS, *TEXTURES),
-            "prop": tuple(NATURAL_SIZES),
+            "prop": (*PROPS, *PROP_CATEGORIES),
             "room": ROOMS,
         }[kind]
     )
@@ -299,7 +299,9 @@ def _number(kind: type[Any], value: Any, where: str, quantity: Quantity) -> Any:
     if kind is int and value != int(value):
         raise BadInputError(f"{where} must be a whole number ({quantity}), not {value!r}")
     if not quantity.low <= value <= quantity.high:  # false for NaN too
-        raise BadInputError(f"{where} is {value:g}, allowed is {quantity}")
+        # A whole number may be too large for a float.
+        shown = f"{value:g}" if isinstance(value, float) else f"{value!s:.20}"
+        raise BadInputError(f"{where} is {shown}, allowed is {quantity}")
     return kind(value)
 
 

@@ -25,10 +25,12 @@ from physion.scenes.parameters import (
     Range,
     Share,
     Shares,
+    pick,
     uniform,
     yaw,
 )
 from physion.scenes.prop_shapes import NATURAL_SIZES
+from physion.scenes.props import expand_props
 from physion.scenes.scene import Body, Camera, Look, Quat
 from physion.scenes.shapes import shape
 
@@ -67,7 +69,7 @@ class SceneryRule:
 
     distractors: Count = 0
     occluders: Count = 0
-    distractor_props: Props = ("chair", "vase", "dog", "globe", "stool", "coffee_maker")
+    distractor_props: Props = ("full",)
     occluder_props: Props = ("vase", "plant", "lamp", "globe")
     distractor_distance: Shares = (0.4, 1.0)
     occluder_distance: Shares = (0.6, 0.8)
@@ -182,7 +184,7 @@ def _draw_prop(
     distance: Range,
     yaw_deg: float,
 ) -> _Drawn:
-    prop = props[int(rng.integers(len(props)))]
+    prop = pick(rng, expand_props(props))
     size = np.array(NATURAL_SIZES[prop])
     largest = float(size.max())
     size = size * float(np.clip(largest, *limits)) / largest
