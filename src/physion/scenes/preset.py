@@ -114,7 +114,7 @@ def parse_presets(text: str, where: str) -> Mapping[str, Preset]:
     """The presets of a file's ``text``; ``where`` names it in errors."""
     try:
         data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise BadInputError(f"{where} is not TOML: {error}") from error
     _check_keys(data, _FILE_KEYS, where)
     scenario = data.get("scenario")
