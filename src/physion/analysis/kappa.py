@@ -1,0 +1,189 @@
+"""Cohen's kappa of many answer vectors at once: how much two agree beyond what chance gives.
+
+Answers are arrays of shape (raters, stimuli) that hold 1 (yes), 0 (no) or NaN (not answered). A
+pair is compared on the stimuli that both answered, and its chance agreement comes from their shares
+of yes on these. Kappa is (observed - chance) / (1 - chance): 1 for equal answers, 0 for what two
+independent raters would have, below 0 for less than that. It is NaN where chance agreement is 1
+(both always give one and the same answer) or where no stimulus is shared; `why_no_kappa` tells.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from physion.errors import BadInputError
+
+Array = npt.NDArray[np.float64]
+
+
+def as_answers(answers: npt.ArrayLike, what: str = "answers") -> Array:
+    """``answers`` as float64 of shape (raters, stimuli) with 0, 1 or NaN, else `BadInputError`."""
+    try:
+        values = np.asarray(answers, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise BadInputError(f"{what} must be numbers: {error}") from error
+    if values.ndim == 1:
+        values = values[None, :]
+    if values.ndim != 2:
+        raise BadInputError(f"{what} must have the shape (raters, stimuli), not {values.shape}")
+    strange = ~np.isnan(values) & (values != 0) & (values != 1)
+    if strange.any():
+        row, column = np.argwhere(strange)[0]
+        raise BadInputError(
+            f"{what}: rater {row}, stimulus {column} holds {values[row, column]}; "
+            "expected 0, 1 or NaN"
+        )
+    return values
+
+
+def cohen_kappa(first: npt.ArrayLike, second: npt.ArrayLike) -> float:
+    """Cohen's kappa of two answer vectors of shape (stimuli,)."""
+    return float(cross_kappa(first, second)[0, 0])
+
+
+def cross_kappa(
+    first: npt.ArrayLike, second: npt.ArrayLike, weights: npt.ArrayLike | None = None
+) -> Array:
+    """Kappa of every rater of ``first`` (n, stimuli) with every one of ``second``: (n, m).
+
+    ``weights`` (stimuli,) counts how often each stimulus stands in the sample: a bootstrap draw.
+    """
+    a, b = as_answers(first, "first answers"), as_answers(second, "second answers")
+    if a.shape[1] != b.shape[1]:
+        raise BadInputError(f"answers to {a.shape[1]} and to {b.shape[1]} stimuli cannot be paired")
+    counted = np.ones(a.shape[1]) if weights is None else np.asarray(weights, dtype=np.float64)
+    return _kappa(_split(a), _split(b), counted)
+
+
+def pairwise_kappa(answers: npt.ArrayLike) -> Array:
+    """Kappa of every two raters, shape (n, n), symmetric; 1 (or NaN) on the diagonal."""
+    values = as_answers(answers)
+    return cross_kappa(values, values)
+
+
+def error_consistency(answers: npt.ArrayLike, labels: npt.ArrayLike) -> Array:
+    """Do two raters err on the same stimuli, beyond what their accuracies make likely? (n, n)
+
+    It is the kappa of right and wrong rather than of yes and no (Geirhos and others, 2020), so it
+    does not grow just because two raters are both accurate. NaN where both are always right.
+    """
+    values = as_answers(answers)
+    return pairwise_kappa(correctness(values, labels))
+
+
+def correctness(answers: npt.ArrayLike, labels: npt.ArrayLike) -> Array:
+    """1 where an answer equals the label, 0 where not, NaN where there is no answer."""
+    values, truth = as_answers(answers), as_answers(labels, "labels")
+    right = np.where(values == truth, 1.0, 0.0)
+    return np.where(np.isnan(values) | np.isnan(truth), np.nan, right)
+
+
+def pairwise_correlation(answers: npt.ArrayLike) -> Array:
+    """Pearson's r of the binary answers of every two raters, (n, n), on what both answered.
+
+    NaN where one of them gives one answer throughout, or where fewer than 3 stimuli are shared.
+    """
+    values = as_answers(answers)
+    given = (~np.isnan(values)).astype(np.float64)
+    zeros = np.where(given > 0, values, 0.0)
+    n, both = given @ given.T, zeros @ zeros.T
+    mine = zeros @ given.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        covariance = both / n - (mine / n) * (mine.T / n)
+        spread = (mine / n) * (1 - mine / n)
+        r = covariance / np.sqrt(spread * spread.T)
+    return np.where((n >= 3) & (spread > 0) & (spread.T > 0), r, np.nan)
+
+
+def why_no_kappa(first: npt.ArrayLike, second: npt.ArrayLike) -> str:
+    """In words why the kappa of two answer vectors is NaN; empty where it is defined."""
+    a, b = as_answers(first)[0], as_answers(second)[0]
+    shared = ~np.isnan(a) & ~np.isnan(b)
+    if not shared.any():
+        return "kappa: no stimulus that both answered"
+    values = {*a[shared], *b[shared]}
+    return "kappa: both always give the same one answer" if len(values) == 1 else ""
+
+
+def pair_values(matrix: Array) -> Array:
+    """The values of an (n, n) matrix above its diagonal: each pair once, shape (n (n-1) / 2,)."""
+    return np.asarray(matrix[np.triu_indices(len(matrix), 1)], dtype=np.float64)
+
+
+def resampled_mean_of_pairs(matrix: Array, weights: npt.ArrayLike) -> Array:
+    """The mean over pairs of raters in each resample of the raters, shape (resamples,).
+
+    ``matrix`` (n, n) holds a pair's value, ``weights`` (resamples, n) how often each rater is
+    drawn. A rater who is drawn twice makes no pair with himself: his agreement of 1 would lift the
+    mean. Pairs without a value are left out; NaN where no pair is left.
+    """
+    drawn = np.asarray(weights, dtype=np.float64)
+    valid = np.isfinite(matrix) & ~np.eye(len(matrix), dtype=bool)
+    total = np.sum((drawn @ np.where(valid, matrix, 0.0)) * drawn, axis=1)
+    pairs = np.sum((drawn @ valid.astype(np.float64)) * drawn, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(pairs > 0, total / pairs, np.nan)
+
+
+def resampled_kappa(
+    first: npt.ArrayLike, second: npt.ArrayLike, weights: npt.ArrayLike
+) -> npt.NDArray[np.float64]:
+    """`cross_kappa` in each resample of the stimuli, shape (resamples, n, m).
+
+    ``weights`` (resamples, stimuli) says how often a stimulus is drawn.
+    """
+    a, b = _split(as_answers(first)), _split(as_answers(second))
+    return np.stack([_kappa(a, b, row) for row in np.asarray(weights, dtype=np.float64)])
+
+
+def resampled_mean_kappa(
+    answers: npt.ArrayLike,
+    stimuli: npt.ArrayLike | None,
+    raters: npt.ArrayLike | None,
+) -> Array:
+    """The mean kappa of all pairs in each resample of stimuli, of raters, or of both.
+
+    ``stimuli`` (resamples, stimuli) and ``raters`` (resamples, n) count the draws; None leaves that
+    side as it is. Shape (resamples,).
+    """
+    values = as_answers(answers)
+    if stimuli is None:
+        if raters is None:
+            raise BadInputError("give the draws of stimuli, of raters, or of both")
+        return resampled_mean_of_pairs(pairwise_kappa(values), raters)
+    drawn = np.asarray(stimuli, dtype=np.float64)
+    people = np.ones((len(drawn), len(values))) if raters is None else np.asarray(raters)
+    parts = _split(values)
+    return np.concatenate(
+        [
+            resampled_mean_of_pairs(_kappa(parts, parts, draw), row[None])
+            for draw, row in zip(drawn, people, strict=True)
+        ]
+    )
+
+
+def _split(values: Array) -> tuple[Array, Array | None]:
+    """Answers with 0 where there is none, and 1 where there is one (None: everywhere)."""
+    given = ~np.isnan(values)
+    if given.all():
+        return values, None
+    return np.where(given, values, 0.0), given.astype(np.float64)
+
+
+def _kappa(a: tuple[Array, Array | None], b: tuple[Array, Array | None], weights: Array) -> Array:
+    """Kappa from matrix products: one where nothing is missing, else four; weights (stimuli,)."""
+    yes_a, yes_b = a[0] * weights, b[0]
+    both = yes_a @ yes_b.T
+    if a[1] is None and b[1] is None:
+        n: Array | np.float64 = weights.sum()
+        mine, yours = yes_a.sum(axis=1)[:, None], (yes_b @ weights)[None, :]
+    else:
+        given_a = (np.ones_like(yes_a) if a[1] is None else a[1]) * weights
+        given_b = np.ones_like(yes_b) if b[1] is None else b[1]
+        n, mine, yours = given_a @ given_b.T, yes_a @ given_b.T, given_a @ yes_b.T
+    # Over n squared, in whole numbers: 1 - chance is then 0 exactly where it should be.
+    agree = n * (n - mine - yours + 2 * both)
+    chance = mine * yours + (n - mine) * (n - yours)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(n * n - chance > 0, (agree - chance) / (n * n - chance), np.nan)
