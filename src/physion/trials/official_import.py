@@ -29,7 +29,13 @@ from physion.errors import BadInputError, UnknownNameError
 from physion.trials.generate import Track
 from physion.trials.index import build_index, write_index
 from physion.trials.layout import INDEX, SAFE_NAME, SETTINGS, TrialPaths
-from physion.trials.official_layout import FOLDERS, guess_scenario, plain_name, redyellow_name
+from physion.trials.official_layout import (
+    FOLDERS,
+    guess_scenario,
+    plain_name,
+    redyellow_name,
+    split_name,
+)
 from physion.trials.official_run import OfficialReport, run_all
 from physion.trials.plan import SPLITS
 
@@ -128,8 +134,10 @@ def _plan(
         trial = _trial_name(source)
         record = lists.record(source, trial)
         parents = [folder.name, *source.relative_to(folder).parts[:-1]]
-        found = scenario or guess_scenario(
-            plain_name(trial), str(record.get("controller_name")), parents[::-1]
+        found = (
+            scenario
+            or guess_scenario(str(record.get("stimulus", "")), "", ())
+            or guess_scenario(plain_name(trial), str(record.get("controller")), parents[::-1])
         )
         where = str(source.relative_to(folder))
         if found is None:
@@ -183,7 +191,11 @@ class _Lists:
     def record(self, source: Path, trial: str) -> dict[str, Any]:
         """What the lists beside ``source`` and above it say of a trial."""
         name = plain_name(trial)
-        found = dict(self._of_folder(source.parent).get(name, {}))
+        records = self._of_folder(source.parent)
+        numbered = [key for key in records if split_name(key)[1] == plain_name(source.name)]
+        # A folder may be called otherwise than the configuration was when it was made.
+        key = name if name in records or len(numbered) != 1 else numbered[0]
+        found = dict(records.get(key, {}))
         for folder in source.parents[:3]:
             if "contact" not in found and name in (labels := self._labels_in(folder)):
                 found["contact"] = labels[name]
@@ -198,7 +210,8 @@ class _Lists:
                 rows = []
             for row in rows if isinstance(rows, list) else []:
                 if isinstance(row, dict) and isinstance(row.get("stimulus_name"), str):
-                    self._metadata[folder][plain_name(row["stimulus_name"])] = _known(row)
+                    known = _known(row)
+                    self._metadata[folder][plain_name(known["stimulus"])] = known
         return self._metadata[folder]
 
     def _labels_in(self, folder: Path) -> dict[str, bool]:
@@ -214,7 +227,12 @@ class _Lists:
 
 def _known(row: dict[str, Any]) -> dict[str, Any]:
     """What we use of a record of metadata.json, as far as it has the right types."""
-    found: dict[str, Any] = {"controller_name": str(row.get("controller_name"))}
+    # Older files have it as "b'config/0007'".
+    stimulus = row["stimulus_name"].removeprefix("b'").removesuffix("'").replace("/", "_")
+    found: dict[str, Any] = {
+        "stimulus": stimulus,
+        "controller": str(row.get("controller_name")),
+    }
     if isinstance(row.get("does_target_contact_zone"), bool):
         found["contact"] = row["does_target_contact_zone"]
     first = row.get("first_target_contact_zone_frame")

@@ -182,7 +182,7 @@ def encode_flow(flow: NDArray[np.floating[Any]]) -> Bytes:
     """Flow (H, W, 2) in pixels as colours (H, W, 3): hue its direction, brightness its size.
 
     Red is to the right, then by the colour wheel clockwise; black is still; full brightness is
-    `FLOW_FULL` of the picture's width or more. A picture, not a measurement, as in the official files.
+    `FLOW_FULL` of the picture's width or more. A picture, not a measurement, as there.
     """
     x, y = np.moveaxis(np.nan_to_num(flow.astype(np.float64), posinf=0.0, neginf=0.0), -1, 0)
     hue = np.arctan2(y, x) / (2 * np.pi) % 1.0
