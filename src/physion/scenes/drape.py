@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from physion.scenes.parameters import (
     pick,
     place,
     uniform,
+    yaw,
 )
 from physion.scenes.placement import CameraRule, SceneryRule, world_bounds
 from physion.scenes.prop_shapes import NATURAL_SIZES
@@ -42,14 +44,24 @@ MAX_FRAMES = 151
 TRIES = 100
 VERTEX_SPACING = 0.04
 """Metres between the vertices of a cloth: 51 along the official two metres (`Cloth`)."""
-SETTINGS: dict[str, tuple[Vec3, float]] = {
-    "floor_lamp": ((0.613, 0.503, 1.286), -1.098),
-    "sculpture": ((1.387, 1.414, 1.121), -1.086),
-    "desk_lamp": ((0.979, 0.231, 1.177), -1.086),
-    "armchair": ((0.915, 0.914, 0.833), -1.4),
+
+
+class Setting(NamedTuple):
+    """Size of a prop in the world, its place on the floor, metres, and how it is turned."""
+
+    size: Vec3
+    place: tuple[float, float]
+    turn_deg: float = 0.0
+
+
+SETTINGS = {
+    "floor_lamp": Setting((0.613, 0.503, 1.286), (0.058, -1.098)),
+    "sculpture": Setting((1.387, 1.414, 1.121), (0.029, -1.086)),
+    "desk_lamp": Setting((0.979, 0.231, 1.177), (0.187, -1.086), turn_deg=-90.0),
+    "armchair": Setting((0.915, 0.914, 0.833), (0.0, -1.4)),
 }
-"""Size in metres and y of the four models that stand behind the official scenes, as measured."""
-OTHER_PROP_Y = -1.1
+"""The four models that stand behind the official scenes, as measured."""
+OTHER_PLACE = (0.0, -1.1)
 
 Frames = Annotated[int, Quantity("frames", 0, 10000)]
 
@@ -186,13 +198,15 @@ def _draw_cloth(rule: ClothRule, rng: np.random.Generator, palette: Palette) -> 
 
 def _draw_prop(rule: PropRule, rng: np.random.Generator, palette: Palette) -> Body:
     name = pick(rng, rule.props)
-    size, y = SETTINGS.get(name, (NATURAL_SIZES[name], OTHER_PROP_Y))
-    times = uniform(rng, rule.size)
+    found = SETTINGS.get(name, Setting(NATURAL_SIZES[name], OTHER_PLACE))
+    width, depth, height = np.array(found.size) * uniform(rng, rule.size)
+    across = found.turn_deg % 180 != 0
     return Body(
         "prop",
         PREFIX + name,
-        (rule.shift[0], y + rule.shift[1], 0.0),
-        (size[0] * times, size[1] * times, size[2] * times),
+        (found.place[0] + rule.shift[0], found.place[1] + rule.shift[1], 0.0),
+        (depth, width, height) if across else (width, depth, height),
+        yaw(math.radians(found.turn_deg)),
         mass=uniform(rng, rule.mass),
         kinematic=True,
         look=palette.look(rule.textures),
