@@ -296,7 +296,7 @@ def _number(kind: type[Any], value: Any, where: str, quantity: Quantity) -> Any:
     unit = f" in {quantity.unit}" if quantity.unit else ""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise BadInputError(f"{where} must be a number{unit} ({quantity}), not {value!r}")
-    if kind is int and value != int(value):
+    if kind is int and isinstance(value, float) and not value.is_integer():
         raise BadInputError(f"{where} must be a whole number ({quantity}), not {value!r}")
     if not quantity.low <= value <= quantity.high:  # false for NaN too
         # A whole number may be too large for a float.
