@@ -19,10 +19,13 @@ from physion.cli import export as export_verb
 from physion.compute.local import SerialExecutor
 from physion.errors import BadInputError
 from physion.rendering.camera import View
+from physion.scenes.scene import Body, Camera, Joint, Roles, Scene
 from physion.scenes.shapes import shape
 from physion.trials.dataset import Dataset
 from physion.trials.official_export import export_official
+from physion.trials.official_file import _of_stack
 from physion.trials.official_layout import CLOTH_DISTANCE
+from physion.trials.official_objects import OfficialObjects
 from physion.trials.trial_file import Trial
 from physion.trials.video import count_frames
 
@@ -375,6 +378,41 @@ def test_choices_and_refusals(dataset: Path, tmp_path: Path) -> None:
         export_official(dataset, dataset / "out")
     with pytest.raises(BadInputError, match="it is no dataset"):
         export_official(tmp_path, tmp_path / "out")
+
+
+def test_stacks_are_described_as_there(dataset: Path) -> None:
+    """Contain and Link: base and attachment by name, links from the lowest to the highest."""
+    parts = [
+        Body("zone", "cube", (0, 0, 0), kinematic=True),
+        Body("target", "torus", (0, 0, 0.4)),
+        Body("probe", "sphere", (1, 0, 0)),
+        Body("base", "cone", (0, 0, 0.1)),
+        Body("attachment", "cylinder", (0, 0, 0.2)),
+        Body("member_0", "torus", (0, 0, 0.3)),
+        Body("cap", "cube", (0, 0, 0.9)),
+    ]
+    scene = Scene(
+        "a",
+        "link",
+        tuple(parts),
+        Roles("target", "zone", "probe"),
+        Camera((3.0, 0.0, 1.0)),
+        joints=(Joint("base", "attachment"),),
+    )
+    told = _of_stack(OfficialObjects(scene, Dataset(dataset).trial(RIGID).trajectory))
+    assert told == {
+        "base_id": 4,
+        "use_base": True,
+        "base_type": "cone",
+        "attachment_id": 5,
+        "use_attachment": True,
+        "attachent_type": "cylinder",
+        "attachment_fixed": True,
+        "link_type": "torus",
+        "num_links": 2,
+        "target_link_idx": 1,
+        "use_cap": True,
+    }
 
 
 def test_the_verb(

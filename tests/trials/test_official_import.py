@@ -491,6 +491,15 @@ def test_core_folders_become_trials_without_motion(core: Path, dataset: Path) ->
     assert len(Dataset(out).observed.frames(RIGID)) == OBSERVED
 
 
+def test_what_has_no_motion_is_not_exported(core: Path, tmp_path: Path) -> None:
+    bring(core)
+    report = export_official(
+        core.with_name("Physion-in"), tmp_path / "out", executor=SerialExecutor()
+    )
+    assert set(report.failed) == {RIGID, CLOTH} and "motion" in report.failed[RIGID]
+    assert not list((tmp_path / "out").rglob("*.hdf5"))
+
+
 def test_a_movie_without_label_fails_alone(core: Path) -> None:
     rows = list(csv.reader((core / "labels.csv").open()))
     with (core / "labels.csv").open("w") as file:

@@ -28,6 +28,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from physion.atomic import folder_lock, remove_leftovers, write_atomic
 from physion.compute.executor import Executor
 from physion.errors import BadInputError
@@ -133,6 +135,11 @@ def export_trial(job: ExportJob) -> str:
     from physion.trials.official_file import official_file
 
     trial = Trial.open(job.paths.trial_file)
+    if not np.isfinite(trial.trajectory.positions).all():
+        raise BadInputError(
+            f"the motion of trial {job.paths.trial!r} is unknown (it was imported from a movie "
+            "alone): official files are full of it"
+        )
     data, _ = official_file(trial)
     map_path = job.map()
     for path in (*job.movies(), job.hdf5, *([map_path] if map_path else [])):

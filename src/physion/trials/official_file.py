@@ -17,7 +17,7 @@ import h5py
 import numpy as np
 
 import physion
-from physion.scenes.scene import Cloth, Joint
+from physion.scenes.scene import Cloth
 from physion.scenes.shapes import shape
 from physion.trials.official_axes import rotation_matrices, swap_axes, to_official_euler
 from physion.trials.official_frames import PASSES, FrameWriter, put
@@ -169,12 +169,16 @@ def _of_stack(objects: OfficialObjects) -> dict[str, Any]:
     base, attachment = parts["base"], parts["attachment"]
     taken = {part.name for part in (base, attachment) if part is not None}
     taken |= {scene.roles.patient, scene.roles.probe or ""}
-    links = [body for body in scene.bodies if body.name not in taken and not body.scenery]
+    # From the lowest to the highest, as they are stacked.
+    links = sorted(
+        (body for body in scene.bodies if body.name not in taken and not body.scenery),
+        key=lambda body: body.position[2],
+    )
     caps = [body for body in links if body.name.split("_")[0] == "cap"]
     links = [body for body in links if body not in caps]
     names = [body.name for body in links]
     agent = scene.roles.agent
-    fixed = {name for joint in scene.joints for name in _ends(joint)}
+    fixed = {name for joint in scene.joints for name in (joint.parent, joint.child)}
     return {
         "base_id": ids[base.name] if base else NONE,
         "use_base": base is not None,
@@ -188,10 +192,6 @@ def _of_stack(objects: OfficialObjects) -> dict[str, Any]:
         "target_link_idx": names.index(agent) if agent in names else NONE,
         "use_cap": bool(caps),
     }
-
-
-def _ends(joint: Joint) -> tuple[str, str]:
-    return joint.parent, joint.child
 
 
 def _write_static(group: h5py.Group, static: dict[str, Any], objects: OfficialObjects) -> None:

@@ -184,10 +184,14 @@ def encode_flow(flow: NDArray[np.floating[Any]]) -> Bytes:
     Red is to the right, then by the colour wheel clockwise; black is still; full brightness is
     `FLOW_FULL` of the picture's width or more. A picture, not a measurement, as there.
     """
-    x, y = np.moveaxis(np.nan_to_num(flow.astype(np.float64), posinf=0.0, neginf=0.0), -1, 0)
+    moving = np.nan_to_num(flow).any(axis=-1)
+    x, y = np.nan_to_num(flow[moving].astype(np.float64), posinf=0.0, neginf=0.0).T
     hue = np.arctan2(y, x) / (2 * np.pi) % 1.0
     value = np.minimum(np.hypot(x, y) / (FLOW_FULL * flow.shape[1]), 1.0)
     # Full saturation: each channel is a trapezoid over the hue, a third of a turn apart.
     thirds = np.array([0.0, 2.0, 4.0]) / 6
-    wave = np.abs((hue[..., None] - thirds) % 1.0 - 0.5) * 6 - 1
-    return np.asarray(np.rint(np.clip(wave, 0, 1) * value[..., None] * 255).astype(np.uint8))
+    wave = np.abs((hue[:, None] - thirds) % 1.0 - 0.5) * 6 - 1
+    # Most of a picture stands still.
+    colors = np.zeros((*moving.shape, 3), np.uint8)
+    colors[moving] = np.rint(np.clip(wave, 0, 1) * value[:, None] * 255)
+    return colors

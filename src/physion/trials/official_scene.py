@@ -214,7 +214,8 @@ class SceneReader:
             look = prop_look(chance, shape)
         mass = float(self._physics("mass", 1.0)[place])
         still = self._never_moves(place)
-        held = zone or model in RAMPS or (still and mass >= HEAVY)
+        # Flex solids carry their weight on the floor and do not move once settled.
+        held = zone or model in RAMPS or mass >= HEAVY or bool(self.cloths)
         position, rotation = self._first_pose(place)
         return Body(
             name=self.label(place),
