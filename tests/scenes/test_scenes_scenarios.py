@@ -16,6 +16,7 @@ from physion.scenes.dominoes import Params as Dominoes
 from physion.scenes.drop import Params as Drop
 from physion.scenes.looks import RED, YELLOW, mistakable, with_role_colors
 from physion.scenes.placement import CameraRule, SceneryRule, place_camera, rotate, world_bounds
+from physion.scenes.props import expand_props
 from physion.scenes.scenarios import Scenario, sample_scene, scenarios
 from physion.scenes.scene import Body, Scene
 from physion.scenes.shapes import shape
@@ -279,5 +280,6 @@ def test_push_has_the_speed_that_was_drawn() -> None:
 
 
 def test_scenery_rule_defaults_have_props() -> None:
-    for prop in SceneryRule().distractor_props + SceneryRule().occluder_props:
+    rule = SceneryRule()
+    for prop in expand_props(rule.distractor_props + rule.occluder_props):
         assert shape(f"prop:{prop}").pieces
