@@ -91,14 +91,18 @@ def get_preset(scenario: str, name: str) -> Preset:
 def default_presets(scenario: str, split: str) -> tuple[str, ...]:
     """Names of the presets that the trials of a split take in turn.
 
-    The familiarization split has its own; every other split takes the published configurations,
-    but for those that people practised on.
+    The familiarization split has its own. Every other split takes the published configurations of
+    which trials were in the test, each once: those without are the ones that people practised on,
+    and some repeat another under a second name.
     """
     known = load_presets(scenario)
     if split == FAMILIARIZATION and FAMILIARIZATION in known:
         return (FAMILIARIZATION,)
-    published = (preset.name for preset in known.values() if preset.published)
-    return tuple(name for name in published if FAMILIARIZATION not in name) or (DEFAULT,)
+    tested = [preset for preset in known.values() if preset.published and preset.published.tested]
+    chosen = [
+        p.name for i, p in enumerate(tested) if p.params not in [q.params for q in tested[:i]]
+    ]
+    return tuple(chosen) or (DEFAULT,)
 
 
 def read_preset_file(path: Path) -> Mapping[str, Preset]:
