@@ -126,15 +126,23 @@ def resampled_mean_of_pairs(matrix: Array, weights: npt.ArrayLike) -> Array:
         return np.where(pairs > 0, total / pairs, np.nan)
 
 
-def resampled_kappa(
-    first: npt.ArrayLike, second: npt.ArrayLike, weights: npt.ArrayLike
-) -> npt.NDArray[np.float64]:
-    """`cross_kappa` in each resample of the stimuli, shape (resamples, n, m).
+def resampled_kappa(answers: npt.ArrayLike, other: npt.ArrayLike, weights: npt.ArrayLike) -> Array:
+    """Kappa of each rater (n, stimuli) with one other (stimuli,) in each resample of the stimuli.
 
-    ``weights`` (resamples, stimuli) says how often a stimulus is drawn.
+    ``weights`` (resamples, stimuli) says how often a stimulus is drawn. Shape (resamples, n).
     """
-    a, b = _split(as_answers(first)), _split(as_answers(second))
-    return np.stack([_kappa(a, b, row) for row in np.asarray(weights, dtype=np.float64)])
+    (yes_a, given_a), (yes_b, given_b) = _split(as_answers(answers)), _split(as_answers(other))
+    drawn = np.asarray(weights, dtype=np.float64)
+    both = drawn @ (yes_a * yes_b).T
+    if given_a is None and given_b is None:
+        n = drawn.sum(axis=1)[:, None]
+        mine, yours = drawn @ yes_a.T, drawn @ yes_b.T
+    else:
+        mask_a = np.ones_like(yes_a) if given_a is None else given_a
+        mask_b = np.ones_like(yes_b) if given_b is None else given_b
+        n, mine = drawn @ (mask_a * mask_b).T, drawn @ (yes_a * mask_b).T
+        yours = drawn @ (mask_a * yes_b).T
+    return _from_counts(n, mine, yours, both)
 
 
 def resampled_mean_kappa(
@@ -176,14 +184,22 @@ def _kappa(a: tuple[Array, Array | None], b: tuple[Array, Array | None], weights
     yes_a, yes_b = a[0] * weights, b[0]
     both = yes_a @ yes_b.T
     if a[1] is None and b[1] is None:
-        n: Array | np.float64 = weights.sum()
+        n = np.asarray(weights.sum())
         mine, yours = yes_a.sum(axis=1)[:, None], (yes_b @ weights)[None, :]
     else:
         given_a = (np.ones_like(yes_a) if a[1] is None else a[1]) * weights
         given_b = np.ones_like(yes_b) if b[1] is None else b[1]
         n, mine, yours = given_a @ given_b.T, yes_a @ given_b.T, given_a @ yes_b.T
-    # Over n squared, in whole numbers: 1 - chance is then 0 exactly where it should be.
-    agree = n * (n - mine - yours + 2 * both)
+    return _from_counts(n, mine, yours, both)
+
+
+def _from_counts(n: Array, mine: Array, yours: Array, both: Array) -> Array:
+    """Kappa from counts: shared stimuli, either one's yes, both yes.
+
+    Over n squared, in whole numbers: 1 - chance is then 0 exactly where it should be.
+    """
     chance = mine * yours + (n - mine) * (n - yours)
+    agree = n * (n - mine - yours + 2 * both)
+    rest = n * n - chance
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(n * n - chance > 0, (agree - chance) / (n * n - chance), np.nan)
+        return np.where(rest > 0, (agree - chance) / rest, np.nan)

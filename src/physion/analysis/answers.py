@@ -1,0 +1,87 @@
+"""Answers of one scenario as arrays: participants by stimuli, for statistics that need no names."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from physion.errors import BadInputError
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Answers:
+    """Who said what in one scenario.
+
+    - ``sessions`` and ``participants``: names, length n, in the order of the rows of ``yes``;
+    - ``stimuli``: names, length s, sorted: the columns;
+    - ``yes`` (n, s): 1, 0, or NaN where that person did not answer;
+    - ``label`` (s,): 1 where agent and patient touch, else 0;
+    - ``log_rt`` (n, s): log response time in log ms, NaN where not known.
+    """
+
+    scenario: str
+    sessions: tuple[str, ...]
+    participants: tuple[str, ...]
+    stimuli: tuple[str, ...]
+    yes: Array
+    label: Array
+    log_rt: Array
+
+    @property
+    def correct(self) -> Array:
+        """1 where right, 0 where wrong, NaN without an answer; (n, s)."""
+        return np.where(np.isnan(self.yes), np.nan, self.yes == self.label)
+
+    def shares(self) -> Array:
+        """Share of people who said yes, by stimulus, (s,)."""
+        return share(self.yes)
+
+
+def share(values: Array, weights: npt.ArrayLike | None = None) -> Array:
+    """Mean over people by stimulus of values (n, s) with gaps; NaN where nobody answered.
+
+    With ``weights`` (resamples, n), how often each person is drawn: shape (resamples, s).
+    """
+    given = ~np.isnan(values)
+    drawn = np.ones(len(values)) if weights is None else np.asarray(weights, dtype=np.float64)
+    total, count = drawn @ np.where(given, values, 0.0), drawn @ given.astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(count > 0, total / count, np.nan)
+
+
+def answers_of(test: pd.DataFrame, scenario: str) -> Answers:
+    """The answers to one scenario, from the test rows of `participants.Responses`.
+
+    Raises `BadInputError` where the scenario has no answer, or a session two to one stimulus.
+    """
+    rows = test[test["scenario"] == scenario]
+    if rows.empty:
+        raise BadInputError(f"scenario {scenario!r} has no answer of people")
+    person, people = pd.factorize(rows["session"], sort=True)
+    column, stimuli = pd.factorize(rows["stimulus"], sort=True)
+    shape = (len(people), len(stimuli))
+    cells = person * shape[1] + column
+    if len(np.unique(cells)) < len(cells):
+        raise BadInputError(f"scenario {scenario!r}: a session answered one stimulus twice")
+
+    def grid(values: npt.ArrayLike) -> Array:
+        found = np.full(shape[0] * shape[1], np.nan)
+        found[cells] = np.asarray(values, dtype=np.float64)
+        return found.reshape(shape)
+
+    owner = rows.drop_duplicates("session").set_index("session")["participant"]
+    label = rows.drop_duplicates("stimulus").set_index("stimulus")["label"]
+    return Answers(
+        scenario,
+        tuple(map(str, people)),
+        tuple(map(str, owner.loc[people])),
+        tuple(map(str, stimuli)),
+        grid(rows["yes"]),
+        label.loc[stimuli].to_numpy(dtype=np.float64),
+        grid(rows["log_rt"]),
+    )

@@ -1,0 +1,146 @@
+"""Is a P(contact) of 0.8 right 8 times in 10? Brier score, its parts, and the reliability curve."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+from scipy import stats
+
+from physion.errors import BadInputError
+
+Array = npt.NDArray[np.float64]
+
+BINS = 10
+
+
+def brier(p: npt.ArrayLike, label: npt.ArrayLike) -> float:
+    """Mean squared difference of probability and outcome, 0 (perfect) to 1; NaN without any.
+
+    0.25 is what a P of 0.5 throughout has.
+    """
+    values, truth = _checked(p, label)
+    return float(np.mean((values - truth) ** 2)) if len(values) else float("nan")
+
+
+@dataclass(frozen=True)
+class Decomposition:
+    """Brier score = reliability - resolution + uncertainty + within.
+
+    - ``reliability``: mean squared distance of a bin's share of contact from its mean P: 0 is best;
+    - ``resolution``: variance of the bins' shares of contact: large is good;
+    - ``uncertainty``: base rate times one minus base rate: nothing the model can do about it;
+    - ``within``: what bins of more than one value of P leave over (Stephenson and others, 2008:
+      variance of P within bins less twice its covariance with the outcome); 0 where every bin holds
+      one value;
+    - ``skill``: 1 - brier / uncertainty, above 0 where the model beats the base rate; NaN for one
+      outcome alone;
+    - ``calibration_error``: mean distance (not squared) of share and mean P, each bin by its size.
+    """
+
+    brier: float
+    reliability: float
+    resolution: float
+    uncertainty: float
+    within: float
+    skill: float
+    calibration_error: float
+    reason: str
+
+
+def decompose(p: npt.ArrayLike, label: npt.ArrayLike, bins: int = BINS) -> Decomposition:
+    """The Brier score and its parts, with ``bins`` of equal width (`reliability_curve`)."""
+    values, truth = _checked(p, label)
+    if not len(values):
+        nan = float("nan")
+        return Decomposition(nan, nan, nan, nan, nan, nan, nan, "no stimulus")
+    at = _bin(values, bins)
+    n = np.bincount(at, minlength=bins).astype(np.float64)
+    full = n > 0
+    mean_p = np.bincount(at, values, bins)[full] / n[full]
+    share = np.bincount(at, truth, bins)[full] / n[full]
+    weight, base = n[full] / len(values), float(np.mean(truth))
+    place = np.cumsum(full)[at] - 1
+    off_p, off_y = values - mean_p[place], truth - share[place]
+    score, uncertainty = brier(values, truth), base * (1 - base)
+    one = uncertainty == 0
+    return Decomposition(
+        brier=score,
+        reliability=float(np.sum(weight * (mean_p - share) ** 2)),
+        resolution=float(np.sum(weight * (share - base) ** 2)),
+        uncertainty=uncertainty,
+        within=float(np.mean(off_p**2) - 2 * np.mean(off_p * off_y)),
+        skill=float("nan") if one else 1 - score / uncertainty,
+        calibration_error=float(np.sum(weight * np.abs(mean_p - share))),
+        reason="skill: all stimuli have one outcome" if one else "",
+    )
+
+
+def reliability_curve(
+    p: npt.ArrayLike, label: npt.ArrayLike, bins: int = BINS, level: float = 0.95
+) -> pd.DataFrame:
+    """One row a bin of equal width in 0..1, empty ones too.
+
+    Columns: ``from``, ``to`` (the last bin includes 1), ``stimuli``, ``mean_p``, ``share`` (of
+    stimuli with contact) with ``low``, ``high`` (Wilson's interval); NaN in empty bins.
+    """
+    values, truth = _checked(p, label)
+    at = _bin(values, bins)
+    n = np.bincount(at, minlength=bins).astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mean_p, share = np.bincount(at, values, bins) / n, np.bincount(at, truth, bins) / n
+        z = float(stats.norm.ppf(0.5 + level / 2))
+        centre = (share + z * z / (2 * n)) / (1 + z * z / n)
+        half = z / (1 + z * z / n) * np.sqrt(share * (1 - share) / n + (z / (2 * n)) ** 2)
+    edges = np.linspace(0, 1, bins + 1)
+    return pd.DataFrame(
+        {
+            "from": edges[:-1],
+            "to": edges[1:],
+            "stimuli": n.astype(int),
+            "mean_p": mean_p,
+            "share": share,
+            "low": centre - half,
+            "high": centre + half,
+        }
+    )
+
+
+def calibration_table(
+    names: list[str], p_contact: npt.ArrayLike, label: npt.ArrayLike, bins: int = BINS
+) -> pd.DataFrame:
+    """`decompose` of each model: ``p_contact`` (m, s) with NaN for stimuli that a model lacks."""
+    values, truth = np.asarray(p_contact, np.float64), np.asarray(label, np.float64)
+    rows = []
+    for name, own in zip(names, values, strict=True):
+        known = ~np.isnan(own)
+        found = decompose(own[known], truth[known], bins)
+        rows.append({"model": name, "stimuli": int(known.sum()), **vars(found)})
+    return pd.DataFrame(rows)
+
+
+def _bin(values: Array, bins: int) -> npt.NDArray[np.intp]:
+    if bins < 1:
+        raise BadInputError(f"{bins} bins: at least 1 is needed")
+    return np.minimum((values * bins).astype(np.intp), bins - 1)
+
+
+def _checked(p: npt.ArrayLike, label: npt.ArrayLike) -> tuple[Array, Array]:
+    values, truth = np.asarray(p, dtype=np.float64), np.asarray(label, dtype=np.float64)
+    if values.shape != truth.shape or values.ndim != 1:
+        raise BadInputError(f"{values.shape} probabilities and {truth.shape} outcomes do not pair")
+    check_probabilities(values)
+    if not np.isin(truth, (0, 1)).all():
+        raise BadInputError("outcomes must be 0 or 1")
+    return values, truth
+
+
+def check_probabilities(p: npt.ArrayLike, gaps: bool = False) -> None:
+    """Raise `BadInputError` with the first value that is not in 0..1 (``gaps``: or NaN)."""
+    values = np.asarray(p, dtype=np.float64)
+    good = (values >= 0) & (values <= 1) | (np.isnan(values) & gaps)
+    if not good.all():
+        place = tuple(int(i) for i in np.argwhere(~good)[0])
+        raise BadInputError(f"probability {values[place]} at {place} does not lie in 0..1")
