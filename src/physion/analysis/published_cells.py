@@ -36,7 +36,8 @@ def accuracy_table(tables: PublishedTables, bootstrap: Bootstrap | None = None) 
 
     Columns: ``model``, ``scenario``; ``published`` with ``published_low``, ``published_high``
     (bootstrap over the rows that it averages: how it would move with other protocols and seeds,
-    not with other stimuli), ``rows`` (how many), ``without_copies`` (the mean with *observed* once);
+    not with other stimuli), ``rows`` (how many), ``without_copies`` (the mean with
+    *observed* once);
     ``expected`` with ``expected_low``, ``expected_high`` (Wilson's 95 % interval: other stimuli of
     the kind) and ``runs`` (seeds averaged in it), ``stimuli`` (tested; see `tested_stimuli`),
     ``difference`` (expected - published).
@@ -140,7 +141,9 @@ def averaged_in_words(tables: PublishedTables) -> str:
         "training protocols alone. "
     )
     if copies:
-        twice = " and ".join(tables.runs[tables.runs["readout"] == OBSERVED_AGAIN]["model"].unique())
+        twice = " and ".join(
+            tables.runs[tables.runs["readout"] == OBSERVED_AGAIN]["model"].unique()
+        )
         words += (
             f"For {twice} observed counts twice: their readout D repeats C in {equal} of {copies} "
             "rows. "

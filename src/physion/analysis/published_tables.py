@@ -124,9 +124,11 @@ def in_paper_order(table: pd.DataFrame, columns: Sequence[str]) -> pd.DataFrame:
 
 
 def _read_runs(results: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
-    accuracies, kappas = results / "model_human_accuracies.csv", results / "model_human_CohensK.csv"
+    accuracies = results / "model_human_accuracies.csv"
+    kappas = results / "model_human_CohensK.csv"
+    measured = ("Cohens_k_lb", "Cohens_k_med", "Cohens_k_ub", "num_datapoints")
     left = read_csv(accuracies, (*_KEY, *_FACTS, "model_correct"))
-    right = read_csv(kappas, (*_KEY, "Cohens_k_lb", "Cohens_k_med", "Cohens_k_ub", "num_datapoints"))
+    right = read_csv(kappas, (*_KEY, *measured))
     for table, path in ((left, accuracies), (right, kappas)):
         refuse_duplicates(table["scenario"] + " / " + table["ModelID"], str(path))
     where = str(accuracies)
@@ -215,7 +217,5 @@ def _by_scenario(path: Path, columns: dict[str, str]) -> pd.DataFrame:
     raw = read_csv(path, ("scenario", *columns))
     scenario = raw["scenario"].map(scenario_name)
     refuse_duplicates(scenario, str(path))
-    values = {
-        ours: as_numbers(raw[theirs], -1, 1, str(path)) for theirs, ours in columns.items()
-    }
+    values = {ours: as_numbers(raw[theirs], -1, 1, str(path)) for theirs, ours in columns.items()}
     return pd.DataFrame(values, index=pd.Index(scenario))
