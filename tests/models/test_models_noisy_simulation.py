@@ -47,7 +47,12 @@ class StraightEngine:
         self.scenes: list[Scene] = []
 
     def simulate(
-        self, scene: Scene, *, start: State | None = None, frames: int | None = None
+        self,
+        scene: Scene,
+        *,
+        start: State | None = None,
+        frames: int | None = None,
+        until_contact: bool = False,
     ) -> Trajectory:
         count = len(scene.bodies)
         if start is None:
@@ -270,3 +275,12 @@ def test_other_processes_give_the_same_answers() -> None:
         tasks[trial.name] = real.task(ask(trial, simulate(trial)), 1.0)
     outcomes = {o.key: o.value for o in LocalExecutor(2).map(run_task, tasks)}
     assert outcomes == {key: run_task(task) for key, task in tasks.items()}
+
+
+def test_trials_without_motion_are_refused() -> None:
+    motion = StraightEngine().simulate(scene())
+    unknown = replace(
+        motion, positions=np.full_like(motion.positions, np.nan), engine="imported: movie alone"
+    )
+    with pytest.raises(BadInputError, match="no motion to go on from"):
+        ask(scene(), unknown)

@@ -13,10 +13,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from physion.errors import BadInputError, BadSceneError
+from physion.physics.engine import simulate
+from physion.physics.labels import label_contact
 from physion.physics.mujoco_engine import MujocoEngine, RigidRun
 from physion.physics.settings import Settings
 from physion.physics.trajectory import ENVIRONMENT, Trajectory
+from physion.scenes.scenarios import sample_scene
 from physion.scenes.scene import Body, Camera, Contact, Ending, Joint, Push, Roles, Scene
+from physion.seeds import trial_seed
 
 G = 9.81
 ROUGH = Contact(0.5, 0.5, 0.0)
@@ -287,3 +291,16 @@ def test_higher_floor_carries_bodies() -> None:
     scene = replace(scene_of(Body("a", "cube", (0, 0, 0.5), (0.2, 0.2, 0.2))), floor=0.25)
     path = run(scene, frames=60)
     assert path.positions[-1, 0, 2] == pytest.approx(0.25, abs=2e-3)
+
+
+def test_stopping_at_contact_gives_the_same_label_and_the_same_start() -> None:
+    outcomes = set()
+    for index in range(6):
+        scene = sample_scene("collide", trial_seed("until", "collide", "x", index))
+        whole, cut = simulate(scene), simulate(scene, until_contact=True)
+        label = label_contact(scene, whole)
+        outcomes.add(label.contact)
+        assert label_contact(scene, cut) == label
+        assert np.array_equal(cut.positions, whole.positions[: len(cut)])
+        assert len(cut) == (label.first_frame + 1 if label.first_frame is not None else len(whole))
+    assert outcomes == {True, False}

@@ -34,7 +34,12 @@ class Flight:
         self.calls, self.fail = 0, fail
 
     def simulate(
-        self, scene: Scene, *, start: State | None = None, frames: int | None = None
+        self,
+        scene: Scene,
+        *,
+        start: State | None = None,
+        frames: int | None = None,
+        until_contact: bool = False,
     ) -> Trajectory:
         self.calls += 1
         if scene.name == self.fail:

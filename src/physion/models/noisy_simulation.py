@@ -106,8 +106,15 @@ class Task:
 
 
 def ask(scene: Scene, trajectory: Trajectory) -> Question:
-    """Cut a trial off after its last observed frame; `BadInputError` if it does not get there."""
+    """Cut a trial off after its last observed frame.
+
+    `BadInputError` if it does not get there, or was imported as a movie alone, without motion.
+    """
     seen = cut_to_observed(scene, trajectory)
+    if not np.isfinite(seen.positions).all():
+        raise BadInputError(
+            f"trial {scene.name!r} has movies alone ({trajectory.engine}): no motion to go on from"
+        )
     return Question(scene, seen.state(LAST_OBSERVED), label_contact(scene, seen).contact)
 
 
@@ -218,7 +225,7 @@ def _touches(task: Task, engine: Engine, sample: int) -> bool:
         max_frames=max(2, scene.ending.max_frames - state.frame),
     )
     scene = replace(scene, ending=ending)
-    return label_contact(scene, engine.simulate(scene, start=state)).contact
+    return label_contact(scene, engine.simulate(scene, start=state, until_contact=True)).contact
 
 
 def _leaders(scene: Scene) -> NDArray[np.int64]:
