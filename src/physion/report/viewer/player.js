@@ -23,6 +23,7 @@ class Player {
   }
 
   close() {
+    this.closed = true;
     this.playing = false;
     cancelAnimationFrame(this.request);
     this.video.pause();
@@ -31,6 +32,8 @@ class Player {
   }
 
   fail() {
+    // Taking the movie away at the end is no failure of it.
+    if (this.closed) return;
     this.broken = true;
     this.onPicture(null);
     if (this.playing) this.play();
@@ -62,7 +65,8 @@ class Player {
   pause() {
     this.playing = false;
     this.video.pause();
-    this.onFrame(this.frame);
+    // The movie may have gone on by a picture before it stood.
+    this.seek(this.frame);
   }
 
   seek(frame) {
@@ -89,8 +93,11 @@ class Player {
 
   // Where browsers tell which picture is on the screen, everything else follows that picture.
   picture(_, { mediaTime }) {
+    if (this.closed) return;
     this.video.requestVideoFrameCallback(this.picture);
     this.presented = mediaTime;
+    // After a seek the picture may come to the screen later than the seek is said to be over.
+    this.onPicture(this.video);
   }
 
   now() {
@@ -111,7 +118,8 @@ class Player {
       this.play();
       return;
     }
-    if (!this.broken && this.video.readyState >= 2) this.onPicture(this.video);
+    const told = "requestVideoFrameCallback" in this.video;
+    if (!this.broken && !told && this.video.readyState >= 2) this.onPicture(this.video);
     if (frame !== this.frame) {
       this.frame = frame;
       this.onFrame(frame);
