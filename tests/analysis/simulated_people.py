@@ -32,8 +32,8 @@ def simulate_study(
     for scenario in scenarios:
         easy = generator.normal(1.0, 1.0, stimuli)
         for person in range(people):
-            key = {"participant": f"{scenario}-p{person:03d}", "session": f"{scenario}-s{person:03d}",
-                   "scenario": scenario}  # fmt: skip
+            key = {"participant": f"{scenario}-p{person:03d}", "scenario": scenario,
+                   "session": f"{scenario}-s{person:03d}"}  # fmt: skip
             ability = generator.normal(0, ability_sd)
             buttons = ("yes-no", "no-yes")[person % 2]
             sessions.append(

@@ -86,9 +86,14 @@ RULE_SETS: Mapping[str, ExclusionRules] = {
 
 def streak_limit(
     trials: int = 150, percentile: float = 97.5, p_yes: float = 0.5,
-    simulations: int = 1000, seed: int = 0,
+    simulations: int = 10_000, seed: int = 0,
 ) -> float:  # fmt: skip
-    """The percentile of the longest streak of independent answers, by seeded simulation."""
+    """The percentile of the longest streak of independent answers, by seeded simulation.
+
+    The exact 97.5th percentile for 150 fair answers is 12 (which 98.3 % of sequences do not exceed,
+    while 96.6 % do not exceed 11). The thousand simulations of the released code gave 11 or 13 now
+    and then; ten thousand do not.
+    """
     generator = np.random.default_rng(stable_hash("streak", seed, trials, simulations))
     answers = generator.random((simulations, trials)) < p_yes
     return float(np.percentile([longest_streak(row) for row in answers], percentile))
