@@ -67,11 +67,11 @@ def build_viewer(
     and `UnknownNameError` for a scenario or split that the dataset does not hold.
     """
     options = options or ViewerOptions()
+    dataset = Dataset(folder)
     if out.is_dir():
         raise BadInputError(f"{out} is a folder; give a file for the page")
     if not out.parent.is_dir():
         raise BadInputError(f"folder {out.parent} does not exist; make it, or choose another")
-    dataset = Dataset(folder)
     chosen, totals = choose_trials(dataset.index, options)
     rows = [row for _, row in chosen.iterrows()]
     shapes: set[str] = set()
