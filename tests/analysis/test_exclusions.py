@@ -9,7 +9,7 @@ from itertools import groupby
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from simulated_people import as_responses, simulate_study, study
 
@@ -41,12 +41,14 @@ def flagged_by(flags: pd.DataFrame, rule: str) -> list[str]:
 # --- measures -----------------------------------------------------------------------------------
 
 
+@settings(deadline=None)
 @given(answers)
 def test_streaks_are_the_longest_groups(yes: list[bool]) -> None:
     expected = max((len(list(group)) for _, group in groupby(yes)), default=0)
     assert longest_streak(yes) == expected
 
 
+@settings(deadline=None)
 @given(answers)
 def test_alternation_is_the_streak_of_every_second_answer_turned(yes: list[bool]) -> None:
     turned = [answer ^ bool(place % 2) for place, answer in enumerate(yes)]
