@@ -118,6 +118,14 @@ def read_human_zone(path: Path) -> pd.DataFrame:
     return zone
 
 
+def find_beside(humans: Path, sibling: str, name: str) -> Path | None:
+    """The official file ``name`` in the folder of people's answers, beside it, or in the folder
+    ``sibling`` beside it; None where it is in none of these."""
+    parent = humans.resolve().parent
+    places = (humans / name, parent / name, parent / sibling / name)
+    return next((place for place in places if place.is_file()), None)
+
+
 def with_labels(humans: pd.DataFrame, labels: Mapping[str, bool]) -> pd.DataFrame:
     """``humans`` with ``label`` and ``p_yes``, the share of people who said yes.
 

@@ -1,4 +1,12 @@
-"""Compare predictions with people and write the report: tables, figures, one page."""
+"""Compare predictions with people and write the report: tables, figures, one page.
+
+physion compare FILES... --humans DIR   the comparison and its report (the options below)
+physion compare official DIR            the published numbers beside those that can be recomputed
+physion compare validate FILE...        check files of predictions; names each bad row
+physion compare leaderboard FILES...    one table of many files, sorted by any column
+
+A file that is called like one of these words is meant by ./official and so on.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +16,12 @@ from typing import Annotated
 
 import tyro
 
-from physion.cli.output import console
-from physion.report.build import compare_files
+SUBVERBS = {
+    "official": "physion.cli.compare_official",
+    "validate": "physion.cli.compare_validate",
+    "leaderboard": "physion.cli.compare_leaderboard",
+}
+"""First words that stand for a verb of their own, and its module."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +44,9 @@ class Options:
 
 def main(options: Options) -> int:
     """Write the report and print where it is."""
+    from physion.cli.output import console
+    from physion.report.build import compare_files
+
     page = compare_files(
         list(options.predictions),
         options.humans,

@@ -55,10 +55,13 @@ def main(argv: list[str] | None = None) -> int:
         import tyro
 
         module = importlib.import_module(f"physion.cli.{MODULES.get(words[0], words[0])}")
+        taken = 1
+        if words[1:2] and words[1] in getattr(module, "SUBVERBS", {}):
+            module, taken = importlib.import_module(module.SUBVERBS[words[1]]), 2
         options = tyro.cli(
             module.Options,
-            args=words[1:],
-            prog=f"physion {words[0]}",
+            args=words[taken:],
+            prog=" ".join(["physion", *words[:taken]]),
             description=module.__doc__,
         )
         return int(module.main(options))

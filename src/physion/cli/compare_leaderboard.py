@@ -1,0 +1,148 @@
+"""One table of many prediction files: accuracy, r, kappa, RMSD, and the versions that made them.
+
+Exit code 1 where a file could not be compared; the others are in the table.
+"""
+
+from __future__ import annotations
+
+import json as json_module
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from physion.analysis.leaderboard import Leaderboard
+
+SHOWN = {
+    "rank": "rank",
+    "model": "model",
+    "readout": "readout",
+    "training": "training",
+    "stimuli": "stimuli",
+    "accuracy": "accuracy",
+    "r": "r",
+    "kappa": "kappa",
+    "rmsd": "RMSD",
+    "versions": "versions",
+    "file": "file",
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """Which files, and what they are compared with."""
+
+    predictions: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Prediction files with the official column names."""
+    humans: Path | None = None
+    """Folder with human_accuracy-*.csv."""
+    labels: Path | None = None
+    """Official outcomes (stim_ID, label); looked for beside the people when not given."""
+    responses: Path | None = None
+    """Answers of single participants, as the experiment exports them: they give kappa."""
+    exclude: Path | None = None
+    """File of stimuli to leave out, one a line."""
+    ledge: bool = False
+    """Keep the Roll stimuli with a ledge, which the study left out."""
+    scenario: str = "mean"
+    """One scenario, or mean (each counts the same), or pooled."""
+    sort: str = "accuracy"
+    """Column to sort by."""
+    ascending: bool = False
+    """Smallest first; without it the best is first."""
+    out: Path | None = None
+    """Folder for leaderboard.csv and leaderboard.json."""
+    json: bool = False
+    """Print one JSON object."""
+
+
+def main(options: Options) -> int:
+    """Print the table; 1 if a file could not be compared."""
+    from physion.cli.output import console
+
+    board = _board(options)
+    record = _record(board)
+    if options.out is not None:
+        _write(board, record, options.out)
+    if options.json:
+        print(json_module.dumps(record))
+    else:
+        _print(board.table)
+        for row in board.refused.itertuples():
+            console.print(f"not compared: {row.file}: {row.reason}", markup=False, soft_wrap=True)
+        left_out = int(board.dropped["stimuli"].sum())
+        if left_out:
+            told = f"{left_out} stimuli left out over all files; reasons with --json or --out"
+            console.print(told, markup=False, soft_wrap=True)
+    return 1 if len(board.refused) else 0
+
+
+def _board(options: Options) -> Leaderboard:
+    from dataclasses import replace
+
+    from physion.analysis.leaderboard import leaderboard, sort_leaderboard
+    from physion.analysis.participants import read_responses
+    from physion.analysis.responses import find_beside, read_humans, read_labels
+    from physion.analysis.stimuli import read_stimulus_list
+
+    humans, labels = options.humans, options.labels
+    if labels is None and humans is not None:
+        labels = find_beside(humans, "stimuli", "stimulus_names_and_labels.csv")
+    board = leaderboard(
+        options.predictions,
+        None if humans is None else read_humans(humans),
+        None if labels is None else read_labels(labels),
+        None if options.responses is None else read_responses(options.responses).test,
+        scenario=options.scenario,
+        exclude=() if options.exclude is None else read_stimulus_list(options.exclude),
+        exclude_ledge=not options.ledge,
+    )
+    ascending = True if options.ascending else None
+    return replace(board, table=sort_leaderboard(board.table, options.sort, ascending))
+
+
+def _record(board: Leaderboard) -> dict[str, Any]:
+    """The board as JSON values; NaN is null."""
+    tables = {"rows": board.table, "dropped": board.dropped, "refused": board.refused}
+    record: dict[str, Any] = {
+        name: json_module.loads(table.to_json(orient="records", double_precision=15))
+        for name, table in tables.items()
+    }
+    return {**record, "settings": dict(board.settings)}
+
+
+def _write(board: Leaderboard, record: dict[str, Any], folder: Path) -> None:
+    from physion.cli.output import write_text
+
+    table = board.table.to_csv(index=False, lineterminator="\n")
+    write_text(folder / "leaderboard.csv", table)
+    write_text(folder / "leaderboard.json", json_module.dumps(record, indent=1) + "\n")
+
+
+def _print(table: pd.DataFrame) -> None:
+    from rich.table import Table
+
+    from physion.cli.output import console
+
+    shown = Table(box=None, pad_edge=False)
+    for title in SHOWN.values():
+        shown.add_column(title, overflow="fold")
+    for _, row in table.iterrows():
+        shown.add_row(*(_cell(row, name) for name in SHOWN))
+    console.print(shown)
+
+
+def _cell(row: pd.Series, name: str) -> str:
+    import pandas as pd
+
+    value = row[name]
+    if pd.isna(value):
+        return ""
+    if f"{name}_low" not in row.index:
+        return str(value)
+    low, high = row[f"{name}_low"], row[f"{name}_high"]
+    return f"{value:.3f}" + ("" if pd.isna(low) else f" [{low:.3f}, {high:.3f}]")

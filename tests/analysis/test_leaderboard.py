@@ -1,0 +1,235 @@
+"""Many files in one table: the scores are those of a comparison, versions and drops are there."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from sklearn.metrics import cohen_kappa_score
+
+from physion.analysis import Bootstrap, compare, read_predictions
+from physion.analysis.leaderboard import (
+    COLUMNS,
+    KAPPA_NEEDS,
+    leaderboard,
+    sidecar_versions,
+    sort_leaderboard,
+)
+from physion.errors import BadInputError, UnknownNameError
+
+QUICK = Bootstrap(resamples=200)
+STEMS = {"collide": "pilot_it2_collision_simple_box", "drop": "pilot_it2_drop_simple_box"}
+STIMULI = [(scenario, f"{stem}_{i:04d}") for scenario, stem in STEMS.items() for i in range(20)]
+LABELS = {name: i % 2 == 0 for i, (_, name) in enumerate(STIMULI)}
+
+
+def humans() -> pd.DataFrame:
+    share = np.random.default_rng(0).integers(5, 20, len(STIMULI)) / 20
+    return pd.DataFrame(
+        {
+            "stimulus": [name for _, name in STIMULI],
+            "scenario": [scenario for scenario, _ in STIMULI],
+            "accuracy": share,
+            "count": 20.0,
+        }
+    )
+
+
+def answers(people: int = 5) -> pd.DataFrame:
+    """The test rows of `Responses` that the leaderboard reads."""
+    generator = np.random.default_rng(3)
+    rows = [
+        {"session": f"{scenario} {k}", "participant": f"{scenario} {k}", "scenario": scenario,
+         "stimulus": name, "label": LABELS[name], "yes": bool(generator.random() < 0.5),
+         "log_rt": 7.0}
+        for scenario, name in STIMULI
+        for k in range(people)
+    ]  # fmt: skip
+    table = pd.DataFrame(rows)
+    return table.assign(correct=table["yes"] == table["label"])
+
+
+def write(path: Path, model: str, skill: float, **columns: object) -> Path:
+    generator = np.random.default_rng(len(model))
+    truth = np.array(list(LABELS.values()))
+    right = generator.random(len(truth)) < skill
+    p = np.where(right == truth, 0.9, 0.1)
+    pd.DataFrame(
+        {
+            "Model": model,
+            "Readout Type": "B",
+            "Predicted Prob_true": p,
+            "Predicted Outcome": p > 0.5,
+            "Actual Outcome": truth,
+            "Stimulus Name": list(LABELS),
+            **columns,
+        }
+    ).to_csv(path, index=False)
+    return path
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> list[Path]:
+    return [
+        write(tmp_path / "good.csv", "good", 0.95, Versions="torch 2.1"),
+        write(tmp_path / "poor.csv", "poor", 0.5),
+        write(tmp_path / "middle.csv", "middle", 0.75),
+    ]
+
+
+def test_scores_are_those_of_a_comparison(files: list[Path]) -> None:
+    board = leaderboard(files, humans(), LABELS, bootstrap=QUICK)
+    assert list(board.table.columns) == list(COLUMNS)
+    assert list(board.table["model"]) == ["good", "middle", "poor"]
+    assert list(board.table["rank"]) == [1, 2, 3]
+    for row in board.table.to_dict("records"):
+        found = compare(
+            read_predictions([Path(row["file"])]), humans(), LABELS, bootstrap=QUICK
+        ).scores
+        one = found[found["scenario"] == "mean"].iloc[0]
+        for score in ("accuracy", "difference", "r", "rmsd"):
+            for end in ("", "_low", "_high"):
+                assert row[score + end] == one[score + end]
+        assert (row["scenarios"], row["stimuli"]) == (2, 40)
+        assert np.isnan(row["kappa"]) and KAPPA_NEEDS in row["reason"]
+
+
+def test_any_column_sorts(files: list[Path]) -> None:
+    table = leaderboard(files, humans(), LABELS, bootstrap=QUICK).table
+    assert list(sort_leaderboard(table, "model")["model"]) == ["good", "middle", "poor"]
+    assert list(sort_leaderboard(table, "model", False)["model"]) == ["poor", "middle", "good"]
+    assert sort_leaderboard(table, "rmsd")["rmsd"].is_monotonic_increasing
+    assert sort_leaderboard(table, "r")["r"].is_monotonic_decreasing
+    assert sort_leaderboard(table, "r", True)["r"].is_monotonic_increasing
+    for column in COLUMNS[1:]:
+        assert list(sort_leaderboard(table, column)["rank"]) == [1, 2, 3]
+    with pytest.raises(UnknownNameError, match="accuracy"):
+        sort_leaderboard(table, "acuracy")
+
+
+def test_undefined_scores_come_last(files: list[Path], tmp_path: Path) -> None:
+    flat = write(tmp_path / "flat.csv", "flat", 0.5, **{"Predicted Prob_true": 0.5})
+    table = leaderboard([flat, *files], humans(), LABELS, bootstrap=QUICK).table
+    for ascending in (True, False):
+        last = sort_leaderboard(table, "r", ascending).iloc[-1]
+        assert last["model"] == "flat" and np.isnan(last["r"]) and "r: undefined" in last["reason"]
+
+
+def test_ties_do_not_depend_on_the_order_of_files(tmp_path: Path) -> None:
+    files = [write(tmp_path / f"{name}.csv", "same", 0.7) for name in "abc"]
+    boards = [leaderboard(order, humans(), LABELS, bootstrap=QUICK).table
+              for order in (files, files[::-1])]  # fmt: skip
+    pd.testing.assert_frame_equal(*boards)
+
+
+def test_versions_come_from_the_column_or_from_a_file_beside(
+    files: list[Path], tmp_path: Path
+) -> None:
+    (tmp_path / "poor.json").write_text(json.dumps({"versions": {"physion": "1", "torch": "2"}}))
+    (tmp_path / "middle.csv.json").write_text(json.dumps({"versions": "by hand"}))
+    (tmp_path / "good.json").write_text(json.dumps({"versions": "not this"}))
+    table = leaderboard(files, humans(), LABELS, bootstrap=QUICK).table.set_index("model")
+    assert dict(table["versions"]) == {
+        "good": "torch 2.1", "poor": "physion 1, torch 2", "middle": "by hand",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("content", ["{", '["a"]', '{"versions": 3}'])
+def test_a_broken_file_of_versions_refuses_the_file(
+    files: list[Path], tmp_path: Path, content: str
+) -> None:
+    (tmp_path / "poor.json").write_text(content)
+    with pytest.raises(BadInputError, match=r"poor\.json"):
+        sidecar_versions(files[1])
+    board = leaderboard(files, humans(), LABELS, bootstrap=QUICK)
+    assert len(board.table) == 2 and "poor.json" in board.refused["reason"].item()
+
+
+def test_bad_files_are_refused_and_named(files: list[Path], tmp_path: Path) -> None:
+    alien = write(
+        tmp_path / "alien.csv", "alien", 0.5, **{"Stimulus Name": [f"x{i}" for i in range(40)]}
+    )
+    broken = tmp_path / "broken.csv"
+    broken.write_text("Model\nm\n")
+    board = leaderboard([alien, files[0], broken], humans(), LABELS, bootstrap=QUICK)
+    assert [Path(name).name for name in board.refused["file"]] == ["alien.csv", "broken.csv"]
+    assert board.refused["reason"].str.len().gt(0).all()
+    assert list(board.table["model"]) == ["good"]
+    with pytest.raises(BadInputError, match="no file can be compared"):
+        leaderboard([alien, broken], humans(), LABELS, bootstrap=QUICK)
+    with pytest.raises(BadInputError, match="no file of predictions"):
+        leaderboard([], humans(), LABELS)
+
+
+def test_what_is_left_out_is_counted(files: list[Path]) -> None:
+    board = leaderboard(
+        files[:1], humans().iloc[:30], LABELS, exclude=[STIMULI[0][1]], bootstrap=QUICK
+    )
+    counts = board.dropped.groupby("reason")["stimuli"].sum()
+    assert counts["people did not see it"] == 10
+    assert counts.drop("people did not see it").sum() >= 1
+    assert board.table["stimuli"].item() == 29
+
+
+def test_files_about_different_outcomes_stand_in_one_table(
+    files: list[Path], tmp_path: Path
+) -> None:
+    other = write(tmp_path / "other.csv", "other", 0.7, **{"Actual Outcome": True})
+    assert len(leaderboard([*files, other], humans(), LABELS, bootstrap=QUICK).table) == 4
+
+
+def test_without_people_there_is_accuracy_alone(files: list[Path]) -> None:
+    table = leaderboard(files, bootstrap=QUICK).table
+    assert table["accuracy"].notna().all() and table["accuracy_low"].notna().all()
+    assert table[["r", "rmsd", "kappa", "difference"]].isna().all(axis=None)
+
+
+def test_one_scenario_can_be_asked_for(files: list[Path]) -> None:
+    table = leaderboard(files, humans(), LABELS, scenario="drop", bootstrap=QUICK).table
+    assert set(table["stimuli"]) == {20} and set(table["scenarios"]) == {1}
+    with pytest.raises(UnknownNameError, match="drop"):
+        leaderboard(files, humans(), LABELS, scenario="drp")
+    with pytest.raises(BadInputError, match="link"):
+        leaderboard(files, humans(), LABELS, scenario="link", bootstrap=QUICK)
+
+
+def test_kappa_is_the_mean_over_participants_then_scenarios(files: list[Path]) -> None:
+    test = answers()
+    table = leaderboard(files, None, None, test, bootstrap=QUICK).table.set_index("model")
+    rows = read_predictions([files[0]]).set_index("stimulus")["predicted"]
+    by_scenario = [
+        np.mean([cohen_kappa_score(own["yes"], rows.loc[own["stimulus"]].to_numpy())
+                 for _, own in part.groupby("session")])
+        for _, part in test.groupby("scenario")
+    ]  # fmt: skip
+    good = table.loc["good"]
+    assert good["kappa"] == pytest.approx(np.mean(by_scenario), abs=1e-12)
+    assert good["kappa_low"] < good["kappa"] < good["kappa_high"]
+    assert table["reason"].eq("").all()
+    people = test.groupby("stimulus")["yes"].mean()
+    p = read_predictions([files[0]]).set_index("stimulus")["p_contact"]
+    r = [np.corrcoef(p.loc[names], people.loc[names])[0, 1]
+         for names in ([n for s, n in STIMULI if s == name] for name in STEMS)]  # fmt: skip
+    assert good["r"] == pytest.approx(np.mean(r), abs=1e-12)
+
+
+def test_kappa_says_why_it_is_missing(files: list[Path]) -> None:
+    test = answers()
+    board = leaderboard(files, humans(), LABELS, test[test["scenario"] == "drop"], bootstrap=QUICK)
+    assert board.table["kappa"].isna().all()
+    assert board.table["reason"].str.contains("single participants").all()
+    pooled = leaderboard(files, humans(), LABELS, test, scenario="pooled", bootstrap=QUICK).table
+    assert pooled["kappa"].isna().all() and pooled["reason"].str.contains("pooled").all()
+
+
+def test_trainings_of_one_file_are_rows_of_their_own(tmp_path: Path) -> None:
+    path = write(tmp_path / "both.csv", "m", 0.8)
+    rows = pd.read_csv(path)
+    pd.concat(
+        [rows.assign(**{"Dynamics Training Dataset": name}) for name in ("all", "all_but")]
+    ).to_csv(path, index=False)
+    table = leaderboard([path], humans(), LABELS, bootstrap=QUICK).table
+    assert set(table["training"]) == {"all", "all but this"} and len(table) == 2

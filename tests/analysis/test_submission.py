@@ -1,0 +1,260 @@
+"""Every kind of fault of a submission is found, with its row and stimulus; none hides another."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from physion.analysis.submission import Checked, Reference, read_index, validate
+from physion.analysis.submission_rows import SHOWN
+from physion.errors import BadInputError
+
+STIMULI = [f"pilot_it2_drop_simple_box_{i:04d}" for i in range(6)]
+LABELS = {name: i % 2 == 0 for i, name in enumerate(STIMULI)}
+
+
+def table(**changes: object) -> pd.DataFrame:
+    p = [0.9, 0.2, 0.7, 0.4, 0.8, 0.1]
+    return pd.DataFrame(
+        {
+            "Model": "m",
+            "Readout Type": "B",
+            "Predicted Prob_false": [1 - value for value in p],
+            "Predicted Prob_true": p,
+            "Predicted Outcome": [value > 0.5 for value in p],
+            "Actual Outcome": list(LABELS.values()),
+            "Stimulus Name": STIMULI,
+            **changes,
+        }
+    )
+
+
+def write(folder: Path, rows: pd.DataFrame) -> Path:
+    path = folder / "predictions.csv"
+    rows.to_csv(path, index=False)
+    return path
+
+
+def check(folder: Path, rows: pd.DataFrame, **reference: object) -> Checked:
+    return validate(write(folder, rows), Reference(**reference))  # type: ignore[arg-type]
+
+
+def test_a_good_file_has_no_fault(tmp_path: Path) -> None:
+    found = check(tmp_path, table(), labels=LABELS, fitted=["another"])
+    assert found.faults == () and found.errors == 0 and found.not_checked == ()
+    assert (found.rows, dict(found.models)) == (6, {"m · observed+simulated": 6})
+
+
+def test_what_cannot_be_checked_is_said(tmp_path: Path) -> None:
+    words = " ".join(check(tmp_path, table()).not_checked)
+    assert "stimuli" in words and "outcomes" in words and "leakage" in words
+
+
+@pytest.mark.parametrize(
+    ("column", "row", "value", "kind"),
+    [
+        ("Predicted Prob_true", 2, "1.2", "probability"),
+        ("Predicted Prob_true", 2, "nan", "probability"),
+        ("Predicted Prob_true", 2, "", "probability"),
+        ("Predicted Prob_true", 2, "inf", "probability"),
+        ("Predicted Prob_false", 2, "-0.1", "probability"),
+        ("Predicted Prob_false", 2, "0.5", "probability"),
+        ("Predicted Outcome", 2, "maybe", "outcome"),
+        ("Actual Outcome", 2, "", "outcome"),
+        ("Model", 2, " ", "blank"),
+        ("Stimulus Name", 2, "", "blank"),
+    ],
+)
+def test_a_bad_value_is_named_with_row_and_stimulus(
+    tmp_path: Path, column: str, row: int, value: str, kind: str
+) -> None:
+    rows = table().astype(str)
+    rows.loc[row, column] = value
+    found = check(tmp_path, rows)
+    assert found.errors == 1
+    fault = next(fault for fault in found.faults if fault.level == "error")
+    assert (fault.kind, fault.row) == (kind, row + 1)
+    assert fault.stimulus == ("" if column == "Stimulus Name" else STIMULI[row])
+    assert f"row {row + 1}" in str(fault) and column.split()[0] in fault.message
+
+
+def test_rounded_probabilities_may_miss_one_by_a_thousandth(tmp_path: Path) -> None:
+    for no, errors in ((0.601, 0), (0.602, 1)):
+        rows = table(**{"Predicted Prob_false": [0.1, 0.8, 0.3, no, 0.2, 0.9]})
+        assert check(tmp_path, rows).errors == errors
+
+
+def test_an_outcome_against_its_probability_is_a_warning(tmp_path: Path) -> None:
+    rows = table()
+    rows.loc[1, "Predicted Outcome"] = True
+    (fault,) = check(tmp_path, rows).faults
+    assert (fault.level, fault.row, fault.stimulus) == ("warning", 2, STIMULI[1])
+
+
+def test_all_missing_columns_are_named_at_once(tmp_path: Path) -> None:
+    found = check(tmp_path, table().drop(columns=["Model", "Predicted Prob_true"]))
+    assert {fault.column for fault in found.faults} == {"Model", "Predicted Prob_true"}
+    assert found.errors == 2 and found.not_checked
+
+
+def test_a_column_that_stands_twice_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "twice.csv"
+    path.write_text(
+        "Model,Readout Type,Predicted Prob_true,Predicted Prob_true,Predicted Outcome,"
+        f"Actual Outcome,Stimulus Name\nm,B,0.1,0.9,False,True,{STIMULI[0]}\n"
+    )
+    assert "twice" in validate(path).faults[0].message
+
+
+def test_duplicates_name_both_rows_and_know_looks(tmp_path: Path) -> None:
+    rows = table()
+    rows.loc[4, "Stimulus Name"] = STIMULI[1] + "-redyellow_img.mp4"
+    (fault,) = check(tmp_path, rows).faults
+    assert (fault.kind, fault.row) == ("duplicate", 5) and "row 2" in fault.message
+
+
+def test_seeds_and_readouts_are_no_duplicates(tmp_path: Path) -> None:
+    rows = pd.concat(
+        [
+            table(**{"Dynamics Training Seed": 0}),
+            table(**{"Dynamics Training Seed": 1}),
+            table(**{"Dynamics Training Seed": 0, "Readout Type": "C"}),
+        ]
+    )
+    assert check(tmp_path, rows, labels=LABELS).errors == 0
+
+
+def test_a_missing_stimulus_is_found_for_its_seed(tmp_path: Path) -> None:
+    rows = pd.concat(
+        [
+            table(**{"Dynamics Training Seed": 0}),
+            table(**{"Dynamics Training Seed": 1}).drop(index=3),
+        ]
+    )
+    (fault,) = check(tmp_path, rows, labels=LABELS).faults
+    assert fault.kind == "missing" and STIMULI[3] in fault.message and "1 stimuli" in fault.message
+
+
+def test_a_whole_scenario_may_be_absent(tmp_path: Path) -> None:
+    labels = {**LABELS, "pilot_towers_x_0001": True}
+    (fault,) = check(tmp_path, table(), labels=labels).faults
+    assert fault.level == "warning" and "support" in fault.message
+
+
+def test_unknown_stimuli(tmp_path: Path) -> None:
+    rows = pd.concat([table(), table().iloc[:2]], ignore_index=True)
+    rows.loc[6, "Stimulus Name"] = "nonsense"
+    rows.loc[7, "Stimulus Name"] = "pilot_it2_drop_simple_box_0099"
+    first, second = check(tmp_path, rows, labels=LABELS).faults
+    assert (first.kind, first.level, first.row) == ("unknown", "error", 7)
+    assert (second.kind, second.level, second.row) == ("unknown", "warning", 8)
+
+
+def test_recorded_outcomes_must_be_the_official_ones(tmp_path: Path) -> None:
+    recorded = [*LABELS.values()]
+    recorded[5] = not recorded[5]
+    actual = [*LABELS.values()]
+    actual[0] = not actual[0]
+    rows = table(**{"Recorded Outcome": recorded, "Actual Outcome": actual})
+    error, warning = check(tmp_path, rows, labels=LABELS).faults
+    assert (error.row, error.level) == (6, "error")
+    assert warning.level == "warning" and "1 rows" in warning.message
+
+
+# --- leakage ------------------------------------------------------------------------------------
+
+
+def index(**changes: object) -> pd.DataFrame:
+    return pd.DataFrame(
+        {
+            "trial": [*STIMULI, "fit_0001"],
+            "scenario": "drop",
+            "split": ["testing"] * 6 + ["readout"],
+            "digest": [f"d{i}" for i in range(7)],
+            "scene_digest": [f"s{i}" for i in range(7)],
+            **changes,
+        }
+    )
+
+
+def test_a_stimulus_of_another_split_leaks(tmp_path: Path) -> None:
+    splits = ["testing", "testing", "readout", "training", "testing", "testing", "readout"]
+    faults = [
+        fault for fault in check(tmp_path, table(), index=index(split=splits)).faults
+        if fault.kind == "leak"
+    ]  # fmt: skip
+    assert [(fault.row, fault.stimulus) for fault in faults] == [(3, STIMULI[2]), (4, STIMULI[3])]
+    assert "readout" in faults[0].message and "training" in faults[1].message
+
+
+@pytest.mark.parametrize("column", ["digest", "scene_digest"])
+def test_a_twin_in_another_split_leaks(tmp_path: Path, column: str) -> None:
+    digests = [f"d{i}" for i in range(6)] + ["d4"]
+    (fault,) = check(tmp_path, table(), index=index(**{column: digests})).faults
+    assert (fault.kind, fault.row) == ("leak", 5) and "fit_0001" in fault.message
+
+
+def test_a_stimulus_that_the_readout_was_fitted_on_leaks_unless_cross_fitted(
+    tmp_path: Path,
+) -> None:
+    fitted = [STIMULI[0] + "_img.mp4"]
+    (fault,) = check(tmp_path, table(), labels=LABELS, fitted=fitted).faults
+    assert (fault.kind, fault.row) == ("leak", 1)
+    assert not check(tmp_path, table(Fold=0), labels=LABELS, fitted=fitted).faults
+    assert check(tmp_path, table(Fold=-1), labels=LABELS, fitted=fitted).errors == 1
+
+
+def test_a_column_split_is_believed(tmp_path: Path) -> None:
+    split = ["testing"] * 5 + ["training"]
+    (fault,) = check(tmp_path, table(Split=split), labels=LABELS).faults
+    assert (fault.kind, fault.row) == ("leak", 6)
+
+
+def test_an_index_can_be_parquet_csv_or_a_dataset(tmp_path: Path) -> None:
+    index().to_parquet(tmp_path / "index.parquet")
+    index().to_csv(tmp_path / "index.csv", index=False)
+    for path in (tmp_path, tmp_path / "index.parquet", tmp_path / "index.csv"):
+        assert list(read_index(path)["trial"]) == [*STIMULI, "fit_0001"]
+    (tmp_path / "broken.parquet").write_bytes(b"PAR1 and no more")
+    index().drop(columns="split").to_parquet(tmp_path / "short.parquet")
+    for name in ("broken.parquet", "short.parquet", "absent.parquet"):
+        with pytest.raises(BadInputError, match=name):
+            read_index(tmp_path / name)
+
+
+# --- many faults --------------------------------------------------------------------------------
+
+
+def test_many_faults_of_one_kind_are_counted(tmp_path: Path) -> None:
+    names = [f"nonsense_{i}" for i in range(3 * SHOWN)]
+    rows = pd.concat([table()] * (SHOWN // 2), ignore_index=True).assign(**{"Stimulus Name": names})
+    found = check(tmp_path, rows, labels=LABELS)
+    unknown = [fault for fault in found.faults if fault.kind == "unknown"]
+    assert len(unknown) == SHOWN + 1 and f"{2 * SHOWN} more" in unknown[-1].message
+
+
+def test_one_fault_does_not_hide_another(tmp_path: Path) -> None:
+    rows = table().astype(str)
+    rows.loc[0, "Predicted Prob_true"] = "2"
+    rows.loc[1, "Stimulus Name"] = STIMULI[0]
+    rows.loc[3, "Actual Outcome"] = "perhaps"
+    kinds = [fault.kind for fault in check(tmp_path, rows, labels=LABELS).faults]
+    assert {"probability", "duplicate", "outcome", "missing"} <= set(kinds)
+
+
+def test_rows_that_end_early_are_faults(tmp_path: Path) -> None:
+    path = write(tmp_path, table())
+    path.write_text(path.read_text() + "m,B,0.5,0.5\n")
+    found = validate(path)
+    assert {fault.row for fault in found.faults} == {7} and found.errors
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff\xfe\x00", b"Model\n", None])
+def test_what_is_no_table_is_refused(tmp_path: Path, content: bytes | None) -> None:
+    path = tmp_path / "file.csv"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(BadInputError, match=r"file\.csv"):
+        validate(path)
