@@ -1,10 +1,12 @@
 """How long statistics of agreement take: ``OMP_NUM_THREADS=1 python benchmarks/agreement.py``.
 
-Side by side in one run: Cohen's kappa of every pair of 100 people who answered 150
-stimuli, by scikit-learn pair by pair and by `physion.analysis.kappa` at once, with the largest
-difference of the two; then 1000 bootstraps of the mean pairwise kappa, drawing people, stimuli or
-both; then 20 models beside the 100 people with every interval. Times are the best of several runs, but
-for the loop, which runs once. ``--write`` puts them into benchmarks/results/agreement.json.
+Side by side in one run: Cohen's kappa of every pair of 100 people who answered 150 stimuli, by
+scikit-learn pair by pair and by `physion.analysis.kappa` at once, with the largest difference of
+the two; then 1000 bootstraps of the mean pairwise kappa, drawing people, stimuli or both; then 20
+models beside the 100 people with every interval; then the same in eight scenarios, from tables,
+with the tests of all pairs of models, zones and calibration. Times are the best of several runs,
+but for the loop and the eight scenarios, which run once. ``--write`` puts them into
+benchmarks/results/agreement.json.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import sklearn
 from sklearn.metrics import cohen_kappa_score
 
@@ -27,6 +30,8 @@ from physion.analysis.answers import Answers
 from physion.analysis.bootstrap import Bootstrap
 from physion.analysis.kappa import pair_values, pairwise_kappa, resampled_mean_kappa
 from physion.analysis.model_people import Models, compare_with_people
+from physion.analysis.people_comparison import compare_everywhere
+from physion.analysis.stimuli import SCENARIOS
 
 RESULTS = Path(__file__).parent / "results" / "agreement.json"
 PEOPLE, STIMULI, MODELS, RESAMPLES = 100, 150, 20, 1000
@@ -43,6 +48,30 @@ def people(seed: int = 0) -> Answers:
     names = tuple(f"p{k:03d}" for k in range(PEOPLE))
     stimuli = tuple(f"s{k:03d}" for k in range(STIMULI))
     return Answers("drop", names, names, stimuli, yes, label, np.full_like(yes, np.nan))
+
+
+def everywhere() -> Callable[[], object]:
+    """The whole comparison of eight scenarios, ready to be run; the tables are made before."""
+    tests, predictions = [], []
+    generator = np.random.default_rng(2)
+    for seed, scenario in enumerate(SCENARIOS):
+        made = people(seed)
+        rows, columns = np.indices(made.yes.shape)
+        label = made.label[columns.ravel()] == 1
+        yes = made.yes.ravel() == 1
+        table = pd.DataFrame({"scenario": scenario, "yes": yes, "label": label, "log_rt": 7.0})
+        table["session"] = [f"{scenario}-{made.sessions[k]}" for k in rows.ravel()]
+        table["stimulus"] = [f"{scenario}-{made.stimuli[k]}" for k in columns.ravel()]
+        tests.append(table.assign(participant=table["session"], correct=yes == label))
+        for model in range(MODELS):
+            p = generator.random(STIMULI)
+            stimuli = [f"{scenario}-{name}" for name in made.stimuli]
+            predictions.append(
+                pd.DataFrame({"agent": f"m{model}", "stimulus": stimuli, "p_contact": p,
+                              "predicted": p > 0.5})
+            )  # fmt: skip
+    test, rows_of_models = pd.concat(tests), pd.concat(predictions)
+    return lambda: compare_everywhere(rows_of_models, test)
 
 
 def by_scikit_learn(yes: np.ndarray) -> np.ndarray:
@@ -90,6 +119,7 @@ def measure() -> dict[str, object]:
         "largest_difference": difference,
         "bootstrap_seconds": bootstraps,
         "models_beside_people_seconds": best(lambda: compare_with_people(models, answers), 2),
+        "eight_scenarios_seconds": best(everywhere(), 1),
     }
 
 
@@ -108,8 +138,12 @@ def main() -> None:
     report = {
         "date": datetime.now(UTC).date().isoformat(),
         "command": "OMP_NUM_THREADS=1 python benchmarks/agreement.py --write",
-        "hardware": {"machine": platform.machine(), "cores": os.cpu_count(), "threads": os.environ.get("OMP_NUM_THREADS", "not limited"),
-                     "load": os.getloadavg()[0]},
+        "hardware": {
+            "machine": platform.machine(),
+            "cores": os.cpu_count(),
+            "threads": os.environ.get("OMP_NUM_THREADS", "not limited"),
+            "load": os.getloadavg()[0],
+        },
         "versions": {"python": platform.python_version(), "numpy": np.__version__,
                      "scikit-learn": sklearn.__version__},
         "people": PEOPLE, "stimuli": STIMULI, "models": MODELS, "resamples": RESAMPLES,

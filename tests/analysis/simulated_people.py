@@ -59,7 +59,7 @@ def simulate_study(
 def _row(key, stimulus, phase, trial, yes, label, rt, buttons):  # type: ignore[no-untyped-def]
     return key | {"stimulus": stimulus, "phase": phase, "trial": trial,
                   "response": "yes" if yes else "no", "label": label, "rt_ms": rt,
-                  "buttons": buttons, "correct": yes == label}  # fmt: skip
+                  "simulated": False, "buttons": buttons, "correct": yes == label}  # fmt: skip
 
 
 def as_responses(trials: pd.DataFrame, sessions: pd.DataFrame | None = None) -> Responses:

@@ -90,7 +90,7 @@ def with_answers(responses_of: dict[str, list[bool]], label: list[bool]) -> Resp
     rows = [
         {"participant": name.split("/")[0], "session": name, "scenario": "drop", "phase": "test",
          "stimulus": f"s{k}", "trial": k, "response": "yes" if yes else "no", "label": label[k],
-         "rt_ms": 1000.0}
+         "rt_ms": 1000.0, "simulated": False}
         for name, given in responses_of.items()
         for k, yes in enumerate(given)
     ]  # fmt: skip

@@ -20,6 +20,7 @@ from physion.analysis import agreement
 from physion.analysis.answers import Answers, answers_of
 from physion.analysis.bootstrap import Bootstrap
 from physion.analysis.calibration import brier, calibration_table, decompose, reliability_curve
+from physion.analysis.difficulty import difficulty_third, r_by_third
 from physion.analysis.kappa import correctness
 from physion.analysis.model_people import (
     MEASURES,
@@ -29,6 +30,7 @@ from physion.analysis.model_people import (
     models_of,
 )
 from physion.analysis.paired import (
+    _coins,
     benjamini_hochberg,
     compare_models,
     holm,
@@ -36,6 +38,7 @@ from physion.analysis.paired import (
     r_permutation_p,
 )
 from physion.analysis.people import draws_of_people, split_halves
+from physion.analysis.people_comparison import PeopleComparison, compare_everywhere
 from physion.analysis.zones import human_zones, released_r_zone, released_zone
 from physion.errors import BadInputError
 
@@ -243,6 +246,85 @@ def test_models_among_themselves(models: Models, answers: Answers) -> None:
     assert found.loc[("chance", "gaps"), "stimuli"] == 23
 
 
+# --- every scenario -----------------------------------------------------------------------------
+
+
+def everywhere(**changes: object) -> tuple[PeopleComparison, pd.DataFrame, pd.DataFrame]:
+    test = study(people=10, stimuli=20, scenarios=("collide", "roll"), seed=8).test
+    shares = test.groupby(["scenario", "stimulus"])["yes"].mean().reset_index()
+    generator = np.random.default_rng(0)
+    parts = [
+        pd.DataFrame({"agent": agent, "stimulus": shares["stimulus"], "p_contact": p,
+                      "predicted": p > 0.5})
+        for agent, p in (("people", shares["yes"]), ("chance", generator.random(len(shares))))
+    ]  # fmt: skip
+    predictions = pd.concat(parts, ignore_index=True).assign(**changes)
+    return compare_everywhere(predictions, test, FEW, halves=20, permutations=50), predictions, test
+
+
+def test_all_scenarios_and_their_mean() -> None:
+    found, predictions, test = everywhere()
+    scores = found.scores.set_index(["model", "scenario", "measure"])
+    for model in ("people", "chance"):
+        for measure in MEASURES:
+            values = scores.loc[(model, ["collide", "roll"], measure), "value"]
+            assert scores.loc[(model, "mean", measure), "value"] == pytest.approx(values.mean())
+    answers = answers_of(test, "roll")
+    models, _ = models_of(predictions, answers)
+    alone = compare_with_people(models, answers, FEW).set_index(["model", "measure"])
+    here = scores.xs("roll", level="scenario").loc[alone.index]
+    pd.testing.assert_frame_equal(here[alone.columns.drop("scenario")],
+                                  alone.drop(columns="scenario"))  # fmt: skip
+    chance = scores.loc[("chance", "mean", "r")]
+    wide = scores.loc[("chance", "roll", "r")]
+    assert chance["low_both"] < chance["value"] < chance["high_both"]
+    assert (
+        chance["high_stimuli"] - chance["low_stimuli"] < wide["high_stimuli"] - wide["low_stimuli"]
+    )
+    row = scores.loc[("people", "collide", "accuracy")]
+    assert row["in_zone"] == (
+        "yes" if row["zone_low"] <= row["value"] <= row["zone_high"] else "no"
+    )
+    assert scores.loc[("people", "mean", "accuracy"), "in_zone"] == ""
+    assert found.dropped.empty and len(found.tests) == 1 and len(found.pairs) == 2
+    assert found.tests["stimuli"].iloc[0] == 40 and found.calibration["stimuli"].tolist() == [
+        40,
+        40,
+    ]
+    again, _, _ = everywhere()
+    pd.testing.assert_frame_equal(found.scores, again.scores)
+
+
+def test_what_is_missing_somewhere_is_counted_and_undefined_there() -> None:
+    _, predictions, test = everywhere()
+    constant = predictions["stimulus"].str.startswith("roll")
+    odd = predictions.assign(p_contact=predictions["p_contact"].where(~constant, 0.5))
+    odd.loc[0, "stimulus"] = "elsewhere"
+    found = compare_everywhere(odd, test, FEW, halves=20, permutations=50)
+    scores = found.scores.set_index(["model", "scenario", "measure"])
+    row = scores.loc[("chance", "mean", "r")]
+    assert np.isnan(row["value"]) and row["reason"].startswith("undefined in roll")
+    assert found.dropped.to_numpy().tolist() == [
+        ["people", "unknown", "people did not see it", 1],
+        ["people", "collide", "the model does not predict it", 1],
+    ]
+    no_roll = compare_everywhere(predictions[~constant], test, FEW, halves=20, permutations=50)
+    gone = no_roll.dropped.set_index(["agent", "scenario"])["stimuli"]
+    assert gone.to_dict() == {("people", "roll"): 20, ("chance", "roll"): 20}
+
+
+def test_r_within_thirds_is_that_of_their_stimuli(answers: Answers, models: Models) -> None:
+    table = r_by_third(models.p_contact, answers.yes, answers.label, halves=30)
+    shares = answers.shares()
+    third = difficulty_third(np.where(answers.label == 1, shares, 1 - shares)).to_numpy()
+    for row in table[table["model"] >= 0].itertuples():
+        own = (third == row.third) & np.isfinite(models.p_contact[row.model])
+        expected = agreement.pearson(models.p_contact[row.model, own], shares[own])
+        assert row.r == pytest.approx(expected, abs=1e-9, nan_ok=True)
+        assert row.stimuli == (third == row.third).sum()
+    assert table["stimuli"].sum() == 25 * 5 and (table["model"] == -1).sum() == 3
+
+
 # --- paired tests and corrections ---------------------------------------------------------------
 
 bits = st.integers(1, 40).flatmap(
@@ -264,7 +346,7 @@ def test_mcnemar_is_that_of_statsmodels(pair: Array) -> None:
         assert found.p == 1
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=40)
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=30))
 def test_corrections_are_those_of_statsmodels(p: list[float]) -> None:
     np.testing.assert_allclose(holm(p), multipletests(p, method="holm")[1], atol=1e-12)
@@ -297,6 +379,21 @@ def test_permutations_keep_their_level_and_find_a_difference() -> None:
     assert np.isnan(r_permutation_p(np.full(100, 0.5), far, y))
 
 
+def test_permutations_are_those_of_swapping_by_hand() -> None:
+    generator = np.random.default_rng(4)
+    y, a, b = generator.random((3, 15))
+    found = r_permutation_p(a, b, y, permutations=50, seed=2)
+    coins = _coins(50, 15, 2) == 1
+    one, two = ((x - x.mean()) / x.std() for x in (a, b))
+    differences = [
+        agreement.pearson(np.where(coin, two, one), y)
+        - agreement.pearson(np.where(coin, one, two), y)
+        for coin in coins
+    ]
+    observed = abs(agreement.pearson(a, y) - agreement.pearson(b, y))
+    assert found == (1 + np.sum(np.abs(differences) >= observed - 1e-12)) / 51
+
+
 def test_pairs_of_models_are_compared_on_what_both_answered() -> None:
     generator = np.random.default_rng(1)
     people, label = generator.random(80), generator.integers(0, 2, 80).astype(float)
@@ -318,6 +415,15 @@ def test_pairs_of_models_are_compared_on_what_both_answered() -> None:
     np.testing.assert_allclose(
         table.loc[known.index, "p_accuracy_holm"], multipletests(known, method="holm")[1]
     )
+    gaps = p.copy()
+    gaps[0, :7] = np.nan
+    part = compare_models(list("ab"), np.where(np.isnan(gaps[:2]), np.nan, correct[:2]), gaps[:2],
+                          people, FEW, permutations=20).iloc[0]  # fmt: skip
+    assert part["stimuli"] == 73
+    assert part["r_difference"] == pytest.approx(
+        agreement.pearson(p[0, 7:], people[7:]) - agreement.pearson(p[1, 7:], people[7:])
+    )
+    assert part["r_difference_low"] < part["r_difference"] < part["r_difference_high"]
     assert table.loc[("a", "c"), "reason"].startswith("r: undefined")
     assert table.loc[("a", "d"), "reason"] == "no stimulus that both predict"
     assert table.loc[("a", "d"), ["p_accuracy", "accuracy_difference", "p_r"]].isna().all()

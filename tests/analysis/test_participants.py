@@ -173,6 +173,9 @@ def test_simulated_participants_are_left_out_and_counted(
     sessions.to_csv(tmp_path / "s.csv", index=False)
     found = read_responses(tmp_path / "t.csv", tmp_path / "s.csv")
     assert counts(found.dropped) == {SIMULATED: (1, 16)} and len(found.sessions) == 2
+    trials.assign(simulated=trials["session"] == "collide-s002").to_csv(tmp_path / "t.csv")
+    marked = read_responses(tmp_path / "t.csv")  # the mark travels with every row
+    assert counts(marked.dropped) == {SIMULATED: (1, 16)}
     kept = read_responses(tmp_path / "t.csv", tmp_path / "s.csv", simulated=True)
     assert kept.dropped.empty and len(kept.sessions) == 3
 

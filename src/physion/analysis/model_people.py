@@ -7,6 +7,7 @@ Intervals draw people, stimuli, or both; each is named, since they answer differ
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,6 +47,12 @@ MEASURES = ("accuracy", "difference", "r", "rmsd", "euclid_over_n", "kappa", "ka
 RESAMPLED = ("people", "stimuli", "both")
 """What an interval draws with replacement."""
 
+TABLE_COLUMNS = (
+    *("model", "scenario", "measure", "stimuli", "value"),
+    *(f"{end}_{what}" for what in RESAMPLED for end in ("low", "high")),
+    *("pair_low", "pair_median", "pair_high", "undefined", "reason"),
+)
+
 
 @dataclass(frozen=True)
 class Models:
@@ -71,18 +78,21 @@ class Models:
             raise BadInputError("a stimulus needs both P(contact) and a predicted outcome")
 
 
-def models_of(rows: pd.DataFrame, answers: Answers) -> tuple[Models, pd.DataFrame]:
+def models_of(
+    rows: pd.DataFrame, answers: Answers, agents: Sequence[str] | None = None
+) -> tuple[Models, pd.DataFrame]:
     """The models of a table with ``agent``, ``stimulus``, ``p_contact``, ``predicted``.
 
-    Also a table of what finds no counterpart: ``agent``, ``reason``, ``stimuli``. A stimulus that a
-    model answers twice raises `BadInputError`.
+    ``agents``: which ones, in this order, be they in ``rows`` or not. Also a table of what finds no
+    counterpart: ``agent``, ``reason``, ``stimuli``. A stimulus that a model answers twice raises
+    `BadInputError`.
     """
     twice = rows[rows.duplicated(["agent", "stimulus"])]
     if len(twice):
         raise BadInputError(
             f"{twice['agent'].iloc[0]!r} answers {twice['stimulus'].iloc[0]!r} twice"
         )
-    names = tuple(map(str, rows["agent"].unique()))
+    names = tuple(map(str, rows["agent"].unique() if agents is None else agents))
     grids = [
         rows.pivot(index="agent", columns="stimulus", values=column)
         .reindex(index=list(names), columns=list(answers.stimuli))
@@ -101,42 +111,85 @@ def models_of(rows: pd.DataFrame, answers: Answers) -> tuple[Models, pd.DataFram
 # --- the measures -------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class Measured:
+    """The measures of models in one scenario with what their intervals are made of.
+
+    ``values[measure]`` (m,); ``pairs[measure]`` (people, m), for kappa and error consistency;
+    ``draws[what][measure]`` (resamples, m) for each of `RESAMPLED`, absent where nothing is drawn.
+    """
+
+    models: Models
+    answers: Answers
+    values: dict[str, Array]
+    pairs: dict[str, Array]
+    draws: dict[str, dict[str, Array]]
+
+
+def measure_models(models: Models, answers: Answers, bootstrap: Bootstrap) -> Measured:
+    """Every measure of every model, and its resamples."""
+    values, pairs = _values(models, answers)
+    draws = {what: _resampled(models, answers, bootstrap, what) for what in RESAMPLED}
+    return Measured(models, answers, values, pairs, draws)
+
+
 def compare_with_people(
     models: Models, answers: Answers, bootstrap: Bootstrap | None = None
 ) -> pd.DataFrame:
-    """Every model's measures, one row a model and measure.
+    """Every model's measures in one scenario, one row a model and measure; see `measure_table`."""
+    draws = bootstrap or Bootstrap()
+    return measure_table(measure_models(models, answers, draws), draws)
+
+
+def measure_table(measured: Measured, bootstrap: Bootstrap) -> pd.DataFrame:
+    """One row a model and measure.
 
     Columns: ``model``, ``scenario``, ``measure``, ``stimuli``, ``value``; ``low`` and ``high`` with
     ``_people``, ``_stimuli``, ``_both`` (interval by what is drawn); for kappa and error
     consistency also ``pair_low``, ``pair_median``, ``pair_high`` (over participants) and
     ``undefined`` (participants for whom it is NaN); ``reason``.
     """
-    draws = bootstrap or Bootstrap()
-    values, pairs = _values(models, answers)
-    resampled = {what: _resampled(models, answers, draws, what) for what in RESAMPLED}
-    records = []
+    models, records = measured.models, []
     for k, name in enumerate(models.names):
-        known = int(np.sum(~np.isnan(models.p_contact[k])))
         for measure in MEASURES:
-            record: dict[str, Any] = {"model": name, "scenario": answers.scenario,
-                                      "measure": measure, "stimuli": known}  # fmt: skip
-            value = float(values[measure][k])
-            reasons = [] if np.isfinite(value) else [_why(measure, k, models, answers)]
-            for what in RESAMPLED:
-                low, high = np.nan, np.nan
-                drawn = resampled[what].get(measure)
-                if drawn is None:
-                    reasons.append("people: they do not enter")
-                elif np.isfinite(value):
-                    low, high = draws.interval(drawn[:, k])
-                record |= {f"low_{what}": low, f"high_{what}": high}
-            if measure in pairs:
-                record |= _over_people(pairs[measure][:, k])
-            records.append({**record, "value": value, "reason": "; ".join(reasons)})
-    columns = ["model", "scenario", "measure", "stimuli", "value"]
-    columns += [f"{end}_{what}" for what in RESAMPLED for end in ("low", "high")]
-    columns += ["pair_low", "pair_median", "pair_high", "undefined", "reason"]
-    return pd.DataFrame(records).reindex(columns=columns)
+            value = float(measured.values[measure][k])
+            draws = {what: measured.draws[what].get(measure) for what in RESAMPLED}
+            own = {what: None if drawn is None else drawn[:, k] for what, drawn in draws.items()}
+            record, reasons = interval_columns(value, own, bootstrap)
+            if not np.isfinite(value):
+                reasons.insert(0, _why(measure, k, models, measured.answers))
+            if measure in measured.pairs:
+                record |= _over_people(measured.pairs[measure][:, k])
+            records.append(
+                {
+                    "model": name,
+                    "scenario": measured.answers.scenario,
+                    "measure": measure,
+                    "stimuli": int(np.sum(~np.isnan(models.p_contact[k]))),
+                    **record,
+                    "reason": "; ".join(reasons),
+                }
+            )
+    return pd.DataFrame(records).reindex(columns=list(TABLE_COLUMNS))
+
+
+def interval_columns(
+    value: float, draws: Mapping[str, Array | None], bootstrap: Bootstrap
+) -> tuple[dict[str, Any], list[str]]:
+    """``value`` with ``low_`` and ``high_`` of each of `RESAMPLED`, and reasons for what is NaN."""
+    record: dict[str, Any] = {"value": value}
+    reasons = []
+    for what in RESAMPLED:
+        low, high = np.nan, np.nan
+        drawn = draws[what]
+        if drawn is None:
+            reasons.append(f"no interval over {what}: they do not enter")
+        elif np.isfinite(value):
+            low, high = bootstrap.interval(drawn)
+            if np.isnan(low):
+                reasons.append(f"no interval over {what}: undefined in most resamples")
+        record |= {f"low_{what}": low, f"high_{what}": high}
+    return record, reasons
 
 
 def _values(models: Models, answers: Answers) -> tuple[dict[str, Array], dict[str, Array]]:

@@ -79,6 +79,7 @@ def _file(path: Path, scenario: str | None, offset: float) -> pd.DataFrame:
             "trial": place,
             "response": raw["response"].str.lower().where(raw["response"].str.lower() != "nan", ""),
             "label": raw["target_hit_zone_label"],
+            "simulated": False,
             "rt_ms": _response_time(raw["rt"], offset, path),
         }
     )

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import combinations
 
 import numpy as np
@@ -13,7 +14,7 @@ from scipy import stats
 
 from physion.analysis.agreement import pearson
 from physion.analysis.bootstrap import Bootstrap
-from physion.analysis.correlation import correlate_resampled, correlate_rows
+from physion.analysis.correlation import correlate_resampled, from_sums
 from physion.errors import BadInputError
 from physion.seeds import stable_hash
 
@@ -75,13 +76,29 @@ def r_permutation_p(
     if not np.isfinite(observed):
         return float("nan")
     a, b = (a - a.mean()) / a.std(), (b - b.mean()) / b.std()
-    swap = np.random.default_rng(stable_hash("swap", seed, len(a))).random(
-        (permutations, len(a))
-    ) < 0.5  # fmt: skip
-    shares = np.broadcast_to(y, swap.shape)
-    r = correlate_rows(np.where(swap, b, a), shares) - correlate_rows(np.where(swap, a, b), shares)
+    swap = _coins(permutations, len(a), seed)
+    r = _swapped_r(a, b, y - y.mean(), swap) - _swapped_r(b, a, y - y.mean(), swap)
     as_large = np.sum(np.abs(r) >= abs(observed) - 1e-12)
     return float((1 + as_large) / (1 + permutations))
+
+
+@lru_cache(maxsize=2)
+def _coins(permutations: int, n: int, seed: int) -> Array:
+    """0 or 1 for each permutation and stimulus; kept, since all pairs of models toss the same."""
+    generator = np.random.default_rng(stable_hash("swap", seed, n))
+    coins = (generator.random((permutations, n)) < 0.5).astype(np.float64)
+    coins.flags.writeable = False
+    return coins
+
+
+def _swapped_r(a: Array, b: Array, y: Array, swap: Array) -> Array:
+    """r with ``y`` of ``a``, in which the stimuli of ``swap`` have the value of ``b``."""
+    change = swap @ np.stack([b - a, b * b - a * a, (b - a) * y], axis=1)
+    n, ones = float(len(a)), np.ones(len(swap))
+    return from_sums(
+        n * ones, a.sum() + change[:, 0], y.sum() * ones,
+        (a * a).sum() + change[:, 1], (y * y).sum() * ones, (a * y).sum() + change[:, 2],
+    )  # fmt: skip
 
 
 # --- corrections for many comparisons -----------------------------------------------------------
@@ -128,20 +145,23 @@ def compare_models(
     people: Array,
     bootstrap: Bootstrap | None = None,
     *,
-    stratum: str = "pooled",
+    strata: Sequence[str] | None = None,
     permutations: int = 2000,
 ) -> pd.DataFrame:
     """Every two models on the same stimuli, one row a pair.
 
     ``correct`` and ``p_contact`` (m, s) with NaN for stimuli that a model lacks, ``people`` (s,)
-    the share of people who say yes. A pair is compared on the stimuli that both answered. Columns:
+    the share of people who say yes. ``strata`` (s,) names the scenario of each stimulus: every one
+    keeps its number of stimuli when they are drawn. A pair is compared on the stimuli that both
+    answered. Columns:
     ``first``, ``second``, ``stimuli``, ``accuracy_difference`` (first - second), ``only_first``,
     ``only_second``, ``p_accuracy`` (McNemar, exact), ``r_difference`` with ``_low``, ``_high``
     (bootstrap over stimuli), ``p_r`` (permutations), and of both p the corrected ``_holm`` and
     ``_bh`` over all pairs of this table, ``reason``.
     """
     draws = bootstrap or Bootstrap()
-    weights = draws.weights(stratum, len(people))
+    weights = _stratified(draws, ["pooled"] * len(people) if strata is None else list(strata))
+    together = correlate_resampled(p_contact, np.broadcast_to(people, weights.shape), weights)
     records = []
     for i, j in combinations(range(len(names)), 2):
         shared = np.isfinite(correct[i]) & np.isfinite(correct[j])
@@ -149,7 +169,11 @@ def compare_models(
         both = shared & np.isfinite(people)
         x, z = np.where(both, p_contact[i], np.nan), np.where(both, p_contact[j], np.nan)
         difference = pearson(x[both], people[both]) - pearson(z[both], people[both])
-        low, high = draws.interval(r_difference_draws(x, z, people, weights))
+        if (np.isfinite(p_contact[i]) == np.isfinite(p_contact[j])).all():
+            drawn = together[:, i] - together[:, j]
+        else:
+            drawn = r_difference_draws(x, z, people, weights)
+        low, high = draws.interval(drawn)
         records.append(
             {
                 "first": names[i],
@@ -175,6 +199,16 @@ def compare_models(
         table[f"{p}_holm"] = holm(table[p])
         table[f"{p}_bh"] = benjamini_hochberg(table[p])
     return table
+
+
+def _stratified(bootstrap: Bootstrap, strata: list[str]) -> Array:
+    """How often each stimulus is drawn, (resamples, s), each stratum by itself."""
+    names = np.array(strata, dtype=object)
+    weights = np.zeros((bootstrap.resamples, len(names)))
+    for name in dict.fromkeys(strata):
+        own = np.flatnonzero(names == name)
+        weights[:, own] = bootstrap.weights(name, len(own))
+    return weights
 
 
 def _why(shared: npt.NDArray[np.bool_], difference: float) -> str:

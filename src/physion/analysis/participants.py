@@ -98,10 +98,12 @@ def read_responses(
     found = clean(
         table, people, where=str(trials), known=known, unknown=unknown, conflicts=conflicts
     )
-    if simulated or "simulated" not in found.sessions:
+    made = set(found.trials.loc[found.trials["simulated"], "session"])
+    if "simulated" in found.sessions:
+        made |= set(found.sessions.loc[found.sessions["simulated"], "session"])
+    if simulated or not made:
         return found
-    persons = found.sessions[~found.sessions["simulated"]]
-    return found.keep_sessions(set(persons["session"]), SIMULATED)
+    return found.keep_sessions(set(found.sessions["session"]) - made, SIMULATED)
 
 
 def _read(path: Path) -> pd.DataFrame:

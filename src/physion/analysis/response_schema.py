@@ -64,6 +64,7 @@ TRIAL_COLUMNS: tuple[Column, ...] = (
         required=True,
     ),
     _must("label", "flag", "Does the agent touch the patient?"),
+    _must("simulated", "flag", "Made by a program for piloting: no person"),
     Column(
         "rt_ms",
         "number",
@@ -100,7 +101,7 @@ SESSION_COLUMNS: tuple[Column, ...] = (
     _must("participant", "text", "As in the trials"),
     _must("session", "text", "As in the trials; unique here"),
     _must("scenario", "text", "Scenario of the session"),
-    _must("simulated", "flag", "Made by a program for piloting: no person"),
+    _must("simulated", "flag", "As in the trials"),
     Column("study", "text", "Name and version of the study"),
     Column("recruited_by", "text", "Where the participant came from"),
     Column("started_at", "time", "When the session began"),
