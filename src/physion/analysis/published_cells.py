@@ -39,12 +39,12 @@ def accuracy_table(tables: PublishedTables, bootstrap: Bootstrap | None = None) 
     not with other stimuli), ``rows`` (how many), ``without_copies`` (the mean with
     *observed* once);
     ``expected`` with ``expected_low``, ``expected_high`` (Wilson's 95 % interval: other stimuli of
-    the kind) and ``runs`` (seeds averaged in it), ``stimuli`` (tested; see `tested_stimuli`),
+    the kind) and ``runs`` (seeds averaged in it), ``stimuli`` (tested; see `count_tested`),
     ``difference`` (expected - published).
     """
     draws = bootstrap or Bootstrap()
     level = draws.level
-    counts = tested_stimuli(tables.runs)
+    counts = count_tested(tables.runs)
     once = tables.distinct
     records = []
     for (model, scenario), rows in tables.runs.groupby(["model", "scenario"], sort=False):
@@ -84,7 +84,7 @@ def grid(table: pd.DataFrame, column: str) -> pd.DataFrame:
     return wide.assign(mean=wide.mean(axis=1, skipna=False)).reset_index().rename_axis(columns=None)
 
 
-def tested_stimuli(runs: pd.DataFrame) -> dict[tuple[str, str], int]:
+def count_tested(runs: pd.DataFrame) -> dict[tuple[str, str], int]:
     """How many stimuli each model was tested on in each scenario, by (model, scenario).
 
     The released tables do not say; the accuracies are fractions, so the number is recovered from

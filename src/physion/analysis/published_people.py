@@ -7,6 +7,7 @@ import pandas as pd
 from scipy import stats
 
 from physion.analysis.bootstrap import Bootstrap
+from physion.analysis.people import spearman_brown
 from physion.analysis.published_tables import PublishedTables
 from physion.analysis.tables import MEAN
 from physion.analysis.zones import released_zone
@@ -45,7 +46,7 @@ def people_by_scenario(tables: PublishedTables, bootstrap: Bootstrap | None = No
     table.insert(
         table.columns.get_loc("half_r_high") + 1,
         "half_r_full",
-        2 * table["half_r"] / (1 + table["half_r"]),
+        spearman_brown(table["half_r"].to_numpy(np.float64)),
     )
     return pd.concat([table, pd.DataFrame([_mean_row(table, draws)])], ignore_index=True)
 

@@ -25,6 +25,9 @@ DominoesLook = Literal["plain", "redyellow", "pooled"]
 """Which people count for Dominoes: those who saw free colours with flashing overlays (the ones of
 the paper), those who saw a red agent and a yellow patient, or both weighted by their number."""
 
+LABELS_FILE = "stimulus_names_and_labels.csv"
+"""The official file of the outcomes of all stimuli that people saw."""
+
 _FILE = re.compile(r"human_accuracy-(?P<scenario>[a-zA-Z]+)(?P<red>-redyellow)?_pilot-.*\.csv$")
 
 

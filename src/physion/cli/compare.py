@@ -1,9 +1,12 @@
 """Compare predictions with people and write the report: tables, figures, one page.
 
-physion compare FILES... --humans DIR   the comparison and its report (the options below)
-physion compare official DIR            the published numbers beside those that can be recomputed
-physion compare validate FILE...        check files of predictions; names each bad row
-physion compare leaderboard FILES...    one table of many files, sorted by any column
+`physion compare FILES... --humans DIR`: the comparison and its report (the options below).
+
+`physion compare official DIR`: the published numbers beside those that can be recomputed.
+
+`physion compare validate FILE...`: checks files of predictions and names each bad row.
+
+`physion compare leaderboard FILES...`: one table of many files, sorted by any column.
 
 A file that is called like one of these words is meant by ./official and so on.
 """

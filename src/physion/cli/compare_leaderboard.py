@@ -17,19 +17,8 @@ if TYPE_CHECKING:
 
     from physion.analysis.leaderboard import Leaderboard
 
-SHOWN = {
-    "rank": "rank",
-    "model": "model",
-    "readout": "readout",
-    "training": "training",
-    "stimuli": "stimuli",
-    "accuracy": "accuracy",
-    "r": "r",
-    "kappa": "kappa",
-    "rmsd": "RMSD",
-    "versions": "versions",
-    "file": "file",
-}
+SHOWN = ("rank", "model", "readout", "training", "stimuli", "accuracy", "r", "kappa", "rmsd")
+"""Columns on the console, then the versions and the file; those without a value are left out."""
 
 
 @dataclass(frozen=True)
@@ -86,12 +75,12 @@ def _board(options: Options) -> Leaderboard:
 
     from physion.analysis.leaderboard import leaderboard, sort_leaderboard
     from physion.analysis.participants import read_responses
-    from physion.analysis.responses import find_beside, read_humans, read_labels
+    from physion.analysis.responses import LABELS_FILE, find_beside, read_humans, read_labels
     from physion.analysis.stimuli import read_stimulus_list
 
     humans, labels = options.humans, options.labels
     if labels is None and humans is not None:
-        labels = find_beside(humans, "stimuli", "stimulus_names_and_labels.csv")
+        labels = find_beside(humans, "stimuli", LABELS_FILE)
     board = leaderboard(
         options.predictions,
         None if humans is None else read_humans(humans),
@@ -124,25 +113,19 @@ def _write(board: Leaderboard, record: dict[str, Any], folder: Path) -> None:
 
 
 def _print(table: pd.DataFrame) -> None:
-    from rich.table import Table
-
     from physion.cli.output import console
+    from physion.cli.text_table import text_table
 
-    shown = Table(box=None, pad_edge=False)
-    for title in SHOWN.values():
-        shown.add_column(title, overflow="fold")
-    for _, row in table.iterrows():
-        shown.add_row(*(_cell(row, name) for name in SHOWN))
-    console.print(shown)
+    shown = table[[*SHOWN, "versions", "file"]].copy()
+    for name in ("accuracy", "r", "kappa", "rmsd"):
+        shown[name] = [_interval(row, name) for row in table.to_dict("records")]
+    empty = [name for name in shown.columns if shown[name].isin(["", None]).all()]
+    text = text_table(shown.drop(columns=empty))
+    console.print(text, markup=False, soft_wrap=True)
 
 
-def _cell(row: pd.Series, name: str) -> str:
-    import pandas as pd
-
-    value = row[name]
-    if pd.isna(value):
+def _interval(row: dict[str, Any], name: str) -> str:
+    value, low, high = row[name], row[f"{name}_low"], row[f"{name}_high"]
+    if value != value:
         return ""
-    if f"{name}_low" not in row.index:
-        return str(value)
-    low, high = row[f"{name}_low"], row[f"{name}_high"]
-    return f"{value:.3f}" + ("" if pd.isna(low) else f" [{low:.3f}, {high:.3f}]")
+    return f"{value:.3f}" + ("" if low != low else f" [{low:.3f}, {high:.3f}]")

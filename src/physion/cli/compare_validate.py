@@ -22,6 +22,8 @@ class Options:
 
     predictions: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Prediction files with the official column names."""
+    humans: Path | None = None
+    """Folder with human_accuracy-*.csv: the official outcomes are looked for beside it."""
     labels: Path | None = None
     """Official outcomes (stim_ID, label): the stimuli that should be predicted."""
     index: Path | None = None
@@ -50,12 +52,18 @@ def main(options: Options) -> int:
 
 
 def _reference(options: Options) -> Reference:
-    from physion.analysis.responses import read_labels
+    from physion.analysis.responses import LABELS_FILE, find_beside, read_labels
     from physion.analysis.stimuli import read_stimulus_list
     from physion.analysis.submission import Reference, read_index
+    from physion.errors import BadInputError
 
+    labels = options.labels
+    if labels is None and options.humans is not None:
+        labels = find_beside(options.humans, "stimuli", LABELS_FILE)
+        if labels is None:
+            raise BadInputError(f"no {LABELS_FILE} lies near {options.humans}; give --labels")
     return Reference(
-        labels=None if options.labels is None else read_labels(options.labels),
+        labels=None if labels is None else read_labels(labels),
         index=None if options.index is None else read_index(options.index),
         fitted=None if options.fitted is None else read_stimulus_list(options.fitted),
     )

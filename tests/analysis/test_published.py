@@ -1,0 +1,305 @@
+"""The released tables give the published numbers, to the digit; broken tables are refused."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from physion.analysis.bootstrap import Bootstrap
+from physion.analysis.published import TITLES, PublishedResults, results_of
+from physion.analysis.published_cells import (
+    averaged_in_words,
+    copies_of_observed,
+    count_tested,
+    grid,
+    wilson,
+)
+from physion.analysis.published_panels import panel_a
+from physion.analysis.published_tables import (
+    MODELS,
+    OBSERVED_AGAIN,
+    PublishedTables,
+    read_published,
+)
+from physion.analysis.stimuli import SCENARIOS
+from physion.errors import BadInputError
+
+
+@pytest.fixture(scope="module")
+def released(official: Path) -> PublishedTables:
+    return read_published(official)
+
+
+@pytest.fixture(scope="module")
+def results(released: PublishedTables) -> PublishedResults:
+    return results_of(released)
+
+
+@pytest.fixture
+def copy(official: Path, tmp_path: Path) -> Path:
+    """A copy of the released tables that a test may spoil."""
+    for name in ("results", "humans"):
+        shutil.copytree(official / name, tmp_path / name)
+    return tmp_path
+
+
+# --- the tables ---------------------------------------------------------------------------------
+
+
+def test_every_row_is_read(released: PublishedTables) -> None:
+    assert len(released.runs) == 1176 and len(released.distinct) == 1008
+    assert released.dropped.empty
+    assert list(dict.fromkeys(released.runs["model"])) == list(MODELS.values())
+    assert list(dict.fromkeys(released.people["scenario"])) == list(SCENARIOS)
+    assert set(released.runs["training"]) == {"all", "all-but", "only"}
+    assert not released.runs.isna().any(axis=None)
+
+
+def test_kappas_belong_to_their_accuracies(official: Path, released: PublishedTables) -> None:
+    kappas = pd.read_csv(official / "results" / "model_human_CohensK.csv")
+    run = "DPI_nan_nan_nan_nan_L2 on particle 3D positions_1_all_readout_B"
+    raw = kappas[kappas["ModelID"].str.startswith(run)].set_index("scenario")["Cohens_k_med"]
+    rows = released.runs
+    own = rows[(rows["model"] == "DPI") & (rows["training"] == "all")].set_index("scenario")
+    assert (
+        own.loc["drop", "kappa"] == raw["drop"]
+        and own.loc["roll", "kappa"] == raw["rollingsliding"]
+    )
+    assert own["kappa_low"].lt(own["kappa"]).all() and own["kappa_high"].gt(own["kappa"]).all()
+
+
+def test_readout_d_is_a_copy(released: PublishedTables) -> None:
+    assert copies_of_observed(released) == (168, 168)
+    again = released.runs[released.runs["readout"] == OBSERVED_AGAIN]
+    assert set(again["model"]) == {"SVG", "RPIN"}
+
+
+# --- table S1 -----------------------------------------------------------------------------------
+
+
+def test_all_88_published_means_to_three_decimals(
+    official: Path, results: PublishedResults
+) -> None:
+    file = official.resolve().parent / "reference" / "table-s1-means.csv"
+    if not file.is_file():
+        pytest.skip(f"the printed table is absent: {file.name} in the folder reference")
+    printed = pd.read_csv(file, dtype=str)
+    ours = results.tables["accuracies"].set_index(["model", "scenario"])["published"]
+    assert len(printed) == len(ours) == 88
+    for model, scenario, mean in printed.itertuples(index=False):
+        assert f"{ours[(model, scenario.lower())]:.3f}" == mean, (model, scenario)
+
+
+def test_the_expected_cells_are_those_of_the_files(
+    official: Path, results: PublishedResults
+) -> None:
+    raw = pd.read_csv(official / "results" / "model_human_accuracies.csv")
+    cell = raw[(raw["Readout Type"] == "B") & (raw["Dynamics Training Dataset Type"] == "all")]
+    means = cell.groupby(["Model", "scenario"])["model_correct"].mean().groupby("Model").mean()
+    ours = grid(results.tables["accuracies"], "expected").set_index("model")["mean"]
+    for official_name, name in MODELS.items():
+        theirs = means[[key for key in means.index if key.strip() == official_name]].item()
+        assert ours[name] == pytest.approx(theirs, abs=1e-12)
+    # Section 1.3 of the reference on models, made by another hand.
+    known = {"SVG": 0.530, "RPIN": 0.584, "CSWM": 0.573, "pVGG-mlp": 0.569, "pDEIT-lstm": 0.605,
+             "GNS": 0.677, "GNS-R": 0.701, "DPI": 0.748}  # fmt: skip
+    assert {name: round(float(ours[name]), 3) for name in known} == known
+
+
+def test_numbers_of_count_tested_are_recovered(released: PublishedTables) -> None:
+    counts = count_tested(released.runs)
+    whole = {"drape": 199, "collide": 240, "contain": 205, "dominoes": 277, "drop": 200,
+             "link": 205, "roll": 117, "support": 239}  # fmt: skip
+    for model in set(MODELS.values()) - {"SVG", "RPIN"}:
+        assert {name: counts[(model, name)] for name in whole} == whole
+    assert all(counts[("SVG", name)] <= n for name, n in whole.items())
+    assert (counts[("RPIN", "roll")], counts[("RPIN", "contain")]) == (115, 204)
+
+
+def test_intervals_hold_their_means(results: PublishedResults) -> None:
+    table = results.tables["accuracies"]
+    for name in ("published", "expected"):
+        assert (table[f"{name}_low"] <= table[name]).all()
+        assert (table[f"{name}_high"] >= table[name]).all()
+    assert (table["expected_high"] - table["expected_low"]).between(0.05, 0.25).all()
+    one = table.set_index(["model", "scenario"]).loc[("DPI", "drop")]
+    assert (one["rows"], one["runs"], one["stimuli"]) == (3, 1, 200)
+    assert table.set_index("model").loc["SVG", "rows"].eq(48).all()
+
+
+def test_wilson_against_scipy() -> None:
+    from scipy.stats import binomtest
+
+    for k, n in ((0, 10), (7, 10), (120, 199), (10, 10)):
+        known = binomtest(k, n).proportion_ci(method="wilson")
+        assert wilson(k / n, n) == pytest.approx((known.low, known.high), abs=1e-12)
+    assert np.isnan(wilson(float("nan"), 10)).all() and np.isnan(wilson(0.5, 0)).all()
+
+
+def test_words_say_what_was_averaged(released: PublishedTables) -> None:
+    words = averaged_in_words(released)
+    for part in ("full", "every training", "RPIN 36", "SVG 48", "168 of 168", "SVG and RPIN",
+                 "Seed 1 of SVG stands in 2", "trained on all scenarios"):  # fmt: skip
+        assert part in words, part
+    # Without the copies the words do not speak of them.
+    own = PublishedTables(released.distinct, released.people, released.stimuli, released.dropped)
+    assert "twice" not in averaged_in_words(own)
+
+
+# --- panels -------------------------------------------------------------------------------------
+
+
+def test_panels_a_and_c_have_the_first_seed_alone(
+    released: PublishedTables, results: PublishedResults
+) -> None:
+    runs = released.distinct
+    for name, measure in (("panel_a", "accuracy"), ("panel_c", "kappa")):
+        table = results.tables[name].set_index(["model", "scenario"])
+        assert len(table) == 11 * 9
+        for model, file in (("SVG", "svg_seed_0_1_2"), ("RPIN", "rpin.csv")):
+            own = runs[
+                (runs["model"] == model)
+                & (runs["training"] == "all")
+                & (runs["readout"] == "observed+simulated")
+                & (runs["seed"] == 0)
+            ]
+            assert own["file"].str.contains(file).all() and len(own) == 8
+            assert table.loc[(model, "mean"), measure] == pytest.approx(own[measure].mean())
+
+
+def test_panels_set_models_beside_people(results: PublishedResults) -> None:
+    a = results.tables["panel_a"].set_index(["model", "scenario"])
+    drop = a.loc[("DPI", "drop")]
+    assert (round(drop["people"], 3), round(drop["zone_low"], 3)) == (0.746, 0.668)
+    assert drop["in_zone"] and not a.loc[("SVG", "drop"), "in_zone"]
+    mean = a.xs("mean", level="scenario")
+    assert mean["people"].nunique() == 1 and round(mean["people"].iloc[0], 3) == 0.747
+    # The released grey band: a bootstrap over eight means, narrower than the participants' zones.
+    width = a.loc["DPI", "zone_high"] - a.loc["DPI", "zone_low"]
+    assert width["mean"] < width.drop("mean").min()
+    c = results.tables["panel_c"].set_index(["model", "scenario"])
+    assert not c.xs("mean", level="scenario")["in_zone"].any()
+
+
+def test_panel_d_and_e_against_the_reference(results: PublishedResults) -> None:
+    d = results.tables["panel_d"].set_index(["model", "readout"])["accuracy"].round(3)
+    # Section 1.3 of the reference on models.
+    for model, full, both, observed in (
+        ("SVG", 0.612, 0.530, 0.551), ("OP3", 0.516, 0.518, 0.524), ("CSWM", 0.634, 0.573, 0.573),
+        ("RPIN", 0.640, 0.584, 0.571), ("pVGG-mlp", 0.697, 0.569, 0.572),
+        ("pDEIT-lstm", 0.721, 0.605, 0.599),
+    ):  # fmt: skip
+        assert (d[model, "full"], d[model, "observed+simulated"]) == (full, both)
+        assert d[model, "observed"] == observed
+    assert not set(d.index.get_level_values("model")) & {"GNS", "GNS-R", "DPI"}
+    e = results.tables["panel_e"].set_index(["model", "training"])["accuracy"].round(3)
+    assert (e["GNS", "only"], e["DPI", "only"], e["GNS-R", "only"]) == (0.746, 0.752, 0.733)
+    assert (e["GNS", "all-but"], e["DPI", "all-but"], e["GNS-R", "all-but"]) == (
+        0.687,
+        0.623,
+        0.698,
+    )
+
+
+def test_the_same_seed_gives_the_same_intervals(released: PublishedTables) -> None:
+    first, again = (panel_a(released, Bootstrap(seed=1)) for _ in range(2))
+    pd.testing.assert_frame_equal(first, again)
+    other = panel_a(released, Bootstrap(seed=2))
+    assert not first["low"].dropna().equals(other["low"].dropna())
+
+
+# --- people -------------------------------------------------------------------------------------
+
+
+def test_people_beside_the_paper(results: PublishedResults) -> None:
+    claims = results.tables["people_claims"].set_index("claim")["ours"]
+    assert claims["participants after exclusions"] == "688"
+    assert claims["proportion correct over scenarios"] == "0.747"
+    shares = [text for claim, text in claims.items() if "stimuli" in str(claim)]
+    assert [round(float(text.rstrip("%"))) for text in shares] == [10, 22, 68]
+    table = results.tables["people"].set_index("scenario")
+    assert table.loc["mean", "stimuli"] == 1144
+    # "Each scenario included some stimuli on which people were below chance."
+    assert table["below_chance"].gt(0).all()
+    assert table.loc["mean", "below_chance"] == table["below_chance"].iloc[:8].sum()
+    assert table["accuracy"].between(table["zone_low"], table["zone_high"]).all()
+    assert (table["accuracy"] - table["accuracy_by_stimulus"]).abs().max() < 0.006
+    assert (table["half_r_full"] > table["half_r"]).all()
+    half = table.loc["drop", "half_r"]
+    assert table.loc["drop", "half_r_full"] == pytest.approx(2 * half / (1 + half))
+
+
+def test_every_table_has_a_title_and_nothing_is_empty(results: PublishedResults) -> None:
+    assert set(results.tables) == set(TITLES)
+    assert all(len(table) for name, table in results.tables.items() if name != "left_out")
+    assert {"accuracies", "panels", "regressions", "people"} == set(results.words)
+
+
+# --- broken tables ------------------------------------------------------------------------------
+
+
+def spoil(path: Path, column: str, row: int, value: str) -> None:
+    table = pd.read_csv(path, dtype=str, keep_default_na=False)
+    table.loc[row, column] = value
+    table.to_csv(path, index=False)
+
+
+@pytest.mark.parametrize(
+    ("file", "column", "value"),
+    [
+        ("model_human_accuracies.csv", "model_correct", "1.5"),
+        ("model_human_accuracies.csv", "model_correct", ""),
+        ("model_human_accuracies.csv", "Model", "SVGG"),
+        ("model_human_accuracies.csv", "Readout Type", "E"),
+        ("model_human_accuracies.csv", "Dynamics Training Dataset Type", "some"),
+        ("model_human_accuracies.csv", "Encoder Training Seed", "x"),
+        ("model_human_CohensK.csv", "Cohens_k_med", "nan"),
+        ("human_accuracy_by_scenario.csv", "obs_mean", "2"),
+        ("human_pairwiseCorrs_by_scenario.csv", "r_mean", ""),
+    ],
+)
+def test_a_bad_value_names_file_row_and_column(
+    copy: Path, file: str, column: str, value: str
+) -> None:
+    spoil(copy / "results" / file, column, 3, value)
+    with pytest.raises(BadInputError) as refused:
+        read_published(copy)
+    words = str(refused.value)
+    assert file in words and "row 4" in words and column in words
+
+
+def test_a_run_without_kappa_is_counted(copy: Path) -> None:
+    path = copy / "results" / "model_human_CohensK.csv"
+    table = pd.read_csv(path, dtype=str, keep_default_na=False)
+    table.iloc[2:].to_csv(path, index=False)
+    found = read_published(copy)
+    assert len(found.runs) == 1174
+    assert found.dropped[["table", "rows"]].values.tolist() == [["model_human_accuracies.csv", 2]]
+
+
+@pytest.mark.parametrize("name", ["results", "humans", "results/human_accuracy_by_scenario.csv"])
+def test_missing_parts_are_named(copy: Path, name: str) -> None:
+    part = copy / name
+    shutil.rmtree(part) if part.is_dir() else part.unlink()
+    with pytest.raises(BadInputError, match=Path(name).name):
+        read_published(copy)
+
+
+def test_a_run_that_stands_twice_is_refused(copy: Path) -> None:
+    path = copy / "results" / "model_human_accuracies.csv"
+    table = pd.read_csv(path, dtype=str, keep_default_na=False)
+    pd.concat([table, table.iloc[:1]]).to_csv(path, index=False)
+    with pytest.raises(BadInputError, match="two rows"):
+        read_published(copy)
+
+
+def test_a_scenario_without_people_is_refused(copy: Path) -> None:
+    path = copy / "results" / "human_pairwiseCohensKs_by_scenario.csv"
+    table = pd.read_csv(path, dtype=str)
+    table[table["scenario"] != "drop"].to_csv(path, index=False)
+    with pytest.raises(BadInputError, match="drop"):
+        read_published(copy)

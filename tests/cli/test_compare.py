@@ -1,0 +1,204 @@
+"""The verb compare: its old form, and the verbs below it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from physion.cli.compare import SUBVERBS
+from physion.cli.main import main
+
+
+def predictions(official: Path, path: Path, model: str = "m", skill: float = 0.8) -> Path:
+    """A made-up model that is right about the share ``skill`` of the official stimuli."""
+    names = pd.read_csv(official / "stimuli" / "stimulus_names_and_labels.csv")
+    right = np.random.default_rng(0).random(len(names)) < skill
+    said = names["label"].to_numpy() == right
+    p = np.where(said, 0.9, 0.1)
+    pd.DataFrame(
+        {
+            "Model": model,
+            "Readout Type": "B",
+            "Predicted Prob_false": 1 - p,
+            "Predicted Prob_true": p,
+            "Predicted Outcome": said,
+            "Actual Outcome": names["label"],
+            "Stimulus Name": names["stim_ID"],
+            "Versions": "made up 1",
+        }
+    ).to_csv(path, index=False)
+    return path
+
+
+@pytest.mark.parametrize("verb", sorted(SUBVERBS))
+def test_every_verb_below_has_help(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as left:
+        main(["compare", verb, "--help"])
+    assert left.value.code == 0
+    assert f"physion compare {verb}" in capsys.readouterr().out
+
+
+def test_help_names_the_verbs_below(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["compare", "--help"])
+    out = capsys.readouterr().out
+    assert all(f"physion compare {verb}" in out for verb in SUBVERBS)
+    assert "physion compare FILES... --humans DIR" in out
+
+
+@pytest.mark.parametrize("words", [["compare"], *(["compare", verb] for verb in sorted(SUBVERBS))])
+def test_help_imports_nothing_heavy(words: list[str]) -> None:
+    code = (
+        "import sys\nfrom physion.cli.main import main\n"
+        f"try: main({[*words, '--help']!r})\nexcept SystemExit: pass\n"
+        "heavy = {'numpy', 'torch', 'scipy', 'matplotlib', 'pandas'} & set(sys.modules)\n"
+        "sys.exit(' '.join(heavy) or 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+def test_the_old_form_writes_the_report(
+    official: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = predictions(official, tmp_path / "m.csv")
+    command = ["compare", str(file), "--humans", str(official / "humans")]
+    assert main([*command, "--out", str(tmp_path / "report")]) == 0
+    assert "report:" in capsys.readouterr().out
+    assert (tmp_path / "report" / "tables" / "comparison.csv").is_file()
+
+
+def test_without_files_it_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    for words in ([], ["validate"], ["leaderboard"]):
+        assert main(["compare", *words]) == 2
+        assert "no file of predictions" in capsys.readouterr().err
+
+
+# --- official -----------------------------------------------------------------------------------
+
+
+def test_official_prints_and_writes_the_published_numbers(
+    official: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "tables"
+    assert main(["compare", "official", str(official), "--out", str(out)]) == 0
+    text = capsys.readouterr().out
+    for part in ("Accuracy as published", "Panel A", "Panel C", "Panel D", "Panel E",
+                 "Regressions", "168 of 168", "0.748", "800 - 112 = 688"):  # fmt: skip
+        assert part in text, part
+    table = pd.read_csv(out / "accuracies.csv")
+    assert len(table) == 88
+    written = json.loads((out / "published.json").read_text())
+    assert {path.stem for path in out.glob("*.csv")} == set(written["tables"])
+    again = tmp_path / "again"
+    main(["compare", "official", str(official), "--out", str(again)])
+    for path in out.iterdir():
+        assert path.read_bytes() == (again / path.name).read_bytes(), path.name
+
+
+def test_official_as_json(official: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["compare", "official", str(official), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    dpi = [row for row in found["tables"]["accuracies"] if row["model"] == "DPI"]
+    assert len(dpi) == 8 and all(0 < row["published"] < 1 for row in dpi)
+    assert "detection" in found["words"]["accuracies"]
+
+
+def test_official_of_another_folder_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["compare", "official", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1 and "results" in message
+    assert not (tmp_path / "out").exists()
+
+
+# --- validate -----------------------------------------------------------------------------------
+
+
+def test_validate_a_good_file(
+    official: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = predictions(official, tmp_path / "m.csv")
+    assert main(["compare", "validate", str(file), "--humans", str(official / "humans")]) == 0
+    out = capsys.readouterr().out
+    assert "1200 rows, 1 models, 0 errors, 0 warnings" in out and "leakage" in out
+
+
+def test_validate_names_the_bad_row(
+    official: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    good, bad = (predictions(official, tmp_path / f"{name}.csv") for name in ("good", "bad"))
+    rows = pd.read_csv(bad, dtype=str)
+    rows.loc[41, "Predicted Prob_true"] = "1.5"
+    rows.to_csv(bad, index=False)
+    assert main(["compare", "validate", str(good), str(bad)]) == 1
+    line = next(line for line in capsys.readouterr().out.splitlines() if "error: " in line)
+    assert "row 42" in line and rows.loc[41, "Stimulus Name"] in line and "bad.csv" in line
+    assert main(["compare", "validate", str(good), str(bad), "--json"]) == 1
+    first, second = json.loads(capsys.readouterr().out)
+    assert (first["errors"], second["errors"]) == (0, 1)
+    assert second["faults"][0]["row"] == 42 and second["faults"][0]["level"] == "error"
+
+
+def test_validate_finds_what_the_readout_was_fitted_on(
+    official: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = predictions(official, tmp_path / "m.csv")
+    fitted = tmp_path / "fitted.txt"
+    fitted.write_text(str(pd.read_csv(file)["Stimulus Name"].iloc[7]) + "\n")
+    assert main(["compare", "validate", str(file), "--fitted", str(fitted)]) == 1
+    assert "row 8" in capsys.readouterr().out
+
+
+def test_validate_needs_the_labels_that_were_asked_for(
+    official: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = predictions(official, tmp_path / "m.csv")
+    assert main(["compare", "validate", str(file), "--humans", str(tmp_path)]) == 2
+    assert "--labels" in capsys.readouterr().err
+
+
+# --- leaderboard --------------------------------------------------------------------------------
+
+
+def test_leaderboard_prints_and_writes(
+    official: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = [
+        predictions(official, tmp_path / f"{name}.csv", name, skill)
+        for name, skill in (("weak", 0.55), ("good", 0.85))
+    ]
+    command = ["compare", "leaderboard", *map(str, files), "--humans", str(official / "humans")]
+    assert main([*command, "--out", str(tmp_path / "out")]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1].split()[:2] == ["1", "good"] and "made up 1" in lines[1]
+    assert "left out" in lines[-1]
+    table = pd.read_csv(tmp_path / "out" / "leaderboard.csv")
+    assert list(table["model"]) == ["good", "weak"] and set(table["stimuli"]) == {1144}
+    written = json.loads((tmp_path / "out" / "leaderboard.json").read_text())
+    assert written["rows"][0]["kappa"] is None and written["rows"][0]["accuracy"] > 0.8
+    assert main([*command, "--sort", "rmsd", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    assert rows[0]["rmsd"] < rows[1]["rmsd"]
+    assert main([*command, "--sort", "accuracy", "--ascending", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["rows"][0]["model"] == "weak"
+
+
+def test_leaderboard_goes_on_without_a_bad_file(
+    official: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    good = predictions(official, tmp_path / "good.csv")
+    (tmp_path / "bad.csv").write_text("a,b\n1,2\n")
+    command = ["compare", "leaderboard", str(good), str(tmp_path / "bad.csv")]
+    assert main(command) == 1
+    assert "not compared" in capsys.readouterr().out
+    assert main([*command, "--sort", "acuracy"]) == 2
+    assert "accuracy" in capsys.readouterr().err
