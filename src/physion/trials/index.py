@@ -12,6 +12,7 @@ import pyarrow as pa
 
 from physion.atomic import write_atomic
 from physion.errors import BadInputError
+from physion.scenes.scene import Scene
 from physion.trials.layout import INDEX, SAFE_NAME, TrialPaths, find_trials
 from physion.trials.trial_file import Trial
 
@@ -38,6 +39,9 @@ COLUMNS = {
     "completed": "bool",
     "physics_seconds": "float64",
     "playback_seconds": "float64",
+    "elements": "int64",
+    "distractors": "Int64",
+    "occluders": "Int64",
     "agent_share": "float64",
     "patient_share": "float64",
     "look": "string",
@@ -83,10 +87,24 @@ def index_row(paths: TrialPaths) -> dict[str, Any]:
         "observed_contact": labels.observed,
         "min_distance": labels.min_distance,
         "robust": labels.robust,
+        **_elements(scene, imported=meta.seed is None),
         "agent_share": float(trial.shares[scene.index(scene.roles.agent)]),
         "patient_share": float(trial.shares[scene.index(scene.roles.patient)]),
     }
     return row
+
+
+def _elements(scene: Scene, imported: bool) -> dict[str, int | None]:
+    """How many things take part besides the patient, and how much scenery of each kind there is.
+
+    Which scenery stands before and which behind is known of sampled scenes alone.
+    """
+    part = [b for b in scene.bodies if not b.scenery and b.name != scene.roles.patient]
+    counts: dict[str, int | None] = {"elements": len(part) + len(scene.cloths)}
+    for kind in ("distractor", "occluder"):
+        found = sum(b.scenery and b.name.startswith(f"{kind}_") for b in scene.bodies)
+        counts[f"{kind}s"] = None if imported else found
+    return counts
 
 
 def build_index(folder: Path) -> tuple[pd.DataFrame, dict[str, str]]:
