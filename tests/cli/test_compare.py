@@ -202,3 +202,44 @@ def test_leaderboard_goes_on_without_a_bad_file(
     assert "not compared" in capsys.readouterr().out
     assert main([*command, "--sort", "acuracy"]) == 2
     assert "accuracy" in capsys.readouterr().err
+
+
+def test_leaderboard_with_single_participants_has_kappa(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = [
+        (f"{scenario}-p{person}", scenario, f"{scenario}_{k:03d}", "test", k, word, k % 2 == 0)
+        for scenario in ("collide", "drop")
+        for person in range(4)
+        for k in range(12)
+        for word in [("yes", "no")[(k + (k * person) % 5 // 3) % 2]]
+    ]
+    columns = ["participant", "scenario", "stimulus", "phase", "trial", "response", "label"]
+    answers = pd.DataFrame(rows, columns=columns)
+    answers = answers.assign(session=answers["participant"], rt_ms=900, simulated=False)
+    answers["correct"] = (answers["response"] == "yes") == answers["label"]
+    # A session that no person made: it must not count, and be told.
+    robot = answers[answers["session"] == "drop-p3"].assign(simulated=True)
+    answers = pd.concat([answers[answers["session"] != "drop-p3"], robot])
+    answers.to_csv(tmp_path / "trials.csv", index=False)
+    one = answers.drop_duplicates("stimulus")
+    p = np.where(one["label"], 0.8, 0.3)
+    predictions_of_all = pd.DataFrame(
+        {
+            "Model": "m",
+            "Readout Type": "B",
+            "Readout Test Data": one["scenario"],
+            "Predicted Prob_true": p,
+            "Predicted Outcome": p > 0.5,
+            "Actual Outcome": one["label"],
+            "Stimulus Name": one["stimulus"],
+        }
+    )
+    predictions_of_all.to_csv(tmp_path / "m.csv", index=False)
+    command = ["compare", "leaderboard", str(tmp_path / "m.csv")]
+    assert main([*command, "--responses", str(tmp_path / "trials.csv"), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    (row,) = found["rows"]
+    assert [(drop["scenario"], drop["rows"]) for drop in found["dropped_answers"]] == [("drop", 12)]
+    assert row["accuracy"] == 1 and row["stimuli"] == 24 and "kappa" not in row["reason"]
+    assert row["kappa_low"] < row["kappa"] < row["kappa_high"] and 0 < row["kappa"] < 1

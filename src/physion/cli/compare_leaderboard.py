@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from physion.analysis.leaderboard import Leaderboard
+    from physion.analysis.participants import Responses
 
 SHOWN = ("rank", "model", "readout", "training", "stimuli", "accuracy", "r", "kappa", "rmsd")
 """Columns on the console, then the versions and the file; those without a value are left out."""
@@ -51,10 +52,12 @@ class Options:
 
 def main(options: Options) -> int:
     """Print the table; 1 if a file could not be compared."""
+    from physion.analysis.participants import read_responses
     from physion.cli.output import console
 
-    board = _board(options)
-    record = _record(board)
+    people = None if options.responses is None else read_responses(options.responses)
+    board = _board(options, people)
+    record = _record(board, people)
     if options.out is not None:
         _write(board, record, options.out)
     if options.json:
@@ -67,14 +70,16 @@ def main(options: Options) -> int:
         if left_out:
             told = f"{left_out} stimuli left out over all files; reasons with --json or --out"
             console.print(told, markup=False, soft_wrap=True)
+        if people is not None and len(people.dropped):
+            told = f"{int(people.dropped['rows'].sum())} answers of people left out"
+            console.print(told, markup=False, soft_wrap=True)
     return 1 if len(board.refused) else 0
 
 
-def _board(options: Options) -> Leaderboard:
+def _board(options: Options, people: Responses | None) -> Leaderboard:
     from dataclasses import replace
 
     from physion.analysis.leaderboard import leaderboard, sort_leaderboard
-    from physion.analysis.participants import read_responses
     from physion.analysis.responses import LABELS_FILE, find_beside, read_humans, read_labels
     from physion.analysis.stimuli import read_stimulus_list
 
@@ -85,7 +90,7 @@ def _board(options: Options) -> Leaderboard:
         options.predictions,
         None if humans is None else read_humans(humans),
         None if labels is None else read_labels(labels),
-        None if options.responses is None else read_responses(options.responses).test,
+        None if people is None else people.test,
         scenario=options.scenario,
         exclude=() if options.exclude is None else read_stimulus_list(options.exclude),
         exclude_ledge=not options.ledge,
@@ -94,9 +99,11 @@ def _board(options: Options) -> Leaderboard:
     return replace(board, table=sort_leaderboard(board.table, options.sort, ascending))
 
 
-def _record(board: Leaderboard) -> dict[str, Any]:
+def _record(board: Leaderboard, people: Responses | None) -> dict[str, Any]:
     """The board as JSON values; NaN is null."""
     tables = {"rows": board.table, "dropped": board.dropped, "refused": board.refused}
+    if people is not None:
+        tables["dropped_answers"] = people.dropped
     record: dict[str, Any] = {
         name: json_module.loads(table.to_json(orient="records", double_precision=15))
         for name, table in tables.items()
