@@ -1,0 +1,110 @@
+"""The minimum of a smooth function with a gradient, its curvature there, and proof that it is one.
+
+Standard deviations are searched over the whole line: the functions are even in them, so that a
+variance of zero, where others need a bound, is an ordinary minimum.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import minimize
+
+Array = npt.NDArray[np.float64]
+Objective = Callable[[Array], tuple[float, Array]]
+
+STEP = 1e-3
+"""Step of the differences of gradients, in units of a parameter's scale (about a standard error)."""
+
+CLOSE = 1e-6
+"""Expected further decrease of the function below which the search has converged."""
+
+SMALL = 0.05
+"""Standard deviations below which it is tried whether zero is no worse."""
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """Where the search ended: ``left`` is the decrease that a further Newton step promises."""
+
+    at: Array
+    value: float
+    hessian: Array
+    left: float
+    zero: npt.NDArray[np.bool_]
+
+    @property
+    def converged(self) -> bool:
+        """Whether the curvature is positive all around and nothing is left to gain."""
+        return bool(np.isfinite(self.left) and abs(self.left) < CLOSE)
+
+
+def find_optimum(objective: Objective, start: Array, scale: Array, spreads: int) -> Optimum:
+    """Minimise ``objective`` from ``start`` (k,); the last ``spreads`` are standard deviations.
+
+    ``scale`` is a matrix (k, k) whose columns are steps of about one standard error: the search is
+    in their coordinates. Quasi-Newton first, then Newton steps on differences of the gradient,
+    whose matrix is the Hessian that standard errors come from.
+    """
+
+    def scaled(z: Array) -> tuple[float, Array]:
+        value, gradient = objective(start + scale @ z)
+        return value, scale.T @ gradient
+
+    options = {"gtol": 1e-4, "maxiter": 200}
+    found = minimize(scaled, np.zeros(len(start)), jac=True, method="BFGS", options=options)
+    at = start + scale @ found.x
+    at[len(at) - spreads :] = np.abs(at[len(at) - spreads :])
+    size = np.sqrt((scale**2).sum(axis=1))
+    best = objective(at)
+    for _ in range(4):
+        at, best, zero = _try_zero(objective, at, best, spreads)
+        hessian = difference_gradient(objective, at, size)
+        step, left = _newton(hessian, best[1])
+        step[len(at) - spreads :][zero] = 0.0
+        trial = objective(at - step) if np.isfinite(left) else (np.inf, best[1])
+        if trial[0] > best[0]:
+            break
+        at, best, before = at - step, trial, left
+        left = _newton(hessian, best[1])[1]
+        if before < CLOSE:
+            break
+    return Optimum(at, best[0], hessian, left, zero)
+
+
+def _newton(hessian: Array, gradient: Array) -> tuple[Array, float]:
+    """The Newton step and half of gradient times step; infinite where the curvature is not up."""
+    if np.linalg.eigvalsh(hessian)[0] <= 0:
+        return np.zeros_like(gradient), np.inf
+    step = np.linalg.solve(hessian, gradient)
+    return step, float(gradient @ step) / 2
+
+
+def _try_zero(
+    objective: Objective, at: Array, best: tuple[float, Array], spreads: int
+) -> tuple[Array, tuple[float, Array], npt.NDArray[np.bool_]]:
+    """Set small standard deviations to zero where that is no worse."""
+    zero = np.zeros(spreads, dtype=bool)
+    first = len(at) - spreads
+    for k in range(spreads):
+        if abs(at[first + k]) < SMALL:
+            trial = at.copy()
+            trial[first + k] = 0.0
+            value, gradient = objective(trial)
+            if value <= best[0] + 1e-9 * max(1.0, abs(best[0])) ** 0.5:
+                at, best, zero[k] = trial, (value, gradient), True
+    return at, best, zero
+
+
+def difference_gradient(objective: Objective, at: Array, size: Array) -> Array:
+    """The Hessian (k, k) by central differences of the gradient with steps of STEP * ``size``."""
+    columns = []
+    for k, step in enumerate(STEP * size):
+        shift = np.zeros_like(at)
+        shift[k] = step
+        columns.append((objective(at + shift)[1] - objective(at - shift)[1]) / (2 * step))
+    hessian = np.array(columns)
+    return (hessian + hessian.T) / 2

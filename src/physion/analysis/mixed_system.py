@@ -1,0 +1,278 @@
+"""The equations of random intercepts, solved exactly: no general sparse library is needed.
+
+With random effects b = Lambda u, u standard normal, Lambda the diagonal of standard deviations and
+Z the indicators of levels, every step needs the matrix H = I + Lambda Z'WZ Lambda. Within one
+grouping Z'WZ is diagonal. So the grouping with most levels ("wide") is eliminated by hand, and what
+remains is a dense matrix over the levels of the others ("narrow"), which splits where no row links
+its levels: with participants and stimuli within scenarios, into one of 100 x 100 per scenario.
+Genuinely crossed designs give one larger block and the same answer.
+
+Cost by step: one pass over rows, and (wide + narrow) * narrow^2 within each block.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import cho_solve, cholesky
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from physion.errors import BadInputError
+
+Array = npt.NDArray[np.float64]
+Codes = npt.NDArray[np.int64]
+
+MOST_CELLS = 100_000_000
+"""Cells of the dense cross tables above which a design is refused (0.8 GB each)."""
+
+FULL_BLOCK = 64
+"""Narrow levels up to which unlinked parts share a block: many tiny ones would be slow."""
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Z'WZ: sums of weights by wide level, by wide x narrow level, by narrow x narrow level.
+
+    The last two are lists over blocks, of shapes (d, e) and (e, e).
+    """
+
+    wide: Array
+    cross: list[Array]
+    narrow: list[Array]
+
+
+class Groupings:
+    """Where each row sits: levels sorted into blocks, and cells of the cross tables.
+
+    ``codes``: one array (n,) a grouping with values 0..levels-1, all present. Positions in the
+    vectors of random effects ("slots", q in all) are by block, wide levels first;
+    ``slots[k][code]`` finds them and ``rows[k]`` gives that of each row.
+    """
+
+    def __init__(self, codes: Sequence[Codes]) -> None:
+        self.n = len(codes[0])
+        self.levels = [int(code.max()) + 1 for code in codes]
+        self.q = sum(self.levels)
+        self._wide = int(np.argmax(self.levels))
+        self._narrow = [k for k in range(len(codes)) if k != self._wide]
+        self.q_wide = self.levels[self._wide]
+        self.slots = self._sort_into_blocks(codes)
+        self.rows = [slot[code] for slot, code in zip(self.slots, codes, strict=True)]
+        self.owner = np.empty(self.q, dtype=np.int64)
+        for k, slot in enumerate(self.slots):
+            self.owner[slot] = k
+        self._index_cells()
+
+    def _sort_into_blocks(self, codes: Sequence[Codes]) -> list[Codes]:
+        """Slots of each grouping's levels; sets the blocks' bounds among wide and narrow ones."""
+        start = np.cumsum([0, *self.levels])
+        links = [(start[self._wide] + codes[self._wide], start[k] + codes[k]) for k in self._narrow]
+        label = np.zeros(self.q, dtype=np.int64)
+        if links:
+            one, other = (np.concatenate(part) for part in zip(*links, strict=True))
+            graph = coo_array((np.ones(len(one), dtype=np.int8), (one, other)), (self.q, self.q))
+            label = connected_components(graph.tocsr(), directed=False)[1].astype(np.int64)
+        parts = [label[start[k] : start[k + 1]] for k in range(len(codes))]
+        narrow = np.concatenate([parts[k] for k in self._narrow]) if links else np.zeros(0, int)
+        # Parts share a block until it holds FULL_BLOCK narrow levels.
+        before = np.cumsum(np.bincount(narrow, minlength=label.max() + 1)) - 1
+        block = np.unique(np.maximum(before, 0) // FULL_BLOCK, return_inverse=True)[1]
+        wide_block, narrow_block = block[parts[self._wide]], block[narrow]
+        bounds = np.arange(block.max() + 2)
+        self._wide_bounds = np.searchsorted(np.sort(wide_block), bounds)
+        self._narrow_bounds = np.searchsorted(np.sort(narrow_block), bounds)
+        slots: list[Codes] = [np.zeros(0, dtype=np.int64)] * len(codes)
+        slots[self._wide] = _rank(wide_block)
+        ranks, at = self.q_wide + _rank(narrow_block), 0
+        for k in self._narrow:
+            slots[k] = ranks[at : at + self.levels[k]]
+            at += self.levels[k]
+        return slots
+
+    def _index_cells(self) -> None:
+        """For each row and narrow grouping its cell in the flat cross tables."""
+        wide, narrow = np.diff(self._wide_bounds), np.diff(self._narrow_bounds)
+        self._shapes = list(zip(wide.tolist(), narrow.tolist(), strict=True))
+        self._cross_starts = np.cumsum([0, *(wide * narrow)])
+        self._narrow_starts = np.cumsum([0, *(narrow * narrow)])
+        if max(self._cross_starts[-1], self._narrow_starts[-1]) > MOST_CELLS:
+            raise BadInputError(
+                f"groups of {' and '.join(map(str, self.levels))} levels are too many to cross; "
+                "fit one scenario at a time, or leave a group out"
+            )
+        row_wide = self.rows[self._wide]
+        block = np.searchsorted(self._wide_bounds, row_wide, side="right") - 1
+        local_wide = row_wide - self._wide_bounds[block]
+        local = {k: self.rows[k] - self.q_wide - self._narrow_bounds[block] for k in self._narrow}
+        width = narrow[block]
+        self._cells = {
+            k: self._cross_starts[block] + local_wide * width + local[k] for k in self._narrow
+        }
+        self._pairs = {
+            (k, m): self._narrow_starts[block] + local[k] * width + local[m]
+            for i, k in enumerate(self._narrow)
+            for m in self._narrow[i:]
+        }
+
+    def _split(self, flat: Array, starts: Codes, square: bool) -> list[Array]:
+        return [
+            flat[a:b].reshape(e if square else d, e)
+            for a, b, (d, e) in zip(starts[:-1], starts[1:], self._shapes, strict=True)
+        ]
+
+    def counts(self, weights: Array | None = None) -> Counts:
+        """Z'WZ for weights of shape (n,), or all one."""
+        wide = np.bincount(self.rows[self._wide], weights, self.q_wide).astype(np.float64)
+        cross = np.zeros(self._cross_starts[-1])
+        for cells in self._cells.values():
+            cross += np.bincount(cells, weights, len(cross))
+        flat = np.zeros(self._narrow_starts[-1])
+        for (k, m), pairs in self._pairs.items():
+            one = np.bincount(pairs, weights, len(flat))
+            flat += one
+            if k != m:
+                blocks = self._split(one, self._narrow_starts, square=True)
+                flat += np.concatenate([block.T.ravel() for block in blocks])
+        return Counts(
+            wide,
+            self._split(cross, self._cross_starts, square=False),
+            self._split(flat, self._narrow_starts, square=True),
+        )
+
+    def sums(self, values: Array) -> Array:
+        """Z' times ``values`` (n,) or (n, p): sums by slot, shape (q,) or (q, p)."""
+        if values.ndim == 2:
+            return np.stack([self.sums(column) for column in values.T], axis=1)
+        total = np.zeros(self.q)
+        for rows in self.rows:
+            total += np.bincount(rows, values, self.q)
+        return total
+
+    def spread(self, effects: Array) -> Array:
+        """Z times ``effects`` (q,): by row."""
+        total = effects[self.rows[0]]
+        for rows in self.rows[1:]:
+            total = total + effects[rows]
+        return total
+
+    def by_grouping(self, values: Array) -> Array:
+        """Sums of ``values`` (q,) over the levels of each grouping."""
+        return np.bincount(self.owner, values, len(self.levels))
+
+    def multiply(self, counts: Counts, effects: Array) -> Array:
+        """Z'WZ times ``effects`` (q,) or (q, p)."""
+        product = np.empty_like(effects)
+        for (wide, narrow), cross, square in self.blocks(counts):
+            x, y = effects[wide], effects[narrow]
+            product[wide] = (counts.wide[wide] * x.T).T + cross @ y
+            product[narrow] = cross.T @ x + square @ y
+        return product
+
+    def blocks(self, counts: Counts) -> list[tuple[tuple[slice, slice], Array, Array]]:
+        """For each block its slots (wide, narrow) and its two tables."""
+        wide = [slice(a, b) for a, b in _pairs(self._wide_bounds)]
+        narrow = [slice(self.q_wide + a, self.q_wide + b) for a, b in _pairs(self._narrow_bounds)]
+        places = list(zip(wide, narrow, strict=True))
+        return list(zip(places, counts.cross, counts.narrow, strict=True))
+
+    def at_rows(self, inverse: Inverse, scale: Array) -> Array:
+        """z'Lambda H^-1 Lambda z for each row, shape (n,); ``scale`` is by slot."""
+        by_slot = inverse.diagonal * scale**2
+        found = self.spread(by_slot)
+        cross = np.concatenate([block.ravel() for block in inverse.cross])
+        for k, cells in self._cells.items():
+            product = scale[self.rows[self._wide]] * scale[self.rows[k]]
+            found += 2 * product * cross[cells]
+        square = np.concatenate([block.ravel() for block in inverse.narrow])
+        for (k, m), pairs in self._pairs.items():
+            if k != m:
+                found += 2 * scale[self.rows[k]] * scale[self.rows[m]] * square[pairs]
+        return found
+
+
+@dataclass(frozen=True)
+class Inverse:
+    """What is needed of H^-1: its diagonal (q,), and the blocks wide x narrow, narrow x narrow."""
+
+    diagonal: Array
+    cross: list[Array]
+    narrow: list[Array]
+
+
+class Factor:
+    """H = I + Lambda Z'WZ Lambda, factorised; ``scale`` is Lambda's diagonal by slot (q,)."""
+
+    def __init__(self, groupings: Groupings, counts: Counts, scale: Array) -> None:
+        self._groupings, self._counts, self._scale = groupings, counts, scale
+        self._wide = 1 + scale[: groupings.q_wide] ** 2 * counts.wide
+        self._places, self._ratio, self._lower = [], [], []
+        self.log_determinant = float(np.log(self._wide).sum())
+        for (wide, narrow), cross, square in groupings.blocks(counts):
+            scaled = scale[wide, None] * cross * scale[narrow]
+            ratio = scaled / self._wide[wide, None]
+            schur = np.eye(len(square)) + scale[narrow, None] * square * scale[narrow]
+            schur -= scaled.T @ ratio
+            lower = cholesky(schur, lower=True, check_finite=False) if len(schur) else schur
+            self.log_determinant += 2 * float(np.log(np.diag(lower)).sum())
+            self._places.append((wide, narrow))
+            self._ratio.append(ratio)
+            self._lower.append(lower)
+
+    def solve(self, right: Array) -> Array:
+        """H^-1 times ``right``, of shape (q,) or (q, p)."""
+        found = np.empty_like(right)
+        for (wide, narrow), ratio, lower in self._parts():
+            below = right[narrow] - ratio.T @ right[wide]
+            solved = cho_solve((lower, True), below, check_finite=False) if len(lower) else below
+            found[narrow] = solved
+            found[wide] = (right[wide].T / self._wide[wide]).T - ratio @ solved
+        return found
+
+    def inverse(self) -> Inverse:
+        """The parts of H^-1 that belong to cells that rows can fill."""
+        diagonal, cross, square = np.empty(self._groupings.q), [], []
+        for (wide, narrow), ratio, lower in self._parts():
+            unit = np.eye(len(lower))
+            inner = cho_solve((lower, True), unit, check_finite=False) if len(lower) else unit
+            outer = ratio @ inner
+            diagonal[narrow] = np.diag(inner)
+            diagonal[wide] = 1 / self._wide[wide] + np.einsum("de,de->d", outer, ratio)
+            cross.append(-outer)
+            square.append(inner)
+        return Inverse(diagonal, cross, square)
+
+    def slopes(self, inverse: Inverse) -> Array:
+        """Half the derivative of log|H| by each grouping's standard deviation: shape (groupings,).
+
+        It is the trace of that grouping's part of H^-1 Lambda Z'WZ, which stays exact at zero.
+        """
+        scale, counts = self._scale, self._counts
+        by_slot = np.empty(len(scale))
+        by_slot[: self._groupings.q_wide] = (
+            inverse.diagonal[: self._groupings.q_wide] * counts.wide
+        ) * scale[: self._groupings.q_wide]
+        blocks = self._groupings.blocks(counts)
+        for k, ((wide, narrow), cross, square) in enumerate(blocks):
+            linked = inverse.cross[k] * cross
+            by_slot[wide] += linked @ scale[narrow]
+            by_slot[narrow] = scale[wide] @ linked
+            by_slot[narrow] += (inverse.narrow[k] * square) @ scale[narrow]
+        return self._groupings.by_grouping(by_slot)
+
+    def _parts(self) -> zip[tuple[tuple[slice, slice], Array, Array]]:
+        return zip(self._places, self._ratio, self._lower, strict=True)
+
+
+def _rank(block: Codes) -> Codes:
+    """The place of each level when levels are sorted by block."""
+    place = np.empty(len(block), dtype=np.int64)
+    place[np.argsort(block, kind="stable")] = np.arange(len(block))
+    return place
+
+
+def _pairs(bounds: Codes) -> list[tuple[int, int]]:
+    return [(int(a), int(b)) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
