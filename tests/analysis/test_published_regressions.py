@@ -84,7 +84,7 @@ def test_fits_are_those_of_lmertest(
     found = fit_contrast(contrast, released, "twice")
     assert found["b"] == pytest.approx(b, rel=1e-3)
     assert found["se"] == pytest.approx(se, rel=1e-3)
-    assert found["df"] == pytest.approx(df, rel=1e-3)
+    assert found["df"] == pytest.approx(df, abs=0.01)
     assert found["t"] == pytest.approx(t, abs=0.006)
 
 

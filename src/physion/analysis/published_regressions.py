@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
+from physion.analysis.mixed_linear import fit_linear
 from physion.analysis.published_claims import CLAIMS, PEOPLE, Claim, Contrast, Rows
-from physion.analysis.published_fit import fit_term
 from physion.analysis.published_tables import PARTICLES, PublishedTables
 from physion.errors import BadInputError
 
@@ -92,7 +92,10 @@ def fit_contrast(contrast: Contrast, tables: PublishedTables, rows: Rows) -> dic
     if not contrast.groups:
         return _against_chance(table["accuracy"])
     terms = ["x", *(name for name in table.columns if str(name).startswith("beside_"))]
-    return fit_term(table, terms, contrast.groups, None if contrast.intercept else "x")
+    groups = [f"(1|{name})" for name in contrast.groups]
+    fit = fit_linear(" ".join(["accuracy ~", " + ".join([*terms, *groups])]), table)
+    row = fit.table.set_index("term").loc["Intercept" if contrast.intercept else "x"]
+    return {**{name: float(row[name]) for name in ESTIMATES[:-1]}, "rows": float(fit.rows)}
 
 
 def _against_chance(values: pd.Series) -> dict[str, float]:
