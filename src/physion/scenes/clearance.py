@@ -9,23 +9,21 @@ from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.optimize import linprog
 
 from physion.scenes.placement import rotate, world_bounds
 from physion.scenes.scene import Body
 from physion.scenes.shapes import shape
+from physion.scenes.solids import Points
 from physion.scenes.stage import raised
 
 GAP = 0.001
 """Metres left free where a body had to be raised off another one."""
 TOUCH = 1e-6
 """Metres: bodies that overlap by less only touch."""
-REFINE = np.stack(np.meshgrid(np.linspace(-1, 1, 5), np.linspace(-1, 1, 5)), axis=-1).reshape(-1, 2)
-ROUNDS = 8
-"""Rounds of a search for the best slope, each with half the step of the one before."""
 
 
-def _slope_grid() -> NDArray[np.float64]:
+def _slope_grid() -> Points:
     turns = 2 * np.pi * np.arange(16) / 16
     tilts = np.tan(np.radians([0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0, 87.0, 89.5]))
     ways = np.stack([np.cos(turns), np.sin(turns)], axis=1)
@@ -33,7 +31,7 @@ def _slope_grid() -> NDArray[np.float64]:
 
 
 SLOPES = _slope_grid()
-"""(K, 2): slopes along x and y that the search starts from, up to nearly upright."""
+"""(K, 2): slopes along x and y, up to nearly upright."""
 
 
 def cleared(body: Body, obstacles: Sequence[Body]) -> Body:
@@ -43,23 +41,23 @@ def cleared(body: Body, obstacles: Sequence[Body]) -> Body:
 
 
 def needed_rise(body: Body, obstacles: Sequence[Body]) -> float:
-    """Metres by which ``body`` must rise until nothing of ``obstacles`` is in or above it.
-
-    Never too few, by their convex pieces; too many by less than a millimetre.
-    """
+    """Metres by which ``body`` must rise until nothing of ``obstacles`` is in or above it."""
     (x0, y0, bottom), (x1, y1, _) = world_bounds(body)
     parts = _corners(body)
-    need = 0.0
+    pairs = []
     for obstacle in obstacles:
         low, high = world_bounds(obstacle)
         if high[2] <= bottom + TOUCH or high[0] <= x0 or high[1] <= y0:
             continue
         if low[0] >= x1 or low[1] >= y1:
             continue
-        for under in _corners(obstacle):
-            for part in parts:
-                need = max(need, _rise(under, part, need))
-    return need if need > TOUCH else 0.0
+        pairs += [(_rough_rise(u, part), u, part) for u in _corners(obstacle) for part in parts]
+    need = 0.0
+    for rough, under, part in sorted(pairs, key=lambda pair: -pair[0]):
+        if rough <= need + TOUCH:
+            break
+        need = max(need, _rise(under, part))
+    return need
 
 
 def beside(body: Body, others: Sequence[Body]) -> bool:
@@ -69,7 +67,7 @@ def beside(body: Body, others: Sequence[Body]) -> bool:
     return all((high[:2] < b[0, :2]).any() or (low[:2] > b[1, :2]).any() for b in boxes)
 
 
-def _corners(body: Body) -> list[NDArray[np.float64]]:
+def _corners(body: Body) -> list[Points]:
     """World corners (K, 3) of each convex piece."""
     place = np.array(body.position)
     return [
@@ -78,29 +76,32 @@ def _corners(body: Body) -> list[NDArray[np.float64]]:
 
 
 @cache
-def _unit_corners(name: str) -> tuple[NDArray[np.float64], ...]:
+def _unit_corners(name: str) -> tuple[Points, ...]:
     return tuple(piece.mesh.vertices for piece in shape(name).pieces)
 
 
-def _rise(under: NDArray[np.float64], part: NDArray[np.float64], enough: float) -> float:
-    """How far a convex ``part`` must rise to be above ``under``, at least ``enough``.
+def _rough_rise(under: Points, part: Points) -> float:
+    """How far a convex ``part`` must rise to be above ``under``, or somewhat more.
 
-    A plane z = ux + vy + c above all of ``under`` is below all of the part once it has risen by
+    A plane z = ux + vy + c above all of ``under`` is below all of the part once that has risen by
     max(z - ux - vy) of the one plus max(ux + vy - z) of the other. The least over all slopes (u, v)
-    is the answer; that of any slope is on the safe side.
+    is the answer; that over a few slopes is on the safe side.
     """
+    over = (under[:, 2:] - under[:, :2] @ SLOPES.T).max(axis=0)
+    return float((over + (part[:, :2] @ SLOPES.T - part[:, 2:]).max(axis=0)).min())
 
-    def rises(slopes: NDArray[np.float64]) -> NDArray[np.float64]:
-        over = (under[:, 2:] - under[:, :2] @ slopes.T).max(axis=0)
-        return np.asarray(over + (part[:, :2] @ slopes.T - part[:, 2:]).max(axis=0))
 
-    slopes, step = SLOPES, 0.35
-    for _ in range(ROUNDS):
-        found = rises(slopes)
-        best = int(found.argmin())
-        if found[best] <= enough:
-            return enough
-        least, slope = float(found[best]), slopes[best]
-        slopes = slope + REFINE * step * (1 + float(slope @ slope))
-        step *= 0.5
-    return least
+def _rise(under: Points, part: Points) -> float:
+    """The least over all slopes, by a linear program; minus infinity where no rise is needed."""
+    one, none = np.ones((len(under), 1)), np.zeros((len(under), 1))
+    other, nought = np.ones((len(part), 1)), np.zeros((len(part), 1))
+    rows = np.vstack(
+        [
+            np.hstack([-under[:, :2], -one, none]),
+            np.hstack([part[:, :2], nought, -other]),
+        ]
+    )
+    limits = np.concatenate([-under[:, 2], part[:, 2]])
+    found = linprog([0, 0, 1, 1], A_ub=rows, b_ub=limits, bounds=(None, None), method="highs")
+    # Without a bound below, the two are beside each other.
+    return float(found.fun) if found.status == 0 else -np.inf
