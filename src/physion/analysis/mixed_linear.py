@@ -1,8 +1,8 @@
 """Linear mixed models with crossed random intercepts (restricted maximum likelihood).
 
-As lme4::lmer with lmerTest: variances maximise the restricted likelihood, profiled over the residual
-variance; t tests have Satterthwaite's degrees of freedom. Own code, since statsmodels' MixedLM has
-no degrees of freedom and needs a dense matrix of all random effects for crossed groups (see
+As lme4::lmer with lmerTest: variances maximise the restricted likelihood, profiled over the
+residual variance; t tests have Satterthwaite's degrees of freedom. Own code, since statsmodels'
+MixedLM has no degrees of freedom and needs dense matrices for crossed groups (figures:
 ``python benchmarks/mixed.py --others``), and since the equations are those of the logistic models.
 Only sums by level and by pair of levels enter, so that the time hardly depends on the rows.
 """
@@ -15,10 +15,11 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from physion.analysis.mixed_formula import Design, build_design
+from physion.analysis.mixed_design import Design, build_design
+from physion.analysis.mixed_factor import Factor
+from physion.analysis.mixed_groupings import Groupings
 from physion.analysis.mixed_optimum import Optimum, difference_gradient, find_optimum
 from physion.analysis.mixed_result import MixedFit, collect
-from physion.analysis.mixed_system import Factor, Groupings
 from physion.errors import BadInputError
 
 Array = npt.NDArray[np.float64]
@@ -120,7 +121,7 @@ class LinearModel:
         """Fixed effects of the columns as given."""
         return np.asarray(np.linalg.solve(self.triangle, self._least + solution.b))
 
-    def backward(self, matrix: Array) -> Array:
+    def backward(self, matrix: npt.ArrayLike) -> Array:
         """A covariance of the orthonormal columns as one of the columns as given."""
         back = np.linalg.inv(self.triangle)
         return np.asarray(back @ matrix @ back.T)

@@ -20,14 +20,19 @@ import numpy.typing as npt
 import pandas as pd
 from scipy.special import expit
 
-from physion.analysis.mixed_formula import Design, build_design
+from physion.analysis.mixed_design import Design, build_design
+from physion.analysis.mixed_factor import Factor
+from physion.analysis.mixed_groupings import Groupings
 from physion.analysis.mixed_optimum import Optimum, find_optimum
 from physion.analysis.mixed_result import MixedFit, collect
 from physion.analysis.mixed_separation import refuse_separation
-from physion.analysis.mixed_system import Counts, Factor, Groupings
 from physion.errors import BadInputError
 
 Array = npt.NDArray[np.float64]
+
+AT_MODE = 1e-17
+"""Gain of a Newton step for the random effects at which they are at their mode. The curvature there
+is part of the likelihood, and is differenced, so that the mode must be exact."""
 
 FAR = 30.0
 """Standard deviation of random effects (logits) beyond which the likelihood is not looked at."""
@@ -143,29 +148,28 @@ class LogisticModel:
     def _penalised(self, eta: Array, u: Array) -> float:
         return float(self.y @ eta - np.logaddexp(0, eta).sum() - u @ u / 2)
 
-    def find_mode(self, beta: Array, scale: Array) -> tuple[Array, Factor, Counts]:
-        """Move ``u`` to its mode; gives the probabilities there and H. Newton, halved at need."""
+    def find_mode(self, beta: Array, scale: Array) -> tuple[Array, Factor]:
+        """Move ``u`` to its mode; gives the logits there and H. Newton steps, halved at need."""
         groupings = self.groupings
         eta = self._linear(beta, scale)
         height = self._penalised(eta, self.u)
         for _ in range(100):
             mean = expit(eta)
-            counts = groupings.counts(mean * (1 - mean))
-            factor = Factor(groupings, counts, scale)
+            factor = Factor(groupings, groupings.counts(mean * (1 - mean)), scale)
             score = scale * groupings.sums(self.y - mean) - self.u
             step = factor.solve(score)
             gain = float(score @ step)
-            if gain < 1e-13:
-                return mean, factor, counts
+            if gain < AT_MODE:
+                break
             for _ in range(40):
                 trial = self.u + step
-                eta = self._linear(beta, scale, trial)
-                reached = self._penalised(eta, trial)
+                moved = self._linear(beta, scale, trial)
+                reached = self._penalised(moved, trial)
                 if reached >= height - 1e-9 * abs(height):
                     break
                 step = step / 2
-            self.u, height = trial, reached
-        return mean, factor, counts
+            self.u, eta, height = trial, moved, reached
+        return eta, factor
 
     def objective(self, at: Array) -> tuple[float, Array]:
         """Negative log-likelihood and its gradient at (coefficients, standard deviations)."""
@@ -174,13 +178,13 @@ class LogisticModel:
             return np.inf, np.zeros_like(at)
         groupings = self.groupings
         scale = spread[groupings.owner]
-        mean, factor, _ = self.find_mode(beta, scale)
-        eta = self._linear(beta, scale)
+        eta, factor = self.find_mode(beta, scale)
+        mean = expit(eta)
         value = self._penalised(eta, self.u) - factor.log_determinant / 2
         inverse = factor.inverse()
         residual, weight = self.y - mean, mean * (1 - mean)
         # How -log|H|/2 changes with the linear predictor of each row, the mode held.
-        tilt = -0.5 * groupings.at_rows(inverse, scale) * weight * (1 - 2 * mean)
+        tilt = -0.5 * factor.at_rows(inverse) * weight * (1 - 2 * mean)
         # ... and through the mode, which moves with the parameters.
         pull = factor.solve(scale * groupings.sums(tilt))
         felt = residual + tilt - weight * groupings.spread(scale * pull)

@@ -17,7 +17,7 @@ Array = npt.NDArray[np.float64]
 Objective = Callable[[Array], tuple[float, Array]]
 
 STEP = 1e-3
-"""Step of the differences of gradients, in units of a parameter's scale (about a standard error)."""
+"""Step of the differences of gradients, in units of a parameter's scale."""
 
 CLOSE = 1e-6
 """Expected further decrease of the function below which the search has converged."""
@@ -79,7 +79,7 @@ def _newton(hessian: Array, gradient: Array) -> tuple[Array, float]:
     """The Newton step and half of gradient times step; infinite where the curvature is not up."""
     if np.linalg.eigvalsh(hessian)[0] <= 0:
         return np.zeros_like(gradient), np.inf
-    step = np.linalg.solve(hessian, gradient)
+    step = np.asarray(np.linalg.solve(hessian, gradient), dtype=np.float64)
     return step, float(gradient @ step) / 2
 
 
@@ -106,5 +106,5 @@ def difference_gradient(objective: Objective, at: Array, size: Array) -> Array:
         shift = np.zeros_like(at)
         shift[k] = step
         columns.append((objective(at + shift)[1] - objective(at - shift)[1]) / (2 * step))
-    hessian = np.array(columns)
-    return (hessian + hessian.T) / 2
+    hessian = np.array(columns, dtype=np.float64)
+    return np.asarray((hessian + hessian.T) / 2)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pandas as pd
 from scipy import stats
 
-from physion.analysis.mixed_formula import Design
+from physion.analysis.mixed_design import Design
 from physion.errors import UnknownNameError
 
 Array = npt.NDArray[np.float64]
@@ -141,7 +141,9 @@ def collect(
     df: DegreesOfFreedom | None = None,
 ) -> MixedFit:
     """Tables and warnings of a fit; ``spreads`` are the standard deviations of the groupings."""
-    se = np.sqrt(np.diag(covariance))
+    variance = np.diag(covariance)
+    # Where the search failed, the curvature can be down: no standard error then.
+    se = np.sqrt(np.where(variance > 0, variance, np.nan))
     each = np.full(len(b), np.inf) if df is None else np.array([df(one) for one in np.eye(len(b))])
     statistic = b / se
     reach = stats.t.ppf(0.5 + level / 2, each) * se

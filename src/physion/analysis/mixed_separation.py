@@ -12,7 +12,7 @@ import numpy.typing as npt
 from scipy.optimize import linprog
 from scipy.special import expit
 
-from physion.analysis.mixed_formula import Design
+from physion.analysis.mixed_design import Design
 from physion.errors import BadInputError
 
 Array = npt.NDArray[np.float64]

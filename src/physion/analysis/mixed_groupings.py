@@ -1,23 +1,20 @@
-"""The equations of random intercepts, solved exactly: no general sparse library is needed.
+"""Levels of crossed groupings, sorted so that their equations split into small dense blocks.
 
-With random effects b = Lambda u, u standard normal, Lambda the diagonal of standard deviations and
-Z the indicators of levels, every step needs the matrix H = I + Lambda Z'WZ Lambda. Within one
-grouping Z'WZ is diagonal. So the grouping with most levels ("wide") is eliminated by hand, and what
-remains is a dense matrix over the levels of the others ("narrow"), which splits where no row links
-its levels: with participants and stimuli within scenarios, into one of 100 x 100 per scenario.
-Genuinely crossed designs give one larger block and the same answer.
-
-Cost by step: one pass over rows, and (wide + narrow) * narrow^2 within each block.
+Z is the matrix of indicators of levels, W the diagonal of weights of rows. Within one grouping Z'WZ
+is diagonal. So the grouping with most levels ("wide") is eliminated by hand, and what remains is a
+dense matrix over the levels of the others ("narrow"), which splits where no row links its levels:
+with participants and stimuli within scenarios, into one of 100 x 100 per scenario. Genuinely
+crossed designs give one larger block and the same answer. `mixed_factor` solves the equations.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import cho_solve, cholesky
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -57,9 +54,9 @@ class Groupings:
         self.n = len(codes[0])
         self.levels = [int(code.max()) + 1 for code in codes]
         self.q = sum(self.levels)
-        self._wide = int(np.argmax(self.levels))
-        self._narrow = [k for k in range(len(codes)) if k != self._wide]
-        self.q_wide = self.levels[self._wide]
+        self.wide = int(np.argmax(self.levels))
+        self._narrow = [k for k in range(len(codes)) if k != self.wide]
+        self.q_wide = self.levels[self.wide]
         self.slots = self._sort_into_blocks(codes)
         self.rows = [slot[code] for slot, code in zip(self.slots, codes, strict=True)]
         self.owner = np.empty(self.q, dtype=np.int64)
@@ -70,7 +67,7 @@ class Groupings:
     def _sort_into_blocks(self, codes: Sequence[Codes]) -> list[Codes]:
         """Slots of each grouping's levels; sets the blocks' bounds among wide and narrow ones."""
         start = np.cumsum([0, *self.levels])
-        links = [(start[self._wide] + codes[self._wide], start[k] + codes[k]) for k in self._narrow]
+        links = [(start[self.wide] + codes[self.wide], start[k] + codes[k]) for k in self._narrow]
         label = np.zeros(self.q, dtype=np.int64)
         if links:
             one, other = (np.concatenate(part) for part in zip(*links, strict=True))
@@ -81,12 +78,12 @@ class Groupings:
         # Parts share a block until it holds FULL_BLOCK narrow levels.
         before = np.cumsum(np.bincount(narrow, minlength=label.max() + 1)) - 1
         block = np.unique(np.maximum(before, 0) // FULL_BLOCK, return_inverse=True)[1]
-        wide_block, narrow_block = block[parts[self._wide]], block[narrow]
+        wide_block, narrow_block = block[parts[self.wide]], block[narrow]
         bounds = np.arange(block.max() + 2)
         self._wide_bounds = np.searchsorted(np.sort(wide_block), bounds)
         self._narrow_bounds = np.searchsorted(np.sort(narrow_block), bounds)
         slots: list[Codes] = [np.zeros(0, dtype=np.int64)] * len(codes)
-        slots[self._wide] = _rank(wide_block)
+        slots[self.wide] = _rank(wide_block)
         ranks, at = self.q_wide + _rank(narrow_block), 0
         for k in self._narrow:
             slots[k] = ranks[at : at + self.levels[k]]
@@ -104,15 +101,15 @@ class Groupings:
                 f"groups of {' and '.join(map(str, self.levels))} levels are too many to cross; "
                 "fit one scenario at a time, or leave a group out"
             )
-        row_wide = self.rows[self._wide]
+        row_wide = self.rows[self.wide]
         block = np.searchsorted(self._wide_bounds, row_wide, side="right") - 1
         local_wide = row_wide - self._wide_bounds[block]
         local = {k: self.rows[k] - self.q_wide - self._narrow_bounds[block] for k in self._narrow}
         width = narrow[block]
-        self._cells = {
+        self.cells = {
             k: self._cross_starts[block] + local_wide * width + local[k] for k in self._narrow
         }
-        self._pairs = {
+        self.pairs = {
             (k, m): self._narrow_starts[block] + local[k] * width + local[m]
             for i, k in enumerate(self._narrow)
             for m in self._narrow[i:]
@@ -126,13 +123,13 @@ class Groupings:
 
     def counts(self, weights: Array | None = None) -> Counts:
         """Z'WZ for weights of shape (n,), or all one."""
-        wide = np.bincount(self.rows[self._wide], weights, self.q_wide).astype(np.float64)
+        wide = np.bincount(self.rows[self.wide], weights, self.q_wide).astype(np.float64)
         cross = np.zeros(self._cross_starts[-1])
-        for cells in self._cells.values():
+        for cells in self.cells.values():
             cross += np.bincount(cells, weights, len(cross))
         flat = np.zeros(self._narrow_starts[-1])
-        for (k, m), pairs in self._pairs.items():
-            one = np.bincount(pairs, weights, len(flat))
+        for (k, m), pairs in self.pairs.items():
+            one = np.bincount(pairs, weights, len(flat)).astype(np.float64)
             flat += one
             if k != m:
                 blocks = self._split(one, self._narrow_starts, square=True)
@@ -161,7 +158,7 @@ class Groupings:
 
     def by_grouping(self, values: Array) -> Array:
         """Sums of ``values`` (q,) over the levels of each grouping."""
-        return np.bincount(self.owner, values, len(self.levels))
+        return np.asarray(np.bincount(self.owner, values, len(self.levels)), dtype=np.float64)
 
     def multiply(self, counts: Counts, effects: Array) -> Array:
         """Z'WZ times ``effects`` (q,) or (q, p)."""
@@ -179,93 +176,6 @@ class Groupings:
         places = list(zip(wide, narrow, strict=True))
         return list(zip(places, counts.cross, counts.narrow, strict=True))
 
-    def at_rows(self, inverse: Inverse, scale: Array) -> Array:
-        """z'Lambda H^-1 Lambda z for each row, shape (n,); ``scale`` is by slot."""
-        by_slot = inverse.diagonal * scale**2
-        found = self.spread(by_slot)
-        cross = np.concatenate([block.ravel() for block in inverse.cross])
-        for k, cells in self._cells.items():
-            product = scale[self.rows[self._wide]] * scale[self.rows[k]]
-            found += 2 * product * cross[cells]
-        square = np.concatenate([block.ravel() for block in inverse.narrow])
-        for (k, m), pairs in self._pairs.items():
-            if k != m:
-                found += 2 * scale[self.rows[k]] * scale[self.rows[m]] * square[pairs]
-        return found
-
-
-@dataclass(frozen=True)
-class Inverse:
-    """What is needed of H^-1: its diagonal (q,), and the blocks wide x narrow, narrow x narrow."""
-
-    diagonal: Array
-    cross: list[Array]
-    narrow: list[Array]
-
-
-class Factor:
-    """H = I + Lambda Z'WZ Lambda, factorised; ``scale`` is Lambda's diagonal by slot (q,)."""
-
-    def __init__(self, groupings: Groupings, counts: Counts, scale: Array) -> None:
-        self._groupings, self._counts, self._scale = groupings, counts, scale
-        self._wide = 1 + scale[: groupings.q_wide] ** 2 * counts.wide
-        self._places, self._ratio, self._lower = [], [], []
-        self.log_determinant = float(np.log(self._wide).sum())
-        for (wide, narrow), cross, square in groupings.blocks(counts):
-            scaled = scale[wide, None] * cross * scale[narrow]
-            ratio = scaled / self._wide[wide, None]
-            schur = np.eye(len(square)) + scale[narrow, None] * square * scale[narrow]
-            schur -= scaled.T @ ratio
-            lower = cholesky(schur, lower=True, check_finite=False) if len(schur) else schur
-            self.log_determinant += 2 * float(np.log(np.diag(lower)).sum())
-            self._places.append((wide, narrow))
-            self._ratio.append(ratio)
-            self._lower.append(lower)
-
-    def solve(self, right: Array) -> Array:
-        """H^-1 times ``right``, of shape (q,) or (q, p)."""
-        found = np.empty_like(right)
-        for (wide, narrow), ratio, lower in self._parts():
-            below = right[narrow] - ratio.T @ right[wide]
-            solved = cho_solve((lower, True), below, check_finite=False) if len(lower) else below
-            found[narrow] = solved
-            found[wide] = (right[wide].T / self._wide[wide]).T - ratio @ solved
-        return found
-
-    def inverse(self) -> Inverse:
-        """The parts of H^-1 that belong to cells that rows can fill."""
-        diagonal, cross, square = np.empty(self._groupings.q), [], []
-        for (wide, narrow), ratio, lower in self._parts():
-            unit = np.eye(len(lower))
-            inner = cho_solve((lower, True), unit, check_finite=False) if len(lower) else unit
-            outer = ratio @ inner
-            diagonal[narrow] = np.diag(inner)
-            diagonal[wide] = 1 / self._wide[wide] + np.einsum("de,de->d", outer, ratio)
-            cross.append(-outer)
-            square.append(inner)
-        return Inverse(diagonal, cross, square)
-
-    def slopes(self, inverse: Inverse) -> Array:
-        """Half the derivative of log|H| by each grouping's standard deviation: shape (groupings,).
-
-        It is the trace of that grouping's part of H^-1 Lambda Z'WZ, which stays exact at zero.
-        """
-        scale, counts = self._scale, self._counts
-        by_slot = np.empty(len(scale))
-        by_slot[: self._groupings.q_wide] = (
-            inverse.diagonal[: self._groupings.q_wide] * counts.wide
-        ) * scale[: self._groupings.q_wide]
-        blocks = self._groupings.blocks(counts)
-        for k, ((wide, narrow), cross, square) in enumerate(blocks):
-            linked = inverse.cross[k] * cross
-            by_slot[wide] += linked @ scale[narrow]
-            by_slot[narrow] = scale[wide] @ linked
-            by_slot[narrow] += (inverse.narrow[k] * square) @ scale[narrow]
-        return self._groupings.by_grouping(by_slot)
-
-    def _parts(self) -> zip[tuple[tuple[slice, slice], Array, Array]]:
-        return zip(self._places, self._ratio, self._lower, strict=True)
-
 
 def _rank(block: Codes) -> Codes:
     """The place of each level when levels are sorted by block."""
@@ -275,4 +185,4 @@ def _rank(block: Codes) -> Codes:
 
 
 def _pairs(bounds: Codes) -> list[tuple[int, int]]:
-    return [(int(a), int(b)) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+    return [(int(a), int(b)) for a, b in pairwise(bounds)]
