@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from conftest import official_folder
 from physion.analysis.mixed_simulation import AnswerDesign, simulate_answers
 
 STORED = Path(__file__).parent / "fixtures" / "mixed_r.csv"
@@ -76,6 +77,17 @@ def models() -> pd.DataFrame:
     )
 
 
+def published() -> pd.DataFrame:
+    """The published table of models' accuracies, where the official data is."""
+    folder = official_folder()
+    if folder is None:
+        raise FileNotFoundError("the official data is absent: set PHYSION_OFFICIAL to its folder")
+    table = pd.read_csv(folder / "results" / "model_human_accuracies.csv")
+    names = {"Readout Type": "readout", "Dynamics Training Dataset Type": "training"}
+    table = table.rename(columns={**names, "Model": "model"})
+    return table[["model_correct", "model", "scenario", "readout", "training"]]
+
+
 CASES = {
     "nested": Case("logistic", f"correct ~ scenario + {PEOPLE}", nested),
     "crossed": Case(
@@ -95,6 +107,14 @@ CASES = {
         models,
     ),
     "inside": Case("linear", "model_correct ~ difficulty + (1|scenario/readout)", models),
+    "published readouts": Case(
+        "linear", "model_correct ~ readout + (1|scenario) + (1|training)", published
+    ),
+    "published models": Case(
+        "linear",
+        "model_correct ~ model + (1|scenario) + (1|readout) + (1|training)",
+        published,
+    ),
     "times big": Case("linear", f"log_rt ~ scenario + elements + {PEOPLE}", big),
 }
 
