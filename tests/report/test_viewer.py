@@ -17,8 +17,9 @@ import pytest
 from viewer_dataset import EVIL, FRAMES, PLANS, Plan, make_dataset, make_scene, make_trajectory
 
 from physion.cli import view
+from physion.cli.main import main as cli
 from physion.errors import BadInputError, UnknownNameError
-from physion.report import viewer_facts
+from physion.report import viewer, viewer_facts
 from physion.report.viewer import ViewerOptions, build_viewer, choose_trials
 from physion.report.viewer_motion import STEPS, pack_grid, pack_motion, pack_shapes
 from physion.report.viewer_movies import fitted
@@ -252,6 +253,30 @@ def test_verb_writes_and_says_where(dataset: Path, tmp_path: Path, capsys: Any) 
     assert view.main(view.Options(dataset, out, trials=1, details=0, json=True)) == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed == {"page": str(out), "bytes": out.stat().st_size, "shown": 2, "left_out": 2}
+
+
+def test_read_only_datasets_say_what_to_do(
+    dataset: Path, tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before anything is rendered; root may write everywhere, so the system's answer is faked."""
+    monkeypatch.setattr(viewer.os, "access", lambda path, mode: path != dataset)
+    monkeypatch.setattr(viewer, "_trial_data", None)
+    assert cli(["view", str(dataset)]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"physion: cannot write {dataset / 'view.html'}: ") and "--out" in said
+    assert said.count("\n") == 1
+
+
+def test_a_page_that_cannot_be_written_is_named(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(path: Path, data: bytes) -> None:
+        raise OSError(28, "No space left on device", str(tmp_path / ".1-ab.part"))
+
+    monkeypatch.setattr(viewer, "write_atomic", fail)
+    with pytest.raises(BadInputError, match=r"v\.html: No space left on device; .*--out") as caught:
+        build_viewer(dataset, tmp_path / "v.html", ViewerOptions(trials=1, details=0))
+    assert ".part" not in str(caught.value)
 
 
 # --- tables --------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,8 +64,9 @@ def build_viewer(
     """Write the page of the dataset in ``folder`` to the file ``out``, whole or not at all.
 
     The page needs no other file and no network. The same trials and options give the same bytes.
-    Raises `BadInputError` where there is no dataset, a trial is damaged, or ``out`` is a folder,
-    and `UnknownNameError` for a scenario or split that the dataset does not hold.
+    Raises `BadInputError` where there is no dataset, a trial is damaged, or ``out`` is a folder or
+    cannot be written, and `UnknownNameError` for a scenario or split that the dataset does not
+    hold.
     """
     options = options or ViewerOptions()
     dataset = Dataset(folder)
@@ -72,6 +74,9 @@ def build_viewer(
         raise BadInputError(f"{out} is a folder; give a file for the page")
     if not out.parent.is_dir():
         raise BadInputError(f"folder {out.parent} does not exist; make it, or choose another")
+    # Rendering takes minutes: better said before.
+    if not os.access(out.parent, os.W_OK):
+        raise _unwritable(out, "the folder is read-only")
     chosen, totals = choose_trials(dataset.index, options)
     rows = [row for _, row in chosen.iterrows()]
     shapes: set[str] = set()
@@ -82,8 +87,15 @@ def build_viewer(
         shapes |= names
     title = ", ".join(sorted(set(dataset.index["dataset"].astype(str)))) or "no trials"
     page = render_viewer(title, found, totals, viewer_motion.pack_shapes(shapes)).encode()
-    write_atomic(out, page)
+    try:
+        write_atomic(out, page)
+    except OSError as error:
+        raise _unwritable(out, error.strerror or str(error)) from error
     return ViewerReport(out, len(page), len(found), sum(totals.values()) - len(found))
+
+
+def _unwritable(out: Path, reason: str) -> BadInputError:
+    return BadInputError(f"cannot write {out}: {reason}; give another place for the page (--out)")
 
 
 def choose_trials(
