@@ -17,6 +17,7 @@ import pandas as pd
 import pytest
 from hand_made import SIZE, make_parts
 
+from physion.cli.main import main as cli
 from physion.errors import BadInputError
 from physion.trials.card import write_card
 from physion.trials.facts import MEANINGS, meaning
@@ -332,3 +333,55 @@ def test_folders_without_trials_are_refused(dataset: Path, tmp_path: Path) -> No
     write_index(tmp_path, read_index(dataset).iloc[:0])
     with pytest.raises(BadInputError, match="no trial"):
         write_card(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("README.md", "# My own words\n"),
+        ("README.md", '---\ntitle: x\n---\npretty_name: "Physion: mine"\n'),
+        ("croissant.json", '{"description": "somebody else\'s"}'),
+        ("croissant.json", "not JSON"),
+        ("croissant.json", "[]"),
+    ],
+)
+def test_files_of_others_are_not_written_over(
+    dataset: Path, tmp_path: Path, name: str, text: str
+) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(BadInputError, match=r"is not a card of ours.*move it away"):
+        write_card(dataset, tmp_path)
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, text)]
+
+
+def test_a_card_takes_the_place_of_an_older_one(dataset: Path, tmp_path: Path) -> None:
+    write_card(dataset, tmp_path, version="1.0.0")
+    card = write_card(dataset, tmp_path, version="1.0.1")
+    assert "Version 1.0.1" in card.readme.read_text()
+    assert json.loads(card.metadata.read_text())["version"] == "1.0.1"
+
+
+def test_a_link_is_not_taken_for_a_card(dataset: Path, tmp_path: Path) -> None:
+    (tmp_path / "README.md").symlink_to(tmp_path / "nowhere")
+    with pytest.raises(BadInputError, match="not a card of ours"):
+        write_card(dataset, tmp_path)
+
+
+def test_the_verb_takes_the_terms(dataset: Path, tmp_path: Path) -> None:
+    terms = ["--license", "CC-BY-4.0", "--creator", "A Lab", "--version", "2.1.0"]
+    terms += ["--url", "https://example.org/x", "--published", "2026-01-31"]
+    words = ["export", str(dataset), str(tmp_path), "--layout", "card", *terms]
+    assert cli(words) == 0
+    said = json.loads((tmp_path / "croissant.json").read_text())
+    assert said["license"].endswith("CC-BY-4.0.html") and said["creator"]["name"] == "A Lab"
+    assert (said["version"], said["url"]) == ("2.1.0", "https://example.org/x")
+    assert said["datePublished"] == "2026-01-31"
+
+
+def test_the_verb_refuses_terms_of_another_layout(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli(["export", str(dataset), str(tmp_path / "out"), "--creator", "me"]) == 2
+    assert "--layout card" in capsys.readouterr().err
+    assert cli(["export", str(dataset), "--layout", "card", "--parts", "seen"]) == 2
+    assert "--layout webdataset" in capsys.readouterr().err

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import tarfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import pytest
 from hand_made import FRAMES, SIZE, images, make_parts, tree_digest
 
 import physion.trials.shards as shards_module
+from physion.cli.main import main as cli
 from physion.errors import BadInputError, UnknownNameError
 from physion.trials.files import encode_png, write_files
 from physion.trials.index import build_index, write_index
@@ -292,3 +294,13 @@ def test_a_manifest_cannot_name_files_elsewhere(dataset: Path, tmp_path: Path) -
     with pytest.raises(BadInputError, match="no shards"):
         export_shards(dataset, out)
     assert victim.read_text() == "keep me"
+
+
+def test_the_verb_writes_what_may_be_seen(dataset: Path, tmp_path: Path) -> None:
+    words = ["export", str(dataset), str(tmp_path / "out"), "--layout", "webdataset"]
+    assert cli([*words, "--parts", "seen"]) == 0
+    names = set()
+    for path in (tmp_path / "out").glob("*.tar"):
+        with tarfile.open(path) as shard:
+            names |= {name.partition(".")[2] for name in shard.getnames()}
+    assert {"json", "observed.mp4"} <= names <= set(SEEN_PARTS)

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from physion.cli.official_report import print_report
 from physion.cli.output import console, track
 from physion.compute.local import LocalExecutor
 from physion.errors import BadInputError
@@ -29,14 +30,35 @@ class Options:
     """Only this part of the dataset."""
     scenario: str | None = None
     """Only this scenario."""
+    parts: Literal["all", "seen"] = "all"
+    """For webdataset: all parts of a sample, or those alone that tell nothing of what happens."""
+    license: str | None = None
+    """For a card: an identifier of spdx.org, like CC-BY-4.0; by default MIT."""
+    creator: str | None = None
+    """For a card: who made the dataset."""
+    version: str | None = None
+    """For a card: three numbers with dots; by default 1.0.0."""
+    url: str | None = None
+    """For a card: the page of the dataset."""
+    published: str | None = None
+    """For a card: the day, like 2026-01-31; by default today."""
     workers: int = os.cpu_count() or 1
     """Processes."""
     json: bool = False
     """Print one JSON object."""
 
 
+CARD_TERMS = ("license", "creator", "version", "url", "published")
+"""Options that only a card has."""
+
+
 def main(options: Options) -> int:
     """Export what is missing; 1 if a trial failed."""
+    terms = [name for name in CARD_TERMS if getattr(options, name) is not None]
+    if terms and options.layout != "card":
+        raise BadInputError(f"--{terms[0]} is for a card: use it with --layout card")
+    if options.parts != "all" and options.layout != "webdataset":
+        raise BadInputError("--parts is for shards: use it with --layout webdataset")
     if options.layout == "card":
         return _card(options)
     if options.out is None:
@@ -51,7 +73,9 @@ def _card(options: Options) -> int:
 
     if options.split or options.scenario:
         raise BadInputError("a card describes a whole dataset: leave out --split and --scenario")
-    card = write_card(options.folder, options.out)
+    given = {name: getattr(options, name) for name in CARD_TERMS}
+    terms = {name: value for name, value in given.items() if value is not None}
+    card = write_card(options.folder, options.out, **terms)
     paths = [card.readme, card.metadata]
     if options.json:
         print(json_module.dumps({"made": [str(path) for path in paths]}))
@@ -62,9 +86,15 @@ def _card(options: Options) -> int:
 
 
 def _webdataset(options: Options, out: Path) -> int:
-    from physion.trials.shards import export_shards
+    from physion.trials.shards import PARTS, SEEN_PARTS, export_shards
 
-    report = export_shards(options.folder, out, split=options.split, scenario=options.scenario)
+    report = export_shards(
+        options.folder,
+        out,
+        split=options.split,
+        scenario=options.scenario,
+        parts=SEEN_PARTS if options.parts == "seen" else PARTS,
+    )
     if options.json:
         values = {"made": report.made, "samples": report.samples, "bytes": report.bytes}
         print(json_module.dumps(values | {"index": str(report.manifest)}, default=list))
@@ -86,12 +116,4 @@ def _official(options: Options, out: Path) -> int:
         executor=LocalExecutor(workers=options.workers),
         track=track,
     )
-    if options.json:
-        values = {"made": report.made, "kept": report.kept, "failed": dict(report.failed)}
-        print(json_module.dumps(values | {"index": str(report.index)}))
-        return report.exit_code
-    for name, reason in report.failed.items():
-        console.print(f"failed: {name}: {reason}", markup=False, soft_wrap=True)
-    done = f"{len(report.made)} made, {len(report.kept)} kept, {len(report.failed)} failed"
-    console.print(f"{done}: {report.index}", markup=False, soft_wrap=True)
-    return report.exit_code
+    return print_report(report, options.json)

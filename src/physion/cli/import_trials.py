@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_module
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,11 +9,10 @@ from typing import Annotated, Literal
 
 import tyro
 
-from physion.cli.output import console, track
+from physion.cli.official_report import print_report
+from physion.cli.output import track
 from physion.compute.local import LocalExecutor
 from physion.trials.official_import import import_official
-
-SHOWN_NOTES = 5
 
 
 @dataclass(frozen=True)
@@ -48,19 +46,4 @@ def main(options: Options) -> int:
         executor=LocalExecutor(workers=options.workers),
         track=track,
     )
-    if options.json:
-        values = {"made": report.made, "kept": report.kept, "failed": dict(report.failed)}
-        values |= {"notes": dict(report.notes), "index": str(report.index)}
-        print(json_module.dumps(values))
-        return report.exit_code
-    for name, reason in report.failed.items():
-        console.print(f"failed: {name}: {reason}", markup=False, soft_wrap=True)
-    notes = [f"{name}: {note}" for name, found in report.notes.items() for note in found]
-    for note in notes[:SHOWN_NOTES]:
-        console.print(f"note: {note}", markup=False, soft_wrap=True)
-    if len(notes) > SHOWN_NOTES:
-        more = len(notes) - SHOWN_NOTES
-        console.print(f"... and {more} more notes (--json lists all)", markup=False)
-    done = f"{len(report.made)} made, {len(report.kept)} kept, {len(report.failed)} failed"
-    console.print(f"{done}: {report.index}", markup=False, soft_wrap=True)
-    return report.exit_code
+    return print_report(report, options.json)

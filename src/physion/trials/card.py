@@ -14,21 +14,15 @@ import pandas as pd
 from physion.atomic import write_atomic
 from physion.errors import BadInputError
 from physion.trials.croissant import Terms, croissant
-from physion.trials.facts import (
-    MEANINGS,
-    SCENARIOS,
-    SPLITS,
-    Facts,
-    biases,
-    collection,
-    limitations,
-    meaning,
-    read_facts,
-)
+from physion.trials.facts import MEANINGS, SCENARIOS, SPLITS, Facts, meaning, read_facts
 from physion.trials.layout import INDEX
 
 CARD = "README.md"
 METADATA = "croissant.json"
+TITLE = "Physion: "
+"""How the name of every dataset begins in a card of ours."""
+MADE_BY = "Made with the package physion after the study of Bear et al. (2021)."
+"""Sentence in every description of ours, by which a file is known to be one."""
 CITATION = """@inproceedings{bear2021physion,
   title = {Physion: Evaluating Physical Prediction from Vision in Humans and Machines},
   author = {Bear, Daniel M. and Wang, Elias and Mrowca, Damian and Binder, Felix J. and
@@ -64,13 +58,15 @@ def write_card(
 
     With ``out`` they are written there, to be put beside the index later. Arguments are as in
     `Terms`; the day is by default today's. All counts come from the index as it is now: write the
-    card anew when the dataset changes. `BadInputError` where there is no index or no trial, or an
-    argument is not what it should be.
+    card anew when the dataset changes; it takes the place of an older card and of nothing else.
+    `BadInputError` where there is no index or no trial, another file has one of the two names, or
+    an argument is not what it should be.
     """
     day = published or datetime.date.today().isoformat()
     terms = _checked(Terms(day, license, version, creator, url))
     facts = read_facts(folder)
     target = folder if out is None else out
+    _refuse_strangers(target)
     metadata = croissant(facts, terms, description(facts), CITATION)
     text = json.dumps(metadata, indent=1, ensure_ascii=False) + "\n"
     try:
@@ -82,13 +78,41 @@ def write_card(
     return Card(target / CARD, target / METADATA, facts)
 
 
+def _refuse_strangers(target: Path) -> None:
+    """Raise `BadInputError` where somebody else's file would be written over."""
+    for name, is_ours in ((CARD, _is_readme), (METADATA, _is_metadata)):
+        path = target / name
+        if not path.exists() and not path.is_symlink():
+            continue
+        if not (path.is_file() and is_ours(path)):
+            raise BadInputError(
+                f"{path} is not a card of ours and would be lost; move it away, or write the card "
+                "into another folder (`physion export DATASET FOLDER --layout card`)"
+            )
+
+
+def _is_readme(path: Path) -> bool:
+    """Whether the front matter is that of a card."""
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    if not lines or lines[0] != "---" or "---" not in lines[1:]:
+        return False
+    return any(x.startswith(f'pretty_name: "{TITLE}') for x in lines[1 : lines.index("---", 1)])
+
+
+def _is_metadata(path: Path) -> bool:
+    try:
+        data = json.loads(path.read_bytes())
+    except (ValueError, RecursionError):
+        return False
+    return isinstance(data, dict) and str(data.get("description")).endswith(MADE_BY)
+
+
 def description(facts: Facts) -> str:
     """What the dataset is, in a few sentences."""
     return (
         f"{len(facts.index)} simulated physical scenes, {facts.movies or 'none'} of them with "
         "movies. Who predicts sees the first part of a trial; the question is whether one thing, "
-        "the agent, touches another, the patient, at any time of it. Made with the package physion "
-        "after the study of Bear et al. (2021)."
+        f"the agent, touches another, the patient, at any time of it. {MADE_BY}"
     )
 
 
@@ -98,7 +122,7 @@ def card_text(facts: Facts, terms: Terms) -> str:
     sections = [
         _front_matter(facts, terms),
         f"# {facts.name}\n{description(facts)}",
-        f"## How it was made\n{collection(facts)}\n\n"
+        f"## How it was made\n{facts.collection()}\n\n"
         f"Creator: {name}. Version {terms.version}, {terms.published}. "
         f"Licence: {terms.license}.",
         f"## Splits\n{_table(_counts(facts.index))}\n\n{_meanings('split', SPLITS, facts)}",
@@ -109,8 +133,8 @@ def card_text(facts: Facts, terms: Terms) -> str:
         "predicts may have the observed movies and the maps, and nothing else: the index, the "
         "trial files and the full movies hold the answers.",
         f"## Columns of the index\n{_table(_columns(facts))}",
-        "## Biases\n" + _list(biases(facts)),
-        "## Known limits\n" + _list(limitations(facts)),
+        "## Biases\n" + _list(facts.biases()),
+        "## Known limits\n" + _list(facts.limitations()),
         f"## Citation\n```bibtex\n{CITATION}\n```",
     ]
     return "\n\n".join(sections) + "\n"
@@ -120,7 +144,7 @@ def _front_matter(facts: Facts, terms: Terms) -> str:
     """Metadata of the hub. Values are JSON, which YAML reads as it is."""
     values: dict[str, Any] = {
         "license": terms.license.lower(),
-        "pretty_name": f"Physion: {facts.name}",
+        "pretty_name": f"{TITLE}{facts.name}",
         "task_categories": ["video-classification"],
         "annotations_creators": ["machine-generated"],
         "size_categories": [_size_category(len(facts.index))],

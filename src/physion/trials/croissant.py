@@ -9,17 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from physion.trials.facts import (
-    MEANINGS,
-    SCENARIOS,
-    SPLITS,
-    Facts,
-    biases,
-    collection,
-    limitations,
-    meaning,
-    missing,
-)
+from physion.trials.facts import MEANINGS, SCENARIOS, SPLITS, Facts, meaning
 from physion.trials.index import COLUMNS
 from physion.trials.layout import INDEX
 
@@ -97,18 +87,18 @@ def responsible(facts: Facts) -> dict[str, Any]:
     """Properties of the responsible-AI vocabulary."""
     n = len(facts.index)
     return {
-        "rai:dataCollection": collection(facts),
+        "rai:dataCollection": facts.collection(),
         "rai:dataCollectionType": ["Software Collection"]
         + (["Secondary Data analysis"] if facts.imported else []),
         "rai:dataCollectionRawData": "Scenes (bodies, poses, pushes, camera) and their simulated "
         "motion are kept in every trial file; pictures can be rendered from them again.",
-        "rai:dataCollectionMissingData": missing(facts),
+        "rai:dataCollectionMissingData": facts.missing(),
         "rai:dataAnnotationProtocol": "Labels are computed, not judged: whether the simulation "
         "made agent and patient touch, at any time of the trial, the unseen part included.",
         "rai:machineAnnotationTools": [facts.versions("engine"), facts.versions("package")],
         "rai:annotationsPerItem": "0 by people; one label is computed",
-        "rai:dataBiases": biases(facts),
-        "rai:dataLimitations": limitations(facts),
+        "rai:dataBiases": facts.biases(),
+        "rai:dataLimitations": facts.limitations(),
         "rai:dataUseCases": [
             "Training models that predict what happens next from video or from physical state.",
             "Testing whether such models foresee contacts, and comparing them with people who "

@@ -112,6 +112,77 @@ class Facts:
         """Size of all files that the index lists."""
         return int(self.index[[f"{name}_bytes" for name in FILES]].sum().sum())
 
+    def collection(self) -> str:
+        """How the trials came to be."""
+        drawn = len(self.index) - self.imported
+        parts = []
+        if drawn:
+            parts.append(
+                f"{drawn} {_scenes(drawn)} drawn at random by the samplers of "
+                f"{self.versions('package')}."
+            )
+        if self.imported:
+            parts.append(
+                f"{self.imported} {_scenes(self.imported)} imported from records made elsewhere."
+            )
+        parts.append(
+            f"All were simulated by {self.versions('engine')} and rendered by "
+            f"{self.versions('renderer')}."
+        )
+        return " ".join(parts)
+
+    def missing(self) -> str:
+        """Cells of the index without a value, by column."""
+        counts = self.index[[name for name in COLUMNS if name in MEANINGS]].isna().sum()
+        gaps = [f"{name} ({count})" for name, count in counts.items() if count]
+        return f"Missing cells by column, of {len(self.index)}: {', '.join(gaps) or 'none'}."
+
+    def biases(self) -> list[str]:
+        """Imbalances, counted."""
+        index = self.index
+        rates = index.groupby("split", observed=True)["contact"].agg(["mean", "size"])
+        said = [
+            f"Agent and patient touch in {row['mean']:.3f} of the {row['size']:.0f} {split} trials."
+            for split, row in rates.iterrows()
+        ]
+        chosen = {
+            name: self.settings[name]
+            for name in ("min_visible", "robust", "observed_contact")
+            if name in self.settings
+        }
+        if chosen and self.imported < len(index):
+            told = ", ".join(f"{name} = {value}" for name, value in chosen.items())
+            said.append(
+                f"Drawn trials were chosen with these settings of `physion generate`: {told}."
+            )
+        said.append(
+            "Shapes, sizes, colours, rooms and cameras follow the package's samplers or the "
+            "imported scenes, not the statistics of any real place."
+        )
+        return said
+
+    def limitations(self) -> list[str]:
+        """What the data cannot show, with counts where something was counted."""
+        index, n = self.index, len(self.index)
+        said = [
+            "Rigid bodies and cloth are simulated; another engine may decide some trials "
+            "otherwise.",
+            "The camera never moves, and there is no sound.",
+            f"In {int(index['observed_contact'].sum())} of {n} trials agent and patient touch "
+            "already in the observed part.",
+        ]
+        robust = index["robust"].dropna()
+        if len(robust):
+            said.append(
+                "Jittered simulations agree with the label in "
+                f"{float(robust.mean()):.3f} of cases, measured on {len(robust)} of {n} trials."
+            )
+        else:
+            said.append("How far labels depend on tiny changes of the scene was not measured.")
+        unfinished = int((~index["completed"]).sum())
+        said.append(f"In {unfinished} of {n} trials something still moved when the time was over.")
+        return said
+
 
 def read_facts(folder: Path) -> Facts:
     """The facts of a dataset; `BadInputError` where there is no index, or not one trial in it."""
@@ -136,77 +207,5 @@ def meaning(column: str) -> str:
     return MEANINGS[column]
 
 
-def collection(facts: Facts) -> str:
-    """How the trials came to be."""
-    drawn = len(facts.index) - facts.imported
-    parts = []
-    if drawn:
-        parts.append(
-            f"{drawn} {_scenes(drawn)} drawn at random by the samplers of "
-            f"{facts.versions('package')}."
-        )
-    if facts.imported:
-        parts.append(
-            f"{facts.imported} {_scenes(facts.imported)} imported from records made elsewhere."
-        )
-    parts.append(
-        f"All were simulated by {facts.versions('engine')} and rendered by "
-        f"{facts.versions('renderer')}."
-    )
-    return " ".join(parts)
-
-
 def _scenes(count: int) -> str:
     return "scene was" if count == 1 else "scenes were"
-
-
-def missing(facts: Facts) -> str:
-    """Cells of the index without a value, by column."""
-    counts = facts.index[[name for name in COLUMNS if name in MEANINGS]].isna().sum()
-    gaps = [f"{name} ({count})" for name, count in counts.items() if count]
-    return f"Missing cells by column, of {len(facts.index)}: {', '.join(gaps) or 'none'}."
-
-
-def biases(facts: Facts) -> list[str]:
-    """Imbalances, counted."""
-    index = facts.index
-    rates = index.groupby("split", observed=True)["contact"].agg(["mean", "size"])
-    said = [
-        f"Agent and patient touch in {row['mean']:.3f} of the {row['size']:.0f} {split} trials."
-        for split, row in rates.iterrows()
-    ]
-    chosen = {
-        name: facts.settings[name]
-        for name in ("min_visible", "robust", "observed_contact")
-        if name in facts.settings
-    }
-    if chosen and facts.imported < len(index):
-        told = ", ".join(f"{name} = {value}" for name, value in chosen.items())
-        said.append(f"Drawn trials were chosen with these settings of `physion generate`: {told}.")
-    said.append(
-        "Shapes, sizes, colours, rooms and cameras follow the package's samplers or the imported "
-        "scenes, not the statistics of any real place."
-    )
-    return said
-
-
-def limitations(facts: Facts) -> list[str]:
-    """What the data cannot show, with counts where something was counted."""
-    index, n = facts.index, len(facts.index)
-    said = [
-        "Rigid bodies and cloth are simulated; another engine may decide some trials otherwise.",
-        "The camera never moves, and there is no sound.",
-        f"In {int(index['observed_contact'].sum())} of {n} trials agent and patient touch already "
-        "in the observed part.",
-    ]
-    robust = index["robust"].dropna()
-    if len(robust):
-        said.append(
-            f"Jittered simulations agree with the label in {float(robust.mean()):.3f} of cases, "
-            f"measured on {len(robust)} of {n} trials."
-        )
-    else:
-        said.append("How far labels depend on tiny changes of the scene was not measured.")
-    unfinished = int((~index["completed"]).sum())
-    said.append(f"In {unfinished} of {n} trials something still moved when the time was over.")
-    return said
