@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from physion.compute.local import SerialExecutor
-from physion.errors import BadInputError, PhysionError
+from physion.errors import BadInputError, BadSceneError, PhysionError
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
 from physion.scenes.scenarios import sample_scene
@@ -154,6 +154,38 @@ def test_a_damaged_record_of_choices_is_named(tmp_path: Path) -> None:
         path.write_text(text)
         with pytest.raises(BadInputError, match=r"c\.json is no record of choices"):
             Choices(path)
+    record = Choices(tmp_path / "d.json")
+    record.by_index = {0: Choice("default", 3, "a" * 64, 0.5)}
+    record.save()
+    (tmp_path / "d.json").write_text((tmp_path / "d.json").read_text().replace("3", "4"))
+    with pytest.raises(BadInputError, match="was changed"):
+        Choices(tmp_path / "d.json")
+
+
+def test_a_preset_that_hardly_varies_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    few_scenes(monkeypatch, 1)
+    monkeypatch.setattr(choosing, "MAX_ELSEWHERE", 40)
+    digest = sample_scene("collide", trial_seed("few", "collide", "x", 0)).physics_digest()
+    other = next(split for split in SPLITS if split != split_of(digest))
+    with pytest.raises(PhysionError, match="default hardly varies"):
+        choose(Slot(slots(other, 1)[0], QUICK))
+
+
+def test_a_preset_that_cannot_be_placed_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> object:
+        raise BadSceneError("ball could not be placed in 100 tries: it meets the wall (100)")
+
+    monkeypatch.setattr(choosing, "sample_scene", refuse)
+    with pytest.raises(PhysionError, match=r"none of 20 draws .*it meets the wall \(100\): 20"):
+        choose(Slot(slots("testing", 1)[0], QUICK))
+
+
+def test_a_draw_that_comes_out_differently_is_refused(tmp_path: Path) -> None:
+    task = slots("testing", 1)[0]
+    choice = choose(Slot(task, QUICK))
+    wrong = dataclasses.replace(choice, attempt=choice.attempt + 1)
+    with pytest.raises(PhysionError, match="comes out differently now"):
+        scene_of(wrong.fill(task))
 
 
 def test_a_killed_search_goes_on(tmp_path: Path) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hand_made import make_by_hand, make_parts, make_scene
 
@@ -12,10 +14,10 @@ from physion.compute.local import SerialExecutor
 from physion.errors import BadInputError
 from physion.trials.dataset import Dataset
 from physion.trials.generate import generate
-from physion.trials.index import build_index, write_index
+from physion.trials.index import build_index, read_index, write_index
 from physion.trials.layout import TrialPaths
 from physion.trials.make import make_trial
-from physion.trials.plan import Job, Settings, Task, plan_scenes
+from physion.trials.plan import Job, Settings, Task, plan_dataset, plan_scenes
 from physion.trials.verify import verify_dataset
 from physion.trials.video import encode_movie, read_frames
 
@@ -91,3 +93,73 @@ def test_a_label_that_the_contacts_contradict_is_found(folder: Path) -> None:
     table, _ = build_index(folder)
     write_index(folder, table)
     assert any("labels/contact" in fault for fault in verify_dataset(folder, again=0))
+
+
+@pytest.fixture(scope="module")
+def sampled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two sampled trials with movies, robustness and stored passes."""
+    folder = tmp_path_factory.mktemp("sampled") / "d"
+    settings = Settings(width=64, height=64, jitters=2, passes=("depth", "flow"))
+    tasks = plan_dataset("verify", ["collide"], {"testing": 2}, {"collide": ["default"]})
+    assert not generate(folder, tasks, settings, executor=SerialExecutor()).failed
+    return folder
+
+
+def test_a_sampled_dataset_comes_out_the_same_again(sampled: Path) -> None:
+    assert verify_dataset(sampled, again=-1) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("dataset.json", "sha256"),
+        ("choices/testing_collide.json", "sha256"),
+        ("index.parquet", "index.parquet"),
+    ],
+)
+def test_one_changed_byte_beside_the_trials_is_found(
+    sampled: Path, tmp_path: Path, name: str, says: str
+) -> None:
+    content = (sampled / name).read_bytes()
+    for place in np.linspace(1, len(content) - 2, 12).astype(int):
+        folder = tmp_path / str(place)
+        shutil.copytree(sampled, folder)
+        changed = bytearray(content)
+        changed[place] ^= 1
+        (folder / name).write_bytes(changed)
+        try:
+            faults = verify_dataset(folder, again=0)
+        except BadInputError as error:
+            faults = [str(error)]
+        assert any(says in fault or name in fault for fault in faults), place
+
+
+def test_strangers_and_trials_of_other_splits_are_named(sampled: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "d"
+    shutil.copytree(sampled, folder)
+    (folder / "testing" / "collide" / "stray_img.mp4").write_bytes(b"x")
+    index = read_index(folder)
+    index["observed_contact"] = True
+    index["contact"] = ~index["contact"]
+    index["scene_digest"] = "0" * 64
+    write_index(folder, index)
+    faults = "\n".join(verify_dataset(folder, again=0))
+    assert "stray_img.mp4 belongs to no trial" in faults
+    assert "its physics belongs to training" in faults
+    assert "the balance of its split wants the other" in faults
+    assert "nothing is left to predict" in faults
+    assert "the same physics as" in faults
+
+
+def test_a_trial_made_again_is_indexed_again(sampled: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "d"
+    shutil.copytree(sampled, folder)
+    index = read_index(folder)
+    index.loc[0, "frames"] = 7
+    write_index(folder, index)
+    paths = Dataset(folder).paths(str(index["trial"][0]))
+    paths.trial_file.unlink()
+    tasks = plan_dataset("verify", ["collide"], {"testing": 2}, {"collide": ["default"]})
+    settings = Settings(width=64, height=64, jitters=2, passes=("depth", "flow"))
+    report = generate(folder, tasks, settings, executor=SerialExecutor())
+    assert len(report.made) == 1 and verify_dataset(folder, again=0) == []

@@ -13,14 +13,12 @@ the same slot ends with the same scene in any process and any order. A draw is r
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from physion.atomic import write_atomic
 from physion.compute.executor import Executor, Outcome
 from physion.errors import BadInputError, BadSceneError, PhysionError
 from physion.physics.engine import simulate
@@ -32,6 +30,7 @@ from physion.scenes.scenarios import sample_scene
 from physion.scenes.scene import Scene
 from physion.seeds import child_generator, stable_hash, trial_seed
 from physion.trials.plan import Settings, Task
+from physion.trials.sealed import read_sealed, write_sealed
 
 BALANCED = ("readout", "testing", "familiarization")
 """Splits of which half the trials end with contact, and where nothing may be seen too early."""
@@ -41,6 +40,11 @@ TRIES_EACH = 12
 """Draws of a preset before the next one is tried: some presets hardly ever end the other way."""
 MAX_TRIES = 600
 """Draws of the right split before a slot is given up."""
+MAX_ELSEWHERE = 600
+"""Draws in a row that belong to other splits before a preset counts as one that hardly varies: by
+chance that happens once in 10^16 to the rarest split."""
+MAX_UNPLACED = 20
+"""Draws in a row that could not be placed before a preset is given up."""
 JITTER = 0.001
 """Standard deviation in metres of the noise that measures robustness."""
 
@@ -62,7 +66,13 @@ class Choice:
 
     def fill(self, task: Task) -> Task:
         """The task with this choice in it."""
-        return replace(task, preset=self.preset, attempt=self.attempt, robust=self.robust)
+        return replace(
+            task,
+            preset=self.preset,
+            attempt=self.attempt,
+            robust=self.robust,
+            scene_digest=self.digest,
+        )
 
 
 @dataclass(frozen=True)
@@ -83,8 +93,9 @@ def split_of(digest: str) -> str:
 def wanted_contact(task: Task) -> bool | None:
     """The outcome that a slot is to have; None where any will do.
 
-    Slots come in pairs, one with contact and one without, in an order that chance decides: the
-    number of a trial does not give its answer away.
+    Slots come in pairs, one with contact and one without, in an order that chance decides. The
+    number of a trial alone does not give its answer away; who knows the answer to one of a pair
+    knows the other's.
     """
     if task.split not in BALANCED:
         return None
@@ -96,21 +107,31 @@ def wanted_contact(task: Task) -> bool | None:
 def choose(slot: Slot) -> Choice:
     """Find the draw of a slot. A pure function; `PhysionError` says why there is none."""
     task, refused = slot.task, Counter[str]()
+    params = {name: get_preset(task.scenario, name).params for name in task.presets}
+    unplaced, elsewhere = Counter[str](), Counter[str]()
     attempt = -1
-    while sum(refused.values()) < MAX_TRIES:
+    while params and sum(refused.values()) < MAX_TRIES:
         attempt += 1
-        tries = sum(refused.values())
-        name = task.presets[(task.index // 2 + tries // TRIES_EACH) % len(task.presets)]
+        tries, names = sum(refused.values()), list(params)
+        name = names[(task.index // 2 + tries // TRIES_EACH) % len(names)]
         seed = trial_seed(task.dataset, task.scenario, task.split, task.index, attempt)
-        preset = get_preset(task.scenario, name)
         try:
-            scene = sample_scene(task.scenario, seed, preset.params)
+            scene = sample_scene(task.scenario, seed, params[name])
         except BadSceneError as error:
-            refused[f"{preset.name}: {error}"] += 1
+            refused[f"{name}: {error}"] += 1
+            unplaced[name] += 1
+            if unplaced[name] >= MAX_UNPLACED:
+                del params[name]
             continue
+        unplaced[name] = 0
         digest = scene.physics_digest()
         if split_of(digest) != task.split:
+            elsewhere[name] += 1
+            if elsewhere[name] >= MAX_ELSEWHERE:
+                refused[f"{name} hardly varies, and its physics belongs to other splits"] += 1
+                del params[name]
             continue
+        elsewhere[name] = 0
         if short(digest) in slot.taken:
             refused["another trial has the same physics"] += 1
             continue
@@ -120,7 +141,7 @@ def choose(slot: Slot) -> Choice:
         refused[reason] += 1
     counts = "; ".join(f"{reason}: {count}" for reason, count in refused.most_common(4))
     raise PhysionError(
-        f"none of {MAX_TRIES} draws of {', '.join(task.presets[:3])}"
+        f"none of {sum(refused.values())} draws of {', '.join(task.presets[:3])}"
         f"{' ...' if len(task.presets) > 3 else ''} can be taken ({counts})"
     )
 
@@ -179,9 +200,9 @@ class Choices:
         self.by_index: dict[int, Choice] = {}
         if path.is_file():
             try:
-                rows = json.loads(path.read_text(encoding="utf-8"))
+                rows = read_sealed(path)
                 self.by_index = {int(index): Choice(**row) for index, row in rows.items()}
-            except (ValueError, TypeError, AttributeError) as error:
+            except (BadInputError, ValueError, TypeError) as error:
                 raise BadInputError(
                     f"{path} is no record of choices ({error}); delete it to have it made again"
                 ) from error
@@ -190,7 +211,7 @@ class Choices:
         """Write the file, whole."""
         rows = {str(index): asdict(self.by_index[index]) for index in sorted(self.by_index)}
         self.path.parent.mkdir(exist_ok=True)
-        write_atomic(self.path, (json.dumps(rows, indent=0) + "\n").encode())
+        write_sealed(self.path, rows)
 
     def missing(self, tasks: Collection[Task]) -> list[Task]:
         """Tasks without a choice, and those whose physics a task of lower index has."""

@@ -22,14 +22,12 @@ from physion.scenes.preset import get_preset
 from physion.scenes.scenarios import as_record
 from physion.seeds import stable_hash
 from physion.trials.index import build_index, read_index, write_index
-from physion.trials.layout import FAILURES, INDEX, SETTINGS, find_trials
+from physion.trials.layout import CHOICES, FAILURES, INDEX, SETTINGS, find_trials
 from physion.trials.plan import Job, Settings, Task, check_names
+from physion.trials.sealed import read_sealed, write_sealed
 
 Track = Callable[[Iterable[Outcome[Any]], str, int], Iterator[Outcome[Any]]]
 """Passes outcomes on and shows how far it is, as `physion.cli.output.track` does."""
-
-CHOICES = "choices"
-"""Folder with the draws that were chosen for the trials of each split and scenario."""
 
 _HOPELESS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EIO}
 """System errors that every later trial would meet too."""
@@ -96,7 +94,7 @@ def generate(
             missing = {name: job for name, job in jobs.items() if not job.complete()}
             chosen, unchosen = _choose(folder, jobs, missing, settings, executor, track)
             made, failed = _run(folder, chosen, executor, track, make)
-            problems = _update_index(folder)
+            problems = _update_index(folder, set(made))
     except OSError as error:
         raise BadInputError(f"cannot write into {folder}: {error.strerror or error}") from error
     kept = [name for name in jobs if name not in missing]
@@ -177,16 +175,24 @@ def _note_failure(folder: Path, outcome: Outcome[Any], job: Job) -> None:
     write_atomic(folder / FAILURES / f"{outcome.key}.txt", text.encode())
 
 
-def _update_index(folder: Path) -> dict[str, str]:
-    """Write the index unless it names exactly the trials that are there; what is wrong, by name."""
+def _update_index(folder: Path, made: set[str]) -> dict[str, str]:
+    """Write the index unless it still holds; what is wrong with trials, by name.
+
+    It holds if it names exactly the trials that are there and none of them was ``made`` just now.
+    """
     there = {(paths.split, paths.trial) for paths in find_trials(folder)}
     try:
         index = read_index(folder)
-        if set(zip(index["split"], index["trial"], strict=True)) == there:
-            return {}
     except BadInputError:
-        pass
-    table, problems = build_index(folder)
+        index = None
+    if (
+        index is not None
+        and not made
+        and set(zip(index["split"], index["trial"], strict=True)) == there
+    ):
+        return {}
+    known = None if index is None else index[~index["trial"].isin(made)]
+    table, problems = build_index(folder, known)
     write_index(folder, table)
     return problems
 
@@ -200,7 +206,7 @@ def _fix_settings(folder: Path, dataset: str, settings: Settings, tasks: Sequenc
     wanted = json.loads(json.dumps({"dataset": dataset, "settings": dataclasses.asdict(settings)}))
     presets = _presets_in_use(tasks)
     if path.is_file():
-        known = _read_settings(path)
+        known = read_sealed(path)
         before = known.pop("presets", {})
         differs = [name for name in wanted if known.get(name) != wanted[name]]
         differs += [name for name in presets if before.get(name, presets[name]) != presets[name]]
@@ -212,9 +218,8 @@ def _fix_settings(folder: Path, dataset: str, settings: Settings, tasks: Sequenc
         presets = {**before, **presets}
         if presets == before:
             return
-    text = json.dumps({**wanted, "presets": presets}, indent=1, sort_keys=True) + "\n"
     if path.is_file():
-        write_atomic(path, text.encode())
+        write_sealed(path, {**wanted, "presets": presets})
         return
     strangers = [item.name for item in folder.iterdir() if not item.name.startswith(".")]
     if strangers:
@@ -222,17 +227,7 @@ def _fix_settings(folder: Path, dataset: str, settings: Settings, tasks: Sequenc
             f"{folder} is not empty and no dataset (it holds {sorted(strangers)[0]!r}); choose an "
             "empty or new folder"
         )
-    write_atomic(path, text.encode())
-
-
-def _read_settings(path: Path) -> dict[str, Any]:
-    try:
-        known = json.loads(path.read_text(encoding="utf-8", errors="replace"))
-    except ValueError as error:
-        raise BadInputError(f"{path} is damaged: {error}; choose another folder") from error
-    if not isinstance(known, dict):
-        raise BadInputError(f"{path} is damaged: it holds no settings; choose another folder")
-    return known
+    write_sealed(path, {**wanted, "presets": presets})
 
 
 def _presets_in_use(tasks: Sequence[Task]) -> dict[str, dict[str, str]]:
@@ -242,5 +237,5 @@ def _presets_in_use(tasks: Sequence[Task]) -> dict[str, dict[str, str]]:
         for name in names:
             preset = get_preset(key.rpartition("/")[2], name)
             digest = stable_hash(json.dumps(as_record(preset.params), sort_keys=True))
-            found.setdefault(key, {})[preset.name] = f"{digest:032x}"
+            found.setdefault(key, {})[name] = f"{digest:032x}"
     return found

@@ -107,18 +107,40 @@ def _elements(scene: Scene, imported: bool) -> dict[str, int | None]:
     return counts
 
 
-def build_index(folder: Path) -> tuple[pd.DataFrame, dict[str, str]]:
-    """The index of all trials under ``folder``, and what is wrong with the others, by name."""
+def build_index(
+    folder: Path, known: pd.DataFrame | None = None
+) -> tuple[pd.DataFrame, dict[str, str]]:
+    """The index of all trials under ``folder``, and what is wrong with the others, by name.
+
+    ``known`` is an older index: its rows are taken over where all their files still have the size
+    that they say, so that a large dataset need not be read again for one more trial.
+    """
+    old = {} if known is None else {row["trial"]: row for row in known.to_dict("records")}
     rows: dict[str, dict[str, Any]] = {}
     problems = {}
     for paths in find_trials(folder):
         try:
+            if paths.trial in old and paths.trial not in rows and _holds(old[paths.trial], paths):
+                rows[paths.trial] = old[paths.trial]
+                continue
             if paths.trial in rows:
                 raise BadInputError(f"{rows[paths.trial]['trial_file']} has the same trial name")
             rows[paths.trial] = index_row(paths)
         except BadInputError as error:
             problems[paths.trial] = f"{error}; delete {paths.trial_file} to have it made again"
     return as_table(list(rows.values())), problems
+
+
+def _holds(row: dict[str, Any], paths: TrialPaths) -> bool:
+    """Whether the files that a row lists are those of ``paths`` and have their sizes."""
+    if (row["split"], row["scenario"]) != (paths.split, paths.scenario):
+        return False
+    sizes = {name: row[f"{name}_bytes"] for name in FILES if not pd.isna(row[name])}
+    files = paths.all(free=True)
+    try:
+        return all(files[name].stat().st_size == size for name, size in sizes.items())
+    except OSError:
+        return False
 
 
 def as_table(rows: list[dict[str, Any]]) -> pd.DataFrame:
@@ -129,11 +151,16 @@ def as_table(rows: list[dict[str, Any]]) -> pd.DataFrame:
 
 def write_index(folder: Path, table: pd.DataFrame) -> Path:
     """Write the index of ``folder``, atomically; the same table gives the same bytes."""
+    path = folder / INDEX
+    write_atomic(path, index_bytes(table))
+    return path
+
+
+def index_bytes(table: pd.DataFrame) -> bytes:
+    """The bytes of the file of an index."""
     buffer = io.BytesIO()
     table.to_parquet(buffer, engine="pyarrow", compression="zstd", index=False)
-    path = folder / INDEX
-    write_atomic(path, buffer.getvalue())
-    return path
+    return buffer.getvalue()
 
 
 def read_index(folder: Path) -> pd.DataFrame:
@@ -145,7 +172,7 @@ def read_index(folder: Path) -> pd.DataFrame:
         raise BadInputError(f"{folder} has no {INDEX}: it is no dataset, or is not finished")
     try:
         table = pd.read_parquet(path, engine="pyarrow")
-    except (pa.ArrowException, OSError, ValueError) as error:
+    except (pa.ArrowException, OSError, ValueError, KeyError, TypeError) as error:
         raise BadInputError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
     missing = [name for name in COLUMNS if name not in table.columns]
     if missing:

@@ -9,6 +9,8 @@ INDEX = "index.parquet"
 """One row a trial; written last."""
 SETTINGS = "dataset.json"
 """How the trials of a folder were made; written first."""
+CHOICES = "choices"
+"""Folder with the draws that were chosen for the trials of each split and scenario."""
 FAILURES = "failures"
 """Folder with one text file for each trial that could not be made."""
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import physion
-from physion.errors import BadInputError
+from physion.errors import BadInputError, PhysionError
 from physion.physics.engine import simulate
 from physion.physics.labels import Labels, label_contact
 from physion.physics.trajectory import Trajectory
@@ -52,6 +52,12 @@ def scene_of(task: Task) -> Scene:
         return task.scene
     params = None if task.preset is None else get_preset(task.scenario, task.preset).params
     scene = sample_scene(task.scenario, task.seed(), params)
+    if task.scene_digest not in (None, scene.physics_digest()):
+        raise PhysionError(
+            f"trial {task.trial!r}: the draw that was chosen for it comes out differently now; "
+            "package or preset have changed since: choose another folder, or delete choices/ and "
+            "the trials made from it"
+        )
     return dataclasses.replace(scene, name=task.trial)
 
 

@@ -42,8 +42,8 @@ class Task:
     A task without ``scene`` draws its scene from its scenario and ``preset`` (None for the
     scenario's own parameters) with a seed of (dataset, scenario, split, index, attempt).
     ``presets`` are those that it may take: `physion.trials.choose` fills in ``preset``,
-    ``attempt`` and ``robust``. A task with an imported ``scene`` takes it as it is, and
-    ``recorded_contact`` is the outcome that it came with.
+    ``attempt``, ``robust`` and the ``scene_digest`` that the draw must have. A task with an
+    imported ``scene`` takes it as it is, and ``recorded_contact`` is the outcome that it came with.
     """
 
     dataset: str
@@ -56,6 +56,7 @@ class Task:
     presets: tuple[str, ...] = ()
     attempt: int = 0
     robust: float | None = None
+    scene_digest: str | None = None
 
     def __post_init__(self) -> None:
         if self.split not in SPLITS:

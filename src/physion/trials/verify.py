@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+import io
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from physion.errors import BadInputError
 from physion.physics.labels import label_contact
+from physion.scenes.preset import load_presets
 from physion.seeds import stable_hash
-from physion.trials.index import COLUMNS, as_table, index_row, read_index
-from physion.trials.layout import TrialPaths, find_trials
+from physion.trials.choose import BALANCED, robustness, split_of, wanted_contact
+from physion.trials.index import COLUMNS, FILES, as_table, index_bytes, index_row, read_index
+from physion.trials.layout import CHOICES, INDEX, SETTINGS, TrialPaths, find_trials
+from physion.trials.plan import Task
+from physion.trials.sealed import read_sealed
 from physion.trials.trial_file import Trial
 from physion.trials.video import count_frames
 
@@ -40,7 +47,9 @@ def verify_dataset(folder: Path, *, again: int = SAMPLE, track: Track | None = N
         for paths in find_trials(folder)
         if paths.trial not in listed
     ]
+    faults += _check_folder(folder, table)
     faults += _copies(table)
+    settings = _settings(folder)
     remade = _sample(table, again)
     rows = [row for _, row in table.iterrows()]
     for row in track(rows, "verifying", len(rows)) if track else rows:
@@ -48,10 +57,65 @@ def verify_dataset(folder: Path, *, again: int = SAMPLE, track: Track | None = N
         try:
             faults += _compare(row, paths)
             faults += _check_trial(paths)
+            faults += _check_split(row, settings)
             if row["trial"] in remade:
-                faults += _make_again(paths)
+                faults += _make_again(paths, settings)
         except BadInputError as error:
             faults.append(str(error))
+    return faults
+
+
+def _settings(folder: Path) -> Mapping[str, Any]:
+    """The settings of `generate`, or none: imported datasets have no such file."""
+    try:
+        return dict(read_sealed(folder / SETTINGS)["settings"])
+    except (BadInputError, KeyError, TypeError, ValueError):
+        return {}
+
+
+def _check_folder(folder: Path, table: pd.DataFrame) -> list[str]:
+    """What is wrong with the files beside the trials, and which files belong to no trial."""
+    faults = []
+    records = [path for path in (folder / SETTINGS,) if path.is_file()]
+    for path in (*records, *sorted((folder / CHOICES).glob("*.json"))):
+        try:
+            read_sealed(path)
+        except BadInputError as error:
+            faults.append(str(error))
+    path = folder / INDEX
+    # Another version of the library that writes the file may write other bytes.
+    mine = index_bytes(table)
+    if path.read_bytes() != mine and _writer(path.read_bytes()) == _writer(mine):
+        faults.append(f"{path}: its bytes are not those of the table that it holds")
+    listed = {folder / str(name) for file in FILES for name in table[file].dropna()}
+    strangers = {path for path in folder.glob("*/*/*") if path.is_file()} - listed
+    faults += [
+        f"{path} belongs to no trial of the index"
+        for path in sorted(strangers)
+        if path.suffix != ".h5"  # said already
+    ]
+    return faults
+
+
+def _writer(content: bytes) -> str:
+    try:
+        return str(pq.read_metadata(io.BytesIO(content)).created_by)
+    except (pa.ArrowException, OSError, ValueError):
+        return ""
+
+
+def _check_split(row: pd.Series[Any], settings: Mapping[str, Any]) -> list[str]:
+    """What a sampled trial has that its split does not take."""
+    if pd.isna(row["seed"]) or not settings:
+        return []
+    faults = []
+    if (belongs := split_of(row["scene_digest"])) != row["split"]:
+        faults.append(f"{row['trial']}: field 'scene_digest': its physics belongs to {belongs}")
+    task = Task(row["dataset"], row["scenario"], row["split"], int(row["index"]))
+    if wanted_contact(task) not in (None, row["contact"]):
+        faults.append(f"{row['trial']}: field 'contact': the balance of its split wants the other")
+    if task.split in BALANCED and row["observed_contact"] and not settings["observed_contact"]:
+        faults.append(f"{row['trial']}: field 'observed_contact': nothing is left to predict")
     return faults
 
 
@@ -113,8 +177,8 @@ def _check_trial(paths: TrialPaths) -> list[str]:
     return faults
 
 
-def _make_again(paths: TrialPaths) -> list[str]:
-    """What comes out differently when the trial is simulated and rendered from its scene."""
+def _make_again(paths: TrialPaths, settings: Mapping[str, Any]) -> list[str]:
+    """What comes out differently when the trial is drawn, simulated and rendered again."""
     from physion.physics.engine import simulate
     from physion.rendering.renderer import role_map
     from physion.trials.files import encode_png
@@ -124,6 +188,7 @@ def _make_again(paths: TrialPaths) -> list[str]:
     meta, faults = trial.metadata, []
     if meta.engine.startswith("imported"):
         return []
+    faults += _draw_again(paths, trial, settings)
     motion = simulate(trial.scene)
     if motion.digest() != meta.digest:
         faults.append(
@@ -134,6 +199,15 @@ def _make_again(paths: TrialPaths) -> list[str]:
     assert ids is not None, "ids were asked for"
     if not np.array_equal(ids, trial.ids):
         faults.append(f"{paths.trial_file}: field 'first_frame/ids': {RENDERER} renders others")
+    counts = np.bincount(ids.ravel(), minlength=len(trial.scene.names()) + 1)[1:]
+    if not np.array_equal((counts / ids.size).astype(np.float32), trial.shares):
+        faults.append(f"{paths.trial_file}: field 'first_frame/shares' does not fit the ids")
+    for name in trial.pass_names:
+        for frame in (0, meta.frames // 2, meta.frames - 1):
+            stored = trial.passes(frame)[name]
+            again = np.asarray(getattr(trial.render(frame, (name,)), name))
+            if not np.array_equal(again.astype(stored.dtype), stored, equal_nan=stored.ndim != 2):
+                faults.append(f"{paths.trial_file}: field 'passes/{name}': frame {frame} differs")
     if not meta.movies:
         return faults
     made = {"map": encode_png(role_map(ids, trial.scene))}
@@ -146,4 +220,35 @@ def _make_again(paths: TrialPaths) -> list[str]:
         for name, content in made.items()
         if files[name].read_bytes() != content
     ]
+    return faults
+
+
+def _draw_again(paths: TrialPaths, trial: Trial, settings: Mapping[str, Any]) -> list[str]:
+    """What comes out differently when a sampled scene is drawn from its preset and seed.
+
+    Presets of files of one's own are not known here, and their scenes taken as they are.
+    """
+    from physion.trials.make import scene_of
+
+    meta = trial.metadata
+    if meta.seed is None or meta.preset not in load_presets(meta.scenario):
+        return []
+    assert meta.preset is not None and meta.attempt is not None, "sampled trials have both"
+    task = Task(
+        meta.dataset,
+        meta.scenario,
+        meta.split,
+        meta.index,
+        preset=meta.preset,
+        attempt=meta.attempt,
+    )
+    faults = []
+    if scene_of(task) != trial.scene:
+        faults.append(f"{paths.trial_file}: field 'scene' is not what preset and seed draw")
+    if trial.labels.robust is not None and settings:
+        found = robustness(trial.scene, trial.labels.contact, task.seed(), settings["jitters"])
+        if found != trial.labels.robust:
+            faults.append(
+                f"{paths.trial_file}: labels/robust is {trial.labels.robust}, again it is {found}"
+            )
     return faults
