@@ -7,50 +7,157 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
 
 import numpy as np
+import pandas as pd
 import pytest
 from matplotlib.colors import to_rgb
-from matplotlib.patches import Rectangle
+from matplotlib.figure import Figure
 from PIL import Image
 
 from physion.analysis import Comparison
-from physion.report import figures
+from physion.analysis.difficulty import below_chance
+from physion.report import figure_tables, figures, figures_stimuli, theme
+from physion.report.inputs import ReportInputs
+from physion.report.plots import plots
 
 Maker = Callable[..., Comparison]
 
 
-def test_bars_are_as_long_as_the_accuracies(make_comparison: Maker) -> None:
+def dots(figure: Figure, panel: int) -> list[float]:
+    """The values at which a panel has a mark, from top to bottom."""
+    lines = [line for line in figure.axes[panel].lines if line.get_marker() not in ("None", None)]
+    points = [(y, x) for line in lines for x, y in line.get_xydata()]  # type: ignore[union-attr]
+    return [x for _, x in sorted(points)]
+
+
+def test_dots_stand_at_the_accuracies(make_comparison: Maker) -> None:
     comparison = make_comparison()
-    figure = figures.accuracy_figure(comparison)
-    data = figures.accuracy_data(comparison)
-    for axis, scenario in zip(figure.axes, ["collide", "drop", "mean"], strict=True):
-        drawn = [
-            p.get_width() for p in axis.patches if isinstance(p, Rectangle) and p.get_height() < 0.9
-        ]
-        assert drawn == pytest.approx(data[data["scenario"] == scenario]["accuracy"].tolist())
+    table = figure_tables.accuracy_table(comparison)
+    figure = figures.measure_figure(table, "accuracy")
+    for place, scenario in enumerate(["collide", "drop", "mean"]):
+        own = table[table["panel"] == scenario]
+        assert dots(figure, place) == pytest.approx(own["value"].tolist())
         people = comparison.people.set_index("scenario").loc[scenario, "accuracy"]
-        assert any(np.allclose(line.get_xdata(), people) for line in axis.lines)
+        assert any(np.allclose(line.get_xdata(), people) for line in figure.axes[place].lines)
     titles = [axis.get_title(loc="left") for axis in figure.axes]
     assert titles == ["collide", "drop", "mean over scenarios"]
 
 
+def test_zones_of_participants_and_of_scenarios_look_different(make_comparison: Maker) -> None:
+    table = figure_tables.accuracy_table(make_comparison())
+    assert set(table.loc[table["zone_low"].notna(), "panel"]) == {"collide"}
+    row = table.iloc[[0]].assign(zone_low=0.4, zone_high=0.6)
+    hatches = []
+    for zone in (figures.PARTICIPANTS, figures.SCENARIO_ZONE):
+        axis = figures.measure_figure(row.assign(zone=zone), "accuracy").axes[0]
+        hatches.append(axis.patches[0].get_hatch())
+    assert hatches[0] is None and hatches[1]
+
+
+def test_undefined_values_are_called_nan_in_the_figure(make_comparison: Maker) -> None:
+    table = figure_tables.r_table(make_comparison(constant=True))
+    assert table["value"].isna().all() and table["reason"].str.contains("undefined|constant").all()
+    words = [text.get_text() for text in figures.measure_figure(table, "r").axes[0].texts]
+    assert words == ["NaN", "NaN"]
+
+
 def test_points_are_the_stimuli(make_comparison: Maker) -> None:
     comparison = make_comparison()
-    figure = figures.scatter_figure(comparison)
-    data = figures.scatter_data(comparison)
+    table = figure_tables.scatter_table(comparison, comparison.agents)
+    figure = figures_stimuli.scatter_figure(table)
     for axis, agent in zip(figure.axes, comparison.agents, strict=False):
-        points = np.concatenate([c.get_offsets() for c in axis.collections])
-        own = data[data["agent"] == agent][["p_yes", "p_contact"]].to_numpy()
-        assert np.allclose(np.sort(points, axis=0), np.sort(own, axis=0))
+        drawn = np.concatenate([line.get_xydata() for line in axis.lines[1:]])
+        own = table[table["agent"] == agent][["p_yes", "p_contact"]].to_numpy()
+        assert np.allclose(np.sort(drawn, axis=0), np.sort(own, axis=0))
 
 
-def test_readouts_differ_without_colour(make_comparison: Maker) -> None:
-    kinds = figures._kinds(make_comparison())
-    hatches = [hatch for _, hatch in kinds.values()]
-    assert len(set(hatches)) == len(hatches) == 2
+def test_bars_hold_every_stimulus_and_mark_the_tail() -> None:
+    accuracy = np.array([0.02, 0.1, 0.4, 0.55, 0.9, 1.0])
+    rows = pd.DataFrame({"scenario": "drop", "stimulus": [f"s{i}" for i in range(6)],
+                         "accuracy": accuracy, "count": 100})  # fmt: skip
+    figure = figures_stimuli.difficulty_figure(below_chance(rows))
+    bars = {(round(p.get_x(), 3), p.get_hatch()): p.get_height() for p in figure.axes[0].patches}
+    assert sum(bars.values()) == 6
+    tail = {x for (x, hatch) in bars if hatch}
+    assert tail == {0.0, 0.1, 0.4}
 
 
-@pytest.mark.parametrize("theme", [figures.LIGHT, figures.DARK], ids=lambda theme: theme.name)
-def test_marks_stand_out_from_the_paper(theme: figures.Theme) -> None:
+def test_calibration_is_the_share_of_contact_in_each_bin(make_comparison: Maker) -> None:
+    comparison = make_comparison()
+    table = figure_tables.calibration_table(comparison)
+    own = comparison.stimuli[comparison.stimuli["agent"] == comparison.agents[0]]
+    first = table[(table["agent"] == comparison.agents[0]) & (table["from"] == 0.5)].iloc[0]
+    inside = own[(own["p_contact"] >= 0.5) & (own["p_contact"] < 0.6)]
+    assert first["stimuli"] == len(inside) and first["share"] == inside["label"].mean()
+    assert first["brier"] == pytest.approx(((own["p_contact"] - own["label"]) ** 2).mean())
+
+
+def test_thirds_are_of_the_stimuli_that_bear_their_name(make_comparison: Maker) -> None:
+    comparison = make_comparison()
+    table = figure_tables.thirds_table(comparison)
+    own = comparison.stimuli[comparison.stimuli["agent"] == comparison.agents[1]]
+    easy = own[own["human_accuracy"] >= 2 / 3]
+    row = table[(table["agent"] == comparison.agents[1]) & table["group"].str.startswith("easy")]
+    assert row["stimuli"].item() == len(easy)
+    expected = np.corrcoef(easy["p_contact"], easy["p_yes"])[0, 1]
+    assert row["value"].item() == pytest.approx(expected)
+    assert row["low"].item() < expected < row["high"].item()
+
+
+# --- readout and training -----------------------------------------------------------------------
+
+
+def trained(make_comparison: Maker, trainings: list[str]) -> tuple[Comparison, pd.DataFrame]:
+    """The comparison with both models as one, trained in as many ways."""
+    comparison = make_comparison()
+    stimuli = comparison.stimuli.assign(model="one", readout="observed")
+    comparison = Comparison(comparison.scores, comparison.people, stimuli, comparison.changed,
+                            comparison.dropped, comparison.settings)  # fmt: skip
+    column = dict(zip(comparison.agents, trainings, strict=True))
+    rows = stimuli[["agent", "stimulus"]]
+    return comparison, rows.assign(**{"Dynamics Training Dataset": rows["agent"].map(column)})
+
+
+def test_effects_hold_the_accuracy_of_each_training(make_comparison: Maker) -> None:
+    comparison, predictions = trained(make_comparison, ["all", "same"])
+    table = figure_tables.effects_table(comparison, predictions)
+    assert table["group"].tolist() == ["all", figure_tables.ONLY]
+    scores = comparison.scores[comparison.scores["scenario"] == "mean"]
+    assert table["value"].tolist() == pytest.approx(scores["accuracy"].tolist())
+    assert ((table["low"] < table["value"]) & (table["value"] < table["high"])).all()
+
+
+def test_one_condition_alone_makes_no_figure(make_comparison: Maker) -> None:
+    comparison, predictions = trained(make_comparison, ["all", "all"])
+    assert figure_tables.effects_table(comparison, predictions).empty
+    assert figure_tables.generalization_table(comparison, predictions).empty
+    names = {plot.name for plot in plots(ReportInputs(comparison, predictions=predictions))}
+    assert names == {"accuracy", "r", "scatter", "thirds", "calibration", "difficulty"}
+
+
+def test_generalization_is_relative_to_people(make_comparison: Maker) -> None:
+    comparison, predictions = trained(make_comparison, ["all", "collision"])
+    table = figure_tables.generalization_table(comparison, predictions)
+    cell = table[(table["trained"] == "collide") & (table["tested"] == "drop")].iloc[0]
+    own = comparison.stimuli[
+        (comparison.stimuli["agent"] == comparison.agents[1])
+        & (comparison.stimuli["scenario"] == "drop")
+    ]
+    right = (own["predicted"] == own["label"]).mean()
+    assert cell["difference"] == pytest.approx(right - own["human_accuracy"].mean())
+    assert set(table["trained"]) == {"all", "collide"} and len(table) == 4
+    words = [t.get_text() for t in figures.generalization_figure(table).axes[0].texts]
+    assert len(words) == 4 and all(word[0] in "+−0" for word in words)
+
+
+# --- looks --------------------------------------------------------------------------------------
+
+
+def test_kinds_differ_without_colour() -> None:
+    assert len(set(theme.MARKERS)) == len(theme.MARKERS) == len(theme.LIGHT.palette)
+
+
+@pytest.mark.parametrize("look", [theme.LIGHT, theme.DARK], ids=lambda look: look.name)
+def test_marks_stand_out_from_the_paper(look: theme.Theme) -> None:
     def brightness(colour: str) -> float:
         linear = [
             c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in to_rgb(colour)
@@ -61,27 +168,31 @@ def test_marks_stand_out_from_the_paper(theme: figures.Theme) -> None:
         dark, light = sorted((brightness(one), brightness(other)))
         return (light + 0.05) / (dark + 0.05)
 
-    assert contrast(theme.ink, theme.paper) > 7
-    assert contrast(theme.faint, theme.paper) > 3
-    assert min(contrast(colour, theme.paper) for colour in theme.palette) > 1.5
+    assert contrast(look.ink, look.paper) > 7
+    assert contrast(look.faint, look.paper) > 3
+    assert min(contrast(colour, look.paper) for colour in look.palette) > 1.5
 
 
 @pytest.mark.parametrize("with_people", [True, False])
 def test_figures_are_sound_files(make_comparison: Maker, with_people: bool) -> None:
-    figure = figures.accuracy_figure(make_comparison(with_people=with_people))
-    assert ElementTree.fromstring(figures.figure_bytes(figure, "svg")).tag.endswith("svg")
-    image = Image.open(io.BytesIO(figures.figure_bytes(figure, "png")))
-    assert image.width > 1000 and np.asarray(image.convert("L")).std() > 10
+    for plot in plots(ReportInputs(make_comparison(with_people=with_people))):
+        figure = plot.draw(plot.table, theme.LIGHT)
+        assert ElementTree.fromstring(theme.figure_bytes(figure, "svg")).tag.endswith("svg")
+        image = Image.open(io.BytesIO(theme.figure_bytes(figure, "png")))
+        assert image.width > 1000 and np.asarray(image.convert("L")).std() > 10
 
 
 def test_bytes_repeat(make_comparison: Maker) -> None:
-    for draw, kind in ((figures.accuracy_figure, "svg"), (figures.scatter_figure, "png")):
-        one, two = (figures.figure_bytes(draw(make_comparison()), kind) for _ in range(2))
-        assert one == two
+    def draw(kind: str) -> list[bytes]:
+        found = plots(ReportInputs(make_comparison()))
+        return [theme.figure_bytes(plot.draw(plot.table, theme.DARK), kind) for plot in found[:3]]
+
+    assert draw("svg") == draw("svg")
+    assert draw("png") == draw("png")
 
 
 def test_model_names_are_text_and_not_formulas(make_comparison: Maker) -> None:
-    odd = make_comparison(model="$x_1$ <b> & co")
-    labels = [t.get_text() for t in figures.accuracy_figure(odd).axes[0].get_yticklabels()]
-    assert labels[0].startswith("$x_1$ <b>")
-    assert figures.figure_bytes(figures.accuracy_figure(odd), "png")
+    table = figure_tables.accuracy_table(make_comparison(model="$x_1$ <b> & co"))
+    figure = figures.measure_figure(table, "accuracy")
+    assert figure.axes[0].get_yticklabels()[0].get_text().startswith("$x_1$ <b>")
+    assert theme.figure_bytes(figure, "png")

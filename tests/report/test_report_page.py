@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 import re
 from collections.abc import Callable
 from html.parser import HTMLParser
@@ -16,7 +17,10 @@ from physion.analysis import Bootstrap, Comparison
 from physion.analysis.tables import MEAN
 from physion.errors import BadInputError
 from physion.report import ReportInputs, build_report, compare_files
-from physion.report.page import EXPECTED_METHODS, Picture, render_page, widest_gaps
+from physion.report.document import Picture
+from physion.report.inputs import EXPECTED_METHODS
+from physion.report.movies import widest_gaps
+from physion.report.page import render_page
 
 Maker = Callable[..., Comparison]
 VOID = {"meta", "img", "source", "br", "hr", "link", "input"}
@@ -51,8 +55,12 @@ class Page(HTMLParser):
         return " ".join(" ".join(self.words).split())
 
     def sources(self) -> list[str]:
-        names = ("src", "srcset", "href", "poster", "data", "action")
+        """What the page loads; links are only followed."""
+        names = ("src", "srcset", "poster", "data", "action")
         return [value for _, attrs in self.tags for name in names if (value := attrs.get(name))]
+
+    def links(self) -> list[str]:
+        return [str(attrs["href"]) for tag, attrs in self.tags if tag == "a"]
 
 
 @pytest.fixture
@@ -62,12 +70,14 @@ def movie(tmp_path: Path) -> Path:
     return path
 
 
+FIGURES = ("accuracy", "r", "scatter", "thirds", "calibration", "difficulty")
 BLANK = {"svg": b"<svg/>", "png": b""}
 
 
 def render(inputs: ReportInputs) -> Page:
     """The page with blank figures, which are slow to draw and tested elsewhere."""
-    names = ("accuracy", "scatter") if inputs.comparison.has_people else ("accuracy",)
+    names = ["accuracy", "calibration"]
+    names += ["r", "scatter", "thirds", "difficulty"] if inputs.comparison.has_people else []
     return Page(render_page(inputs, [Picture(name, BLANK, BLANK) for name in names]))
 
 
@@ -100,7 +110,8 @@ def test_bytes_repeat_in_any_folder(make_comparison: Maker, tmp_path: Path, movi
         "report.html",
         *(f"tables/{n}.csv" for n in ("comparison", "people", "stimuli", "changed_outcomes")),
         "tables/left_out.csv",
-        *(f"figures/{n}.{k}" for n in ("accuracy", "scatter") for k in ("svg", "png", "csv")),
+        "report.json",
+        *(f"figures/{n}.{k}" for n in FIGURES for k in ("svg", "png", "csv")),
     }
 
 
@@ -138,7 +149,7 @@ def test_choices_are_stated_or_said_to_be_missing(make_comparison: Maker) -> Non
 def test_undefined_scores_come_with_their_reason(make_comparison: Maker) -> None:
     page = render(ReportInputs(make_comparison(constant=True)))
     assert "r: undefined in collide, drop" in page.text
-    assert "nan" not in page.text.lower()
+    assert page.text.count("NaN") > 4
     titles = [attrs["title"] for _, attrs in page.tags if "title" in attrs]
     assert any("constant" in str(title) for title in titles)
 
@@ -147,8 +158,27 @@ def test_without_people_there_is_a_page_too(make_comparison: Maker, tmp_path: Pa
     path = build_report(ReportInputs(make_comparison(with_people=False)), tmp_path / "out")
     text = page_of(path).text
     assert "No answers of people were given" in text
-    assert "Pearson r by scenario" not in text and "nan" not in text.lower()
+    assert "Pearson r by scenario" not in text
+    assert "Everything that compares with people" in text
     assert not (tmp_path / "out" / "figures" / "scatter.svg").exists()
+
+
+def test_contents_lead_to_every_section(make_comparison: Maker) -> None:
+    page = render(ReportInputs(make_comparison()))
+    places = [f"#{attrs['id']}" for tag, attrs in page.tags if tag == "section"]
+    assert page.links() == places and len(places) > 6
+
+
+def test_numbers_for_machines_are_those_of_the_tables(
+    make_comparison: Maker, tmp_path: Path
+) -> None:
+    comparison = make_comparison(constant=True)
+    build_report(ReportInputs(comparison), tmp_path)
+    values = json.loads((tmp_path / "report.json").read_text())
+    assert len(values["comparison"]) == len(comparison.scores)
+    assert values["comparison"][0]["accuracy"] == comparison.scores["accuracy"].iloc[0]
+    assert values["comparison"][0]["r"] is None and "constant" in values["comparison"][0]["reason"]
+    assert values["methods"]["Intervals"] == comparison.settings["Intervals"]
 
 
 # --- movies --------------------------------------------------------------------------------------
@@ -178,6 +208,14 @@ def test_movies_are_inside_and_within_their_budget(make_comparison: Maker, movie
     prefix = "data:video/mp4;base64,"
     assert base64.b64decode(str(videos[0]).removeprefix(prefix)) == movie.read_bytes()
     assert page.text.count("the page would grow too large") == 5
+
+
+def test_changed_trials_link_to_their_movies(make_comparison: Maker, tmp_path: Path) -> None:
+    comparison = make_comparison()
+    name = comparison.changed["stimulus"].iloc[0]
+    inputs = ReportInputs(comparison, movies={name: tmp_path / "trials" / "it's.mp4"})
+    text = render_page(inputs, [Picture(n, BLANK, BLANK) for n in FIGURES], tmp_path / "report")
+    assert "../trials/it's.mp4" in Page(text).links()
 
 
 def test_bad_movies_are_refused_and_no_page_is_left(make_comparison: Maker, tmp_path: Path) -> None:

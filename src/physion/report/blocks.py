@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from html import escape
+from typing import Literal
 
 import numpy as np
 import pandas as pd
@@ -12,11 +14,8 @@ from physion.analysis.comparison import Comparison
 from physion.analysis.tables import MEAN, POOLED, in_order
 
 DASH = "–"
-
-
-def section(title: str, content: str) -> str:
-    """A part of the page under a heading; ``content`` is HTML."""
-    return f"<section><h2>{escape(title)}</h2>\n{content}</section>"
+MOST_BARS = 8
+"""Models of which a card shows each; of more it shows the one it is about and the others' mean."""
 
 
 def details(title: str, content: str) -> str:
@@ -31,20 +30,94 @@ def plural(count: int, noun: str) -> str:
 
 
 def number(value: float, digits: int = 2) -> str:
-    """A number with so many decimals, a minus that is one, no minus zero, a dash for NaN."""
-    if not np.isfinite(value):
-        return DASH
+    """A number with so many decimals, a minus that is one, no minus zero; ``NaN`` if undefined."""
+    if pd.isna(value):
+        return "NaN"
     # Adding zero turns -0.0 into 0.0.
     return f"{round(float(value), digits) + 0.0:.{digits}f}".replace("-", "−")
 
 
-def interval(row: pd.Series, key: str) -> str:
-    """A value with its interval in small print, as HTML; the reason on hovering where undefined."""
-    if not np.isfinite(row[key]):
-        return f'<span class="none" title="{escape(str(row["reason"]))}">{DASH}</span>'
-    low, high = row[f"{key}_low"], row[f"{key}_high"]
-    spread = f"{number(low)} to {number(high)}" if np.isfinite(low) else "no interval"
-    return f"{number(row[key])} <small>{spread}</small>"
+def p_value(value: float) -> str:
+    """A p value to three decimals, or ``< .001``."""
+    if pd.isna(value):
+        return "NaN"
+    return "&lt; 0.001" if value < 0.001 else number(value, 3)
+
+
+def undefined(reason: str) -> str:
+    """``NaN`` with its reason on hovering, as HTML."""
+    return f'<span class="none" title="{escape(reason)}">NaN</span>'
+
+
+def interval(row: pd.Series, key: str, low: str = "", high: str = "", digits: int = 2) -> str:
+    """A value with its interval in small print, as HTML; NaN with its reason where undefined.
+
+    ``low`` and ``high``: columns of the bounds, if they are not ``key`` with _low and _high.
+    """
+    if pd.isna(row[key]):
+        return undefined(str(row.get("reason", "")))
+    bounds = row.get(low or f"{key}_low", np.nan), row.get(high or f"{key}_high", np.nan)
+    if pd.isna(bounds[0]):
+        return f"{number(row[key], digits)} <small>no interval</small>"
+    spread = " to ".join(number(bound, digits) for bound in bounds)
+    return f"{number(row[key], digits)} <small>{spread}</small>"
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table of the page: its heading, and how the value of ``key`` is written."""
+
+    heading: str
+    key: str
+    kind: Literal["text", "count", "number", "interval", "p", "percent"] = "number"
+    digits: int = 2
+    low: str = ""
+    high: str = ""
+
+    def cell(self, row: pd.Series) -> str:
+        """The cell as HTML."""
+        value = row.get(self.key)
+        if self.kind == "interval":
+            return interval(row, self.key, self.low, self.high, self.digits)
+        if self.kind == "text":
+            return "" if value is None or value != value else escape(str(value))
+        if pd.isna(value):
+            return undefined(str(row.get("reason", "")))
+        if self.kind == "count":
+            return f"{round(float(value)):,}".replace(",", " ")
+        if self.kind == "p":
+            return p_value(float(value))
+        return percent(float(value)) if self.kind == "percent" else number(value, self.digits)
+
+
+def rows_table(rows: pd.DataFrame, columns: Sequence[Column], caption: str = "") -> str:
+    """A table of some columns of ``rows``; reasons of undefined numbers are listed below it."""
+    cells = [[column.cell(row) for column in columns] for _, row in rows.iterrows()]
+    return table([column.heading for column in columns], cells, caption) + notes(rows, columns)
+
+
+def notes(rows: pd.DataFrame, columns: Sequence[Column]) -> str:
+    """The column ``reason`` of rows, once each, with how many rows it is about."""
+    if "reason" not in rows:
+        return ""
+    given = rows[rows["reason"].astype(str).str.len() > 0]
+    items = []
+    for reason, own in given.groupby("reason", sort=False):
+        named = [str(row[columns[0].key]) for _, row in own.iterrows()]
+        who = ", ".join(dict.fromkeys(named)) if len(set(named)) <= 8 else f"{len(named)} rows"
+        items.append(f"<li>{escape(who)}: {escape(str(reason))}</li>")
+    return f'<ul class="notes">{"".join(items)}</ul>' if items else ""
+
+
+def words_list(values: Mapping[str, str]) -> str:
+    """Names and what they mean or say."""
+    rows = "".join(f"<dt>{escape(k)}</dt><dd>{escape(v)}</dd>" for k, v in values.items())
+    return f"<dl>{rows}</dl>"
+
+
+def paragraph(words: str) -> str:
+    """Words as a paragraph."""
+    return f"<p>{escape(words)}</p>"
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]], caption: str = "") -> str:
@@ -151,14 +224,14 @@ def definitions() -> str:
         "that is, with the average person; “same outcome”: without the stimuli whose simulated "
         "outcome is not the official one, as there people and model saw different events",
         "RMSD": "root of the mean squared difference of these two",
-        DASH: "undefined; the reason stands below the table or shows on hovering",
+        "NaN": "undefined; the reason stands below the table or shows on hovering",
+        DASH: "nothing to say here",
     }
-    rows = "".join(f"<dt>{escape(k)}</dt><dd>{escape(v)}</dd>" for k, v in meaning.items())
-    return f"<h3>What the numbers mean</h3><dl>{rows}</dl>"
+    return f"<h3>What the numbers mean</h3>{words_list(meaning)}"
 
 
-def changed(comparison: Comparison) -> str:
-    """The trials whose simulated outcome is not the official one, with every model's P(contact)."""
+def changed(comparison: Comparison, links: Mapping[str, str] | None = None) -> str:
+    """The trials whose simulated outcome is not the official one; ``links``: to their movies."""
     rows = comparison.changed
     if rows.empty:
         return "<p>None.</p>"
@@ -171,9 +244,9 @@ def changed(comparison: Comparison) -> str:
     header += ["people say yes"] if comparison.has_people else []
     cells = []
     for _, row in rows.iterrows():
-        line = [f"<code>{escape(row['stimulus'])}</code>", escape(row["scenario"])]
+        line = [stimulus_link(row["stimulus"], links or {}), escape(row["scenario"])]
         line += [_outcome(row["label"]), _outcome(row["simulated"])]
-        line += [_percent(row["p_yes"])] if comparison.has_people else []
+        line += [percent(row["p_yes"])] if comparison.has_people else []
         cells.append(line)
     listing = details(f"{plural(len(rows), 'trial')}, one by one", table(header, cells))
     return (
@@ -181,6 +254,12 @@ def changed(comparison: Comparison) -> str:
         "There the models were shown another event than people saw, so accuracy is given against "
         "both outcomes and r also without them.</p>" + listing
     )
+
+
+def stimulus_link(stimulus: str, links: Mapping[str, str]) -> str:
+    """The name of a stimulus, a link where ``links`` has its movie."""
+    name = f"<code>{escape(stimulus)}</code>"
+    return f'<a href="{escape(links[stimulus])}">{name}</a>' if stimulus in links else name
 
 
 def dropped(comparison: Comparison) -> str:
@@ -201,9 +280,15 @@ def card(comparison: Comparison, row: pd.Series, movie: str) -> str:
     """One stimulus: its movie (HTML), outcome, what people and what every model said."""
     own = comparison.stimuli[comparison.stimuli["stimulus"] == row["stimulus"]]
     bars = [_bar("people say yes", row["p_yes"], "human")]
-    for _, answer in own.iterrows():
-        kind = "model named" if answer["agent"] == row["agent"] else "model"
-        bars.append(_bar(str(answer["agent"]), answer["p_contact"], kind))
+    named = own["agent"] == row["agent"]
+    if len(own) <= MOST_BARS:
+        for _, answer in own.iterrows():
+            kind = "model named" if answer["agent"] == row["agent"] else "model"
+            bars.append(_bar(str(answer["agent"]), answer["p_contact"], kind))
+    else:
+        bars.append(_bar(str(row["agent"]), row["p_contact"], "model named"))
+        others = own.loc[~named, "p_contact"]
+        bars.append(_bar(f"mean of {len(others)} other models", others.mean(), "model"))
     return (
         f"<article>{movie}<h3>{escape(row['scenario'])}: {_outcome(row['label'])}</h3>"
         f"<p><code>{escape(row['stimulus'])}</code></p>{''.join(bars)}</article>"
@@ -214,7 +299,7 @@ def _bar(name: str, value: float, kind: str) -> str:
     """A labelled bar; a ``meter`` would be coloured by the browser as good or bad."""
     width = number(100 * value, 0)
     return (
-        f'<div class="bar {kind}"><span>{escape(name)}</span><b>{_percent(value)}</b>'
+        f'<div class="bar {kind}"><span>{escape(name)}</span><b>{percent(value)}</b>'
         f'<i style="width:{width}%"></i></div>'
     )
 
@@ -223,5 +308,6 @@ def _outcome(value: bool) -> str:
     return "contact" if value else "no contact"
 
 
-def _percent(value: float) -> str:
-    return f"{100 * value:.0f} %" if np.isfinite(value) else DASH
+def percent(value: float) -> str:
+    """A share in percent, or ``NaN``."""
+    return f"{100 * value:.0f} %" if np.isfinite(value) else "NaN"

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-
-import pandas as pd
+from typing import Any
 
 from physion.analysis import (
     Bootstrap,
@@ -15,13 +15,21 @@ from physion.analysis import (
     read_labels,
     read_predictions,
 )
-from physion.analysis.comparison import Comparison
 from physion.analysis.responses import DominoesLook
 from physion.analysis.stimuli import read_stimulus_list
 from physion.atomic import write_atomic
 from physion.errors import BadInputError
-from physion.report import figures
-from physion.report.page import Picture, ReportInputs, check_movies, page_kind, render_page
+from physion.report.assembly import (
+    completed,
+    people_from_files,
+    people_in_words,
+    with_participants,
+)
+from physion.report.inputs import ReportInputs
+from physion.report.movies import check_movies
+from physion.report.page import render_page
+from physion.report.plots import plots
+from physion.report.write import prepare_folder, write_csv, write_plot
 
 LABELS_FILE = "stimulus_names_and_labels.csv"
 ZONE_FILE = "human_accuracy_by_scenario.csv"
@@ -33,37 +41,39 @@ _LOOKS = {
 }
 
 
-def build_report(inputs: ReportInputs, folder: Path) -> Path:
-    """Write ``report.html``, ``tables/*.csv`` and ``figures/*.{svg,png,csv}``; the page's path.
+# --- writing ------------------------------------------------------------------------------------
 
-    The page needs none of the other files. Every file is whole or absent, the page comes last, and
-    the same inputs give the same bytes. Raises `BadInputError`, before anything is written, where
-    ``folder`` is a file or a movie is not one.
+
+def build_report(inputs: ReportInputs, folder: Path) -> Path:
+    """Write ``report.html``, ``report.json``, ``tables/*.csv`` and ``figures/*.{svg,png,csv}``.
+
+    The path of the page, which needs none of the other files. Every file is whole or absent, the
+    page comes last, and the same inputs give the same bytes. Raises `BadInputError`, before
+    anything is written, where ``folder`` is a file or a movie is not one.
     """
-    if folder.exists() and not folder.is_dir():
-        raise BadInputError(f"{folder} is a file; give a folder for the report")
     check_movies(inputs)
-    tables, pictures = folder / "tables", folder / "figures"
-    for place in (tables, pictures):
-        place.mkdir(parents=True, exist_ok=True)
-    for name, table in comparison_tables(inputs.comparison).items():
-        _write_csv(tables / f"{name}.csv", table)
-    shown = _write_figures(inputs, pictures)
+    pictures = prepare_folder(folder)
+    for name, table in inputs.tables().items():
+        write_csv(folder / "tables" / f"{name}.csv", table)
+    shown = [write_plot(plot, pictures) for plot in plots(inputs)]
+    text = json.dumps(report_numbers(inputs), indent=1, ensure_ascii=False, allow_nan=False)
+    write_atomic(folder / "report.json", f"{text}\n".encode())
     page = folder / "report.html"
-    write_atomic(page, render_page(inputs, shown).encode())
+    write_atomic(page, render_page(inputs, shown, folder).encode())
     return page
 
 
-def comparison_tables(comparison: Comparison) -> dict[str, pd.DataFrame]:
-    """The tables of a comparison by the name of their file."""
-    tables = {
-        "comparison": comparison.scores,
-        "people": comparison.people,
-        "stimuli": comparison.stimuli,
-        "changed_outcomes": comparison.changed,
-        "left_out": comparison.dropped,
+def report_numbers(inputs: ReportInputs) -> dict[str, Any]:
+    """Every table of a report, and the choices, as plain values for JSON; NaN becomes null."""
+    values: dict[str, Any] = {
+        name: json.loads(table.to_json(orient="records", double_precision=15))
+        for name, table in inputs.tables().items()
+        if name != "stimuli"
     }
-    return {name: table for name, table in tables.items() if len(table.columns)}
+    return {"methods": {**inputs.methods, **inputs.comparison.settings}, **values}
+
+
+# --- from files ---------------------------------------------------------------------------------
 
 
 def compare_files(
@@ -72,6 +82,9 @@ def compare_files(
     labels: Path | Mapping[str, bool] | None,
     folder: Path,
     *,
+    responses: Sequence[Path] = (),
+    sessions: Path | None = None,
+    rules: str = "preregistered",
     zone: Path | None = None,
     exclude: Path | None = None,
     exclude_ledge: bool = True,
@@ -85,31 +98,52 @@ def compare_files(
     ``humans``: folder of ``human_accuracy-*.csv``, or None. ``labels``: a CSV file with ``stim_ID``
     and ``label``, or outcomes by stimulus; None looks for the official file in ``humans``, beside
     it, and in ``stimuli`` beside it, then goes by *Recorded Outcome* of the predictions.
-    ``zone``: the official table of participants' percentiles; None looks for it likewise, in
-    ``results``, and goes on without. ``exclude``: a file of stimuli to leave out, one a line.
-    ``methods``: see `ReportInputs`. Raises `BadInputError`, before anything is written.
+    ``responses``: participant-level answers in place of ``humans``: our export (with its table of
+    ``sessions``) or the study's raw files; sessions are flagged by ``rules`` (a name of
+    `exclusions.RULE_SETS`). ``zone``: the official table of participants' percentiles; None looks
+    for it likewise, in ``results``, and goes on without. ``exclude``: a file of stimuli to leave
+    out, one a line. ``methods``: see `ReportInputs`. Raises `BadInputError`, before anything is
+    written.
     """
-    people = None if humans is None else read_humans(humans, dominoes)
-    labels = labels if labels is not None else _beside(humans, "stimuli", LABELS_FILE)
-    zone = zone if zone is not None else _beside(humans, "results", ZONE_FILE)
+    draws = bootstrap or Bootstrap()
     rows = read_predictions(predictions)
-    if people is not None and labels is None and rows["recorded"].isna().all():
-        raise BadInputError(f"no {LABELS_FILE} lies near {humans}; give the file with the labels")
-    comparison = compare(
-        rows,
-        people,
-        read_labels(labels) if isinstance(labels, Path) else labels,
-        zone=read_human_zone(zone) if zone is not None and people is not None else None,
-        exclude=read_stimulus_list(exclude) if exclude is not None else (),
-        exclude_ledge=exclude_ledge,
-        bootstrap=bootstrap,
-    )
+    excluded = read_stimulus_list(exclude) if exclude is not None else []
     choices = dict(methods or {})
-    if people is not None:
-        origin = labels.name if isinstance(labels, Path) else "those recorded with the trials"
-        choices.setdefault("Official outcomes", origin)
-        choices.setdefault("People for Dominoes", _LOOKS[dominoes])
-    return build_report(ReportInputs(comparison, methods=choices, movies=movies or {}), folder)
+    known: Mapping[str, bool] | None
+    if responses:
+        if humans is not None:
+            raise BadInputError("give people's tables (humans) or their responses, not both")
+        given = read_labels(labels) if isinstance(labels, Path) else labels
+        people = people_from_files(
+            responses, sessions, rules, given, excluded, exclude_ledge, draws
+        )
+        inputs = with_participants(rows, people, excluded, exclude_ledge, draws)
+        choices.setdefault("Official outcomes", "those recorded with the responses")
+        choices.setdefault("People", people_in_words(responses, people))
+    else:
+        averages = None if humans is None else read_humans(humans, dominoes)
+        labels = labels if labels is not None else _beside(humans, "stimuli", LABELS_FILE)
+        zone = zone if zone is not None else _beside(humans, "results", ZONE_FILE)
+        if averages is not None and labels is None and rows["recorded"].isna().all():
+            raise BadInputError(
+                f"no {LABELS_FILE} lies near {humans}; give the file with the labels"
+            )
+        known = read_labels(labels) if isinstance(labels, Path) else labels
+        comparison = compare(
+            rows,
+            averages,
+            known,
+            zone=read_human_zone(zone) if zone is not None and averages is not None else None,
+            exclude=excluded,
+            exclude_ledge=exclude_ledge,
+            bootstrap=draws,
+        )
+        inputs = ReportInputs(comparison)
+        if averages is not None:
+            origin = labels.name if isinstance(labels, Path) else "those recorded with the trials"
+            choices.setdefault("Official outcomes", origin)
+            choices.setdefault("People for Dominoes", _LOOKS[dominoes])
+    return build_report(completed(inputs, rows, choices, movies or {}, draws), folder)
 
 
 def _beside(humans: Path | None, sibling: str, name: str) -> Path | None:
@@ -119,34 +153,3 @@ def _beside(humans: Path | None, sibling: str, name: str) -> Path | None:
     parent = humans.resolve().parent
     places = (humans / name, parent / name, parent / sibling / name)
     return next((place for place in places if place.is_file()), None)
-
-
-def _write_figures(inputs: ReportInputs, folder: Path) -> list[Picture]:
-    """Write each figure as SVG and PNG with its data beside it; those that the page shows."""
-    comparison = inputs.comparison
-    drawn = ["accuracy", *(["scatter"] if comparison.has_people else [])]
-    data = {"accuracy": figures.accuracy_data, "scatter": figures.scatter_data}
-    shown = []
-    for name in drawn:
-        _write_csv(folder / f"{name}.csv", data[name](comparison))
-        light = _draw(name, inputs, figures.LIGHT, ("svg", "png"))
-        # The dark figure is for the page alone, so it is drawn in the one kind that goes there.
-        dark = _draw(name, inputs, figures.DARK, (page_kind(light),))
-        for kind, content in light.items():
-            write_atomic(folder / f"{name}.{kind}", content)
-        shown.append(Picture(name, light, dark))
-    return shown
-
-
-def _draw(
-    name: str, inputs: ReportInputs, theme: figures.Theme, kinds: Sequence[str]
-) -> dict[str, bytes]:
-    if name == "accuracy":
-        figure = figures.accuracy_figure(inputs.comparison, theme)
-    else:
-        figure = figures.scatter_figure(inputs.comparison, inputs.scatter_agents(), theme)
-    return {kind: figures.figure_bytes(figure, kind) for kind in kinds}
-
-
-def _write_csv(path: Path, table: pd.DataFrame) -> None:
-    write_atomic(path, table.to_csv(index=False, lineterminator="\n").encode())

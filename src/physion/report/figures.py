@@ -1,276 +1,244 @@
-"""Figures of a comparison: the same for colour-blind readers, in print, on white and on dark.
+"""Figures of models beside people: measures by scenario, effects by condition, generalization.
 
-Colours are those of Okabe and Ito; what a colour says, a hatch or the shape of a marker says too.
-The bytes depend on the tables and on the version of matplotlib, not on the time or the process.
+Every function draws its table and nothing else; `figure_tables` makes the tables.
 """
 
 from __future__ import annotations
 
-import io
-import math
+import re
 import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import matplotlib
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from physion.analysis.comparison import Comparison
-from physion.analysis.tables import MEAN, POOLED, in_order
-
-CHANCE = 0.5
-
-
-@dataclass(frozen=True)
-class Theme:
-    """The colours of page and figures: paper, ink, faint lines, the human zone."""
-
-    name: str
-    paper: str
-    ink: str
-    faint: str
-    zone: str
-    palette: tuple[str, ...]
+from physion.analysis.tables import MEAN
+from physion.report.blocks import number
+from physion.report.theme import LIGHT, Theme, legend, panels, style, title
 
 
-_OKABE_ITO = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#B8A800")
-_BRIGHT = ("#4FA8E0", *_OKABE_ITO[1:4], "#A5DAF5", *_OKABE_ITO[5:])
-LIGHT = Theme("light", "#ffffff", "#1b1f24", "#8a9099", "#d9dde3", (*_OKABE_ITO, "#4d4d4d"))
-DARK = Theme("dark", "#15181d", "#e6e8eb", "#7d848e", "#3a414b", (*_BRIGHT, "#c9c9c9"))
-
-_READOUTS = ("observed", "observed+simulated", "full")
-_HATCHES = ("", "///", "...", "xx", "\\\\\\", "ooo", "++", "--")
-_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+def label(agent: str, width: int = 48) -> str:
+    """The name of a model on an axis: trainings as the paper calls them, broken into lines."""
+    short = re.sub(r" · dynamics training dataset (\S[^·]*)", _training, str(agent))
+    return textwrap.fill(short, width)
 
 
-def accuracy_figure(comparison: Comparison, theme: Theme = LIGHT) -> Figure:
-    """Bars: accuracy by scenario and model, interval, people as a dashed line, their zone a band.
+def _training(match: re.Match[str]) -> str:
+    name = match[1].strip()
+    return f" · {'only' if name == 'same' else name}"
 
-    One panel a scenario and one for the mean over scenarios; the dotted line is chance.
+
+CHANCE = {"accuracy": 0.5, "r": 0.0, "kappa": 0.0}
+"""What a guesser has."""
+
+LABELS = {
+    "accuracy": "accuracy",
+    "r": "Pearson's r with the average person",
+    "kappa": "Cohen's kappa with participants",
+}
+
+
+def measure_figure(table: pd.DataFrame, measure: str, theme: Theme = LIGHT) -> Figure:
+    """One measure by scenario and model, with intervals, people as a line, their zone as a band.
+
+    ``table``: see `figure_tables.MEASURE_COLUMNS`. One panel a scenario and one for the mean; the
+    dotted line is chance.
     """
-    panels = [*in_order(comparison.stimuli["scenario"]), MEAN]
-    agents, kinds = comparison.agents, _kinds(comparison)
-    columns = min(3, len(panels))
-    rows = math.ceil(len(panels) / columns)
-    with matplotlib.rc_context(_style(theme)):
-        figure = Figure(figsize=(11, rows * (0.3 * len(agents) + 0.75) + 0.9), layout="constrained")
-        axes = figure.subplots(rows, columns, squeeze=False, sharex=True)
-        for place, axis in enumerate(axes.flat):
-            if place >= len(panels):
-                axis.set_visible(False)
-                continue
-            _bars(axis, comparison, panels[place], agents, kinds, theme)
-            names = [textwrap.fill(agent, 42) for agent in agents]
-            axis.set_yticks(range(len(agents)), names if place % columns == 0 else [])
-            axis.tick_params(labelbottom=place + columns >= len(panels))
-        figure.supxlabel("accuracy", fontsize=10)
-        handles = [
-            Patch(facecolor=c, hatch=h, edgecolor=theme.paper, label=k)
-            for k, (c, h) in kinds.items()
-        ]
-        handles += _human_handles(comparison, theme)
-        figure.legend(handles=handles, loc="outside upper center", ncols=len(handles))
+    names = list(table["panel"].unique())
+    agents = list(table["agent"].unique())
+    kinds = {kind: theme.mark(place) for place, kind in enumerate(table["kind"].unique())}
+    row_height = 0.3 if len(agents) <= 8 else 0.2
+    low, high = _limits(table, CHANCE[measure])
+    with matplotlib.rc_context(style(theme)):
+        size = (11 / min(3, len(names)), row_height * len(agents) + 0.75)
+        figure, axes = panels(len(names), 3, size, sharex=True)
+        for place, (axis, name) in enumerate(zip(axes, names, strict=True)):
+            rows = table[table["panel"] == name].set_index("agent")
+            _human_marks(axis, rows, theme)
+            _dots(axis, rows, agents, kinds, theme, high)
+            axis.axvline(CHANCE[measure], color=theme.faint, linestyle=":", linewidth=1, zorder=1)
+            title(axis, "mean over scenarios" if name == MEAN else str(name))
+            labels = [label(agent, 48) for agent in agents]
+            small = 9 if row_height == 0.3 else 8
+            axis.set_yticks(range(len(agents)), labels if place % 3 == 0 else [], fontsize=small)
+            axis.tick_params(labelbottom=place + 3 >= len(names))
+            axis.set_ylim(len(agents) - 0.4, -0.6)
+            # The values stand in a column of their own, right of everything else.
+            axis.set_xlim(low, high + 0.16 * (high - low))
+        figure.supxlabel(LABELS[measure], fontsize=10)
+        legend(figure, _measure_handles(table, kinds, theme), 4)
     return figure
 
 
-def _bars(
+def _limits(table: pd.DataFrame, chance: float) -> tuple[float, float]:
+    columns = ["value", "low", "high", "people", "zone_low", "zone_high"]
+    values = table[columns].to_numpy(dtype=np.float64)
+    values = np.append(values[np.isfinite(values)], chance)
+    margin = 0.03 * (values.max() - values.min() + 0.1)
+    return float(values.min() - margin), float(values.max() + margin)
+
+
+def _dots(
     axis: Axes,
-    comparison: Comparison,
-    panel: str,
+    rows: pd.DataFrame,
     agents: Sequence[str],
     kinds: dict[str, tuple[str, str]],
     theme: Theme,
+    high: float,
 ) -> None:
-    scores = comparison.scores[comparison.scores["scenario"] == panel].set_index("agent")
     for place, agent in enumerate(agents):
-        if agent not in scores.index:
-            axis.text(0.02, place, "no predictions", va="center", fontsize=7, color=theme.faint)
+        if agent not in rows.index:
+            axis.text(0.5, place, "no predictions", va="center", ha="center", fontsize=7,
+                      color=theme.faint, transform=axis.get_yaxis_transform())  # fmt: skip
             continue
-        row = scores.loc[agent]
-        colour, hatch = kinds[row["readout"]]
-        axis.barh(place, row["accuracy"], 0.72, color=colour, hatch=hatch, edgecolor=theme.paper)
-        low, high = row["accuracy_low"], row["accuracy_high"]
-        if np.isfinite(low):
-            axis.plot([low, high], [place, place], color=theme.ink, linewidth=1.2)
-        # In a column of their own, where neither intervals nor the human line cross them.
-        axis.text(1.14, place, f"{row['accuracy']:.2f}", va="center", ha="right", fontsize=8)
-    _human_marks(axis, comparison, panel, theme)
-    axis.axvline(CHANCE, color=theme.faint, linestyle=":", linewidth=1, zorder=3)
-    title = "mean over scenarios" if panel == MEAN else panel
-    axis.set_title(title, fontsize=10, fontweight="bold", loc="left")
-    axis.set_xlim(0, 1.15)
-    axis.set_xticks([0, 0.25, 0.5, 0.75, 1.0])
-    axis.set_ylim(len(agents) - 0.4, -0.6)
+        row = rows.loc[agent]
+        colour, marker = kinds[row["kind"]]
+        if np.isfinite(row["low"]):
+            axis.plot([row["low"], row["high"]], [place, place], color=colour, linewidth=1.4)
+        axis.plot(row["value"], place, marker=marker, color=colour, markersize=5.5,
+                  markeredgecolor=theme.ink, markeredgewidth=0.6, linestyle="")  # fmt: skip
+        words = number(row["value"])
+        axis.text(0.995, place, words, va="center", ha="right", fontsize=7.5,
+                  transform=axis.get_yaxis_transform())  # fmt: skip
 
 
-def _human_marks(axis: Axes, comparison: Comparison, panel: str, theme: Theme) -> None:
-    if not comparison.has_people:
-        return
-    people = comparison.people.set_index("scenario")
-    if panel not in people.index:
-        return
-    row = people.loc[panel]
-    if np.isfinite(row["zone_low"]):
-        axis.axvspan(row["zone_low"], row["zone_high"], color=theme.zone, linewidth=0, zorder=0)
-    axis.axvline(row["accuracy"], color=theme.ink, linestyle="--", linewidth=1.4, zorder=3)
+def _human_marks(axis: Axes, rows: pd.DataFrame, theme: Theme) -> None:
+    own = rows.iloc[0]
+    if np.isfinite(own["zone_low"]):
+        # A hatch marks the zones that are not of participants, as the legend says.
+        plain = own["zone"] != SCENARIO_ZONE
+        axis.axvspan(own["zone_low"], own["zone_high"], **_zone(plain, theme), zorder=0)
+    if np.isfinite(own["people"]):
+        axis.axvline(own["people"], color=theme.ink, linestyle="--", linewidth=1.3, zorder=1)
 
 
-def _human_handles(comparison: Comparison, theme: Theme) -> list[Any]:
-    handles: list[Any] = []
-    if comparison.has_people:
-        handles.append(Line2D([], [], color=theme.ink, linestyle="--", label="people"))
-        if comparison.people["zone_low"].notna().any():
-            handles.append(Patch(color=theme.zone, label="95 % of participants"))
+def _zone(plain: bool, theme: Theme) -> dict[str, Any]:
+    if plain:
+        return {"facecolor": theme.zone, "linewidth": 0}
+    return {"facecolor": "none", "edgecolor": theme.faint, "hatch": "/////", "linewidth": 0}
+
+
+PARTICIPANTS = "95 % of participants"
+SCENARIO_ZONE = "paper's band: bootstrap of scenario means"
+"""Names of zones; the second one is hatched, since it says nothing about participants."""
+
+
+def _measure_handles(
+    table: pd.DataFrame, kinds: dict[str, tuple[str, str]], theme: Theme
+) -> list[Any]:
+    handles: list[Any] = [
+        Line2D([], [], color=colour, marker=marker, markeredgecolor=theme.ink, label=kind)
+        for kind, (colour, marker) in kinds.items()
+        if kind
+    ]
+    if table["people"].notna().any():
+        words = table.loc[table["people"].notna(), "people_is"].iloc[0]
+        handles.append(Line2D([], [], color=theme.ink, linestyle="--", label=words))
+    zones = table.loc[table["zone_low"].notna(), "zone"].unique()
+    handles += [Patch(**_zone(zone != SCENARIO_ZONE, theme), label=zone) for zone in zones]
     return [*handles, Line2D([], [], color=theme.faint, linestyle=":", label="chance")]
 
 
-def scatter_figure(
-    comparison: Comparison, agents: Sequence[str] | None = None, theme: Theme = LIGHT
-) -> Figure:
-    """Points: P(contact) of each model against the share of people who say yes, by stimulus.
+def grouped_figure(table: pd.DataFrame, words: str, chance: float, theme: Theme = LIGHT) -> Figure:
+    """Rows are models, marks are conditions: how much the condition matters to each model.
 
-    One panel a model; colour and shape say the scenario; hollow points are stimuli whose simulated
-    outcome is not the official one.
+    ``table``: see `figure_tables.GROUPED_COLUMNS`; one panel for each of its ``panel``.
     """
-    shown = list(comparison.agents if agents is None else agents)
-    scenarios = in_order(comparison.stimuli["scenario"])
-    columns = min(3, len(shown))
-    rows = math.ceil(len(shown) / columns)
-    with matplotlib.rc_context(_style(theme)):
-        figure = Figure(figsize=(3.65 * max(columns, 2), 3.6 * rows + 0.9), layout="constrained")
-        axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
-        for place, axis in enumerate(axes.flat):
-            if place < len(shown):
-                _points(axis, comparison, shown[place], scenarios, theme)
-                axis.tick_params(labelbottom=place + columns >= len(shown))
-            else:
-                axis.set_visible(False)
-        figure.supxlabel("share of people who say yes", fontsize=10)
-        figure.supylabel("P(contact) of the model", fontsize=10)
-        figure.legend(
-            handles=_scatter_handles(comparison, scenarios, theme),
-            loc="outside upper center",
-            ncols=5,
-        )
+    names = list(table["panel"].unique())
+    agents = list(table["agent"].unique())
+    with matplotlib.rc_context(style(theme)):
+        size = (11 / len(names), (0.34 if len(agents) <= 8 else 0.27) * len(agents) + 0.9)
+        figure, axes = panels(len(names), 2, size, above=0.3, sharex=True, sharey=True)
+        for axis, name in zip(axes, names, strict=True):
+            rows = table[table["panel"] == name]
+            groups = list(rows["group"].unique())
+            for place, group in enumerate(groups):
+                own = rows[rows["group"] == group]
+                at = own["agent"].map(agents.index) + (place - (len(groups) - 1) / 2) * 0.24
+                _group_marks(axis, own, at.to_numpy(dtype=np.float64), theme.mark(place), theme)
+            axis.axvline(chance, color=theme.faint, linestyle=":", linewidth=1, zorder=0)
+            people = rows["people"].iloc[0]
+            if np.isfinite(people):
+                axis.axvline(people, color=theme.ink, linestyle="--", linewidth=1.3, zorder=0)
+            title(axis, str(name))
+            axis.set_xlabel(words)
+            axis.set_yticks(range(len(agents)), [label(agent) for agent in agents])
+            axis.set_ylim(len(agents) - 0.5, -0.5)
+            axis.grid(axis="y", color=theme.zone, linewidth=0.5)
+            axis.set_axisbelow(True)
+            axis.legend(handles=_group_handles(groups, people, theme), loc="lower center",
+                        bbox_to_anchor=(0.5, 1.02 + 0.18 / len(agents)), ncols=5, fontsize=8,
+                        handletextpad=0.4, columnspacing=1.2)  # fmt: skip
     return figure
 
 
-def _points(
-    axis: Axes, comparison: Comparison, agent: str, scenarios: Sequence[str], theme: Theme
+def _group_marks(
+    axis: Axes, rows: pd.DataFrame, at: Any, mark: tuple[str, str], theme: Theme
 ) -> None:
-    rows = comparison.stimuli[comparison.stimuli["agent"] == agent]
-    axis.plot([0, 1], [0, 1], color=theme.faint, linewidth=1, zorder=0)
-    for place, scenario in enumerate(scenarios):
-        for hollow in (False, True):
-            part = rows[rows["scenario"] == scenario]
-            part = part[(part["label"] != part["simulated"]) == hollow]
-            colour, marker = _mark(place, theme)
-            axis.scatter(
-                part["p_yes"],
-                part["p_contact"],
-                s=16,
-                marker=marker,
-                facecolors="none" if hollow else colour,
-                edgecolors=colour,
-                linewidths=0.8 if hollow else 0,
-                alpha=0.95 if hollow else 0.65,
-            )
-    scores = comparison.scores
-    r = scores[(scores["agent"] == agent) & (scores["scenario"] == POOLED)]["r"].iloc[0]
-    worth = "r undefined" if np.isnan(r) else f"r = {r:.2f} pooled"
-    axis.set_title(
-        f"{textwrap.fill(agent, 44)}\n{worth}, {len(rows)} stimuli", fontsize=8.5, loc="left"
-    )
-    axis.set_xlim(-0.03, 1.03)
-    axis.set_ylim(-0.03, 1.03)
-    axis.set_aspect("equal")
-    axis.set_xticks([0, 0.5, 1])
-    axis.set_yticks([0, 0.5, 1])
+    colour, marker = mark
+    axis.hlines(at, rows["low"], rows["high"], color=colour, linewidth=1.4)
+    axis.plot(rows["value"], at, linestyle="", marker=marker, color=colour, markersize=5.5,
+              markeredgecolor=theme.ink, markeredgewidth=0.6)  # fmt: skip
 
 
-def _scatter_handles(
-    comparison: Comparison, scenarios: Sequence[str], theme: Theme
-) -> list[Line2D]:
+def _group_handles(groups: Sequence[str], people: float, theme: Theme) -> list[Line2D]:
     handles = []
-    for place, scenario in enumerate(scenarios):
-        colour, marker = _mark(place, theme)
+    for place, group in enumerate(groups):
+        colour, marker = theme.mark(place)
         handles.append(
-            Line2D([], [], color=colour, marker=marker, linestyle="", markersize=5, label=scenario)
+            Line2D([], [], color=colour, marker=marker, markeredgecolor=theme.ink, label=group)
         )
-    if len(comparison.changed):
-        hollow = Line2D([], [], color=theme.ink, marker="o", linestyle="", markersize=5)
-        hollow.set_markerfacecolor("none")
-        hollow.set_label("simulated outcome differs")
-        handles.append(hollow)
+    if np.isfinite(people):
+        handles.append(Line2D([], [], color=theme.ink, linestyle="--", label="people"))
     return handles
 
 
-def accuracy_data(comparison: Comparison) -> pd.DataFrame:
-    """What the bars show: a row a model and panel, with the human value and zone beside it."""
-    columns = ["agent", "scenario", "stimuli", "accuracy", "accuracy_low", "accuracy_high"]
-    table = comparison.scores[comparison.scores["scenario"] != POOLED][columns]
-    wanted = ["scenario", "accuracy", "zone_low", "zone_high"]
-    if not comparison.has_people:
-        return table.assign(people_accuracy=np.nan, zone_low=np.nan, zone_high=np.nan)
-    people = comparison.people[wanted].rename(columns={"accuracy": "people_accuracy"})
-    return table.merge(people, on="scenario", how="left")
+def generalization_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
+    """Trained on (rows) x tested on (columns), accuracy less that of people; one panel a model.
+
+    ``table``: see `figure_tables.GENERALIZATION_COLUMNS`. The number stands in each cell, so that
+    the colours, purple below people and orange above, may be lost in print.
+    """
+    agents = list(table["agent"].unique())
+    trained, tested = (list(table[name].unique()) for name in ("trained", "tested"))
+    widest = max(float(table["difference"].abs().max()), 0.01)
+    with matplotlib.rc_context(style(theme)):
+        size = (0.46 * len(tested) + 1.2, 0.3 * len(trained) + 0.6)
+        columns = max(1, min(int(12 / size[0]), 3))
+        figure, axes = panels(len(agents), columns, size, above=0.8, sharex=True, sharey=True)
+        image = None
+        for axis, agent in zip(axes, agents, strict=True):
+            grid = table[table["agent"] == agent].pivot(
+                index="trained", columns="tested", values="difference"
+            )
+            values = grid.reindex(index=trained, columns=tested).to_numpy(dtype=np.float64)
+            image = axis.imshow(values, cmap="PuOr_r", norm=TwoSlopeNorm(0, -widest, widest),
+                                aspect="auto")  # fmt: skip
+            _cells(axis, values, widest, theme)
+            title(axis, label(agent, 40))
+            axis.set_xticks(range(len(tested)), tested, rotation=45, ha="right")
+            axis.set_yticks(range(len(trained)), trained)
+        figure.supxlabel("tested on", fontsize=10)
+        figure.supylabel("trained on", fontsize=10)
+        if image is not None:
+            figure.colorbar(image, ax=axes, label="accuracy less that of people", shrink=0.9)
+    return figure
 
 
-def scatter_data(comparison: Comparison) -> pd.DataFrame:
-    """What the points show: a row a model and stimulus."""
-    columns = ["agent", "scenario", "stimulus", "p_yes", "p_contact", "label", "simulated"]
-    return comparison.stimuli[columns].reset_index(drop=True)
-
-
-def figure_bytes(figure: Figure, kind: str) -> bytes:
-    """A figure as ``svg`` or ``png``, without date, program version or random names."""
-    metadata: dict[str, None] = {"Date": None} if kind == "svg" else {"Software": None}
-    buffer = io.BytesIO()
-    with matplotlib.rc_context({"svg.hashsalt": "physion", "svg.fonttype": "path"}):
-        figure.savefig(buffer, format=kind, dpi=150, metadata=metadata)
-    return buffer.getvalue()
-
-
-def _kinds(comparison: Comparison) -> dict[str, tuple[str, str]]:
-    """Colour and hatch of each readout that occurs."""
-    found = list(comparison.scores["readout"].unique())
-    names = [name for name in _READOUTS if name in found]
-    names += sorted(set(found) - set(names))
-    return {
-        name: (_OKABE_ITO[place % len(_OKABE_ITO)], _HATCHES[place % len(_HATCHES)])
-        for place, name in enumerate(names)
-    }
-
-
-def _mark(place: int, theme: Theme) -> tuple[str, str]:
-    return theme.palette[place % len(theme.palette)], _MARKERS[place % len(_MARKERS)]
-
-
-def _style(theme: Theme) -> Any:
-    """Settings for ``rc_context``; its type in matplotlib spells out every key."""
-    return {
-        "font.family": "DejaVu Sans",
-        "font.size": 9,
-        "text.color": theme.ink,
-        "axes.labelcolor": theme.ink,
-        "axes.edgecolor": theme.faint,
-        "axes.facecolor": theme.paper,
-        "figure.facecolor": theme.paper,
-        "savefig.facecolor": theme.paper,
-        "xtick.color": theme.ink,
-        "ytick.color": theme.ink,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "legend.frameon": False,
-        "hatch.linewidth": 0.8,
-        # A person's own settings must not change what a report looks like.
-        "text.usetex": False,
-        "text.parse_math": False,
-        "path.simplify": True,
-    }
+def _cells(axis: Axes, values: Any, widest: float, theme: Theme) -> None:
+    for row, column in np.ndindex(*values.shape):
+        value = values[row, column]
+        if not np.isfinite(value):
+            axis.text(column, row, "–", ha="center", va="center", color=theme.faint, fontsize=8)
+            continue
+        # The map is light in its middle and dark at its ends, on any paper.
+        colour = "#ffffff" if abs(value) > 0.6 * widest else "#1b1f24"
+        words = number(value) if value < 0.005 else f"+{number(value)}"
+        axis.text(column, row, words, ha="center", va="center", color=colour, fontsize=7)

@@ -1,0 +1,153 @@
+"""From checked tables to all that a report needs: people, comparison, tests."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from physion.analysis import Bootstrap, compare
+from physion.analysis.calibration import calibration_table
+from physion.analysis.comparison import Comparison
+from physion.analysis.exclusions import RULE_SETS
+from physion.analysis.paired import compare_models
+from physion.analysis.participants import check_labels
+from physion.analysis.people import accuracy_by_stimulus
+from physion.analysis.people_comparison import compare_everywhere
+from physion.errors import UnknownNameError
+from physion.report.inputs import ReportInputs
+from physion.report.mixed_fits import fits_of_models, fits_of_people
+from physion.report.people_results import (
+    PeopleResults,
+    analyse_people,
+    read_any_responses,
+)
+
+
+def people_from_files(
+    responses: Sequence[Path],
+    sessions: Path | None,
+    rules: str,
+    labels: Mapping[str, bool] | None,
+    excluded: list[str],
+    exclude_ledge: bool,
+    draws: Bootstrap,
+) -> PeopleResults:
+    if rules not in RULE_SETS:
+        raise UnknownNameError("set of exclusion rules", rules, RULE_SETS)
+    read = read_any_responses(responses, sessions)
+    if labels is not None:
+        check_labels(read, labels)
+    return analyse_people(
+        read,
+        rules=RULE_SETS[rules],
+        exclude=excluded,
+        exclude_ledge=exclude_ledge,
+        bootstrap=draws,
+    )
+
+
+def people_in_words(responses: Sequence[Path], people: PeopleResults) -> str:
+    flags = people.tables["flags"]
+    return (
+        f"answers of single participants from {', '.join(path.name for path in responses)}: "
+        f"{len(flags)} sessions, {int(flags['flagged'].sum())} of them flagged by the rules "
+        f"“{people.rules.name}” and left out of the main analysis"
+    )
+
+
+def with_participants(
+    rows: pd.DataFrame,
+    people: PeopleResults,
+    excluded: list[str],
+    exclude_ledge: bool,
+    draws: Bootstrap,
+) -> ReportInputs:
+    """The comparison with the sessions that are not flagged, and with all complete ones."""
+    settings: dict[str, Any] = {
+        "exclude": excluded,
+        "exclude_ledge": exclude_ledge,
+        "bootstrap": draws,
+    }
+    main = compare(
+        rows, people.tables["by_stimulus"], people.labels(), zone=people.zone(), **settings
+    )
+    everybody = accuracy_by_stimulus(people.whole.test, draws)
+    whole = compare(rows, everybody, people.labels(), **settings)
+    beside = compare_everywhere(main.stimuli, people.kept.test, draws)
+    return ReportInputs(
+        main,
+        people=people,
+        comparison_all=whole,
+        beside=beside,
+        paired=beside.tests if len(main.agents) > 1 else None,
+        calibration=beside.calibration,
+    )
+
+
+def completed(
+    inputs: ReportInputs,
+    rows: pd.DataFrame,
+    methods: Mapping[str, str],
+    movies: Mapping[str, Path],
+    draws: Bootstrap,
+) -> ReportInputs:
+    """Adds the choices, and tests of pairs and calibration where no participants gave them."""
+    paired, calibration = inputs.paired, inputs.calibration
+    if inputs.beside is None:
+        paired = paired_table(inputs.comparison, draws)
+        calibration = calibration_scores(inputs.comparison)
+    fits = fits_of_models(inputs.comparison)
+    if inputs.people is not None:
+        fits = fits_of_people(inputs.people) + fits
+    return replace(
+        inputs,
+        mixed=tuple(fits),
+        methods=methods,
+        movies=movies,
+        predictions=rows,
+        paired=paired,
+        calibration=calibration,
+    )
+
+
+def _by_model(comparison: Comparison, column: str) -> pd.DataFrame:
+    """Models by stimuli of one column of ``comparison.stimuli``."""
+    wide = comparison.stimuli.pivot(index="agent", columns="stimulus", values=column)
+    return wide.loc[comparison.agents].astype("float64")
+
+
+def paired_table(comparison: Comparison, bootstrap: Bootstrap) -> pd.DataFrame | None:
+    """`paired.compare_models` on all stimuli together; None for one model alone."""
+    if len(comparison.agents) < 2:
+        return None
+    rows = comparison.stimuli.assign(
+        correct=comparison.stimuli["predicted"] == comparison.stimuli["label"]
+    )
+    p_contact = _by_model(comparison, "p_contact")
+    correct = rows.pivot(index="agent", columns="stimulus", values="correct")
+    correct = correct.loc[comparison.agents].astype("float64")
+    by_stimulus = rows.drop_duplicates("stimulus").set_index("stimulus")
+    by_stimulus = by_stimulus.reindex(p_contact.columns)
+    return compare_models(
+        comparison.agents,
+        correct.to_numpy(),
+        p_contact.to_numpy(),
+        by_stimulus["p_yes"].to_numpy(dtype="float64"),
+        bootstrap,
+        strata=list(by_stimulus["scenario"]),
+    )
+
+
+def calibration_scores(comparison: Comparison) -> pd.DataFrame:
+    """`calibration.calibration_table` of all models against the official outcomes."""
+    p_contact = _by_model(comparison, "p_contact")
+    truth = comparison.stimuli.drop_duplicates("stimulus").set_index("stimulus")["label"]
+    return calibration_table(
+        comparison.agents,
+        p_contact.to_numpy(),
+        truth.reindex(p_contact.columns).to_numpy(dtype="float64"),
+    )

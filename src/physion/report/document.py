@@ -1,0 +1,99 @@
+"""The frame of a page that needs nothing beside it: no network, no script, no other file."""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from importlib.resources import files
+
+SVG_LIMIT = 500_000
+"""Bytes above which a figure is embedded as PNG, since thousands of points make a heavy drawing."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure in two themes, as bytes by kind: ``svg`` and ``png``, of the dark one that which
+    `page_kind` names; ``words`` stand under it."""
+
+    name: str
+    light: Mapping[str, bytes]
+    dark: Mapping[str, bytes]
+    words: str = ""
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of a page under a heading; ``content`` is HTML."""
+
+    title: str
+    content: str
+
+    @property
+    def anchor(self) -> str:
+        """The heading as the name of a place in the page."""
+        return re.sub(r"[^a-z0-9]+", "-", self.title.lower()).strip("-")
+
+
+def page_kind(figure: Mapping[str, bytes]) -> str:
+    """As what a figure is embedded: ``svg``, or ``png`` where the drawing would be too heavy."""
+    return "svg" if len(figure["svg"]) <= SVG_LIMIT else "png"
+
+
+def render_document(title: str, lead: str, sections: Sequence[Section]) -> str:
+    """The page as text: heading, ``lead`` (HTML), contents, sections."""
+    links = "".join(f'<li><a href="#{s.anchor}">{escape(s.title)}</a></li>' for s in sections)
+    parts = [
+        f'<section id="{s.anchor}"><h2>{escape(s.title)}</h2>\n{s.content}</section>'
+        for s in sections
+    ]
+    nav = f'<nav aria-label="Contents"><ol>{links}</ol></nav>'
+    return _TEMPLATE.format(
+        title=escape(title), style=_style(), body="\n".join([lead, nav, *parts])
+    )
+
+
+_TEMPLATE = """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; img-src data:; \
+media-src data:; style-src 'unsafe-inline'">
+<title>{title}</title>
+<style>
+{style}</style>
+</head>
+<body>
+<main>
+<h1>{title}</h1>
+{body}
+</main>
+</body>
+</html>
+"""
+
+
+def _style() -> str:
+    return files("physion.report").joinpath("report.css").read_text(encoding="utf-8")
+
+
+def figure(picture: Picture) -> str:
+    """A figure with its words, light or dark as the reader's system asks."""
+    kind = page_kind(picture.light)
+    mime = {"svg": "image/svg+xml", "png": "image/png"}[kind]
+    light, dark = (data_uri(mime, theme[kind]) for theme in (picture.light, picture.dark))
+    return (
+        f'<figure><picture><source media="(prefers-color-scheme: dark)" srcset="{dark}">'
+        f'<img src="{light}" alt="{escape(picture.words)}"></picture>'
+        f"<figcaption>{escape(picture.words)} Table: <code>figures/{picture.name}.csv</code>."
+        "</figcaption></figure>"
+    )
+
+
+def data_uri(mime: str, data: bytes) -> str:
+    """Bytes as an address that holds them."""
+    return f"data:{mime};base64,{base64.b64encode(data).decode('ascii')}"

@@ -1,0 +1,111 @@
+"""The mixed models of a report: of people's single answers, and of the models' accuracies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import pandas as pd
+
+from physion.analysis.comparison import Comparison
+from physion.analysis.hypotheses import HYPOTHESES, answer_rows, with_attributes
+from physion.analysis.mixed_linear import fit_linear
+from physion.analysis.mixed_logistic import fit_logistic
+from physion.analysis.mixed_result import MixedFit
+from physion.analysis.tables import MEAN, POOLED
+from physion.errors import PhysionError
+from physion.report.people_results import PeopleResults, attributes_by_name
+
+CROSSED = "(1|participant) + (1|stimulus)"
+
+
+@dataclass(frozen=True)
+class MixedTable:
+    """A mixed model for the page: what it asks, its formula, its fit, or why there is none."""
+
+    name: str
+    about: str
+    formula: str
+    fit: MixedFit | None
+    reason: str = ""
+
+    def table(self) -> pd.DataFrame:
+        """Fixed effects, then the standard deviation of each grouping, as one table."""
+        if self.fit is None:
+            return pd.DataFrame({"term": ["(none)"], "reason": [self.reason]})
+        random = self.fit.random.assign(term="sd of " + self.fit.random["group"].astype(str))
+        return pd.concat([self.fit.table, random[["term", "levels", "sd"]]], ignore_index=True)
+
+
+Fitter = Callable[[str, pd.DataFrame], MixedFit]
+
+
+def _fitted(name: str, about: str, formula: str, fitter: Fitter, rows: pd.DataFrame) -> MixedTable:
+    """A fit, or the fitter's reason for not giving one."""
+    try:
+        return MixedTable(name, about, formula, fitter(formula, rows))
+    except PhysionError as error:
+        return MixedTable(name, about, formula, None, str(error))
+
+
+def fits_of_people(people: PeopleResults) -> list[MixedTable]:
+    """The preregistered models of single answers; flags on all complete sessions."""
+    stimuli = with_attributes(people.tables["by_stimulus"], attributes_by_name(people))
+    rows = answer_rows(people.kept.test, stimuli)
+    scenario = "scenario + " if rows["scenario"].nunique() > 1 else ""
+    found = [
+        _fitted(
+            "scenarios",
+            "Do people differ between scenarios? Log odds of being right, logistic",
+            f"correct ~ {scenario or '1 + '}{CROSSED}",
+            fit_logistic,
+            rows,
+        )
+    ]
+    for key, hypothesis in HYPOTHESES.items():
+        fitter = fit_logistic if hypothesis.family == "logistic" else fit_linear
+        formula = hypothesis.formula if scenario else hypothesis.formula.replace("scenario + ", "")
+        about = f"{key}, preregistered: {hypothesis.about} ({hypothesis.family})"
+        found.append(_fitted(key.lower(), about, formula, fitter, rows))
+    flagged = people.tables["flags"].set_index("session")["flagged"]
+    whole = people.whole.test
+    whole = whole.assign(flagged=whole["session"].map(flagged).astype(float))
+    about = "Effect of a session's flag on being right, all complete sessions, logistic"
+    found.append(
+        _fitted("flagged", about, f"correct ~ flagged + {scenario}{CROSSED}", fit_logistic, whole)
+    )
+    return found
+
+
+def fits_of_models(comparison: Comparison) -> list[MixedTable]:
+    """Linear models of accuracy by model and scenario, as the study compared models.
+
+    Each row is the accuracy of one model in one scenario.
+    """
+    scores = comparison.scores
+    rows = scores[~scores["scenario"].isin([MEAN, POOLED])]
+    if len(comparison.agents) < 2 or rows["scenario"].nunique() < 2:
+        return []
+    rows = rows[["agent", "model", "readout", "scenario", "accuracy"]]
+    first = sorted(rows["agent"].unique())[0]
+    found = [
+        _fitted(
+            "models",
+            f"Do models differ in accuracy? Linear, each against {first!r}",
+            "accuracy ~ agent + (1|scenario)",
+            fit_linear,
+            rows,
+        )
+    ]
+    if rows["readout"].nunique() > 1 and rows["model"].nunique() > 1:
+        first = sorted(rows["readout"].unique())[0]
+        found.append(
+            _fitted(
+                "readouts",
+                f"Does the readout matter? Linear, against {first!r}",
+                "accuracy ~ readout + (1|scenario) + (1|model)",
+                fit_linear,
+                rows,
+            )
+        )
+    return found

@@ -1,0 +1,120 @@
+"""How figures look: colours on white and on dark paper, marks that need no colour, and their bytes.
+
+Colours are those of Okabe and Ito; what a colour says, a hatch or the shape of a marker says too.
+The bytes depend on the tables and on the version of matplotlib, not on the time or the process.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class Theme:
+    """The colours of page and figures: paper, ink, faint lines, the human zone."""
+
+    name: str
+    paper: str
+    ink: str
+    faint: str
+    zone: str
+    palette: tuple[str, ...]
+
+    def mark(self, place: int) -> tuple[str, str]:
+        """Colour and marker of the ``place``-th of things that are told apart."""
+        return self.palette[place % len(self.palette)], MARKERS[place % len(MARKERS)]
+
+
+_OKABE_ITO = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#B8A800")
+_BRIGHT = ("#4FA8E0", *_OKABE_ITO[1:4], "#A5DAF5", *_OKABE_ITO[5:])
+LIGHT = Theme("light", "#ffffff", "#1b1f24", "#8a9099", "#d9dde3", (*_OKABE_ITO, "#4d4d4d"))
+DARK = Theme("dark", "#15181d", "#e6e8eb", "#7d848e", "#3a414b", (*_BRIGHT, "#c9c9c9"))
+
+HATCHES = ("", "///", "...", "xx", "\\\\\\", "ooo", "++", "--")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A figure as data: what is drawn is ``table`` and nothing else.
+
+    ``name``: of its files; ``words``: what it shows, under it; ``draw`` makes it in a theme.
+    """
+
+    name: str
+    words: str
+    table: pd.DataFrame
+    draw: Callable[[pd.DataFrame, Theme], Figure]
+
+
+def panels(
+    count: int, columns: int, size: tuple[float, float], above: float = 0.9, **shared: Any
+) -> tuple[Figure, list[Axes]]:
+    """A figure of ``count`` panels, each about ``size`` inches, and its axes row by row.
+
+    ``above`` is room for the legend. Call it inside ``rc_context(style(theme))``.
+    """
+    columns = min(columns, count)
+    rows = math.ceil(count / columns)
+    width, height = size
+    figure = Figure(figsize=(width * columns, height * rows + above), layout="constrained")
+    axes = list(figure.subplots(rows, columns, squeeze=False, **shared).flat)
+    for axis in axes[count:]:
+        axis.set_visible(False)
+    return figure, axes[:count]
+
+
+def legend(figure: Figure, handles: Sequence[Any], columns: int) -> None:
+    """One legend for all panels, above them."""
+    figure.legend(
+        handles=list(handles), loc="outside upper center", ncols=min(columns, len(handles))
+    )
+
+
+def title(axis: Axes, words: str) -> None:
+    """The heading of a panel."""
+    axis.set_title(words, fontsize=10, fontweight="bold", loc="left")
+
+
+def figure_bytes(figure: Figure, kind: str) -> bytes:
+    """A figure as ``svg`` or ``png``, without date, program version or random names."""
+    metadata: dict[str, None] = {"Date": None} if kind == "svg" else {"Software": None}
+    buffer = io.BytesIO()
+    with matplotlib.rc_context({"svg.hashsalt": "physion", "svg.fonttype": "path"}):
+        figure.savefig(buffer, format=kind, dpi=150, metadata=metadata)
+    # The layout is the same in every kind and takes long to find.
+    figure.set_layout_engine("none")
+    return buffer.getvalue()
+
+
+def style(theme: Theme) -> Any:
+    """Settings for ``rc_context``; its type in matplotlib spells out every key."""
+    return {
+        "font.family": "DejaVu Sans",
+        "font.size": 9,
+        "text.color": theme.ink,
+        "axes.labelcolor": theme.ink,
+        "axes.edgecolor": theme.faint,
+        "axes.facecolor": theme.paper,
+        "figure.facecolor": theme.paper,
+        "savefig.facecolor": theme.paper,
+        "xtick.color": theme.ink,
+        "ytick.color": theme.ink,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "legend.frameon": False,
+        "hatch.linewidth": 0.8,
+        # A person's own settings must not change what a report looks like.
+        "text.usetex": False,
+        "text.parse_math": False,
+        "path.simplify": True,
+    }

@@ -1,0 +1,40 @@
+"""Files of a report: folders, tables, figures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pandas as pd
+
+from physion.atomic import write_atomic
+from physion.errors import BadInputError
+from physion.report import theme
+from physion.report.document import Picture, page_kind
+from physion.report.theme import Plot
+
+
+def prepare_folder(folder: Path) -> Path:
+    """Make ``folder`` with its ``tables`` and ``figures``; the path of the latter."""
+    if folder.exists() and not folder.is_dir():
+        raise BadInputError(f"{folder} is a file; give a folder for the report")
+    for place in ("tables", "figures"):
+        (folder / place).mkdir(parents=True, exist_ok=True)
+    return folder / "figures"
+
+
+def write_plot(plot: Plot, folder: Path) -> Picture:
+    """Write a figure as SVG and PNG with its table beside it; what the page shows of it."""
+    write_csv(folder / f"{plot.name}.csv", plot.table)
+    figure = plot.draw(plot.table, theme.LIGHT)
+    light = {kind: theme.figure_bytes(figure, kind) for kind in ("svg", "png")}
+    # The dark figure is for the page alone, so it is made in the one kind that goes there.
+    kind = page_kind(light)
+    dark = {kind: theme.figure_bytes(plot.draw(plot.table, theme.DARK), kind)}
+    for ending, content in light.items():
+        write_atomic(folder / f"{plot.name}.{ending}", content)
+    return Picture(plot.name, light, dark, plot.words)
+
+
+def write_csv(path: Path, table: pd.DataFrame) -> None:
+    """A table as CSV, whole or not at all."""
+    write_atomic(path, table.to_csv(index=False, lineterminator="\n").encode())
