@@ -158,7 +158,7 @@ def make_trials(options: Options, tasks: list[Task]) -> list[str]:
     report = generate(
         folder(options) / "trials",
         tasks,
-        Settings(width=options.size, height=options.size, look="redyellow"),
+        Settings(width=options.size, height=options.size, look="redyellow", jitters=0),
         executor=LocalExecutor(workers=options.workers),
         track=track,
     )
