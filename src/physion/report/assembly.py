@@ -18,7 +18,7 @@ from physion.analysis.participants import check_labels
 from physion.analysis.people import accuracy_by_stimulus
 from physion.analysis.people_comparison import compare_everywhere
 from physion.errors import UnknownNameError
-from physion.report.inputs import ReportInputs
+from physion.report.inputs import ReportInputs, permutations_of
 from physion.report.mixed_fits import fits_of_models, fits_of_people
 from physion.report.people_results import (
     PeopleResults,
@@ -77,7 +77,9 @@ def with_participants(
     )
     everybody = accuracy_by_stimulus(people.whole.test, draws)
     whole = compare(rows, everybody, people.labels(), **settings)
-    beside = compare_everywhere(main.stimuli, people.kept.test, draws)
+    agents = len(main.agents)
+    permutations = permutations_of(agents * (agents - 1) // 2)
+    beside = compare_everywhere(main.stimuli, people.kept.test, draws, permutations=permutations)
     return ReportInputs(
         main,
         people=people,
@@ -139,6 +141,7 @@ def paired_table(comparison: Comparison, bootstrap: Bootstrap) -> pd.DataFrame |
         by_stimulus["p_yes"].to_numpy(dtype="float64"),
         bootstrap,
         strata=list(by_stimulus["scenario"]),
+        permutations=permutations_of(len(correct) * (len(correct) - 1) // 2),
     )
 
 

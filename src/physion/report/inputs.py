@@ -17,6 +17,14 @@ EXPECTED_METHODS = ("Engine", "Renderer", "Readout", "Encoder weights", "Noise o
 """Choices that are made outside the analysis; the page says so where the caller names none."""
 
 
+def permutations_of(pairs: int) -> int:
+    """Permutations for so many pairs of models: Holm's correction must be able to find something.
+
+    The least p is one over their number, which the correction multiplies by that of the pairs.
+    """
+    return min(20_000, max(2_000, 40 * pairs))
+
+
 @dataclass(frozen=True)
 class ReportInputs:
     """All that a report is made of.

@@ -21,13 +21,17 @@ CROSSED = "(1|participant) + (1|stimulus)"
 
 @dataclass(frozen=True)
 class MixedTable:
-    """A mixed model for the page: what it asks, its formula, its fit, or why there is none."""
+    """A mixed model for the page: what it asks, its formula, its fit, or why there is none.
+
+    ``term``: the one whose coefficients are tested together, where the question is about it.
+    """
 
     name: str
     about: str
     formula: str
     fit: MixedFit | None
     reason: str = ""
+    term: str = ""
 
     def table(self) -> pd.DataFrame:
         """Fixed effects, then the standard deviation of each grouping, as one table."""
@@ -40,10 +44,12 @@ class MixedTable:
 Fitter = Callable[[str, pd.DataFrame], MixedFit]
 
 
-def _fitted(name: str, about: str, formula: str, fitter: Fitter, rows: pd.DataFrame) -> MixedTable:
+def _fitted(
+    name: str, about: str, formula: str, fitter: Fitter, rows: pd.DataFrame, term: str = ""
+) -> MixedTable:
     """A fit, or the fitter's reason for not giving one."""
     try:
-        return MixedTable(name, about, formula, fitter(formula, rows))
+        return MixedTable(name, about, formula, fitter(formula, rows), term=term)
     except PhysionError as error:
         return MixedTable(name, about, formula, None, str(error))
 
@@ -60,6 +66,7 @@ def fits_of_people(people: PeopleResults) -> list[MixedTable]:
             f"correct ~ {scenario or '1 + '}{CROSSED}",
             fit_logistic,
             rows,
+            "scenario" if scenario else "",
         )
     ]
     for key, hypothesis in HYPOTHESES.items():
@@ -95,6 +102,7 @@ def fits_of_models(comparison: Comparison) -> list[MixedTable]:
             "accuracy ~ agent + (1|scenario)",
             fit_linear,
             rows,
+            "agent",
         )
     ]
     if rows["readout"].nunique() > 1 and rows["model"].nunique() > 1:
@@ -106,6 +114,7 @@ def fits_of_models(comparison: Comparison) -> list[MixedTable]:
                 "accuracy ~ readout + (1|scenario) + (1|model)",
                 fit_linear,
                 rows,
+                "readout",
             )
         )
     return found

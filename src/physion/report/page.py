@@ -70,8 +70,8 @@ def _summary(inputs: ReportInputs) -> str:
     if inputs.people is not None:
         flags = inputs.people.tables["flags"]
         words.append(
-            f"Of {blocks.plural(len(flags), 'session')}, {int(flags['flagged'].sum())} are flagged "
-            "and left out; the main results are given with them too."
+            f"Flagged and left out: {int(flags['flagged'].sum())} of "
+            f"{blocks.plural(len(flags), 'session')}; the main results are given with them too."
         )
     if len(comparison.changed):
         words.append(

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from physion.report.blocks import Column, details, number, paragraph, rows_table
-from physion.report.inputs import ReportInputs
+from physion.report.inputs import ReportInputs, permutations_of
 from physion.report.mixed_fits import MixedTable
 
 
@@ -43,7 +43,8 @@ def _paired(rows: pd.DataFrame) -> str:
     words = (
         "Every two models on the stimuli that both answered, all scenarios together. Accuracy: "
         "exact test of McNemar. r with the average person: permutation test that swaps the two "
-        "models stimulus by stimulus, interval by drawing stimuli. Correction over all pairs: by "
+        f"models stimulus by stimulus ({permutations_of(len(rows))} permutations), interval by "
+        "drawing stimuli. Correction over all pairs: by "
         "Holm (chance of any false alarm) and by Benjamini and Hochberg (share of false alarms). "
         f"Of {counts['p_accuracy'][2]} pairs, {counts['p_accuracy'][0]} differ in accuracy by "
         f"Holm and {counts['p_accuracy'][1]} by Benjamini and Hochberg (5 %); of "
@@ -69,25 +70,39 @@ def _paired(rows: pd.DataFrame) -> str:
 
 
 def _mixed(model: MixedTable) -> str:
-    words = f"<p>{escape(model.about)}: <code>{escape(model.formula)}</code>.</p>"
+    formula = f"<p><code>{escape(model.formula)}</code></p>"
     if model.fit is None:
-        return words + f'<p class="none">Not fitted: {escape(model.reason)}</p>'
+        return details(f"{model.about}: not fitted", formula + paragraph(model.reason))
     fit = model.fit
+    rows = fit.table.assign(
+        term=fit.table["term"].str.replace(r"(\w+)\[T\.(.*)\]", r"\1: \2", regex=True)
+    )
     columns = [
         Column("term", "term", "text"), Column("b", "b", "interval", 3, "low", "high"),
         Column("SE", "se", digits=3), Column("z", "z"), Column("t", "t"),
         Column("df", "df", digits=1), Column("p", "p", "p"),
     ]  # fmt: skip
-    logistic = "z" in fit.table
-    known = [c for c in columns if c.key in fit.table and not (logistic and c.key == "df")]
-    listing = rows_table(fit.table, known)
+    logistic = "z" in rows
+    known = [c for c in columns if c.key in rows and not (logistic and c.key == "df")]
     spreads = ", ".join(
         f"{row['group']} {number(row['sd'], 3)} ({int(row['levels'])})"
         for _, row in fit.random.iterrows()
     )
     note = f"{fit.rows} rows, {fit.left_out} left out; standard deviations (levels): {spreads}. "
     note += " ".join(fit.warnings)
-    return words + listing + f'<p class="note">{escape(note)}</p>'
+    listing = rows_table(rows, known) + f'<p class="note">{escape(note)}</p>'
+    return details(f"{model.about}{_together(model)}", formula + listing)
+
+
+def _together(model: MixedTable) -> str:
+    """The test that all coefficients of the model's term are zero, in words."""
+    if model.fit is None or not model.term:
+        return ""
+    test = model.fit.joint_test(model.term)
+    p = "p < 0.001" if test.p < 0.001 else f"p = {number(test.p, 3)}"
+    if np.isinf(test.df2):
+        return f". All together: χ²({test.df1}) = {number(test.statistic * test.df1, 1)}, {p}"
+    return f". All together: F({test.df1}, {number(test.df2, 1)}) = {number(test.statistic)}, {p}"
 
 
 def calibration(inputs: ReportInputs) -> str:

@@ -1,0 +1,198 @@
+"""The report with single participants: sections, counts, flags, with and without, bad input."""
+
+from __future__ import annotations
+
+import json
+import re
+from html import unescape
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from physion.analysis import Bootstrap
+from physion.analysis.kappa import cohen_kappa
+from physion.errors import BadInputError, UnknownNameError
+from physion.report import compare_files
+from physion.report.inputs import permutations_of
+
+SCENARIOS = ("collide", "drop")
+STEMS = {"collide": "pilot_it2_collision_simple_box", "drop": "pilot_it2_drop_simple_box"}
+PEOPLE, STIMULI = 8, 16
+
+
+def responses() -> pd.DataFrame:
+    """Eight people a scenario; the last of Collide says yes throughout."""
+    generator = np.random.default_rng(1)
+    rows = []
+    for scenario in SCENARIOS:
+        easy = generator.normal(1.0, 1.2, STIMULI)
+        for person in range(PEOPLE):
+            key = {"participant": f"{scenario}-{person}", "session": f"{scenario}-{person}",
+                   "scenario": scenario, "simulated": False}  # fmt: skip
+            for place in range(STIMULI):
+                label = place % 2 == 0
+                right = generator.random() < 1 / (1 + np.exp(-easy[place]))
+                yes = True if (scenario, person) == ("collide", PEOPLE - 1) else label == right
+                rows.append(key | {"stimulus": f"{STEMS[scenario]}_{place:04d}", "phase": "test",
+                                   "trial": place, "response": "yes" if yes else "no",
+                                   "label": label,
+                                   "rt_ms": 500 + 900 * generator.random()})  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def predictions() -> pd.DataFrame:
+    generator = np.random.default_rng(2)
+    tables = []
+    for model, readout in (("one", "observed"), ("one", "full"), ("two", "observed")):
+        for scenario in SCENARIOS:
+            p = generator.random(STIMULI)
+            tables.append(pd.DataFrame({
+                "Model": model, "Readout Type": readout, "Predicted Prob_true": p,
+                "Predicted Outcome": p > 0.5, "Actual Outcome": np.arange(STIMULI) % 2 == 0,
+                "Stimulus Name": [f"{STEMS[scenario]}_{i:04d}" for i in range(STIMULI)],
+            }))  # fmt: skip
+    return pd.concat(tables)
+
+
+def build(folder: Path, name: str = "out", **options: object) -> Path:
+    answers = options.pop("answers", None)
+    table = responses() if answers is None else answers
+    assert isinstance(table, pd.DataFrame)
+    table.to_csv(folder / "responses.csv", index=False)
+    predictions().to_csv(folder / "predictions.csv", index=False)
+    return compare_files(
+        [folder / "predictions.csv"], None, None, folder / name, bootstrap=Bootstrap(60),
+        responses=[folder / "responses.csv"], **options,
+    )  # type: ignore[arg-type]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build(tmp_path_factory.mktemp("people"))
+
+
+def text_of(page: Path) -> str:
+    whole = re.sub(r"<(style|figure)>.*?</\1>", " ", page.read_text(encoding="utf-8"), flags=re.S)
+    return " ".join(unescape(re.sub(r"<[^>]+>", " ", whole)).split())
+
+
+def test_every_figure_has_its_files(report: Path) -> None:
+    stems = {path.stem for path in (report.parent / "figures").iterdir()}
+    assert stems == {"accuracy", "r", "kappa", "effects", "scatter", "thirds", "calibration",
+                     "difficulty", "response_time"}  # fmt: skip
+    for stem in stems:
+        for kind in ("svg", "png", "csv"):
+            assert (report.parent / "figures" / f"{stem}.{kind}").stat().st_size > 100
+
+
+def test_flagged_session_is_counted_and_left_out(report: Path) -> None:
+    flags = pd.read_csv(report.parent / "tables" / "people_flags.csv")
+    assert flags.loc[flags["flagged"], "session"].tolist() == ["collide-7"]
+    text = text_of(report)
+    assert "Flagged and left out: 1 of 16 sessions" in text
+    assert "session is flagged 1 16" in text
+    people = pd.read_csv(report.parent / "tables" / "people_by_scenario.csv").set_index("scenario")
+    assert people.loc["collide", "people"] == PEOPLE - 1 and people.loc["drop", "people"] == PEOPLE
+
+
+def test_with_and_without_flagged_sessions(report: Path) -> None:
+    table = pd.read_csv(report.parent / "tables" / "people_with_and_without.csv")
+    own = table[table["scenario"] == "collide"].set_index("sessions")
+    answers = responses()
+    right = (answers["response"] == "yes") == answers["label"]
+    own_right = right[answers["scenario"] == "collide"]
+    assert own.loc["complete", "accuracy"] == pytest.approx(own_right.mean())
+    assert own.loc["unflagged", "accuracy"] == pytest.approx(own_right[:-STIMULI].mean())
+    tables = [pd.read_csv(report.parent / "tables" / f"{name}.csv")
+              for name in ("comparison", "comparison_with_flagged")]  # fmt: skip
+    assert not np.allclose(tables[0]["r"], tables[1]["r"])
+
+
+def test_kappa_of_the_figure_is_the_mean_over_people(report: Path) -> None:
+    table = pd.read_csv(report.parent / "figures" / "kappa.csv").set_index(["panel", "agent"])
+    answers = responses()
+    model = predictions().iloc[STIMULI : 2 * STIMULI]["Predicted Outcome"].to_numpy(float)
+    people = answers[answers["scenario"] == "drop"].groupby("session")["response"]
+    kappas = [cohen_kappa((own == "yes").to_numpy(float), model) for _, own in people]
+    row = table.loc[("drop", "one · observed")]
+    assert row["value"] == pytest.approx(np.mean(kappas))
+    assert row["low"] < row["value"] < row["high"] and row["zone_low"] < row["zone_high"]
+    assert row["zone"] == "95 % of participants"
+
+
+def test_tests_and_mixed_models_are_told(report: Path) -> None:
+    text = text_of(report)
+    assert "test of McNemar" in text and "Holm" in text
+    assert "correct ~ scenario + (1|participant) + (1|stimulus)" in text
+    assert "log_rt ~ accuracy + scenario" in text
+    assert "accuracy ~ agent + (1|scenario)" in text
+    values = json.loads((report.parent / "report.json").read_text())
+    assert len(values["paired_tests"]) == 3
+    fitted = {row["term"] for row in values["mixed_flagged"]}
+    assert {"flagged", "sd of participant", "sd of stimulus"} <= fitted
+
+
+def test_hypotheses_without_their_attribute_give_a_reason(report: Path) -> None:
+    values = json.loads((report.parent / "report.json").read_text())
+    first = next(row for row in values["people_hypotheses"] if row["hypothesis"] == "H1")
+    assert first["b"] is None and "predictor" in first["reason"]
+    assert "H1, preregistered: Stimuli with more elements are harder (logistic): not fitted" in (
+        text_of(report)
+    )
+
+
+def test_bytes_repeat(report: Path, tmp_path: Path) -> None:
+    again = build(tmp_path)
+    for path in sorted(report.parent.rglob("*")):
+        if path.is_file():
+            assert (
+                again.parent / path.relative_to(report.parent)
+            ).read_bytes() == path.read_bytes()
+
+
+# --- what is refused ----------------------------------------------------------------------------
+
+
+def test_two_kinds_of_people_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="not both"):
+        compare_files([_predictions(tmp_path)], tmp_path, None, tmp_path / "out",
+                      responses=[tmp_path / "r.csv"])  # fmt: skip
+
+
+def _predictions(folder: Path) -> Path:
+    predictions().to_csv(folder / "p.csv", index=False)
+    return folder / "p.csv"
+
+
+def test_unknown_rules_are_refused_with_the_known_ones(tmp_path: Path) -> None:
+    with pytest.raises(UnknownNameError, match="preregistered"):
+        build(tmp_path, rules="preregistred")
+
+
+def test_labels_that_contradict_are_refused(tmp_path: Path) -> None:
+    answers = responses()
+    labels = {answers["stimulus"].iloc[0]: False}
+    answers.to_csv(tmp_path / "r.csv", index=False)
+    with pytest.raises(BadInputError, match="ends otherwise"):
+        compare_files([_predictions(tmp_path)], None, labels, tmp_path / "out",
+                      responses=[tmp_path / "r.csv"])  # fmt: skip
+    assert not (tmp_path / "out").exists()
+
+
+def test_no_session_left_is_refused(tmp_path: Path) -> None:
+    answers = responses().assign(response="yes")
+    with pytest.raises(BadInputError, match="all 16 sessions are flagged"):
+        build(tmp_path, answers=answers)
+
+
+def test_answers_without_times_say_so(tmp_path: Path) -> None:
+    page = build(tmp_path, answers=responses().assign(rt_ms=np.nan))
+    assert not (page.parent / "figures" / "response_time.svg").exists()
+    assert "no answer has one above 0" in text_of(page)
+
+
+def test_permutations_let_holm_find_something() -> None:
+    for pairs in (1, 50, 190, 400):
+        assert pairs / (1 + permutations_of(pairs)) < 0.05

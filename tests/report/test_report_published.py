@@ -1,0 +1,53 @@
+"""The page of the published results: its numbers are those of the tables, its bytes repeat."""
+
+from __future__ import annotations
+
+import json
+import re
+from html import unescape
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from physion.analysis.published import PublishedResults, published_results
+from physion.report.figures import SCENARIO_ZONE
+from physion.report.published_report import build_published_report, published_plots
+
+
+@pytest.fixture(scope="module")
+def results(official: Path) -> PublishedResults:
+    return published_results(official)
+
+
+@pytest.fixture(scope="module")
+def built(results: PublishedResults, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build_published_report(results, tmp_path_factory.mktemp("pub"))
+
+
+def test_page_shows_published_and_expected_means(built: Path) -> None:
+    whole = re.sub(r"<(style|figure)>.*?</\1>", " ", built.read_text(encoding="utf-8"), flags=re.S)
+    text = " ".join(unescape(re.sub(r"<[^>]+>", " ", whole)).split())
+    table = pd.read_csv(built.parent / "tables" / "accuracies.csv")
+    for column in ("published", "expected"):
+        values = table.loc[table["model"] == "DPI", column]
+        words = " ".join(f"{value:.3f}" for value in [*values, values.mean()])
+        assert f"DPI {words}" in text
+    assert "mix detection into prediction" in text
+    assert "released table calls pVGG a Transformer" in text
+
+
+def test_four_panels_with_their_tables(built: Path) -> None:
+    names = {path.name for path in (built.parent / "figures").iterdir()}
+    assert names == {f"panel_{p}.{k}" for p in "acde" for k in ("svg", "png", "csv")}
+    values = json.loads((built.parent / "published.json").read_text())
+    assert len(values["tables"]["accuracies"]) == 88
+    panel = pd.read_csv(built.parent / "figures" / "panel_a.csv")
+    assert set(panel.loc[panel["panel"] == "mean", "zone"]) == {SCENARIO_ZONE}
+    assert panel["value"].notna().all() and len(panel) == 99
+
+
+def test_bytes_repeat(results: PublishedResults, built: Path, tmp_path: Path) -> None:
+    assert [plot.name for plot in published_plots(results)] == [f"panel_{p}" for p in "acde"]
+    again = build_published_report(results, tmp_path / "again")
+    assert again.read_bytes() == built.read_bytes()
