@@ -51,7 +51,7 @@ from physion.scenes.rules import (
     draw_zone,
     require_apart,
 )
-from physion.scenes.scenarios import as_record, scenarios
+from physion.scenes.scenarios import as_record, sample_scene, scenarios
 from physion.scenes.scene import Body, Look
 from physion.scenes.shapes import shape, shapes
 
@@ -220,18 +220,17 @@ def test_apart_or_not() -> None:
     cube = Body("one", "cube", (0.0, 0.0, 0.0))
     require_apart(cube, Body("other", "cube", (1.001, 0.0, 0.0)))
     require_apart(cube, Body("other", "cube", (0.0, 0.0, 1.001)))
-    with pytest.raises(BadSceneError, match=r"one and other would start .* \(0\.999, 0\.0"):
+    with pytest.raises(BadSceneError, match=r"one and other would start [^\d]*$"):
         require_apart(cube, Body("other", "cube", (0.999, 0.0, 0.0)))
 
 
-def test_placing_counts_what_stands_in_the_way() -> None:
+def test_placing_says_what_stands_in_the_way() -> None:
     answers = iter(["too wide"] * 3 + ["too high"] + [None])
     place(5, "it", lambda: next(answers))
-    answers = iter(["too wide", "too high", "too wide"])
-    with pytest.raises(
-        BadSceneError, match=r"^it could not be placed in 3 tries: too wide \(2 of 3\); too high"
-    ):
-        place(3, "it", lambda: next(answers))
+    for order in (["too wide", "too high", "too wide"], ["too high", "too wide", "too wide"]):
+        answers = iter(order)
+        with pytest.raises(BadSceneError, match=r"^it could not be placed in 3 tries: too wide$"):
+            place(3, "it", lambda: next(answers))  # noqa: B023  # called at once
 
 
 @dataclass(frozen=True)
@@ -288,6 +287,33 @@ def test_numbers_are_taken_within_their_limits_only(key: str, value: float) -> N
         check_params(dataclasses.replace(Sample(), **{key: value}), "here")
 
 
+BELOW_LEAST = {
+    "drape": ["cloth.size", "anchors.width", "anchors.depth", "prop.size"],
+    "drop": ["camera.radius", "scenery.distractor_size", "scenery.occluder_size"],
+}
+
+
+@pytest.mark.parametrize(
+    ("scenario", "key"), [(name, key) for name, keys in BELOW_LEAST.items() for key in keys]
+)
+@pytest.mark.parametrize("value", [0, [0, 1], [np.float64(0), np.float64(1)]])
+def test_what_must_be_there_is_not_nothing(scenario: str, key: str, value: Any) -> None:
+    rule, name = key.split(".")
+    kind = scenarios.get(scenario).params
+    with pytest.raises(BadInputError, match=f"here: {rule}: {name} is 0, allowed is 0[.]") as error:
+        read_params(kind, {rule: {name: value}}, "here")
+    assert "np." not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "value", [(np.float64(3), np.float64(2)), (np.float64(1),) * 4, [(np.float64(1),), np.int64(2)]]
+)
+def test_numbers_of_numpy_are_told_as_any_other(value: Any) -> None:
+    with pytest.raises(BadInputError, match=r"^mine: width must .*\d\]$") as error:
+        check_params(dataclasses.replace(Sample(), width=value), "mine")
+    assert "np." not in str(error.value)
+
+
 JUNK = st.recursive(
     st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=5),
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=4), inner),
@@ -322,6 +348,37 @@ def test_parameters_survive_their_record(name: str) -> None:
     limits = drawn_limits(kind())
     assert limits["room"] == "names of rooms" and limits["camera.height"] == "0 to 50 m"
     assert all(limits.values())
+
+
+def test_values_are_checked_with_one_another_wherever_they_are_nested() -> None:
+    slippery = BodyRule(static_friction=(0.1, 0.2), dynamic_friction=(0.3, 0.9))
+    roll = scenarios.get("roll").params()
+    nested = dataclasses.replace(roll, ledge=dataclasses.replace(roll.ledge, target=slippery))
+    with pytest.raises(
+        BadInputError,
+        match=r"mine: ledge: target: static_friction is at most 0\.2 and dynamic_friction at least",
+    ):
+        check_params(nested, "mine")
+    meeting = dataclasses.replace(slippery, static_friction=(0.1, 0.3))
+    check_params(meeting, "mine")
+
+
+@pytest.mark.parametrize("name", ["dominoes", "collide", "contain", "link", "support"])
+def test_pushes_come_before_a_trial_can_end(name: str) -> None:
+    kind = scenarios.get(name).params
+    last = sample_scene(name, np.random.SeedSequence(0)).ending.min_frames - 1
+    assert read_params(kind, {"push": {"frame": last}}, "here").push.frame == (last, last)
+    for late in (last + 1, [0, 400]):
+        with pytest.raises(BadInputError, match=f"frame is .*, allowed is 0 to {last} frames"):
+            read_params(kind, {"push": {"frame": late}}, "here")
+
+
+def test_rules_of_another_kind_are_refused() -> None:
+    wrong = dataclasses.replace(scenarios.get("collide").params(), push=BodyRule(), room=Inner())
+    with pytest.raises(BadInputError, match="mine: push must be a PushRule, not a BodyRule"):
+        check_params(wrong, "mine")
+    with pytest.raises(BadInputError, match="mine: room must name a room"):
+        check_params(dataclasses.replace(wrong, push=PushRule()), "mine")
 
 
 def test_parameters_in_code_are_checked_too() -> None:

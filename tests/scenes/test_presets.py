@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import re
 from collections import Counter
 from pathlib import Path
@@ -195,6 +196,31 @@ def test_a_file_of_ones_own(tmp_path: Path) -> None:
         get_preset("collide", "yeet_bx")
 
 
+def test_ones_own_may_be_based_on_one_that_comes_with_the_scenario() -> None:
+    text = """
+    scenario = "collide"
+    shared.room = "empty"
+    [presets.tilted]
+    based_on = "yeet_box"
+    params.push.heading_deg = 3
+    [presets.default]
+    based_on = "default"
+    params.length = 3
+    [presets.far]
+    based_on = "default"
+    """
+    own, known = parse_presets(text, "own.toml"), load_presets("collide")
+    base = known["yeet_box"].params
+    assert own["tilted"].params == dataclasses.replace(
+        base, room="empty", push=dataclasses.replace(base.push, heading_deg=(3.0, 3.0))
+    )
+    assert own["tilted"].official is None and own["tilted"].published is None
+    assert own["far"].params.length == 3, "that of the file comes first"
+    assert own["far"].params == dataclasses.replace(
+        known["default"].params, length=3.0, room="empty"
+    )
+
+
 PARAMS = 'scenario = "collide"\n[presets.mine.params]\n'
 OTHER = 'scenario = "collide"\n[presets.mine]\n'
 BAD = {
@@ -238,11 +264,36 @@ BAD = {
     "unknown room": (PARAMS + 'room = "boxx"', "room: unknown room 'boxx'; closest: box"),
     "unknown base": (
         OTHER + 'based_on = "theirs"',
-        "preset 'mine' is based on 'theirs', not yet",
+        "preset 'mine': based_on 'theirs' is neither before it in",
+    ),
+    "base is no name": (OTHER + "based_on = [1]", "'mine': based_on must name a preset, not [1]"),
+    "base comes later": (
+        OTHER + 'based_on = "later"\n[presets.later]',
+        "preset 'mine': based_on 'later' is neither before it in",
+    ),
+    "base of another scenario": (
+        OTHER + 'based_on = "sizes_box"',  # of drop
+        "nor among the presets of collide",
+    ),
+    "static below dynamic": (
+        PARAMS + "target = { static_friction = 0.1, dynamic_friction = 0.9 }",
+        "preset 'mine': target: static_friction is at most 0.1 and dynamic_friction at least 0.9",
+    ),
+    "pushed after the end": (
+        PARAMS + "push.frame = [0, 151]",
+        "preset 'mine': push: frame is 151, allowed is 0 to 150 frames",
     ),
     "unknown property": (OTHER + "param = {}", "preset 'mine': unknown key 'param'; known: about"),
     "bad about": (OTHER + "about = 3", "preset 'mine': about must be str, not 3"),
-    "bad published": (OTHER + "published = { trials = 3 }", "preset 'mine': published: "),
+    "bad published": (
+        OTHER + 'published = { trials = "a", contact = 0, frames = 151 }',
+        "preset 'mine': published: trials must be a number (0 to 1e+06), not 'a'",
+    ),
+    "half published": (
+        OTHER + "published = { trials = 3 }",
+        "preset 'mine': published lacks contact, frames",
+    ),
+    "published is no table": (OTHER + "published = 3", "preset 'mine': published must be a table"),
     "preset is no table": (
         'scenario = "collide"\npresets.mine = 3',
         "preset 'mine' must be a table",

@@ -22,7 +22,7 @@ from physion.physics.labels import label_contact
 from physion.scenes import drape, roll
 from physion.scenes.parameters import three_turns
 from physion.scenes.placement import on_screen, rotate, world_bounds, world_corners
-from physion.scenes.preset import Preset, load_presets
+from physion.scenes.preset import Preset, load_presets, parse_presets
 from physion.scenes.rules import BodyRule
 from physion.scenes.scenarios import sample_scene
 from physion.scenes.scene import Body, Scene
@@ -333,9 +333,26 @@ def test_what_cannot_be_placed_says_why() -> None:
     tight = drape.AnchorRule(between=(0.0, 0.0), jitter=0.0)
     with pytest.raises(BadSceneError, match=r"anchor_right .*100 tries.*anchor_left"):
         draw("drape", drape.Params(anchors=tight), 0)
-    short = drape.AnchorRule(height=0.2, height_jitter=0.3)
-    with pytest.raises(BadInputError, match=r"height_jitter is 0\.3 m.*height \(0\.2\)"):
-        draw("drape", drape.Params(anchors=short), 0)
+
+
+@pytest.mark.parametrize("key", ["height", "extra_height"])
+def test_anchors_keep_some_height(key: str) -> None:
+    text = 'scenario = "drape"\n[presets.low.params]\nanchors = { height_jitter = 0.7, '
+    higher = parse_presets(text + "height = 0.71, extra_height = 0.8 }", "own.toml")["low"].params
+    draw("drape", higher, 0)
+    said = rf"anchors: height_jitter is 0\.7 m and {key} 0\.704 m; at least 0\.005 m must be left"
+    values = {"height": 0.71, "extra_height": 0.71, key: 0.704}
+    with pytest.raises(BadInputError, match=f"^own.toml: preset 'low': {said}"):
+        parse_presets(text + ", ".join(f"{k} = {v}" for k, v in values.items()) + " }", "own.toml")
+    low = drape.AnchorRule(height_jitter=0.7, **values)
+    with pytest.raises(BadInputError, match=f"^parameters of drape: {said}"):
+        draw("drape", drape.Params(anchors=low), 0)
+
+
+def test_props_have_the_numbers_of_python() -> None:
+    """Those of numpy would be printed as such in messages."""
+    scene = draw("drape", drape.Params(), 0)
+    assert {type(side) for one in scene.bodies for side in one.scale} == {float}
 
 
 def test_cloth_over_the_zone_touches_it_and_cloth_beside_it_does_not() -> None:

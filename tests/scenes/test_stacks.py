@@ -8,22 +8,24 @@ import math
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
 from sound_scenes import body, hulls, overlap
 
-from physion.errors import BadSceneError
+from physion.errors import BadInputError, BadSceneError
 from physion.physics.engine import simulate
 from physion.scenes import contain, link, support
 from physion.scenes.clearance import GAP, beside, cleared, needed_rise
-from physion.scenes.parameters import Range, yaw
+from physion.scenes.parameters import LEAST_MASS, Range, yaw
 from physion.scenes.placement import world_bounds
-from physion.scenes.preset import get_preset, load_presets
+from physion.scenes.preset import get_preset, load_presets, parse_presets
 from physion.scenes.prop_shapes import NATURAL_SIZES
+from physion.scenes.scenarios import sample_scene
 from physion.scenes.scene import Body, Scene
 from physion.scenes.shapes import TORUS_INNER
-from physion.scenes.stacks import SMALLEST, choose, top_of, weighed
+from physion.scenes.stacks import SMALLEST, StackRule, choose, top_of, weighed
 from physion.scenes.tdw import read_scenes
 from physion.seeds import trial_seed
 
@@ -111,6 +113,34 @@ def test_masses_are_those_of_the_official_logs() -> None:
     scene = draw(link, link.Params(stand=stand))
     assert body(scene, "base").mass == body(scene, "cap").mass == pytest.approx(0.864)
     assert body(scene, "attachment").mass == pytest.approx(0.4241, abs=1e-4)
+
+
+def test_no_body_is_lighter_than_the_least_mass() -> None:
+    member = dataclasses.replace(link.LINKS.member, mass=(0.001, 0.001), scale=(0.005, 0.005))
+    stack = dataclasses.replace(link.LINKS, member=member, count=(2, 2))
+    scene = draw(link, link.Params(stack=stack))
+    assert {one.mass for one in (body(scene, "target"), *members(scene, "member"))} == {LEAST_MASS}
+
+
+@pytest.mark.parametrize("module", [contain, link])
+@pytest.mark.parametrize("count", ["0", "[0, 1]"])
+def test_the_agent_is_one_of_at_least_one(module: ModuleType, count: str) -> None:
+    name = module.__name__.rpartition(".")[2]
+    text = f'scenario = "{name}"\n[presets.few.params]\nstack.count = '
+    with pytest.raises(
+        BadInputError, match=r"^own\.toml: preset 'few': stack: count is 0, allowed is 1 to 50$"
+    ):
+        parse_presets(text + count, "own.toml")
+    assert parse_presets(text + "1", "own.toml")["few"].params.stack.count == (1, 1)
+    seed = trial_seed("test", name, "train", 0)
+    none = dataclasses.replace(module.Params().stack, count=(0, 1))
+    with pytest.raises(BadInputError, match=f"parameters of {name}: stack: count is 0, allowed"):
+        sample_scene(name, seed, module.Params(stack=none))
+    with pytest.raises(BadInputError, match="stack must be a FilledStackRule, not a StackRule"):
+        sample_scene(name, seed, module.Params(stack=StackRule(count=(0, 1))))
+    # A tower may be nothing but what is on its top.
+    empty = support.Params(stack=dataclasses.replace(support.BLOCKS, count=(0, 0)))
+    assert not members(sample_scene("support", seed, empty), "block")
 
 
 def test_choice_of_the_agent() -> None:
@@ -264,8 +294,9 @@ def test_official_trials_could_have_been_drawn(scenario: str, official: Path) ->
                 assert within([one.scale[axis] - grown], limits(params.stack.member.scale, axis))
             aside = [abs(one.position[axis]) / one.scale[axis] for axis in (0, 1)]
             assert within(aside, (0.0, params.stack.jitter))
-            unit = dataclasses.replace(one, mass=1.0)
-            assert within([one.mass / weighed(unit, share).mass], params.stack.member.mass)
+            # Some official blocks are so small that a cube of 1 kg would be below the least mass.
+            heavy = dataclasses.replace(one, mass=1e4)
+            assert within([1e4 * one.mass / weighed(heavy, share).mass], params.stack.member.mass)
             assert one.shape in params.stack.member.shapes
         if scenario == "link":
             assert len(scene.joints) == params.stand.attached + params.stand.capped

@@ -11,7 +11,7 @@ from physion.scenes.placement import CameraRule, SceneryRule
 from physion.scenes.rules import BodyRule, PushRule, ZoneRule
 from physion.scenes.scenarios import scenario
 from physion.scenes.scene import Scene, Vec3
-from physion.scenes.stacks import StackRule, StandRule
+from physion.scenes.stacks import FilledStackRule, StandRule
 from physion.scenes.standing import sample_standing
 
 ATTACHMENT_COLOR: Vec3 = (0.8, 0.8, 0.8)
@@ -21,7 +21,7 @@ STAND = StandRule(
     False,
     BodyRule(("bowl",), (0.6, 0.6), mass=(3.0, 3.0), textures=("wood_ash",)),
 )
-CONTAINED = StackRule(
+CONTAINED = FilledStackRule(
     BodyRule(
         ("sphere",),
         (0.2, 0.4),
@@ -61,7 +61,7 @@ class Params:
 
     length: Length = 2.0
     stand: StandRule = STAND
-    stack: StackRule = CONTAINED
+    stack: FilledStackRule = CONTAINED
     choice: Counts = (0, 50)
     zone: ZoneRule = ZONE
     probe: BodyRule = PROBE

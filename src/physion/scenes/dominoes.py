@@ -121,7 +121,7 @@ def _row(
     def attempt() -> str | None:
         row[:] = _draw_row(params, rng, looks, *free)
         if len(row) < params.middles:
-            return f"no room left for number {len(row) + 1} of {params.middles}"
+            return f"no room left for all {params.middles} in the middle"
         return None
 
     place(ROW_TRIES, f"a row of dominoes {params.length:g} m long", attempt)

@@ -10,13 +10,12 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from physion.errors import BadInputError
 from physion.scenes.parameters import (
+    SMALLEST_SIDE,
     Length,
     Lengths,
     Masses,
     Materials,
-    Multiples,
     Offsets,
     Place,
     Props,
@@ -26,6 +25,8 @@ from physion.scenes.parameters import (
     Shapes,
     Share,
     Shares,
+    Sides,
+    SizeFactors,
     pick,
     place,
     uniform,
@@ -79,7 +80,7 @@ class ClothRule:
     - ``x``, ``y``, ``height``: metres, of its centre. ``mass``: kg. ``textures``: materials.
     """
 
-    size: Lengths = (2.0, 2.0)
+    size: Sides = (2.0, 2.0)
     stretch: Shares = (0.0, 1.0)
     bend: Shares = (0.0, 1.0)
     tether: Shares = (0.0, 1.0)
@@ -104,8 +105,8 @@ class AnchorRule:
     """
 
     shapes: Shapes = ("cone", "cube", "cylinder", "pyramid", "triangular_prism")
-    width: Lengths = (0.1, 0.3)
-    depth: Lengths = (0.2, 0.5)
+    width: Sides = (0.1, 0.3)
+    depth: Sides = (0.2, 0.5)
     height: Length = 0.6
     height_jitter: Length = 0.2
     taller: Length = 0.1
@@ -118,6 +119,16 @@ class AnchorRule:
     mass: Masses = (25.0, 25.0)
     textures: Materials = FAMILIES
 
+    def check_values(self) -> str | None:
+        """What is wrong with values that are good one by one, or None."""
+        for key, height in (("height", self.height), ("extra_height", self.extra_height)):
+            if height - self.height_jitter < SMALLEST_SIDE:
+                return (
+                    f"height_jitter is {self.height_jitter:g} m and {key} {height:g} m; "
+                    f"at least {SMALLEST_SIDE:g} m must be left"
+                )
+        return None
+
 
 @dataclass(frozen=True)
 class PropRule:
@@ -128,7 +139,7 @@ class PropRule:
     """
 
     props: Props = tuple(SETTINGS)
-    size: Multiples = (1.0, 1.0)
+    size: SizeFactors = (1.0, 1.0)
     shift: Place = (0.0, 0.0)
     mass: Masses = (100.0, 100.0)
     textures: Materials = FAMILIES
@@ -199,7 +210,8 @@ def _draw_cloth(rule: ClothRule, rng: np.random.Generator, palette: Palette) -> 
 def _draw_prop(rule: PropRule, rng: np.random.Generator, palette: Palette) -> Body:
     name = pick(rng, rule.props)
     found = SETTINGS.get(name, Setting(NATURAL_SIZES[name], OTHER_PLACE))
-    width, depth, height = np.array(found.size) * uniform(rng, rule.size)
+    factor = uniform(rng, rule.size)
+    width, depth, height = (side * factor for side in found.size)
     across = found.turn_deg % 180 != 0
     return Body(
         "prop",
@@ -217,11 +229,6 @@ def _draw_anchors(
     rule: AnchorRule, rng: np.random.Generator, palette: Palette, prop: Body
 ) -> list[Body]:
     """The anchors left and right, and perhaps the extra one."""
-    if rule.height_jitter >= min(rule.height, rule.extra_height):
-        raise BadInputError(
-            f"drape: anchors.height_jitter is {rule.height_jitter:g} m; it must be less than "
-            f"anchors.height ({rule.height:g}) and anchors.extra_height ({rule.extra_height:g})"
-        )
     left, right = rule.between
     rightwards, leftwards = (0.0, rule.jitter), (-rule.jitter, 0.0)
     wanted = [

@@ -11,7 +11,7 @@ from physion.scenes.placement import CameraRule, SceneryRule
 from physion.scenes.rules import BodyRule, PushRule, ZoneRule
 from physion.scenes.scenarios import scenario
 from physion.scenes.scene import Scene, Vec3
-from physion.scenes.stacks import StackRule, StandRule
+from physion.scenes.stacks import FilledStackRule, StandRule
 from physion.scenes.standing import sample_standing
 
 STAND_COLOR: Vec3 = (1.0, 1.0, 1.0)
@@ -27,7 +27,7 @@ STAND = StandRule(
     ),
     True,
 )
-LINKS = StackRule(
+LINKS = FilledStackRule(
     BodyRule(
         ("torus",),
         (0.3, 0.3),
@@ -66,7 +66,7 @@ class Params:
 
     length: Length = 2.0
     stand: StandRule = STAND
-    stack: StackRule = LINKS
+    stack: FilledStackRule = LINKS
     choice: Counts = (0, 50)
     zone: ZoneRule = ZONE
     probe: BodyRule = PROBE

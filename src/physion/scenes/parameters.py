@@ -19,7 +19,7 @@ from typing import Annotated, Any, TypeAlias
 import numpy as np
 
 from physion.errors import BadInputError, BadSceneError, UnknownNameError
-from physion.scenes.scene import Quat, Vec3
+from physion.scenes.scene import Ending, Quat, Vec3
 
 ROOMS = ("box", "bright", "empty")
 
@@ -54,12 +54,20 @@ class NamesOf:
 
 Length = Annotated[float, Quantity("m", 0.0, 50.0)]
 Lengths = Annotated[Range, Quantity("m", 0.0, 50.0)]
+SMALLEST_SIDE = 0.005
+"""Metres: no body is thinner, so that none vanishes."""
+Sides = Annotated[Range, Quantity("m", SMALLEST_SIDE, 50.0)]
+"""Lengths of a thing's sides."""
+Distances = Annotated[Range, Quantity("m", 0.1, 50.0)]
+"""Lengths between things that may not be at the same place."""
 Offsets = Annotated[Range, Quantity("m", -50.0, 50.0)]
 Place = Annotated[tuple[float, float], Quantity("m as [x, y]", -50.0, 50.0)]
-Sizes = Annotated[Axes, Quantity("m", 0.005, 200.0)]
-"""Scale of a shape whose unit size is about a metre; the smallest is 5 mm, so none vanishes."""
+Sizes = Annotated[Axes, Quantity("m", SMALLEST_SIDE, 200.0)]
+"""Scale of a shape whose unit size is about a metre."""
 Slope = Annotated[float, Quantity("m", -1.0, 1.0)]
-Masses = Annotated[Range, Quantity("kg", 0.001, 10000.0)]
+LEAST_MASS = 0.001
+"""Kilogrammes: no body is lighter."""
+Masses = Annotated[Range, Quantity("kg", LEAST_MASS, 10000.0)]
 Angles = Annotated[Range, Quantity("degrees", -360.0, 360.0)]
 Angle = Annotated[float, Quantity("degrees", -360.0, 360.0)]
 Turns = Annotated[Axes, Quantity("degrees", -360.0, 360.0)]
@@ -67,13 +75,18 @@ Turns = Annotated[Axes, Quantity("degrees", -360.0, 360.0)]
 Share = Annotated[float, Quantity("", 0.0, 1.0)]
 Shares = Annotated[Range, Quantity("", 0.0, 1.0)]
 Multiples = Annotated[Range, Quantity("times", 0.0, 100.0)]
+SizeFactors = Annotated[Range, Quantity("times", 0.01, 100.0)]
+"""Multiples of a size, which leave something of it."""
 Multiple = Annotated[float, Quantity("times", -100.0, 100.0)]
 Speeds = Annotated[Range, Quantity("m/s", 0.0, 100.0)]
 Frictions = Annotated[Range, Quantity("", 0.0, 10.0)]
-FrameRange = Annotated[Range, Quantity("frames", 0.0, 10000.0)]
+EarlyFrames = Annotated[Range, Quantity("frames", 0.0, Ending().min_frames - 1.0)]
+"""Frames that every trial has: one whose bodies are all at rest ends after them."""
 Count = Annotated[int, Quantity("", 0, 50)]
 Counts = Annotated[tuple[int, int], Quantity("", 0, 50)]
 """Fewest and most, both possible."""
+CountsFromOne = Annotated[tuple[int, int], Quantity("", 1, 50)]
+"""`Counts` of what there must be at least one of."""
 Shapes = Annotated[tuple[str, ...], NamesOf("shape")]
 """One of these is chosen, each as likely; so with materials and props."""
 Materials = Annotated[tuple[str, ...], NamesOf("material")]
@@ -177,12 +190,35 @@ def read_params(kind: type[Any], table: Mapping[str, Any], where: str, base: Any
 
 def check_params(params: Any, where: str) -> None:
     """Raise `BadInputError` where a value of ``params`` is not one that a file could give."""
+    _check_each(params, where)
+    check_together(params, where)
+
+
+def _check_each(params: Any, where: str) -> None:
     for key, hint in _hints(type(params)).items():
         value = getattr(params, key)
-        if dataclasses.is_dataclass(value):
-            check_params(value, f"{where}: {key}")
-        else:
+        if not dataclasses.is_dataclass(hint):
             _read(hint, value, f"{where}: {key}", value)
+        elif isinstance(value, kind := typing.cast(type[Any], hint)):
+            _check_each(value, f"{where}: {key}")
+        else:
+            given = type(value).__name__
+            raise BadInputError(f"{where}: {key} must be a {kind.__name__}, not a {given}")
+
+
+def check_together(params: Any, where: str) -> None:
+    """Raise `BadInputError` where values are good one by one, but not with one another.
+
+    Parameters, and those nested in them, say so by a method ``check_values``: it returns what is
+    wrong, beginning with the key, or None.
+    """
+    for key, hint in _hints(type(params)).items():
+        if dataclasses.is_dataclass(hint):
+            check_together(getattr(params, key), f"{where}: {key}")
+    check = getattr(params, "check_values", None)
+    wrong = None if check is None else check()
+    if wrong is not None:
+        raise BadInputError(f"{where}: {wrong}")
 
 
 def drawn_limits(params: Any) -> dict[str, str]:
@@ -195,6 +231,13 @@ def drawn_limits(params: Any) -> dict[str, str]:
         else:
             allowed[key] = _word(hint)
     return allowed
+
+
+def _told(value: Any) -> str:
+    """A value as a file would have it, also if it is one of numpy's."""
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_told, value))}]"
+    return repr(value.item() if isinstance(value, np.generic) else value)
 
 
 def _hints(kind: Any) -> dict[str, Any]:
@@ -231,7 +274,7 @@ def _read(hint: Any, value: Any, where: str, base: Any) -> Any:
     if isinstance(note, NamesOf):
         return _read_names(typing.get_args(hint)[0] is str, value, where, note)
     if type(value) is not hint:
-        raise BadInputError(f"{where} must be {_word(hint)}, not {value!r}")
+        raise BadInputError(f"{where} must be {_word(hint)}, not {_told(value)}")
     return value
 
 
@@ -239,7 +282,7 @@ def _read_names(single: bool, value: Any, where: str, note: NamesOf) -> Any:
     kind = note.kind
     names = [value] if isinstance(value, str) else value
     if not isinstance(names, list | tuple) or not names or (single and len(names) > 1):
-        raise BadInputError(f"{where} must name a {kind}, not {value!r}")
+        raise BadInputError(f"{where} must name a {kind}, not {_told(value)}")
     known = note.names or _known_names(kind)
     for name in names:
         if not isinstance(name, str) or name not in known:
@@ -275,7 +318,7 @@ def _read_quantity(kind: Any, value: Any, where: str, quantity: Quantity) -> Any
         return (_number(int, low, where, quantity), _number(int, high, where, quantity))
     if quantity == _note(Place):
         if not isinstance(value, list | tuple) or len(value) != 2:
-            raise BadInputError(f"{where} must be a place [x, y] in m, not {value!r}")
+            raise BadInputError(f"{where} must be a place [x, y] in m, not {_told(value)}")
         return tuple(_number(float, part, where, quantity) for part in value)
     return _range(value, where, quantity)
 
@@ -285,19 +328,19 @@ def _range(value: Any, where: str, quantity: Quantity) -> Range:
         number = _number(float, value, where, quantity)
         return (number, number)
     if len(value) != 2:
-        raise BadInputError(f"{where} must be a number or [smallest, largest], not {value!r}")
+        raise BadInputError(f"{where} must be a number or [smallest, largest], not {_told(value)}")
     low, high = (_number(float, part, where, quantity) for part in value)
     if low > high:
-        raise BadInputError(f"{where} must go from smaller to larger, not {value!r}")
+        raise BadInputError(f"{where} must go from smaller to larger, not [{low:g}, {high:g}]")
     return (low, high)
 
 
 def _number(kind: type[Any], value: Any, where: str, quantity: Quantity) -> Any:
     unit = f" in {quantity.unit}" if quantity.unit else ""
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise BadInputError(f"{where} must be a number{unit} ({quantity}), not {value!r}")
+        raise BadInputError(f"{where} must be a number{unit} ({quantity}), not {_told(value)}")
     if kind is int and isinstance(value, float) and not value.is_integer():
-        raise BadInputError(f"{where} must be a whole number ({quantity}), not {value!r}")
+        raise BadInputError(f"{where} must be a whole number ({quantity}), not {_told(value)}")
     if not quantity.low <= value <= quantity.high:  # false for NaN too
         # A whole number may be too large for a float.
         shown = f"{value:g}" if isinstance(value, float) else f"{value!s:.20}"
@@ -308,7 +351,8 @@ def _number(kind: type[Any], value: Any, where: str, quantity: Quantity) -> Any:
 def place(tries: int, what: str, attempt: typing.Callable[[], str | None]) -> None:
     """Call ``attempt`` until it returns None, at most ``tries`` times.
 
-    It returns what stands in the way otherwise; `BadSceneError` counts what did so most often.
+    It returns what stands in the way otherwise; `BadSceneError` says what did so most often. That
+    is to be free of what was drawn, so that draws which fail for the same reason can be counted.
     """
     reasons: dict[str, int] = {}
     for _ in range(tries):
@@ -316,6 +360,6 @@ def place(tries: int, what: str, attempt: typing.Callable[[], str | None]) -> No
         if reason is None:
             return
         reasons[reason] = reasons.get(reason, 0) + 1
-    worst = sorted(reasons.items(), key=lambda item: -item[1])
-    counted = "; ".join(f"{reason} ({count} of {tries})" for reason, count in worst[:3])
-    raise BadSceneError(f"{what} could not be placed in {tries} tries: {counted}")
+    raise BadSceneError(
+        f"{what} could not be placed in {tries} tries: {max(reasons, key=lambda one: reasons[one])}"
+    )

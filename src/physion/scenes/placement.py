@@ -6,10 +6,11 @@ addition: a camera that does not see agent and patient is drawn again.
 
 from __future__ import annotations
 
-import dataclasses
+import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,12 +20,14 @@ from physion.scenes.looks import prop_look
 from physion.scenes.parameters import (
     Angle,
     Angles,
-    Count,
+    Distances,
     Lengths,
     Props,
+    Quantity,
     Range,
     Share,
     Shares,
+    Sides,
     pick,
     uniform,
     yaw,
@@ -40,6 +43,15 @@ CAMERA_TRIES = 200
 NEAREST_OCCLUDER = 0.85
 """Largest share of the way to the camera at which scenery may stand."""
 
+STEPS_ASIDE = (0, 1, -1, 2, -2, 3, -3, 4, -4, 5, -5, 6, -6)
+"""Places at which a prop is tried, one after the other, in angles between neighbours."""
+FARTHER = (1.0, 1.5)
+"""Rows in which places are tried, in times the distance that was drawn."""
+FARTHEST_ASIDE = math.radians(80.0)
+"""Places more than a few steps aside are at most this far from straight behind or before."""
+
+PropCount = Annotated[int, Quantity("", 0, 12)]
+
 
 @dataclass(frozen=True, slots=True)
 class CameraRule:
@@ -52,7 +64,7 @@ class CameraRule:
     - ``mirror``: chance that left and right (the signs of x) are swapped.
     """
 
-    radius: Lengths = (1.75, 1.75)
+    radius: Distances = (1.75, 1.75)
     angle_deg: Angles = (45.0, 225.0)
     height: Lengths = (0.75, 2.0)
     mirror: Share = 0.0
@@ -67,8 +79,8 @@ class SceneryRule:
     occluder's top ends.
     """
 
-    distractors: Count = 0
-    occluders: Count = 0
+    distractors: PropCount = 0
+    occluders: PropCount = 0
     distractor_props: Props = ("full",)
     occluder_props: Props = ("vase", "plant", "lamp", "globe")
     distractor_distance: Shares = (0.4, 1.0)
@@ -76,8 +88,8 @@ class SceneryRule:
     distractor_spacing_deg: Angle = 15.0
     occluder_spacing_deg: Angle = 10.0
     yaw_deg: Angle = 30.0
-    distractor_size: Lengths = (0.5, 1.5)
-    occluder_size: Lengths = (0.25, 1.5)
+    distractor_size: Sides = (0.5, 1.5)
+    occluder_size: Sides = (0.25, 1.5)
     occlusion: Share = 0.75
 
 
@@ -132,8 +144,8 @@ def place_camera(
         camera = Camera((x, y, uniform(rng, rule.height)), (0.0, 0.0, aim_height))
         if all(max(map(abs, on_screen(camera, center))) < 0.98 for center in centers):
             return camera
-    names = [body.name for body in seen]
-    raise BadSceneError(f"no camera of {rule} shows {names}; widen its ranges or move it away")
+    names = " and ".join(body.name for body in seen)
+    raise BadSceneError(f"no camera shows {names}: widen the camera's ranges or move it away")
 
 
 def place_scenery(
@@ -159,7 +171,7 @@ def place_scenery(
         spacing = math.radians(rule.occluder_spacing_deg)
         turn = (i - (rule.occluders - 1) / 2) * spacing
         size = _occluding_size(drawn, camera, keep_out, turn, rule)
-        drawn = dataclasses.replace(drawn, size=size)
+        drawn = replace(drawn, size=size)
         placed.append(_first_free(drawn, camera, keep_out, turn, spacing, placed))
     return tuple(placed)
 
@@ -202,12 +214,18 @@ def _first_free(
     spacing: float,
     placed: Sequence[Body],
 ) -> Body:
-    """The prop at its angle or, where another prop is, a few steps of ``spacing`` beside it."""
-    for step in (0, 1, -1, 2, -2, 3, -3):
-        body = _standing(drawn, camera, keep_out, turn + step * spacing)
+    """The prop at its angle or, where another prop is, steps of ``spacing`` beside it or behind."""
+    for times, step in itertools.product(FARTHER, STEPS_ASIDE):
+        at = turn + step * spacing
+        if abs(step) > 3 and abs(math.cos(at)) < math.cos(FARTHEST_ASIDE):
+            continue
+        body = _standing(replace(drawn, share=drawn.share * times), camera, keep_out, at)
         if not any(_footprints_meet(body, other) for other in placed):
-            break
-    return body
+            return body
+    raise BadSceneError(
+        f"no room for {drawn.name} beside {placed[-1].name}: make scenery fewer or smaller, or "
+        "its spacing wider"
+    )
 
 
 def _standing(drawn: _Drawn, camera: Camera, keep_out: NDArray[np.float64], turn: float) -> Body:

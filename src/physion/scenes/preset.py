@@ -2,7 +2,8 @@
 
 A preset file is TOML. ``scenario`` names whose parameters it fills; ``[shared]`` holds what all
 its presets have; each ``[presets.NAME]`` has its own ``params`` and may say what it is ``about``,
-which preset it is ``based_on``, and, for a published configuration, its ``official`` name, its
+which preset it is ``based_on`` (one before it in the file, or one that comes with the scenario),
+and, for a published configuration, its ``official`` name, its
 ``seed`` and what was ``published`` about its trials. Keys and units are those of the scenario's
 ``Params``; ``physion ls presets SCENARIO`` prints them.
 """
@@ -15,14 +16,15 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from physion.errors import BadInputError, UnknownNameError
-from physion.scenes.parameters import read_params
+from physion.scenes.parameters import Quantity, check_together, read_params
 from physion.scenes.scenarios import scenarios
 
 DEFAULT, FAMILIARIZATION, DEBUG = "default", "familiarization", "debug"
 """Presets that every scenario has besides the published ones."""
+Trials = Annotated[int, Quantity("", 0, 1_000_000)]
 _PRESET_KEYS = ("about", "based_on", "official", "seed", "published", "params")
 _FILE_KEYS = ("scenario", "shared", "presets")
 
@@ -36,12 +38,12 @@ class Published:
     - ``readout_trials``, ``readout_contact``: the same of the readout set.
     """
 
-    trials: int
-    contact: int
-    frames: float
-    tested: int = 0
-    readout_trials: int = 0
-    readout_contact: int = 0
+    trials: Trials
+    contact: Trials
+    frames: Annotated[float, Quantity("frames", 0.0, 10000.0)]
+    tested: Trials = 0
+    readout_trials: Trials = 0
+    readout_contact: Trials = 0
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ def load_presets(scenario: str) -> Mapping[str, Preset]:
     file = resources.files("physion.scenes").joinpath("presets", f"{scenario}.toml")
     if not file.is_file():
         return {DEFAULT: Preset(DEFAULT, scenario, kind())}
-    return parse_presets(file.read_text(encoding="utf-8"), f"presets/{scenario}.toml")
+    return parse_presets(file.read_text(encoding="utf-8"), f"presets/{scenario}.toml", own=False)
 
 
 def get_preset(scenario: str, name: str) -> Preset:
@@ -114,8 +116,11 @@ def read_preset_file(path: Path) -> Mapping[str, Preset]:
     return parse_presets(text, str(path))
 
 
-def parse_presets(text: str, where: str) -> Mapping[str, Preset]:
-    """The presets of a file's ``text``; ``where`` names it in errors."""
+def parse_presets(text: str, where: str, *, own: bool = True) -> Mapping[str, Preset]:
+    """The presets of a file's ``text``; ``where`` names it in errors.
+
+    Those of one's ``own`` may be based on presets that come with the scenario.
+    """
     try:
         data = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
@@ -125,7 +130,9 @@ def parse_presets(text: str, where: str) -> Mapping[str, Preset]:
     if not isinstance(scenario, str):
         raise BadInputError(f"{where} needs scenario = one of {scenarios.names()}")
     kind = scenarios.get(scenario).params
-    shared = read_params(kind, _table(data, "shared", where), f"{where}: shared")
+    common = _table(data, "shared", where)
+    shared = read_params(kind, common, f"{where}: shared")
+    known = load_presets(scenario) if own else {}
     presets: dict[str, Preset] = {}
     for name, entry in _table(data, "presets", where).items():
         here = f"{where}: preset {name!r}"
@@ -134,10 +141,20 @@ def parse_presets(text: str, where: str) -> Mapping[str, Preset]:
         _check_keys(entry, _PRESET_KEYS, here)
         base = shared
         if "based_on" in entry:
-            if entry["based_on"] not in presets:
-                raise BadInputError(f"{here} is based on {entry['based_on']!r}, not yet in {where}")
-            base = presets[entry["based_on"]].params
+            chosen = entry["based_on"]
+            if not isinstance(chosen, str):
+                raise BadInputError(f"{here}: based_on must name a preset, not {chosen!r}")
+            if chosen in presets:
+                base = presets[chosen].params
+            elif chosen in known:
+                base = read_params(kind, common, f"{where}: shared", known[chosen].params)
+            else:
+                raise BadInputError(
+                    f"{here}: based_on {chosen!r} is neither before it in {where} nor among the "
+                    f"presets of {scenario}"
+                )
         params = read_params(kind, _table(entry, "params", here), here, base)
+        check_together(params, here)
         presets[name] = _preset(name, scenario, params, entry, here)
     return presets
 
@@ -146,12 +163,7 @@ def _preset(name: str, scenario: str, params: Any, entry: Mapping[str, Any], her
     for key, kind in (("about", str), ("official", str), ("seed", int)):
         if key in entry and type(entry[key]) is not kind:
             raise BadInputError(f"{here}: {key} must be {kind.__name__}, not {entry[key]!r}")
-    published = None
-    if "published" in entry:
-        try:
-            published = Published(**entry["published"])
-        except TypeError as error:
-            raise BadInputError(f"{here}: published: {error}") from error
+    published = _published(_table(entry, "published", here), here) if "published" in entry else None
     return Preset(
         name,
         scenario,
@@ -161,6 +173,15 @@ def _preset(name: str, scenario: str, params: Any, entry: Mapping[str, Any], her
         entry.get("seed"),
         published,
     )
+
+
+def _published(table: Mapping[str, Any], here: str) -> Published:
+    missing = [key for key in ("trials", "contact", "frames") if key not in table]
+    if missing:
+        raise BadInputError(f"{here}: published lacks {', '.join(missing)}")
+    read = read_params(Published, table, f"{here}: published", Published(0, 0, 0.0))
+    assert isinstance(read, Published)
+    return read
 
 
 def _from_file(path: Path, name: str, scenario: str) -> Preset:

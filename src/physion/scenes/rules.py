@@ -10,7 +10,7 @@ import numpy as np
 from physion.errors import BadSceneError
 from physion.scenes.parameters import (
     Angles,
-    FrameRange,
+    EarlyFrames,
     Frictions,
     Length,
     Masses,
@@ -47,7 +47,7 @@ class BodyRule:
     - ``turn_deg``: about the upright, or about three axes. ``mass``: kg. With ``tumbled`` a single
       range gives one angle for all three axes, as the probes of the official Roll have.
     - ``static_friction``, ``dynamic_friction``: drawn apart, but static is never below dynamic
-      (officially it may be). ``restitution``: 0 to 1.
+      (officially it may be), so that their ranges must meet. ``restitution``: 0 to 1.
     - ``textures``: material names or families.
     """
 
@@ -60,6 +60,16 @@ class BodyRule:
     dynamic_friction: Frictions = (0.5, 0.5)
     restitution: Shares = (0.0, 0.0)
     textures: Materials = ("wood_cedar",)
+
+    def check_values(self) -> str | None:
+        """What is wrong with values that are good one by one, or None."""
+        most, least = self.static_friction[1], self.dynamic_friction[0]
+        if most >= least:
+            return None
+        return (
+            f"static_friction is at most {most:g} and dynamic_friction at least {least:g}; static "
+            "friction is never below dynamic friction"
+        )
 
 
 @dataclass(frozen=True)
@@ -95,7 +105,7 @@ class PushRule:
     rise: Multiples = (0.0, 0.0)
     height: Multiple = 0.8
     point_jitter: Length = 0.0
-    frame: FrameRange = (0.0, 0.0)
+    frame: EarlyFrames = (0.0, 0.0)
 
 
 def draw_body(
@@ -134,8 +144,8 @@ def require_apart(one: Body, other: Body) -> None:
     low, high = np.array([world_bounds(body) for body in (one, other)]).transpose(1, 0, 2)
     if (low.max(axis=0) < high.min(axis=0)).all():
         raise BadSceneError(
-            f"{one.name} and {other.name} would start inside each other, at {one.position} and "
-            f"{other.position} m: make the scene longer or the bodies smaller"
+            f"{one.name} and {other.name} would start inside each other: make the scene longer or "
+            "the bodies smaller"
         )
 
 

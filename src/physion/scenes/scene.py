@@ -190,9 +190,10 @@ class Scene:
             )
         for body in self.bodies:
             if not (body.mass > 0 and min(body.scale) > 0):
+                scale = ", ".join(f"{side:g}" for side in body.scale)
                 raise BadSceneError(
                     f"scene {self.name!r}: body {body.name!r} needs a mass and scales above zero, "
-                    f"not {body.mass} kg and {body.scale}"
+                    f"not {body.mass:g} kg and ({scale})"
                 )
 
     def names(self) -> list[str]:

@@ -9,7 +9,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from physion.scenes.clearance import GAP, cleared
-from physion.scenes.parameters import Counts, Share, Slope, draw_count, uniform
+from physion.scenes.parameters import (
+    LEAST_MASS,
+    Counts,
+    CountsFromOne,
+    Share,
+    Slope,
+    draw_count,
+    uniform,
+)
 from physion.scenes.prop_shapes import NATURAL_SIZES
 from physion.scenes.rules import BodyRule, draw_body
 from physion.scenes.scene import Body, Joint, Look
@@ -46,6 +54,13 @@ class StackRule:
     count: Counts = (2, 2)
     gradient: Slope = 0.0
     jitter: Share = 0.0
+
+
+@dataclass(frozen=True)
+class FilledStackRule(StackRule):
+    """A `StackRule` of at least one body: the agent is one of them."""
+
+    count: CountsFromOne = (2, 2)
 
 
 @dataclass(frozen=True)
@@ -88,8 +103,12 @@ class Stand:
 
 
 def weighed(body: Body, share: float = 1.0) -> Body:
-    """The body with a ``share`` of its mass by volume, ``body.mass`` being that of the unit."""
-    return replace(body, mass=body.mass * math.prod(body.scale) / UNIT_VOLUME * share)
+    """The body with a ``share`` of its mass by volume, ``body.mass`` being that of the unit.
+
+    It keeps the least mass that a body may have.
+    """
+    mass = body.mass * math.prod(body.scale) / UNIT_VOLUME * share
+    return replace(body, mass=max(mass, LEAST_MASS))
 
 
 def top_of(body: Body) -> float:

@@ -12,7 +12,7 @@ from physion.scenes.parameters import place
 from physion.scenes.rules import BodyRule, PushRule, ZoneRule, draw_body, draw_push, draw_zone
 from physion.scenes.scene import Body, Look, Roles, Scene, Vec3
 from physion.scenes.stacks import (
-    StackRule,
+    FilledStackRule,
     Stand,
     StandRule,
     choose,
@@ -45,7 +45,7 @@ class Standing(Staged, Protocol):
         ...
 
     @property
-    def stack(self) -> StackRule:
+    def stack(self) -> FilledStackRule:
         """What stands on or in it."""
         ...
 
