@@ -23,9 +23,9 @@ P = TypeVar("P")
 class Scenario:
     """A kind of trial.
 
-    ``params`` is a frozen dataclass that says where its defaults come from, and may have a method
-    ``check_values`` (`physion.scenes.parameters.check_together`). ``sample(params(), seed)`` draws
-    a scene that depends on nothing else.
+    ``params`` is a frozen dataclass with a default for each field, not always the official one, and
+    may have a method ``check_values`` (`physion.scenes.parameters.check_together`).
+    ``sample(params(), seed)`` draws a scene that depends on nothing else.
     """
 
     name: str
