@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -122,6 +123,7 @@ def make_dataset(folder: Path) -> Path:
             index=3,
             preset="default",
             seed="ff",
+            attempt=0,
             look="redyellow",
             width=SIZE,
             height=SIZE,
@@ -137,7 +139,7 @@ def make_dataset(folder: Path) -> Path:
             scene_digest=scene.physics_digest(),
             free_movies=True,
         )
-        labels = label_contact(scene, trajectory)
+        labels = replace(label_contact(scene, trajectory), robust=0.875)
         files["map"] = encode_png(role_map(ids, scene))
         files["trial_file"] = TrialWriter(metadata, scene, trajectory, labels, ids).finish()
         write_files(paths, files)

@@ -23,10 +23,10 @@ class Options:
     """Folder with official files, at any depth."""
     out: Annotated[Path, tyro.conf.Positional]
     """Folder of the dataset to make or to go on with."""
-    name: str = "imported"
-    """Name of the dataset."""
-    split: Literal["training", "readout", "testing", "familiarization"] = "testing"
-    """Which part of the dataset the trials are."""
+    name: str | None = None
+    """Name of the dataset; by default that of our own files, and "imported" for others."""
+    split: Literal["training", "readout", "testing", "familiarization"] | None = None
+    """Which part of the dataset the trials are; by default that of our own files, else testing."""
     scenario: str | None = None
     """The scenario of all files; by default the one that their names say."""
     workers: int = os.cpu_count() or 1

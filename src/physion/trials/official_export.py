@@ -37,7 +37,7 @@ from physion.trials.dataset import Dataset
 from physion.trials.files import encode_png
 from physion.trials.generate import Track
 from physion.trials.layout import TrialPaths
-from physion.trials.official_layout import FOLDERS, redyellow_name, split_name
+from physion.trials.official_layout import FOLDERS, TRIAL_FILE, redyellow_name, split_name
 from physion.trials.official_reader import OfficialFile
 from physion.trials.official_record import trial_stats
 from physion.trials.official_run import OfficialReport, run_all
@@ -192,7 +192,7 @@ def _is_done(job: ExportJob) -> bool:
     try:
         wanted: Metadata = Trial.open(job.paths.trial_file).metadata
         with OfficialFile.open(job.hdf5) as file:
-            found = json.loads(file.text("physion/metadata"))
+            found = json.loads(file.text("physion/metadata")) if file.has(TRIAL_FILE) else None
     except (BadInputError, ValueError):
         return False
     return isinstance(found, dict) and all(

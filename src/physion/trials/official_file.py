@@ -3,8 +3,9 @@
 Names, shapes and encodings are those of reference/official-system.md, section 4, with gzip alone.
 Static arrays all have one entry for each object (the originals leave scenery out of masses and
 frictions, so that they do not line up). What the official layout has no place for stands apart,
-under ``physion/``: the scene, labels and metadata as JSON, the record for ``metadata.json``, and
-the flow in pixels (``flow``: frames, rows, columns, (right, down), half precision).
+under ``physion/``: the scene, labels and metadata as JSON, the record for ``metadata.json``, the
+flow in pixels (``flow``: frames, rows, columns, (right, down), half precision), and the bytes of
+the trial file without passes (``trial_file``), of which an import makes the same trial again.
 """
 
 from __future__ import annotations
@@ -21,10 +22,10 @@ from physion.scenes.scene import Cloth
 from physion.scenes.shapes import shape
 from physion.trials.official_axes import rotation_matrices, swap_axes, to_official_euler
 from physion.trials.official_frames import PASSES, FrameWriter, put
-from physion.trials.official_layout import RAMPS, ROOMS, segmentation_colors, split_name
+from physion.trials.official_layout import RAMPS, ROOMS, TRIAL_FILE, segmentation_colors, split_name
 from physion.trials.official_objects import OfficialObjects, model_name
 from physion.trials.official_record import trial_record
-from physion.trials.trial_file import Trial
+from physion.trials.trial_file import Trial, TrialWriter
 
 NONE = -1
 """Id of an object that a trial does not have."""
@@ -63,12 +64,15 @@ def official_file(trial: Trial) -> tuple[bytes, dict[str, Any]]:
             assert images.flow is not None
             with np.errstate(over="ignore"):
                 flow[frame] = images.flow.astype(np.float16)
-        record = trial_record(writer, static)
+        record = {**trial_record(writer, static), "split": meta.split}
         texts = {"scene": scene.to_json(), "record": json.dumps(record)}
         texts |= {"labels": json.dumps(dataclasses.asdict(trial.labels))}
         texts |= {"metadata": json.dumps(dataclasses.asdict(meta))}
         for name, text in texts.items():
             put(extra, name, np.array(text.encode()))
+        whole = TrialWriter(meta, trial.scene, trial.trajectory, trial.labels, trial.ids).finish()
+        # It is packed already.
+        file.create_dataset(TRIAL_FILE, data=np.frombuffer(whole, np.uint8))
         file.flush()
         return bytes(file.id.get_file_image()), record
 

@@ -39,6 +39,8 @@ from physion.trials.official_layout import (
 from physion.trials.official_run import OfficialReport, run_all
 from physion.trials.plan import SPLITS
 
+IMPORTED = "imported"
+"""Name of a dataset of others' files, unless it is given one."""
 MAX_LIST_BYTES = 2**28
 """Largest metadata.json or labels.csv that is read."""
 
@@ -49,13 +51,14 @@ class ImportJob:
 
     ``source`` is its HDF5 file, or its movie where it has no state. ``scenario`` is None where no
     name betrays it; ``contact`` is the recorded outcome, as far as lists beside the file say so,
-    and ``first_frame`` the first frame of contact.
+    and ``first_frame`` the first frame of contact. ``dataset`` is None where a file of ours may
+    keep the name that it has, and those of others are `IMPORTED`.
     """
 
     source: Path
     paths: TrialPaths
     index: int
-    dataset: str
+    dataset: str | None
     contact: bool | None = None
     first_frame: int | None = None
 
@@ -64,24 +67,26 @@ def import_official(
     folder: Path,
     out: Path,
     *,
-    name: str = "imported",
-    split: str = "testing",
+    name: str | None = None,
+    split: str | None = None,
     scenario: str | None = None,
     executor: Executor | None = None,
     track: Track | None = None,
 ) -> OfficialReport:
     """Bring every official trial under ``folder`` into the dataset ``out``, then index it.
 
-    ``name`` is the dataset's; ``split`` is where the trials go; ``scenario`` is that of trials
-    whose names do not say it. Trials that are there already are kept, and a bad file fails alone.
-    Raises `BadInputError` where there is no official file at all, or ``out`` holds something else
-    or cannot be written.
+    ``name`` is the dataset's; ``split`` is where the trials go; by default both are those that
+    files of our own come from, else `IMPORTED` and ``testing``. ``scenario`` is that of trials
+    whose names do not say it. Files of our own become the trials that they were made of (see
+    `physion.trials.official_restore`). Trials that are there already are kept, and a bad file fails
+    alone. Raises `BadInputError` where there is no official file at all, or ``out`` holds something
+    else or cannot be written.
     """
-    if split not in SPLITS:
+    if split is not None and split not in SPLITS:
         raise UnknownNameError("split", split, SPLITS)
     if scenario is not None and scenario not in FOLDERS:
         raise UnknownNameError("scenario", scenario, FOLDERS)
-    if not re.fullmatch(SAFE_NAME, name):
+    if name is not None and not re.fullmatch(SAFE_NAME, name):
         raise BadInputError(f"dataset name {name!r} cannot be a file name")
     if not folder.is_dir():
         raise BadInputError(f"folder {folder} does not exist")
@@ -119,7 +124,7 @@ def import_trial(job: ImportJob) -> tuple[str, ...]:
 
 
 def _plan(
-    folder: Path, out: Path, dataset: str, split: str, scenario: str | None
+    folder: Path, out: Path, dataset: str | None, split: str | None, scenario: str | None
 ) -> tuple[dict[str, ImportJob], dict[str, str]]:
     """Jobs by trial name, and why other files cannot be one."""
     sources = list(_sources(folder))
@@ -128,7 +133,7 @@ def _plan(
     lists = _Lists()
     jobs: dict[str, ImportJob] = {}
     failed: dict[str, str] = {}
-    counts: Counter[str] = Counter()
+    counts: Counter[tuple[str, str]] = Counter()
     seen: dict[str, Path] = {}
     for source in sources:
         trial = _trial_name(source)
@@ -149,9 +154,10 @@ def _plan(
             failed[where] = f"there is a trial {trial!r} already: {other}"
         else:
             contact, first = record.get("contact"), record.get("first_frame")
-            paths = TrialPaths(out, split, found, trial)
-            index = counts[found]
-            counts[found] += 1
+            part = split or record.get("split", "testing")
+            paths = TrialPaths(out, part, found, trial)
+            index = counts[part, found]
+            counts[part, found] += 1
             jobs[trial] = ImportJob(source, paths, index, dataset, contact, first)
     return jobs, failed
 
@@ -235,6 +241,8 @@ def _known(row: dict[str, Any]) -> dict[str, Any]:
     }
     if isinstance(row.get("does_target_contact_zone"), bool):
         found["contact"] = row["does_target_contact_zone"]
+    if row.get("split") in SPLITS:
+        found["split"] = row["split"]
     first = row.get("first_target_contact_zone_frame")
     if type(first) is int and first >= 0 and found.get("contact"):
         found["first_frame"] = first

@@ -52,6 +52,8 @@ CLOTH_THRESHOLD = 0.1222
 CLOTH_DISTANCE = CLOTH_THRESHOLD - CLOTH_CONTACT_GAP
 """What ``minimum_distance_target_to_zone`` is more than our gap between the surfaces, so that the
 official threshold tells our outcomes, and our threshold the official ones."""
+TRIAL_FILE = "physion/trial_file"
+"""Where the bytes of the trial file are in an official file of ours."""
 MAX_SIDE = 4096
 """Pixels; larger pictures are refused."""
 FLOW_FULL = 0.02

@@ -151,13 +151,14 @@ class MotionReader:
         for place in self.reader.cloths:
             corners, weights = self._weights(place)
             for_all = [
-                np.einsum("vk,vkj->vj", weights, self._particles(place, frame)[corners])
+                np.einsum("vk,vkj->vj", weights, self.particles(place, frame)[corners])
                 for frame in range(frames)
             ]
             parts.append(np.stack(for_all).astype(np.float32))
         return np.concatenate(parts, axis=1)
 
-    def _particles(self, place: int, frame: int) -> Floats:
+    def particles(self, place: int, frame: int) -> Floats:
+        """Where the particles (P, 3) of a cloth are in a frame, ours."""
         path = f"{self.reader.frames[frame]}/particles/{self.reader.ids[place]}"
         found = swap_axes(self.reader.file.numbers(path, (None, 4))[:, :3])
         if len(found) < 4 or not np.isfinite(found).all():
@@ -166,7 +167,7 @@ class MotionReader:
 
     def _resolution(self, place: int) -> int:
         """Vertices along a side of the sheet with about as many vertices as there are particles."""
-        count = len(self._particles(place, 0))
+        count = len(self.particles(place, 0))
         return int(np.clip(round(np.sqrt(count)), 2, MAX_RESOLUTION))
 
     def _weights(self, place: int) -> tuple[NDArray[np.int64], Floats]:
@@ -177,7 +178,7 @@ class MotionReader:
         """
         reader = self.reader
         turn = rotation_matrices(reader.motion.rotations[0, place])
-        flat = (self._particles(place, 0) - reader.motion.positions[0, place]) @ turn
+        flat = (self.particles(place, 0) - reader.motion.positions[0, place]) @ turn
         side = self._resolution(place)
         along_x, along_y = (np.linspace(-s, s, side) for s in reader.scales[place][:2])
         grid = np.stack(np.meshgrid(along_x, along_y, indexing="ij"), axis=-1).reshape(-1, 2)

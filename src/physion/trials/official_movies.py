@@ -31,6 +31,12 @@ _MATRICES = {_BT709: Colorspace.ITU709}
 PICTURES = "images/_img"
 
 
+def beside(path: Path, folder: str, name: str) -> Path | None:
+    """A file of PhysionTest-Core that belongs to one in a folder beside its own, if it is there."""
+    found = path.parent.parent / folder / name
+    return found if found.is_file() and not found.is_symlink() else None
+
+
 class SourceMovie:
     """An official movie file: what it says of itself, and its frames. `BadInputError` if broken."""
 

@@ -143,14 +143,18 @@ class OfficialFile(AbstractContextManager["OfficialFile"]):
             raise self.bad(path, "holds more text than can be true")
         return [text.rstrip(b"\0").decode("utf-8", "replace") for text in texts]
 
-    def picture(self, path: str) -> NDArray[np.uint8]:
-        """The PNG or JPEG picture (H, W, 3) whose bytes are at ``path``."""
+    def data(self, path: str) -> bytes:
+        """The bytes at ``path``, an array of them."""
         dataset = self._dataset(path)
         if dataset.dtype != np.uint8 or len(dataset.shape) != 1:
-            raise self.bad(path, f"is {dataset.dtype} {dataset.shape}, not the bytes of a picture")
-        data = self._guard(path, lambda: dataset[()])
+            raise self.bad(path, f"is {dataset.dtype} {dataset.shape}, not a row of bytes")
+        return bytes(self._guard(path, lambda: dataset[()]))
+
+    def picture(self, path: str) -> NDArray[np.uint8]:
+        """The PNG or JPEG picture (H, W, 3) whose bytes are at ``path``."""
+        data = np.frombuffer(self.data(path), np.uint8)
         try:
-            return decode_picture(np.asarray(data))
+            return decode_picture(data)
         except BadInputError as error:
             raise self.bad(path, f"is {error}") from error
 

@@ -14,7 +14,7 @@ from physion.physics.trajectory import Trajectory
 from physion.rendering.renderer import Renderer, role_map
 from physion.scenes.scene import FRAME_TIME, OBSERVED_FRAMES, PLAYBACK_RATE, Scene
 from physion.trials.files import encode_png, write_files
-from physion.trials.official_import import ImportJob
+from physion.trials.official_import import IMPORTED, ImportJob
 from physion.trials.official_motion import MotionReader
 from physion.trials.official_movies import (
     PICTURES,
@@ -24,6 +24,7 @@ from physion.trials.official_movies import (
     stored_frames,
 )
 from physion.trials.official_reader import OfficialFile
+from physion.trials.official_restore import restored_files, stored_trial
 from physion.trials.official_scene import SceneReader
 from physion.trials.trial_file import Metadata, TrialWriter
 
@@ -44,6 +45,10 @@ def import_state(job: ImportJob) -> tuple[str, ...]:
             raise file.bad(
                 "frames", f"holds {frames}; nothing is left to predict after {OBSERVED_FRAMES}"
             )
+        stored = stored_trial(motion, trajectory)
+        if stored is not None:
+            write_files(job.paths, restored_files(job, file, reader.frames, stored))
+            return ()
         movies = _movies(job, file, reader, frames)
         ids = _ids(file, reader, scene, trajectory, movies.size if movies else UNSEEN_SIZE)
         said = motion.said
@@ -152,7 +157,7 @@ def imported_metadata(
     """Where an imported trial comes from; ``rate`` is its movies' frames a second."""
     return Metadata(
         trial=job.paths.trial,
-        dataset=job.dataset,
+        dataset=job.dataset or IMPORTED,
         scenario=job.paths.scenario,
         split=job.paths.split,
         index=job.index,

@@ -9,8 +9,6 @@ movie says it.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
@@ -23,7 +21,7 @@ from physion.scenes.scene import OBSERVED_FRAMES, Body, Camera, Roles, Scene
 from physion.trials.files import encode_png, write_files
 from physion.trials.official_import import ImportJob
 from physion.trials.official_layout import decode_picture, plain_name, redyellow_name
-from physion.trials.official_movies import read_movie
+from physion.trials.official_movies import beside, read_movie
 from physion.trials.official_states import imported_metadata
 from physion.trials.trial_file import TrialWriter
 
@@ -40,7 +38,7 @@ def import_movie(job: ImportJob) -> tuple[str, ...]:
         )
     notes = [NOTE]
     free = read_movie(job.source)
-    marked = _beside(job.source, "mp4s-redyellow", f"{redyellow_name(job.paths.trial)}_img.mp4")
+    marked = beside(job.source, "mp4s-redyellow", f"{redyellow_name(job.paths.trial)}_img.mp4")
     own = read_movie(marked, free.frames) if marked is not None else free
     ids = _ids(job, own.size, notes)
     scene, trajectory = _scene(job), _unknown(own.frames)
@@ -66,16 +64,10 @@ def import_movie(job: ImportJob) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _beside(movie: Path, folder: str, name: str) -> Path | None:
-    """A file of PhysionTest-Core that belongs to a movie of its ``mp4s``, if it is there."""
-    path = movie.parent.parent / folder / name
-    return path if path.is_file() and not path.is_symlink() else None
-
-
 def _ids(job: ImportJob, size: tuple[int, int], notes: list[str]) -> NDArray[np.int16]:
     """1 where the map is red, 2 where it is yellow, else 0: (H, W)."""
     name = f"{plain_name(job.paths.trial)}_map.png"
-    path = _beside(job.source, "maps", name)
+    path = beside(job.source, "maps", name)
     if path is None:
         notes.append("no map: agent and patient are not pointed out")
         return np.zeros(size[::-1], np.int16)
