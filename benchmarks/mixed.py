@@ -5,9 +5,9 @@
 120 000 answers: 8 scenarios, 100 participants and 150 stimuli in each. Ours are timed on one core,
 formula to tables. ``--r`` adds glmmTMB and lme4 (R and its packages must be there; see
 mixed_fixtures.py; lme4 takes minutes). ``--others`` builds an environment with GPBoost, mixedlm,
-lme-python and interlace-lme and gives each, and statsmodels, LIMIT seconds. "b" is the largest
-difference of a fixed effect from ours in units of our standard error, "se" the largest share by
-which a standard error differs. ``--write`` keeps benchmarks/results/mixed.json.
+lme-python and interlace-lme and gives each, and statsmodels, LIMIT seconds and 12 GB. "b" is the
+largest difference of a fixed effect from ours in units of our standard error, "se" the largest
+share by which a standard error differs. ``--write`` keeps benchmarks/results/mixed.json.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ LIMIT = 300
 PINNED = ("gpboost==1.8.0", "mixedlm==1.3.0", "lme-python==0.2.7", "interlace-lme==0.3.2")
 
 START = """
-import json, sys, time, warnings
+import json, resource, sys, time, warnings
+resource.setrlimit(resource.RLIMIT_AS, (12 << 30, 12 << 30))
 import numpy as np, pandas as pd
 warnings.simplefilter("ignore")
 data = pd.read_csv(sys.argv[1])

@@ -77,6 +77,12 @@ def test_scenarios_with_their_own_people_become_blocks() -> None:
     assert [block.shape for block in blocks] == [(80, 70)] * 3
 
 
+def test_levels_that_share_256_rows_are_linked() -> None:
+    codes = np.repeat(np.arange(80), 256)
+    groupings = Groupings([codes, codes // 2])
+    assert sum(block.sum() for block in groupings.counts().cross) == len(codes)
+
+
 def differences(value: Callable[[np.ndarray], float], at: np.ndarray) -> np.ndarray:
     """The gradient by central differences."""
     shifts = 1e-4 * np.eye(len(at))

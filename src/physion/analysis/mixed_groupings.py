@@ -71,7 +71,7 @@ class Groupings:
         label = np.zeros(self.q, dtype=np.int64)
         if links:
             one, other = (np.concatenate(part) for part in zip(*links, strict=True))
-            graph = coo_array((np.ones(len(one), dtype=np.int8), (one, other)), (self.q, self.q))
+            graph = coo_array((np.ones(len(one)), (one, other)), (self.q, self.q))
             label = connected_components(graph.tocsr(), directed=False)[1].astype(np.int64)
         parts = [label[start[k] : start[k + 1]] for k in range(len(codes))]
         narrow = np.concatenate([parts[k] for k in self._narrow]) if links else np.zeros(0, int)

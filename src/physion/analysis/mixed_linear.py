@@ -2,8 +2,8 @@
 
 As lme4::lmer with lmerTest: variances maximise the restricted likelihood, profiled over the
 residual variance; t tests have Satterthwaite's degrees of freedom. Own code, since statsmodels'
-MixedLM has no degrees of freedom and needs dense matrices for crossed groups (figures:
-``python benchmarks/mixed.py --others``), and since the equations are those of the logistic models.
+MixedLM has no degrees of freedom, and for crossed groups of this size does not end in 300 s
+(``python benchmarks/mixed.py --others``), and since the equations are those of logistic models.
 Only sums by level and by pair of levels enter, so that the time hardly depends on the rows.
 """
 

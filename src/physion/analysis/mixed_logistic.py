@@ -1,11 +1,12 @@
 """Logistic regression with crossed random intercepts (maximum likelihood, Laplace approximation).
 
-Why own code: no maintained fitter did it at the size of the study (800 participants, 120 000
-answers). Run ``python benchmarks/mixed.py --others`` for the figures side by side. GPBoost is quick
-but stops early and gives standard errors of the fixed effects as if the random ones were known;
-mixedlm is right but takes minutes, and its standard errors take the variances as known; lme-python
-gives coefficients of nAGQ = 0 (biased toward zero); interlace-lme ended at a wrong zero variance;
-statsmodels has Bayesian approximations only; bambi samples; pymer4 needs R.
+Why own code: of the maintained fitters none is both quick and right at the size of the study (800
+participants, 120 000 answers). ``python benchmarks/mixed.py --r --others`` runs them side by side;
+its last figures are in benchmarks/results/mixed.json. mixedlm and interlace-lme agree with us and
+take minutes; GPBoost is quick, but stops early and gives standard errors of the fixed effects up to
+65 % too small; lme-python's coefficients are those of nAGQ = 0 (toward zero by 0.2 of a standard
+error); statsmodels has Bayesian approximations only, which do not end in 300 s; bambi samples;
+pymer4 needs R.
 
 The marginal likelihood of the fixed effects and standard deviations is, as in glmmTMB and
 lme4::glmer(nAGQ = 1), that of the normal distribution around the mode of the random effects. Its
