@@ -41,7 +41,8 @@ def make_scene(name: str, cloth: bool) -> Scene:
         ),
         Body("cone", "cone", (0.0, 0.1, 0.3), (0.2, 0.3, 0.4), contact=Contact(0.3, 0.2, 0.1)),
     ]
-    sheet = Cloth("sheet", (0.2, 0.1, 0.9), (0.8, 0.8, 0.0), resolution=5)
+    stiffness = {"stretch": 0.2, "bend": 0.3, "tether": 0.9}
+    sheet = Cloth("sheet", (0.2, 0.1, 0.9), (0.8, 0.8, 0.0), resolution=5, **stiffness)
     return Scene(
         name=name,
         scenario="drape" if cloth else "collide",

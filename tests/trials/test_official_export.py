@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import gzip
 import io
 import json
 import shutil
@@ -18,6 +19,7 @@ from PIL import Image
 from physion.cli import export as export_verb
 from physion.compute.local import SerialExecutor
 from physion.errors import BadInputError
+from physion.physics.cloth import ClothSettings
 from physion.rendering.camera import View
 from physion.scenes.scene import Body, Camera, Joint, Roles, Scene
 from physion.scenes.shapes import shape
@@ -284,6 +286,51 @@ def test_cloth_has_particles_and_distances(exported: Path, cloth: Trial) -> None
     touching = [gap < 0.1222 for gap in gaps]  # the official rule tells our outcome
     assert touching.index(True) == cloth.labels.first_frame
     assert read_label(path) == cloth.labels.contact
+
+
+def test_ids_are_int64_and_measures_float32(exported: Path) -> None:
+    """Section 4 of the reference; of masses and turns one kind alone."""
+    with h5py.File(exported / f"{CONFIGS['collide']}.hdf5", "r") as f:
+        for frame in f["frames"].values():
+            for name in ("collisions", "env_collisions"):
+                assert frame[name]["object_ids"].dtype == f["static/object_ids"].dtype == np.int64
+        kinds = {name: d.dtype for name, d in f["static"].items() if isinstance(d, h5py.Dataset)}
+        assert kinds["probe_mass"] == kinds["target_rotation"] == np.float32
+        assert not [name for name, kind in kinds.items() if kind == np.float64]
+        np.testing.assert_allclose(
+            f["static/target_rotation"][:], f["static/initial_rotation"][1], atol=1e-6
+        )
+
+
+def test_drape_says_how_cloth_was_simulated(exported: Path, cloth: Trial, official: Path) -> None:
+    sent: dict[str, dict[str, Any]] = {}
+    for path in sorted((official / "scenes/drape").glob("*/tdw_commands.json.gz")):
+        for line in gzip.decompress(path.read_bytes()).decode().splitlines():
+            if (start := line.find("[")) >= 0 and "flex" in line:
+                commands, _ = json.JSONDecoder().raw_decode(line[start:])
+                sent |= {c["$type"]: c for c in commands if "flex" in c.get("$type", "")}
+    settings, sheet = ClothSettings(), cloth.scene.cloths[0]
+    with h5py.File(exported / f"{CONFIGS['drape']}.hdf5", "r") as f:
+        static = f["static"]
+        container = {name: d[()] for name, d in static["container"].items()}
+        for name in ("collision_distance", "static_friction", "dynamic_friction"):
+            assert container[name] == np.float32(sent["create_flex_container"][name])
+        assert container["substep_count"] == settings.substeps
+        assert container["solid_rest"] == np.float32(settings.rest_distance)
+        solids = {name: d[:] for name, d in static["solid_actors"].items()}
+        assert static["model_names"][[1, 3]].tolist() == [b"cloth_square", b"prop:vase"]
+        assert solids["object_id"].tolist() == [1, 3, 5]  # neither the cloth nor the scenery
+        for name in ("mass_scale", "mesh_expansion", "particle_spacing"):
+            assert (solids[name] == np.float32(sent["set_flex_solid_actor"][name])).all()
+        cloths = {name: d[:].tolist() for name, d in static["cloth_actors"].items()}
+        assert cloths.pop("object_id") == [2]
+        for name in ("stretch", "bend", "tether"):
+            value = np.float32(getattr(sheet, name))
+            assert cloths.pop(f"{name}_stiffness") == [value]
+        assert cloths == {n: [sent["set_flex_cloth_actor"][n]] for n in cloths} and cloths
+        assert not len(static["soft_actors"]) and not len(static["fluid_actors"])
+    with h5py.File(exported / f"{CONFIGS['collide']}.hdf5", "r") as f:
+        assert "container" not in f["static"]
 
 
 def test_metadata_has_all_official_keys(exported: Path, official: Path) -> None:

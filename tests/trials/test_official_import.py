@@ -167,6 +167,9 @@ def test_scene_camera_labels_and_origin_come_back(dataset: Path, imported: Path)
             if not a.scenery:
                 np.testing.assert_allclose(b.look.color, a.look.color, atol=1e-6)
         assert [c.resolution for c in other.cloths] == [c.resolution for c in one.cloths]
+        for a, b in zip(one.cloths, other.cloths, strict=True):
+            soft = [(c.stretch, c.bend, c.tether) for c in (a, b)]
+            np.testing.assert_allclose(*soft, atol=1e-6)
         p = np.random.default_rng(0).uniform(-1, 1, (9, 3))
         seen, depth = View(one.camera, 64, 64).project(p)
         again, depth_again = View(other.camera, 64, 64).project(p)

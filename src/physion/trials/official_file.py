@@ -2,10 +2,11 @@
 
 Names, shapes and encodings are those of reference/official-system.md, section 4, with gzip alone.
 Static arrays all have one entry for each object (the originals leave scenery out of masses and
-frictions, so that they do not line up). What the official layout has no place for stands apart,
-under ``physion/``: the scene, labels and metadata as JSON, the record for ``metadata.json``, the
-flow in pixels (``flow``: frames, rows, columns, (right, down), half precision), and the bytes of
-the trial file without passes (``trial_file``), of which an import makes the same trial again.
+frictions, so that they do not line up). Ids and counts are int64, measures float32. What the
+official layout has no place for stands apart, under ``physion/``: the scene, labels and metadata as
+JSON, the record for ``metadata.json``, the flow in pixels (``flow``: frames, rows, columns, (right,
+down), half precision), and the bytes of the trial file without passes (``trial_file``), of which an
+import makes the same trial again.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import physion
 from physion.scenes.scene import Cloth
 from physion.scenes.shapes import shape
 from physion.trials.official_axes import rotation_matrices, swap_axes, to_official_euler
+from physion.trials.official_flex import flex_groups
 from physion.trials.official_frames import PASSES, FrameWriter, put
 from physion.trials.official_layout import RAMPS, ROOMS, TRIAL_FILE, segmentation_colors, split_name
 from physion.trials.official_objects import OfficialObjects, model_name
@@ -97,11 +99,11 @@ def _static(trial: Trial, objects: OfficialObjects) -> dict[str, Any]:
         "probe_id": ids[roles.probe] if roles.probe else NONE,
         "ramp_id": ids[ramps[0].name] if ramps else NONE,
         "ramp_base_id": NONE,
-        "ramp_base_height": ramps[0].position[2] - scene.floor if ramps else 0.0,
+        "ramp_base_height": np.float32(ramps[0].position[2] - scene.floor if ramps else 0.0),
         "target_type": model_name(things[roles.agent]),
-        "target_rotation": to_official_euler(things[roles.agent].rotation),
+        "target_rotation": to_official_euler(things[roles.agent].rotation).astype(np.float32),
         "probe_type": model_name(things[roles.probe]) if roles.probe else "",
-        "probe_mass": things[roles.probe].mass if roles.probe else 0.0,
+        "probe_mass": np.float32(things[roles.probe].mass if roles.probe else 0.0),
         **_push(objects),
         **{
             kind: [model_name(things[name]) for name in names]
@@ -123,7 +125,10 @@ def _push(objects: OfficialObjects) -> dict[str, Any]:
     """The first push: impulse, point, frame; zeros where nothing is pushed."""
     scene = objects.scene
     if not scene.pushes:
-        return {"push_force": np.zeros(3), "push_position": np.zeros(3), "push_time": 0}
+        return {
+            **dict.fromkeys(("push_force", "push_position"), np.zeros(3, np.float32)),
+            "push_time": 0,
+        }
     push = scene.pushes[0]
     point = push.point
     if point is None:
@@ -231,6 +236,10 @@ def _write_static(group: h5py.Group, static: dict[str, Any], objects: OfficialOb
     }
     for name, values in arrays.items():
         put(group, name, values)
+    for name, values in flex_groups(objects).items():
+        actors = group.create_group(name)
+        for key, value in values.items():
+            put(actors, key, value)
     mesh = group.create_group("mesh")
     for place in range(count):
         vertices, faces = objects.mesh(place)

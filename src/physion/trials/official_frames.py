@@ -151,14 +151,14 @@ class FrameWriter:
         velocities = np.pad(velocities, ((0, len(self.objects.scene.cloths)), (0, 0)))
         bodies = contacts.bodies[chosen]
         group = frame_group.create_group("collisions")
-        put(group, "object_ids", self._ids[bodies].astype(np.int32).reshape(-1, 2))
+        put(group, "object_ids", self._ids[bodies].reshape(-1, 2))
         relative = velocities[bodies[:, 1]] - velocities[bodies[:, 0]]
         put(group, "relative_velocities", swap_axes(relative).astype(np.float32).reshape(-1, 3))
         put(group, "states", np.array([state for _, state in pairs], "S5"))
         put(group, "contacts", self._normal_and_point(chosen, -1.0))
         group = frame_group.create_group("env_collisions")
         outside = np.array(environment, np.int64)
-        put(group, "object_ids", self._ids[contacts.bodies[outside, 1]].astype(np.int32))
+        put(group, "object_ids", self._ids[contacts.bodies[outside, 1]])
         put(group, "contacts", self._normal_and_point(outside, 1.0))
 
     def _normal_and_point(self, rows: NDArray[np.int64], sign: float) -> NDArray[np.float32]:

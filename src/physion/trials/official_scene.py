@@ -245,8 +245,25 @@ class SceneReader:
             size=(2 * float(scale[0]), 2 * float(scale[1]), 0.0),
             mass=float(self._physics("mass", 0.5)[place]),
             resolution=resolution,
+            **self._stiffness(place),
             look=Look(_vector(np.clip(color, 0, 1)), "cloth"),
         )
+
+    def _stiffness(self, place: int) -> dict[str, float]:
+        """Stretch, bend and tether of a cloth, as far as the file says them."""
+        group = "static/cloth_actors"
+        if not self.file.has(f"{group}/object_id"):
+            return {}
+        ids = self.file.numbers(f"{group}/object_id", (None,)).tolist()
+        found = {}
+        for name in ("stretch", "bend", "tether"):
+            path = f"{group}/{name}_stiffness"
+            if self.ids[place] in ids and self.file.has(path):
+                value = self.file.numbers(path, (len(ids),))[ids.index(self.ids[place])]
+                if not 0 <= value <= 1:
+                    raise self.file.bad(path, f"holds {value}, which is no stiffness in 0..1")
+                found[name] = float(value)
+        return found
 
     def _first_pose(self, place: int) -> tuple[Vec3, Quat]:
         rotation = self.motion.rotations[0, place]
