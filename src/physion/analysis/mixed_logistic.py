@@ -2,11 +2,11 @@
 
 Why own code: of the maintained fitters none is both quick and right at the size of the study (800
 participants, 120 000 answers). ``python benchmarks/mixed.py --r --others`` runs them side by side;
-its last figures are in benchmarks/results/mixed.json. mixedlm and interlace-lme agree with us and
-take minutes; GPBoost is quick, but stops early and gives standard errors of the fixed effects up to
-65 % too small; lme-python's coefficients are those of nAGQ = 0 (toward zero by 0.2 of a standard
-error); statsmodels has Bayesian approximations only, which do not end in 300 s; bambi samples;
-pymer4 needs R.
+its last figures are in benchmarks/results/mixed.json. mixedlm and interlace-lme agree with us
+and take one minute and three; GPBoost is quick, but stops early and gives standard errors of the
+fixed effects up to 65 % too small; lme-python's coefficients are 0.2 of a standard error off, as
+those of lme4 with nAGQ = 0 would be; statsmodels has Bayesian approximations only, which do not end
+in 300 s; bambi samples; pymer4 needs R.
 
 The marginal likelihood of the fixed effects and standard deviations is, as in glmmTMB and
 lme4::glmer(nAGQ = 1), that of the normal distribution around the mode of the random effects. Its
