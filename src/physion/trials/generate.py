@@ -29,7 +29,7 @@ from physion.trials.sealed import read_sealed, write_sealed
 Track = Callable[[Iterable[Outcome[Any]], str, int], Iterator[Outcome[Any]]]
 """Passes outcomes on and shows how far it is, as `physion.cli.output.track` does."""
 
-_HOPELESS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EIO}
+HOPELESS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EIO}
 """System errors that every later trial would meet too."""
 
 
@@ -124,7 +124,7 @@ def _choose(
         path = folder / CHOICES / f"{split}_{scenario}.json"
         choices, outcomes = choose_all(tasks, settings, path, executor, track)
         for name, outcome in outcomes.items():
-            if outcome.errno in _HOPELESS:
+            if outcome.errno in HOPELESS:
                 raise PhysionError(f"cannot write into {folder}: {outcome.error}")
             if name in names:
                 failed[name] = str(outcome.error)
@@ -152,7 +152,7 @@ def _run(
                 made.add(outcome.key)
                 (folder / FAILURES / f"{outcome.key}.txt").unlink(missing_ok=True)
                 continue
-            if outcome.errno in _HOPELESS:
+            if outcome.errno in HOPELESS:
                 raise PhysionError(
                     f"cannot write into {folder}: {outcome.error}; {len(made)} new trials are "
                     "whole, and the same command goes on from there"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,12 +9,9 @@ from typing import Any, TypeVar
 
 from physion.compute.executor import Executor
 from physion.errors import PhysionError
-from physion.trials.generate import Track
+from physion.trials.generate import HOPELESS, Track
 
 T = TypeVar("T")
-
-_HOPELESS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EIO}
-"""System errors that every later file would meet too."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +59,7 @@ def run_all(
         for outcome in track(outcomes, what, len(jobs)) if track else outcomes:
             if outcome.error is None:
                 results[outcome.key] = outcome.value
-            elif outcome.errno in _HOPELESS:
+            elif outcome.errno in HOPELESS:
                 raise PhysionError(
                     f"cannot write into {out}: {outcome.error}; {len(results)} new trials are "
                     "whole, and the same command goes on from there"

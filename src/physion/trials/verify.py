@@ -231,9 +231,10 @@ def _draw_again(paths: TrialPaths, trial: Trial, settings: Mapping[str, Any]) ->
     from physion.trials.make import scene_of
 
     meta = trial.metadata
-    if meta.seed is None or meta.preset not in load_presets(meta.scenario):
+    if meta.seed is None or meta.preset is None or meta.preset not in load_presets(meta.scenario):
         return []
-    assert meta.preset is not None and meta.attempt is not None, "sampled trials have both"
+    if meta.attempt is None:
+        return [f"{paths.trial_file}: field 'metadata' has a seed but no attempt"]
     task = Task(
         meta.dataset,
         meta.scenario,
