@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from physion.analysis import (
     Bootstrap,
     compare,
@@ -15,7 +17,8 @@ from physion.analysis import (
     read_labels,
     read_predictions,
 )
-from physion.analysis.responses import DominoesLook
+from physion.analysis.comparison import Comparison
+from physion.analysis.responses import LABELS_FILE, DominoesLook, find_beside
 from physion.analysis.stimuli import read_stimulus_list
 from physion.atomic import write_atomic
 from physion.errors import BadInputError
@@ -31,7 +34,6 @@ from physion.report.page import render_page
 from physion.report.plots import plots
 from physion.report.write import prepare_folder, write_csv, write_plot
 
-LABELS_FILE = "stimulus_names_and_labels.csv"
 ZONE_FILE = "human_accuracy_by_scenario.csv"
 
 _LOOKS = {
@@ -109,7 +111,6 @@ def compare_files(
     rows = read_predictions(predictions)
     excluded = read_stimulus_list(exclude) if exclude is not None else []
     choices = dict(methods or {})
-    known: Mapping[str, bool] | None
     if responses:
         if humans is not None:
             raise BadInputError("give people's tables (humans) or their responses, not both")
@@ -121,35 +122,34 @@ def compare_files(
         choices.setdefault("Official outcomes", "those recorded with the responses")
         choices.setdefault("People", people_in_words(responses, people))
     else:
-        averages = None if humans is None else read_humans(humans, dominoes)
-        labels = labels if labels is not None else _beside(humans, "stimuli", LABELS_FILE)
-        zone = zone if zone is not None else _beside(humans, "results", ZONE_FILE)
-        if averages is not None and labels is None and rows["recorded"].isna().all():
-            raise BadInputError(
-                f"no {LABELS_FILE} lies near {humans}; give the file with the labels"
-            )
-        known = read_labels(labels) if isinstance(labels, Path) else labels
-        comparison = compare(
-            rows,
-            averages,
-            known,
-            zone=read_human_zone(zone) if zone is not None and averages is not None else None,
-            exclude=excluded,
-            exclude_ledge=exclude_ledge,
-            bootstrap=draws,
+        settings: dict[str, Any] = {"exclude": excluded, "exclude_ledge": exclude_ledge}
+        comparison, words = _with_averages(
+            rows, humans, labels, zone, dominoes, {**settings, "bootstrap": draws}
         )
         inputs = ReportInputs(comparison)
-        if averages is not None:
-            origin = labels.name if isinstance(labels, Path) else "those recorded with the trials"
-            choices.setdefault("Official outcomes", origin)
-            choices.setdefault("People for Dominoes", _LOOKS[dominoes])
+        choices = {**words, **choices}
     return build_report(completed(inputs, rows, choices, movies or {}, draws), folder)
 
 
-def _beside(humans: Path | None, sibling: str, name: str) -> Path | None:
-    """The official file ``name`` near the folder of people's answers, if it is there."""
+def _with_averages(
+    rows: pd.DataFrame,
+    humans: Path | None,
+    labels: Path | Mapping[str, bool] | None,
+    zone: Path | None,
+    dominoes: DominoesLook,
+    settings: Mapping[str, Any],
+) -> tuple[Comparison, dict[str, str]]:
+    """The comparison with people's averages, if there are any, and its choices in words."""
     if humans is None:
-        return None
-    parent = humans.resolve().parent
-    places = (humans / name, parent / name, parent / sibling / name)
-    return next((place for place in places if place.is_file()), None)
+        known = read_labels(labels) if isinstance(labels, Path) else labels
+        return compare(rows, None, known, **settings), {}
+    averages = read_humans(humans, dominoes)
+    labels = find_beside(humans, "stimuli", LABELS_FILE) if labels is None else labels
+    zone = find_beside(humans, "results", ZONE_FILE) if zone is None else zone
+    if labels is None and rows["recorded"].isna().all():
+        raise BadInputError(f"no {LABELS_FILE} lies near {humans}; give the file with the labels")
+    known = read_labels(labels) if isinstance(labels, Path) else labels
+    found = None if zone is None else read_human_zone(zone)
+    origin = labels.name if isinstance(labels, Path) else "those recorded with the trials"
+    words = {"Official outcomes": origin, "People for Dominoes": _LOOKS[dominoes]}
+    return compare(rows, averages, known, zone=found, **settings), words

@@ -58,7 +58,7 @@ def measure_figure(table: pd.DataFrame, measure: str, theme: Theme = LIGHT) -> F
     low, high = _limits(table, CHANCE[measure])
     with matplotlib.rc_context(style(theme)):
         size = (11 / min(3, len(names)), row_height * len(agents) + 0.75)
-        figure, axes = panels(len(names), 3, size, sharex=True)
+        figure, axes = panels(len(names), min(3, len(names)), size, sharex=True)
         for place, (axis, name) in enumerate(zip(axes, names, strict=True)):
             rows = table[table["panel"] == name].set_index("agent")
             _human_marks(axis, rows, theme)
@@ -155,7 +155,7 @@ def grouped_figure(table: pd.DataFrame, words: str, chance: float, theme: Theme 
     agents = list(table["agent"].unique())
     with matplotlib.rc_context(style(theme)):
         size = (11 / len(names), (0.34 if len(agents) <= 8 else 0.27) * len(agents) + 0.9)
-        figure, axes = panels(len(names), 2, size, above=0.3, sharex=True, sharey=True)
+        figure, axes = panels(len(names), len(names), size, above=0.3, sharex=True, sharey=True)
         for axis, name in zip(axes, names, strict=True):
             rows = table[table["panel"] == name]
             groups = list(rows["group"].unique())
@@ -211,7 +211,7 @@ def generalization_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
     widest = max(float(table["difference"].abs().max()), 0.01)
     with matplotlib.rc_context(style(theme)):
         size = (0.46 * len(tested) + 1.2, 0.3 * len(trained) + 0.6)
-        columns = max(1, min(int(12 / size[0]), 3))
+        columns = max(1, min(int(12 / size[0]), 3, len(agents)))
         figure, axes = panels(len(agents), columns, size, above=0.8, sharex=True, sharey=True)
         image = None
         for axis, agent in zip(axes, agents, strict=True):

@@ -42,7 +42,9 @@ def scatter_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
     columns = 3 if len(agents) <= 6 else 4
     with matplotlib.rc_context(style(theme)):
         width = 11 / columns
-        figure, axes = panels(len(agents), columns, (width, width), sharex=True, sharey=True)
+        figure, axes = panels(
+            len(agents), columns, (width, width), above=1.1, sharex=True, sharey=True
+        )
         for place, (axis, agent) in enumerate(zip(axes, agents, strict=True)):
             _points(axis, table[table["agent"] == agent], scenarios, theme)
             axis.tick_params(labelbottom=place + columns >= len(agents))
@@ -99,7 +101,7 @@ def difficulty_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
     """
     scenarios = in_order(table["scenario"])
     with matplotlib.rc_context(style(theme)):
-        size = (11 / min(4, len(scenarios)), 2.1)
+        size = (11 / 4, 2.1)
         figure, axes = panels(len(scenarios), 4, size, above=0.7, sharex=True, sharey=True)
         for axis, scenario in zip(axes, scenarios, strict=True):
             rows = table[table["scenario"] == scenario]
@@ -153,7 +155,7 @@ def response_time_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
     """
     scenarios = in_order(table["scenario"])
     with matplotlib.rc_context(style(theme)):
-        size = (11 / min(4, len(scenarios)), 2.5)
+        size = (11 / 4, 2.5)
         figure, axes = panels(len(scenarios), 4, size, above=0.3, sharex=True, sharey=True)
         for place, (axis, scenario) in enumerate(zip(axes, scenarios, strict=True)):
             rows = table[(table["scenario"] == scenario) & table["mean_log_rt"].notna()]
@@ -186,7 +188,7 @@ def calibration_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
     columns = 3 if len(agents) <= 6 else 5
     with matplotlib.rc_context(style(theme)):
         width = 11 / columns
-        figure, axes = panels(len(agents), columns, (width, width + 0.2), above=0.2,
+        figure, axes = panels(len(agents), columns, (width, width + 0.2), above=0.5,
                               sharex=True, sharey=True)  # fmt: skip
         for place, (axis, agent) in enumerate(zip(axes, agents, strict=True)):
             rows = table[(table["agent"] == agent) & (table["stimuli"] > 0)]

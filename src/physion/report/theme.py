@@ -61,15 +61,18 @@ def panels(
 ) -> tuple[Figure, list[Axes]]:
     """A figure of ``count`` panels, each about ``size`` inches, and its axes row by row.
 
-    ``above`` is room for the legend. Call it inside ``rc_context(style(theme))``.
+    Where there are fewer than ``columns``, the rest of the width stays empty, so that panels are
+    as large as in other figures. ``above`` is room for the legend. Call it inside
+    ``rc_context(style(theme))``.
     """
-    columns = min(columns, count)
     rows = math.ceil(count / columns)
     width, height = size
     figure = Figure(figsize=(width * columns, height * rows + above), layout="constrained")
     axes = list(figure.subplots(rows, columns, squeeze=False, **shared).flat)
     for axis in axes[count:]:
         axis.set_visible(False)
+    for axis in axes[max(count - columns, 0) : count]:
+        axis.tick_params(labelbottom=True)  # also where the panel below is not there
     return figure, axes[:count]
 
 
