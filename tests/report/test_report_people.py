@@ -122,6 +122,15 @@ def test_kappa_of_the_figure_is_the_mean_over_people(report: Path) -> None:
     assert row["zone"] == "95 % of participants"
 
 
+def test_band_of_the_paper_bears_its_name(report: Path) -> None:
+    table = pd.read_csv(report.parent / "figures" / "r.csv")
+    zones = pd.read_csv(report.parent / "tables" / "zones.csv")
+    halves = zones[(zones["measure"] == "r") & (zones["of"] == "halves")]
+    mean = table[table["panel"] == "mean"]
+    assert set(mean["zone"]) == {"paper's band: r of halves, mean over scenarios"}
+    assert mean["zone_high"].iloc[0] == pytest.approx(halves["high"].mean())
+
+
 def test_tests_and_mixed_models_are_told(report: Path) -> None:
     text = text_of(report)
     assert "test of McNemar" in text and "Holm" in text

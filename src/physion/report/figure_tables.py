@@ -21,7 +21,7 @@ from physion.analysis.predictions import DATASETS, READOUTS
 from physion.analysis.stimuli import OFFICIAL_SCENARIOS, SCENARIOS
 from physion.analysis.tables import MEAN, POOLED, in_order
 from physion.analysis.zones import released_zone
-from physion.report.figures import PARTICIPANTS, SCENARIO_ZONE
+from physion.report.figures import HALVES_ZONE, PARTICIPANTS, SCENARIO_ZONE
 
 Array = npt.NDArray[np.float64]
 
@@ -49,12 +49,16 @@ def accuracy_table(comparison: Comparison) -> pd.DataFrame:
 def r_table(comparison: Comparison, zones: pd.DataFrame | None = None) -> pd.DataFrame:
     """Pearson's r with the average person; the dashed line is its ceiling; `MEASURE_COLUMNS`.
 
-    ``zones`` (`zones.human_zones`): what single participants reach with the average of the others.
+    ``zones`` (`zones.human_zones`): what single participants reach with the average of the others;
+    in the mean the paper's band, as in `zones.released_r_zone`.
     """
     people = comparison.people.set_index("scenario")[["ceiling"]].set_axis(["people"], axis=1)
-    return _measure(
-        _scores(comparison, "r"), _with_zone(people, zones, "r", released=False), "ceiling"
-    )
+    people = _with_zone(people, zones, "r", released=False)
+    if zones is not None and MEAN in people.index:
+        halves = zones[(zones["measure"] == "r") & (zones["of"] == "halves")]
+        people.loc[MEAN, ["zone_low", "zone_high"]] = halves[["low", "high"]].mean().tolist()
+        people.loc[MEAN, "zone"] = HALVES_ZONE
+    return _measure(_scores(comparison, "r"), people, "ceiling")
 
 
 def kappa_table(comparison: Comparison, beside: PeopleComparison) -> pd.DataFrame:

@@ -113,7 +113,7 @@ def _human_marks(axis: Axes, rows: pd.DataFrame, theme: Theme) -> None:
     own = rows.iloc[0]
     if np.isfinite(own["zone_low"]):
         # A hatch marks the zones that are not of participants, as the legend says.
-        plain = own["zone"] != SCENARIO_ZONE
+        plain = own["zone"] not in RELEASED_ZONES
         axis.axvspan(own["zone_low"], own["zone_high"], **_zone(plain, theme), zorder=0)
     if np.isfinite(own["people"]):
         axis.axvline(own["people"], color=theme.ink, linestyle="--", linewidth=1.3, zorder=1)
@@ -127,7 +127,9 @@ def _zone(plain: bool, theme: Theme) -> dict[str, Any]:
 
 PARTICIPANTS = "95 % of participants"
 SCENARIO_ZONE = "paper's band: bootstrap of scenario means"
-"""Names of zones; the second one is hatched, since it says nothing about participants."""
+HALVES_ZONE = "paper's band: r of halves, mean over scenarios"
+RELEASED_ZONES = (SCENARIO_ZONE, HALVES_ZONE)
+"""Names of zones; those of the paper are hatched, as they say nothing about participants."""
 
 
 def _measure_handles(
@@ -142,7 +144,7 @@ def _measure_handles(
         words = table.loc[table["people"].notna(), "people_is"].iloc[0]
         handles.append(Line2D([], [], color=theme.ink, linestyle="--", label=words))
     zones = table.loc[table["zone_low"].notna(), "zone"].unique()
-    handles += [Patch(**_zone(zone != SCENARIO_ZONE, theme), label=zone) for zone in zones]
+    handles += [Patch(**_zone(zone not in RELEASED_ZONES, theme), label=zone) for zone in zones]
     return [*handles, Line2D([], [], color=theme.faint, linestyle=":", label="chance")]
 
 

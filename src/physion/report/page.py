@@ -8,7 +8,7 @@ from html import escape
 from pathlib import Path
 
 from physion.analysis.tables import MEAN, POOLED, in_order
-from physion.report import blocks, people_blocks, tests_of_models
+from physion.report import blocks, people_blocks, session_blocks, tests_of_models
 from physion.report.document import Picture, Section, figure, render_document
 from physion.report.inputs import EXPECTED_METHODS, ReportInputs
 from physion.report.movies import gaps
@@ -31,7 +31,7 @@ def render_page(
         Section("Stimulus by stimulus", _stimuli(inputs, shown, links)),
         Section("Where model and people differ most", _gaps(inputs)),
         Section("People", people_blocks.people(inputs, shown)),
-        Section("Sessions left out", people_blocks.sessions(inputs)),
+        Section("Sessions left out", session_blocks.sessions(inputs)),
         Section("Tests", tests_of_models.tests(inputs)),
         Section("Trials whose simulated outcome differs", blocks.changed(inputs.comparison, links)),
         Section("How this was made", _methods(inputs)),
@@ -132,14 +132,14 @@ def _gaps(inputs: ReportInputs) -> str:
 
 def _methods(inputs: ReportInputs) -> str:
     stated = dict.fromkeys(EXPECTED_METHODS, "not stated") | dict(inputs.methods)
-    choices = {**stated, **inputs.comparison.settings, **people_blocks.methods(inputs)}
+    choices = {**stated, **inputs.comparison.settings, **session_blocks.methods(inputs)}
     return blocks.words_list(choices) + blocks.definitions()
 
 
 def _left_out(inputs: ReportInputs) -> str:
     parts = ["<h3>Stimuli</h3>", blocks.dropped(inputs.comparison)]
     if inputs.people is not None:
-        parts += ["<h3>Answers of people</h3>", people_blocks.dropped(inputs.people)]
+        parts += ["<h3>Answers of people</h3>", session_blocks.dropped(inputs.people)]
     missing = _cannot_be_said(inputs)
     if missing:
         items = "".join(f"<li>{escape(words)}</li>" for words in missing)

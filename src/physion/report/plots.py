@@ -74,7 +74,8 @@ def _r(inputs: ReportInputs) -> Plot:
     if zones is not None:
         words += (
             " Grey: the middle 95 % of single participants, each with the average of the others; "
-            "they answer yes or no, which costs r, so that a model can pass them."
+            "they answer yes or no, which costs r, so that a model can pass them. Hatched, in "
+            "the mean: the band of the paper, r between random halves of the people."
         )
     return Plot("r", words, tables.r_table(inputs.comparison, zones), partial(_measure, "r"))
 
