@@ -355,6 +355,15 @@ def test_training_on_each_scenario_in_turn_is_one_model(spelling: str) -> None:
     assert suffixes == ["same", "all but this", "all"]
 
 
+def test_a_stray_stimulus_does_not_split_a_model() -> None:
+    people = humans()
+    given = predictions(people)
+    stray = given.iloc[:1].assign(**{"Stimulus Name": "of_no_known_scenario_0001"})
+    found = compare(pd.concat([given, stray]), people, labels(people), bootstrap=QUICK)
+    assert found.agents == ["m · observed"]
+    assert counts(found.dropped) == {("m · observed", NOT_SEEN): 1}
+
+
 @pytest.mark.parametrize(
     ("column", "value", "message"),
     [

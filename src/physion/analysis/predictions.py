@@ -162,9 +162,10 @@ def _recorded(table: pd.DataFrame, where: str) -> pd.Series:
 def _relative(trained: pd.Series, scenario: pd.Series) -> pd.Series:
     """``same`` where the training scenario is the tested one; all else stays as it is.
 
-    Without this a model trained on each scenario in turn would count as eight models.
+    Without this a model trained on each scenario in turn would count as eight models. An absent
+    training scenario stays absent, also beside a stimulus whose scenario nothing tells.
     """
     ours = trained.map(lambda name: OFFICIAL_SCENARIOS.get(name.lower(), name.lower()))
     left_out = trained.str.lower().str.startswith(("all_but", "no_"))
-    relative = trained.where(ours != scenario.fillna(""), "same")
+    relative = trained.where((trained == "") | (ours != scenario.fillna("")), "same")
     return relative.where(~left_out, "all but this")
