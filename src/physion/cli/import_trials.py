@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from physion.cli.official_report import print_report
+from physion.cli.official_files import print_report
 from physion.cli.output import track
 from physion.compute.local import LocalExecutor
 from physion.trials.official_import import import_official
