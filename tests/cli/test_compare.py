@@ -84,6 +84,7 @@ def test_without_files_it_says_so(capsys: pytest.CaptureFixture[str]) -> None:
 # --- official -----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_official_prints_and_writes_the_published_numbers(
     official: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -93,14 +94,14 @@ def test_official_prints_and_writes_the_published_numbers(
     for part in ("Accuracy as published", "Panel A", "Panel C", "Panel D", "Panel E",
                  "Regressions", "168 of 168", "0.748", "800 - 112 = 688"):  # fmt: skip
         assert part in text, part
-    table = pd.read_csv(out / "accuracies.csv")
+    table = pd.read_csv(out / "tables" / "accuracies.csv")
     assert len(table) == 88
     written = json.loads((out / "published.json").read_text())
-    assert {path.stem for path in out.glob("*.csv")} == set(written["tables"])
-    again = tmp_path / "again"
-    main(["compare", "official", str(official), "--out", str(again)])
-    for path in out.iterdir():
-        assert path.read_bytes() == (again / path.name).read_bytes(), path.name
+    assert {path.stem for path in (out / "tables").glob("*.csv")} == set(written["tables"])
+    assert "report.html" in text and "<figure" in (out / "report.html").read_text(encoding="utf-8")
+    assert {path.name for path in (out / "figures").glob("*.svg")} == {
+        f"panel_{panel}.svg" for panel in "acde"
+    }
 
 
 def test_official_as_json(official: Path, capsys: pytest.CaptureFixture[str]) -> None:

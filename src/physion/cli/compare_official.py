@@ -27,39 +27,26 @@ class Options:
     folder: Annotated[Path, tyro.conf.Positional]
     """Folder with results/ and humans/ of the original study."""
     out: Path | None = None
-    """Folder for the tables as CSV files and published.json."""
+    """Folder for the page, the figures, the tables as CSV files and published.json."""
     json: bool = False
     """Print one JSON object."""
 
 
 def main(options: Options) -> int:
-    """Print the tables, and write them where asked."""
+    """Print the tables, and write the page where asked."""
     from physion.analysis.published import published_results
-    from physion.cli.output import console, write_text
+    from physion.cli.output import console
+    from physion.report.published_report import build_published_report, published_numbers
 
     results = published_results(options.folder)
-    text = json_module.dumps(_record(results), indent=1)
-    if options.out is not None:
-        for name, table in results.tables.items():
-            content = table.to_csv(index=False, lineterminator="\n")
-            write_text(options.out / f"{name}.csv", content)
-        write_text(options.out / "published.json", text + "\n")
+    page = None if options.out is None else build_published_report(results, options.out)
     if options.json:
-        print(text)
+        print(json_module.dumps(published_numbers(results), indent=1))
         return 0
     _print(results)
-    if options.out is not None:
-        console.print(f"tables: {options.out}", markup=False, soft_wrap=True)
+    if page is not None:
+        console.print(f"report: {page}", markup=False, soft_wrap=True)
     return 0
-
-
-def _record(results: PublishedResults) -> dict[str, object]:
-    """Tables as lists of rows; NaN is null."""
-    tables = {
-        name: json_module.loads(table.to_json(orient="records", double_precision=15))
-        for name, table in results.tables.items()
-    }
-    return {"tables": tables, "words": dict(results.words)}
 
 
 def _print(results: PublishedResults) -> None:

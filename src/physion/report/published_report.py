@@ -33,18 +33,20 @@ def build_published_report(results: PublishedResults, folder: Path) -> Path:
     for name, rows in results.tables.items():
         write_csv(folder / "tables" / f"{name}.csv", rows)
     shown = {plot.name: figure(write_plot(plot, pictures)) for plot in published_plots(results)}
-    write_atomic(folder / "published.json", f"{_json(results)}\n".encode())
+    text = json.dumps(published_numbers(results), indent=1, allow_nan=False)
+    write_atomic(folder / "published.json", f"{text}\n".encode())
     page = folder / "report.html"
     write_atomic(page, _page(results, shown).encode())
     return page
 
 
-def _json(results: PublishedResults) -> str:
-    values: dict[str, Any] = {
+def published_numbers(results: PublishedResults) -> dict[str, Any]:
+    """Every table, as a list of rows, and what is said of them, for JSON; NaN becomes null."""
+    tables = {
         name: json.loads(rows.to_json(orient="records", double_precision=15))
         for name, rows in results.tables.items()
     }
-    return json.dumps({"tables": values, "words": dict(results.words)}, indent=1, allow_nan=False)
+    return {"tables": tables, "words": dict(results.words)}
 
 
 # --- figures ------------------------------------------------------------------------------------
