@@ -218,6 +218,13 @@ def test_rules_can_be_turned_off_and_missing_times_do_not_flag() -> None:
     assert not flags["slow"].any() and (flags["no_log_rt"] == 40).all()
 
 
+def test_practice_alone_is_refused() -> None:
+    trials, sessions = simulate_study(people=3, stimuli=4, scenarios=("roll",))
+    practice = trials[trials["phase"] == "familiarization"]
+    with pytest.raises(BadInputError, match="no test answer"):
+        flag_sessions(as_responses(practice, sessions))
+
+
 # --- with and without, and the effect -----------------------------------------------------------
 
 

@@ -9,6 +9,7 @@ import numpy.typing as npt
 import pandas as pd
 
 from physion.analysis.participants import Responses
+from physion.errors import BadInputError
 
 
 def longest_streak(yes: npt.ArrayLike) -> int:
@@ -48,8 +49,14 @@ def session_measures(
     ``accuracy``, ``yes``, ``mean_log_rt``, ``median_log_rt``, ``no_log_rt`` (trials without a
     response time above 0), ``longest_streak``, ``longest_alternation``,
     ``longest_alternation_from_first``, ``familiarization_trials``, ``familiarization_correct``.
+    Raises `BadInputError` where no session has a test answer.
     """
     test = responses.test
+    if test.empty:
+        raise BadInputError(
+            f"{len(responses.sessions)} session(s) hold practice alone and no test answer: "
+            "give responses with test trials"
+        )
     found = test.groupby("scenario")["stimulus"].nunique().to_dict()
     found |= dict(expected or {})
     by_session = {
