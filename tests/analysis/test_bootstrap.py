@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from physion.analysis.bootstrap import Bootstrap
+from physion.errors import BadInputError
 
 
 @given(st.integers(1, 60), st.integers(0, 5))
@@ -60,5 +61,5 @@ def test_undefined_draws_are_left_out_until_they_are_most() -> None:
 
 @pytest.mark.parametrize("wrong", [{"resamples": 0}, {"level": 1.0}, {"level": 0.0}])
 def test_senseless_settings_are_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match="bootstrap needs"):
+    with pytest.raises(BadInputError, match="bootstrap needs"):
         Bootstrap(**wrong)  # type: ignore[arg-type]

@@ -14,6 +14,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
+from physion.errors import BadInputError
 from physion.seeds import stable_hash
 
 Array = npt.NDArray[np.float64]
@@ -29,7 +30,7 @@ class Bootstrap:
 
     def __post_init__(self) -> None:
         if self.resamples < 1 or not 0 < self.level < 1:
-            raise ValueError("a bootstrap needs resamples >= 1 and a level between 0 and 1")
+            raise BadInputError("a bootstrap needs resamples >= 1 and a level between 0 and 1")
 
     def weights(self, stratum: str, n: int) -> Array:
         """How often each of ``n`` stimuli is drawn, shape (resamples, n), rows that sum to n.
