@@ -15,6 +15,7 @@ from simulated_people import as_responses, simulate_study, study
 
 from physion.analysis.clustered_logit import clustered_logit
 from physion.analysis.exclusions import (
+    BY_CONSTRUCTION,
     OFFICIAL_CODE,
     PREREGISTERED,
     RULE_SETS,
@@ -26,7 +27,7 @@ from physion.analysis.exclusions import (
     streak_limit,
     with_and_without,
 )
-from physion.analysis.participants import Responses
+from physion.analysis.participants import DROPPED_COLUMNS, Responses, missing_times
 from physion.analysis.people import accuracy_by_scenario
 from physion.analysis.session_measures import longest_alternation, longest_streak
 from physion.errors import BadInputError
@@ -216,6 +217,19 @@ def test_rules_can_be_turned_off_and_missing_times_do_not_flag() -> None:
     blind = replace(found, trials=found.trials.assign(log_rt=np.nan))
     flags = flag_sessions(blind)
     assert not flags["slow"].any() and (flags["no_log_rt"] == 40).all()
+    assert count_flags(flags).set_index("rule")["sessions"]["slow not assessed"] == 2
+    assert "slow not assessed" not in set(count_flags(flag_sessions(found))["rule"])
+
+
+def test_missing_response_times_are_counted() -> None:
+    found = with_answers({"a": [True, False] * 3, "b": [True, False] * 3}, [True] * 6)
+    assert missing_times(found).empty
+    late = found.trials["session"].eq("a") & (found.trials["trial"] < 2)
+    some = replace(found, trials=found.trials.assign(log_rt=found.trials["log_rt"].mask(late)))
+    table = missing_times(some)
+    assert tuple(table.columns) == DROPPED_COLUMNS
+    assert table[["scenario", "sessions", "rows"]].to_numpy().tolist() == [["drop", 1, 2]]
+    assert table["rows"].sum() == flag_sessions(some)["no_log_rt"].sum()
 
 
 def test_practice_alone_is_refused() -> None:
@@ -259,6 +273,12 @@ def test_the_effect_of_a_flag_is_found_and_its_interval_allows_for_people() -> N
     assert found["b"].iloc[0] == pytest.approx(odds[True] - odds[False], abs=0.03)
     nobody = flag_effect(responses, flags.assign(slow=False), "slow")
     assert np.isnan(nobody["b"].iloc[0]) and "same in all rows" in nobody["reason"].iloc[0]
+    poor = flags.assign(low_accuracy=worse, flagged=worse)
+    for column in ("low_accuracy", "flagged"):
+        assert flag_effect(responses, poor, column)["reason"].tolist() == [BY_CONSTRUCTION]
+    assert flag_effect(responses, poor.assign(slow=worse), "slow")["reason"].tolist() == [""]
+    other = flag_effect(responses, flags.assign(low_accuracy=False, flagged=worse), "flagged")
+    assert other["reason"].tolist() == [""]
     with pytest.raises(BadInputError, match="no rule"):
         flag_effect(responses, flags, "tired")
 

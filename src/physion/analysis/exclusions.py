@@ -35,6 +35,9 @@ RULES = (
 ``repeated`` ones are a participant's second and later sessions in a scenario."""
 
 
+BY_CONSTRUCTION = "by construction: sessions are flagged for their low accuracy"
+
+
 @dataclass(frozen=True)
 class ExclusionRules:
     """Thresholds of the rules; None turns a rule off.
@@ -200,7 +203,8 @@ def count_flags(flags: pd.DataFrame) -> pd.DataFrame:
     """Sessions that each rule flags, by scenario: ``scenario``, ``rule``, ``sessions``, ``only``.
 
     ``only`` counts those that no other rule flags. The rows ``flagged`` (by any rule), ``kept`` and
-    ``all`` end each scenario; ``familiarization not assessed`` stands where it applies.
+    ``all`` end each scenario; ``familiarization not assessed`` (no practice trial) and ``slow not
+    assessed`` (no response time) stand where they apply.
     """
     rows = []
     for scenario in in_order(flags["scenario"]):
@@ -210,9 +214,13 @@ def count_flags(flags: pd.DataFrame) -> pd.DataFrame:
             (scenario, rule, int(part[rule].sum()), int((part[rule] & alone).sum()))
             for rule in RULES
         ]
-        blind = int((part["familiarization_trials"] == 0).sum())
-        if blind:
-            rows.append((scenario, "familiarization not assessed", blind, 0))
+        blind = {
+            "familiarization": part["familiarization_trials"] == 0,
+            "slow": part["mean_log_rt"].isna(),
+        }
+        for rule, unknown in blind.items():
+            if unknown.any():
+                rows.append((scenario, f"{rule} not assessed", int(unknown.sum()), 0))
         flagged = int(part["flagged"].sum())
         rows.append((scenario, "flagged", flagged, int(alone.sum())))
         rows.append((scenario, "kept", len(part) - flagged, 0))
@@ -250,8 +258,8 @@ def flag_effect(
     Logistic regression of every test answer on the flag and the scenario, with standard errors
     that allow for the answers of one participant being alike (`clustered_logit`). Columns are
     those of `clustered_logit`, for the term ``column`` alone; NaN with a ``reason`` where all or no
-    sessions are flagged. Mind that low accuracy is itself a reason to be flagged: an effect of
-    ``flagged`` is there by construction; ask for the columns of the other rules.
+    sessions are flagged. Low accuracy is itself a rule, so the effects of ``low_accuracy``, and of
+    ``flagged`` where it flags any session, are there by construction, which the ``reason`` says.
     """
     if column not in (*RULES, "flagged"):
         raise BadInputError(f"{column!r} is no rule; choose one of {', '.join(RULES)} or flagged")
@@ -259,4 +267,8 @@ def flag_effect(
     value = test["session"].map(flags.set_index("session")[column]).astype(np.float64)
     table = test.assign(**{column: value})
     fit = clustered_logit(table, "correct", [column], fixed="scenario", level=level)
-    return fit[fit["term"] == column].reset_index(drop=True)
+    found = fit[fit["term"] == column].reset_index(drop=True)
+    if column in ("low_accuracy", "flagged") and flags["low_accuracy"].any():
+        known = found["reason"] != ""
+        found["reason"] = (found["reason"] + "; ").where(known, "") + BY_CONSTRUCTION
+    return found

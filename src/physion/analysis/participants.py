@@ -30,6 +30,7 @@ UNKNOWN = "stimulus is not known"
 SIMULATED = "session of a simulated participant"
 EXCLUDED = "on the list of stimuli to leave out"
 LEDGE = "Roll stimulus with a ledge"
+NO_TIME = "no response time above 0: the answer counts, its time does not"
 
 DROPPED_COLUMNS = ("step", "scenario", "reason", "sessions", "rows")
 
@@ -247,15 +248,28 @@ def _without(found: Responses, gone: pd.Series, step: str, reason: str) -> Respo
     """``found`` without the rows that are ``gone``, which are counted."""
     if not gone.any():
         return found
-    rows = found.trials[gone]
-    counts = rows.groupby("scenario", sort=False)["session"].agg(sessions="nunique", rows="size")
-    counts = counts.reset_index().assign(step=step, reason=reason)[list(DROPPED_COLUMNS)]
+    counts = _counted(found.trials[gone], step, reason)
     parts = [part for part in (found.dropped, counts) if len(part)]
     return replace(
         found,
         trials=found.trials[~gone].reset_index(drop=True),
         dropped=pd.concat(parts, ignore_index=True),
     )
+
+
+def _counted(rows: pd.DataFrame, step: str, reason: str) -> pd.DataFrame:
+    """``rows`` by scenario, with `DROPPED_COLUMNS`."""
+    counts = rows.groupby("scenario", sort=False)["session"].agg(sessions="nunique", rows="size")
+    return counts.reset_index().assign(step=step, reason=reason)[list(DROPPED_COLUMNS)]
+
+
+def missing_times(responses: Responses) -> pd.DataFrame:
+    """Test answers that no analysis of response times can use, as rows of ``dropped``.
+
+    They are not among `Responses.dropped`, since the answers themselves are kept.
+    """
+    test = responses.test
+    return _counted(test[test["log_rt"].isna()], "response times", NO_TIME)
 
 
 def check_labels(responses: Responses, labels: Mapping[str, bool]) -> None:
