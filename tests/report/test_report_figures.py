@@ -9,12 +9,14 @@ from collections.abc import Callable
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from PIL import Image
 
 from physion.analysis import Comparison
 from physion.analysis.difficulty import below_chance
+from physion.analysis.stimuli import SCENARIOS
 from physion.report import figure_tables, figures, figures_stimuli, theme
 from physion.report.inputs import ReportInputs
 from physion.report.plots import plots
@@ -147,6 +149,36 @@ def test_generalization_is_relative_to_people(make_comparison: Maker) -> None:
     assert set(table["trained"]) == {"all", "collide"} and len(table) == 4
     words = [t.get_text() for t in figures.generalization_figure(table).axes[0].texts]
     assert len(words) == 4 and all(word[0] in "+−0" for word in words)
+
+
+def numbered(axis: Axes, which: str) -> tuple[bool, bool]:
+    """Whether an axis has ticks on its outer side, and whether these have numbers."""
+    ticks = (axis.xaxis if which == "x" else axis.yaxis).get_major_ticks()
+    return ticks[0].tick1line.get_visible(), ticks[0].label1.get_visible()
+
+
+def test_an_odd_number_of_models_leaves_no_column_without_scenarios() -> None:
+    pairs = [(agent, trained, tested) for agent in "abc" for trained in ("all", "drop")
+             for tested in SCENARIOS]  # fmt: skip
+    table = pd.DataFrame(pairs, columns=["agent", "trained", "tested"])
+    figure = figures.generalization_figure(table.assign(difference=0.1, people=0.7))
+    figure.draw_without_rendering()
+    first, right, lower = figure.axes[:3]
+    for axis in (right, lower):
+        assert [text.get_text() for text in axis.get_xticklabels()] == list(SCENARIOS)
+        assert numbered(axis, "x") == (True, True)
+    assert numbered(first, "x") == (False, False)
+    assert numbered(first, "y") == (True, True) and numbered(right, "y") == (False, False)
+
+
+def test_panels_inside_have_neither_ticks_nor_numbers(make_comparison: Maker) -> None:
+    table = figure_tables.accuracy_table(make_comparison())
+    table = pd.concat([table[table["panel"] == "drop"].assign(panel=name) for name in SCENARIOS])
+    axes = figures.measure_figure(table, "accuracy").axes
+    ticks = [(numbered(axis, "x"), numbered(axis, "y")[0]) for axis in axes[: len(SCENARIOS)]]
+    yes, no = (True, True), (False, False)
+    assert [x for x, _ in ticks] == [no] * 5 + [yes] * 3
+    assert [y for _, y in ticks] == [True, False, False] * 2 + [True, False]
 
 
 # --- looks --------------------------------------------------------------------------------------

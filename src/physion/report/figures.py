@@ -68,12 +68,14 @@ def measure_figure(table: pd.DataFrame, measure: str, theme: Theme = LIGHT) -> F
             labels = [label(agent, 48) for agent in agents]
             small = 9 if row_height == 0.3 else 8
             axis.set_yticks(range(len(agents)), labels if place % 3 == 0 else [], fontsize=small)
-            axis.tick_params(labelbottom=place + 3 >= len(names))
+            # Without ticks the values of the panel to the left do not read as their numbers.
+            axis.tick_params(axis="y", left=place % 3 == 0)
             axis.set_ylim(len(agents) - 0.4, -0.6)
             # The values stand in a column of their own, right of everything else.
             axis.set_xlim(low, high + 0.16 * (high - low))
         figure.supxlabel(LABELS[measure], fontsize=10)
         legend(figure, _measure_handles(table, kinds, theme), 4)
+        figure.get_layout_engine().set(wspace=0.05)  # type: ignore[union-attr]
     return figure
 
 
@@ -230,7 +232,8 @@ def generalization_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
         figure.supxlabel("tested on", fontsize=10)
         figure.supylabel("trained on", fontsize=10)
         if image is not None:
-            figure.colorbar(image, ax=axes, label="accuracy less that of people", shrink=0.9)
+            base = "that of people" if table["people"].notna().any() else "0.5"
+            figure.colorbar(image, ax=axes, label=f"accuracy less {base}", shrink=0.9)
     return figure
 
 

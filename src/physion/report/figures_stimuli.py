@@ -45,9 +45,8 @@ def scatter_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
         figure, axes = panels(
             len(agents), columns, (width, width), above=1.1, sharex=True, sharey=True
         )
-        for place, (axis, agent) in enumerate(zip(axes, agents, strict=True)):
+        for axis, agent in zip(axes, agents, strict=True):
             _points(axis, table[table["agent"] == agent], scenarios, theme)
-            axis.tick_params(labelbottom=place + columns >= len(agents))
         figure.supxlabel("share of people who say yes", fontsize=10)
         figure.supylabel("P(contact) of the model", fontsize=10)
         changed = bool((table["label"] != table["simulated"]).any())
@@ -190,7 +189,7 @@ def calibration_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
         width = 11 / columns
         figure, axes = panels(len(agents), columns, (width, width + 0.2), above=0.5,
                               sharex=True, sharey=True)  # fmt: skip
-        for place, (axis, agent) in enumerate(zip(axes, agents, strict=True)):
+        for axis, agent in zip(axes, agents, strict=True):
             rows = table[(table["agent"] == agent) & (table["stimuli"] > 0)]
             axis.plot([0, 1], [0, 1], color=theme.faint, linewidth=1, linestyle=":")
             axis.vlines(rows["mean_p"], rows["low"], rows["high"], color=theme.palette[0],
@@ -207,7 +206,6 @@ def calibration_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
             axis.set_aspect("equal")
             axis.set_xticks([0, 0.5, 1])
             axis.set_yticks([0, 0.5, 1])
-            axis.tick_params(labelbottom=place + columns >= len(agents))
         figure.supxlabel("P(contact) of the model", fontsize=10)
         figure.supylabel("share of stimuli with contact", fontsize=10)
     return figure

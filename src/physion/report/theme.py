@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -62,7 +62,8 @@ def panels(
     """A figure of ``count`` panels, each about ``size`` inches, and its axes row by row.
 
     Where there are fewer than ``columns``, the rest of the width stays empty, so that panels are
-    as large as in other figures. ``above`` is room for the legend. Call it inside
+    as large as in other figures. ``above`` is room for the legend. Of panels that share an axis
+    only the outer ones have ticks with numbers, see `outer`. Call it inside
     ``rc_context(style(theme))``.
     """
     rows = math.ceil(count / columns)
@@ -71,9 +72,19 @@ def panels(
     axes = list(figure.subplots(rows, columns, squeeze=False, **shared).flat)
     for axis in axes[count:]:
         axis.set_visible(False)
-    for axis in axes[max(count - columns, 0) : count]:
-        axis.tick_params(labelbottom=True)  # also where the panel below is not there
+    for place, axis in enumerate(axes[:count]):
+        outer(axis, place, count, columns, shared)
     return figure, axes[:count]
+
+
+def outer(axis: Axes, place: int, count: int, columns: int, shared: Mapping[str, Any]) -> None:
+    """Takes ticks that would have no numbers, and gives them where no panel stands below."""
+    if shared.get("sharex"):
+        last = place + columns >= count
+        axis.tick_params(axis="x", bottom=last, labelbottom=last)
+    if shared.get("sharey"):
+        first = place % columns == 0
+        axis.tick_params(axis="y", left=first, labelleft=first)
 
 
 def legend(figure: Figure, handles: Sequence[Any], columns: int) -> None:
