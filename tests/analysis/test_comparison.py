@@ -10,7 +10,8 @@ import pandas as pd
 import pytest
 
 from physion.analysis import Bootstrap, compare, read_predictions
-from physion.analysis.comparison import EXCLUDED, LEDGE, NO_LABEL, NOT_PREDICTED, NOT_SEEN
+from physion.analysis.comparison import NO_LABEL, NOT_PREDICTED, NOT_SEEN
+from physion.analysis.participants import EXCLUDED, LEDGE
 from physion.analysis.predictions import check_predictions, name_models
 from physion.analysis.responses import read_humans, read_labels
 from physion.analysis.tables import MEAN, POOLED

@@ -9,14 +9,13 @@ import numpy as np
 import pandas as pd
 
 from physion.analysis.bootstrap import Bootstrap
+from physion.analysis.participants import EXCLUDED, LEDGE
 from physion.analysis.predictions import check_predictions, name_models
 from physion.analysis.responses import with_labels
 from physion.analysis.stimuli import canonical_name, is_ledge
 from physion.analysis.tables import people_table, score_table
 from physion.errors import BadInputError
 
-LEDGE = "Roll stimulus with a ledge"
-EXCLUDED = "on the list of stimuli to leave out"
 NO_LABEL = "no official outcome is known"
 NOT_SEEN = "people did not see it"
 NOT_PREDICTED = "the model does not predict it"
@@ -139,8 +138,8 @@ def _drop(
     reason = pd.Series("", index=people.index, dtype=object)
     reason = reason.mask(people["scenario"].isna(), NO_SCENARIO)
     reason = reason.mask(people["label"].isna(), NO_LABEL)
-    reason = reason.mask(_purpose(people["stimulus"], unwanted, exclude_ledge) != "", EXCLUDED)
-    reason = reason.mask(people["stimulus"].map(is_ledge) & exclude_ledge, LEDGE)
+    purpose = _purpose(people["stimulus"], unwanted, exclude_ledge)
+    reason = reason.mask(purpose != "", purpose)
     kept = reason == ""
     left_out = people[~kept].assign(reason=reason[~kept], agent="")
     return people[kept].reset_index(drop=True), _count(left_out)

@@ -13,7 +13,7 @@ from physion.analysis.tables import MEAN
 from physion.analysis.zones import released_zone
 
 RECRUITED = 800
-EXCLUDED = 112
+PEOPLE_EXCLUDED = 112
 THIRDS = ((0.0, 1 / 3, "hard", 0.10), (1 / 3, 2 / 3, "chance", 0.22), (2 / 3, 1.0, "easy", 0.68))
 """Accuracy of people from, to, the paper's word for such stimuli, and the share that it prints."""
 
@@ -73,7 +73,7 @@ def people_claims(tables: PublishedTables) -> pd.DataFrame:
     rows: list[tuple[str, str, str, str]] = [
         (
             "participants after exclusions",
-            f"{RECRUITED} - {EXCLUDED} = {RECRUITED - EXCLUDED}",
+            f"{RECRUITED} - {PEOPLE_EXCLUDED} = {RECRUITED - PEOPLE_EXCLUDED}",
             f"{answered.sum():.0f}",
             "sum over scenarios of the people behind the tables by stimulus",
         ),

@@ -12,6 +12,7 @@ import numpy.typing as npt
 import pandas as pd
 
 from physion.analysis.agreement import CONSTANT, FEWEST
+from physion.analysis.correlation import from_sums
 
 Array = npt.NDArray[np.float64]
 
@@ -75,21 +76,11 @@ def scores(sums: Array) -> dict[str, Array]:
             "accuracy_simulated": total["correct_simulated"] / total["n"],
             "human_accuracy": total["human"] / total["n"],
             "difference": (total["correct"] - total["human"]) / total["n"],
-            "r": _pearson(*(total[key] for key in ("n", *_MOMENTS))),
-            "r_same": _pearson(*(total[key] for key in _SAME)),
+            "r": from_sums(*(total[key] for key in ("n", *_MOMENTS))),
+            "r_same": from_sums(*(total[key] for key in _SAME)),
             "rmsd": np.sqrt(total["square"] / total["n"]),
         }
     return found
-
-
-def _pearson(n: Array, x: Array, y: Array, xx: Array, yy: Array, xy: Array) -> Array:
-    """r from sums of values that lie around 0, so that little is lost in the subtractions."""
-    spread_x = xx / n - (x / n) ** 2
-    spread_y = yy / n - (y / n) ** 2
-    defined = (n >= FEWEST) & (np.minimum(spread_x, spread_y) >= CONSTANT**2)
-    covariance = xy / n - (x / n) * (y / n)
-    product = np.where(defined, spread_x * spread_y, np.nan)
-    return np.asarray(covariance / np.sqrt(product))
 
 
 def why_no_r(x: npt.ArrayLike, y: npt.ArrayLike) -> str:
