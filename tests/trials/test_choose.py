@@ -60,7 +60,7 @@ def test_every_physics_belongs_to_one_split() -> None:
 @pytest.mark.parametrize("split", ["testing", "training"])
 def test_chosen_draws_are_what_their_split_takes(split: str, tmp_path: Path) -> None:
     tasks = slots(split, 8)
-    choices, failed = choose_all(tasks, QUICK, tmp_path / "c.json", SerialExecutor())
+    choices, failed = choose_all({tmp_path / "c.json": tasks}, QUICK, SerialExecutor())
     assert not failed
     contacts = []
     for task in tasks:
@@ -77,9 +77,9 @@ def test_chosen_draws_are_what_their_split_takes(split: str, tmp_path: Path) -> 
 
 def test_choices_do_not_depend_on_order_or_on_what_else_is_asked(tmp_path: Path) -> None:
     tasks = slots("testing", 6)
-    whole, _ = choose_all(tasks, QUICK, tmp_path / "a.json", SerialExecutor())
-    part, _ = choose_all(tasks[:2], QUICK, tmp_path / "b.json", SerialExecutor())
-    rest, _ = choose_all(tasks[::-1], QUICK, tmp_path / "b.json", SerialExecutor())
+    whole, _ = choose_all({tmp_path / "a.json": tasks}, QUICK, SerialExecutor())
+    part, _ = choose_all({tmp_path / "b.json": tasks[:2]}, QUICK, SerialExecutor())
+    rest, _ = choose_all({tmp_path / "b.json": tasks[::-1]}, QUICK, SerialExecutor())
     assert {**rest, **part} == whole
     assert json.loads((tmp_path / "a.json").read_text()) == json.loads(
         (tmp_path / "b.json").read_text()
@@ -103,7 +103,7 @@ def test_copies_are_refused_and_scarce_physics_is_said(
     few_scenes(monkeypatch, 12)
     monkeypatch.setattr(choosing, "MAX_TRIES", 60)
     tasks = slots("training", 12)
-    choices, failed = choose_all(tasks, QUICK, tmp_path / "c.json", SerialExecutor())
+    choices, failed = choose_all({tmp_path / "c.json": tasks}, QUICK, SerialExecutor())
     digests = [choice.digest for choice in choices.values()]
     assert len(set(digests)) == len(digests) > 2
     assert failed, "twelve scenes, of which some belong to other splits, cannot fill twelve slots"

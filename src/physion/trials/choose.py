@@ -45,6 +45,8 @@ MAX_ELSEWHERE = 600
 chance that happens once in 10^16 to the rarest split."""
 MAX_UNPLACED = 20
 """Draws in a row that could not be placed before a preset is given up."""
+SAVE_EVERY = 100
+"""Choices that a killed run may lose."""
 JITTER = 0.001
 """Standard deviation in metres of the noise that measures robustness."""
 
@@ -193,8 +195,6 @@ def _visible(scene: Scene, trajectory: Trajectory, settings: Settings) -> bool:
 class Choices:
     """The choices of one split of one scenario, kept in a file so that a killed run goes on."""
 
-    SAVE_EVERY = 100
-
     def __init__(self, path: Path) -> None:
         self.path = path
         self.by_index: dict[int, Choice] = {}
@@ -231,33 +231,60 @@ class Choices:
 
 
 def choose_all(
-    tasks: Collection[Task],
+    groups: Mapping[Path, Collection[Task]],
     settings: Settings,
-    path: Path,
     executor: Executor,
     track: Track | None = None,
 ) -> tuple[dict[str, Choice], dict[str, Outcome[Choice]]]:
-    """Choices by trial name for the tasks of one split and scenario; and failures by name.
+    """Choices by trial name, and failures by name, for tasks by the file of their choices.
 
-    Slots are searched side by side, and those that found the physics of a slot before them search
-    on, so that the result does not depend on who was first.
+    Each group is one split of one scenario. Slots are searched side by side, and those that found
+    the physics of a slot before them search on, so that the result does not depend on who was
+    first.
     """
-    choices, failed = Choices(path), dict[str, Outcome[Choice]]()
-    while todo := [task for task in choices.missing(tasks) if task.trial not in failed]:
-        slots = {t.trial: Slot(t, settings, choices.taken(t.index)) for t in todo}
-        index_of = {task.trial: task.index for task in todo}
-        outcomes = executor.map(choose, slots)
+    records = {path: Choices(path) for path in groups}
+    failed: dict[str, Outcome[Choice]] = {}
+    while todo := _slots(groups, records, settings, failed.keys()):
+        outcomes = executor.map(choose, {name: slot for name, (_, slot) in todo.items()})
+        unsaved: set[Path] = set()
         for done, outcome in enumerate(
-            track(outcomes, f"choosing {todo[0].scenario}", len(todo)) if track else outcomes
+            track(outcomes, "choosing", len(todo)) if track else outcomes, start=1
         ):
             if outcome.error is not None:
                 failed[outcome.key] = outcome
                 continue
-            choices.by_index[index_of[outcome.key]] = outcome.value
-            if done % Choices.SAVE_EVERY == Choices.SAVE_EVERY - 1:
-                choices.save()
-        choices.missing(tasks)  # drops what came twice
-        choices.save()
-    return {
-        task.trial: choices.by_index[task.index] for task in tasks if task.trial not in failed
-    }, failed
+            path, slot = todo[outcome.key]
+            records[path].by_index[slot.task.index] = outcome.value
+            unsaved.add(path)
+            if done % SAVE_EVERY == 0:
+                _save(records, unsaved)
+        _save(records, unsaved)
+    chosen = {
+        task.trial: records[path].by_index[task.index]
+        for path, tasks in groups.items()
+        for task in tasks
+        if task.trial not in failed
+    }
+    return chosen, failed
+
+
+def _slots(
+    groups: Mapping[Path, Collection[Task]],
+    records: Mapping[Path, Choices],
+    settings: Settings,
+    failed: Collection[str],
+) -> dict[str, tuple[Path, Slot]]:
+    """What is still to be chosen, by trial name; choices that came twice are dropped before."""
+    todo = {}
+    for path, tasks in groups.items():
+        for task in records[path].missing(tasks):
+            if task.trial not in failed:
+                taken = records[path].taken(task.index)
+                todo[task.trial] = (path, Slot(task, settings, taken))
+    return todo
+
+
+def _save(records: Mapping[Path, Choices], unsaved: set[Path]) -> None:
+    for path in sorted(unsaved):
+        records[path].save()
+    unsaved.clear()

@@ -110,28 +110,31 @@ def _choose(
     track: Track | None,
 ) -> tuple[dict[str, Job], dict[str, str]]:
     """The missing jobs with their draws chosen, and why some could not be chosen."""
-    groups: dict[tuple[str, str], list[Task]] = {}
+    groups: dict[Path, list[Task]] = {}
     for job in jobs.values():
         if job.task.presets:
-            groups.setdefault((job.task.split, job.task.scenario), []).append(job.task)
+            path = folder / CHOICES / f"{job.task.split}_{job.task.scenario}.json"
+            groups.setdefault(path, []).append(job.task)
+    wanted = {
+        path: tasks
+        for path, tasks in groups.items()
+        if any(task.trial in missing for task in tasks)
+    }
     chosen, failed = dict(missing), dict[str, str]()
-    for (split, scenario), tasks in groups.items():
-        names = {task.trial for task in tasks} & missing.keys()
-        if not names:
-            continue
-        from physion.trials.choose import choose_all
+    if not wanted:
+        return chosen, failed
+    from physion.trials.choose import choose_all
 
-        path = folder / CHOICES / f"{split}_{scenario}.json"
-        choices, outcomes = choose_all(tasks, settings, path, executor, track)
-        for name, outcome in outcomes.items():
-            if outcome.errno in HOPELESS:
-                raise PhysionError(f"cannot write into {folder}: {outcome.error}")
-            if name in names:
-                failed[name] = str(outcome.error)
-                _note_failure(folder, outcome, chosen.pop(name))
-        for name in names - failed.keys():
-            job = chosen[name]
-            chosen[name] = dataclasses.replace(job, task=choices[name].fill(job.task))
+    choices, outcomes = choose_all(wanted, settings, executor, track)
+    for name, outcome in outcomes.items():
+        if outcome.errno in HOPELESS:
+            raise PhysionError(f"cannot write into {folder}: {outcome.error}")
+        if name in chosen:
+            failed[name] = str(outcome.error)
+            _note_failure(folder, outcome, chosen.pop(name))
+    for name in choices.keys() & chosen.keys():
+        job = chosen[name]
+        chosen[name] = dataclasses.replace(job, task=choices[name].fill(job.task))
     return chosen, failed
 
 
