@@ -310,6 +310,23 @@ def test_the_zone_is_for_whole_scenarios_alone() -> None:
     assert np.isnan(table.loc["drop", "zone_low"]) and np.isnan(table.loc[MEAN, "zone_low"])
 
 
+def test_the_settings_say_where_the_zone_comes_from_and_what_is_drawn() -> None:
+    people = humans()
+    zone = pd.DataFrame({"scenario": ["collide", "drop"], "low": 0.6, "high": 0.8})
+    given = (predictions(people), people, labels(people))
+    plain = compare(*given, zone=zone, bootstrap=QUICK).settings
+    assert "official" not in plain["Human zone"] and "not resampled" not in plain["Intervals"]
+    assert "Intervals with participants" not in plain
+    told = compare(
+        *given, zone=zone, zone_origin="from the responses", participants=True, bootstrap=QUICK
+    ).settings
+    assert "from the responses" in told["Human zone"]
+    for word in ("participants", "stimuli", "both", "200 resamples"):
+        assert word in told["Intervals with participants"]
+    assert "not given" in compare(*given, bootstrap=QUICK).settings["Human zone"]
+    assert "Human zone" not in compare(given[0], None, bootstrap=QUICK).settings
+
+
 def test_an_interval_without_width_says_so() -> None:
     people = humans()
     given = predictions(people)

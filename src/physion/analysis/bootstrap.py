@@ -1,9 +1,10 @@
-"""Intervals by resampling stimuli.
+"""Intervals by resampling stimuli, people, or whatever else is numbered.
 
-People and models answered the same stimuli, and stimuli are what one wants to generalise over, so
-stimuli are drawn with replacement; each scenario keeps its number of them. The participants are
-not resampled, which the tables by stimulus do not permit. All models of a comparison that answered
-the same stimuli get the same draws, so that differences between them are paired.
+Stimuli are drawn with replacement, since they are what one wants to generalise over; each scenario
+keeps its number of them. Where the answers of single participants are known, people are drawn
+likewise (`people`), or both (`model_people`); tables by stimulus permit the stimuli alone. All
+models of a comparison that answered the same stimuli get the same draws, so that differences
+between them are paired.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ class Bootstrap:
             raise BadInputError("a bootstrap needs resamples >= 1 and a level between 0 and 1")
 
     def weights(self, stratum: str, n: int) -> Array:
-        """How often each of ``n`` stimuli is drawn, shape (resamples, n), rows that sum to n.
+        """How often each of ``n`` stimuli (or people) is drawn, shape (resamples, n), rows that sum to n.
 
         A function of the seed, the name of the stratum and n, and of nothing else.
         """

@@ -61,6 +61,8 @@ def compare(
     labels: Mapping[str, bool] | None = None,
     *,
     zone: pd.DataFrame | None = None,
+    zone_origin: str = "",
+    participants: bool = False,
     exclude: Iterable[str] = (),
     exclude_ledge: bool = True,
     bootstrap: Bootstrap | None = None,
@@ -71,9 +73,11 @@ def compare(
     the outcome of the trial that the model was shown. ``humans``: from `responses.read_humans`, or
     None to have the models' accuracies alone. ``labels``: official outcome by stimulus; where it is
     silent the column *Recorded Outcome* of the predictions speaks, and without people the simulated
-    outcome. ``zone``: from
-    `responses.read_human_zone`. ``exclude``: stimuli to leave out. ``exclude_ledge``: leave out the
-    Roll stimuli with a ledge, as the study does.
+    outcome. ``zone``: from `responses.read_human_zone` or from single participants' accuracies,
+    with ``scenario``, ``low`` and ``high``; ``zone_origin`` says in words where it comes from.
+    ``participants``: the answers of single participants are known and are drawn for the intervals
+    of other tables, which the settings then say. ``exclude``: stimuli to leave out.
+    ``exclude_ledge``: leave out the Roll stimuli with a ledge, as the study does.
 
     Everything left out is counted in ``dropped``. Raises `BadInputError` where nothing is left, or
     where a model or the tables contradict themselves.
@@ -107,7 +111,9 @@ def compare(
         stimuli=stimuli,
         changed=_changed(stimuli),
         dropped=pd.concat(dropped, ignore_index=True),
-        settings=_settings(humans is not None, unwanted, exclude_ledge, zone, draws),
+        settings=_settings(humans is not None, unwanted, exclude_ledge, draws)
+        | (_intervals_with_participants(draws) if participants else {})
+        | (_zone_in_words(zone, zone_origin) if humans is not None else {}),
     )
 
 
@@ -202,7 +208,6 @@ def _settings(
     has_people: bool,
     unwanted: set[str],
     exclude_ledge: bool,
-    zone: pd.DataFrame | None,
     draws: Bootstrap,
 ) -> dict[str, str]:
     words = {
@@ -213,19 +218,31 @@ def _settings(
         "Roll stimuli with a ledge": "left out, as in the study" if exclude_ledge else "kept",
         "Further stimuli left out": f"{len(unwanted)} on a list" if unwanted else "none",
         "Intervals": f"{draws.level:.0%} percentile bootstrap over stimuli within each scenario, "
-        f"{draws.resamples} resamples, seed {draws.seed}; participants are not resampled",
+        f"{draws.resamples} resamples, seed {draws.seed}; people's averages stay as they are",
         "Overall": "“mean” averages the scores of the scenarios, each counting the same; “pooled” "
         "takes all stimuli together",
     }
     if has_people:
-        words["Human zone"] = (
-            "not given: it needs the answers of single participants"
-            if zone is None
-            else "2.5th to 97.5th percentile of participants' accuracies, official table; only for "
-            "scenarios of which all stimuli that people saw are predicted"
-        )
         words["Ceiling of r"] = (
             "expected r of a model that knows the true share of yes: square root of the "
             "reliability that binomial sampling noise leaves, from accuracy and number of people"
         )
     return words
+
+
+def _intervals_with_participants(draws: Bootstrap) -> dict[str, str]:
+    return {
+        "Intervals with participants": f"{draws.level:.0%} percentile bootstrap, three of them: by "
+        "drawing participants, stimuli, or both with replacement within each scenario, "
+        f"{draws.resamples} resamples, seed {draws.seed}"
+    }
+
+
+def _zone_in_words(zone: pd.DataFrame | None, origin: str) -> dict[str, str]:
+    if zone is None:
+        return {"Human zone": "not given: it needs the answers of single participants"}
+    return {
+        "Human zone": "2.5th to 97.5th percentile of participants' accuracies"
+        + (f", {origin}" if origin else "")
+        + "; only for scenarios of which all stimuli that people saw are predicted"
+    }
