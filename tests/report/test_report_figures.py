@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
@@ -17,8 +18,13 @@ from PIL import Image
 from physion.analysis import Comparison
 from physion.analysis.difficulty import below_chance
 from physion.analysis.stimuli import SCENARIOS
-from physion.report import figure_tables, figures, figures_stimuli, theme
+from physion.analysis.tables import MEAN
+from physion.report import blocks, figure_tables, figures, figures_stimuli, theme
+from physion.report.blocks import protocol_names
+from physion.report.document import Picture
 from physion.report.inputs import ReportInputs
+from physion.report.mixed_fits import fits_of_models
+from physion.report.page import render_page
 from physion.report.plots import plots
 
 Maker = Callable[..., Comparison]
@@ -179,6 +185,61 @@ def test_panels_inside_have_neither_ticks_nor_numbers(make_comparison: Maker) ->
     yes, no = (True, True), (False, False)
     assert [x for x, _ in ticks] == [no] * 5 + [yes] * 3
     assert [y for _, y in ticks] == [True, False, False] * 2 + [True, False]
+
+
+# --- one name, one way of writing ----------------------------------------------------------------
+
+
+def pictures(inputs: ReportInputs) -> list[Picture]:
+    blank = {"svg": b"<svg/>", "png": b""}
+    return [Picture(plot.name, blank, blank, plot.words) for plot in plots(inputs)]
+
+
+def test_page_and_figures_call_a_model_by_one_name(make_comparison: Maker) -> None:
+    long = "m · observed · dynamics training dataset same"
+    comparison = make_comparison()
+    renamed = {comparison.agents[0]: long}
+    tables = [t.replace({"agent": renamed}) for t in (comparison.scores, comparison.stimuli)]
+    comparison = dataclasses.replace(comparison, scores=tables[0], stimuli=tables[1])
+    inputs = ReportInputs(comparison, scatter_limit=0)
+    page = render_page(inputs, pictures(inputs))
+    assert "dynamics training" not in page
+    assert page.count(figures.label(long)) > 4  # tables, cards, caption of the scatter figure
+    assert protocol_names("m · readout train data all but this") == "m · readout train data all-but"
+    assert protocol_names("the same dynamics") == "the same dynamics"
+
+
+def test_columns_of_simulated_outcomes_stand_only_where_these_differ(
+    make_comparison: Maker,
+) -> None:
+    comparison = make_comparison()
+    stimuli = comparison.stimuli.assign(simulated=comparison.stimuli["label"])
+    same = dataclasses.replace(comparison, changed=comparison.changed.iloc[:0], stimuli=stimuli)
+    for own, there in ((comparison, True), (same, False)):
+        text = blocks.overall_table(own, MEAN) + blocks.definitions(own)
+        assert ("against simulated outcome" in text) is there
+        assert ("same outcome" in text) is there
+        assert text.count("<td>") % text.count('<th scope="row">') == 0
+        assert text.count('scope="col"') - 1 == text.count("<td>") / len(own.agents)
+
+
+def test_counts_and_gaps_are_written_in_one_way(make_comparison: Maker) -> None:
+    column = blocks.Column("rows", "rows", "count")
+    assert column.cell(pd.Series({"rows": 120000})) == "120000"
+    comparison = make_comparison()
+    assert "–" not in blocks.people(comparison) + blocks.matrix(comparison, "r")
+
+
+def test_models_are_held_against_the_first_in_the_files(make_comparison: Maker) -> None:
+    comparison = make_comparison()
+    assert comparison.agents != sorted(comparison.agents)
+    spread = comparison.scores.assign(accuracy=np.linspace(0.4, 0.9, len(comparison.scores)) ** 2)
+    comparison = dataclasses.replace(comparison, scores=spread)
+    models = fits_of_models(comparison)[0]
+    assert models.fit is not None
+    terms = models.fit.table["term"].tolist()
+    assert len(terms) == 2 and comparison.agents[1] in terms[1]
+    assert comparison.agents[0] in models.about
 
 
 # --- looks --------------------------------------------------------------------------------------

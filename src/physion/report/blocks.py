@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -11,9 +12,9 @@ import numpy as np
 import pandas as pd
 
 from physion.analysis.comparison import Comparison
+from physion.analysis.predictions import DATASETS
 from physion.analysis.tables import MEAN, POOLED, in_order
 
-DASH = "–"
 MOST_BARS = 8
 """Models of which a card shows each; of more it shows the one it is about and the others' mean."""
 
@@ -27,6 +28,22 @@ def plural(count: int, noun: str) -> str:
     """``1 model``, ``2 models``, ``2 stimuli``."""
     many = noun.removesuffix("us") + "i" if noun.endswith("us") else noun + "s"
     return f"{count} {noun if count == 1 else many}"
+
+
+def protocol_names(text: str) -> str:
+    """``text`` with trainings called by their protocols: *all*, *all-but*, *only*.
+
+    Tables of the analysis name the column of the predictions, *dynamics training dataset same*; the
+    page and the figures write *only*. Of parts other than the dynamics the column stays in sight.
+    """
+    short = _RELATIVE.sub(lambda found: found[1] + PROTOCOLS[found[2]], text)
+    return short.replace(" · dynamics training dataset ", " · ")
+
+
+PROTOCOLS = {"same": "only", "all but this": "all-but"}
+"""What a training in relation to the tested scenario is called, by its name in predictions."""
+
+_RELATIVE = re.compile(rf"( · (?:{'|'.join(DATASETS)}) )(same|all but this)\b", re.IGNORECASE)
 
 
 def number(value: float, digits: int = 2) -> str:
@@ -84,7 +101,7 @@ class Column:
         if pd.isna(value):
             return undefined(str(row.get("reason", "")))
         if self.kind == "count":
-            return f"{round(float(value)):,}".replace(",", " ")
+            return str(round(float(value)))
         if self.kind == "p":
             return p_value(float(value))
         return percent(float(value)) if self.kind == "percent" else number(value, self.digits)
@@ -136,18 +153,23 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]], caption: str = "
 
 
 def overall_table(comparison: Comparison, which: str, caption: str = "") -> str:
-    """A row a model: accuracy against both outcomes, beside people; r with its ceiling; RMSD."""
+    """A row a model: accuracy against both outcomes, beside people; r with its ceiling; RMSD.
+
+    What is about simulated outcomes is absent where they all are the official ones.
+    """
     rows = comparison.scores[comparison.scores["scenario"] == which]
-    header = ["model", "readout", "stimuli", "accuracy", "against simulated outcome"]
+    shown = {"accuracy": "accuracy", "accuracy_simulated": "against simulated outcome"}
     if comparison.has_people:
-        header += ["people", "difference", "Pearson r", "r, same outcome", "ceiling of r", "RMSD"]
+        shown |= {"human_accuracy": "people", "difference": "difference", "r": "Pearson r",
+                  "r_same": "r, same outcome"}  # fmt: skip
+    if comparison.changed.empty:
+        shown = {k: v for k, v in shown.items() if k not in ("accuracy_simulated", "r_same")}
+    header = ["model", "readout", "stimuli", *shown.values()]
+    header += ["ceiling of r", "RMSD"] if comparison.has_people else []
     cells = []
     for _, row in rows.iterrows():
         line = [escape(_model_words(row)), escape(row["readout"]), str(row["stimuli"])]
-        keys = ["accuracy", "accuracy_simulated"]
-        if comparison.has_people:
-            keys += ["human_accuracy", "difference", "r", "r_same"]
-        line += [interval(row, key) for key in keys]
+        line += [interval(row, key) for key in shown]
         if comparison.has_people:
             line += [number(row["ceiling"]), interval(row, "rmsd")]
         cells.append(line)
@@ -175,7 +197,10 @@ def matrix(comparison: Comparison, key: str) -> str:
         rows.append([f"<em>{_people_title(key)}</em>", *_people_cells(comparison, key, columns)])
     for agent in comparison.agents:
         own = scores[scores["agent"] == agent].set_index("scenario")
-        cells = [interval(own.loc[name], key) if name in own.index else DASH for name in columns]
+        cells = [
+            interval(own.loc[name], key) if name in own.index else undefined("no predictions")
+            for name in columns
+        ]
         rows.append([escape(agent), *cells])
     return table(["", *columns], rows)
 
@@ -189,6 +214,9 @@ def _people_cells(comparison: Comparison, key: str, columns: Sequence[str]) -> l
     if key == "accuracy":
         return [interval(people.loc[name], key) if name in people.index else "" for name in columns]
     return [number(people.loc[name, "ceiling"]) if name in people.index else "" for name in columns]
+
+
+_NO_ZONE = "known only of scenarios of which all stimuli that single participants saw are predicted"
 
 
 def people(comparison: Comparison) -> str:
@@ -205,7 +233,7 @@ def people(comparison: Comparison) -> str:
                 number(row["base_rate"]),
                 number(row["yes"]),
                 interval(row, "accuracy"),
-                zone if np.isfinite(row["zone_low"]) else DASH,
+                zone if np.isfinite(row["zone_low"]) else undefined(_NO_ZONE),
                 number(row["reliability"], 3),
                 number(row["ceiling"], 3),
             ]
@@ -213,8 +241,8 @@ def people(comparison: Comparison) -> str:
     return table([*header, "reliability", "ceiling of r"], rows, "People")
 
 
-def definitions() -> str:
-    """What the columns mean."""
+def definitions(comparison: Comparison) -> str:
+    """What the columns mean; those that are hidden, see `overall_table`, are not explained."""
     meaning = {
         "accuracy": "share of the model's answers that equal the official outcome; people: mean "
         "over stimuli of the share who are right, on the same stimuli",
@@ -225,8 +253,12 @@ def definitions() -> str:
         "outcome is not the official one, as there people and model saw different events",
         "RMSD": "root of the mean squared difference of these two",
         "NaN": "undefined; the reason stands below the table or shows on hovering",
-        DASH: "nothing to say here",
+        "all, all-but, only": "a model's training: on all scenarios, on all but the tested one, on "
+        "the tested one alone; in the files the last two are “all but this” and “same”",
     }
+    if comparison.changed.empty:
+        del meaning["against simulated outcome"]
+        meaning["Pearson r"] = meaning["Pearson r"].partition(";")[0]
     return f"<h3>What the numbers mean</h3>{words_list(meaning)}"
 
 

@@ -21,6 +21,7 @@ from physion.analysis.predictions import DATASETS, READOUTS
 from physion.analysis.stimuli import OFFICIAL_SCENARIOS, SCENARIOS
 from physion.analysis.tables import MEAN, POOLED, in_order
 from physion.analysis.zones import released_zone
+from physion.report.blocks import PROTOCOLS
 from physion.report.figures import HALVES_ZONE, PARTICIPANTS, SCENARIO_ZONE
 
 Array = npt.NDArray[np.float64]
@@ -37,7 +38,7 @@ GROUPED_COLUMNS = ("panel", "agent", "group", "value", "low", "high", "people", 
 GENERALIZATION_COLUMNS = ("agent", "trained", "tested", "stimuli", "accuracy", "people",
                           "difference")  # fmt: skip
 
-ALL_BUT, ONLY, ANOTHER = "all but the tested one", "only the tested one", "another scenario"
+ALL_BUT, ONLY, ANOTHER = PROTOCOLS["all but this"], PROTOCOLS["same"], "another scenario"
 
 
 def accuracy_table(comparison: Comparison) -> pd.DataFrame:

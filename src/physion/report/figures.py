@@ -5,7 +5,6 @@ Every function draws its table and nothing else; `figure_tables` makes the table
 
 from __future__ import annotations
 
-import re
 import textwrap
 from collections.abc import Sequence
 from typing import Any
@@ -20,19 +19,13 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from physion.analysis.tables import MEAN
-from physion.report.blocks import number
+from physion.report.blocks import number, protocol_names
 from physion.report.theme import LIGHT, Theme, legend, panels, style, title
 
 
 def label(agent: str, width: int = 48) -> str:
-    """The name of a model on an axis: trainings as the paper calls them, broken into lines."""
-    short = re.sub(r" · dynamics training dataset (\S[^·]*)", _training, str(agent))
-    return textwrap.fill(short, width)
-
-
-def _training(match: re.Match[str]) -> str:
-    name = match[1].strip()
-    return f" · {'only' if name == 'same' else name}"
+    """The name of a model on an axis, as on the page, broken into lines."""
+    return textwrap.fill(protocol_names(str(agent)), width)
 
 
 CHANCE = {"accuracy": 0.5, "r": 0.0, "kappa": 0.0}
@@ -225,7 +218,7 @@ def generalization_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
             values = grid.reindex(index=trained, columns=tested).to_numpy(dtype=np.float64)
             image = axis.imshow(values, cmap="PuOr_r", norm=TwoSlopeNorm(0, -widest, widest),
                                 aspect="auto")  # fmt: skip
-            _cells(axis, values, widest, theme)
+            _cells(axis, values, widest)
             title(axis, label(agent, 40))
             axis.set_xticks(range(len(tested)), tested, rotation=45, ha="right")
             axis.set_yticks(range(len(trained)), trained)
@@ -237,12 +230,11 @@ def generalization_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
     return figure
 
 
-def _cells(axis: Axes, values: Any, widest: float, theme: Theme) -> None:
+def _cells(axis: Axes, values: Any, widest: float) -> None:
     for row, column in np.ndindex(*values.shape):
         value = values[row, column]
         if not np.isfinite(value):
-            axis.text(column, row, "–", ha="center", va="center", color=theme.faint, fontsize=8)
-            continue
+            continue  # not tested so
         # The map is light in its middle and dark at its ends, on any paper.
         colour = "#ffffff" if abs(value) > 0.6 * widest else "#1b1f24"
         words = number(value) if value < 0.005 else f"+{number(value)}"

@@ -37,7 +37,8 @@ def render_page(
         Section("How this was made", _methods(inputs)),
         Section("What was left out", _left_out(inputs)),
     ]
-    return render_document(inputs.title, _summary(inputs), [s for s in sections if s.content])
+    page = render_document(inputs.title, _summary(inputs), [s for s in sections if s.content])
+    return blocks.protocol_names(page)  # here, so that no table or caption has names of its own
 
 
 def _links(inputs: ReportInputs, folder: Path | None) -> Mapping[str, str]:
@@ -133,7 +134,7 @@ def _gaps(inputs: ReportInputs) -> str:
 def _methods(inputs: ReportInputs) -> str:
     stated = dict.fromkeys(EXPECTED_METHODS, "not stated") | dict(inputs.methods)
     choices = {**stated, **inputs.comparison.settings, **session_blocks.methods(inputs)}
-    return blocks.words_list(choices) + blocks.definitions()
+    return blocks.words_list(choices) + blocks.definitions(inputs.comparison)
 
 
 def _left_out(inputs: ReportInputs) -> str:

@@ -87,20 +87,27 @@ _KAPPA = (
 )
 
 
+_PROTOCOLS = (
+    "Training: all scenarios together (all), all but the tested one (all-but), the tested one "
+    "alone (only)."
+)
+
+
 def _training(inputs: ReportInputs, predictions: pd.DataFrame) -> list[Plot]:
     comparison, found = inputs.comparison, []
     table = tables.effects_table(comparison, predictions)
     if len(table):
         words = (
             "Accuracy by readout protocol and by training protocol, mean over scenarios, seeds of "
-            "one model averaged; intervals draw stimuli. Readout full sees the whole movie."
+            "one model averaged; intervals draw stimuli. Readout full sees the whole movie. "
+            f"{_PROTOCOLS}"
         )
         words += " Dashed: people." if comparison.has_people else ""
         found.append(Plot("effects", words, table, _grouped_accuracy))
     table = tables.generalization_table(comparison, predictions)
     if len(table):
         base = "that of people on the same stimuli" if comparison.has_people else "0.5, a guesser's"
-        words = f"Trained on (rows) and tested on (columns): accuracy less {base}."
+        words = f"Trained on (rows) and tested on (columns): accuracy less {base}. {_PROTOCOLS}"
         found.append(Plot("generalization", words, table, _generalization))
     return found
 
