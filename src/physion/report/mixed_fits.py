@@ -87,18 +87,24 @@ def fits_of_people(people: PeopleResults) -> list[MixedTable]:
 def fits_of_models(comparison: Comparison) -> list[MixedTable]:
     """Linear models of accuracy by model and scenario, as the study compared models.
 
-    Each row is the accuracy of one model in one scenario.
+    Coefficients are differences to the model, and the readout, that comes first in the files. Each
+    row is the accuracy of one model in one scenario.
     """
     scores = comparison.scores
     rows = scores[~scores["scenario"].isin([MEAN, POOLED])]
     if len(comparison.agents) < 2 or rows["scenario"].nunique() < 2:
         return []
     rows = rows[["agent", "model", "readout", "scenario", "accuracy"]]
-    first = sorted(rows["agent"].unique())[0]
+    # The order of the files, not of the alphabet, says which one the others are held against.
+    rows = rows.assign(
+        agent=pd.Categorical(rows["agent"], categories=comparison.agents),
+        readout=pd.Categorical(rows["readout"], categories=rows["readout"].unique()),
+    )
     found = [
         _fitted(
             "models",
-            f"Do models differ in accuracy? Linear, each against {first!r}",
+            f"Do models differ in accuracy? Linear, each against {comparison.agents[0]}, "
+            "the first in the files",
             "accuracy ~ agent + (1|scenario)",
             fit_linear,
             rows,
@@ -106,11 +112,11 @@ def fits_of_models(comparison: Comparison) -> list[MixedTable]:
         )
     ]
     if rows["readout"].nunique() > 1 and rows["model"].nunique() > 1:
-        first = sorted(rows["readout"].unique())[0]
+        first = rows["readout"].cat.categories[0]
         found.append(
             _fitted(
                 "readouts",
-                f"Does the readout matter? Linear, against {first!r}",
+                f"Does the readout matter? Linear, against {first}, the first in the files",
                 "accuracy ~ readout + (1|scenario) + (1|model)",
                 fit_linear,
                 rows,
