@@ -199,6 +199,17 @@ def flag_sessions(
     return table.assign(flagged=table[list(RULES)].any(axis=1))
 
 
+def without_flagged(responses: Responses, flags: pd.DataFrame) -> Responses:
+    """The responses of the main analysis: only sessions that no rule flags.
+
+    Raises `BadInputError` where none remains.
+    """
+    unflagged = set(flags.loc[~flags["flagged"], "session"])
+    if not unflagged:
+        raise BadInputError(f"all {len(flags)} sessions are flagged: nothing is left to analyse")
+    return responses.keep_sessions(unflagged, "session is flagged")
+
+
 def count_flags(flags: pd.DataFrame) -> pd.DataFrame:
     """Sessions that each rule flags, by scenario: ``scenario``, ``rule``, ``sessions``, ``only``.
 
