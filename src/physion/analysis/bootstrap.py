@@ -34,7 +34,7 @@ class Bootstrap:
             raise BadInputError("a bootstrap needs resamples >= 1 and a level between 0 and 1")
 
     def weights(self, stratum: str, n: int) -> Array:
-        """How often each of ``n`` stimuli (or people) is drawn, shape (resamples, n), rows that sum to n.
+        """How often each of ``n`` stimuli or people is drawn: (resamples, n), rows that sum to n.
 
         A function of the seed, the name of the stratum and n, and of nothing else.
         """
