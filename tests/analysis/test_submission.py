@@ -93,6 +93,30 @@ def test_an_outcome_against_its_probability_is_a_warning(tmp_path: Path) -> None
     assert (fault.level, fault.row, fault.stimulus) == ("warning", 2, STIMULI[1])
 
 
+@pytest.mark.parametrize(
+    ("changes", "columns"),
+    [
+        ({"Actual Outcome": True}, {"Actual Outcome"}),
+        ({"Predicted Outcome": True, "Predicted Prob_true": 0.9, "Predicted Prob_false": 0.1},
+         {"Predicted Outcome", "Predicted Prob_true"}),
+        ({"Predicted Prob_true": 0.5, "Predicted Prob_false": 0.5}, {"Predicted Prob_true"}),
+    ],
+)  # fmt: skip
+def test_constant_columns_of_a_model_and_scenario_are_warnings(
+    tmp_path: Path, changes: dict[str, object], columns: set[str]
+) -> None:
+    # Another model and another scenario vary: these two alone do not make the constant one vary.
+    other = table(**{"Model": "n"})
+    links = [name.replace("it2_drop_simple_box", "linking_nl1") for name in STIMULI]
+    elsewhere = table(**{"Stimulus Name": links})
+    rows = pd.concat([table(**changes), other, elsewhere], ignore_index=True)
+    found = check(tmp_path, rows)
+    assert found.errors == 0
+    assert {(fault.kind, fault.column) for fault in found.faults} == {("alike", c) for c in columns}
+    words = "all 6 rows of m · observed+simulated, drop"
+    assert all(words in fault.message for fault in found.faults)
+
+
 def test_all_missing_columns_are_named_at_once(tmp_path: Path) -> None:
     found = check(tmp_path, table().drop(columns=["Model", "Predicted Prob_true"]))
     assert {fault.column for fault in found.faults} == {"Model", "Predicted Prob_true"}

@@ -12,11 +12,12 @@ from pathlib import Path
 
 import pandas as pd
 
-from physion.analysis.csv_table import read_csv
+from physion.analysis.csv_table import read_csv, read_table
 from physion.analysis.predictions import READOUTS
 from physion.analysis.stimuli import canonical_name
 from physion.analysis.submission_rows import (
     Fault,
+    alike,
     blank,
     columns,
     duplicates,
@@ -26,7 +27,6 @@ from physion.analysis.submission_rows import (
     shorten,
 )
 from physion.analysis.submission_trials import Reference, coverage, labels, leaks
-from physion.errors import BadInputError
 
 __all__ = ["Checked", "Fault", "Reference", "read_index", "validate"]
 
@@ -67,6 +67,7 @@ def validate(path: Path, reference: Reference | None = None) -> Checked:
         outcomes(table, stimulus),
         readouts(table),
         duplicates(table, stimulus),
+        alike(table, stimulus),
         labels(table, stimulus, against.labels),
         coverage(table, stimulus, against),
         leaks(table, stimulus, against),
@@ -80,16 +81,7 @@ def validate(path: Path, reference: Reference | None = None) -> Checked:
 def read_index(path: Path) -> pd.DataFrame:
     """An index of trials (parquet or CSV) with at least ``trial`` and ``split``."""
     file = path / "index.parquet" if path.is_dir() else path
-    if file.suffix.lower() != ".parquet":
-        return read_csv(file, ("trial", "split"))
-    try:
-        table = pd.read_parquet(file, engine="pyarrow")
-    except (OSError, ValueError) as error:
-        raise BadInputError(f"{file} is not an index of trials: {error}") from error
-    missing = {"trial", "split"} - set(table.columns)
-    if missing:
-        raise BadInputError(f"{file} lacks the column(s) {', '.join(sorted(missing))}")
-    return table
+    return read_table(file, ("trial", "split"))
 
 
 def _unchecked(table: pd.DataFrame, against: Reference) -> tuple[str, ...]:

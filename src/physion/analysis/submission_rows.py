@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from physion.analysis.predictions import DISTINGUISHING, READOUTS, REQUIRED
+from physion.analysis.stimuli import scenario_of
 
 SUM_TOLERANCE = 1e-3
 """By how much the two probabilities may miss 1: what rounding to three decimals can cost."""
@@ -17,6 +18,14 @@ SHOWN = 20
 
 _WORDS = {"true": True, "1": True, "1.0": True, "yes": True,
           "false": False, "0": False, "0.0": False, "no": False}  # fmt: skip
+
+
+_ALIKE = {
+    "Actual Outcome": "accuracy cannot tell knowing it from always saying it",
+    "Predicted Outcome": "kappa and accuracy say nothing about what the model sees",
+    "Predicted Prob_true": "r is undefined",
+}
+"""Columns that should vary within a model and scenario, and what is lost where they do not."""
 
 
 @dataclass(frozen=True)
@@ -157,6 +166,33 @@ def duplicates(table: pd.DataFrame, stimulus: pd.Series) -> list[Fault]:
         )
         for row in np.flatnonzero(~first.to_numpy())
     ]
+
+
+def alike(table: pd.DataFrame, stimulus: pd.Series) -> list[Fault]:
+    """Warnings where all outcomes, or all answers, of a model in a scenario are one and the same.
+
+    Values that are wrong in themselves, and single rows, are left to the other checks.
+    """
+    values = {
+        "Actual Outcome": booleans(table["Actual Outcome"]),
+        "Predicted Outcome": booleans(table["Predicted Outcome"]),
+        "Predicted Prob_true": pd.to_numeric(table["Predicted Prob_true"], errors="coerce"),
+    }
+    named = [name for name in DISTINGUISHING if name in table.columns]
+    keys = [table[name] for name in ("Model", "Readout Type", *named)]
+    scenario = stimulus.map(lambda name: scenario_of(name) or "an unknown scenario").rename("on")
+    found = []
+    for of, own in table.groupby([*keys, scenario], sort=False).groups.items():
+        for column, consequence in _ALIKE.items():
+            given = values[column].loc[own].dropna()
+            if len(given) > 1 and given.nunique() == 1:
+                readout = READOUTS.get(of[1], of[1])
+                where = " · ".join([of[0], readout, *(word for word in of[2:-1] if word)])
+                told = f"{column} is {given.iloc[0]} in all {len(given)} rows of {where}, {of[-1]}"
+                found.append(
+                    Fault("alike", f"{told}: {consequence}", column=column, level="warning")
+                )
+    return found
 
 
 def shorten(faults: list[Fault]) -> list[Fault]:
