@@ -310,6 +310,20 @@ def test_the_zone_is_for_whole_scenarios_alone() -> None:
     assert np.isnan(table.loc["drop", "zone_low"]) and np.isnan(table.loc[MEAN, "zone_low"])
 
 
+def test_labels_of_one_class_are_said() -> None:
+    people = humans()
+    known = {name: value or "drop" in name for name, value in labels(people).items()}
+    scores = compare(predictions(people), people, known, bootstrap=QUICK).scores
+    agent = "m · observed"
+    assert "labels: all contact" in score(scores, agent, "drop")["reason"]
+    assert "labels: of one class in drop" in score(scores, agent, MEAN)["reason"]
+    for scenario in ("collide", POOLED):
+        assert "labels" not in score(scores, agent, scenario)["reason"]
+    never = compare(predictions(people), people, dict.fromkeys(known, False), bootstrap=QUICK)
+    for scenario in ("collide", POOLED):
+        assert "labels: all no contact" in score(never.scores, agent, scenario)["reason"]
+
+
 def test_the_settings_say_where_the_zone_comes_from_and_what_is_drawn() -> None:
     people = humans()
     zone = pd.DataFrame({"scenario": ["collide", "drop"], "low": 0.6, "high": 0.8})

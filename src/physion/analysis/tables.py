@@ -34,7 +34,8 @@ def score_table(stimuli: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
     Rows: for each ``agent`` its scenarios, then `MEAN` and `POOLED`. Columns: ``agent``, ``model``,
     ``readout``, ``scenario``, ``stimuli`` and ``changed`` (counts; those whose simulated outcome is
     not the official one), every score of `scores.SCORES` with ``_low`` and ``_high``, ``ceiling``
-    of r and ``floor`` of the RMSD, ``reason`` (why a score or an interval is NaN, else empty).
+    of r and ``floor`` of the RMSD, ``reason`` (why a score or an interval is NaN, or says less than
+    it seems to, as where all labels are of one class; else empty).
     """
     # Sorted, so that a draw means the same stimulus whatever the order of the files.
     ordered = stimuli.sort_values("stimulus", kind="stable")
@@ -60,8 +61,10 @@ def _agent_rows(rows: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
     undefined = [
         name for name, found in zip(names, by_scenario, strict=True) if np.isnan(found["r"][0])
     ]
-    why = f"r: undefined in {', '.join(undefined)}" if undefined else ""
-    records.append(_record(MEAN, rows, mean, bootstrap, why))
+    one_class = [name for name, part in zip(names, parts, strict=True) if _one_class(part)]
+    whys = [f"r: undefined in {', '.join(undefined)}"] if undefined else []
+    whys += [f"labels: of one class in {', '.join(one_class)}"] if one_class else []
+    records.append(_record(MEAN, rows, mean, bootstrap, "; ".join(whys)))
     for key in ("ceiling", "floor"):
         records[-1][key] = float(np.mean([record[key] for record in records[:-1]]))
     pooled = scores(np.sum(sums, axis=0))
@@ -79,10 +82,18 @@ def _all_sums(part: pd.DataFrame, stratum: str, bootstrap: Bootstrap) -> Array:
     return np.vstack([values.sum(axis=0), weights @ values])
 
 
+def _one_class(rows: pd.DataFrame) -> bool:
+    """Do all of several stimuli end alike?"""
+    return len(rows) > 1 and rows["label"].nunique() == 1
+
+
 def _record(
     name: str, rows: pd.DataFrame, found: dict[str, Array], bootstrap: Bootstrap, why: str
 ) -> dict[str, Any]:
     reasons = [why] if why else []
+    if name != MEAN and _one_class(rows):
+        word = "contact" if bool(rows["label"].iloc[0]) else "no contact"
+        reasons.append(f"labels: all {word}, so accuracy cannot tell knowing from always saying it")
     record: dict[str, Any] = {
         "scenario": name,
         "stimuli": len(rows),
