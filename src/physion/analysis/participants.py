@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from physion.analysis.csv_table import read_csv, refuse_duplicates
+from physion.analysis.csv_table import read_table, refuse_duplicates
 from physion.analysis.response_schema import SESSION_COLUMNS, TRIAL_COLUMNS, check_table
 from physion.analysis.stimuli import OFFICIAL_SCENARIOS, canonical_name, is_ledge
 from physion.errors import BadInputError
@@ -92,10 +92,10 @@ def read_responses(
     ``conflicts``: what to do with a second answer of one session to one stimulus (``drop`` keeps
     the first). ``simulated``: keep the sessions that no person made. Raises `BadInputError`.
     """
-    table = check_table(_read(trials), TRIAL_COLUMNS, str(trials))
+    table = check_table(read_table(trials, ()), TRIAL_COLUMNS, str(trials))
     people = None
     if sessions is not None:
-        people = check_table(_read(sessions), SESSION_COLUMNS, str(sessions))
+        people = check_table(read_table(sessions, ()), SESSION_COLUMNS, str(sessions))
     found = clean(
         table, people, where=str(trials), known=known, unknown=unknown, conflicts=conflicts
     )
@@ -105,15 +105,6 @@ def read_responses(
     if simulated or not made:
         return found
     return found.keep_sessions(set(found.sessions["session"]) - made, SIMULATED)
-
-
-def _read(path: Path) -> pd.DataFrame:
-    if path.suffix.lower() != ".parquet":
-        return read_csv(path, ())
-    try:
-        return pd.read_parquet(path, engine="pyarrow")
-    except (OSError, ValueError) as error:
-        raise BadInputError(f"{path} is not a parquet table: {error}") from error
 
 
 def clean(

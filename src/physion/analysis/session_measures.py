@@ -44,11 +44,12 @@ def session_measures(
 ) -> pd.DataFrame:
     """What the rules look at, one row a session, in the order of ``responses.sessions``.
 
-    ``expected``: test trials of a scenario; where absent, the stimuli of it that any session
-    answered. Columns: ``session``, ``participant``, ``scenario``, ``expected``, ``trials``,
-    ``accuracy``, ``yes``, ``mean_log_rt``, ``median_log_rt``, ``no_log_rt`` (trials without a
-    response time above 0), ``longest_streak``, ``longest_alternation``,
-    ``longest_alternation_from_first``, ``familiarization_trials``, ``familiarization_correct``.
+    ``expected``: test trials by scenario, or by session where people see subsets; where absent,
+    the stimuli of the scenario that any session answered. Columns: ``session``,
+    ``participant``, ``scenario``, ``expected``, ``trials``, ``accuracy``, ``yes``,
+    ``mean_log_rt``, ``median_log_rt``, ``no_log_rt`` (trials without a response time above 0),
+    ``longest_streak``, ``longest_alternation``, ``longest_alternation_from_first``,
+    ``familiarization_trials``, ``familiarization_correct``.
     Raises `BadInputError` where no session has a test answer.
     """
     test = responses.test
@@ -76,7 +77,8 @@ def session_measures(
     keys = responses.sessions[["session", "participant", "scenario"]]
     measures = pd.DataFrame([records.get(session, nothing) for session in keys["session"]])
     measures = pd.concat([keys.reset_index(drop=True), measures], axis=1)
-    measures["expected"] = measures["scenario"].map(found).fillna(1).astype(int)
+    own = measures["session"].map(dict(expected or {}))
+    measures["expected"] = own.fillna(measures["scenario"].map(found)).fillna(1).astype(int)
     practice = responses.trials[responses.trials["phase"] == "familiarization"]
     counts = practice.groupby("session")["correct"].agg(["size", "sum"])
     counts = counts.reindex(measures["session"])
