@@ -20,7 +20,7 @@ from physion.analysis import agreement
 from physion.analysis.answers import Answers, answers_of
 from physion.analysis.bootstrap import Bootstrap
 from physion.analysis.calibration import brier, calibration_table, decompose, reliability_curve
-from physion.analysis.difficulty import difficulty_third, r_by_third
+from physion.analysis.difficulty import difficulty_third
 from physion.analysis.kappa import correctness
 from physion.analysis.model_people import (
     MEASURES,
@@ -39,7 +39,7 @@ from physion.analysis.paired import (
 )
 from physion.analysis.people import draws_of_people, split_halves
 from physion.analysis.people_comparison import PeopleComparison, compare_everywhere
-from physion.analysis.zones import human_zones, released_r_zone, released_zone
+from physion.analysis.zones import RELEASED_R, human_zones, released_r_zone, released_zone
 from physion.errors import BadInputError
 
 Array = npt.NDArray[np.float64]
@@ -187,12 +187,16 @@ def test_the_released_zone_is_another_thing(official: Path) -> None:
     mean, low, high = released_zone(table["obs_mean"])
     assert mean == pytest.approx(table["obs_mean"].mean()) and low < mean < high
     assert high - low < 0.6 * float(np.mean(table["pct_97.5"] - table["pct_2.5"]))
-    bounds = pd.read_csv(official / "results" / "human_pairwiseCorrs_by_scenario.csv")
-    halves = [np.array([a, b]) for a, b in bounds[["r_lb", "r_ub"]].to_numpy()]
-    edge = [np.percentile(pair, [2.5, 97.5]) for pair in halves]
-    assert released_r_zone(halves) == pytest.approx(tuple(np.mean(edge, axis=0)))
     with pytest.raises(BadInputError, match="defined"):
         released_zone([0.7, np.nan])
+
+
+def test_the_band_of_r_is_undefined_where_a_scenario_has_none(answers: Answers) -> None:
+    one = human_zones(answers, split_halves(answers.yes, 50))
+    other = human_zones(answers, np.full(50, np.nan))
+    assert released_r_zone(pd.concat([one, one]))["low"].notna().all()
+    band = released_r_zone(pd.concat([one, other])).iloc[0]
+    assert np.isnan([band["low"], band["high"]]).all() and band["undefined"] == 1
 
 
 # --- tables in, models out ----------------------------------------------------------------------
@@ -291,6 +295,11 @@ def test_all_scenarios_and_their_mean() -> None:
         40,
         40,
     ]
+    halves = found.zones[found.zones["of"] == "halves"]
+    (band,) = found.zones[found.zones["of"] == RELEASED_R].to_dict("records")
+    assert (band["scenario"], band["measure"], band["values"]) == ("mean", "r", 2)
+    for edge in ("low", "high"):
+        assert band[edge] == pytest.approx(np.mean(halves[edge]))
     again, _, _ = everywhere()
     pd.testing.assert_frame_equal(found.scores, again.scores)
 
@@ -313,16 +322,10 @@ def test_what_is_missing_somewhere_is_counted_and_undefined_there() -> None:
     assert gone.to_dict() == {("people", "roll"): 20, ("chance", "roll"): 20}
 
 
-def test_r_within_thirds_is_that_of_their_stimuli(answers: Answers, models: Models) -> None:
-    table = r_by_third(models.p_contact, answers.yes, answers.label, halves=30)
-    shares = answers.shares()
-    third = difficulty_third(np.where(answers.label == 1, shares, 1 - shares)).to_numpy()
-    for row in table[table["model"] >= 0].itertuples():
-        own = (third == row.third) & np.isfinite(models.p_contact[row.model])
-        expected = agreement.pearson(models.p_contact[row.model, own], shares[own])
-        assert row.r == pytest.approx(expected, abs=1e-9, nan_ok=True)
-        assert row.stimuli == (third == row.third).sum()
-    assert table["stimuli"].sum() == 25 * 5 and (table["model"] == -1).sum() == 3
+def test_thirds_are_parted_at_their_edges() -> None:
+    found = difficulty_third([0.0, 1 / 3, 0.34, 0.66, 2 / 3, 1.0, np.nan]).tolist()
+    assert found[:6] == ["hard", "hard", "chance", "chance", "easy", "easy"]
+    assert np.isnan(found[6])
 
 
 # --- paired tests and corrections ---------------------------------------------------------------

@@ -38,7 +38,7 @@ def as_answers(answers: npt.ArrayLike, what: str = "answers") -> Array:
 
 
 def cohen_kappa(first: npt.ArrayLike, second: npt.ArrayLike) -> float:
-    """Cohen's kappa of two answer vectors of shape (stimuli,)."""
+    """Cohen's kappa of two answer vectors of shape (stimuli,), for a single pair."""
     return float(cross_kappa(first, second)[0, 0])
 
 

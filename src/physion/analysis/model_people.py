@@ -136,7 +136,11 @@ def measure_models(models: Models, answers: Answers, bootstrap: Bootstrap) -> Me
 def compare_with_people(
     models: Models, answers: Answers, bootstrap: Bootstrap | None = None
 ) -> pd.DataFrame:
-    """Every model's measures in one scenario, one row a model and measure; see `measure_table`."""
+    """Every model's measures in one scenario, one row a model and measure; see `measure_table`.
+
+    To call for models and people that one has as arrays; `people_comparison.compare_everywhere`
+    does the same, and more, from tables of all scenarios.
+    """
     draws = bootstrap or Bootstrap()
     return measure_table(measure_models(models, answers, draws), draws)
 

@@ -26,7 +26,7 @@ from physion.analysis.model_people import (
 from physion.analysis.paired import compare_models
 from physion.analysis.people import HALVES, all_answers, split_halves
 from physion.analysis.tables import MEAN
-from physion.analysis.zones import human_zones
+from physion.analysis.zones import human_zones, released_r_zone
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,8 @@ class PeopleComparison:
     - ``scores``: `model_people.measure_table` of every scenario, then of their mean (each scenario
       counts the same; NaN where one of them is undefined), with ``zone_low``, ``zone_high`` (of
       single participants) and ``in_zone`` (yes, no, or empty where either is not defined).
-    - ``zones``: `zones.human_zones` of every scenario.
+    - ``zones``: `zones.human_zones` of every scenario, and of several also the paper's band of r
+      (`zones.released_r_zone`), whose scenario is the mean.
     - ``pairs``: `model_people.model_pairs` of every scenario.
     - ``tests``: `paired.compare_models` on the stimuli of all scenarios together.
     - ``calibration``: `calibration.calibration_table`, likewise.
@@ -81,6 +82,8 @@ def compare_everywhere(
         zones.append(human_zones(answers, split_halves(answers.yes, halves, draws.seed)))
         pairs.append(model_pairs(models, answers).assign(scenario=answers.scenario))
     zone = pd.concat(zones, ignore_index=True)
+    if len(measured) > 1:
+        zone = pd.concat([zone, released_r_zone(zone)], ignore_index=True)
     tables = [measure_table(one, draws) for one in measured]
     if len(measured) > 1:
         tables.append(_mean_table(measured, draws))

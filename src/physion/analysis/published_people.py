@@ -26,7 +26,8 @@ def people_by_scenario(tables: PublishedTables, bootstrap: Bootstrap | None = No
     ``stimuli`` and ``participants`` of the tables by stimulus, ``accuracy_by_stimulus`` (their
     mean; a laxer exclusion than ``accuracy``), ``below_chance`` (stimuli on which p + 1.96
     sqrt(p (1 - p) / n) < 0.5). In the row of the mean ``zone_low`` and ``zone_high``, likewise of
-    kappa, are the paper's grey bands (`zones.released_zone`).
+    kappa, are the paper's grey bands (`zones.released_zone`), and so are ``half_r_low`` and
+    ``half_r_high`` for r (as `zones.released_r_zone`).
     """
     draws = bootstrap or Bootstrap()
     stimuli = tables.stimuli

@@ -13,9 +13,13 @@ from physion.analysis.answers import Answers, share
 from physion.analysis.bootstrap import Bootstrap
 from physion.analysis.correlation import correlate_rows
 from physion.analysis.kappa import cross_kappa
+from physion.analysis.tables import MEAN
 from physion.errors import BadInputError
 
 Array = npt.NDArray[np.float64]
+
+RELEASED_R = "halves, mean of scenarios (the paper's band)"
+"""Whose values the paper's grey band for r is made of; see `released_r_zone`."""
 
 
 def human_zones(answers: Answers, halves: Array | None = None) -> pd.DataFrame:
@@ -88,10 +92,15 @@ def released_zone(
     return float(np.mean(values)), low, high
 
 
-def released_r_zone(halves: Sequence[Array]) -> tuple[float, float]:
-    """The grey band of the published panel for r: the mean over scenarios of the 2.5th and of the
-    97.5th percentile of r between random halves of the people, uncorrected for their halved number.
+def released_r_zone(zones: pd.DataFrame) -> pd.DataFrame:
+    """The grey band of the published panel for r, as one row with the columns of `human_zones`.
+
+    ``zones`` holds the rows of `human_zones` of several scenarios. The band is the mean over them
+    of the 2.5th and of the 97.5th percentile of r between random halves of the people, uncorrected
+    for their halved number; NaN where a scenario has none. ``values`` counts the scenarios.
     """
-    bounds = [np.percentile(values[np.isfinite(values)], [2.5, 97.5]) for values in halves]
-    low, high = np.mean(bounds, axis=0)
-    return float(low), float(high)
+    halves = zones[(zones["measure"] == "r") & (zones["of"] == "halves")]
+    bounds = halves[["mean", "low", "median", "high"]].mean(skipna=False)
+    counts = {"values": len(halves), "undefined": int(halves["low"].isna().sum())}
+    names = {"scenario": MEAN, "measure": "r", "of": RELEASED_R}
+    return pd.DataFrame([names | bounds.to_dict() | counts])[list(zones.columns)]
