@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from sklearn.metrics import cohen_kappa_score
 
 from physion.analysis import Bootstrap, compare, read_predictions
+from physion.analysis.exclusions import ExclusionRules
 from physion.analysis.leaderboard import (
     COLUMNS,
     KAPPA_NEEDS,
@@ -18,6 +20,8 @@ from physion.analysis.leaderboard import (
     sidecar_versions,
     sort_leaderboard,
 )
+from physion.analysis.participants import Responses, clean
+from physion.analysis.response_schema import TRIAL_COLUMNS, check_table
 from physion.errors import BadInputError, UnknownNameError
 
 QUICK = Bootstrap(resamples=200)
@@ -38,18 +42,27 @@ def humans() -> pd.DataFrame:
     )
 
 
-def answers(people: int = 5) -> pd.DataFrame:
-    """The test rows of `Responses` that the leaderboard reads."""
+def answers(people: int = 5) -> Responses:
+    """Answers at random of ``people`` in each scenario."""
     generator = np.random.default_rng(3)
     rows = [
         {"session": f"{scenario} {k}", "participant": f"{scenario} {k}", "scenario": scenario,
-         "stimulus": name, "label": LABELS[name], "yes": bool(generator.random() < 0.5),
-         "log_rt": 7.0}
+         "stimulus": name, "phase": "test", "trial": int(name[-4:]), "simulated": False,
+         "response": "yes" if generator.random() < 0.5 else "no", "label": LABELS[name],
+         "rt_ms": 1000 + 100 * generator.random()}
         for scenario, name in STIMULI
         for k in range(people)
     ]  # fmt: skip
-    table = pd.DataFrame(rows)
-    return table.assign(correct=table["yes"] == table["label"])
+    return clean(check_table(pd.DataFrame(rows), TRIAL_COLUMNS, "answers"))
+
+
+def constant(responses: Responses, session: str) -> Responses:
+    """The same, but one session says yes throughout."""
+    trials = responses.trials.copy()
+    own = trials["session"] == session
+    trials.loc[own, "yes"] = True
+    trials["correct"] = trials["yes"] == trials["label"]
+    return replace(responses, trials=trials)
 
 
 def write(path: Path, model: str, skill: float, **columns: object) -> Path:
@@ -197,8 +210,9 @@ def test_one_scenario_can_be_asked_for(files: list[Path]) -> None:
 
 
 def test_kappa_is_the_mean_over_participants_then_scenarios(files: list[Path]) -> None:
-    test = answers()
-    table = leaderboard(files, None, None, test, bootstrap=QUICK).table.set_index("model")
+    responses = answers()
+    test = responses.test
+    table = leaderboard(files, None, None, responses, bootstrap=QUICK).table.set_index("model")
     rows = read_predictions([files[0]]).set_index("stimulus")["predicted"]
     by_scenario = [
         np.mean([cohen_kappa_score(own["yes"], rows.loc[own["stimulus"]].to_numpy())
@@ -217,11 +231,12 @@ def test_kappa_is_the_mean_over_participants_then_scenarios(files: list[Path]) -
 
 
 def test_kappa_says_why_it_is_missing(files: list[Path]) -> None:
-    test = answers()
-    board = leaderboard(files, humans(), LABELS, test[test["scenario"] == "drop"], bootstrap=QUICK)
+    both = answers()
+    drop = both.keep_sessions({f"drop {k}" for k in range(5)}, "not asked")
+    board = leaderboard(files, humans(), LABELS, drop, bootstrap=QUICK)
     assert board.table["kappa"].isna().all()
     assert board.table["reason"].str.contains("single participants").all()
-    pooled = leaderboard(files, humans(), LABELS, test, scenario="pooled", bootstrap=QUICK).table
+    pooled = leaderboard(files, humans(), LABELS, both, scenario="pooled", bootstrap=QUICK).table
     assert pooled["kappa"].isna().all() and pooled["reason"].str.contains("pooled").all()
 
 
@@ -233,3 +248,61 @@ def test_trainings_of_one_file_are_rows_of_their_own(tmp_path: Path) -> None:
     ).to_csv(path, index=False)
     table = leaderboard([path], humans(), LABELS, bootstrap=QUICK).table
     assert set(table["training"]) == {"all", "all but this"} and len(table) == 2
+
+
+def cut(path: Path, model: str, keep: list[str]) -> Path:
+    """A submission that is always right, about some of the stimuli alone."""
+    rows = pd.read_csv(write(path, model, 1.0))
+    rows[rows["Stimulus Name"].isin(keep)].to_csv(path, index=False)
+    return path
+
+
+@pytest.mark.parametrize("with_people", [True, False])
+def test_a_partial_submission_ranks_after_the_whole_ones(
+    files: list[Path], tmp_path: Path, with_people: bool
+) -> None:
+    names = list(LABELS)
+    partial = cut(tmp_path / "partial.csv", "partial", names[20:])
+    few = cut(tmp_path / "few.csv", "few", names[:4] + names[20:24])
+    given = (humans(), LABELS) if with_people else ()
+    table = leaderboard([partial, few, *files], *given, bootstrap=QUICK).table
+    assert list(table["model"])[:3] == ["good", "middle", "poor"]
+    last = table.set_index("model").loc[["few", "partial"]]
+    assert (last["accuracy"] == 1).all() and (last["rank"] > 3).all()
+    assert last.loc["partial", "reason"].startswith("mean over 1 of 2 scenarios")
+    assert last.loc["few", "reason"].startswith("over 8 of 40 stimuli")
+    for ascending in (True, False):
+        order = list(sort_leaderboard(table, "accuracy", ascending)["model"])
+        assert set(order[3:]) == {"few", "partial"}
+    assert sort_leaderboard(table, "stimuli", True)["model"].iloc[0] == "few"
+    drop = leaderboard([partial, *files], *given, scenario="drop", bootstrap=QUICK).table
+    assert drop["model"].iloc[0] == "partial" and "over" not in drop["reason"].iloc[0]
+
+
+def test_flagged_sessions_do_not_count(files: list[Path]) -> None:
+    broken = constant(answers(), "drop 1")
+    rest = answers().keep_sessions(set(broken.sessions["session"]) - {"drop 1"}, "not asked")
+    board = leaderboard(files, None, None, broken, bootstrap=QUICK)
+    same = leaderboard(files, None, None, rest, bootstrap=QUICK)
+    pd.testing.assert_frame_equal(board.table, same.table)
+    assert board.dropped_answers is not None
+    assert list(board.dropped_answers["reason"]) == ["session is flagged"]
+    assert "1 of 10 sessions" in board.settings["Exclusions"]
+    assert "preregistered" in board.settings["Exclusions"]
+    lenient = ExclusionRules("none", streak_over=None, alternation=None, accuracy_sd=None,
+                             rt_sd=None)  # fmt: skip
+    everybody = leaderboard(files, None, None, broken, rules=lenient, bootstrap=QUICK)
+    assert not np.allclose(everybody.table["kappa"], board.table["kappa"])
+    assert "“none”" in everybody.settings["Exclusions"]
+
+
+def test_outcomes_of_responses_must_be_those_of_the_labels(files: list[Path]) -> None:
+    other = {**LABELS, STIMULI[0][1]: not LABELS[STIMULI[0][1]]}
+    with pytest.raises(BadInputError, match=STIMULI[0][1]):
+        leaderboard(files, None, other, answers(), bootstrap=QUICK)
+
+
+def test_a_session_that_lacks_expected_trials_is_flagged(files: list[Path]) -> None:
+    asked = {"collide": 20, "drop 1": 25}
+    board = leaderboard(files, None, None, answers(), expected=asked, bootstrap=QUICK)
+    assert "1 of 10 sessions" in board.settings["Exclusions"]

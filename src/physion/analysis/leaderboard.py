@@ -3,6 +3,7 @@
 Each file is compared by itself, on the stimuli that people saw and it predicts, so that files made
 on different sets of trials can stand in one table; the column ``stimuli`` says on how many. A file
 that cannot be compared is not dropped silently: it stands in `Leaderboard.refused` with the reason.
+A model that lacks stimuli ranks after those that lack none, whatever its scores.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,10 +20,17 @@ import pandas as pd
 
 from physion.analysis.answers import Answers, share
 from physion.analysis.bootstrap import Bootstrap
-from physion.analysis.comparison import Comparison, compare
+from physion.analysis.comparison import NOT_PREDICTED, Comparison, compare
 from physion.analysis.csv_table import read_csv
+from physion.analysis.exclusions import (
+    PREREGISTERED,
+    ExclusionRules,
+    flag_sessions,
+    without_flagged,
+)
 from physion.analysis.kappa import cross_kappa
 from physion.analysis.model_people import models_of
+from physion.analysis.participants import Responses, check_labels
 from physion.analysis.people import all_answers, draws_of_people
 from physion.analysis.predictions import REQUIRED, check_predictions, name_models
 from physion.analysis.stimuli import SCENARIOS
@@ -42,14 +51,18 @@ COLUMNS = (
     "training",
     "file",
     "scenarios",
+    "of_scenarios",
     "stimuli",
+    "of_stimuli",
     *(f"{score}{end}" for score in (*SCORED, "kappa") for end in ("", "_low", "_high")),
     "versions",
     "agent",
     "reason",
 )
-"""Columns of the table. ``scenarios`` and ``stimuli`` count what the scores rest on; ``agent`` is
-the name by which the file's own rows are told apart; ``reason`` says why a score is NaN."""
+"""Columns of the table. ``scenarios`` and ``stimuli`` count what the scores rest on, out of
+``of_scenarios`` and ``of_stimuli``: what people saw or, without people, what all files name.
+``agent`` is the name by which the file's own rows are told apart; ``reason`` says what a score
+rests on where that is not everything, and why a score is NaN."""
 
 KAPPA_NEEDS = "kappa: needs the answers of single participants"
 
@@ -58,11 +71,13 @@ KAPPA_NEEDS = "kappa: needs the answers of single participants"
 class Leaderboard:
     """The ranked table (`COLUMNS`), what was left out of each file (``file``, ``agent``,
     ``scenario``, ``reason``, ``stimuli``), the files that could not be compared (``file``,
-    ``reason``), and the choices in words."""
+    ``reason``), the answers of people that were left out (`Responses.dropped`; None: there were no
+    single answers), and the choices in words."""
 
     table: pd.DataFrame
     dropped: pd.DataFrame
     refused: pd.DataFrame
+    dropped_answers: pd.DataFrame | None
     settings: Mapping[str, str]
 
 
@@ -70,8 +85,10 @@ def leaderboard(
     files: Sequence[Path],
     humans: pd.DataFrame | None = None,
     labels: Mapping[str, bool] | None = None,
-    test: pd.DataFrame | None = None,
+    responses: Responses | None = None,
     *,
+    rules: ExclusionRules = PREREGISTERED,
+    expected: Mapping[str, int] | None = None,
     scenario: str = MEAN,
     exclude: Iterable[str] = (),
     exclude_ledge: bool = True,
@@ -79,11 +96,14 @@ def leaderboard(
 ) -> Leaderboard:
     """Score every model of every file, best accuracy first; see `sort_leaderboard`.
 
-    ``humans``, ``labels``, ``exclude``, ``exclude_ledge``: as `comparison.compare`. ``test``: the
-    test rows of `participants.Responses`; they give kappa and, where ``humans`` is None, stand in
-    for it. ``scenario``: one of the eight, *mean* (each counting the same) or *pooled*.
+    ``humans``, ``labels``, ``exclude``, ``exclude_ledge``: as `comparison.compare`. ``responses``:
+    answers of single participants, of which the sessions that ``rules`` flag are left out; they
+    give kappa and, where ``humans`` is None, stand in for it. ``expected``: see
+    `exclusions.flag_sessions`. ``scenario``: one of the eight, *mean* (each counting the same) or
+    *pooled*.
 
-    Raises `BadInputError` where there is no file, or not one that can be compared.
+    Raises `BadInputError` where there is no file, or not one that can be compared; where no session
+    is left; where the outcomes of the responses contradict ``labels``.
     """
     if not files:
         raise BadInputError("no file of predictions was given")
@@ -91,9 +111,11 @@ def leaderboard(
         raise UnknownNameError("scenario", scenario, (*SCENARIOS, MEAN, POOLED))
     draws = bootstrap or Bootstrap()
     unwanted = tuple(exclude)
+    kept, flagging = _unflagged(responses, rules, expected, labels)
+    test = None if kept is None else kept.test
     people, outcomes = _people(humans, labels, test)
     answers = {} if test is None else {each.scenario: each for each in all_answers(test)}
-    tables, dropped, refused = [], [], []
+    tables, dropped, refused, rested = [], [], [], []
     settings: Mapping[str, str] = {}
     for path in files:
         try:
@@ -112,17 +134,74 @@ def leaderboard(
             continue
         tables.append(own.assign(file=str(path), versions=own["agent"].map(versions)))
         dropped.append(found.dropped.assign(file=str(path)))
+        rested.append(found.stimuli[["agent", "scenario", "stimulus"]].assign(file=str(path)))
         settings = found.settings
     if not tables:
         raise BadInputError(f"no file can be compared: {refused[0]['reason']}")
-    table = pd.concat(tables, ignore_index=True).reindex(columns=list(COLUMNS))
+    left_out = pd.concat(dropped, ignore_index=True)
+    asked = _asked(pd.concat(rested, ignore_index=True), left_out)
+    table = _with_asked(pd.concat(tables, ignore_index=True), asked, scenario)
     order = ["file", "agent", "scenario", "reason", "stimuli"]
     return Leaderboard(
-        sort_leaderboard(table),
-        pd.concat(dropped, ignore_index=True)[order],
+        sort_leaderboard(table.reindex(columns=list(COLUMNS))),
+        left_out[order],
         pd.DataFrame(refused, columns=["file", "reason"]),
-        {**settings, **_words(scenario, test is not None)},
+        None if kept is None else kept.dropped,
+        {**settings, **_words(scenario, test is not None), **flagging},
     )
+
+
+def _unflagged(
+    responses: Responses | None,
+    rules: ExclusionRules,
+    expected: Mapping[str, int] | None,
+    labels: Mapping[str, bool] | None,
+) -> tuple[Responses | None, dict[str, str]]:
+    """The responses without flagged sessions, and how they were flagged in words."""
+    if responses is None:
+        return None, {}
+    if labels is not None:
+        check_labels(responses, labels)
+    flags = flag_sessions(responses, rules, expected=expected)
+    words = (
+        f"{int(flags['flagged'].sum())} of {len(flags)} sessions flagged by the rules "
+        f"“{rules.name}” and left out"
+    )
+    return without_flagged(responses, flags), {"Exclusions": words}
+
+
+def _asked(rested: pd.DataFrame, dropped: pd.DataFrame) -> pd.Series:
+    """How many stimuli a whole submission would have, by scenario.
+
+    What people saw: what a model answered of it and what it lacks. Without people: what all files
+    name together.
+    """
+    keys = ["file", "agent", "scenario"]
+    lacking = dropped[dropped["reason"] == NOT_PREDICTED].groupby(keys)["stimuli"].sum()
+    seen = rested.groupby(keys)["stimulus"].nunique().add(lacking, fill_value=0)
+    named = rested.groupby("scenario")["stimulus"].nunique()
+    most = pd.concat([seen.groupby("scenario").max(), named], axis=1).max(axis=1)
+    return most.astype(int)
+
+
+def _with_asked(table: pd.DataFrame, asked: pd.Series, scenario: str) -> pd.DataFrame:
+    """``of_scenarios`` and ``of_stimuli``, and a reason where a model lacks some of them."""
+    whole = asked if scenario in (MEAN, POOLED) else asked[[scenario]]
+    table = table.assign(of_scenarios=len(whole), of_stimuli=int(whole.sum()))
+    for place, row in table.iterrows():
+        if not _is_partial(row):
+            continue
+        over = "mean over" if scenario == MEAN else "over"
+        why = f"{over} {row['scenarios']} of {len(whole)} scenarios"
+        if row["scenarios"] == len(whole):
+            why = f"over {row['stimuli']} of {row['of_stimuli']} stimuli"
+        table.loc[place, "reason"] = "; ".join(filter(None, [why, row["reason"]]))
+    return table
+
+
+def _is_partial(rows: Any) -> Any:
+    """Does a row, or do the rows of a table, rest on fewer stimuli than there are?"""
+    return rows["stimuli"] < rows["of_stimuli"]
 
 
 def sort_leaderboard(
@@ -130,8 +209,9 @@ def sort_leaderboard(
 ) -> pd.DataFrame:
     """The table sorted by any column, ``rank`` by that order, NaN last, ties by model and file.
 
-    ``ascending`` None puts the best first: large scores, small RMSD, words by the alphabet. Raises
-    `UnknownNameError` with the closest columns.
+    By a score, models that lack stimuli come after those that lack none: means over other
+    scenarios do not compare. ``ascending`` None puts the best first: large scores, small RMSD,
+    words by the alphabet. Raises `UnknownNameError` with the closest columns.
     """
     if by not in table.columns or by == "rank":
         raise UnknownNameError("column", by, [name for name in table.columns if name != "rank"])
@@ -142,6 +222,9 @@ def sort_leaderboard(
     order = table.sort_values(ties, kind="stable").sort_values(
         by, ascending=ascending, kind="stable", na_position="last"
     )
+    if by.removesuffix("_low").removesuffix("_high") in (*SCORED, "kappa"):
+        after = _is_partial(order).astype(int).mask(order[by].isna(), 2)
+        order = order.loc[after.sort_values(kind="stable").index]
     return order.assign(rank=np.arange(1, len(order) + 1)).reset_index(drop=True)
 
 

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from physion.analysis.leaderboard import Leaderboard
-    from physion.analysis.participants import Responses
 
-SHOWN = ("rank", "model", "readout", "training", "stimuli", "accuracy", "r", "kappa", "rmsd")
+SHOWN = ("rank", "model", "readout", "training", "scenarios", "stimuli")
+SCORES = ("accuracy", "r", "kappa", "rmsd")
 """Columns on the console, then the versions and the file; those without a value are left out."""
 
 
@@ -32,8 +32,14 @@ class Options:
     """Folder with human_accuracy-*.csv."""
     labels: Path | None = None
     """Official outcomes (stim_ID, label); looked for beside the people when not given."""
-    responses: Path | None = None
-    """Answers of single participants, as the experiment exports them: they give kappa."""
+    responses: tuple[Path, ...] = ()
+    """Answers of single participants, which give kappa: our export or the study's raw files."""
+    sessions: Path | None = None
+    """Table of sessions of our export."""
+    rules: str | None = None
+    """By which sessions are flagged and left out: preregistered (without this) or official-code."""
+    expected: Path | None = None
+    """Table of the stimuli (stimulus) that each session, or each scenario, must have."""
     exclude: Path | None = None
     """File of stimuli to leave out, one a line."""
     ledge: bool = False
@@ -52,31 +58,19 @@ class Options:
 
 def main(options: Options) -> int:
     """Print the table; 1 if a file could not be compared."""
-    from physion.analysis.participants import read_responses
-    from physion.cli.output import console
-
-    people = None if options.responses is None else read_responses(options.responses)
-    board = _board(options, people)
-    record = _record(board, people)
+    board = _board(options)
+    record = _record(board)
     if options.out is not None:
         _write(board, record, options.out)
     if options.json:
         print(json_module.dumps(record))
     else:
         _print(board.table)
-        for row in board.refused.itertuples():
-            console.print(f"not compared: {row.file}: {row.reason}", markup=False, soft_wrap=True)
-        left_out = int(board.dropped["stimuli"].sum())
-        if left_out:
-            told = f"{left_out} stimuli left out over all files; reasons with --json or --out"
-            console.print(told, markup=False, soft_wrap=True)
-        if people is not None and len(people.dropped):
-            told = f"{int(people.dropped['rows'].sum())} answers of people left out"
-            console.print(told, markup=False, soft_wrap=True)
+        _print_notes(board)
     return 1 if len(board.refused) else 0
 
 
-def _board(options: Options, people: Responses | None) -> Leaderboard:
+def _board(options: Options) -> Leaderboard:
     from dataclasses import replace
 
     from physion.analysis.leaderboard import leaderboard, sort_leaderboard
@@ -90,20 +84,37 @@ def _board(options: Options, people: Responses | None) -> Leaderboard:
         options.predictions,
         None if humans is None else read_humans(humans),
         None if labels is None else read_labels(labels),
-        None if people is None else people.test,
         scenario=options.scenario,
         exclude=() if options.exclude is None else read_stimulus_list(options.exclude),
         exclude_ledge=not options.ledge,
+        **_people(options),
     )
     ascending = True if options.ascending else None
     return replace(board, table=sort_leaderboard(board.table, options.sort, ascending))
 
 
-def _record(board: Leaderboard, people: Responses | None) -> dict[str, Any]:
+def _people(options: Options) -> dict[str, Any]:
+    """Responses, and the choices that were made about them."""
+    from physion.errors import BadInputError
+    from physion.report.people_results import read_any_responses, read_expected, rules_called
+
+    if not options.responses:
+        if options.sessions or options.rules or options.expected:
+            raise BadInputError("--sessions, --rules and --expected are about --responses")
+        return {}
+    found: dict[str, Any] = {"responses": read_any_responses(options.responses, options.sessions)}
+    if options.rules is not None:
+        found["rules"] = rules_called(options.rules)
+    if options.expected is not None:
+        found["expected"] = read_expected(options.expected)
+    return found
+
+
+def _record(board: Leaderboard) -> dict[str, Any]:
     """The board as JSON values; NaN is null."""
     tables = {"rows": board.table, "dropped": board.dropped, "refused": board.refused}
-    if people is not None:
-        tables["dropped_answers"] = people.dropped
+    if board.dropped_answers is not None:
+        tables["dropped_answers"] = board.dropped_answers
     record: dict[str, Any] = {
         name: json_module.loads(table.to_json(orient="records", double_precision=15))
         for name, table in tables.items()
@@ -123,12 +134,40 @@ def _print(table: pd.DataFrame) -> None:
     from physion.cli.output import console
     from physion.cli.text_table import text_table
 
-    shown = table[[*SHOWN, "versions", "file"]].copy()
-    for name in ("accuracy", "r", "kappa", "rmsd"):
+    shown = table[[*SHOWN, *SCORES, "versions", "file"]].copy()
+    for name in ("scenarios", "stimuli"):
+        shown[name] = [
+            f"{row[name]}"
+            if row[name] == row[f"of_{name}"]
+            else f"{row[name]} of {row[f'of_{name}']}"
+            for row in table.to_dict("records")
+        ]
+    for name in SCORES:
         shown[name] = [_interval(row, name) for row in table.to_dict("records")]
     empty = [name for name in shown.columns if shown[name].isin(["", None]).all()]
     text = text_table(shown.drop(columns=empty))
     console.print(text, markup=False, soft_wrap=True)
+
+
+def _print_notes(board: Leaderboard) -> None:
+    """What was ranked last, refused and left out, and by which rules people were."""
+    partial = board.table[board.table["stimuli"] < board.table["of_stimuli"]]
+    notes = [f"not whole, so after those that are: {row.model}: {row.reason}" for row in
+             partial.itertuples()]  # fmt: skip
+    for row in board.refused.itertuples():
+        path, reason = str(row.file), str(row.reason)
+        notes.append(f"not compared: {reason if path in reason else f'{path}: {reason}'}")
+    left_out = int(board.dropped["stimuli"].sum())
+    if left_out:
+        notes.append(f"{left_out} stimuli left out over all files; reasons with --json or --out")
+    if "Exclusions" in board.settings:
+        notes.append(board.settings["Exclusions"])
+    if board.dropped_answers is not None and len(board.dropped_answers):
+        notes.append(f"{int(board.dropped_answers['rows'].sum())} answers of people left out")
+    from physion.cli.output import console
+
+    for note in notes:
+        console.print(note, markup=False, soft_wrap=True)
 
 
 def _interval(row: dict[str, Any], name: str) -> str:

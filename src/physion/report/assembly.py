@@ -12,18 +12,17 @@ import pandas as pd
 from physion.analysis import Bootstrap, compare
 from physion.analysis.calibration import calibration_table
 from physion.analysis.comparison import Comparison
-from physion.analysis.exclusions import RULE_SETS
 from physion.analysis.paired import compare_models
 from physion.analysis.participants import check_labels
 from physion.analysis.people import accuracy_by_stimulus
 from physion.analysis.people_comparison import compare_everywhere
-from physion.errors import UnknownNameError
 from physion.report.inputs import ReportInputs, permutations_of
 from physion.report.mixed_fits import fits_of_models, fits_of_people
 from physion.report.people_results import (
     PeopleResults,
     analyse_people,
     read_any_responses,
+    rules_called,
 )
 
 
@@ -35,15 +34,19 @@ def people_from_files(
     excluded: list[str],
     exclude_ledge: bool,
     draws: Bootstrap,
+    *,
+    expected: Mapping[str, int] | None = None,
+    attributes: pd.DataFrame | None = None,
 ) -> PeopleResults:
-    if rules not in RULE_SETS:
-        raise UnknownNameError("set of exclusion rules", rules, RULE_SETS)
+    chosen = rules_called(rules)
     read = read_any_responses(responses, sessions)
     if labels is not None:
         check_labels(read, labels)
     return analyse_people(
         read,
-        rules=RULE_SETS[rules],
+        rules=chosen,
+        expected=expected,
+        attributes=attributes,
         exclude=excluded,
         exclude_ledge=exclude_ledge,
         bootstrap=draws,
@@ -56,6 +59,32 @@ def people_in_words(responses: Sequence[Path], people: PeopleResults) -> str:
         f"answers of single participants from {', '.join(path.name for path in responses)}: "
         f"{len(flags)} sessions, {int(flags['flagged'].sum())} of them flagged by the rules "
         f"“{people.rules.name}” and left out of the main analysis"
+    )
+
+
+def expected_in_words(people: PeopleResults, given: bool) -> str:
+    """What a session must have, and how many did not have it."""
+    flags = people.tables["flags"]
+    counts = flags.groupby("scenario")["expected"].agg(["min", "max"])
+    each = ", ".join(
+        f"{name} {row['min']}" + (f" to {row['max']}" if row["max"] > row["min"] else "")
+        for name, row in counts.iterrows()
+    )
+    by = (
+        "by the list that was given"
+        if given
+        else "all stimuli of the scenario that anyone answered"
+    )
+    return f"{by}: {each}; {int(flags['incomplete'].sum())} sessions had fewer"
+
+
+def attributes_in_words(people: PeopleResults) -> str:
+    """From where the attributes of the stimuli come."""
+    sources = people.tables["attributes"]["source"].value_counts()
+    stimuli = len(people.tables["by_stimulus"])
+    return (
+        f"of {stimuli} stimuli {sources.get('table', 0)} by the table that was given, "
+        f"{sources.get('name', 0)} by their official names, {stimuli - sources.sum()} not known"
     )
 
 

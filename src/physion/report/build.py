@@ -18,12 +18,15 @@ from physion.analysis import (
     read_predictions,
 )
 from physion.analysis.comparison import Comparison
+from physion.analysis.exclusions import PREREGISTERED
 from physion.analysis.responses import LABELS_FILE, DominoesLook, find_beside
 from physion.analysis.stimuli import read_stimulus_list
 from physion.atomic import write_atomic
 from physion.errors import BadInputError
 from physion.report.assembly import (
+    attributes_in_words,
     completed,
+    expected_in_words,
     people_from_files,
     people_in_words,
     with_participants,
@@ -31,6 +34,7 @@ from physion.report.assembly import (
 from physion.report.inputs import ReportInputs
 from physion.report.movies import check_movies
 from physion.report.page import render_page
+from physion.report.people_results import read_attributes, read_expected
 from physion.report.plots import plots
 from physion.report.write import prepare_folder, write_csv, write_plot
 
@@ -86,7 +90,9 @@ def compare_files(
     *,
     responses: Sequence[Path] = (),
     sessions: Path | None = None,
-    rules: str = "preregistered",
+    rules: str = PREREGISTERED.name,
+    expected: Path | Mapping[str, int] | None = None,
+    attributes: Path | pd.DataFrame | None = None,
     zone: Path | None = None,
     exclude: Path | None = None,
     exclude_ledge: bool = True,
@@ -97,15 +103,18 @@ def compare_files(
 ) -> Path:
     """Compare predictions in CSV files with people and write the report; the page's path.
 
-    ``humans``: folder of ``human_accuracy-*.csv``, or None. ``labels``: a CSV file with ``stim_ID``
-    and ``label``, or outcomes by stimulus; None looks for the official file in ``humans``, beside
-    it, and in ``stimuli`` beside it, then goes by *Recorded Outcome* of the predictions.
-    ``responses``: participant-level answers in place of ``humans``: our export (with its table of
-    ``sessions``) or the study's raw files; sessions are flagged by ``rules`` (a name of
-    `exclusions.RULE_SETS`). ``zone``: the official table of participants' percentiles; None looks
-    for it likewise, in ``results``, and goes on without. ``exclude``: a file of stimuli to leave
-    out, one a line. ``methods``: see `ReportInputs`. Raises `BadInputError`, before anything is
-    written.
+    ``humans``: folder of ``human_accuracy-*.csv``, or None. ``labels``: a CSV file with
+    ``stim_ID`` and ``label``, or outcomes by stimulus; None looks for the official file in
+    ``humans``, beside it, and in ``stimuli`` beside it, then goes by *Recorded Outcome* of the
+    predictions. ``responses``: participant-level answers in place of ``humans``: our export
+    (with its table of ``sessions``) or the study's raw files; sessions are flagged by ``rules``
+    (a name of `exclusions.RULE_SETS`). ``expected``: which stimuli a session must have, as the
+    file of `people_results.read_expected` or as counts by scenario or session; None: what
+    anyone answered. ``attributes``: elements, distractors and occluders of one's own stimuli,
+    as a table of `attributes.attributes_from_table`, its file, or a dataset. ``zone``: the
+    official table of participants' percentiles; None looks for it likewise, in ``results``, and
+    goes on without. ``exclude``: a file of stimuli to leave out, one a line. ``methods``: see
+    `ReportInputs`. Raises `BadInputError`, before anything is written.
     """
     draws = bootstrap or Bootstrap()
     rows = read_predictions(predictions)
@@ -116,12 +125,21 @@ def compare_files(
             raise BadInputError("give people's tables (humans) or their responses, not both")
         given = read_labels(labels) if isinstance(labels, Path) else labels
         people = people_from_files(
-            responses, sessions, rules, given, excluded, exclude_ledge, draws
-        )
+            responses, sessions, rules, given, excluded, exclude_ledge, draws,
+            expected=read_expected(expected) if isinstance(expected, Path) else expected,
+            attributes=read_attributes(attributes) if isinstance(attributes, Path) else attributes,
+        )  # fmt: skip
         inputs = with_participants(rows, people, excluded, exclude_ledge, draws)
         choices.setdefault("Official outcomes", "those recorded with the responses")
         choices.setdefault("People", people_in_words(responses, people))
+        choices.setdefault(
+            "Trials of a whole session", expected_in_words(people, expected is not None)
+        )
+        if attributes is not None:
+            choices.setdefault("Attributes of stimuli", attributes_in_words(people))
     else:
+        if sessions is not None or expected is not None or attributes is not None:
+            raise BadInputError("sessions, expected and attributes are about responses: give those")
         settings: dict[str, Any] = {"exclude": excluded, "exclude_ledge": exclude_ledge}
         comparison, words = _with_averages(
             rows, humans, labels, zone, dominoes, {**settings, "bootstrap": draws}

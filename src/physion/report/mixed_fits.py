@@ -14,7 +14,7 @@ from physion.analysis.mixed_logistic import fit_logistic
 from physion.analysis.mixed_result import MixedFit
 from physion.analysis.tables import MEAN, POOLED
 from physion.errors import PhysionError
-from physion.report.people_results import PeopleResults, attributes_by_name
+from physion.report.people_results import PeopleResults
 
 CROSSED = "(1|participant) + (1|stimulus)"
 
@@ -56,7 +56,7 @@ def _fitted(
 
 def fits_of_people(people: PeopleResults) -> list[MixedTable]:
     """The preregistered models of single answers; flags on all complete sessions."""
-    stimuli = with_attributes(people.tables["by_stimulus"], attributes_by_name(people))
+    stimuli = with_attributes(people.tables["by_stimulus"], people.tables["attributes"])
     rows = answer_rows(people.kept.test, stimuli)
     scenario = "scenario + " if rows["scenario"].nunique() > 1 else ""
     found = [

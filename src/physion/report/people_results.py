@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
 
 from physion.analysis import Bootstrap
+from physion.analysis.attributes import (
+    ATTRIBUTES,
+    attributes_from_names,
+    attributes_from_table,
+    better_attributes,
+)
 from physion.analysis.attributes import COLUMNS as ATTRIBUTE_COLUMNS
-from physion.analysis.attributes import attributes_from_names
 from physion.analysis.biases import (
     accuracy_by_background,
     background,
@@ -18,15 +23,17 @@ from physion.analysis.biases import (
     side_bias,
     yes_bias,
 )
-from physion.analysis.csv_table import read_csv
+from physion.analysis.csv_table import read_csv, read_table
 from physion.analysis.exclusions import (
     PREREGISTERED,
+    RULE_SETS,
     RULES,
     ExclusionRules,
     count_flags,
     flag_effect,
     flag_sessions,
     with_and_without,
+    without_flagged,
 )
 from physion.analysis.hypotheses import regress_hypotheses, with_attributes
 from physion.analysis.official_responses import read_official_responses
@@ -37,8 +44,8 @@ from physion.analysis.people import (
     accuracy_by_stimulus,
     agreement_by_scenario,
 )
-from physion.analysis.stimuli import scenario_of
-from physion.errors import BadInputError
+from physion.analysis.stimuli import OFFICIAL_SCENARIOS, canonical_name, scenario_of
+from physion.errors import BadInputError, UnknownNameError
 
 
 @dataclass(frozen=True)
@@ -54,7 +61,8 @@ class PeopleResults:
     - ``participants``, ``by_scenario``, ``by_stimulus`` (`people.accuracy_by_...`);
     - ``agreement``: how alike people are (`people.agreement_by_scenario`);
     - ``yes_bias``, ``side_bias``, ``learning``, ``background``, ``background_tests``;
-    - ``hypotheses`` (`hypotheses.regress_hypotheses`);
+    - ``attributes`` of the stimuli that people answered, and ``hypotheses``
+      (`hypotheses.regress_hypotheses`);
     - ``left_out``: answers that were dropped, with their reasons.
     """
 
@@ -94,20 +102,63 @@ def read_any_responses(files: Sequence[Path], sessions: Path | None = None) -> R
     return read_responses(files[0], sessions)
 
 
+def rules_called(name: str) -> ExclusionRules:
+    """The rules of this name; `UnknownNameError` with the closest ones."""
+    if name not in RULE_SETS:
+        raise UnknownNameError("set of exclusion rules", name, RULE_SETS)
+    return RULE_SETS[name]
+
+
+def read_expected(path: Path) -> dict[str, int]:
+    """How many stimuli a session must have, from the list of them (CSV or parquet).
+
+    Columns: ``stimulus``, and ``session`` where each has a list of its own or else ``scenario``.
+    The keys are sessions or scenarios, as `exclusions.flag_sessions` takes them.
+    """
+    table = read_table(path, ("stimulus",))
+    if "session" not in table and "scenario" not in table:
+        raise BadInputError(f"{path} must say whose stimuli these are: column session or scenario")
+    names = table["stimulus"].astype(str).map(canonical_name)
+    if "session" in table:
+        whose = table["session"].astype(str)
+    else:
+        lower = table["scenario"].astype(str).str.strip().str.lower()
+        whose = lower.replace(OFFICIAL_SCENARIOS)
+    return {str(key): int(count) for key, count in names.groupby(whose).nunique().items()}
+
+
+def read_attributes(path: Path) -> pd.DataFrame:
+    """Attributes of one's own stimuli: a table (CSV or parquet), or a dataset or its index.
+
+    Columns: ``stimulus`` (or ``trial``), ``scenario``, any of `attributes.ATTRIBUTES`.
+    """
+    file = path / "index.parquet" if path.is_dir() else path
+    table = read_table(file, ())
+    if "stimulus" not in table and "trial" in table:
+        table = table.rename(columns={"trial": "stimulus"})
+    return attributes_from_table(table, str(file))
+
+
 def analyse_people(
     responses: Responses,
     *,
     rules: ExclusionRules = PREREGISTERED,
+    expected: Mapping[str, int] | None = None,
+    attributes: pd.DataFrame | None = None,
     exclude: Iterable[str] = (),
     exclude_ledge: bool = True,
     bootstrap: Bootstrap | None = None,
 ) -> PeopleResults:
     """Flag sessions, leave out stimuli, then every analysis of people.
 
-    Raises `BadInputError` where no session remains.
+    ``expected``: how many test trials a session must have, by scenario or by session; where it is
+    silent, the stimuli of the scenario that anyone answered. ``attributes``: of one's own stimuli,
+    from `attributes.attributes_from_table`; stimuli that it lacks go by their official names.
+    Raises `BadInputError` where no session remains, or ``expected`` names none.
     """
     draws = bootstrap or Bootstrap()
-    flags = flag_sessions(responses, rules)
+    _check_expected(responses, expected)
+    flags = flag_sessions(responses, rules, expected=expected)
     shown = responses.drop_stimuli(exclude, exclude_ledge)
     kept, whole = _sets(shown, flags)
     tables = {"flags": flags, "flag_counts": count_flags(flags)}
@@ -124,21 +175,29 @@ def analyse_people(
     tables["learning"] = learning(kept.test)
     tables["background"] = background(kept.sessions)
     tables["background_tests"] = accuracy_by_background(kept.test, kept.sessions)
+    tables["attributes"] = _attributes(tables["by_stimulus"]["stimulus"], attributes)
     tables["hypotheses"] = regress_hypotheses(
-        with_attributes(tables["by_stimulus"], _attributes(tables["by_stimulus"]))
+        with_attributes(tables["by_stimulus"], tables["attributes"])
     )
     tables["left_out"] = kept.dropped
     return PeopleResults(kept, whole, rules, tables)
 
 
+def _check_expected(responses: Responses, expected: Mapping[str, int] | None) -> None:
+    """Refuse a list that is about none of these sessions."""
+    known = {*responses.sessions["session"], *responses.sessions["scenario"]}
+    if expected is not None and not known & set(expected):
+        raise BadInputError(
+            f"the list of expected stimuli names {next(iter(expected), 'nothing')!r}, which is "
+            "neither a session nor a scenario of the responses"
+        )
+
+
 def _sets(shown: Responses, flags: pd.DataFrame) -> tuple[Responses, Responses]:
     """The responses without flagged sessions, and all complete first sessions."""
     whole = set(flags.loc[~flags["incomplete"] & ~flags["repeated"], "session"])
-    unflagged = set(flags.loc[~flags["flagged"], "session"])
-    if not unflagged:
-        raise BadInputError(f"all {len(flags)} sessions are flagged: nothing is left to analyse")
     return (
-        shown.keep_sessions(unflagged, "session is flagged"),
+        without_flagged(shown, flags),
         shown.keep_sessions(whole, "session is incomplete or repeated"),
     )
 
@@ -149,12 +208,20 @@ def _flag_effects(responses: Responses, flags: pd.DataFrame) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
 
 
-def attributes_by_name(people: PeopleResults) -> pd.DataFrame:
-    """Elements, distractors and occluders of the stimuli that people answered."""
-    return _attributes(people.tables["by_stimulus"])
-
-
-def _attributes(by_stimulus: pd.DataFrame) -> pd.DataFrame:
-    """The attributes as official names tell them; other stimuli have none."""
-    named = [name for name in by_stimulus["stimulus"] if scenario_of(name) is not None]
-    return attributes_from_names(named) if named else pd.DataFrame(columns=list(ATTRIBUTE_COLUMNS))
+def _attributes(stimuli: pd.Series, given: pd.DataFrame | None) -> pd.DataFrame:
+    """Attributes of ``stimuli``: those given, else as official names tell them, else none."""
+    named = [name for name in stimuli if scenario_of(name) is not None]
+    by_name = (
+        attributes_from_names(named) if named else pd.DataFrame(columns=list(ATTRIBUTE_COLUMNS))
+    )
+    found = by_name
+    if given is not None:
+        own = given[given["stimulus"].isin(stimuli)]
+        if own.empty:
+            raise BadInputError(
+                f"the table of attributes names none of the stimuli that people answered: they "
+                f"answered {stimuli.iloc[0]!r}, it has {given['stimulus'].iloc[0]!r}"
+            )
+        found = better_attributes(own, by_name) if len(by_name) else own
+    # Counts of parquet may be whole numbers with gaps, which regressions do not take.
+    return found.astype(dict.fromkeys(ATTRIBUTES, "float64")).reset_index(drop=True)
