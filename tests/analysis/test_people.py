@@ -20,6 +20,7 @@ from physion.analysis import agreement
 from physion.analysis.answers import answers_of
 from physion.analysis.attributes import (
     ATTRIBUTES,
+    MISLABELLED,
     attributes_from_metadata,
     attributes_from_names,
     attributes_from_table,
@@ -312,6 +313,8 @@ def test_background_is_counted_and_related_to_accuracy(made: Responses) -> None:
     [
         ("pilot_dominoes_2mid_J020R15_d3chairs_o1plants_tdwroom_2_0004_img", 2, 3, 1, "tdw"),
         ("pilot_dominoes_4midRM1_boxroom_0001", 3, 0, 0, "box"),
+        ("pilot_dominoes_4mid_boxroom_0001", 4, 0, 0, "box"),
+        ("pilot_dominoes_4mid_tdwroom_0001", 8, 0, 0, "tdw"),
         ("pilot_dominoes_SJ020_d3chairs_o1plants_tdwroom_0001", np.nan, 3, 1, "tdw"),
         ("pilot_dominoes_1mid_J025R45_o1full_tdwroom_0001", 1, 0, 1, "tdw"),
         ("pilot_towers_nb4_fr015_SJ000_gr-01_mono1_dis1_occ1_boxroom_0003", 4, 1, 1, "box"),
@@ -330,9 +333,10 @@ def test_official_names_are_read(
         [elements, distractors, occluders], nan_ok=True
     )
     assert row["room"] == room
+    assert row["source"] == ("name, corrected" if "4mid_tdwroom" in name else "name")
 
 
-def test_names_say_what_the_metadata_say_but_for_one_configuration(
+def test_names_with_their_correction_say_what_the_metadata_say(
     official_people: pd.DataFrame, official: Path
 ) -> None:
     names = attributes_from_names(official_people["stimulus"])
@@ -343,8 +347,9 @@ def test_names_say_what_the_metadata_say_but_for_one_configuration(
     for name in ATTRIBUTES:
         both = joined[[name, f"{name}_name"]]
         differ = joined[(both[name] != both[f"{name}_name"]) & both.notna().any(axis=1)]
-        wrong = {"pilot_dominoes_4mid_tdwroom"} if name == "elements" else set()
-        assert set(differ["configuration"]) == wrong
+        assert differ.empty
+    corrected = joined[joined["source_name"] == "name, corrected"]
+    assert set(corrected["configuration"]) == set(MISLABELLED) and len(corrected) == 3
     best = better_attributes(metadata, names).set_index("stimulus")
     assert best.index.is_unique and set(official_people["stimulus"]) <= set(best.index)
     assert (best[best["configuration"] == "pilot_dominoes_4mid_tdwroom"]["elements"] == 8).all()

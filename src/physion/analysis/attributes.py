@@ -1,9 +1,10 @@
 """Attributes of stimuli: how many elements, distractors and occluders they hold.
 
 Three sources, each named in the column ``source``: the official names, which say what the
-configuration was called; the official ``metadata.json`` files, which say what was generated (they
-differ: ``4mid_tdwroom`` has 8 dominoes); any table with the columns, such as that of one's own
-stimuli. What a source does not say is NaN.
+configuration was called; the official ``metadata.json`` files, which say what was generated; any
+table with the columns, such as that of one's own stimuli. Where metadata are given they go before
+names (`better_attributes`); names that are known to be wrong are corrected (`MISLABELLED`). What a
+source does not say is NaN.
 """
 
 from __future__ import annotations
@@ -28,6 +29,11 @@ take no part, behind the scene and in front of it."""
 
 COLUMNS = ("stimulus", "scenario", "configuration", *ATTRIBUTES, "room", "source")
 
+MISLABELLED = {"pilot_dominoes_4mid_tdwroom": {"elements": 8.0}}
+"""Configurations whose name belies what was generated, and what their metadata say: this one's
+``num_middle_objects`` is 8 (reference/official-system.md, section 3.9). ``source`` is then
+*name, corrected*."""
+
 _NUMBERED = re.compile(r"_?\d{4}$")
 _PATTERNS: dict[str, tuple[re.Pattern[str], ...]] = {
     "elements": (re.compile(r"_(\d+)mid"), re.compile(r"_nb(\d+)_")),
@@ -41,7 +47,8 @@ _ALWAYS_ONE_EACH = ("contain",)
 
 
 def attributes_from_names(stimuli: Iterable[str]) -> pd.DataFrame:
-    """Attributes by what official names say; columns `COLUMNS`, one row a stimulus.
+    """Attributes by what official names say, `MISLABELLED` ones corrected; columns `COLUMNS`, one
+    row a stimulus.
 
     A name that does not mention scenery (``..._simple_box``) stands for a stimulus without it: 0.
     ``elements`` are NaN where the name gives none or, as in Link, a range of them. Raises
@@ -68,9 +75,11 @@ def _from_name(stimulus: str) -> dict[str, Any]:
         found["elements"] -= 1
     if scenario in ("link", "contain"):
         found["elements"] = np.nan
+    source = "name, corrected" if configuration in MISLABELLED else "name"
+    found |= MISLABELLED.get(configuration, {})
     room = "tdw" if "tdw" in configuration else "box"
     return {"stimulus": stimulus, "scenario": scenario, "configuration": configuration, **found,
-            "room": room, "source": "name"}  # fmt: skip
+            "room": room, "source": source}  # fmt: skip
 
 
 def _first(patterns: tuple[re.Pattern[str], ...], text: str) -> float:
