@@ -20,7 +20,7 @@ from physion.analysis import agreement
 from physion.analysis.answers import Answers, answers_of
 from physion.analysis.bootstrap import Bootstrap
 from physion.analysis.calibration import brier, calibration_table, decompose, reliability_curve
-from physion.analysis.difficulty import difficulty_third
+from physion.analysis.difficulty import difficulty_third, r_by_third
 from physion.analysis.kappa import correctness
 from physion.analysis.model_people import (
     MEASURES,
@@ -326,6 +326,18 @@ def test_thirds_are_parted_at_their_edges() -> None:
     found = difficulty_third([0.0, 1 / 3, 0.34, 0.66, 2 / 3, 1.0, np.nan]).tolist()
     assert found[:6] == ["hard", "hard", "chance", "chance", "easy", "easy"]
     assert np.isnan(found[6])
+
+
+def test_r_within_thirds_is_that_of_their_stimuli(answers: Answers, models: Models) -> None:
+    table = r_by_third(models.p_contact, answers.yes, answers.label, halves=30)
+    shares = answers.shares()
+    third = difficulty_third(np.where(answers.label == 1, shares, 1 - shares)).to_numpy()
+    for row in table[table["model"] >= 0].itertuples():
+        own = (third == row.third) & np.isfinite(models.p_contact[row.model])
+        expected = agreement.pearson(models.p_contact[row.model, own], shares[own])
+        assert row.r == pytest.approx(expected, abs=1e-9, nan_ok=True)
+        assert row.stimuli == (third == row.third).sum()
+    assert table["stimuli"].sum() == 25 * 5 and (table["model"] == -1).sum() == 3
 
 
 # --- paired tests and corrections ---------------------------------------------------------------

@@ -7,7 +7,10 @@ import numpy.typing as npt
 import pandas as pd
 from scipy import stats
 
+from physion.analysis.answers import share
+from physion.analysis.correlation import correlate_rows
 from physion.analysis.paired import benjamini_hochberg
+from physion.analysis.people import split_halves
 from physion.errors import BadInputError
 
 Array = npt.NDArray[np.float64]
@@ -56,6 +59,36 @@ def difficulty_third(accuracy: npt.ArrayLike, edges: tuple[float, float] = EDGES
     values = np.asarray(accuracy, dtype=np.float64)
     names = np.select([values <= edges[0], values >= edges[1]], ["hard", "easy"], "chance")
     return pd.Series(names, dtype=object).where(np.isfinite(values), np.nan)
+
+
+def r_by_third(
+    p_contact: npt.ArrayLike, yes: npt.ArrayLike, label: npt.ArrayLike, halves: int = 200,
+    seed: int = 0,
+) -> pd.DataFrame:  # fmt: skip
+    """r of models with the average person within hard, chance and easy stimuli of one scenario.
+
+    ``p_contact`` (m, s) with NaN for gaps, ``yes`` (n, s) the answers of people, ``label`` (s,).
+    Columns: ``third``, ``stimuli``, ``model`` (row number; -1: the two halves of the people, whose
+    ``low`` and ``high`` are the 2.5th and 97.5th percentile of r), ``r`` (halves: mean), ``low``,
+    ``high``. Thirds are made by the very answers that r is about: within a third accuracy hardly
+    varies, so r there is mostly whether P(contact) follows the outcome (easy) or its opposite
+    (hard). NaN where r is undefined.
+    """
+    answers, truth = np.asarray(yes, np.float64), np.asarray(label, np.float64)
+    models = np.atleast_2d(np.asarray(p_contact, np.float64))
+    shares = share(answers)
+    third = difficulty_third(np.where(truth == 1, shares, 1 - shares)).to_numpy()
+    rows: list[tuple[str, int, int, float, float, float]] = []
+    for name in THIRDS:
+        own = np.flatnonzero(third == name)
+        r = correlate_rows(models[:, own], np.broadcast_to(shares[own], (len(models), len(own))))
+        rows += [(name, len(own), k, float(value), np.nan, np.nan) for k, value in enumerate(r)]
+        among = split_halves(answers[:, own], halves, seed) if len(own) else np.empty(0)
+        among = among[np.isfinite(among)]
+        low, high = np.percentile(among, [2.5, 97.5]) if len(among) else (np.nan, np.nan)
+        mean = float(np.mean(among)) if len(among) else np.nan
+        rows.append((name, len(own), -1, mean, float(low), float(high)))
+    return pd.DataFrame(rows, columns=["third", "stimuli", "model", "r", "low", "high"])
 
 
 def _shares(accuracy: npt.ArrayLike, count: npt.ArrayLike) -> tuple[Array, Array]:
