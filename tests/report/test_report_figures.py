@@ -68,14 +68,22 @@ def test_undefined_values_are_called_nan_in_the_figure(make_comparison: Maker) -
     assert words == ["NaN", "NaN"]
 
 
-def test_points_are_the_stimuli(make_comparison: Maker) -> None:
+def test_points_are_the_stimuli_in_the_square_of_their_scenario(make_comparison: Maker) -> None:
     comparison = make_comparison()
     table = figure_tables.scatter_table(comparison, comparison.agents)
     figure = figures_stimuli.scatter_figure(table)
-    for axis, agent in zip(figure.axes, comparison.agents, strict=False):
-        drawn = np.concatenate([line.get_xydata() for line in axis.lines[1:]])
-        own = table[table["agent"] == agent][["p_yes", "p_contact"]].to_numpy()
-        assert np.allclose(np.sort(drawn, axis=0), np.sort(own, axis=0))
+    own = table[table["agent"] == comparison.agents[1]]
+    changed = own["label"] != own["simulated"]
+    assert changed.sum() == 1
+    filled, hollow = figure.axes[1].lines[1:]
+    assert hollow.get_markerfacecolor() == "none" and filled.get_markerfacecolor() != "none"
+    for line, part in ((filled, own[~changed]), (hollow, own[changed])):
+        squares = (part["scenario"] == "drop") * figures_stimuli.SQUARE
+        expected = np.column_stack([part["p_yes"] + squares, part["p_contact"]])
+        assert np.allclose(line.get_xydata(), expected)
+    words = [text.get_text() for text in figure.axes[1].texts]
+    r = np.corrcoef(*own.loc[own["scenario"] == "drop", ["p_contact", "p_yes"]].T.to_numpy())[0, 1]
+    assert words[1] == f"drop, r = {blocks.number(r)}"
 
 
 def test_bars_hold_every_stimulus_and_mark_the_tail() -> None:
@@ -104,11 +112,38 @@ def test_thirds_are_of_the_stimuli_that_bear_their_name(make_comparison: Maker) 
     table = figure_tables.thirds_table(comparison)
     own = comparison.stimuli[comparison.stimuli["agent"] == comparison.agents[1]]
     easy = own[own["human_accuracy"] >= 2 / 3]
-    row = table[(table["agent"] == comparison.agents[1]) & table["group"].str.startswith("easy")]
+    row = table[(table["agent"] == comparison.agents[1]) & table["panel"].str.startswith("easy")]
     assert row["stimuli"].item() == len(easy)
     expected = np.corrcoef(easy["p_contact"], easy["p_yes"])[0, 1]
     assert row["value"].item() == pytest.approx(expected)
     assert row["low"].item() < expected < row["high"].item()
+    assert table["people"].isna().all()
+
+
+def test_thirds_show_what_halves_of_people_reach(make_comparison: Maker) -> None:
+    comparison = make_comparison()
+    shown = comparison.stimuli.drop_duplicates("stimulus").set_index("stimulus")
+    people = [f"p{i}" for i in range(20)]
+    rows = pd.DataFrame(
+        [(p, s) for p in people for s in shown.index], columns=["session", "stimulus"]
+    )
+    drawn = np.random.default_rng(0).random(len(rows))
+    rows["yes"] = drawn < shown.loc[rows["stimulus"], "p_yes"].to_numpy()
+    table = figure_tables.thirds_table(comparison, rows).drop_duplicates("panel").set_index("panel")
+    easy = shown.index[shown["human_accuracy"] >= 2 / 3]
+    yes = rows[rows["stimulus"].isin(easy)].pivot(index="session", columns="stimulus", values="yes")
+    # Written out here: halves of people, their shares of yes, r of the two.
+    order = np.random.default_rng(1).permuted(np.tile(np.arange(20), (500, 1)), axis=1)
+    halves = [(yes.to_numpy()[one[:10]].mean(0), yes.to_numpy()[one[10:]].mean(0)) for one in order]
+    r = [np.corrcoef(*pair)[0, 1] for pair in halves]
+    row = table.loc["easy (from 2/3)"]
+    assert row["people"] == pytest.approx(np.mean(r), abs=0.02)
+    assert row["zone_low"] == pytest.approx(np.percentile(r, 2.5), abs=0.08)
+    assert row["zone_low"] < row["people"] < row["zone_high"]
+    figure = figures.measure_figure(figure_tables.thirds_table(comparison, rows), "r")
+    place = list(table["people"].notna()).index(True)
+    value = table["people"].iloc[place]
+    assert any(np.allclose(line.get_xdata(), value) for line in figure.axes[place].lines)
 
 
 # --- readout and training -----------------------------------------------------------------------

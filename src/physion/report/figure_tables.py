@@ -16,13 +16,14 @@ from physion.analysis.calibration import brier, reliability_curve
 from physion.analysis.comparison import Comparison
 from physion.analysis.correlation import correlate_resampled, correlate_rows
 from physion.analysis.difficulty import THIRDS, below_chance, difficulty_third
+from physion.analysis.people import split_halves
 from physion.analysis.people_comparison import PeopleComparison
 from physion.analysis.predictions import DATASETS, READOUTS
 from physion.analysis.stimuli import OFFICIAL_SCENARIOS, SCENARIOS
 from physion.analysis.tables import MEAN, POOLED, in_order
 from physion.analysis.zones import released_zone
 from physion.report.blocks import PROTOCOLS
-from physion.report.figures import HALVES_ZONE, PARTICIPANTS, SCENARIO_ZONE
+from physion.report.figures import HALVES, HALVES_ZONE, PARTICIPANTS, SCENARIO_ZONE
 
 Array = npt.NDArray[np.float64]
 
@@ -174,34 +175,69 @@ def calibration_table(comparison: Comparison) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True)
 
 
-def thirds_table(comparison: Comparison, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
+def thirds_table(
+    comparison: Comparison, answers: pd.DataFrame | None = None, bootstrap: Bootstrap | None = None
+) -> pd.DataFrame:
     """r with the average person within the stimuli that are hard, chance and easy for people.
 
-    `GROUPED_COLUMNS`; all scenarios pooled, intervals by drawing stimuli of the third.
+    `MEASURE_COLUMNS` and ``stimuli``, their number; a panel a third; all scenarios pooled,
+    intervals by drawing stimuli of the third. With the ``answers`` of participants (``test`` of
+    `participants.Responses`) the dashed line is what halves of them reach with each other.
     """
     draws = bootstrap or Bootstrap()
-    records = []
-    for agent, own in comparison.stimuli.groupby("agent", sort=False):
-        rows = own.sort_values("stimulus", kind="stable").reset_index(drop=True)
-        third = difficulty_third(rows["human_accuracy"])
-        for name, words in zip(
-            THIRDS, ("hard (up to 1/3)", "chance", "easy (from 2/3)"), strict=True
-        ):
-            part = rows[(third == name).to_numpy()]
-            x, y = (
-                part[["p_contact"]].to_numpy(np.float64).T,
-                part[["p_yes"]].to_numpy(np.float64).T,
-            )
-            r = float(correlate_rows(x, y)[0]) if len(part) else np.nan
-            low, high = np.nan, np.nan
-            if np.isfinite(r):
-                weights = draws.weights(f"third {name}", len(part))
-                drawn = correlate_resampled(x, np.broadcast_to(y, weights.shape), weights)
-                low, high = draws.interval(drawn[:, 0])
-            reason = "" if np.isfinite(r) else "fewer than 3 stimuli, or constant answers"
-            records.append((f"r by difficulty, {POOLED}", agent, words, r, low, high, np.nan,
-                            len(part), reason))  # fmt: skip
-    return pd.DataFrame(records, columns=list(GROUPED_COLUMNS))
+    people = _halves_by_third(comparison, answers)
+    parts = []
+    for name, words in THIRD_WORDS.items():
+        rows = [
+            {"agent": agent, "kind": own["readout"].iloc[0]} | _third(own, name, draws)
+            for agent, own in comparison.stimuli.groupby("agent", sort=False)
+        ]
+        parts.append(pd.DataFrame(rows).assign(panel=words, **people[name]))
+    table = pd.concat(parts, ignore_index=True)
+    return table[[*MEASURE_COLUMNS, "stimuli"]]
+
+
+THIRD_WORDS = dict(zip(THIRDS, ("hard (up to 1/3)", "chance", "easy (from 2/3)"), strict=True))
+
+
+def _third(own: pd.DataFrame, name: str, draws: Bootstrap) -> dict[str, float | str]:
+    """r of one model within one third, with its interval."""
+    rows = own.sort_values("stimulus", kind="stable")
+    part = rows[(difficulty_third(rows["human_accuracy"]) == name).to_numpy()]
+    x, y = (part[[key]].to_numpy(np.float64).T for key in ("p_contact", "p_yes"))
+    found: dict[str, float | str] = {"stimuli": len(part), "low": np.nan, "high": np.nan}
+    r = float(correlate_rows(x, y)[0]) if len(part) else np.nan
+    if not np.isfinite(r):
+        return found | {"value": np.nan, "reason": "fewer than 3 stimuli, or constant answers"}
+    weights = draws.weights(f"third {name}", len(part))
+    drawn = correlate_resampled(x, np.broadcast_to(y, weights.shape), weights)
+    found["low"], found["high"] = draws.interval(drawn[:, 0])
+    return found | {"value": r, "reason": ""}
+
+
+def _halves_by_third(
+    comparison: Comparison, answers: pd.DataFrame | None
+) -> dict[str, dict[str, float | str]]:
+    """r between random halves of the people within each third, for the columns of its panel."""
+    found: dict[str, dict[str, float | str]] = {}
+    shown = comparison.stimuli.drop_duplicates("stimulus").set_index("stimulus")
+    third = difficulty_third(shown["human_accuracy"]).set_axis(shown.index)
+    for name in THIRDS:
+        found[name] = {"people": np.nan, "people_is": "", "zone_low": np.nan, "zone_high": np.nan,
+                       "zone": ""}  # fmt: skip
+        own = third.index[third == name]
+        if answers is None or not answers["stimulus"].isin(own).any():
+            continue
+        asked = answers[answers["stimulus"].isin(own)]
+        yes = asked.pivot(index="session", columns="stimulus", values="yes").astype("float64")
+        r = split_halves(yes.to_numpy())
+        r = r[np.isfinite(r)]
+        if len(r):
+            low, high = np.percentile(r, [2.5, 97.5])
+            found[name] = {"people": float(r.mean()), "zone": HALVES,
+                           "people_is": "half of the people with the others",
+                           "zone_low": float(low), "zone_high": float(high)}  # fmt: skip
+    return found
 
 
 # --- readout and training -----------------------------------------------------------------------

@@ -68,7 +68,7 @@ def measure_figure(table: pd.DataFrame, measure: str, theme: Theme = LIGHT) -> F
             axis.set_xlim(low, high + 0.16 * (high - low))
         figure.supxlabel(LABELS[measure], fontsize=10)
         legend(figure, _measure_handles(table, kinds, theme), 4)
-        figure.get_layout_engine().set(wspace=0.05)  # type: ignore[union-attr]
+        figure.set_layout_engine("constrained", wspace=0.05)
     return figure
 
 
@@ -121,6 +121,7 @@ def _zone(plain: bool, theme: Theme) -> dict[str, Any]:
 
 
 PARTICIPANTS = "95 % of participants"
+HALVES = "95 % of random halves"
 SCENARIO_ZONE = "paper's band: bootstrap of scenario means"
 HALVES_ZONE = "paper's band: r of halves, mean over scenarios"
 RELEASED_ZONES = (SCENARIO_ZONE, HALVES_ZONE)

@@ -6,6 +6,7 @@ Every function draws its table and nothing else; `figure_tables` makes the table
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -17,6 +18,7 @@ from matplotlib.patches import Patch
 
 from physion.analysis.agreement import pearson
 from physion.analysis.tables import in_order
+from physion.report.blocks import number
 from physion.report.figures import label
 from physion.report.theme import HATCHES, LIGHT, Theme, legend, panels, style, title
 
@@ -31,66 +33,82 @@ TAIL = (
 """What the bars of that distribution are made of, and their places in the palette."""
 
 
+SQUARE = 1.16
+"""Width of a scenario's square and the gap beside it, in units of its scale from 0 to 1."""
+
+
 def scatter_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
     """Points: P(contact) of each model against the share of people who say yes, by stimulus.
 
-    ``table``: see `figure_tables.scatter_table`. One panel a model; colour and shape say the
-    scenario; hollow points are stimuli whose simulated outcome is not the official one.
+    ``table``: see `figure_tables.scatter_table`. A panel a model, in it a square a scenario, so
+    that no colour is needed; hollow points are stimuli whose simulated outcome is not the official
+    one.
     """
     agents = list(table["agent"].unique())
     scenarios = in_order(table["scenario"])
-    columns = 3 if len(agents) <= 6 else 4
+    columns = max(1, min(4, 8 // len(scenarios)))
+    width = 11 / columns
+    height = (width - 0.4) / (SQUARE * len(scenarios))
     with matplotlib.rc_context(style(theme)):
-        width = 11 / columns
         figure, axes = panels(
-            len(agents), columns, (width, width), above=1.1, sharex=True, sharey=True
+            len(agents), columns, (width, height + 0.52), above=0.4, sharex=True, sharey=True
         )
         for axis, agent in zip(axes, agents, strict=True):
-            _points(axis, table[table["agent"] == agent], scenarios, theme)
+            _squares(axis, table[table["agent"] == agent], scenarios, theme)
         figure.supxlabel("share of people who say yes", fontsize=10)
         figure.supylabel("P(contact) of the model", fontsize=10)
-        changed = bool((table["label"] != table["simulated"]).any())
-        legend(figure, _scatter_handles(scenarios, changed, theme), 5)
+        if (table["label"] != table["simulated"]).any():
+            legend(figure, _scatter_handles(theme), 2)
     return figure
 
 
-def _points(axis: Axes, rows: pd.DataFrame, scenarios: Sequence[str], theme: Theme) -> None:
-    axis.plot([0, 1], [0, 1], color=theme.faint, linewidth=1, zorder=0)
+def _squares(axis: Axes, rows: pd.DataFrame, scenarios: Sequence[str], theme: Theme) -> None:
+    """The squares of one model, beside each other on one axis, which is quick to draw."""
+    left = SQUARE * np.arange(len(scenarios))
+    frame = np.array([(0, 0), (1, 1), (np.nan, np.nan), (0, 1), (0, 0), (1, 0), (np.nan, np.nan)])
+    lines = np.concatenate([frame + np.array([x, 0]) for x in left])
+    axis.plot(*lines.T, color=theme.faint, linewidth=0.8, zorder=0)
+    x = rows["p_yes"] + rows["scenario"].map(dict(zip(scenarios, left, strict=True)))
     changed = rows["label"] != rows["simulated"]
-    for place, scenario in enumerate(scenarios):
-        colour, marker = theme.mark(place)
-        for hollow in (False, True):
-            part = rows[(rows["scenario"] == scenario) & (changed == hollow)]
-            if len(part):
-                # Markers of a line are one drawing each in SVG and quick to make.
-                axis.plot(part["p_yes"], part["p_contact"], linestyle="", marker=marker,
-                          markersize=3.6, color=colour, alpha=0.95 if hollow else 0.6,
-                          markerfacecolor="none" if hollow else colour,
-                          markeredgewidth=0.8 if hollow else 0)  # fmt: skip
-    r = pearson(rows["p_contact"], rows["p_yes"])
-    worth = "r NaN" if np.isnan(r) else f"r = {r:.2f}".replace("-", "−") + " pooled"
-    words = f"{label(rows['agent'].iloc[0], 36)}\n{worth}, {len(rows)} stimuli"
-    axis.set_title(words, fontsize=8.5, loc="left")
-    axis.set_xlim(-0.03, 1.03)
-    axis.set_ylim(-0.03, 1.03)
+    for hollow in (False, True):
+        if (changed == hollow).any():
+            # Markers of a line are one drawing each in SVG and quick to make.
+            axis.plot(x[changed == hollow], rows["p_contact"][changed == hollow],
+                      **_point(hollow, theme))  # fmt: skip
+    for place, scenario in zip(left, scenarios, strict=True):
+        own = rows[rows["scenario"] == scenario]
+        words = f"{scenario}, {_r_words(own['p_contact'], own['p_yes'])}"
+        axis.text(place, 1.05, words, fontsize=7.5, va="bottom")
+    pooled = f"{_r_words(rows['p_contact'], rows['p_yes'])} pooled, {len(rows)} stimuli"
+    join = ", " if len(scenarios) > 3 else "\n"
+    axis.set_title(f"{label(rows['agent'].iloc[0], 90)}{join}{pooled}", fontsize=8.5, loc="left",
+                   pad=15)  # fmt: skip
+    axis.set_xlim(-0.04, left[-1] + 1.04)
+    axis.set_ylim(-0.04, 1.04)
     axis.set_aspect("equal")
-    axis.set_xticks([0, 0.5, 1])
+    axis.set_xticks(np.ravel(np.column_stack([left, left + 1])), ["0", "1"] * len(left), fontsize=8)
     axis.set_yticks([0, 0.5, 1])
+    axis.spines[["left", "bottom"]].set_visible(False)
 
 
-def _scatter_handles(scenarios: Sequence[str], changed: bool, theme: Theme) -> list[Line2D]:
-    handles = []
-    for place, scenario in enumerate(scenarios):
-        colour, marker = theme.mark(place)
-        handles.append(
-            Line2D([], [], color=colour, marker=marker, linestyle="", markersize=5, label=scenario)
-        )
-    if changed:
-        hollow = Line2D([], [], color=theme.ink, marker="o", linestyle="", markersize=5)
-        hollow.set_markerfacecolor("none")
-        hollow.set_label("simulated outcome differs")
-        handles.append(hollow)
-    return handles
+def _r_words(x: pd.Series, y: pd.Series) -> str:
+    return f"r = {number(pearson(x, y))}"
+
+
+def _point(hollow: bool, theme: Theme) -> dict[str, Any]:
+    colour = theme.palette[0]
+    look = {"linestyle": "", "marker": "o", "markersize": 3.2, "color": colour}
+    if hollow:
+        return look | {"markerfacecolor": "none", "markeredgewidth": 0.9}
+    return look | {"alpha": 0.55, "markeredgewidth": 0}
+
+
+def _scatter_handles(theme: Theme) -> list[Line2D]:
+    names = ("stimulus", "stimulus whose simulated outcome differs")
+    return [
+        Line2D([], [], label=name, **_point(hollow, theme))
+        for name, hollow in zip(names, (False, True), strict=True)
+    ]
 
 
 def difficulty_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
@@ -168,9 +186,8 @@ def response_time_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
                 slope, level = np.polyfit(x, y, 1)
                 ends = np.array([x.min(), x.max()])
                 axis.plot(ends, level + slope * ends, color=theme.ink, linewidth=1.3)
-            words = "r NaN" if np.isnan(r) else f"r = {r:.2f}".replace("-", "−")
             title(axis, scenario)
-            axis.set_title(words, fontsize=8.5, loc="right")
+            axis.set_title(f"r = {number(r)}", fontsize=8.5, loc="right")
             axis.set_xlim(-0.03, 1.03)
             axis.set_xticks([0, 0.5, 1])
         figure.supxlabel("accuracy of people on a stimulus", fontsize=10)

@@ -114,7 +114,10 @@ def _training(inputs: ReportInputs, predictions: pd.DataFrame) -> list[Plot]:
 
 def _scatter(inputs: ReportInputs) -> Plot:
     comparison, shown = inputs.comparison, inputs.scatter_agents()
-    words = "P(contact) of the model against the share of people who say yes; one point a stimulus."
+    words = (
+        "P(contact) of each model (rows) against the share of people who say yes, by scenario; one "
+        "point a stimulus."
+    )
     if len(comparison.changed):
         words += " Hollow: the simulated outcome is not the official one."
     rest = comparison.agents[inputs.scatter_limit :]
@@ -129,7 +132,15 @@ def _thirds(inputs: ReportInputs) -> Plot:
         "pooled, intervals draw stimuli. Within hard and easy stimuli the answers of people nearly "
         "tell the outcome, so that a model which is right throughout has r below 0 in hard ones."
     )
-    return Plot("thirds", words, tables.thirds_table(inputs.comparison), _grouped_r)
+    answers = None if inputs.people is None else inputs.people.kept.test
+    if answers is not None:
+        words += (
+            " Dashed: mean r between random halves of the people within the same stimuli; grey: "
+            "the middle 95 % of these r. A half is a noisier average than all people, to whom "
+            "models are held."
+        )
+    table = tables.thirds_table(inputs.comparison, answers)
+    return Plot("thirds", f"{words} Dotted: chance.", table, partial(_measure, "r"))
 
 
 _CALIBRATION = (
@@ -160,10 +171,6 @@ def _measure(measure: str, table: pd.DataFrame, theme: Theme) -> Figure:
 
 def _grouped_accuracy(table: pd.DataFrame, theme: Theme) -> Figure:
     return grouped_figure(table, "accuracy", 0.5, theme)
-
-
-def _grouped_r(table: pd.DataFrame, theme: Theme) -> Figure:
-    return grouped_figure(table, "Pearson's r with the average person", 0.0, theme)
 
 
 def _generalization(table: pd.DataFrame, theme: Theme) -> Figure:
