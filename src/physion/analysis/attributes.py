@@ -31,8 +31,7 @@ COLUMNS = ("stimulus", "scenario", "configuration", *ATTRIBUTES, "room", "source
 
 MISLABELLED = {"pilot_dominoes_4mid_tdwroom": {"elements": 8.0}}
 """Configurations whose name belies what was generated, and what their metadata say: this one's
-``num_middle_objects`` is 8 (reference/official-system.md, section 3.9). ``source`` is then
-*name, corrected*."""
+``num_middle_objects`` is 8 (reference/official-system.md, section 3.9). ``source`` stays *name*."""
 
 _NUMBERED = re.compile(r"_?\d{4}$")
 _PATTERNS: dict[str, tuple[re.Pattern[str], ...]] = {
@@ -75,11 +74,10 @@ def _from_name(stimulus: str) -> dict[str, Any]:
         found["elements"] -= 1
     if scenario in ("link", "contain"):
         found["elements"] = np.nan
-    source = "name, corrected" if configuration in MISLABELLED else "name"
     found |= MISLABELLED.get(configuration, {})
     room = "tdw" if "tdw" in configuration else "box"
     return {"stimulus": stimulus, "scenario": scenario, "configuration": configuration, **found,
-            "room": room, "source": source}  # fmt: skip
+            "room": room, "source": "name"}  # fmt: skip
 
 
 def _first(patterns: tuple[re.Pattern[str], ...], text: str) -> float:
