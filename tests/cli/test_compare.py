@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,8 @@ import pytest
 
 from physion.cli.compare import SUBVERBS
 from physion.cli.main import main
+from physion.trials.index import COLUMNS
+from physion.trials.layout import TrialPaths
 
 
 def predictions(official: Path, path: Path, model: str = "m", skill: float = 0.8) -> Path:
@@ -79,6 +82,125 @@ def test_without_files_it_says_so(capsys: pytest.CaptureFixture[str]) -> None:
     for words in ([], ["validate"], ["leaderboard"]):
         assert main(["compare", *words]) == 2
         assert "no file of predictions" in capsys.readouterr().err
+
+
+@dataclass(frozen=True)
+class Own:
+    """A study of one's own stimuli: predictions, answers, a dataset, and who should see what."""
+
+    predictions: Path
+    responses: Path
+    dataset: Path
+    expected: Path
+
+
+def own_study(folder: Path) -> Own:
+    """Eight people a scenario; the first of Drop was shown 12 of the 16 stimuli."""
+    generator = np.random.default_rng(1)
+    stimuli = [(scenario, f"{scenario}_{k:03d}") for scenario in ("collide", "drop")
+               for k in range(16)]  # fmt: skip
+    rows = [
+        {"participant": f"{scenario}-p{person}", "session": f"{scenario}-p{person}",
+         "scenario": scenario, "stimulus": name, "phase": "test", "trial": k % 16,
+         "simulated": False, "label": k % 2 == 0, "rt_ms": 900 + 100 * generator.random(),
+         "response": "yes" if (generator.random() < 0.7) == (k % 2 == 0) else "no"}
+        for k, (scenario, name) in enumerate(stimuli)
+        for person in range(8)
+        if (scenario, person) != ("drop", 0) or k % 16 < 12
+    ]  # fmt: skip
+    answers = pd.DataFrame(rows)
+    answers.to_csv(folder / "trials.csv", index=False)
+    answers[["session", "stimulus"]].to_csv(folder / "expected.csv", index=False)
+    p = generator.random(32).round(3)
+    pd.DataFrame(
+        {
+            "Model": "m",
+            "Readout Type": "B",
+            "Readout Test Data": [scenario for scenario, _ in stimuli],
+            "Predicted Prob_true": p,
+            "Predicted Outcome": p > 0.5,
+            "Actual Outcome": np.arange(32) % 2 == 0,
+            "Stimulus Name": [name for _, name in stimuli],
+        }
+    ).to_csv(folder / "m.csv", index=False)
+    dataset = folder / "dataset"
+    index = pd.DataFrame(index=range(32), columns=list(COLUMNS)).assign(
+        trial=[name for _, name in stimuli], scenario=[scenario for scenario, _ in stimuli],
+        split="testing", elements=np.arange(32) % 3 + 1,
+        distractors=pd.array(np.arange(32) % 4, dtype="Int64"), occluders=0,
+    )  # fmt: skip
+    for scenario, name in stimuli:
+        movie = TrialPaths(dataset, "testing", scenario, name).movie
+        movie.parent.mkdir(parents=True, exist_ok=True)
+        movie.write_bytes(b"not a movie")
+    index.to_parquet(dataset / "index.parquet")
+    return Own(folder / "m.csv", folder / "trials.csv", dataset, folder / "expected.csv")
+
+
+@pytest.mark.slow
+def test_every_option_of_a_comparison_reaches_the_report(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = own_study(tmp_path)
+    command = ["compare", str(own.predictions), "--responses", str(own.responses), "--json"]
+    command += ["--resamples", "60", "--out", str(tmp_path / "report")]
+    assert main(command) == 0
+    plain = json.loads(capsys.readouterr().out)
+    assert Path(plain["report"]).is_file()
+    flags = {row["session"]: row["incomplete"] for row in plain["people_flags"]}
+    assert [session for session, flag in flags.items() if flag] == ["drop-p0"]
+    assert "60 resamples, seed 0" in plain["methods"]["Intervals"]
+    assert (
+        "anyone answered: collide 16, drop 16; 1 session"
+        in (plain["methods"]["Trials of a whole session"])
+    )
+    assert all(row["reason"] for row in plain["people_hypotheses"] if row["hypothesis"] == "H1")
+    command += ["--expected", str(own.expected), "--attributes", str(own.dataset)]
+    command += ["--movies", str(own.dataset), "--rules", "official-code", "--seed", "5"]
+    assert main(command) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert not any(row["incomplete"] for row in found["people_flags"])
+    assert (
+        "list that was given: collide 16, drop 12 to 16"
+        in (found["methods"]["Trials of a whole session"])
+    )
+    assert "official-code" in found["methods"]["People"]
+    assert "seed 5" in found["methods"]["Intervals"]
+    slopes = {row["hypothesis"]: row for row in found["people_hypotheses"]
+              if row["scenario"] == "all"}  # fmt: skip
+    assert slopes["H1"]["b"] is not None and slopes["H2"]["b"] is not None
+    assert slopes["H1"]["stimuli"] == 32 and "vary" in slopes["H3"]["reason"]
+    assert {row["elements"] for row in found["people_attributes"]} == {1, 2, 3}
+    page = Path(found["report"]).read_text(encoding="utf-8")
+    assert "<video" in page
+    assert "32 by the table that was given" in page
+
+
+def test_options_that_do_not_fit_are_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = own_study(tmp_path)
+    base = ["compare", str(own.predictions), "--out", str(tmp_path / "out")]
+    people = ["--responses", str(own.responses)]
+    other = tmp_path / "other.csv"
+    other.write_text("stimulus,scenario,elements\nelsewhere,drop,3\n")
+    strangers = tmp_path / "strangers.csv"
+    strangers.write_text("stimulus,session\ndrop_000,nobody\n")
+    for words, told in (
+        (["--attributes", str(other)], "about responses"),
+        ([*people, "--attributes", str(other)], "elsewhere"),
+        ([*people, "--expected", str(strangers)], "nobody"),
+        ([*people, "--expected", str(other)], "stimulus"),
+        ([*people, "--rules", "offical-code"], "official-code"),
+        ([*people, "--resamples", "0"], "resamples"),
+        ([*people, "--movies", str(tmp_path)], "dataset"),
+    ):
+        if words[-1] == str(other) and "--expected" in words:
+            other.write_text("session\ndrop-p0\n")
+        assert main([*base, *words]) == 2, words
+        message = capsys.readouterr().err
+        assert told in message and message.count("\n") == 1, message
+    assert not (tmp_path / "out").exists()
 
 
 # --- official -----------------------------------------------------------------------------------
@@ -200,7 +322,8 @@ def test_leaderboard_goes_on_without_a_bad_file(
     (tmp_path / "bad.csv").write_text("a,b\n1,2\n")
     command = ["compare", "leaderboard", str(good), str(tmp_path / "bad.csv")]
     assert main(command) == 1
-    assert "not compared" in capsys.readouterr().out
+    told = [line for line in capsys.readouterr().out.splitlines() if "not compared" in line]
+    assert len(told) == 1 and told[0].count("bad.csv") == 1
     assert main([*command, "--sort", "acuracy"]) == 2
     assert "accuracy" in capsys.readouterr().err
 
@@ -244,3 +367,36 @@ def test_leaderboard_with_single_participants_has_kappa(
     assert [(drop["scenario"], drop["rows"]) for drop in found["dropped_answers"]] == [("drop", 12)]
     assert row["accuracy"] == 1 and row["stimuli"] == 24 and "kappa" not in row["reason"]
     assert row["kappa_low"] < row["kappa"] < row["kappa_high"] and 0 < row["kappa"] < 1
+
+
+def test_leaderboard_flags_sessions_and_reads_the_raw_files(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = own_study(tmp_path)
+    command = ["compare", "leaderboard", str(own.predictions), "--responses", str(own.responses)]
+    assert main(command) == 0
+    assert "1 of 16 sessions flagged by the rules “preregistered”" in capsys.readouterr().out
+    assert main([*command, "--expected", str(own.expected), "--rules", "official-code"]) == 0
+    assert "0 of 16 sessions flagged by the rules “official-code”" in capsys.readouterr().out
+    assert main([*command[:3], "--rules", "official-code"]) == 2
+    assert "--responses" in capsys.readouterr().err
+    answers = pd.read_csv(own.responses)
+    raw = pd.DataFrame(
+        {
+            "gameID": answers["session"],
+            "trialNum": answers["trial"],
+            "stim_ID": answers["stimulus"],
+            "response": answers["response"].str.upper(),
+            "target_hit_zone_label": answers["label"],
+            "rt": answers["rt_ms"] + 5000,
+        }
+    )
+    files = []
+    for scenario, study in (("collide", "collision"), ("drop", "drop")):
+        files.append(tmp_path / f"human_responses-{study}_pilot.csv")
+        raw[answers["scenario"] == scenario].to_csv(files[-1], index=False)
+    kappas = []
+    for responses in ([str(own.responses)], [str(file) for file in files]):
+        assert main([*command[:3], "--responses", *responses, "--json"]) == 0
+        kappas.append(json.loads(capsys.readouterr().out)["rows"][0]["kappa"])
+    assert kappas[0] == kappas[1] is not None

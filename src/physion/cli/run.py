@@ -218,19 +218,17 @@ def write_report(
 
     from physion.analysis.stimuli import canonical_name
     from physion.report.build import compare_files
+    from physion.report.movies import movies_of
     from physion.trials.dataset import Dataset
 
     dataset = Dataset(folder(options) / "trials")
-    movies = {
-        canonical_name(trial): dataset.paths(trial).movie for trial in dataset.trials("testing")
-    }
     page = compare_files(
         predictions,
         options.humans,
         {canonical_name(name): contact for name, contact in plan.recorded.items()} or None,
         folder(options) / "report",
         methods=methods(options, dataset.index),
-        movies=movies,
+        movies=movies_of(dataset.folder),
     )
     scores = pd.read_csv(page.parent / "tables" / "comparison.csv")
     return page, json_module.loads(scores.to_json(orient="records"))

@@ -16,6 +16,7 @@ from physion.analysis.paired import compare_models
 from physion.analysis.participants import check_labels
 from physion.analysis.people import accuracy_by_stimulus
 from physion.analysis.people_comparison import compare_everywhere
+from physion.report.blocks import plural
 from physion.report.inputs import ReportInputs, permutations_of
 from physion.report.mixed_fits import fits_of_models, fits_of_people
 from physion.report.people_results import (
@@ -75,7 +76,7 @@ def expected_in_words(people: PeopleResults, given: bool) -> str:
         if given
         else "all stimuli of the scenario that anyone answered"
     )
-    return f"{by}: {each}; {int(flags['incomplete'].sum())} sessions had fewer"
+    return f"{by}: {each}; {plural(int(flags['incomplete'].sum()), 'session')} had fewer"
 
 
 def attributes_in_words(people: PeopleResults) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pandas as pd
 
 from physion.analysis.comparison import Comparison
+from physion.analysis.stimuli import canonical_name
 from physion.errors import BadInputError
 from physion.report import blocks
 from physion.report.document import data_uri
@@ -20,6 +21,20 @@ _MIME = {
     ".png": "image/png",
     ".jpg": "image/jpeg",
 }
+
+
+def movies_of(folder: Path) -> dict[str, Path]:
+    """The movies of a dataset's testing trials, by canonical stimulus, as `ReportInputs` has them.
+
+    Raises `BadInputError` where ``folder`` is no dataset or has no testing trial.
+    """
+    from physion.trials.dataset import Dataset
+
+    dataset = Dataset(folder)
+    trials = dataset.trials("testing")
+    if not trials:
+        raise BadInputError(f"{folder} has no testing trial, so no movie that people saw")
+    return {canonical_name(trial): dataset.paths(trial).movie for trial in trials}
 
 
 def widest_gaps(comparison: Comparison, count: int) -> pd.DataFrame:
