@@ -15,8 +15,7 @@ from physion.analysis import Bootstrap
 from physion.analysis.calibration import brier, reliability_curve
 from physion.analysis.comparison import Comparison
 from physion.analysis.correlation import correlate_resampled, correlate_rows
-from physion.analysis.difficulty import THIRDS, below_chance, difficulty_third
-from physion.analysis.people import split_halves
+from physion.analysis.difficulty import THIRDS, below_chance, difficulty_third, r_by_third
 from physion.analysis.people_comparison import PeopleComparison
 from physion.analysis.predictions import DATASETS, READOUTS
 from physion.analysis.stimuli import OFFICIAL_SCENARIOS, SCENARIOS
@@ -218,26 +217,22 @@ def _third(own: pd.DataFrame, name: str, draws: Bootstrap) -> dict[str, float | 
 def _halves_by_third(
     comparison: Comparison, answers: pd.DataFrame | None
 ) -> dict[str, dict[str, float | str]]:
-    """r between random halves of the people within each third, for the columns of its panel."""
-    found: dict[str, dict[str, float | str]] = {}
-    shown = comparison.stimuli.drop_duplicates("stimulus").set_index("stimulus")
-    third = difficulty_third(shown["human_accuracy"]).set_axis(shown.index)
-    for name in THIRDS:
-        found[name] = {"people": np.nan, "people_is": "", "zone_low": np.nan, "zone_high": np.nan,
-                       "zone": ""}  # fmt: skip
-        own = third.index[third == name]
-        if answers is None or not answers["stimulus"].isin(own).any():
-            continue
-        asked = answers[answers["stimulus"].isin(own)]
-        yes = asked.pivot(index="session", columns="stimulus", values="yes").astype("float64")
-        r = split_halves(yes.to_numpy())
-        r = r[np.isfinite(r)]
-        if len(r):
-            low, high = np.percentile(r, [2.5, 97.5])
-            found[name] = {"people": float(r.mean()), "zone": HALVES,
-                           "people_is": "half of the people with the others",
-                           "zone_low": float(low), "zone_high": float(high)}  # fmt: skip
-    return found
+    """What `difficulty.r_by_third` says of people, for the columns of each third's panel."""
+    none: dict[str, float | str] = {"people": np.nan, "people_is": "", "zone_low": np.nan,
+                                    "zone_high": np.nan, "zone": ""}  # fmt: skip
+    if answers is None:
+        return dict.fromkeys(THIRDS, none)
+    labels = comparison.stimuli.drop_duplicates("stimulus").set_index("stimulus")["label"]
+    asked = answers[answers["stimulus"].isin(labels.index)]
+    yes = asked.pivot(index="session", columns="stimulus", values="yes").astype("float64")
+    truth = labels.loc[yes.columns].to_numpy(dtype=np.float64)
+    rows = r_by_third(np.full((1, len(truth)), np.nan), yes.to_numpy(), truth)
+    halves = rows[rows["model"] == -1].set_index("third")
+    return {
+        str(name): {"people": row["r"], "people_is": "half of the people with the others",
+                    "zone_low": row["low"], "zone_high": row["high"], "zone": HALVES}
+        for name, row in halves.iterrows()
+    }  # fmt: skip
 
 
 # --- readout and training -----------------------------------------------------------------------

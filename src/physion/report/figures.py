@@ -68,7 +68,7 @@ def measure_figure(table: pd.DataFrame, measure: str, theme: Theme = LIGHT) -> F
             axis.set_xlim(low, high + 0.16 * (high - low))
         figure.supxlabel(LABELS[measure], fontsize=10)
         legend(figure, _measure_handles(table, kinds, theme), 4)
-        figure.set_layout_engine("constrained", wspace=0.05)
+        figure.set_layout_engine("constrained", wspace=0.05, w_pad=0.1)
     return figure
 
 
