@@ -176,6 +176,21 @@ def test_every_option_of_a_comparison_reaches_the_report(
     assert "32 by the table that was given" in page
 
 
+@pytest.mark.slow
+def test_the_python_of_the_documentation_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = own_study(tmp_path)
+    own.predictions.rename(tmp_path / "model.csv")
+    page = (Path(__file__).parents[2] / "docs" / "analysis.md").read_text(encoding="utf-8")
+    code = page.split("```python\n")[1].split("```")[0]
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, "analysis.md", "exec"), {})
+    assert (tmp_path / "report" / "report.html").is_file()
+    out = capsys.readouterr().out
+    assert "elements" in out and "accuracy" in out
+
+
 def test_options_that_do_not_fit_are_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
