@@ -15,11 +15,10 @@ from physion.analysis import Bootstrap, compare, read_predictions
 from physion.analysis.exclusions import ExclusionRules
 from physion.analysis.leaderboard import (
     COLUMNS,
-    KAPPA_NEEDS,
     leaderboard,
-    sidecar_versions,
     sort_leaderboard,
 )
+from physion.analysis.leaderboard_rows import KAPPA_NEEDS, sidecar_versions
 from physion.analysis.participants import Responses, clean
 from physion.analysis.response_schema import TRIAL_COLUMNS, check_table
 from physion.errors import BadInputError, UnknownNameError
