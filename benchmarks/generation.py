@@ -35,6 +35,8 @@ from physion.trials.trial_file import Trial
 RESULTS = Path(__file__).parent / "results"
 CORES = (16, 64, 1000)
 SPLITS = ("training", "readout", "testing")
+PAIR_COUNT = 6
+"""Trials a scenario that two workers make together."""
 
 
 def measure(scenario: str, split: str, count: int, settings: Settings) -> dict[str, float]:
@@ -126,7 +128,7 @@ def main() -> None:
     }
     for name, row in state.items():
         print(f"collide, state alone, {name}: {row['trials_per_s']:.1f} trials/s a core")
-    pair = two_workers(options.count)
+    pair = two_workers(PAIR_COUNT)
     study = whole_study(rows)
     print(
         f"two workers: {pair['cores_used']:.2f} cores in use over {pair['trials']} trials, "
@@ -134,7 +136,7 @@ def main() -> None:
     )
     print(f"25,200 trials: {study['core_hours']:.0f} core hours, {study['gigabytes']:.0f} GB")
     for cores in CORES:
-        print(f"  on {cores} cores: {study['core_hours'] / cores:.1f} hours")
+        print(f"  on {cores} cores: {study['core_hours'] / cores:.2g} hours")
     if options.write:
         found = {
             "date": date.today().isoformat(),

@@ -103,7 +103,13 @@ def with_participants(
         "bootstrap": draws,
     }
     main = compare(
-        rows, people.tables["by_stimulus"], people.labels(), zone=people.zone(), **settings
+        rows,
+        people.tables["by_stimulus"],
+        people.labels(),
+        zone=people.zone(),
+        zone_origin="from the responses themselves",
+        participants=True,
+        **settings,
     )
     everybody = accuracy_by_stimulus(people.whole.test, draws)
     whole = compare(rows, everybody, people.labels(), **settings)

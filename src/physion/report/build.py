@@ -170,4 +170,5 @@ def _with_averages(
     found = None if zone is None else read_human_zone(zone)
     origin = labels.name if isinstance(labels, Path) else "those recorded with the trials"
     words = {"Official outcomes": origin, "People for Dominoes": _LOOKS[dominoes]}
-    return compare(rows, averages, known, zone=found, **settings), words
+    told = "" if zone is None else f"official table {zone.name}"
+    return compare(rows, averages, known, zone=found, zone_origin=told, **settings), words

@@ -37,7 +37,7 @@ from physion.analysis.exclusions import (
 )
 from physion.analysis.hypotheses import regress_hypotheses, with_attributes
 from physion.analysis.official_responses import read_official_responses
-from physion.analysis.participants import Responses, read_responses
+from physion.analysis.participants import Responses, missing_times, read_responses
 from physion.analysis.people import (
     accuracy_by_participant,
     accuracy_by_scenario,
@@ -179,7 +179,7 @@ def analyse_people(
     tables["hypotheses"] = regress_hypotheses(
         with_attributes(tables["by_stimulus"], tables["attributes"])
     )
-    tables["left_out"] = kept.dropped
+    tables["left_out"] = pd.concat([kept.dropped, missing_times(kept)], ignore_index=True)
     return PeopleResults(kept, whole, rules, tables)
 
 

@@ -130,10 +130,4 @@ def methods(inputs: ReportInputs) -> dict[str, str]:
     return {
         "Exclusions": rules_in_words(inputs.people.rules),
         "Rules applied": ", ".join(name.replace("_", " ") for name in RULES),
-        "Intervals with participants": "by drawing participants, stimuli or both with replacement, "
-        "as many draws as above; tables/measures.csv has all three; figures and tables of kappa "
-        "show both",
-        "Human zone": "2.5th to 97.5th percentile of single participants of the scenario, each "
-        "beside the others (r, kappa) or the outcomes (accuracy); only for scenarios of which all "
-        "stimuli that people saw are predicted (accuracy)",
     }
