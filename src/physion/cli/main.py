@@ -19,7 +19,7 @@ VERBS = {
     "export": "write the official layout, webdataset shards, or a dataset card",
     "import": "read official HDF5 and movie folders into trials",
     "verify": "check every byte, label and motion of a dataset",
-    "ls": "list scenarios, shapes, models, engines",
+    "ls": "list scenarios, presets and their values, props, materials, models",
     "doctor": "check this machine and say what to install",
 }
 
