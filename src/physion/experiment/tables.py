@@ -1,0 +1,159 @@
+"""The tables of a study's database, the same on SQLite and PostgreSQL.
+
+Times are seconds since 1970 in UTC, of the server's clock. What can be computed (order of trials,
+correct or not) is not stored twice; labels are in the study folder alone.
+"""
+
+from __future__ import annotations
+
+from sqlalchemy import (
+    JSON,
+    BigInteger,
+    Boolean,
+    CheckConstraint,
+    Column,
+    Float,
+    ForeignKey,
+    Index,
+    Integer,
+    MetaData,
+    String,
+    Table,
+    Text,
+    UniqueConstraint,
+)
+
+METADATA = MetaData(
+    naming_convention={
+        "ix": "ix_%(table_name)s_%(column_0_N_name)s",
+        "uq": "uq_%(table_name)s_%(column_0_N_name)s",
+        "ck": "ck_%(table_name)s_%(constraint_name)s",
+        "fk": "fk_%(table_name)s_%(column_0_N_name)s",
+        "pk": "pk_%(table_name)s",
+    }
+)
+
+STUDIES = Table(
+    "studies",
+    METADATA,
+    Column("digest", String(64), primary_key=True),
+    Column("name", String(200), nullable=False),
+    Column("version", String(200), nullable=False),
+    Column("stimuli_digest", String(64), nullable=False),
+    Column("settings", JSON, nullable=False),
+    Column("first_served", Float, nullable=False),
+)
+"""Every state of the study folder under which sessions ran; ``settings`` is all of it but media."""
+
+PARTICIPANTS = Table(
+    "participants",
+    METADATA,
+    Column("participant", String(32), primary_key=True),
+    Column("first_seen", Float, nullable=False),
+)
+"""``participant`` is the keyed hash of source and id."""
+
+RAW_IDS = Table(
+    "raw_ids",
+    METADATA,
+    Column("participant", String(32), primary_key=True),
+    Column("source", String(20), nullable=False),
+    Column("raw_id", String(200), nullable=False),
+    Column("recruiter", JSON, nullable=False),
+    Column("seen", Float, nullable=False),
+)
+"""For payment alone; no other table refers to it, so it can be emptied at any time."""
+
+SESSIONS = Table(
+    "sessions",
+    METADATA,
+    Column("session", String(32), primary_key=True),
+    Column("participant", ForeignKey("participants.participant"), nullable=False),
+    Column("scenario", String(200), nullable=False),
+    Column("kind", String(10), nullable=False),
+    Column("source", String(20), nullable=False),
+    Column("study", ForeignKey("studies.digest"), nullable=False),
+    Column("reference", String(20), nullable=False),
+    Column("order_seed", BigInteger, nullable=False),
+    Column("order_number", Integer, nullable=False),
+    Column("buttons", String(6), nullable=False),
+    Column("language", String(20), nullable=False),
+    Column("started_at", Float, nullable=False),
+    Column("consent_version", String(200)),
+    Column("consented_at", Float),
+    Column("instructed_at", Float),
+    Column("ready_at", Float),
+    Column("demographics_at", Float),
+    Column("finished_at", Float),
+    Column("withdrawn_at", Float),
+    Column("answered_familiarization", Integer, nullable=False, default=0),
+    Column("answered_test", Integer, nullable=False, default=0),
+    Column("loads", Integer, nullable=False, default=0),
+    Column("loaded_at_phase", String(15)),
+    Column("loaded_at_trial", Integer),
+    Column("last_seen", Float, nullable=False),
+    Column("age", Integer),
+    Column("gender", String(200)),
+    Column("education", String(200)),
+    Column("difficulty", Integer),
+    Column("technical_problems", Boolean),
+    Column("feedback", Text),
+    Column("device", JSON, nullable=False),
+    UniqueConstraint("participant", "scenario"),
+    CheckConstraint("kind IN ('person', 'simulated', 'preview')", name="kind"),
+    CheckConstraint("buttons IN ('yes-no', 'no-yes')", name="buttons"),
+    Index("ix_sessions_scenario_kind", "scenario", "kind"),
+)
+"""``kind`` is written once, when the session begins, and by no other statement. ``order_number`` is
+the prepared order where the study has some, else 0; ``order_seed`` with the stimuli gives the order
+of the trials. ``loaded_at_*``: the trial that was next when the page was loaded again."""
+
+TOKENS = Table(
+    "tokens",
+    METADATA,
+    Column("token_hash", String(64), primary_key=True),
+    Column("session", ForeignKey("sessions.session"), nullable=False, index=True),
+    Column("made", Float, nullable=False),
+)
+"""SHA-256 of each token; a token opens one session."""
+
+ANSWERS = Table(
+    "answers",
+    METADATA,
+    Column("session", ForeignKey("sessions.session"), primary_key=True),
+    Column("phase", String(15), primary_key=True),
+    Column("trial", Integer, primary_key=True),
+    Column("key", String(64), nullable=False),
+    Column("stimulus", String(200), nullable=False),
+    Column("response", String(3), nullable=False),
+    Column("rt_ms", Float, nullable=False),
+    Column("input", String(8), nullable=False),
+    Column("fixation_ms", Float),
+    Column("cue_ms", Float),
+    Column("frames_expected", Integer, nullable=False),
+    Column("frames_shown", Integer),
+    Column("frames_dropped", Integer),
+    Column("movie_ms", Float),
+    Column("visibility_changes", Integer),
+    Column("window_width", Integer),
+    Column("window_height", Integer),
+    Column("resumed", Boolean, nullable=False),
+    Column("answered_at", Float, nullable=False),
+    Column("details", Text, nullable=False),
+    UniqueConstraint("session", "key"),
+    UniqueConstraint("session", "phase", "stimulus"),
+    CheckConstraint("response IN ('yes', 'no')", name="response"),
+)
+"""One row a session and trial; ``details`` is JSON text."""
+
+EVENTS = Table(
+    "events",
+    METADATA,
+    Column("event", Integer, primary_key=True, autoincrement=True),
+    Column("session", ForeignKey("sessions.session"), nullable=False, index=True),
+    Column("kind", String(40), nullable=False),
+    Column("at_ms", Float, nullable=False),
+    Column("stored_at", Float, nullable=False),
+    Column("data", JSON, nullable=False),
+)
+"""What happened in the browser or to the session besides answers."""
