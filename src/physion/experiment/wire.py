@@ -19,6 +19,7 @@ request                       body, answer               meaning
 ``POST /api/events``          `Events`, `Stored`         what else happened in the browser
 ``GET /api/result``           `Result`                   accuracy, percentile, completion; at the
                                                          end alone
+``GET /api/health``           `Health`                   for load balancers: the database answers
 ============================  =========================  ==========================================
 
 Refusals are `Refusal` bodies with a status of 4xx; see `REFUSALS`.
@@ -60,6 +61,8 @@ REFUSALS = {
     "not_yet": 403,
     "too_many": 429,
     "not_found": 404,
+    "not_allowed": 405,
+    "unavailable": 503,
     "server_error": 500,
 }
 """Codes of refusals and their HTTP status. ``out_of_order``, ``already_answered`` and
@@ -224,10 +227,14 @@ class Stored(Message):
 
 
 class Completion(Message):
-    """How the participant gets the credit: a code to copy, an address to go to, or both."""
+    """How the participant gets the credit: a code to copy, an address to go to, or both.
+
+    ``post``: the address takes a form by POST with these fields (MTurk), not a visit.
+    """
 
     code: str | None
     url: str | None
+    post: dict[str, str] | None = None
 
 
 class Result(Message):
@@ -240,6 +247,21 @@ class Result(Message):
     accuracy: float
     percentile: float | None
     completion: Completion
+
+
+class Recruiter(Message):
+    """How the address of the page tells who comes: names of one recruiter's parameters.
+
+    An address belongs to the first recruiter whose ``id`` or one of whose ``preview`` parameters it
+    has, else it is a plain link. ``others`` go into ``Enter.recruiter`` where present. ``preview``:
+    an address with one of these values shows only information and no session may begin (MTurk).
+    Any address may have ``scenario``, ``language`` and ``pass``, which go into `Enter` as they are.
+    """
+
+    source: Source
+    id: str
+    others: list[str]
+    preview: dict[str, str] = {}
 
 
 class PublicStudy(Message):
@@ -259,6 +281,14 @@ class PublicStudy(Message):
     """So many trials ahead are loaded before they are shown."""
     example: dict[str, TrialMedia]
     """Media of the instructions' animated example, by scenario."""
+    recruiters: list[Recruiter]
+    """In the order in which they are tried."""
+
+
+class Health(Message):
+    """The server answers, and so does its database."""
+
+    ok: bool
 
 
 class Refusal(Message):
