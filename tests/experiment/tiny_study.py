@@ -1,0 +1,158 @@
+"""A real study folder in a second: tiny movies whose frame number can be read off the pixels.
+
+Each movie shows a blue disk (agent) and a green square (patient) on grey. Along the lower edge, an
+eighth of the picture high, are six blocks of equal width: white for 1, black for 0, the highest
+digit left; together the number of the frame, from 0. `read_number` reads it from a picture; a
+browser test does the same with the pixels of a canvas, at ``((i + 0.5) / 6, 15 / 16)`` of width and
+height. Whole movies go on to frame 59 and end with the agent at the patient, or away from it.
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from physion.experiment.stimuli import STIMULI_FILE, Stimulus, write_stimuli
+from physion.experiment.study import Study, load_study, write_settings
+from physion.experiment.texts import TEXTS_FOLDER, shipped_file
+from physion.trials.video import encode_movie
+
+OBSERVED, FULL, RATE, BLOCKS = 45, 60, 30, 6
+PASSWORD = "tiny password"
+
+
+def make_tiny_study(
+    folder: Path,
+    *,
+    test: int = 6,
+    familiarization: int = 10,
+    scenarios: tuple[str, ...] = ("collide",),
+    size: int = 128,
+    password: str = PASSWORD,
+    **settings: Any,
+) -> Study:
+    """A study with so many trials a scenario, labels alternating (the first with contact).
+
+    ``settings`` are fields of `Study` (``participants=3``, ``timing=Timing(cue_ms=100)``, ...).
+    """
+    (folder / "media").mkdir(parents=True, exist_ok=True)
+    stimuli, number = [], 0
+    for scenario in scenarios:
+        for phase, count in (("familiarization", familiarization), ("test", test)):
+            for place in range(count):
+                stimuli.append(_stimulus(folder, scenario, phase, place, number, size))
+                number += 1
+    write_stimuli(folder / STIMULI_FILE, stimuli)
+    study = Study(
+        folder=folder,
+        name="tiny",
+        version="1",
+        title="A tiny study",
+        contact="Ada Lab, ada@example.org",
+        scenarios=scenarios,
+    )
+    study = replace(study, **settings)
+    (folder / TEXTS_FOLDER).mkdir(exist_ok=True)
+    for language in study.languages:
+        (folder / TEXTS_FOLDER / f"{language}.toml").write_bytes(shipped_file(language))
+    write_settings(study)
+    _create_secrets(folder, password)
+    return load_study(folder)
+
+
+def read_number(frame: NDArray[np.uint8]) -> int:
+    """The number of the frame that a picture (H, W, 3) shows."""
+    height, width = frame.shape[:2]
+    row = frame[height * 15 // 16]
+    digits = [int(row[int((i + 0.5) * width / BLOCKS)].mean() > 127) for i in range(BLOCKS)]
+    return int("".join(map(str, digits)), 2)
+
+
+def _stimulus(
+    folder: Path, scenario: str, phase: str, place: int, number: int, size: int
+) -> Stimulus:
+    practice, contact = phase == "familiarization", place % 2 == 0
+    observed, whole, picture = _media(number, contact, size)
+    # Names that tell neither label nor phase.
+    name = f"media/{number * 7919 % 10007:05d}"
+    (folder / f"{name}.mp4").write_bytes(observed)
+    (folder / f"{name}.png").write_bytes(picture)
+    if practice:
+        (folder / f"{name}-w.mp4").write_bytes(whole)
+    return Stimulus(
+        stimulus=f"{scenario}_tiny_{phase[:3]}_{place:04d}",
+        scenario=scenario,
+        phase=phase,
+        place=place,
+        label=contact,
+        movie=f"{name}.mp4",
+        map=f"{name}.png",
+        full=f"{name}-w.mp4" if practice else "",
+        frames=OBSERVED,
+        full_frames=FULL if practice else 0,
+        rate=float(RATE),
+        width=size,
+        height=size,
+        look="free",
+    )
+
+
+@cache
+def _media(number: int, contact: bool, size: int) -> tuple[bytes, bytes, bytes]:
+    """Observed movie, whole movie and map of one stimulus."""
+    frames = draw(number, contact, size)
+    return encode_movie(frames[:OBSERVED]), encode_movie(frames), _map(number, size)
+
+
+def draw(number: int, contact: bool, size: int) -> NDArray[np.uint8]:
+    """The frames (60, size, size, 3) of one stimulus."""
+    frames = np.full((FULL, size, size, 3), 128, np.uint8)
+    disk, square = _shapes(number, size)
+    for frame in range(FULL):
+        late = max(0, frame - OBSERVED) / (FULL - OBSERVED)
+        frames[frame, square] = (40, 150, 60)
+        x, y = 0.2 + 0.2 * frame / FULL + 0.4 * late, 0.5 if contact else 0.5 - 0.4 * late
+        frames[frame, disk(x, y)] = (50, 70, 200)
+        for block in range(BLOCKS):
+            left, right = (int(edge * size / BLOCKS) for edge in (block, block + 1))
+            white = frame >> (BLOCKS - 1 - block) & 1
+            frames[frame, size * 7 // 8 :, left:right] = 255 if white else 0
+    return frames
+
+
+def _shapes(number: int, size: int) -> tuple[Any, NDArray[np.bool_]]:
+    rows, columns = np.mgrid[0:size, 0:size] / size
+    # Both grow a little with the number, so that no two stimuli are alike.
+    radius = 0.06 + 0.0007 * (number % 60)
+    square = (abs(columns - 0.8) < radius + 0.04) & (abs(rows - 0.5) < 0.08)
+    square &= (rows - 0.4) * size >= number // 60 % 8
+
+    def disk(x: float, y: float) -> NDArray[np.bool_]:
+        return np.asarray((columns - x) ** 2 + (rows - y) ** 2 < radius**2)
+
+    return disk, square
+
+
+def _map(number: int, size: int) -> bytes:
+    disk, square = _shapes(number, size)
+    picture = np.zeros((size, size, 4), np.uint8)
+    picture[square] = (255, 255, 0, 255)
+    picture[disk(0.2, 0.5)] = (255, 0, 0, 255)
+    buffer = io.BytesIO()
+    Image.fromarray(picture, "RGBA").save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def _create_secrets(folder: Path, password: str) -> None:
+    try:
+        from physion.experiment.identity import Secrets
+    except ModuleNotFoundError:
+        return
+    Secrets.create(folder, password)
