@@ -19,17 +19,18 @@ PART_SUFFIX = ".part"
 """How the name of a file that is still being written ends."""
 
 
-def write_atomic(path: Path, data: bytes) -> None:
+def write_atomic(path: Path, data: bytes, mode: int = 0o644) -> None:
     """Write ``data`` to ``path`` so that no reader ever sees a part of it, not even after a crash.
 
     The bytes go to a temporary name in the same folder, to the disk, and only then take the
     place of ``path``. The temporary name belongs to this call alone, so that two writers of one
-    path do not meet. Raises ``OSError`` (disk full, no permission, ...) with nothing left behind.
+    path do not meet. ``mode`` holds from the first byte on (less the process's umask): 0o600 for
+    secrets. Raises ``OSError`` (disk full, no permission, ...) with nothing left behind.
     """
     # A short name of its own: adding to a long file name could pass the system's limit.
     part = path.with_name(f".{os.getpid()}-{secrets.token_hex(8)}{PART_SUFFIX}")
     try:
-        descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
+        descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
         try:
             view = memoryview(data)
             while len(view) > 0:
