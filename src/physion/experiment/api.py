@@ -1,0 +1,135 @@
+"""The endpoints of `physion.experiment.wire`: a body in, one call of the store, a message out."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+from fastapi import APIRouter
+from sqlalchemy import text
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import Response
+
+from physion.experiment.bodies import read_message
+from physion.experiment.media_links import example_media
+from physion.experiment.recruitment import RECRUITERS, begins_nothing
+from physion.experiment.refusals import Reply, refuse
+from physion.experiment.wire import (
+    Answer,
+    Enter,
+    Events,
+    Health,
+    PageDone,
+    PublicStudy,
+)
+
+if TYPE_CHECKING:
+    from physion.experiment.identity import Secrets
+    from physion.experiment.store import Store
+    from physion.experiment.study import Study
+
+PHASES = ("familiarization", "test")
+
+
+def public_study(study: Study, secrets: Secrets) -> PublicStudy:
+    """What anyone may know."""
+    return PublicStudy(
+        title=study.title,
+        contact=study.contact,
+        languages=list(study.languages),
+        consent_version=study.consent_version,
+        scenarios=list(study.scenarios),
+        id_needed=study.recruitment.id_needed,
+        min_width=study.screen.min_width,
+        min_height=study.screen.min_height,
+        cue_ms=study.timing.cue_ms,
+        flash_hz=study.timing.flash_hz,
+        preload=study.preload,
+        example={name: example_media(study, secrets, name) for name in study.scenarios},
+        recruiters=list(RECRUITERS),
+    )
+
+
+def token_of(request: Request) -> str:
+    """The token that a request carries; empty where there is none."""
+    scheme, _, token = request.headers.get("authorization", "").partition(" ")
+    token = token.strip()
+    return token if scheme.lower() == "bearer" and len(token) <= 200 else ""
+
+
+def build_api(study: Study, secrets: Secrets, store: Store) -> APIRouter:
+    """The router of ``/api``."""
+    router = APIRouter(prefix="/api")
+    about = public_study(study, secrets).model_dump_json().encode()
+    texts = {
+        language: json.dumps(dict(words), ensure_ascii=False).encode()
+        for language, words in study.texts.items()
+    }
+
+    @router.get("/study")
+    async def get_study(request: Request) -> Response:
+        return Response(about, media_type="application/json")
+
+    @router.get("/texts/{language}")
+    async def get_texts(request: Request) -> Response:
+        words = texts.get(request.path_params["language"])
+        return (
+            refuse("not_found") if words is None else Response(words, media_type="application/json")
+        )
+
+    @router.post("/enter")
+    async def post_enter(request: Request) -> Response:
+        enter = await read_message(request, Enter)
+        if begins_nothing(enter):
+            return refuse("not_yet", "Accept the task first.")
+        address = request.client.host if request.client else ""
+        return Reply(await store.enter(enter, address))
+
+    @router.get("/session")
+    async def get_session(request: Request) -> Response:
+        load = request.query_params.get("load") == "true"
+        return Reply(await store.state(token_of(request), load))
+
+    @router.get("/trials/{phase}")
+    async def get_trials(request: Request) -> Response:
+        phase = request.path_params["phase"]
+        if phase not in PHASES:
+            return refuse("not_found")
+        return Reply(store.trials(token_of(request), phase))
+
+    @router.post("/page")
+    async def post_page(request: Request) -> Response:
+        page = await read_message(request, PageDone)
+        return Reply(await store.page(token_of(request), page))
+
+    @router.post("/answers")
+    async def post_answer(request: Request) -> Response:
+        answer = await read_message(request, Answer)
+        return Reply(await store.answer(token_of(request), answer))
+
+    @router.post("/events")
+    async def post_events(request: Request) -> Response:
+        events = await read_message(request, Events)
+        return Reply(await store.events(token_of(request), events))
+
+    @router.get("/result")
+    async def get_result(request: Request) -> Response:
+        return Reply(store.result(token_of(request)))
+
+    @router.api_route("/health", methods=["GET", "HEAD"])
+    async def get_health(request: Request) -> Response:
+        answers = await run_in_threadpool(_database_answers, store)
+        return Reply(Health(ok=True)) if answers else refuse("unavailable")
+
+    return router
+
+
+def _database_answers(store: Store) -> bool:
+    """Does the database take a question?"""
+    try:
+        with store.engine.connect() as connection:
+            connection.execute(text("SELECT 1"))
+    except Exception:  # whatever the driver raises, the answer is the same
+        return False
+    return True

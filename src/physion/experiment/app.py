@@ -1,0 +1,93 @@
+"""The application of one study: pages, endpoints, media and the experimenter's pages."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from fastapi import FastAPI
+from fastapi.exceptions import RequestValidationError
+from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import Response
+
+from physion.experiment.api import build_api
+from physion.experiment.bodies import BadBodyError
+from physion.experiment.experimenter.routes import build_router
+from physion.experiment.guards import Guards
+from physion.experiment.media_links import read_media_path
+from physion.experiment.media_serving import MediaFiles
+from physion.experiment.page_files import PACKAGE, read_page_file, read_page_files
+from physion.experiment.refusals import code_of, refuse
+from physion.experiment.store import Refused
+
+if TYPE_CHECKING:
+    from physion.experiment.identity import Secrets
+    from physion.experiment.store import Store
+    from physion.experiment.study import Study
+
+
+def build_app(study: Study, secrets: Secrets, store: Store) -> FastAPI:
+    """Everything that one study serves. Nothing about the program itself is served."""
+    app = FastAPI(
+        docs_url=None,
+        redoc_url=None,
+        openapi_url=None,
+        redirect_slashes=False,
+        middleware=[Middleware(Guards, study=study)],
+        exception_handlers={
+            Refused: _refused,
+            BadBodyError: _bad_body,
+            HTTPException: _framework_error,
+            RequestValidationError: _bad_request,
+        },
+    )
+    app.include_router(build_api(study, secrets, store))
+    _serve_pages(app)
+    _serve_media(app, study, secrets)
+    app.include_router(build_router(study, secrets, store), prefix="/experimenter")
+    return app
+
+
+def _serve_pages(app: FastAPI) -> None:
+    index = read_page_file(PACKAGE / "pages" / "index.html")
+    files = read_page_files(PACKAGE / "static")
+
+    @app.get("/")
+    async def get_index(request: Request) -> Response:
+        return index.response(request)
+
+    @app.get("/static/{name:path}")
+    async def get_static(request: Request) -> Response:
+        found = files.get(request.path_params["name"])
+        return refuse("not_found") if found is None else found.response(request)
+
+
+def _serve_media(app: FastAPI, study: Study, secrets: Secrets) -> None:
+    files = MediaFiles()
+
+    @app.get("/media/{name}")
+    async def get_media(request: Request) -> Response:
+        path = read_media_path(study, secrets, request.path_params["name"])
+        if path is None:
+            return refuse("not_found")
+        return await files.response(path)
+
+
+async def _refused(request: Request, error: Exception) -> Response:
+    assert isinstance(error, Refused)
+    return refuse(error.code, error.message, error.state)
+
+
+async def _bad_body(request: Request, error: Exception) -> Response:
+    return refuse("bad_request", str(error))
+
+
+async def _bad_request(request: Request, error: Exception) -> Response:
+    return refuse("bad_request")
+
+
+async def _framework_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    headers = dict(error.headers or {}) if error.status_code == 405 else None
+    return refuse(code_of(error.status_code), status=error.status_code, headers=headers)
