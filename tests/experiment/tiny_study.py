@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from physion.experiment.identity import Secrets
 from physion.experiment.stimuli import STIMULI_FILE, Stimulus, write_stimuli
 from physion.experiment.study import Study, load_study, write_settings
 from physion.experiment.texts import TEXTS_FOLDER, shipped_file
@@ -63,7 +64,7 @@ def make_tiny_study(
     for language in study.languages:
         (folder / TEXTS_FOLDER / f"{language}.toml").write_bytes(shipped_file(language))
     write_settings(study)
-    _create_secrets(folder, password)
+    Secrets.create(folder, password)
     return load_study(folder)
 
 
@@ -148,11 +149,3 @@ def _map(number: int, size: int) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(picture, "RGBA").save(buffer, "PNG")
     return buffer.getvalue()
-
-
-def _create_secrets(folder: Path, password: str) -> None:
-    try:
-        from physion.experiment.identity import Secrets
-    except ModuleNotFoundError:
-        return
-    Secrets.create(folder, password)

@@ -14,19 +14,17 @@
 from __future__ import annotations
 
 import hashlib
-import json
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from physion.atomic import write_atomic
-from physion.errors import BadInputError, UnknownNameError
+from physion.errors import BadInputError
 from physion.experiment.plain_files import check_plain, read_plain
 from physion.experiment.stimuli import MAX_BYTES as MAX_STIMULI_BYTES
 from physion.experiment.stimuli import PHASES, STIMULI_FILE, Stimulus, parse_stimuli
-from physion.experiment.study_checks import KEYS, TABLES, Key
+from physion.experiment.study_file import check_tables, parse_toml, tables_to_toml
 from physion.experiment.texts import TEXTS_FOLDER, read_texts
 
 STUDY_FILE = "study.toml"
@@ -125,10 +123,6 @@ class Study:
 
 
 _PARTS = {"timing": Timing, "screen": Screen, "recruitment": Recruitment, "limits": Limits}
-_HEAD = """\
-# What this study decides. Texts are in texts/, stimuli in stimuli.csv (which is never served).
-# Serve it with: physion experiment serve FOLDER
-"""
 
 
 def load_study(folder: Path | str) -> Study:
@@ -142,11 +136,11 @@ def load_study(folder: Path | str) -> Study:
         raise BadInputError(f"there is no study folder {folder}; make one: physion experiment init")
     path = folder / STUDY_FILE
     content = read_plain(path, MAX_BYTES)
-    study = replace(read_settings(path, content), folder=folder)
+    study = replace(study_of(parse_toml(path, content), path), folder=folder)
     texts, written = {}, []
     for language in study.languages:
-        texts[language], bytes_of = read_texts(folder / TEXTS_FOLDER, language)
-        written.append(bytes_of)
+        texts[language], text_file = read_texts(folder / TEXTS_FOLDER, language)
+        written.append(text_file)
     listed = folder / STIMULI_FILE
     rows = read_plain(listed, MAX_STIMULI_BYTES)
     stimuli = tuple(s for s in parse_stimuli(listed, rows) if s.scenario in study.scenarios)
@@ -160,47 +154,23 @@ def load_study(folder: Path | str) -> Study:
     )
 
 
-def read_settings(path: Path, content: bytes) -> Study:
-    """The settings of a ``study.toml`` alone, without stimuli and texts, in its own folder."""
-    try:
-        table = tomllib.loads(content.decode())
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise BadInputError(f"{path} is not TOML: {error}") from error
-    return study_of(path, table)
+def study_of(table: Mapping[str, Any], path: Path) -> Study:
+    """The settings in the tables of a ``study.toml`` that stands, or will stand, at ``path``.
 
-
-def study_of(path: Path, table: Mapping[str, Any]) -> Study:
-    """The settings in the tables of a ``study.toml`` that stands, or will stand, at ``path``."""
-    top = {key.name for key in KEYS if not key.table} | set(TABLES)
-    _refuse_unknown(path, "", table, top)
-    values: dict[str, dict[str, Any]] = {name: {} for name in ("", *TABLES)}
-    for name in TABLES:
-        part = table.get(name, {})
-        if not isinstance(part, Mapping):
-            raise BadInputError(f"{path}: {name} must be a table, [{name}], not {part!r}")
-        _refuse_unknown(path, name, part, {key.name for key in KEYS if key.table == name})
-    for key in KEYS:
-        given = table.get(key.table, {}) if key.table else table
-        if key.name in given:
-            values[key.table][key.name] = _checked(path, key, given[key.name])
-        elif key.required:
-            raise BadInputError(f"{path} lacks {key.name}: {_one_line(key.about)}")
+    Stimuli and texts are left empty. Errors as of `load_study`.
+    """
+    values = check_tables(table, path)
     parts = {name: part(**values[name]) for name, part in _PARTS.items()}
     return Study(folder=path.parent, **values[""], **parts)
 
 
 def study_to_toml(study: Study) -> str:
-    """``study.toml`` of a study: every key with its comment; `read_settings` gives it back."""
-    lines = [_HEAD]
-    for name in ("", *TABLES):
-        if name:
-            lines.append(f"\n# {TABLES[name]}\n[{name}]\n")
-        owner = getattr(study, name) if name else study
-        for key in (key for key in KEYS if key.table == name):
-            value = _checked(study.folder / STUDY_FILE, key, getattr(owner, key.name))
-            comment = "".join(f"# {line}\n" for line in key.about.splitlines())
-            lines.append(f"{comment}{key.name} = {_toml(value)}\n")
-    return "".join(lines)
+    """``study.toml`` of a study: every key with its comment; `study_of` gives it back.
+
+    `BadInputError` names the key of a value that could not be read back.
+    """
+    values = {name: vars(getattr(study, name)) for name in _PARTS}
+    return tables_to_toml({"": vars(study), **values}, study.folder / STUDY_FILE)
 
 
 def write_settings(study: Study) -> Path:
@@ -210,26 +180,11 @@ def write_settings(study: Study) -> Path:
     return path
 
 
-def _checked(path: Path, key: Key, value: Any) -> Any:
-    name = f"{key.table}.{key.name}" if key.table else key.name
-    try:
-        return key.check(value)
-    except ValueError as error:
-        shown = repr(list(value) if isinstance(value, tuple) else value)
-        raise BadInputError(f"{path}: {name} must be {error}, not {shown[:200]}") from error
-
-
-def _refuse_unknown(path: Path, table: str, given: Mapping[str, Any], known: set[str]) -> None:
-    for name in given:
-        if name not in known:
-            where = f"{path}, [{table}]" if table else str(path)
-            raise BadInputError(f"{where}: {UnknownNameError('key', name, known)}")
-
-
 def _check_stimuli(study: Study, stimuli: tuple[Stimulus, ...], path: Path) -> None:
+    there = {(s.scenario, s.phase) for s in stimuli}
     for scenario in study.scenarios:
         for phase in PHASES:
-            if not any((s.scenario, s.phase) == (scenario, phase) for s in stimuli):
+            if (scenario, phase) not in there:
                 raise BadInputError(
                     f"{path} has no stimulus of {scenario} for {phase}; add some, or take "
                     f"{scenario} out of scenarios in {STUDY_FILE}"
@@ -245,16 +200,3 @@ def _digest(*parts: bytes) -> str:
     for part in parts:
         hashed.update(len(part).to_bytes(8, "big") + part)
     return hashed.hexdigest()
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, tuple):
-        return f"[{', '.join(_toml(one) for one in value)}]"
-    if isinstance(value, str):
-        # A TOML string is escaped as a JSON string is, where nothing is left to surrogates.
-        return json.dumps(value, ensure_ascii=False)
-    return json.dumps(value)
-
-
-def _one_line(words: str) -> str:
-    return " ".join(words.split())

@@ -121,7 +121,7 @@ def address(*needed: str) -> Check:
 
     def check(value: Any) -> str:
         allowed = f"empty or an address that begins with https://{rest}"
-        line = text(1000)(value)
+        line = str(text(1000)(value))
         if not line:
             return ""
         try:
@@ -146,9 +146,9 @@ _site = pattern(
 
 
 def _rules(value: Any) -> str:
-    if not isinstance(value, str) or value not in RULE_SETS:
+    if value not in tuple(RULE_SETS):
         raise ValueError(" or ".join(RULE_SETS))
-    return value
+    return str(value)
 
 
 KEYS: tuple[Key, ...] = (
