@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from fastapi import APIRouter
 from sqlalchemy import text
@@ -12,9 +12,10 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from physion.experiment.bodies import read_message
-from physion.experiment.media_links import example_media
+from physion.experiment.media_links import sign_media
 from physion.experiment.recruitment import RECRUITERS, begins_nothing
 from physion.experiment.refusals import Reply, refuse
+from physion.experiment.stimuli import PHASES
 from physion.experiment.wire import (
     Answer,
     Enter,
@@ -22,6 +23,7 @@ from physion.experiment.wire import (
     Health,
     PageDone,
     PublicStudy,
+    TrialMedia,
 )
 
 if TYPE_CHECKING:
@@ -29,7 +31,7 @@ if TYPE_CHECKING:
     from physion.experiment.store import Store
     from physion.experiment.study import Study
 
-PHASES = ("familiarization", "test")
+KINDS: tuple[Literal["movie"], Literal["map"]] = ("movie", "map")
 
 
 def public_study(study: Study, secrets: Secrets) -> PublicStudy:
@@ -46,8 +48,29 @@ def public_study(study: Study, secrets: Secrets) -> PublicStudy:
         cue_ms=study.timing.cue_ms,
         flash_hz=study.timing.flash_hz,
         preload=study.preload,
-        example={name: example_media(study, secrets, name) for name in study.scenarios},
+        example={name: _example(study, secrets, name) for name in study.scenarios},
         recruiters=list(RECRUITERS),
+    )
+
+
+def _example(study: Study, secrets: Secrets, scenario: str) -> TrialMedia:
+    """The last trial of familiarization, observed part alone: the one whose memory fades longest
+    until it comes, and no trial of the test.
+    """
+    trial = len(study.phase(scenario, "familiarization")) - 1
+    shown = study.phase(scenario, "familiarization")[trial]
+    movie, picture = (
+        sign_media(study, secrets, scenario, 0, "familiarization", trial, kind) for kind in KINDS
+    )
+    return TrialMedia(
+        trial=0,
+        movie=movie,
+        map=picture,
+        frames=shown.frames,
+        rate=shown.rate,
+        width=shown.width,
+        height=shown.height,
+        fixation_ms=1000,
     )
 
 

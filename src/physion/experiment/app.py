@@ -11,6 +11,7 @@ from starlette.middleware import Middleware
 from starlette.requests import Request
 from starlette.responses import Response
 
+from physion.errors import BadInputError
 from physion.experiment.api import build_api
 from physion.experiment.bodies import BadBodyError
 from physion.experiment.experimenter.routes import build_router
@@ -19,7 +20,7 @@ from physion.experiment.media_links import read_media_path
 from physion.experiment.media_serving import MediaFiles
 from physion.experiment.page_files import PACKAGE, read_page_file, read_page_files
 from physion.experiment.refusals import code_of, refuse
-from physion.experiment.store import Refused
+from physion.experiment.refused import Refused
 
 if TYPE_CHECKING:
     from physion.experiment.identity import Secrets
@@ -68,8 +69,9 @@ def _serve_media(app: FastAPI, study: Study, secrets: Secrets) -> None:
 
     @app.get("/media/{name}")
     async def get_media(request: Request) -> Response:
-        path = read_media_path(study, secrets, request.path_params["name"])
-        if path is None:
+        try:
+            path = read_media_path(study, secrets, request.scope["path"])
+        except BadInputError:
             return refuse("not_found")
         return await files.response(path)
 

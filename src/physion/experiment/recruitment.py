@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl, quote, urlencode, urlsplit, urlunsplit
 
 from physion.errors import BadInputError
-from physion.experiment.identity import check_signature, sign
+from physion.experiment.identity import REFERENCE_LETTERS, check_signature, sign
 from physion.experiment.wire import Completion, Enter, Kind, Recruiter
 
 if TYPE_CHECKING:
@@ -37,8 +37,6 @@ RECRUITERS = (
 MTURK_HOSTS = ("https://www.mturk.com", "https://workersandbox.mturk.com")
 """The only places that a form of ours is ever sent to besides our own."""
 PROLIFIC_COMPLETION = "https://app.prolific.com/submissions/complete"
-CODE_LETTERS = "23456789ABCDEFGHJKLMNPQRSTUVWXYZ"
-"""32 signs that nobody mistakes for one another."""
 
 
 def begins_nothing(enter: Enter) -> bool:
@@ -63,7 +61,7 @@ def kind_of_pass(secrets: Secrets, word: str) -> Kind | None:
 def session_code(secrets: Secrets, session: str) -> str:
     """Ten signs of a session that only this study can make, for a recruiter's form."""
     digest = hashlib.sha256(sign(secrets, "completion", session).encode()).digest()
-    return "".join(CODE_LETTERS[byte % 32] for byte in digest[:10])
+    return "".join(REFERENCE_LETTERS[byte % 32] for byte in digest[:10])
 
 
 def completion(study: Study, secrets: Secrets, session: Any, raw: Any = None) -> Completion:
