@@ -13,12 +13,15 @@ from dataclasses import dataclass
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from physion.analysis.exclusions import RULE_SETS
 from physion.experiment.stimuli import NAME
 
 Check = Callable[[Any], Any]
 LANGUAGE = r"[a-z]{2,3}(-[A-Za-z0-9]{2,8})?"
 """Names of languages and of their files, as in HTML: en, de, pt-BR."""
+
+
+EXCLUSIONS = ("preregistered", "official-code")
+"""Names of `physion.analysis.exclusions.RULE_SETS`, whose import takes seconds (pandas, SciPy)."""
 
 
 @dataclass(frozen=True)
@@ -146,8 +149,8 @@ _site = pattern(
 
 
 def _rules(value: Any) -> str:
-    if value not in tuple(RULE_SETS):
-        raise ValueError(" or ".join(RULE_SETS))
+    if value not in EXCLUSIONS:
+        raise ValueError(" or ".join(EXCLUSIONS))
     return str(value)
 
 
@@ -173,7 +176,7 @@ KEYS: tuple[Key, ...] = (
         "0: an order of their own for each participant; else so many prepared orders, least used\n"
         "first (the official study had 125)."),
     Key("", "exclusions", _rules,
-        f"Rules by which sessions are flagged: {', '.join(RULE_SETS)}."),
+        f"Rules by which sessions are flagged: {', '.join(EXCLUSIONS)}."),
     Key("", "percentile_from", whole(1, 1_000_000),
         "Finished people that it takes before anyone is told a percentile."),
     Key("", "preload", whole(1, 1000), "Trials that are loaded before they are shown."),
