@@ -44,6 +44,7 @@ import sqlalchemy as sa
 import uvloop
 
 from light_http import Connection, request
+from physion.experiment.database import open_database, sqlite_url
 from physion.experiment.identity import Secrets
 from physion.experiment.own_server import HOST, OwnServer
 from physion.experiment.recruitment import pass_word
@@ -264,10 +265,10 @@ def cpu_seconds(pid: int) -> float:
 
 def check(study: Study, database: str | None, tally: Tally) -> int:
     """Answers that are not as acknowledged: missing, altered, or never acknowledged."""
-    url = database or f"sqlite:///{study.folder / 'responses.sqlite'}"
+    url = database or sqlite_url(study.folder)
     columns = (ANSWERS.c.key, SESSIONS.c.reference, ANSWERS.c.trial, ANSWERS.c.response,
                ANSWERS.c.rt_ms)  # fmt: skip
-    engine = sa.create_engine(url)
+    engine = open_database(url, must_exist=True)
     with engine.connect() as connection:
         rows = connection.execute(sa.select(*columns).join(SESSIONS)).all()
     engine.dispose()
@@ -302,8 +303,8 @@ def new_database(server: str | None) -> Iterator[str | None]:
         yield None
         return
     name = f"physion_load_{uuid.uuid4().hex[:12]}"
-    engine = sa.create_engine(server, isolation_level="AUTOCOMMIT")
-    with engine.connect() as connection:
+    engine = open_database(server)
+    with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
         connection.execute(sa.text(f"CREATE DATABASE {name}"))
         try:
             yield engine.url.set(database=name).render_as_string(hide_password=False)

@@ -6,6 +6,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
+from physion.experiment.database import open_database, sqlite_url
 from physion.experiment.study import Study
 from physion.experiment.tables import ANSWERS, SESSIONS
 
@@ -25,7 +26,7 @@ def stored_answers(study: Study, url: str | None = None) -> dict[tuple[str, str,
 
 
 def _rows(study: Study, url: str | None, query: sa.Select[Any]) -> list[Any]:
-    engine = sa.create_engine(url or f"sqlite:///{study.folder / 'responses.sqlite'}")
+    engine = open_database(url or sqlite_url(study.folder), must_exist=True)
     try:
         with engine.connect() as connection:
             return list(connection.execute(query).all())

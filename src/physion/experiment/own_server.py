@@ -53,9 +53,8 @@ class OwnServer:
         Raises `PhysionError` with the server's last words where it ends or stays silent.
         """
         begin = time.monotonic()
-        self._process = subprocess.Popen(
-            self._command, stdin=subprocess.DEVNULL, stdout=self._said, stderr=self._said
-        )
+        self.launch()
+        assert self._process is not None
         with httpx2.Client(base_url=self.url, trust_env=False, timeout=5.0) as client:
             while time.monotonic() - begin < patience_s:
                 if self._process.poll() is not None:
@@ -68,6 +67,12 @@ class OwnServer:
                 time.sleep(POLL_S)
         self.kill()
         raise PhysionError(f"the server did not answer in {patience_s:g} s: {self.last_words()}")
+
+    def launch(self) -> None:
+        """Start the process and wait for nothing."""
+        self._process = subprocess.Popen(
+            self._command, stdin=subprocess.DEVNULL, stdout=self._said, stderr=self._said
+        )
 
     def stop(self, patience_s: float = 30.0) -> int:
         """Ask the server to finish and wait; killed where it does not. Returns its exit code."""

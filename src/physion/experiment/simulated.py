@@ -238,8 +238,7 @@ class Participation:
 
     def _shown(self, phase: wire.Phase, movie: str) -> Stimulus:
         """What a movie's path stands for; the server's keys can tell, a browser cannot."""
-        name = movie.removeprefix("/media/")
-        path = read_media_path(self._study, self._secrets, name)
+        path = read_media_path(self._study, self._secrets, movie)
         for stimulus in self._study.phase(self._visit.scenario, phase):
             if self._study.folder / stimulus.movie == path:
                 return stimulus
