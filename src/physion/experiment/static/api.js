@@ -1,0 +1,147 @@
+/**
+ * Requests to the server. What fails on the way (no connection, timeout, 5xx, 429) is tried again,
+ * with growing pauses, until it is answered; what the server refuses is thrown as `Refused`.
+ * Every request may be repeated safely: answers have keys, pages can be sent twice.
+ * @module api
+ */
+
+const TIMEOUT_MS = 15_000;
+const FIRST_PAUSE_MS = 500;
+const LONGEST_PAUSE_MS = 8_000;
+
+/** The server said no. `state`: where the session stands, where the server told it. */
+export class Refused extends Error {
+  /** @param {number} status @param {any} body A `Refusal`, or anything. */
+  constructor(status, body) {
+    super(body?.message ?? `status ${status}`);
+    this.status = status;
+    this.code = body?.error ?? "bad_request";
+    this.state = body?.state ?? null;
+  }
+}
+
+/** A failure that may pass: the request is tried again. */
+class Trouble extends Error {
+  /** @param {string} message @param {number} [pauseMs] What the server asks to wait. */
+  constructor(message, pauseMs = 0) {
+    super(message);
+    this.pauseMs = pauseMs;
+  }
+}
+
+/** Waits, but not longer than until the browser is online again. */
+function pause(ms, signal) {
+  return new Promise((resolve, reject) => {
+    const end = () => {
+      clearTimeout(timer);
+      window.removeEventListener("online", end);
+      signal?.removeEventListener("abort", end);
+      if (signal?.aborted) reject(signal.reason);
+      else resolve();
+    };
+    const timer = setTimeout(end, ms);
+    window.addEventListener("online", end);
+    signal?.addEventListener("abort", end);
+  });
+}
+
+export class Api {
+  /** @param {(troubled: boolean) => void} onTrouble Called as requests begin or cease to fail. */
+  constructor(onTrouble) {
+    this.onTrouble = onTrouble;
+    /** @type {string|null} */
+    this.token = null;
+    this.failing = 0;
+  }
+
+  /** @param {string} path @param {Options} [options] @returns {Promise<any>} */
+  get(path, options = {}) {
+    return this.#repeat(() => this.#json("GET", path, undefined, options), options.signal);
+  }
+
+  /** @param {string} path @param {any} body @param {Options} [options] @returns {Promise<any>} */
+  post(path, body, options = {}) {
+    return this.#repeat(() => this.#json("POST", path, body, options), options.signal);
+  }
+
+  /** @param {string} path @param {AbortSignal} [signal] @returns {Promise<Blob>} */
+  blob(path, signal) {
+    return this.#repeat(async () => (await this.#fetch(path, {}, signal)).blob(), signal);
+  }
+
+  /** One try alone, that outlives the page. @param {string} path @param {any} body */
+  async tell(path, body) {
+    const init = { ...this.#init("POST", body, this.token), keepalive: true };
+    await this.#fetch(path, init);
+  }
+
+  /**
+   * @typedef {{token?: string|null, signal?: AbortSignal}} Options
+   * `token`: of whom, where it is not the one who entered here.
+   */
+
+  async #json(method, path, body, { token = this.token, signal } = {}) {
+    const response = await this.#fetch(path, this.#init(method, body, token), signal);
+    return response.json();
+  }
+
+  #init(method, body, token) {
+    const headers = { Accept: "application/json" };
+    if (token) headers.Authorization = `Bearer ${token}`;
+    if (body !== undefined) headers["Content-Type"] = "application/json";
+    return { method, headers, body: body === undefined ? undefined : JSON.stringify(body) };
+  }
+
+  /** A whole answer, so that one that breaks off midway counts as failed. */
+  async #fetch(path, init, signal) {
+    const timeout = new AbortController();
+    const timer = setTimeout(() => timeout.abort(), TIMEOUT_MS);
+    const stop = () => timeout.abort();
+    signal?.addEventListener("abort", stop);
+    try {
+      const options = { credentials: "omit", signal: timeout.signal, ...init };
+      const response = await fetch(path, options);
+      const whole = new Response(await response.blob(), response);
+      if (response.ok) return whole;
+      const body = await whole.json().catch(() => null);
+      if (response.status === 429 || response.status >= 500) {
+        const seconds = Number(response.headers.get("Retry-After")) || 0;
+        throw new Trouble(`status ${response.status}`, Math.min(seconds, 60) * 1000);
+      }
+      throw new Refused(response.status, body);
+    } catch (error) {
+      if (signal?.aborted) throw signal.reason;
+      if (error instanceof Refused || error instanceof Trouble) throw error;
+      throw new Trouble(String(error));
+    } finally {
+      clearTimeout(timer);
+      signal?.removeEventListener("abort", stop);
+    }
+  }
+
+  async #repeat(attempt, signal) {
+    let wait = FIRST_PAUSE_MS;
+    let failed = false;
+    try {
+      for (;;) {
+        try {
+          return await attempt();
+        } catch (error) {
+          if (!(error instanceof Trouble)) throw error;
+          if (!failed) this.#troubled(1);
+          failed = true;
+          // Spread over time, so that a room of participants does not come back in one moment.
+          await pause(Math.max(error.pauseMs, wait * (0.5 + Math.random() / 2)), signal);
+          wait = Math.min(wait * 2, LONGEST_PAUSE_MS);
+        }
+      }
+    } finally {
+      if (failed) this.#troubled(-1);
+    }
+  }
+
+  #troubled(change) {
+    this.failing += change;
+    this.onTrouble(this.failing > 0);
+  }
+}

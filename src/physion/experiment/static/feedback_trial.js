@@ -1,0 +1,97 @@
+/**
+ * A jsPsych plugin: after a familiarization answer, whether it was right, and the whole movie. Goes
+ * on when the movie has been seen to its end.
+ * @module feedback_trial
+ */
+
+import { button, el } from "./dom.js";
+import { MovieFailed, Screen } from "./screen.js";
+
+const { ParameterType } = window.jsPsychModule;
+
+const info = {
+  name: "physion-feedback",
+  version: "1.0.0",
+  parameters: {
+    /** Gives the server's `Feedback`, as a promise: it is told only after the answer is stored. */
+    feedback: { type: ParameterType.FUNCTION, default: undefined },
+    /** Gives the address of a movie by its path, as a promise. */
+    load: { type: ParameterType.FUNCTION, default: undefined },
+    /** Size and rate of the movie: a `TrialMedia`. */
+    media: { type: ParameterType.OBJECT, default: undefined },
+    /** Words by name: waiting, correct, incorrect, contact, no_contact, next, trouble, retry. */
+    words: { type: ParameterType.OBJECT, default: undefined },
+    /** Called with the kind and data of what went wrong. */
+    log: { type: ParameterType.FUNCTION, default: () => {} },
+    /** Gives the AbortSignal that ends the trial. */
+    signal: { type: ParameterType.FUNCTION, default: () => new AbortController().signal },
+  },
+  data: {
+    correct: { type: ParameterType.BOOL },
+    contact: { type: ParameterType.BOOL },
+    frames_shown: { type: ParameterType.INT },
+  },
+};
+
+export class FeedbackTrial {
+  static info = info;
+
+  /** @param {any} jsPsych */
+  constructor(jsPsych) {
+    this.jsPsych = jsPsych;
+  }
+
+  /** @param {HTMLElement} display @param {any} trial @param {() => void} on_load */
+  async trial(display, trial, on_load) {
+    const { words } = trial;
+    const signal = trial.signal();
+    const screen = new Screen(trial.media, signal);
+    const verdict = el("p", { class: "verdict", role: "status" }, words.waiting);
+    const outcome = el("p", { class: "prompt" }, "\u00a0");
+    const next = button(words.next, () => {}, { disabled: true });
+    const row = el("div", { class: "answers" }, next);
+    display.replaceChildren(
+      el("div", { class: "trial has-verdict" }, verdict, screen.element, row, outcome),
+    );
+    on_load();
+    const feedback = await trial.feedback();
+    const address = await trial.load(feedback.movie);
+    verdict.textContent = feedback.correct ? words.correct : words.incorrect;
+    verdict.classList.add(feedback.correct ? "verdict-correct" : "verdict-incorrect");
+    outcome.textContent = feedback.contact ? words.contact : words.no_contact;
+    try {
+      await playOnce(screen, address, trial, outcome);
+    } finally {
+      URL.revokeObjectURL(address);
+    }
+    next.disabled = false;
+    next.focus();
+    await new Promise((resolve, reject) => {
+      next.addEventListener("click", resolve);
+      signal.addEventListener("abort", () => reject(signal.reason));
+    });
+    return {
+      correct: feedback.correct,
+      contact: feedback.contact,
+      frames_shown: screen.record().shown,
+    };
+  }
+}
+
+/** Play the movie; where it fails, say so and try again twice, then let the participant go on. */
+async function playOnce(screen, address, trial, outcome) {
+  const told = outcome.textContent;
+  for (let attempt = 1; attempt <= 3; attempt++) {
+    try {
+      await screen.load({ movie: address });
+      screen.hide(false);
+      await screen.play({ hide: false });
+      outcome.textContent = told;
+      return;
+    } catch (error) {
+      if (!(error instanceof MovieFailed)) throw error;
+      trial.log("feedback_movie_failed", { attempt, reason: error.message });
+      outcome.textContent = trial.words.trouble;
+    }
+  }
+}

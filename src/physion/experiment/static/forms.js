@@ -1,0 +1,148 @@
+/**
+ * The pages with questions, and their parts.
+ * @module forms
+ */
+
+import { button, el, paragraphs } from "./dom.js";
+import { bound } from "./pages.js";
+
+const GENDERS = ["female", "male", "other"];
+const EDUCATIONS = [
+  "none",
+  "secondary",
+  "vocational",
+  "some_college",
+  "bachelor",
+  "master",
+  "doctorate",
+];
+const AGES = [18, 120];
+
+/** Age, gender, education; each may be left open. @returns {import("./pages.js").Render} */
+export function demographicsPage({ texts }) {
+  const { t } = bound(texts);
+  return (page, done) => {
+    const age = el("input", { id: "age", type: "text", inputmode: "numeric", maxlength: 3 });
+    age.autocomplete = "off";
+    const wrong = el("p", { class: "wrong", id: "age-wrong", role: "alert" });
+    age.setAttribute("aria-describedby", "age-wrong");
+    const choice = (name, words) => selectOf(name, words, t);
+    const gender = choice("gender", GENDERS);
+    const education = choice("education", EDUCATIONS);
+    const send = () => {
+      const years = readAge(age.value);
+      wrong.textContent = Number.isNaN(years) ? t("demographics.age_wrong") : "";
+      age.setAttribute("aria-invalid", String(Number.isNaN(years)));
+      if (Number.isNaN(years)) return age.focus();
+      return done({ age: years, gender: gender.value, education: education.value });
+    };
+    page.append(
+      el("h1", {}, t("demographics.title")),
+      ...paragraphs(t("demographics.text")),
+      form(
+        send,
+        field("age", t("demographics.age"), age, wrong),
+        field("gender", t("demographics.gender"), gender),
+        field("education", t("demographics.education"), education),
+        el("div", { class: "buttons" }, submit(t("demographics.send"))),
+      ),
+    );
+  };
+}
+
+/** Difficulty, technical problems, free text. @returns {import("./pages.js").Render} */
+export function feedbackPage({ texts }) {
+  const { t } = bound(texts);
+  return (page, done) => {
+    const difficulty = radios(
+      "difficulty",
+      t("feedback.difficulty"),
+      [1, 2, 3, 4, 5].map((value) => [value, t(`feedback.difficulty_${value}`)]),
+      t,
+    );
+    const technical = radios(
+      "technical",
+      t("feedback.technical"),
+      [
+        ["yes", t("feedback.technical_yes")],
+        ["no", t("feedback.technical_no")],
+      ],
+      t,
+    );
+    const text = el("textarea", { id: "text", rows: 3, maxlength: 5000 });
+    const send = () => {
+      const open = [difficulty, technical].filter((one) => !one.check());
+      if (open.length > 0) return open[0].focus();
+      return done({
+        difficulty: Number(difficulty.value()),
+        technical_problems: technical.value() === "yes",
+        text: text.value,
+      });
+    };
+    page.append(
+      el("h1", {}, t("feedback.title")),
+      form(
+        send,
+        difficulty.element,
+        technical.element,
+        field("text", t("feedback.text"), text),
+        el("div", { class: "buttons" }, submit(t("feedback.send"))),
+      ),
+    );
+  };
+}
+
+/** Years, null where left open, NaN where it is no age. */
+function readAge(text) {
+  if (text.trim() === "") return null;
+  const years = /^\d{1,3}$/.test(text.trim()) ? Number(text) : NaN;
+  return years >= AGES[0] && years <= AGES[1] ? years : NaN;
+}
+
+function form(send, ...children) {
+  const element = el("form", { novalidate: true }, ...children);
+  element.addEventListener("submit", (event) => {
+    event.preventDefault();
+    send();
+  });
+  return element;
+}
+
+function submit(label) {
+  return el("button", { type: "submit", class: "button" }, label);
+}
+
+function field(id, label, control, ...more) {
+  return el("div", { class: "field" }, el("label", { for: id }, label), control, ...more);
+}
+
+function selectOf(name, words, t) {
+  const options = [
+    el("option", { value: "" }, t("demographics.no_answer")),
+    ...words.map((word) => el("option", { value: word }, t(`demographics.${name}_${word}`))),
+  ];
+  return el("select", { id: name }, ...options);
+}
+
+/** A group of which one has to be chosen. */
+function radios(name, question, choices, t) {
+  const wrong = el("p", { class: "wrong", role: "alert" });
+  const inputs = choices.map(([value]) =>
+    el("input", { type: "radio", name, value, id: `${name}-${value}` }),
+  );
+  const labels = choices.map(([value, word], place) =>
+    el("label", { class: "radio", for: `${name}-${value}` }, inputs[place], word),
+  );
+  const row = el("div", { class: "radios" }, ...labels);
+  const element = el("fieldset", {}, el("legend", {}, question), row, wrong);
+  const chosen = () => inputs.find((input) => input.checked);
+  return {
+    element,
+    value: () => chosen()?.value ?? "",
+    focus: () => inputs[0].focus(),
+    check() {
+      wrong.textContent = chosen() ? "" : t("common.required");
+      return Boolean(chosen());
+    },
+  };
+}

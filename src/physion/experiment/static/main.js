@@ -1,0 +1,157 @@
+/**
+ * The page begins: study and texts, device, who comes; then the session.
+ * @module main
+ */
+
+import { AnswerQueue } from "./answer_queue.js";
+import { Api, Refused } from "./api.js";
+import { readArrival } from "./arrival.js";
+import { EventLog } from "./event_log.js";
+import { Frame } from "./frame.js";
+import { deviceProblem, measureDevice, windowFits } from "./gate.js";
+import { showPage } from "./page_trial.js";
+import { messagePage, windowPage } from "./pages.js";
+import { Session } from "./session.js";
+import { keep, recall } from "./storage.js";
+import { takeOver } from "./tabs.js";
+import { Texts, chooseLanguage } from "./texts.js";
+
+async function begin() {
+  const address = window.location.href;
+  const api = new Api((lost) => frame?.connection(lost));
+  let frame = null;
+  const study = await api.get("/api/study");
+  const arrival = readArrival(window.location.search, study.recruiters);
+  const language = chooseLanguage(study.languages, [arrival.language, recall("language")]);
+  const texts = await loadTexts(api, language);
+  frame = new Frame(study, texts);
+  const basis = { api, texts, study, frame, address, log: new EventLog(api) };
+  window.addEventListener("pageshow", (event) => event.persisted && window.location.reload());
+  const problem = deviceProblem(study);
+  if (problem) return refuse(basis, problem);
+  if (arrival.preview) return tell(basis, "information");
+  await largeWindow(basis);
+  return takePart(basis, arrival);
+}
+
+async function takePart(basis, arrival) {
+  const { api, frame, log } = basis;
+  let session = null;
+  const queue = new AnswerQueue(api, (error) => session?.refused(error));
+  takeOver(() => {
+    if (session) session.close();
+    else queue.close();
+    log.add("other_tab");
+    log.send();
+    tell(basis, "tabs", { label: "tabs.here", run: () => window.location.reload() });
+  });
+  queue.load();
+  await queue.empty();
+  try {
+    const state = await enter(basis, arrival);
+    session = new Session(basis, queue);
+    frame.onStop = () => session.askToStop();
+    frame.onLanguage = (language) => changeLanguage(basis, session, language);
+    await session.run(state);
+  } catch (error) {
+    if (!(error instanceof Refused)) throw error;
+    if (error.code === "unknown_token") keep("session", null);
+    refuse(basis, error.code, error.message);
+  }
+}
+
+/** Begin a session, or go on with the one that the address or the browser knows. */
+async function enter({ api, texts, log }, arrival) {
+  const remembered = recall("session");
+  const device = await measureDevice();
+  if (remembered && !arrival.named) {
+    const state = await resume(api, remembered, arrival.enter.scenario);
+    if (state) {
+      log.add("loaded", { ...device });
+      window.history.replaceState(null, "", window.location.pathname);
+      return state;
+    }
+  }
+  try {
+    const message = { ...arrival.enter, language: texts.language, device };
+    const entered = await api.post("/api/enter", message);
+    api.token = entered.token;
+    keep("session", entered.token);
+    window.history.replaceState(null, "", window.location.pathname);
+    return entered.state;
+  } catch (error) {
+    if (error.code !== "already_took_part" || !remembered) throw error;
+    // In the browser in which they took part, people still find their result.
+    const state = await resume(api, remembered, arrival.enter.scenario);
+    if (state?.stage !== "done") throw error;
+    return state;
+  }
+}
+
+/** The state of a remembered session; null where there is none, or it is of another scenario. */
+async function resume(api, token, scenario) {
+  try {
+    const state = await api.get("/api/session?load=true", { token });
+    if (scenario && state.scenario !== scenario) return null;
+    api.token = token;
+    return state;
+  } catch (error) {
+    if (error.code !== "unknown_token") throw error;
+    keep("session", null);
+    return null;
+  }
+}
+
+async function changeLanguage(basis, session, language) {
+  basis.texts = await loadTexts(basis.api, language);
+  basis.log.add("language", { language });
+  keep("language", language);
+  basis.frame.speak(basis.texts);
+  session.restart();
+}
+
+async function loadTexts(api, language) {
+  return new Texts(language, await api.get(`/api/texts/${encodeURIComponent(language)}`));
+}
+
+/** Waits until the window is large enough. */
+function largeWindow(basis) {
+  const fits = () => windowFits(basis.study);
+  if (fits()) return Promise.resolve();
+  return new Promise((resolve) => {
+    const over = new AbortController();
+    const done = () => {
+      over.abort();
+      resolve();
+    };
+    showPage(basis.frame.main, (page) => windowPage(basis, fits)(page, done, over.signal));
+  });
+}
+
+/** One of the pages that only say something. */
+function tell({ texts, frame }, name, action = null) {
+  const [title, text] = [texts.t(`${name}.title`), texts.t(`${name}.text`)];
+  const labelled = action && { label: texts.t(action.label), run: action.run };
+  document.body.classList.remove("in-trials");
+  document.getElementById("tools").replaceChildren();
+  document.getElementById("progress").hidden = true;
+  showPage(frame.main, messagePage({ title, text, action: labelled }));
+}
+
+/** Why it does not work, by the name of a text of `refusal`, or else by the server's sentence. */
+function refuse({ texts, frame, study }, name, message = "") {
+  const known = texts.has(`refusal.${name}`);
+  const size = { width: study.min_width, height: study.min_height };
+  const why = known ? texts.t(`refusal.${name}`, size) : texts.t("refusal.other", { message });
+  const text = `${why}\n\n${texts.t("refusal.contact", study)}`;
+  const again = { label: texts.t("refusal.again"), run: () => window.location.reload() };
+  const action = known ? null : again;
+  const title = texts.t(name === "already_took_part" ? "result.title" : "refusal.title");
+  document.getElementById("tools").replaceChildren();
+  showPage(frame.main, messagePage({ title, text, action }));
+}
+
+begin().catch((error) => {
+  console.error(error);
+  showPage(document.getElementById("main"), messagePage({ title: "Error", text: String(error) }));
+});

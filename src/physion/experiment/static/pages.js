@@ -1,0 +1,204 @@
+/**
+ * The pages between the trials. Each function gives the `render` of a `PageTrial`.
+ * @module pages
+ */
+
+import { button, el, paragraphs, sleep } from "./dom.js";
+import { showExample } from "./example.js";
+import { focusHeading } from "./page_trial.js";
+
+/**
+ * @typedef {Object} Context What every page may need.
+ * @property {import("./texts.js").Texts} texts
+ * @property {any} study `PublicStudy`
+ * @property {any} state `State`
+ * @property {import("./api.js").Api} api
+ * @property {import("./media.js").Media} media
+ * @property {import("./event_log.js").EventLog} log
+ * @property {string} address The address by which the participant came.
+ */
+
+/** @typedef {(page: HTMLElement, done: (values?: any) => void, signal: AbortSignal) => void} Render */
+
+/** Minutes that so many trials take, with the pages before practice, as people say it. */
+function minutes(study, practice, test) {
+  const seconds = practice * 12 + test * (study.cue_ms / 1000 + 4.5);
+  const exact = (practice ? 3 : 0) + seconds / 60;
+  return exact > 7.5 ? Math.round(exact / 5) * 5 : Math.max(1, Math.ceil(exact));
+}
+
+/** @param {Context} context @returns {Render} */
+export function consentPage({ texts, study, state }) {
+  const { t } = bound(texts);
+  const { familiarization, test } = state.trials;
+  return (page, done) =>
+    page.append(
+      el("h1", {}, t("consent.title")),
+      ...paragraphs(
+        t("consent.text", {
+          trials: familiarization + test,
+          minutes: minutes(study, familiarization, test),
+          contact: study.contact,
+        }),
+      ),
+      el("p", { class: "small" }, t("consent.version", { version: study.consent_version })),
+      el(
+        "div",
+        { class: "buttons" },
+        button(t("consent.decline"), () => done({ agreed: false }), { class: "button quiet" }),
+        button(t("consent.agree"), () => done({ agreed: true })),
+      ),
+    );
+}
+
+/** Several pages with an animated example. @param {Context} context @returns {Render} */
+export function instructionsPages(context) {
+  const { texts, state } = context;
+  const { t } = bound(texts);
+  const prompt = t("trial.prompt");
+  const practice = state.trials.familiarization;
+  const answer = practice > 0 ? "instructions.answer" : "instructions.answer_without_practice";
+  const parts = [
+    () => [
+      el("h1", {}, t("instructions.title_task")),
+      ...paragraphs(t("instructions.task", { prompt })),
+    ],
+    (signal) => [
+      el("h1", {}, t("instructions.title_example")),
+      ...paragraphs(t("instructions.example")),
+      showExample(context, signal),
+      el("p", { class: "small" }, t("instructions.example_alone")),
+    ],
+    () => [
+      el("h1", {}, t("instructions.title_answer")),
+      ...paragraphs(t(answer, { practice, trials: state.trials.test })),
+    ],
+  ];
+  return (page, done, signal) => {
+    let over = new AbortController();
+    signal.addEventListener("abort", () => over.abort());
+    const show = (number) => {
+      over.abort();
+      over = new AbortController();
+      const last = number === parts.length - 1;
+      const back = () => show(number - 1);
+      const next = () => (last ? done() : show(number + 1));
+      page.replaceChildren(
+        ...parts[number](over.signal),
+        el(
+          "div",
+          { class: "buttons" },
+          el("span", { class: "small" }, t("common.page_of", { page: number + 1, pages: 3 })),
+          button(t("common.back"), back, { class: "button quiet", disabled: number === 0 }),
+          button(t(last ? "instructions.start" : "common.next"), next),
+        ),
+      );
+      focusHeading(page);
+    };
+    show(0);
+  };
+}
+
+/** @param {Context} context @returns {Render} */
+export function readyPage(context) {
+  const { t } = bound(context.texts);
+  const { test } = context.state.trials;
+  const values = { trials: test, minutes: minutes(context.study, 0, test) };
+  return (page, done) =>
+    page.append(
+      el("h1", {}, t("ready.title")),
+      ...paragraphs(t("ready.text", values)),
+      el("div", { class: "buttons" }, button(t("ready.start"), () => done())),
+    );
+}
+
+/** Shown until the next trials are loaded. @param {Context} context @returns {Render} */
+export function loadingPage({ texts, media }) {
+  const { t } = bound(texts);
+  return async (page, done, signal) => {
+    const bar = el("progress", { "aria-label": t("trial.loading"), max: 1, value: 0 });
+    const count = el("p", { class: "small" });
+    const heading = el("h1", {}, t("trial.loading"));
+    page.append(heading, bar, count);
+    while (!signal.aborted) {
+      const { loaded, wanted } = media.progress();
+      bar.value = wanted ? loaded / wanted : 1;
+      count.textContent = t("trial.loaded", { loaded, wanted });
+      if (loaded >= wanted) return done();
+      if (media.failed()) return retry();
+      await sleep(100);
+    }
+    function retry() {
+      const again = button(t("trial.retry"), () => {
+        media.retry();
+        page.replaceChildren();
+        loadingPage({ texts, media })(page, done, signal);
+      });
+      page.replaceChildren(heading, el("p", { role: "alert" }, t("trial.media_failed")), again);
+      again.focus();
+    }
+  };
+}
+
+/** Shown while something is awaited that needs no action. @param {Context} context */
+export function waitingPage({ texts }, waited) {
+  const { t } = bound(texts);
+  return (page, done) => {
+    page.append(el("h1", {}, t("saving.title")), el("p", {}, t("saving.text")));
+    waited().then(() => done());
+  };
+}
+
+/** A heading, text, and where given a button. */
+export function messagePage({ title, text, action = null }) {
+  return (page) => {
+    page.append(el("h1", {}, title), ...paragraphs(text));
+    if (action) page.append(el("div", { class: "buttons" }, button(action.label, action.run)));
+  };
+}
+
+/** Shown before a trial while the window is too small. @param {Context} context */
+export function windowPage({ texts, study, address }, fits) {
+  const { t } = bound(texts);
+  return (page, done, signal) => {
+    const text = el("p", { role: "alert" });
+    const check = () => {
+      text.textContent = t("window.text", {
+        width: study.min_width,
+        height: study.min_height,
+        now_width: window.innerWidth,
+        now_height: window.innerHeight,
+      });
+      if (fits()) done();
+    };
+    page.append(el("h1", {}, t("window.title")), text);
+    if (window.top !== window.self) {
+      const link = { href: address, target: "_blank", rel: "noopener" };
+      page.append(el("p", {}, el("a", link, t("window.open_alone"))));
+    }
+    window.addEventListener("resize", check, { signal });
+    check();
+  };
+}
+
+/** Do you really want to stop? Ends with {stop}. @param {Context} context @returns {Render} */
+export function stopPage({ texts, study, state }) {
+  const { t } = bound(texts);
+  return (page, done) =>
+    page.append(
+      el("h1", {}, t("stop.title")),
+      ...paragraphs(t("stop.text", { contact: study.contact })),
+      el("p", { class: "small" }, t("common.reference", { reference: state.reference })),
+      el(
+        "div",
+        { class: "buttons" },
+        button(t("stop.confirm"), () => done({ stop: true }), { class: "button quiet" }),
+        button(t("stop.go_on"), () => done({ stop: false })),
+      ),
+    );
+}
+
+/** `t` without its object. */
+export function bound(texts) {
+  return { t: texts.t.bind(texts) };
+}

@@ -1,0 +1,75 @@
+/**
+ * The last page: how well it went, and how to get the credit.
+ * @module result_page
+ */
+
+import { button, el } from "./dom.js";
+import { bound } from "./pages.js";
+
+/**
+ * @param {import("./pages.js").Context} context
+ * @param {any} result `Result`
+ * @returns {(page: HTMLElement) => void}
+ */
+export function resultPage({ texts, study, state }, result) {
+  const { t } = bound(texts);
+  const percent = number(texts, 100 * result.accuracy);
+  const { correct, trials, percentile, completion } = result;
+  return (page) => {
+    page.append(
+      el("h1", {}, t("result.title")),
+      el("p", {}, t("result.accuracy", { correct, trials, percent })),
+    );
+    if (percentile !== null) {
+      const share = number(texts, percentile);
+      page.append(el("p", {}, t("result.percentile", { percentile: share })));
+    }
+    page.append(el("p", {}, t("result.saved")));
+    if (completion.code) page.append(codeBox(completion.code, t));
+    if (completion.url) page.append(el("p", {}, t("result.go_hint")), wayBack(completion, t));
+    else page.append(el("p", {}, t("result.close")));
+    const contact = t("result.contact", { contact: study.contact });
+    const reference = t("common.reference", { reference: state.reference });
+    page.append(el("p", { class: "small" }, `${contact} · ${reference}`));
+  };
+}
+
+const number = (texts, value) =>
+  new Intl.NumberFormat(texts.language, { maximumFractionDigits: 0 }).format(value);
+
+function codeBox(code, t) {
+  const shown = el("output", { class: "code", id: "code", tabindex: "0" }, code);
+  const told = el("span", { role: "status", class: "small" });
+  const copy = button(t("result.copy"), async () => {
+    told.textContent = t((await copied(code, shown)) ? "result.copied" : "result.copy_failed");
+  });
+  copy.classList.add("quiet");
+  const label = el("label", { for: "code" }, t("result.code"));
+  return el("div", { class: "code-box" }, label, shown, copy, told);
+}
+
+/** The clipboard is missing outside https; selecting is then the next best. */
+async function copied(code, shown) {
+  try {
+    await navigator.clipboard.writeText(code);
+    return true;
+  } catch {
+    window.getSelection().selectAllChildren(shown);
+    return document.execCommand("copy");
+  }
+}
+
+/** A link, or a form where the recruiter takes one. Only web addresses are ever followed. */
+function wayBack({ url, post }, t) {
+  if (!/^https?:\/\//i.test(url)) return el("p", {}, t("result.close"));
+  if (!post) {
+    const link = { class: "button", href: url, rel: "noreferrer", id: "go" };
+    return el("div", { class: "buttons" }, el("a", link, t("result.go")));
+  }
+  const fields = Object.entries(post).map(([name, value]) =>
+    el("input", { type: "hidden", name, value }),
+  );
+  const send = el("button", { type: "submit", class: "button", id: "go" }, t("result.go"));
+  const target = { method: "post", action: url, target: "_top" };
+  return el("form", target, ...fields, el("div", { class: "buttons" }, send));
+}

@@ -1,0 +1,216 @@
+/**
+ * The place where stimuli are shown: a movie with the map of agent and patient above it and a cover
+ * that hides both. It flashes the map, plays the movie, and records what was really shown.
+ * @module screen
+ */
+
+import { el, nextFrame, sleep } from "./dom.js";
+
+const STALLED_MS = 3_000;
+const FIRST_FRAME_MS = 1_000;
+
+/** The movie could not be shown. `reason`: load, play, stalled. */
+export class MovieFailed extends Error {
+  /** @param {string} reason @param {string} [detail] */
+  constructor(reason, detail = "") {
+    super(`${reason} ${detail}`.trim());
+    this.reason = reason;
+  }
+}
+
+/**
+ * Counts the frames that were presented, from what requestVideoFrameCallback reports. Callbacks may
+ * be missed, so that the counter of presented frames counts; a frame that is presented twice (the
+ * first one is, where the movie starts) counts once.
+ */
+export class FrameCount {
+  /** @param {number} rate Frames a second of the movie. */
+  constructor(rate) {
+    this.rate = rate;
+    this.shown = 0;
+    /** @type {Array<[number, number, number]>} Moment (ms), frame, counter of presented frames. */
+    this.seen = [];
+  }
+
+  /** @param {number} now @param {{mediaTime: number, presentedFrames: number}} metadata */
+  add(now, metadata) {
+    const frame = Math.round(metadata.mediaTime * this.rate);
+    const last = this.seen.at(-1);
+    if (!last) this.shown = 1;
+    else this.shown += Math.max(0, Math.min(metadata.presentedFrames - last[2], frame - last[1]));
+    this.seen.push([now, frame, metadata.presentedFrames]);
+  }
+}
+
+export class Screen {
+  #frames = null;
+  #stop;
+
+  /**
+   * @param {{width: number, height: number, rate: number}} media
+   * @param {AbortSignal} stop Ends everything that runs here.
+   */
+  constructor(media, stop) {
+    this.media = media;
+    this.#stop = stop;
+    this.video = el("video", {
+      class: "screen-movie",
+      playsinline: true,
+      disablepictureinpicture: true,
+      disableremoteplayback: true,
+      preload: "auto",
+      tabindex: "-1",
+      "aria-hidden": "true",
+    });
+    this.video.muted = true;
+    this.map = el("img", { class: "screen-map", alt: "", hidden: true });
+    this.cover = el("div", { class: "screen-cover" });
+    this.element = el("div", { class: "screen" }, this.video, this.map, this.cover);
+    this.element.style.setProperty("--ratio", String(media.width / media.height));
+  }
+
+  /**
+   * Load movie and map behind the cover, until the first frame is decoded and painted.
+   * @param {{movie: string, map?: string}} addresses
+   */
+  async load({ movie, map }) {
+    this.#frames = new FrameCount(this.media.rate);
+    const loaded = new Promise((resolve, reject) => {
+      this.video.onloadeddata = resolve;
+      this.video.onerror = () => reject(new MovieFailed("load", this.video.error?.message));
+      setTimeout(() => reject(new MovieFailed("load", "timeout")), 10_000);
+    });
+    const painted = new Promise((resolve) => this.#watch(resolve));
+    this.video.src = movie;
+    if (map) {
+      this.map.src = map;
+      const decoded = this.map.decode();
+      await decoded.catch(() => Promise.reject(new MovieFailed("load", "map")));
+    }
+    await loaded;
+    // Some browsers report no frame before the movie plays; it is painted all the same.
+    await Promise.race([painted, sleep(FIRST_FRAME_MS)]);
+    await nextFrame();
+  }
+
+  /** Records each presented frame, from the first. */
+  #watch(first) {
+    const frames = this.#frames;
+    const seen = (now, metadata) => {
+      if (this.#frames !== frames) return;
+      frames.add(now, metadata);
+      first();
+      this.video.requestVideoFrameCallback(seen);
+    };
+    this.video.requestVideoFrameCallback(seen);
+  }
+
+  /** Show what is behind the cover, or hide it. @param {boolean} hidden */
+  hide(hidden) {
+    this.cover.hidden = !hidden;
+  }
+
+  /**
+   * Flash the map above the still first frame: on first, whole cycles only, in time with the
+   * screen's own frames.
+   * @param {{ms: number, hz: number}} cue `hz` 0: on all the time.
+   * @returns {Promise<{ms: number, changes: Array<[number, boolean]>}>} How long it really took and
+   *   when the map went on and off, in ms since the first frame was shown.
+   */
+  async flash({ ms, hz }) {
+    const cycles = Math.floor((ms * hz) / 1000 + 1e-6);
+    const start = await nextFrame();
+    const changes = [];
+    let on = false;
+    const set = (value, at) => {
+      if (value === on) return;
+      on = value;
+      this.map.hidden = !value;
+      changes.push([round(at), value]);
+    };
+    this.hide(false);
+    let before = start;
+    for (let now = start; ; now = await nextFrame()) {
+      this.#stop.throwIfAborted();
+      const at = now - start;
+      // The frame of the screen that is nearest to the time, rather than the first one after it.
+      const ahead = Math.min(now - before, 20) / 2;
+      before = now;
+      if (at + ahead >= ms) {
+        set(false, at);
+        return { ms: round(at), changes };
+      }
+      const halves = Math.floor(((at + ahead) * hz * 2) / 1000);
+      set(hz === 0 || (halves < cycles * 2 && halves % 2 === 0), at);
+    }
+  }
+
+  /**
+   * Play the loaded movie from its first frame to its end, and hide it in that moment if asked to.
+   * @param {{hide: boolean}} options
+   * @returns {Promise<{ms: number, ended: number}>} How long it took, and the moment of the end.
+   */
+  async play({ hide }) {
+    const video = this.video;
+    const watch = new AbortController();
+    const signal = watch.signal;
+    let failed = () => {};
+    let ended = () => {};
+    const end = new Promise((resolve, reject) => ([ended, failed] = [resolve, reject]));
+    const on = (target, name, listener) => target.addEventListener(name, listener, { signal });
+    on(this.#stop, "abort", () => failed(this.#stop.reason));
+    on(video, "error", () => failed(new MovieFailed("play", video.error?.message)));
+    on(video, "ended", () => {
+      if (hide) this.hide(true);
+      ended(performance.now());
+    });
+    // Browsers pause silent movies of hidden pages.
+    const goOn = () => !document.hidden && !video.ended && video.play().catch(() => {});
+    on(document, "visibilitychange", goOn);
+    const timer = this.#watchStall(failed);
+    const start = performance.now();
+    try {
+      this.#stop.throwIfAborted();
+      await Promise.race([
+        video.play().catch((error) => {
+          if (!document.hidden) throw new MovieFailed("play", error.message);
+        }),
+        end,
+      ]);
+      const begun = performance.now();
+      const at = await end;
+      return { ms: round(at - begun), ended: at, startMs: round(begun - start) };
+    } finally {
+      clearInterval(timer);
+      watch.abort();
+    }
+  }
+
+  #watchStall(failed) {
+    let time = -1;
+    let moved = performance.now();
+    return setInterval(() => {
+      const now = performance.now();
+      if (document.hidden || this.video.currentTime !== time) moved = now;
+      time = this.video.currentTime;
+      if (now - moved > STALLED_MS) failed(new MovieFailed("stalled", `at ${time} s`));
+    }, 250);
+  }
+
+  /**
+   * What was presented since `load`. Ask when the movie has ended a while ago: the last reports
+   * arrive after the last frame.
+   * @returns {{shown: number, dropped: number|null, seen: Array<[number, number, number]>}}
+   */
+  record() {
+    const quality = this.video.getVideoPlaybackQuality?.();
+    return {
+      shown: this.#frames?.shown ?? 0,
+      dropped: quality ? quality.droppedVideoFrames : null,
+      seen: this.#frames?.seen ?? [],
+    };
+  }
+}
+
+/** @param {number} ms @returns {number} Tenths of a millisecond. */
+export const round = (ms) => Math.round(ms * 10) / 10;

@@ -1,0 +1,249 @@
+/**
+ * A session: from the state that the server tells, the next stretch of the experiment as a jsPsych
+ * timeline; when it has ended, or the server has told of another state, the next one.
+ * @module session
+ */
+
+import { AnswerQueue, newKey } from "./answer_queue.js";
+import { Refused } from "./api.js";
+import { FeedbackTrial } from "./feedback_trial.js";
+import { demographicsPage, feedbackPage } from "./forms.js";
+import { windowFits } from "./gate.js";
+import { Media } from "./media.js";
+import { PageTrial, showPage } from "./page_trial.js";
+import * as pages from "./pages.js";
+import { PredictionTrial } from "./prediction_trial.js";
+import { resultPage } from "./result_page.js";
+
+const PAGES = {
+  consent: pages.consentPage,
+  instructions: pages.instructionsPages,
+  ready: pages.readyPage,
+  demographics: demographicsPage,
+  feedback: feedbackPage,
+};
+
+/** The stretch of the timeline that runs was left for another state. */
+class Left extends Error {}
+
+export class Session {
+  #stretch = new AbortController();
+  #closed = false;
+  #refused = null;
+
+  /**
+   * @param {any} basis api, texts, study, log, frame (see frame.js), address.
+   * @param {AnswerQueue} queue Its refusals come to `refused`.
+   */
+  constructor(basis, queue) {
+    this.basis = basis;
+    this.queue = queue;
+    this.media = new Media(basis.api, basis.study.preload);
+    this.state = null;
+  }
+
+  /** Everything that pages need. @returns {import("./pages.js").Context} */
+  get context() {
+    return { ...this.basis, media: this.media, state: this.state };
+  }
+
+  /** An answer was refused: go on from the state that the server told. */
+  refused(error) {
+    this.basis.log.add("answer_refused", { code: error.code });
+    this.#refused = error;
+    this.#leave();
+  }
+
+  /** Another tab has taken over. */
+  close() {
+    this.#closed = true;
+    this.queue.close();
+    this.#leave();
+  }
+
+  /** The participant asks to stop: the trial that runs is left, and begins anew otherwise. */
+  askToStop() {
+    this.asked = true;
+    this.#leave();
+  }
+
+  /** Go through the session to its end. @param {any} state `State` @returns {Promise<void>} */
+  async run(state) {
+    this.state = state;
+    while (!this.#closed) {
+      this.#stretch = new AbortController();
+      this.basis.frame.show(this.context);
+      if (this.state.stage === "done" || this.state.stage === "withdrawn") return this.#end();
+      try {
+        this.state = this.asked ? await this.#stop() : await this.#stage();
+      } catch (error) {
+        if (this.#closed) return;
+        this.state = await this.#stateAfter(error);
+      }
+    }
+  }
+
+  /** Show the page that is shown anew, in another language. */
+  restart() {
+    this.#leave();
+  }
+
+  #leave() {
+    this.#stretch.abort(new Left());
+  }
+
+  async #stateAfter(error) {
+    const { api, log } = this.basis;
+    const refused = error instanceof Refused ? error : this.#refused;
+    if (refused?.code === "unknown_token") throw refused;
+    if (!(error instanceof Refused) && !(error instanceof Left)) {
+      log.add("error", { message: String(error) });
+      throw error;
+    }
+    // Answers that are still on their way come first: the state then counts them.
+    await this.queue.empty();
+    const state = this.#refused?.state ?? refused?.state;
+    this.#refused = null;
+    return this.queue.length === 0 && state && !this.asked ? state : api.get("/api/session");
+  }
+
+  #stage() {
+    const { stage } = this.state;
+    if (stage === "familiarization" || stage === "test") return this.#phase(stage);
+    return this.#page(stage, PAGES[stage](this.context));
+  }
+
+  async #page(page, render) {
+    const [result] = await this.#timeline([{ type: PageTrial, render }]);
+    const data = result.values;
+    if (page === "consent") data.language = this.basis.texts.language;
+    const { signal } = this.#stretch;
+    return this.basis.api.post("/api/page", { page, data }, { signal });
+  }
+
+  async #stop() {
+    const [result] = await this.#timeline([
+      { type: PageTrial, render: pages.stopPage(this.context) },
+    ]);
+    this.asked = false;
+    if (result.values.stop) return this.basis.api.post("/api/page", { page: "withdraw", data: {} });
+    return this.state;
+  }
+
+  /** All trials of a phase that are not answered yet, and then the state after them. */
+  async #phase(phase) {
+    const { api } = this.basis;
+    const { signal } = this.#stretch;
+    const { trials } = await api.get(`/api/trials/${phase}`, { signal });
+    this.media.start(trials, this.state.trial);
+    const left = trials.filter((trial) => trial.trial >= this.state.trial);
+    const waiting = pages.waitingPage(this.context, () => this.queue.empty());
+    await this.#timeline([
+      ...left.flatMap((media) => this.#trial(phase, media)),
+      {
+        timeline: [{ type: PageTrial, render: waiting }],
+        conditional_function: () => this.queue.length > 0,
+      },
+    ]);
+    return api.get("/api/session", { signal });
+  }
+
+  /** One trial, before which the window and the media are seen to, as pieces of a timeline. */
+  #trial(phase, media) {
+    const { study, texts, frame, log } = this.basis;
+    const fits = () => windowFits(study);
+    const number = media.trial;
+    let stored = null;
+    const prediction = {
+      type: PredictionTrial,
+      media,
+      load: (attempt) => (attempt > 1 ? this.media.reload(number) : this.media.get(number)),
+      fixation_ms: media.fixation_ms,
+      cue_ms: study.cue_ms,
+      flash_hz: study.flash_hz,
+      choices: this.state.buttons.split("-"),
+      words: words(texts, "trial", ["prompt", "yes", "no", "trouble", "retry"]),
+      log: (kind, data) => log.add(kind, data),
+      on_start: () => {
+        this.media.advance(number);
+        frame.progress(phase, number);
+      },
+      on_finish: (data) => {
+        if (!data.response) return; // left before the answer
+        stored = this.queue.add(answerOf(phase, number, data));
+        this.state = { ...this.state, trial: number + 1 };
+      },
+    };
+    const feedback = {
+      type: FeedbackTrial,
+      media,
+      feedback: async () => (await stored).feedback,
+      load: async (path) => URL.createObjectURL(await this.basis.api.blob(path)),
+      words: words(texts, "practice", [
+        ...["waiting", "correct", "incorrect", "contact", "no_contact", "next"],
+      ], { trouble: texts.t("trial.trouble") }),
+      log: (kind, data) => log.add(kind, data),
+    };
+    const small = () => {
+      if (!fits()) log.add("too_small", { width: innerWidth, height: innerHeight });
+      return !fits();
+    };
+    return [
+      {
+        timeline: [{ type: PageTrial, render: pages.windowPage(this.context, fits) }],
+        conditional_function: small,
+      },
+      {
+        timeline: [{ type: PageTrial, render: pages.loadingPage(this.context) }],
+        conditional_function: () => {
+          this.media.advance(number);
+          return !this.media.isReady(number);
+        },
+      },
+      prediction,
+      ...(phase === "familiarization" ? [feedback] : []),
+    ];
+  }
+
+  /** Run a timeline; gives what its trials gave. */
+  async #timeline(pieces) {
+    const { signal } = this.#stretch;
+    signal.throwIfAborted();
+    const main = this.basis.frame.main;
+    main.replaceChildren();
+    const jsPsych = window.initJsPsych({ display_element: main, use_webaudio: false });
+    const abort = () => jsPsych.abortExperiment();
+    signal.addEventListener("abort", abort);
+    try {
+      await jsPsych.run([{ timeline: pieces, signal: () => signal }]);
+    } finally {
+      signal.removeEventListener("abort", abort);
+      main.tabIndex = -1;
+    }
+    signal.throwIfAborted();
+    return jsPsych.data.get().values();
+  }
+
+  async #end() {
+    const { texts, study, api, frame } = this.basis;
+    if (this.state.stage === "withdrawn") {
+      const [title, text] = [texts.t("withdrawn.title"), texts.t("withdrawn.text", study)];
+      return showPage(frame.main, pages.messagePage({ title, text }));
+    }
+    const result = await api.get("/api/result");
+    return showPage(frame.main, resultPage(this.context, result));
+  }
+}
+
+/** Words of a table of the texts by their names there. */
+function words(texts, table, names, more = {}) {
+  const own = names.map((name) => [name, texts.t(`${table}.${name}`)]);
+  return { ...Object.fromEntries(own), ...more };
+}
+
+/** An `Answer` from the data of a prediction trial. */
+function answerOf(phase, trial, data) {
+  const names = Object.keys(PredictionTrial.info.data);
+  const measured = Object.fromEntries(names.map((name) => [name, data[name]]));
+  return { key: newKey(), phase, trial, ...measured };
+}

@@ -1,0 +1,2 @@
+/* Run only by browsers that know no modules. */
+document.getElementById("too-old").hidden = false;
