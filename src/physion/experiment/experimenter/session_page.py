@@ -1,0 +1,120 @@
+"""All that is stored about one session, but for the id that the recruiter knows."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import Connection, Engine, select
+
+from physion.experiment.experimenter.flagging import Flags
+from physion.experiment.experimenter.session_list import flags_shown
+from physion.experiment.experimenter.summaries import Summary
+from physion.experiment.study import Study
+from physion.experiment.tables import ANSWERS, EVENTS, SESSIONS, STUDIES
+
+EVENTS_SHOWN = 500
+"""Events of one session that its page shows, from the first on."""
+
+
+@dataclass(frozen=True)
+class AnswerLine:
+    """One answer in the order in which it came; ``label`` None: no longer in the study."""
+
+    phase: str
+    trial: int
+    stimulus: str
+    response: str
+    label: bool | None
+    rt_ms: float
+    input: str
+    frames_shown: int | None
+    frames_expected: int
+    frames_dropped: int | None
+    hidden: int | None
+    resumed: bool
+    answered_at: float
+
+    @property
+    def correct(self) -> bool | None:
+        """None where there is no label."""
+        return None if self.label is None else (self.response == "yes") == self.label
+
+
+@dataclass(frozen=True)
+class EventLine:
+    """Something that happened; ``data`` is JSON text."""
+
+    kind: str
+    at_ms: float
+    stored_at: float
+    data: str
+
+
+@dataclass(frozen=True)
+class SessionPage:
+    """``row`` holds the columns of the table of sessions, ``others`` the same person's further
+    sessions as (session, scenario, state)."""
+
+    row: Mapping[str, Any]
+    summary: Summary
+    flags: tuple[str, ...]
+    study: str
+    answers: tuple[AnswerLine, ...]
+    events: tuple[EventLine, ...]
+    events_left_out: int
+    others: tuple[tuple[str, str, str], ...]
+
+
+def read_session(
+    study: Study, engine: Engine, summaries: Sequence[Summary], flags: Flags, session: str
+) -> SessionPage | None:
+    """The page of a session; None where there is none of that name."""
+    summary = next((s for s in summaries if s.facts["session"] == session), None)
+    if summary is None:
+        return None
+    with engine.connect() as connection:
+        row = connection.execute(select(SESSIONS).where(SESSIONS.c.session == session)).one()
+        facts = connection.execute(select(STUDIES).where(STUDIES.c.digest == row.study)).first()
+        answers = _answers(study, connection, session)
+        events = _events(connection, session)
+    others = tuple(
+        (str(s.facts["session"]), str(s.facts["scenario"]), s.state)
+        for s in summaries
+        if s.facts["participant"] == row.participant and s is not summary
+    )
+    return SessionPage(
+        row._asdict(), summary, flags_shown(summary, flags),
+        f"{facts.name} {facts.version}" if facts else "", answers,
+        events[:EVENTS_SHOWN], max(0, len(events) - EVENTS_SHOWN), others,
+    )  # fmt: skip
+
+
+def _answers(study: Study, connection: Connection, session: str) -> tuple[AnswerLine, ...]:
+    labels = {stimulus.stimulus: stimulus.label for stimulus in study.stimuli}
+    table = ANSWERS.c
+    rows = connection.execute(
+        select(*(column for column in table if column.name != "details"))
+        .where(table.session == session)
+        .order_by(table.phase, table.trial)
+    )
+    return tuple(
+        AnswerLine(
+            row.phase, row.trial, row.stimulus, row.response, labels.get(row.stimulus), row.rt_ms,
+            row.input, row.frames_shown, row.frames_expected, row.frames_dropped,
+            row.visibility_changes, row.resumed, row.answered_at,
+        )
+        for row in rows
+    )  # fmt: skip
+
+
+def _events(connection: Connection, session: str) -> tuple[EventLine, ...]:
+    rows = connection.execute(
+        select(EVENTS).where(EVENTS.c.session == session).order_by(EVENTS.c.event)
+    )
+    return tuple(
+        EventLine(row.kind, row.at_ms, row.stored_at, json.dumps(row.data, ensure_ascii=False))
+        for row in rows
+    )

@@ -1,0 +1,223 @@
+"""What is known of every session, kept up to date by reading new answers alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from statistics import median
+from typing import Any
+
+from sqlalchemy import ColumnElement, Connection, Engine, Row, and_, or_, select
+
+from physion.experiment.study import Study
+from physion.experiment.tables import ANSWERS, SESSIONS
+
+ACTIVE_WITHIN = 15 * 60.0
+"""Seconds since a session was last heard of within which it counts as going on."""
+
+STATES = {
+    "finished": "Finished",
+    "going": "In progress",
+    "left": "Dropped out",
+    "withdrawn": "Withdrawn",
+    "declined": "Declined",
+}
+"""States of a session; who dropped out may still come back and go on."""
+
+STAGES = {
+    "consent": "Consent",
+    "instructions": "Instructions",
+    "familiarization": "Familiarization",
+    "ready": "Start page",
+    "test": "Test",
+    "demographics": "Demographics",
+    "feedback": "Feedback",
+    "done": "Finished",
+}
+"""Where a session stands, in order."""
+
+_SESSION = (
+    "session", "participant", "scenario", "kind", "source", "reference", "language", "started_at",
+    "consented_at", "instructed_at", "ready_at", "demographics_at", "finished_at", "withdrawn_at",
+    "answered_familiarization", "answered_test", "loads", "last_seen", "device",
+)  # fmt: skip
+_ANSWER = (
+    "session", "phase", "trial", "stimulus", "response", "rt_ms", "frames_expected",
+    "frames_shown", "frames_dropped", "visibility_changes",
+)  # fmt: skip
+_CHUNK = 200
+"""Sessions whose answers one statement reads."""
+
+
+@dataclass
+class Answered:
+    """Sums over the answers of a session. ``rt_ms`` and ``correct`` are of the test alone.
+
+    Trials of both phases by how the movie was shown: ``full`` (as many frames as expected),
+    ``short`` (fewer), ``over`` (more), ``unknown`` (the browser could not say); ``dropped``: with
+    frames decoded and dropped; ``hidden``: while the page was hidden or shown again.
+    """
+
+    familiarization: int = 0
+    test: int = 0
+    familiarization_correct: int = 0
+    correct: int = 0
+    rt_ms: list[float] = field(default_factory=list)
+    full: int = 0
+    short: int = 0
+    over: int = 0
+    unknown: int = 0
+    dropped: int = 0
+    hidden: int = 0
+
+    @property
+    def trials(self) -> int:
+        """Answers of both phases."""
+        return self.familiarization + self.test
+
+    @property
+    def accuracy(self) -> float | None:
+        """Share of right test answers; None without any."""
+        return self.correct / self.test if self.test else None
+
+    @property
+    def median_rt(self) -> float | None:
+        """Median response time of the test in ms; None without any."""
+        return median(self.rt_ms) if self.rt_ms else None
+
+    @property
+    def troubled(self) -> int:
+        """Trials whose movie was not shown with all its frames, as far as known."""
+        return self.short + self.over
+
+    def add(self, answer: Row[Any], label: bool | None) -> None:
+        """Counts one answer; ``label`` None: the stimulus is in the study no more."""
+        correct = label is not None and (answer.response == "yes") == label
+        if answer.phase == "test":
+            self.test += 1
+            self.correct += correct
+            self.rt_ms.append(answer.rt_ms)
+        else:
+            self.familiarization += 1
+            self.familiarization_correct += correct
+        shown = answer.frames_shown
+        if shown is None:
+            self.unknown += 1
+        elif shown == answer.frames_expected:
+            self.full += 1
+        elif shown < answer.frames_expected:
+            self.short += 1
+        else:
+            self.over += 1
+        self.dropped += bool(answer.frames_dropped)
+        self.hidden += bool(answer.visibility_changes)
+
+
+@dataclass
+class Summary:
+    """A session: its row (``facts``), where it stands, and sums over its answers."""
+
+    facts: Mapping[str, Any]
+    state: str
+    stage: str
+    answered: Answered
+
+
+class Summaries:
+    """Summaries of all sessions. `refresh` reads the rows of sessions, and of answers those alone
+    that came since: an answer, once stored, is never altered.
+    """
+
+    def __init__(self, study: Study, engine: Engine) -> None:
+        self._engine = engine
+        self._labels = {stimulus.stimulus: stimulus.label for stimulus in study.stimuli}
+        self._wanted = {
+            (scenario, phase): len(study.phase(scenario, phase))
+            for scenario in study.scenarios
+            for phase in ("familiarization", "test")
+        }
+        self._answered: dict[str, Answered] = {}
+
+    def refresh(self, now: float) -> list[Summary]:
+        """All sessions at the moment ``now``, in the order in which they began."""
+        columns = [SESSIONS.c[name] for name in _SESSION]
+        with self._engine.connect() as connection:
+            rows = connection.execute(select(*columns).order_by(SESSIONS.c.started_at)).all()
+            self._read_answers(connection, rows)
+        return [self._summary(row, now) for row in rows]
+
+    def _summary(self, row: Row[Any], now: float) -> Summary:
+        facts = row._asdict()
+        return Summary(
+            facts,
+            state_of(facts, now),
+            self._stage(facts),
+            self._answered.get(row.session, Answered()),
+        )
+
+    def _read_answers(self, connection: Connection, rows: Sequence[Row[Any]]) -> None:
+        """Adds up the answers that the rows of sessions count and that were not read yet."""
+        behind = []
+        for row in rows:
+            known = self._answered.setdefault(row.session, Answered())
+            if row.answered_familiarization > known.familiarization or (
+                row.answered_test > known.test
+            ):
+                behind.append(row.session)
+        for part in _parts(behind):
+            for answer in connection.execute(self._newer(part)):
+                label = self._labels.get(answer.stimulus)
+                self._answered[answer.session].add(answer, label)
+
+    def _newer(self, sessions: Sequence[str]) -> Any:
+        """The statement that reads the answers of ``sessions`` beyond those already counted.
+
+        Trials are answered in order, so that their number is how many came before.
+        """
+        columns = [ANSWERS.c[name] for name in _ANSWER]
+        fresh = [session for session in sessions if not self._answered[session].trials]
+        terms: list[ColumnElement[bool]] = [ANSWERS.c.session.in_(fresh)] if fresh else []
+        for session in sessions:
+            known = self._answered[session]
+            if known.trials:
+                terms += [
+                    and_(
+                        ANSWERS.c.session == session,
+                        ANSWERS.c.phase == phase,
+                        ANSWERS.c.trial >= count,
+                    )
+                    for phase, count in (
+                        ("familiarization", known.familiarization),
+                        ("test", known.test),
+                    )
+                ]
+        return select(*columns).where(or_(*terms))
+
+    def _stage(self, facts: Mapping[str, Any]) -> str:
+        """The first stage that is not passed."""
+        wanted = {phase: self._wanted.get((facts["scenario"], phase), 0)
+                  for phase in ("familiarization", "test")}  # fmt: skip
+        passed = {
+            "consent": facts["consented_at"] is not None,
+            "instructions": facts["instructed_at"] is not None,
+            "familiarization": facts["answered_familiarization"] >= wanted["familiarization"],
+            "ready": facts["ready_at"] is not None,
+            "test": facts["answered_test"] >= wanted["test"],
+            "demographics": facts["demographics_at"] is not None,
+            "feedback": facts["finished_at"] is not None,
+        }
+        return next((stage for stage, done in passed.items() if not done), "done")
+
+
+def state_of(facts: Mapping[str, Any], now: float) -> str:
+    """A word of `STATES`. Who leaves before agreeing to take part has declined."""
+    if facts["finished_at"] is not None:
+        return "finished"
+    if facts["withdrawn_at"] is not None:
+        return "declined" if facts["consented_at"] is None else "withdrawn"
+    return "going" if now - facts["last_seen"] <= ACTIVE_WITHIN else "left"
+
+
+def _parts(names: Sequence[str]) -> Iterator[Sequence[str]]:
+    for start in range(0, len(names), _CHUNK):
+        yield names[start : start + _CHUNK]
