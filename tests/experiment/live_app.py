@@ -1,0 +1,57 @@
+"""An application on a real server in a thread, and raw connections to it."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import uvicorn
+
+from physion.experiment.connections import CarefulProtocol
+
+HOST = "127.0.0.1"
+
+
+@contextlib.contextmanager
+def running(app: Any, **settings: Any) -> Iterator[int]:
+    """Serve ``app`` as the package's server does, on a free port, which is given."""
+    given = {"http": CarefulProtocol, "ws": "none", "lifespan": "off", "log_config": None,
+             "access_log": False, "server_header": False, "proxy_headers": False}  # fmt: skip
+    server = uvicorn.Server(uvicorn.Config(app, **{**given, **settings}))
+    with socket.create_server((HOST, 0)) as listening:
+        thread = threading.Thread(target=server.run, args=([listening],))
+        thread.start()
+        while not server.started:
+            time.sleep(0.005)
+        try:
+            yield int(listening.getsockname()[1])
+        finally:
+            server.should_exit = True
+            thread.join(20)
+
+
+def exchange(port: int, *parts: bytes, patience: float = 10.0) -> bytes:
+    """Send bytes as they are; what the server says until it closes or falls silent for 1 s."""
+    with socket.create_connection((HOST, port), timeout=patience) as connection:
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+            for part in parts:
+                connection.sendall(part)
+        return read_all(connection)
+
+
+def read_all(connection: socket.socket, silence: float = 1.0) -> bytes:
+    """All that comes until the other side closes or is silent."""
+    heard = b""
+    while True:
+        connection.settimeout(silence if heard else 30.0)
+        try:
+            more = connection.recv(65536)
+        except (TimeoutError, ConnectionResetError):
+            return heard
+        if not more:
+            return heard
+        heard += more
