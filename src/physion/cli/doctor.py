@@ -15,7 +15,10 @@ from physion.cli.output import console
 
 EXTRAS = {
     "models": ("torch", "torchvision", "timm", "lightning-fabric", "safetensors"),
-    "experiment": ("fastapi", "uvicorn", "sqlalchemy", "alembic", "argon2-cffi"),
+    "experiment": (
+        *("fastapi", "uvicorn", "sqlalchemy", "alembic", "psycopg"),
+        *("argon2-cffi", "jinja2", "python-multipart", "httpx2"),
+    ),
     "ray": ("ray",),
     "slurm": ("submitit",),
     "dev": ("pytest", "pytest-xdist", "hypothesis", "ruff", "mypy", "import-linter"),

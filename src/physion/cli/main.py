@@ -15,6 +15,7 @@ VERBS = {
     "replay": "simulate official command logs and compare with the recorded outcomes",
     "evaluate": "train models and readouts on trials and write their predictions",
     "compare": "compare predictions with people",
+    "experiment": "run the experiment with people: init, serve, export",
     "view": "one page of a dataset: movies, passes, motion to turn by hand",
     "export": "write the official layout, webdataset shards, or a dataset card",
     "import": "read official HDF5 and movie folders into trials",

@@ -60,6 +60,11 @@ class Stimulus:
 COLUMNS = tuple(field.name for field in fields(Stimulus))
 
 
+def is_name(name: str) -> bool:
+    """Can a stimulus or scenario be called so?"""
+    return re.fullmatch(NAME, name) is not None
+
+
 def read_stimuli(path: Path) -> tuple[Stimulus, ...]:
     """The stimuli of a file, checked; `BadInputError` names the row and column of what is wrong.
 
@@ -195,9 +200,9 @@ def _faults(s: Stimulus) -> Iterable[tuple[str, str]]:
     """Column and what would be allowed, for each fault of one row."""
     practice = s.phase == "familiarization"
     letters = "letters, digits and ._+- alone"
-    if not re.fullmatch(NAME, s.stimulus):
+    if not is_name(s.stimulus):
         yield "stimulus", letters
-    if not re.fullmatch(NAME, s.scenario):
+    if not is_name(s.scenario):
         yield "scenario", letters
     if s.phase not in PHASES:
         yield "phase", " or ".join(PHASES)

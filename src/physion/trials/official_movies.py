@@ -49,6 +49,7 @@ class SourceMovie:
             context = stream.codec_context
             self.width, self.height = int(context.width), int(context.height)
             self.rate = max(round(float(stream.average_rate or 30)), 1)
+            self.pixels, self.streams = str(context.pix_fmt), len(container.streams)
             self.copied = (
                 context.name == "h264"
                 and int(context.colorspace) == _BT709
