@@ -35,7 +35,7 @@ def running(app: Any, **settings: Any) -> Iterator[int]:
 
 
 def exchange(port: int, *parts: bytes, patience: float = 10.0) -> bytes:
-    """Send bytes as they are; what the server says until it closes or falls silent for 1 s."""
+    """Send bytes as they are; what the server says until it closes or falls silent."""
     with socket.create_connection((HOST, port), timeout=patience) as connection:
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             for part in parts:
@@ -43,7 +43,7 @@ def exchange(port: int, *parts: bytes, patience: float = 10.0) -> bytes:
         return read_all(connection)
 
 
-def read_all(connection: socket.socket, silence: float = 1.0) -> bytes:
+def read_all(connection: socket.socket, silence: float = 0.4) -> bytes:
     """All that comes until the other side closes or is silent."""
     heard = b""
     while True:

@@ -6,7 +6,6 @@ import json
 from typing import TYPE_CHECKING, Literal
 
 from fastapi import APIRouter
-from sqlalchemy import text
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import Response
@@ -119,7 +118,7 @@ def build_api(study: Study, secrets: Secrets, store: Store) -> APIRouter:
         phase = request.path_params["phase"]
         if phase not in PHASES:
             return refuse("not_found")
-        return Reply(store.trials(token_of(request), phase))
+        return Reply(await run_in_threadpool(store.trials, token_of(request), phase))
 
     @router.post("/page")
     async def post_page(request: Request) -> Response:
@@ -138,21 +137,11 @@ def build_api(study: Study, secrets: Secrets, store: Store) -> APIRouter:
 
     @router.get("/result")
     async def get_result(request: Request) -> Response:
-        return Reply(store.result(token_of(request)))
+        return Reply(await run_in_threadpool(store.result, token_of(request)))
 
     @router.api_route("/health", methods=["GET", "HEAD"])
     async def get_health(request: Request) -> Response:
-        answers = await run_in_threadpool(_database_answers, store)
+        answers = await run_in_threadpool(store.healthy)
         return Reply(Health(ok=True)) if answers else refuse("unavailable")
 
     return router
-
-
-def _database_answers(store: Store) -> bool:
-    """Does the database take a question?"""
-    try:
-        with store.engine.connect() as connection:
-            connection.execute(text("SELECT 1"))
-    except Exception:  # whatever the driver raises, the answer is the same
-        return False
-    return True

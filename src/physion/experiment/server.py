@@ -118,7 +118,7 @@ def _configure(app: FastAPI, address: Address) -> uvicorn.Config:
         app,
         http=CarefulProtocol,
         ws="none",
-        lifespan="off",
+        lifespan="on",
         log_config=None,
         access_log=False,
         server_header=False,
