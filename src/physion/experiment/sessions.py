@@ -1,0 +1,154 @@
+"""A session as it stands: read by its token, with its stage and the state that a client is told."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, cast
+
+from sqlalchemy import Connection, Table, bindparam, select, update
+from sqlalchemy.dialects import postgresql, sqlite
+
+from physion.experiment.refused import Refused
+from physion.experiment.stimuli import PHASES
+from physion.experiment.study import Study
+from physion.experiment.tables import SESSIONS, TOKENS
+from physion.experiment.wire import Stage, State
+
+STAGES: tuple[Stage, ...] = (
+    "consent", "instructions", "familiarization", "ready", "test", "demographics", "feedback",
+    "done", "withdrawn",
+)  # fmt: skip
+
+
+@dataclass(slots=True)
+class Session:
+    """What decides how a session goes on: these columns of SESSIONS."""
+
+    session: str
+    participant: str
+    scenario: str
+    kind: str
+    order_seed: int
+    buttons: str
+    language: str
+    reference: str
+    started_at: float
+    consented_at: float | None
+    instructed_at: float | None
+    ready_at: float | None
+    demographics_at: float | None
+    finished_at: float | None
+    withdrawn_at: float | None
+    answered_familiarization: int
+    answered_test: int
+    loads: int
+    loaded_at_phase: str | None
+    loaded_at_trial: int | None
+
+
+SESSION_COLUMNS = tuple(SESSIONS.c[field.name] for field in fields(Session))
+_BY_TOKEN = (
+    select(*SESSION_COLUMNS)
+    .join(TOKENS, TOKENS.c.session == SESSIONS.c.session)
+    .where(TOKENS.c.token_hash == bindparam("token_hash"))
+)
+
+
+class Trials:
+    """How many trials each phase of each scenario has."""
+
+    def __init__(self, study: Study) -> None:
+        self._counts: dict[str, dict[str, int]] = {
+            scenario: {phase: len(study.phase(scenario, phase)) for phase in PHASES}
+            for scenario in study.scenarios
+        }
+
+    def of(self, scenario: str) -> Mapping[str, int]:
+        """Counts by phase; none for a scenario that the study has no more."""
+        return self._counts.get(scenario, dict.fromkeys(PHASES, 0))
+
+
+def read_session(connection: Connection, token_hash: str) -> Session:
+    """The session that a token opens; `Refused` where it opens none."""
+    row = connection.execute(_BY_TOKEN, {"token_hash": token_hash}).first()
+    if row is None:
+        raise Refused("unknown_token", "This session is not known here; open your link again.")
+    return Session(*row)
+
+
+def stage_of(session: Session, trials: Mapping[str, int]) -> Stage:
+    """The stage that a session is in: the first that is not over."""
+    over = (
+        session.consented_at is not None,
+        session.instructed_at is not None,
+        session.answered_familiarization >= trials["familiarization"],
+        session.ready_at is not None,
+        session.answered_test >= trials["test"],
+        session.demographics_at is not None,
+        session.finished_at is not None,
+    )
+    if session.withdrawn_at is not None:
+        return "withdrawn"
+    return STAGES[over.index(False)] if False in over else "done"
+
+
+def answered(session: Session, phase: str) -> int:
+    """How many trials of a phase are answered; the number of the next one."""
+    return session.answered_test if phase == "test" else session.answered_familiarization
+
+
+def state_of(session: Session, trials: Mapping[str, int]) -> State:
+    """What the client is told of a session."""
+    stage = stage_of(session, trials)
+    return State(
+        stage=stage,
+        trial=answered(session, stage) if stage in PHASES else None,
+        trials=cast(Any, dict(trials)),
+        scenario=session.scenario,
+        language=session.language,
+        kind=cast(Any, session.kind),
+        buttons=cast(Any, session.buttons),
+        reference=session.reference,
+    )
+
+
+def change_session(connection: Connection, session: Session, **values: Any) -> None:
+    """Write some columns of a session, and have them in ``session`` too."""
+    assert "kind" not in values, "what a session is stays as it began"
+    statement = update(SESSIONS).where(SESSIONS.c.session == session.session).values(**values)
+    connection.execute(statement)
+    for name, value in values.items():
+        if hasattr(session, name):
+            setattr(session, name, value)
+
+
+def mark_loaded(session: Session, trials: Mapping[str, int]) -> dict[str, Any]:
+    """The columns that say at which trial the page was loaded; none where no trial is next.
+
+    A page must have been loaded before, for the consent: so this was again.
+    """
+    stage = stage_of(session, trials)
+    if stage not in PHASES:
+        return {}
+    return {"loaded_at_phase": stage, "loaded_at_trial": answered(session, stage)}
+
+
+def insert_new(connection: Connection, table: Table) -> Any:
+    """An INSERT that leaves out what would break a UNIQUE constraint."""
+    postgres = connection.dialect.name == "postgresql"
+    insert = postgresql.insert if postgres else sqlite.insert
+    return insert(table).on_conflict_do_nothing()
+
+
+def plain(text: str) -> str:
+    """A text without what PostgreSQL cannot store: NUL, and halves of characters."""
+    return text.replace("\0", "").encode("utf-8", "replace").decode("utf-8")
+
+
+def plain_values(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The same for names and texts of a flat object."""
+    return {
+        plain(name): plain(value) if isinstance(value, str) else value
+        for name, value in values.items()
+    }
