@@ -14,7 +14,7 @@ from typing import Any
 
 from sqlalchemy import Connection, Engine, create_engine, event, text
 from sqlalchemy.engine import URL, make_url
-from sqlalchemy.exc import ArgumentError, OperationalError, SQLAlchemyError
+from sqlalchemy.exc import ArgumentError, DBAPIError, SQLAlchemyError
 
 from physion.atomic import folder_lock
 from physion.errors import BadInputError, PhysionError
@@ -176,7 +176,7 @@ def upgrade(engine: Engine) -> None:
             _refuse_unknown(engine, script, version)
             config.attributes["connection"] = connection
             command.upgrade(config, "head")
-    except OperationalError as error:
+    except DBAPIError as error:
         raise _no_answer(engine, error) from error
 
 
