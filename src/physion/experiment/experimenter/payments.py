@@ -12,7 +12,7 @@ from physion.experiment.recruitment import completion
 from physion.experiment.study import Study
 from physion.experiment.tables import RAW_IDS, SESSIONS
 
-PAGE = 200
+PAGE = 100
 """Rows on one page."""
 
 

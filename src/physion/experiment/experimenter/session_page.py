@@ -11,7 +11,7 @@ from sqlalchemy import Connection, Engine, select
 
 from physion.experiment.experimenter.flagging import Flags
 from physion.experiment.experimenter.session_list import flags_shown
-from physion.experiment.experimenter.summaries import Summary
+from physion.experiment.experimenter.summaries import Summary, labels_of
 from physion.experiment.study import Study
 from physion.experiment.tables import ANSWERS, EVENTS, SESSIONS, STUDIES
 
@@ -78,7 +78,7 @@ def read_session(
     with engine.connect() as connection:
         row = connection.execute(select(SESSIONS).where(SESSIONS.c.session == session)).one()
         facts = connection.execute(select(STUDIES).where(STUDIES.c.digest == row.study)).first()
-        answers = _answers(study, connection, session)
+        answers = _answers(study, connection, session, row.scenario)
         events = _events(connection, session)
     others = tuple(
         (str(s.facts["session"]), str(s.facts["scenario"]), s.state)
@@ -92,8 +92,10 @@ def read_session(
     )  # fmt: skip
 
 
-def _answers(study: Study, connection: Connection, session: str) -> tuple[AnswerLine, ...]:
-    labels = {stimulus.stimulus: stimulus.label for stimulus in study.stimuli}
+def _answers(
+    study: Study, connection: Connection, session: str, scenario: str
+) -> tuple[AnswerLine, ...]:
+    labels = labels_of(study)
     table = ANSWERS.c
     rows = connection.execute(
         select(*(column for column in table if column.name != "details"))
@@ -102,8 +104,8 @@ def _answers(study: Study, connection: Connection, session: str) -> tuple[Answer
     )
     return tuple(
         AnswerLine(
-            row.phase, row.trial, row.stimulus, row.response, labels.get(row.stimulus), row.rt_ms,
-            row.input, row.frames_shown, row.frames_expected, row.frames_dropped,
+            row.phase, row.trial, row.stimulus, row.response, labels.get((scenario, row.stimulus)),
+            row.rt_ms, row.input, row.frames_shown, row.frames_expected, row.frames_dropped,
             row.visibility_changes, row.resumed, row.answered_at,
         )
         for row in rows

@@ -1,4 +1,4 @@
-"""What is known of every session, kept up to date by reading new answers alone."""
+"""What is known of every session, kept up to date without reading all answers each time."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from statistics import median
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Engine, Row, and_, or_, select
+from sqlalchemy import Connection, Engine, Row, select
 
+from physion.experiment.sessions import SESSION_COLUMNS, Session, Trials, stage_of
 from physion.experiment.study import Study
 from physion.experiment.tables import ANSWERS, SESSIONS
 
@@ -36,11 +37,7 @@ STAGES = {
 }
 """Where a session stands, in order."""
 
-_SESSION = (
-    "session", "participant", "scenario", "kind", "source", "reference", "language", "started_at",
-    "consented_at", "instructed_at", "ready_at", "demographics_at", "finished_at", "withdrawn_at",
-    "answered_familiarization", "answered_test", "loads", "last_seen", "device",
-)  # fmt: skip
+_SESSION = (*SESSION_COLUMNS, SESSIONS.c.source, SESSIONS.c.last_seen, SESSIONS.c.device)
 _ANSWER = (
     "session", "phase", "trial", "stimulus", "response", "rt_ms", "frames_expected",
     "frames_shown", "frames_dropped", "visibility_changes",
@@ -123,26 +120,24 @@ class Summary:
     answered: Answered
 
 
+_NOTHING = Answered()
+
+
 class Summaries:
-    """Summaries of all sessions. `refresh` reads the rows of sessions, and of answers those alone
-    that came since: an answer, once stored, is never altered.
+    """Summaries of all sessions. `refresh` reads the rows of sessions, and the answers of those
+    sessions alone that have got more of them: an answer, once stored, is never altered.
     """
 
     def __init__(self, study: Study, engine: Engine) -> None:
         self._engine = engine
-        self._labels = {stimulus.stimulus: stimulus.label for stimulus in study.stimuli}
-        self._wanted = {
-            (scenario, phase): len(study.phase(scenario, phase))
-            for scenario in study.scenarios
-            for phase in ("familiarization", "test")
-        }
+        self._labels = labels_of(study)
+        self._trials = Trials(study)
         self._answered: dict[str, Answered] = {}
 
     def refresh(self, now: float) -> list[Summary]:
         """All sessions at the moment ``now``, in the order in which they began."""
-        columns = [SESSIONS.c[name] for name in _SESSION]
         with self._engine.connect() as connection:
-            rows = connection.execute(select(*columns).order_by(SESSIONS.c.started_at)).all()
+            rows = connection.execute(select(*_SESSION).order_by(SESSIONS.c.started_at)).all()
             self._read_answers(connection, rows)
         return [self._summary(row, now) for row in rows]
 
@@ -152,61 +147,40 @@ class Summaries:
             facts,
             state_of(facts, now),
             self._stage(facts),
-            self._answered.get(row.session, Answered()),
+            self._answered.get(row.session, _NOTHING),
         )
 
     def _read_answers(self, connection: Connection, rows: Sequence[Row[Any]]) -> None:
-        """Adds up the answers that the rows of sessions count and that were not read yet."""
-        behind = []
-        for row in rows:
-            known = self._answered.setdefault(row.session, Answered())
-            if row.answered_familiarization > known.familiarization or (
-                row.answered_test > known.test
-            ):
-                behind.append(row.session)
-        for part in _parts(behind):
-            for answer in connection.execute(self._newer(part)):
-                label = self._labels.get(answer.stimulus)
-                self._answered[answer.session].add(answer, label)
-
-    def _newer(self, sessions: Sequence[str]) -> Any:
-        """The statement that reads the answers of ``sessions`` beyond those already counted.
-
-        Trials are answered in order, so that their number is how many came before.
-        """
+        """Adds up the answers of sessions whose number of answers is not the known one."""
+        scenarios = {
+            row.session: row.scenario
+            for row in rows
+            if (row.answered_familiarization, row.answered_test) != self._counts(row.session)
+        }
         columns = [ANSWERS.c[name] for name in _ANSWER]
-        fresh = [session for session in sessions if not self._answered[session].trials]
-        terms: list[ColumnElement[bool]] = [ANSWERS.c.session.in_(fresh)] if fresh else []
-        for session in sessions:
-            known = self._answered[session]
-            if known.trials:
-                terms += [
-                    and_(
-                        ANSWERS.c.session == session,
-                        ANSWERS.c.phase == phase,
-                        ANSWERS.c.trial >= count,
-                    )
-                    for phase, count in (
-                        ("familiarization", known.familiarization),
-                        ("test", known.test),
-                    )
-                ]
-        return select(*columns).where(or_(*terms))
+        for part in _parts(list(scenarios)):
+            chosen = select(*columns).where(ANSWERS.c.session.in_(part))
+            answers = connection.execute(chosen.order_by(ANSWERS.c.session)).all()
+            found = {session: Answered() for session in part}
+            for answer in answers:
+                label = self._labels.get((scenarios[answer.session], answer.stimulus))
+                found[answer.session].add(answer, label)
+            self._answered |= found
+
+    def _counts(self, session: str) -> tuple[int, int]:
+        known = self._answered.get(session, _NOTHING)
+        return known.familiarization, known.test
 
     def _stage(self, facts: Mapping[str, Any]) -> str:
-        """The first stage that is not passed."""
-        wanted = {phase: self._wanted.get((facts["scenario"], phase), 0)
-                  for phase in ("familiarization", "test")}  # fmt: skip
-        passed = {
-            "consent": facts["consented_at"] is not None,
-            "instructions": facts["instructed_at"] is not None,
-            "familiarization": facts["answered_familiarization"] >= wanted["familiarization"],
-            "ready": facts["ready_at"] is not None,
-            "test": facts["answered_test"] >= wanted["test"],
-            "demographics": facts["demographics_at"] is not None,
-            "feedback": facts["finished_at"] is not None,
-        }
-        return next((stage for stage, done in passed.items() if not done), "done")
+        """Where a session stands, or stood when it was withdrawn."""
+        columns = {column.name: facts[column.name] for column in SESSION_COLUMNS}
+        session = Session(**columns | {"withdrawn_at": None})
+        return stage_of(session, self._trials.of(session.scenario))
+
+
+def labels_of(study: Study) -> dict[tuple[str, str], bool]:
+    """How each stimulus of each scenario ends."""
+    return {(each.scenario, each.stimulus): each.label for each in study.stimuli}
 
 
 def state_of(facts: Mapping[str, Any], now: float) -> str:
