@@ -7,7 +7,6 @@ if it is called otherwise, the map's ``map_url``. Movies are ``STIM_ID.mp4``, al
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -15,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from physion.analysis.stimuli import OFFICIAL_SCENARIOS, SCENARIOS, canonical_name, scenario_of
 from physion.errors import BadInputError
+from physion.experiment.csv_rows import csv_rows
 from physion.experiment.init_trials import Choice, check_even
 from physion.experiment.media import Source
 from physion.experiment.plain_files import read_plain
@@ -83,11 +82,18 @@ def choose_listed(
 
 
 def read_list(path: Path) -> list[Listed]:
-    """The rows of a list in their order; `BadInputError` names a bad row (from 1) and column."""
+    """The rows of a list in their order; `BadInputError` names a bad row and column.
+
+    Rows of JSON count from 1, those of CSV as a spreadsheet shows them.
+    """
     content = read_plain(path, MAX_LIST_BYTES)
-    rows = _csv_rows(path, content) if path.suffix.lower() == ".csv" else _json_rows(path, content)
+    rows: Iterable[tuple[int, dict[str, Any]]]
+    if path.suffix.lower() == ".csv":
+        rows = csv_rows(path, content, (ID, LABEL))
+    else:
+        rows = enumerate(_json_rows(path, content), start=1)
     found: dict[str, Listed] = {}
-    for number, row in enumerate(rows, start=1):
+    for number, row in rows:
         name = str(row[ID]).strip()
         label = _LABELS.get(str(row[LABEL]).strip().lower())
         if not is_name(name):
@@ -132,31 +138,17 @@ def _json_rows(path: Path, content: bytes) -> list[dict[str, Any]]:
         raise BadInputError(f"{path} is not JSON: {error}") from error
     if not isinstance(columns, dict) or not all(isinstance(c, dict) for c in columns.values()):
         raise BadInputError(f'{path} is not one object a column, {{"{ID}": {{"0": ...}}, ...}}')
-    _require(path, columns)
+    for name in (ID, LABEL):
+        if name not in columns:
+            raise BadInputError(
+                f"{path} lacks the column {name}; it has {', '.join(columns)[:200]}"
+            )
     keys = list(columns[ID])
     for name in (LABEL, *({MAP} & set(columns))):
         if list(columns[name]) != keys:
             raise BadInputError(f"{path}: the columns {ID} and {name} have different rows")
     wanted = [name for name in (ID, LABEL, MAP) if name in columns]
     return [{name: columns[name][key] for name in wanted} for key in keys]
-
-
-def _csv_rows(path: Path, content: bytes) -> list[dict[str, Any]]:
-    try:
-        table = pd.read_csv(io.BytesIO(content), dtype=str, keep_default_na=False)
-    except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
-        raise BadInputError(f"{path} is not a CSV table: {error}") from error
-    _require(path, table.columns)
-    return [{str(name): value for name, value in row.items()} for row in table.to_dict("records")]
-
-
-def _require(path: Path, columns: Iterable[Any]) -> None:
-    found = list(columns)
-    for name in (ID, LABEL):
-        if name not in found:
-            raise BadInputError(
-                f"{path} lacks the column {name}; it has {', '.join(map(str, found[:12]))}"
-            )
 
 
 def _chosen(

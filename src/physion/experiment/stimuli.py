@@ -14,7 +14,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 from physion.atomic import write_atomic
-from physion.errors import BadInputError
+from physion.errors import BadInputError, UnknownNameError
+from physion.experiment.csv_rows import csv_rows
 from physion.experiment.plain_files import read_plain
 
 STIMULI_FILE = "stimuli.csv"
@@ -75,25 +76,11 @@ def read_stimuli(path: Path) -> tuple[Stimulus, ...]:
 
 def parse_stimuli(path: Path, content: bytes) -> tuple[Stimulus, ...]:
     """The same from the bytes of a file that was read from ``path``."""
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise BadInputError(f"{path} is not UTF-8 text; save it as CSV UTF-8") from error
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     found = []
-    try:
-        header = next(reader, [])
-        _check_header(path, header)
-        for row, cells in enumerate(reader, start=2):
-            if not any(cells):
-                continue
-            if len(cells) != len(header):
-                raise BadInputError(
-                    f"{path}, row {row}: {len(cells)} cells, not {len(header)} as in the header"
-                )
-            found.append((row, _parse(path, row, dict(zip(header, cells, strict=True)))))
-    except csv.Error as error:
-        raise BadInputError(f"{path}, row {reader.line_num}: not CSV: {error}") from error
+    for row, cells in csv_rows(path, content, COLUMNS):
+        if unknown := set(cells) - set(COLUMNS):
+            raise BadInputError(f"{path}: {UnknownNameError('column', min(unknown), COLUMNS)}")
+        found.append((row, _parse(path, row, cells)))
     check_stimuli(found, path)
     return tuple(stimulus for _, stimulus in found)
 
@@ -108,18 +95,6 @@ def write_stimuli(path: Path, stimuli: Iterable[Stimulus]) -> None:
     for stimulus in chosen:
         writer.writerow([getattr(stimulus, name) for name in COLUMNS])
     write_atomic(path, lines.getvalue().encode())
-
-
-def _check_header(path: Path, header: list[str]) -> None:
-    for name in COLUMNS:
-        if header.count(name) != 1:
-            what = "lacks the column" if name not in header else "has more than one column"
-            raise BadInputError(f"{path} {what} {name!r}; it needs {', '.join(COLUMNS)}")
-    unknown = [name for name in header if name not in COLUMNS]
-    if unknown:
-        raise BadInputError(
-            f"{path} has the unknown column {unknown[0]!r}; known are {', '.join(COLUMNS)}"
-        )
 
 
 def _flag(cell: str) -> bool:
@@ -155,7 +130,7 @@ def _parse(path: Path, row: int, cells: dict[str, str]) -> Stimulus:
     values: dict[str, str | int | float | bool] = {}
     for name, cell in cells.items():
         try:
-            values[name] = _READ[name](cell.strip())
+            values[name] = _READ[name](cell)
         except ValueError as error:
             raise BadInputError(
                 f"{path}, row {row}: {name} must be {error}, not {cell[:60]!r}"

@@ -6,8 +6,8 @@ A check takes the value that the file holds, gives the value that the study has,
 
 from __future__ import annotations
 
-import math
 import re
+import unicodedata
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +16,8 @@ from urllib.parse import parse_qs, urlsplit
 from physion.experiment.stimuli import NAME
 
 Check = Callable[[Any], Any]
+_UNFIT = ("Cc", "Cs", "Zl", "Zp")
+"""Unicode's control characters, halves of characters, and other ends of lines."""
 LANGUAGE = r"[a-z]{2,3}(-[A-Za-z0-9]{2,8})?"
 """Names of languages and of their files, as in HTML: en, de, pt-BR."""
 
@@ -42,7 +44,7 @@ def text(most: int, least: int = 0) -> Check:
     def check(value: Any) -> str:
         if not isinstance(value, str) or not least <= len(value.strip()) <= most:
             raise ValueError(allowed)
-        if not value.isprintable():
+        if any(unicodedata.category(sign) in _UNFIT for sign in value):
             raise ValueError(f"{allowed}, without control characters")
         return value.strip()
 
@@ -75,7 +77,7 @@ def number(low: float, high: float) -> Check:
     """A number between two inclusive bounds."""
 
     def check(value: Any) -> float:
-        if type(value) not in (int, float) or not math.isfinite(value) or not low <= value <= high:
+        if type(value) not in (int, float) or not low <= value <= high:
             raise ValueError(f"a number from {low:g} to {high:g}")
         return float(value)
 

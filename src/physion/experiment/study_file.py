@@ -21,7 +21,7 @@ def parse_toml(path: Path, content: bytes) -> dict[str, Any]:
     """The tables of a TOML file that was read from ``path``; `BadInputError` where it is none."""
     try:
         return tomllib.loads(content.decode())
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise BadInputError(f"{path} is not TOML: {error}") from error
 
 

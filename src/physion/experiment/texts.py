@@ -8,7 +8,6 @@ the pages. A study has copies of its own, so that a lab can change every word.
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Mapping
 from functools import cache
 from importlib import resources
@@ -17,6 +16,7 @@ from typing import Any
 
 from physion.errors import BadInputError, UnknownNameError
 from physion.experiment.plain_files import read_plain
+from physion.experiment.study_file import parse_toml
 
 TEXTS_FOLDER = "texts"
 MAX_BYTES = 1_000_000
@@ -70,12 +70,8 @@ def shipped_texts() -> Mapping[str, str]:
 
 
 def _flat(path: Path, content: bytes) -> dict[str, str]:
-    try:
-        tables = tomllib.loads(content.decode())
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise BadInputError(f"{path} is not TOML: {error}") from error
     found: dict[str, str] = {}
-    _walk(path, "", tables, found)
+    _walk(path, "", parse_toml(path, content), found)
     return found
 
 
