@@ -72,11 +72,14 @@ FIELDS: Mapping[str, Mapping[str, Callable[[Any], Any]]] = {
     "withdraw": {},
 }
 """Fields of each page, all of them needed; null where a person prefers not to say."""
+OPTIONAL: Mapping[str, Mapping[str, Callable[[Any], Any]]] = {"consent": {"language": _words}}
+"""Fields that a page may have besides."""
 
 
 def check_page(done: PageDone) -> dict[str, Any]:
     """The values of a page; `Refused` names the first field that is missing, wrong or unknown."""
-    expected = FIELDS[done.page]
+    optional = OPTIONAL.get(done.page, {})
+    expected = {**FIELDS[done.page], **{k: v for k, v in optional.items() if k in done.data}}
     unknown = sorted(set(done.data) - set(expected))
     if unknown:
         name = ascii(unknown[0][:40])
@@ -119,7 +122,10 @@ def turn_page(
 def _columns(study: Study, page: str, values: Mapping[str, Any], now: float) -> dict[str, Any]:
     match page:
         case "consent":
-            return {"consented_at": now, "consent_version": study.consent_version}
+            # The consent is given in the language in which it was read.
+            known = values.get("language") in study.languages
+            language = {"language": values["language"]} if known else {}
+            return {"consented_at": now, "consent_version": study.consent_version, **language}
         case "instructions":
             return {"instructed_at": now}
         case "ready":

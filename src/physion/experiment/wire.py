@@ -167,7 +167,8 @@ class TrialList(Message):
 
 
 class PageDone(Message):
-    """A page was sent: ``consent`` {agreed: bool}, ``instructions`` {}, ``ready`` {},
+    """A page was sent: ``consent`` {agreed: bool, language: what it was read in, optional},
+    ``instructions`` {}, ``ready`` {},
     ``demographics`` {age, gender, education}, ``feedback`` {difficulty, technical_problems, text},
     ``withdraw`` {}. Sending a page twice changes nothing and gives the state.
     """
