@@ -108,7 +108,13 @@ SESSION_COLUMNS: tuple[Column, ...] = (
     Column("finished_at", "time", "When the last page was sent; empty: not finished"),
     Column("consent_version", "text", "Version of the consent text that was agreed to"),
     Column("consented_at", "time", "When it was agreed to"),
+    Column("instructed_at", "time", "When the instructions were done"),
+    Column("ready_at", "time", "When the page between practice and test was sent"),
     Column("buttons", "choice", "The buttons from left to right", choices=("yes-no", "no-yes")),
+    Column("language", "text", "Language of the pages"),
+    Column("order_number", "integer", "Prepared order of trials, from 1; 0: an order of its own",
+           low=0),
+    Column("loads", "integer", "How often the page was loaded; more than 1: it was resumed", low=0),
     Column("age", "integer", "Age", unit="years", low=0, high=130),
     Column("gender", "text", "Gender, in the words of the questionnaire"),
     Column("education", "text", "Highest education, in the words of the questionnaire"),
@@ -120,6 +126,8 @@ SESSION_COLUMNS: tuple[Column, ...] = (
     Column("refresh_hz", "number", "Refresh rate of the screen", unit="Hz", low=0, high=1000),
     Column("screen_width", "integer", "Width of the screen", unit="px", low=0),
     Column("screen_height", "integer", "Height of the screen", unit="px", low=0),
+    Column("pixel_ratio", "number", "Device pixels in one CSS pixel", low=0, high=100),
+    Column("touch", "flag", "Does the device have a touch screen?"),
 )  # fmt: skip
 """One row a session; demographics are asked at its end, so that they are empty in broken ones."""
 
