@@ -100,6 +100,7 @@ class Participant:
     def __init__(self, number: int, port: int, word: str, tally: Tally) -> None:
         self._connection = Connection(HOST, port)
         self._host, self._word, self._tally = f"{HOST}:{port}", word, tally
+        self.close = self._connection.close
         self._number, self._life = number, 0
         self._random = random.Random(number)
 
@@ -232,6 +233,8 @@ async def play(name: str, server: OwnServer, word: str, options: argparse.Namesp
     tally = Tally()
     people = [Participant(n, server.port, word, tally) for n in range(options.people)]
     await asyncio.gather(*(guarded(person.begin(), tally) for person in people))
+    if tally.errors:
+        raise SystemExit(f"{name}: not everybody could begin: {tally.errors.most_common(3)}")
     begin, spent, own = time.perf_counter(), cpu_seconds(server.pid), time.process_time()
     tally.seconds.clear()
     if name == "full":

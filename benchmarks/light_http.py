@@ -19,8 +19,7 @@ class Connection(asyncio.Protocol):
         self._body_at = self._length = 0
         self.opened = 0
 
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.Transport)
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         self._transport = transport
         self._received.clear()
         self._body_at = 0
@@ -51,7 +50,8 @@ class Connection(asyncio.Protocol):
         loop = asyncio.get_running_loop()
         if self._transport is None or self._transport.is_closing():
             await loop.create_connection(lambda: self, self._host, self._port)
-        assert self._transport is not None
+        if self._transport is None:
+            raise ConnectionResetError("the server closed the connection at once")
         self._answer = loop.create_future()
         self._transport.write(request)
         return await self._answer

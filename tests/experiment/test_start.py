@@ -28,6 +28,7 @@ def test_rules_are_those_of_the_analysis() -> None:
 
 def test_serving_imports_nothing_slow() -> None:
     pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
-    code = f"import sys, physion.experiment.server; print([m for m in {SLOW_TO_IMPORT} if m in sys.modules])"
+    found = f"[name for name in {SLOW_TO_IMPORT} if name in sys.modules]"
+    code = f"import sys, physion.experiment.server; print({found})"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
