@@ -26,9 +26,9 @@ from physion.experiment.entering import let_in, receive
 from physion.experiment.identity import Secrets, hash_token
 from physion.experiment.media_links import sign_media
 from physion.experiment.orders import fixations, order_of
-from physion.experiment.pages import check_page, turn_page
 from physion.experiment.refused import Refused
 from physion.experiment.scores import Scores, percentile
+from physion.experiment.sent_pages import check_page, turn_page
 from physion.experiment.sessions import (
     Session,
     Trials,
@@ -190,6 +190,10 @@ class Store:
     def result(self, token: str) -> Result:
         """Accuracy, percentile and completion of a session that is done."""
         return self._read(lambda connection: self._result(connection, token))
+
+    async def write(self, command: Callable[[Connection], T]) -> T:
+        """Have the writer run a command of someone else's; see `Writer` for what it must keep."""
+        return await self._writer.run(command)
 
     def healthy(self) -> bool:
         """Does the database answer?"""
