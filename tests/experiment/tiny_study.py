@@ -109,7 +109,7 @@ def _stimulus(
 def _media(number: int, contact: bool, size: int) -> tuple[bytes, bytes, bytes]:
     """Observed movie, whole movie and map of one stimulus."""
     frames = draw(number, contact, size)
-    return encode_movie(frames[:OBSERVED]), encode_movie(frames), _map(number, size)
+    return encode_movie(frames[:OBSERVED]), encode_movie(frames), draw_map(number, size)
 
 
 def draw(number: int, contact: bool, size: int) -> NDArray[np.uint8]:
@@ -141,7 +141,8 @@ def _shapes(number: int, size: int) -> tuple[Any, NDArray[np.bool_]]:
     return disk, square
 
 
-def _map(number: int, size: int) -> bytes:
+def draw_map(number: int, size: int) -> bytes:
+    """The PNG with the agent in red and the patient in yellow, else transparent."""
     disk, square = _shapes(number, size)
     picture = np.zeros((size, size, 4), np.uint8)
     picture[square] = (255, 255, 0, 255)

@@ -22,13 +22,16 @@ def read_plain(path: Path, limit: int) -> bytes:
         raise BadInputError(f"{path} is missing") from None
     except OSError as error:
         raise BadInputError(_why_not(path, error)) from error
-    with os.fdopen(descriptor, "rb") as file:
-        found = os.fstat(file.fileno())
+    try:
+        found = os.fstat(descriptor)
         if not stat.S_ISREG(found.st_mode):
             raise BadInputError(f"{path} is no plain file")
         if found.st_size > limit:
             raise BadInputError(f"{path} has {found.st_size} bytes, more than {limit}")
-        content = file.read(limit + 1)
+        with os.fdopen(descriptor, "rb", closefd=False) as file:
+            content = file.read(limit + 1)
+    finally:
+        os.close(descriptor)
     if len(content) > limit:
         raise BadInputError(f"{path} has more than {limit} bytes")
     return content
