@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+from typing import TYPE_CHECKING
 
-import numpy as np
+if TYPE_CHECKING:
+    import numpy as np
 
 
 def stable_hash(*parts: str | int) -> int:
@@ -20,6 +22,8 @@ def trial_seed(
 
     ``attempt`` counts the draws that were refused before: each has a seed of its own.
     """
+    import numpy as np  # here, since `stable_hash` alone serves programs that should start quickly
+
     parts = (dataset, scenario, split, index)
     return np.random.SeedSequence(stable_hash(*parts, attempt) if attempt else stable_hash(*parts))
 
@@ -30,6 +34,8 @@ def child_generator(seed: np.random.SeedSequence, name: str) -> np.random.Genera
     Streams are independent of each other, so that drawing one number more for a distractor does
     not move the agent.
     """
+    import numpy as np
+
     entropy = seed.entropy
     assert isinstance(entropy, int), "trial seeds are made by trial_seed"
     return np.random.default_rng(np.random.SeedSequence([entropy, stable_hash(name)]))
