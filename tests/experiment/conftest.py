@@ -1,7 +1,17 @@
-"""Fixtures of all tests of the experiment: databases of both kinds."""
+"""Fixtures of all tests of the experiment: databases of both kinds, and stores on them."""
 
 from __future__ import annotations
 
 from postgres import database_url, fresh_postgres, postgres_cluster, postgres_url
+from store_walk import small_secrets, small_study, sqlite_store, store
 
-__all__ = ["database_url", "fresh_postgres", "postgres_cluster", "postgres_url"]
+__all__ = [
+    "database_url",
+    "fresh_postgres",
+    "postgres_cluster",
+    "postgres_url",
+    "small_secrets",
+    "small_study",
+    "sqlite_store",
+    "store",
+]

@@ -87,7 +87,7 @@ def _parse(path: Path, content: bytes) -> Secrets:
         keys = [bytes.fromhex(values[name]) for name in ("hash_key", "link_key")]
         password_hash = values["password_hash"]
         good = all(len(key) == KEY_BYTES for key in keys) and isinstance(password_hash, str)
-    except (ValueError, TypeError, KeyError) as error:
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise BadInputError(f"{path} is damaged; bring back a copy of it") from error
     if not good:
         raise BadInputError(f"{path} is damaged; bring back a copy of it")

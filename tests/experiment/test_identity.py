@@ -1,0 +1,188 @@
+"""Keys, hashes, signatures, orders and addresses of media."""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from physion.errors import BadInputError
+from physion.experiment.identity import (
+    SECRET_FILE,
+    Secrets,
+    check_password,
+    check_signature,
+    hash_token,
+    new_reference,
+    new_token,
+    participant_hash,
+    set_password,
+    sign,
+)
+from physion.experiment.media_links import read_media_path, sign_media
+from physion.experiment.orders import (
+    draw_buttons,
+    fixations,
+    order_of,
+    own_order_seed,
+    prepared_order_seed,
+)
+from physion.experiment.study import Study, Timing
+
+KEYS = Secrets(b"a" * 32, b"b" * 32)
+
+
+def test_keys_are_kept_for_their_owner_alone(tmp_path: Path) -> None:
+    made = Secrets.create(tmp_path, "a long password")
+    path = tmp_path / SECRET_FILE
+    assert Secrets.load(tmp_path) == made
+    assert b"a long password" not in path.read_bytes()
+    assert "a long" not in repr(made) and made.hash_key.hex() not in repr(made)
+    with pytest.raises(BadInputError, match="there already"):
+        Secrets.create(tmp_path, "another password")
+    if os.name == "posix":
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+        path.chmod(0o640)
+        with pytest.raises(BadInputError, match="chmod 600"):
+            Secrets.load(tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"", b"[]", b"{}", b'{"version": 1, "hash_key": "zz"}',
+                                     b'{"version": 2}', b"\xff", b"[" * 5000])  # fmt: skip
+def test_damaged_keys_are_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / SECRET_FILE
+    with pytest.raises(BadInputError, match="there is no"):
+        Secrets.load(tmp_path)
+    path.write_bytes(content)
+    path.chmod(0o600)
+    with pytest.raises(BadInputError, match=r"damaged|version"):
+        Secrets.load(tmp_path)
+
+
+def test_passwords(tmp_path: Path) -> None:
+    secrets = Secrets.create(tmp_path)
+    assert not check_password(secrets, "")
+    changed = set_password(tmp_path, "first password")
+    assert (changed.hash_key, changed.link_key) == (secrets.hash_key, secrets.link_key)
+    assert changed.password_hash.startswith("$argon2id$")
+    assert check_password(Secrets.load(tmp_path), "first password")
+    for wrong in ("first passwor", "", "x" * 5000, "\ud800 first password"):
+        assert not check_password(changed, wrong)
+    with pytest.raises(BadInputError, match="8 to"):
+        set_password(tmp_path, "short")
+    assert not check_password(replace(changed, password_hash="no hash"), "first password")
+
+
+@given(st.lists(st.text(max_size=20), min_size=1, max_size=4),
+       st.lists(st.text(max_size=20), min_size=1, max_size=4))  # fmt: skip
+def test_signatures_are_of_the_words_and_their_bounds(one: list[str], other: list[str]) -> None:
+    assert check_signature(KEYS, sign(KEYS, *one), *one)
+    assert check_signature(KEYS, sign(KEYS, *one), *other) == (one == other)
+    assert not check_signature(replace(KEYS, link_key=b"c" * 32), sign(KEYS, *one), *one)
+
+
+def test_hashes_need_the_key_and_keep_sources_apart() -> None:
+    hashed = participant_hash(KEYS, "prolific", "5f1e")
+    assert re.fullmatch("[0-9a-f]{32}", hashed)
+    assert hashed == participant_hash(KEYS, "prolific", "5f1e")
+    others = {
+        participant_hash(KEYS, "sona", "5f1e"),
+        participant_hash(KEYS, "prolific5", "f1e"),
+        participant_hash(replace(KEYS, hash_key=b"c" * 32), "prolific", "5f1e"),
+    }
+    assert len(others) == 3 and hashed not in others
+
+
+def test_tokens_and_references_do_not_repeat() -> None:
+    assert len({new_token() for _ in range(1000)}) == 1000
+    assert len({new_reference() for _ in range(1000)}) == 1000
+    assert re.fullmatch("[2-9A-HJ-NP-Z]{4}-[2-9A-HJ-NP-Z]{4}", new_reference())
+    assert len(hash_token("\ud800")) == 64  # whatever a header holds
+
+
+def test_orders_are_of_the_seed_alone(small_study: Study) -> None:
+    order = order_of(small_study, "collide", 11)
+    assert order["familiarization"] == small_study.phase("collide", "familiarization")
+    assert set(order["test"]) == set(small_study.phase("collide", "test"))
+    shuffled = replace(small_study, stimuli=small_study.stimuli[::-1])
+    assert order_of(shuffled, "collide", 11) == order
+    # Pinned: an upgrade must not change the order of a session that is under way.
+    assert [stimulus.place for stimulus in order["test"]] == [1, 0, 3, 2]
+
+
+def test_every_order_is_as_likely(small_study: Study) -> None:
+    seeds = [own_order_seed(small_study, "drop", f"person {number}") for number in range(4800)]
+    assert all(0 <= seed < 2**63 for seed in seeds)
+    orders = Counter(
+        tuple(stimulus.place for stimulus in order_of(small_study, "drop", seed)["test"])
+        for seed in seeds
+    )
+    assert len(orders) == 24
+    # 200 expected each, standard deviation 13.8.
+    assert min(orders.values()) > 140 and max(orders.values()) < 260
+
+
+def test_seeds_differ_by_study_scenario_and_participant(small_study: Study) -> None:
+    other = replace(small_study, seed=1)
+    seeds = {
+        own_order_seed(study, scenario, person)
+        for study in (small_study, other)
+        for scenario in ("collide", "drop")
+        for person in ("a", "b")
+    } | {prepared_order_seed(small_study, "drop", number) for number in range(1, 126)}
+    assert len(seeds) == 8 + 125
+
+
+def test_fixations_lie_within_the_timing(small_study: Study) -> None:
+    long = replace(small_study, timing=Timing(fixation_ms=(500, 502)))
+    drawn = Counter(
+        cross for seed in range(300) for cross in fixations(long, "collide", seed, "test")
+    )
+    assert set(drawn) == {500, 501, 502}
+    assert min(drawn.values()) > 330  # of 1200, 400 expected
+    without = replace(small_study, timing=Timing(fixation_in_familiarization=False))
+    assert fixations(without, "collide", 1, "familiarization") == (0, 0, 0)
+
+
+def test_buttons_are_a_fair_coin_for_each_participant(small_study: Study) -> None:
+    drawn = Counter(draw_buttons(small_study, str(number)) for number in range(1000))
+    assert set(drawn) == {"yes-no", "no-yes"} and min(drawn.values()) > 430
+
+
+def test_addresses_of_media_lead_to_the_files(small_study: Study) -> None:
+    for phase, kinds in (("familiarization", ("movie", "map", "full")), ("test", ("movie", "map"))):
+        for trial, stimulus in enumerate(order_of(small_study, "drop", 77)[phase]):
+            for kind in kinds:
+                path = sign_media(small_study, KEYS, "drop", 77, phase, trial, kind)
+                expected = small_study.folder / getattr(stimulus, kind)
+                assert read_media_path(small_study, KEYS, path) == expected
+                assert stimulus.stimulus not in path and "drop" not in path
+
+
+def test_no_full_movie_of_a_test_trial(small_study: Study) -> None:
+    with pytest.raises(ValueError, match="full movie of a test trial"):
+        sign_media(small_study, KEYS, "drop", 77, "test", 0, "full")
+
+
+def test_other_addresses_lead_nowhere(small_study: Study) -> None:
+    good = sign_media(small_study, KEYS, "drop", 77, "test", 0, "movie")
+    practice = sign_media(small_study, KEYS, "drop", 77, "familiarization", 0, "movie")
+    bad = [
+        good.replace("-t-0-", "-t-1-"), good.replace("movie", "full"), good.replace("1-77", "0-77"),
+        practice.replace("movie", "full"), good + "0", good[:-1], good.upper(), good + "\n",
+        good.replace("/media/", "/media/../"), "/media/../secret.json", "", "/media/", "\ud800",
+        good.replace("77", "٧٧"), "/media/media/00000.mp4",
+        sign_media(replace(small_study, scenarios=("a", "b", "drop")), KEYS, "drop", 1, "test", 0,
+                   "map"),
+        sign_media(small_study, KEYS, "drop", 77, "test", 99, "map"),
+    ]  # fmt: skip
+    for path in bad:
+        with pytest.raises(BadInputError, match="no such"):
+            read_media_path(small_study, KEYS, path)
