@@ -133,7 +133,7 @@ function radios(name, question, choices, t) {
   const labels = choices.map(([value, word], place) =>
     el("label", { class: "radio", for: `${name}-${value}` }, inputs[place], word),
   );
-  const row = el("div", { class: "radios" }, ...labels);
+  const row = el("div", { class: `radios radios-${choices.length}` }, ...labels);
   const element = el("fieldset", {}, el("legend", {}, question), row, wrong);
   const chosen = () => inputs.find((input) => input.checked);
   return {

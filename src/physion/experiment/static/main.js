@@ -49,6 +49,7 @@ async function takePart(basis, arrival) {
   await queue.empty();
   try {
     const state = await enter(basis, arrival);
+    if (state.stage !== "consent") await speak(basis, state.language);
     session = new Session(basis, queue);
     frame.onStop = () => session.askToStop();
     frame.onLanguage = (language) => changeLanguage(basis, session, language);
@@ -78,7 +79,7 @@ async function enter({ api, texts, log }, arrival) {
     api.token = entered.token;
     keep("session", entered.token);
     window.history.replaceState(null, "", window.location.pathname);
-    return entered.state;
+    return await api.get("/api/session?load=true");
   } catch (error) {
     if (error.code !== "already_took_part" || !remembered) throw error;
     // In the browser in which they took part, people still find their result.
@@ -103,11 +104,17 @@ async function resume(api, token, scenario) {
 }
 
 async function changeLanguage(basis, session, language) {
-  basis.texts = await loadTexts(basis.api, language);
   basis.log.add("language", { language });
   keep("language", language);
-  basis.frame.speak(basis.texts);
+  await speak(basis, language);
   session.restart();
+}
+
+/** Go on in a language. */
+async function speak(basis, language) {
+  if (language === basis.texts.language) return;
+  basis.texts = await loadTexts(basis.api, language);
+  basis.frame.speak(basis.texts);
 }
 
 async function loadTexts(api, language) {

@@ -24,7 +24,7 @@ import { focusHeading } from "./page_trial.js";
 function minutes(study, practice, test) {
   const seconds = practice * 12 + test * (study.cue_ms / 1000 + 4.5);
   const exact = (practice ? 3 : 0) + seconds / 60;
-  return exact > 7.5 ? Math.round(exact / 5) * 5 : Math.max(1, Math.ceil(exact));
+  return exact > 7.5 ? Math.round(exact / 5) * 5 : Math.max(2, Math.ceil(exact));
 }
 
 /** @param {Context} context @returns {Render} */
@@ -57,7 +57,6 @@ export function instructionsPages(context) {
   const { t } = bound(texts);
   const prompt = t("trial.prompt");
   const practice = state.trials.familiarization;
-  const answer = practice > 0 ? "instructions.answer" : "instructions.answer_without_practice";
   const parts = [
     () => [
       el("h1", {}, t("instructions.title_task")),
@@ -71,7 +70,7 @@ export function instructionsPages(context) {
     ],
     () => [
       el("h1", {}, t("instructions.title_answer")),
-      ...paragraphs(t(answer, { practice, trials: state.trials.test })),
+      ...paragraphs(t("instructions.answer", { practice, trials: state.trials.test })),
     ],
   ];
   return (page, done, signal) => {

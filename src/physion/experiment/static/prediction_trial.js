@@ -89,7 +89,7 @@ async function show(display, trial, signal, visibility, on_load) {
   const screen = new Screen(trial.media, signal);
   const buttons = trial.choices.map((choice, side) => answerButton(trial, choice, side));
   const cross = el("div", { class: "fixation", "aria-hidden": "true" });
-  screen.element.append(cross);
+  if (trial.fixation_ms > 0) screen.element.append(cross);
   display.replaceChildren(
     el(
       "div",
