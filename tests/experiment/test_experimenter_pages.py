@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import html
+import os
 import re
+import signal
 import time
 from collections import Counter
 from collections.abc import Iterator
+from multiprocessing import active_children
 from pathlib import Path
 
 import pytest
@@ -14,9 +17,12 @@ import sqlalchemy as sa
 
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
-from experimenter_client import Lab, Visitor, lab
+from experimenter_client import TWO, Lab, Visitor, lab
 from experimenter_rows import insert_sessions
 
+from physion.analysis.exclusions import PREREGISTERED, RULES, flag_sessions
+from physion.analysis.participants import clean
+from physion.experiment.answer_tables import read_tables
 from physion.experiment.tables import ANSWERS, EVENTS, RAW_IDS, SESSIONS
 
 HOSTILE = (
@@ -253,3 +259,68 @@ def test_pages_of_one_hostile_session(tmp_path: Path, database_url: str) -> None
         assert "<script>alert" not in visitor.see(f"/sessions?{words}").text
         assert "<script>alert" not in visitor.see(f"/payments?source={address}").text
         assert len(rows_of(one)) == 1, "the tables are still there"
+
+
+# --- flags, deleting, the process that counts ----------------------------------------------------
+
+
+def test_flags_are_those_of_the_analysis(busy: tuple[Lab, Visitor]) -> None:
+    found, visitor = busy
+    trials, sessions = read_tables(found.store.engine, found.study, kinds=("person",))
+    table = flag_sessions(
+        clean(trials, sessions), PREREGISTERED, expected={"collide": 6, "drop": 6}
+    )
+    finished = {row.session: row for row in rows_of(found) if row.finished_at}
+    table = table[table["session"].isin(finished)]
+    assert table["flagged"].any(), "else this shows nothing"
+    text = visitor.see().text
+    counts = {line[0]: line[1:] for line in table_after(text, "Exclusion rules")[1:]}
+    for rule in RULES:
+        own = [int(table.loc[table["scenario"] == name, rule].sum()) for name in TWO]
+        assert counts[rule.replace("_", " ")] == [str(count) for count in own], rule
+    flagged = set(table.loc[table["flagged"], "session"])
+    shown = references(visitor.see("/sessions?state=finished&flag=any").text)
+    assert set(shown) == {finished[name].reference for name in flagged}
+    one = visitor.see(f"/sessions/{flagged.pop()}").text
+    assert '<span class="flag">' in one
+
+
+def test_deleting_ids_needs_the_word_and_leaves_answers(tmp_path: Path, database_url: str) -> None:
+    with lab(tmp_path, database_url) as own:
+        engine = own.store.engine
+        insert_sessions(engine, own.study, own.secrets, 20)
+        visitor = own.experimenter()
+        assert "Delete raw ids" in visitor.open_payments().text
+        token = visitor.token("/payments")
+        before = table_after(visitor.see().text, "Progress")[1:]
+        for word in ("", "yes", "delete all"):
+            answer = visitor.submit("/payments/forget", token, word=word)
+            assert answer.status_code == 422 and "Nothing was deleted" in answer.text
+        answer = visitor.submit("/payments/forget", token, word="Delete")
+        assert "20 ids were deleted" in answer.text and "Delete raw ids" not in answer.text
+        with engine.connect() as connection:
+            assert connection.scalar(sa.select(sa.func.count()).select_from(RAW_IDS)) == 0
+        assert table_after(visitor.see().text, "Progress")[1:] == before
+        assert before[0][2] != "0 of 100"
+        if engine.dialect.name == "sqlite":
+            stored = b"".join(path.read_bytes() for path in tmp_path.glob("*.sqlite*"))
+            stored += Path(str(engine.url.database)).read_bytes()
+            assert b"person-0-000" not in stored
+
+
+def counting() -> set[int | None]:
+    return {each.pid for each in active_children() if each.name == "physion-experimenter"}
+
+
+def test_the_process_that_counts_may_die(tmp_path: Path) -> None:
+    others = counting()
+    with lab(tmp_path) as own:
+        visitor = own.experimenter()
+        assert visitor.see().status_code == 200
+        (first,) = counting() - others
+        assert first is not None
+        os.kill(first, signal.SIGKILL)
+        assert visitor.see("/sessions").status_code == 200
+        (second,) = counting() - others
+        assert second != first
+    assert counting() == others, "it ends with the server"

@@ -8,10 +8,12 @@ the server is gone, since its end of the pipe closes.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import multiprocessing
 import threading
 import time
+from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from multiprocessing.connection import Connection
@@ -24,6 +26,7 @@ from physion.experiment.study import Study
 LOG = logging.getLogger(__name__)
 PATIENCE = 120.0
 """Seconds that a question may take before the process is given up."""
+TRIES = 2
 LOOK_UP = 0.25
 """Seconds after which a waiting thread looks whether the server is still there."""
 
@@ -48,6 +51,18 @@ class Desk:
         loop = asyncio.get_running_loop()
         return await loop.run_in_executor(self._threads, self._ask, question, arguments)
 
+    @contextlib.asynccontextmanager
+    async def closed(self) -> AsyncIterator[None]:
+        """Nothing is read meanwhile; questions wait."""
+        if self._process is not None:
+            self._process.kill()
+        await asyncio.to_thread(self._lock.acquire)
+        try:
+            await asyncio.to_thread(self._end)
+            yield
+        finally:
+            self._lock.release()
+
     def close(self) -> None:
         """Ends the process, without waiting for an answer that is on its way."""
         if self._process is not None:
@@ -57,17 +72,16 @@ class Desk:
             self._end()
 
     def _ask(self, question: str, arguments: dict[str, Any]) -> Any:
-        with self._lock:
-            try:
-                kind, found = self._exchange(question, arguments)
-            except (EOFError, OSError):
-                # It may have ended for want of questions just now: once more with a new one.
-                self._end()
+        for _ in range(TRIES):
+            with self._lock:
                 try:
                     kind, found = self._exchange(question, arguments)
-                except (EOFError, OSError) as error:
+                    break
+                except (EOFError, OSError):
+                    # It may have ended for want of questions just now: once more with a new one.
                     self._end()
-                    raise DeskError("the process that counts ended before it answered") from error
+        else:
+            raise DeskError("the process that counts ended before it answered")
         if kind == "refused":
             raise PhysionError(found)
         if kind == "failed":

@@ -97,7 +97,6 @@ def find_flags(study: Study, engine: Engine) -> Mapping[str, Flags]:
     """
     from physion.analysis.exclusions import RULE_SETS, RULES, flag_sessions
     from physion.analysis.participants import clean
-    from physion.analysis.response_schema import SESSION_COLUMNS, TRIAL_COLUMNS, check_table
     from physion.experiment.answer_tables import read_tables
 
     trials, sessions = read_tables(engine, study)
@@ -110,10 +109,7 @@ def find_flags(study: Study, engine: Engine) -> Mapping[str, Flags]:
             continue
         people = sessions[sessions["simulated"] == simulated]
         try:
-            responses = clean(
-                check_table(rows, TRIAL_COLUMNS, "answers"),
-                check_table(people, SESSION_COLUMNS, "sessions"),
-            )
+            responses = clean(rows, people, where="the database")
             table = flag_sessions(responses, RULE_SETS[study.exclusions], expected=expected)
         except PhysionError as error:
             found[kind] = Flags(study.exclusions, at=time.time(), problem=str(error))

@@ -226,7 +226,14 @@ class _Pages:
             return await self._payments(request, problem, 422)
         from physion.experiment.forget import forget_raw_ids
 
-        deleted = await forget_raw_ids(self._store)
+        if self._exporting:
+            return await self._payments(request, "An export is being made; wait for its end.", 409)
+        try:
+            # Whoever reads just now would keep the deleted bytes in the log of the database.
+            async with self._desk.closed():
+                deleted = await forget_raw_ids(self._store)
+        except PhysionError as error:
+            return await self._payments(request, str(error), 503)
         LOG.warning("%d raw ids were deleted by an experimenter", deleted)
         return await self._payments(request, f"{deleted} ids were deleted.")
 

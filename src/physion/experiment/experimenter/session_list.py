@@ -130,9 +130,8 @@ def _is_chosen(summary: Summary, flags: Flags, choice: Choice) -> bool:
 
 
 def flags_shown(summary: Summary, flags: Flags) -> tuple[str, ...]:
-    """The flags of a session; one that is going on is not yet blamed for being incomplete."""
-    rules = flags.of(str(summary.facts["session"]))
-    return tuple(r for r in rules if summary.state != "going" or r != "incomplete")
+    """The flags of a session; of one that is going on it is too early to tell."""
+    return () if summary.state == "going" else flags.of(str(summary.facts["session"]))
 
 
 def _line(summary: Summary, flags: Flags) -> Line:
