@@ -142,7 +142,7 @@ def _filled(connection: Connection, visitor: Visitor) -> Mapping[str, int]:
         )
         .group_by(columns.scenario)
     )
-    return dict(connection.execute(statement).tuples().all())
+    return dict(connection.execute(statement).all())
 
 
 def _begin(connection: Connection, study: Study, scenario: str, visitor: Visitor) -> Session:
@@ -184,7 +184,7 @@ def _least_used(connection: Connection, study: Study, scenario: str, kind: str) 
         .where(columns.scenario == scenario, columns.kind == kind, columns.withdrawn_at.is_(None))
         .group_by(columns.order_number)
     )
-    used: dict[int, int] = dict(connection.execute(statement).tuples().all())
+    used: dict[int, int] = dict(connection.execute(statement).all())
     return min(range(1, study.orders + 1), key=lambda number: (used.get(number, 0), number))
 
 

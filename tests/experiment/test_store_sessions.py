@@ -1,0 +1,535 @@
+"""Entering, pages, states and results, on both databases."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import update
+from store_walk import (
+    PAGES,
+    STAGES,
+    answer,
+    enter,
+    give,
+    page,
+    refusal,
+    rows,
+    run,
+    walk,
+)
+
+from physion.errors import BadInputError, PhysionError
+from physion.experiment.entering import ACTIVE_S
+from physion.experiment.identity import Secrets, participant_hash
+from physion.experiment.recruitment import pass_word
+from physion.experiment.scores import percentile
+from physion.experiment.store import Refused, Store
+from physion.experiment.study import Recruitment, Study
+from physion.experiment.tables import EVENTS, PARTICIPANTS, RAW_IDS, SESSIONS, STUDIES, TOKENS
+from physion.experiment.wire import REFUSALS, Device, Enter, Event, Events, PageDone
+
+HOSTILE = "'; DROP TABLE sessions; -- \"<script>alert(1)</script>\\ %s {0} \0 é ☃ 🎲"
+
+
+def test_a_whole_session(store: Store, small_study: Study) -> None:
+    token = enter(store, "Ada", source="prolific", scenario="drop")
+    seen = []
+    for stage in STAGES:
+        walk(store, token, stage)
+        state = run(store.state(token))
+        seen.append((state.stage, state.trial))
+    in_phase = {"familiarization", "test"}
+    assert seen == [(stage, 0 if stage in in_phase else None) for stage in STAGES]
+    result = store.result(token)
+    # Half of the four test trials end with contact, and the walk says yes to all.
+    assert (result.correct, result.trials, result.accuracy, result.percentile) == (2, 4, 0.5, None)
+    (session,) = rows(store, SESSIONS)
+    assert (session.age, session.gender, session.education) == (31, "woman", "master")
+    assert (session.difficulty, session.technical_problems, session.feedback) == (2, False, "fine")
+    assert session.consent_version == small_study.consent_version
+    assert session.started_at < session.consented_at < session.instructed_at < session.ready_at
+    assert session.ready_at < session.demographics_at < session.finished_at == session.last_seen
+    assert session.kind == "person" and session.study == small_study.digest
+
+
+def test_ids_are_kept_apart_from_the_data(store: Store, small_secrets: Secrets) -> None:
+    recruiter = {"STUDY_ID": "s1", "SESSION_ID": HOSTILE}
+    enter(store, "Ada-5f1e", source="prolific", recruiter=recruiter)
+    enter(store, "Ada-5f1e", source="prolific", recruiter={"STUDY_ID": "s2"})
+    hashed = participant_hash(small_secrets, "prolific", "Ada-5f1e")
+    (raw,) = rows(store, RAW_IDS)
+    assert (raw.participant, raw.source, raw.raw_id) == (hashed, "prolific", "Ada-5f1e")
+    assert raw.recruiter == {"STUDY_ID": "s2"}
+    assert [row.participant for row in rows(store, PARTICIPANTS)] == [hashed]
+    for table in (SESSIONS, TOKENS, EVENTS, PARTICIPANTS, STUDIES):
+        assert "5f1e" not in repr(rows(store, table))
+
+
+def test_tokens_are_stored_as_hashes_and_both_open_the_session(store: Store) -> None:
+    one, two = enter(store, "Ada"), enter(store, "Ada")
+    assert one != two and len(rows(store, SESSIONS)) == 1
+    assert one not in repr(rows(store, TOKENS))
+    walk(store, one, "test")
+    assert run(store.state(two)).stage == "test"
+
+
+@pytest.mark.parametrize("token", ["", "x", "\0", "\ud800", HOSTILE, "a" * 5000])
+def test_unknown_tokens_open_nothing(sqlite_store: Store, token: str) -> None:
+    done = PageDone(page="ready")
+    for asked in (
+        sqlite_store.state(token),
+        sqlite_store.state(token, True),
+        sqlite_store.page(token, done),
+        sqlite_store.events(token, Events(events=[])),
+    ):
+        assert refusal(asked).code == "unknown_token"
+    for ask in (lambda: sqlite_store.trials(token, "test"), lambda: sqlite_store.result(token)):
+        with pytest.raises(Refused) as caught:
+            ask()
+        assert caught.value.code == "unknown_token"
+
+
+def test_who_finished_or_withdrew_may_not_begin_again(store: Store) -> None:
+    walk(store, enter(store, "Ada", scenario="drop"), "done")
+    page(store, enter(store, "Bob", scenario="drop"), "withdraw")
+    for person in ("Ada", "Bob"):
+        assert refusal(store.enter(Enter(id=person, scenario="drop"))).code == "already_took_part"
+        # The other scenario is open to them, asked for or not.
+        assert run(store.enter(Enter(id=person))).state.scenario == "collide"
+    walk(store, enter(store, "Ada"), "done")
+    assert refusal(store.enter(Enter(id="Ada"))).code == "already_took_part"
+    assert len(rows(store, SESSIONS)) == 4
+
+
+def test_the_unfinished_session_goes_on_before_another_begins(store: Store) -> None:
+    walk(store, enter(store, "Ada", scenario="drop"), "test")
+    state = run(store.enter(Enter(id="Ada"))).state
+    assert (state.scenario, state.stage) == ("drop", "test")
+    assert run(store.enter(Enter(id="Ada", scenario="collide"))).state.stage == "consent"
+
+
+def test_sources_keep_ids_apart(store: Store) -> None:
+    for source in ("link", "prolific", "sona", "mturk"):
+        enter(store, "17", source=source)
+    assert len({row.participant for row in rows(store, SESSIONS)}) == 4
+
+
+def test_least_filled_scenario_first_until_the_study_is_full(store: Store) -> None:
+    # participants=3: one of drop has finished, one of collide withdrew, one left long ago.
+    walk(store, enter(store, "done", scenario="drop"), "done")
+    page(store, enter(store, "gone", scenario="collide"), "withdraw")
+    enter(store, "asleep", scenario="collide")
+    sleeps = update(SESSIONS).where(SESSIONS.c.withdrawn_at.is_(None))
+    sleeps = sleeps.where(SESSIONS.c.scenario == "collide")
+    with store.engine.begin() as connection:
+        connection.execute(sleeps.values(last_seen=SESSIONS.c.last_seen - ACTIVE_S - 1))
+    given = [run(store.enter(Enter(id=f"p{i}"))).state.scenario for i in range(5)]
+    assert given == ["collide", "collide", "drop", "collide", "drop"]
+    assert refusal(store.enter(Enter(id="late"))).code == "study_full"
+    assert refusal(store.enter(Enter(id="late", scenario="drop"))).code == "study_full"
+    # Who has begun may finish.
+    assert run(store.enter(Enter(id="asleep"))).state.scenario == "collide"
+
+
+def test_previews_and_programs_take_nobodys_place(store: Store, small_secrets: Secrets) -> None:
+    for kind in ("preview", "simulated"):
+        word = pass_word(small_secrets, kind)
+        for number in range(4):
+            token = enter(store, f"p{number}", scenario="drop", **{"pass": word})
+            assert run(store.state(token)).kind == kind
+    assert [run(store.enter(Enter(id=f"p{i}", scenario="drop"))).state.kind for i in range(3)] == [
+        "person"
+    ] * 3
+    kinds = Counter(row.kind for row in rows(store, SESSIONS))
+    assert kinds == {"preview": 4, "simulated": 4, "person": 3}
+    assert len(rows(store, RAW_IDS)) == 3
+
+
+@pytest.mark.parametrize("word", ["", "preview", "preview-", "person-{0}", "preview-{0}", HOSTILE])
+def test_words_that_we_never_gave_are_refused(
+    sqlite_store: Store, small_secrets: Secrets, word: str
+) -> None:
+    signature = pass_word(small_secrets, "simulated").partition("-")[2]
+    asked = Enter.model_validate({"pass": word.replace("{0}", signature)})
+    assert refusal(sqlite_store.enter(asked)).code == "bad_link"
+    assert rows(sqlite_store, SESSIONS) == []
+
+
+def test_what_a_session_is_never_changes(store: Store, small_secrets: Secrets) -> None:
+    token = enter(store, "Ada", scenario="drop", **{"pass": pass_word(small_secrets, "simulated")})
+    walk(store, token, "done")
+    (session,) = rows(store, SESSIONS)
+    assert session.kind == "simulated"
+
+
+def test_ids_where_they_are_needed(
+    store: Store, small_study: Study, small_secrets: Secrets, tmp_path: Path
+) -> None:
+    assert enter(store) != enter(store)
+    assert len({row.participant for row in rows(store, SESSIONS)}) == 2
+    for blank in (None, "\0"):
+        assert refusal(store.enter(Enter(source="sona", id=blank))).code == "id_needed"
+    needed = replace(small_study, recruitment=Recruitment(id_needed=True))
+    strict = Store.open(needed, small_secrets, f"sqlite:///{tmp_path / 'strict.sqlite'}")
+    try:
+        assert refusal(strict.enter(Enter())).code == "id_needed"
+        preview = Enter.model_validate({"pass": pass_word(small_secrets, "preview")})
+        assert run(strict.enter(preview)).state.kind == "preview"
+    finally:
+        strict.close()
+
+
+@pytest.mark.parametrize("scenario", ["none", "Drop", HOSTILE])
+def test_unknown_scenarios_are_refused(sqlite_store: Store, scenario: str) -> None:
+    assert refusal(sqlite_store.enter(Enter(scenario=scenario))).code == "bad_link"
+
+
+LANGUAGES = {"de": "de", "de-AT": "de", "DE": "de", "": "en", "fr": "en", "en_US": "en"}
+
+
+@pytest.mark.parametrize(("wanted", "given"), LANGUAGES.items())
+def test_languages(sqlite_store: Store, wanted: str, given: str) -> None:
+    assert run(sqlite_store.enter(Enter(language=wanted))).state.language == given
+
+
+def test_prepared_orders_are_used_evenly(
+    small_study: Study, small_secrets: Secrets, database_url: str
+) -> None:
+    study = replace(small_study, orders=3, participants=100)
+    store = Store.open(study, small_secrets, database_url)
+    try:
+        for number in range(6):
+            enter(store, f"p{number}", scenario="drop")
+        enter(store, "other", scenario="collide")
+        page(store, enter(store, "p1", scenario="drop"), "withdraw")
+        enter(store, "p6", scenario="drop")
+        found = {row.participant: row for row in rows(store, SESSIONS)}
+        numbers = [
+            found[participant_hash(small_secrets, "link", f"p{number}")].order_number
+            for number in range(7)
+        ]
+        # The order of who withdrew is free again.
+        assert numbers == [1, 2, 3, 1, 2, 3, 2]
+        seeds = {(row.scenario, row.order_number, row.order_seed) for row in found.values()}
+        assert len(seeds) == 4
+    finally:
+        store.close()
+
+
+def test_buttons_stay_with_the_participant(store: Store) -> None:
+    for person in ("a", "b", "c"):
+        buttons = {
+            run(store.enter(Enter(id=person, scenario=scenario))).state.buttons
+            for scenario in ("collide", "drop")
+        }
+        assert len(buttons) == 1
+
+
+def test_many_at_once_make_one_session_each(store: Store) -> None:
+    async def all_at_once() -> list[Any]:
+        visits = [Enter(id=f"p{number % 3}", scenario="drop") for number in range(30)]
+        return await asyncio.gather(*(store.enter(visit) for visit in visits))
+
+    entered = run(all_at_once())
+    assert len({each.token for each in entered}) == 30
+    assert len(rows(store, SESSIONS)) == 3 and len(rows(store, TOKENS)) == 30
+    assert len({each.state.reference for each in entered}) == 3
+
+
+def test_pages_come_in_their_order_and_twice_is_once(store: Store) -> None:
+    token = enter(store, "Ada")
+    for stage in STAGES[:-1]:
+        walk(store, token, stage)
+        late = [name for name in PAGES if STAGES.index(name) > STAGES.index(stage)]
+        for name in late:
+            refused = refusal(store.page(token, PageDone(page=name, data=PAGES[name])))
+            assert refused.code == "wrong_stage"
+            assert refused.state is not None and refused.state.stage == stage
+        before = rows(store, SESSIONS)
+        for name in PAGES:
+            if name not in late and name != stage:
+                assert page(store, token, name).stage == stage
+        assert rows(store, SESSIONS) == before
+    walk(store, token, "done")
+    page(store, token, "feedback", difficulty=5, technical_problems=True, text="other")
+    (session,) = rows(store, SESSIONS)
+    assert (session.difficulty, session.feedback) == (2, "fine")
+
+
+@pytest.mark.parametrize("stage", STAGES[:-1])
+@pytest.mark.parametrize("how", ["withdraw", "consent"])
+def test_who_withdraws_is_left_alone(sqlite_store: Store, stage: str, how: str) -> None:
+    token = walk(sqlite_store, enter(sqlite_store, "Ada"), stage)
+    data = {} if how == "withdraw" else {"agreed": False}
+    for _ in range(2):
+        assert page(sqlite_store, token, how, **data).stage == "withdrawn"
+    before = (rows(sqlite_store, SESSIONS), rows(sqlite_store))
+    event = Events(events=[Event(kind="hidden", at_ms=1)])
+    for asked in (
+        *(sqlite_store.page(token, PageDone(page=name, data=PAGES[name])) for name in PAGES),
+        sqlite_store.answer(token, answer(9)),
+        sqlite_store.events(token, event),
+    ):
+        refused = refusal(asked)
+        assert refused.code == "wrong_stage"
+        assert refused.state is not None and refused.state.stage == "withdrawn"
+    for ask in (lambda: sqlite_store.trials(token, "test"), lambda: sqlite_store.result(token)):
+        with pytest.raises(Refused) as caught:
+            ask()
+        assert caught.value.code == "wrong_stage"
+    assert run(sqlite_store.state(token, True)).stage == "withdrawn"
+    assert (rows(sqlite_store, SESSIONS), rows(sqlite_store)) == before
+
+
+def test_a_finished_session_stays_finished(store: Store) -> None:
+    token = walk(store, enter(store, "Ada"), "done")
+    assert refusal(store.page(token, PageDone(page="withdraw"))).code == "wrong_stage"
+    assert store.result(token).trials == 4
+
+
+BAD_PAGES: list[tuple[str, dict[str, Any], str]] = [
+    ("consent", {}, "agreed is missing"),
+    ("consent", {"agreed": 1}, "agreed: true or false"),
+    ("instructions", {"a'b\n": 1}, "no field"),
+    *(("demographics", {"age": age, "gender": None, "education": None}, "age: a whole number")
+      for age in (17, 131, -1, 20.5, "30", True, 1e300)),
+    ("demographics", {"age": 30, "gender": "x" * 201, "education": None}, "gender: text"),
+    ("demographics", {"age": 30, "gender": None, "education": 5}, "education: text"),
+    ("demographics", {"age": 30, "gender": None}, "education is missing"),
+    ("demographics", {"age": 30, "gender": None, "education": None, "kind": "preview"}, "no field"),
+    *(("feedback", {"difficulty": value, "technical_problems": False, "text": ""}, "difficulty")
+      for value in (0, 6, None, 2.5, "2", True)),
+    ("feedback", {"difficulty": 2, "technical_problems": None, "text": ""}, "technical_problems"),
+    ("feedback", {"difficulty": 2, "technical_problems": False, "text": None}, "text: text"),
+    ("feedback", {"difficulty": 2, "technical_problems": False}, "text is missing"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "data", "said"), BAD_PAGES)
+def test_bad_pages_name_the_field(
+    sqlite_store: Store, name: Any, data: dict[str, Any], said: str
+) -> None:
+    token = walk(sqlite_store, enter(sqlite_store), name)
+    refused = refusal(sqlite_store.page(token, PageDone(page=name, data=data)))
+    assert refused.code == "bad_request" and said in refused.message
+    assert run(sqlite_store.state(token)).stage == name
+
+
+def test_nobody_has_to_say_anything(store: Store) -> None:
+    token = walk(store, enter(store), "demographics")
+    page(store, token, "demographics", age=None, gender=None, education=" ")
+    page(store, token, "feedback", difficulty=5.0, technical_problems=True, text="")
+    (session,) = rows(store, SESSIONS)
+    assert (session.age, session.gender, session.education) == (None, None, None)
+    assert (session.difficulty, session.technical_problems) == (5, True)
+
+
+def test_hostile_texts_are_stored_as_texts(store: Store) -> None:
+    device = Device(user_agent=HOSTILE)
+    token = enter(store, HOSTILE, recruiter={HOSTILE: HOSTILE}, language=HOSTILE[:20],
+                  device=device)  # fmt: skip
+    walk(store, token, "demographics")
+    page(store, token, "demographics", age=20, gender=HOSTILE, education=HOSTILE)
+    page(store, token, "feedback", difficulty=1, technical_problems=False, text=HOSTILE * 50)
+    event = Event(kind="error", at_ms=5, data={HOSTILE: HOSTILE})
+    assert run(store.events(token, Events(events=[event]))).stored == 1
+    clean = HOSTILE.replace("\0", "")
+    (session,), (raw,), (stored,) = rows(store, SESSIONS), rows(store, RAW_IDS), rows(store, EVENTS)
+    assert (session.gender, session.education, session.feedback) == (clean, clean, clean * 50)
+    assert session.device["user_agent"] == clean
+    assert raw.raw_id == clean and raw.recruiter == {clean: clean}
+    assert stored.data == {clean: clean}
+    assert run(store.enter(Enter(id="other"))).state.stage == "consent"
+
+
+def test_trials_come_after_the_consent_in_the_sessions_order(store: Store) -> None:
+    token = enter(store, "Ada", scenario="drop")
+    with pytest.raises(Refused) as caught:
+        store.trials(token, "familiarization")
+    assert caught.value.code == "not_yet"
+    walk(store, token, "instructions")
+    listed = store.trials(token, "test")
+    assert [each.trial for each in listed.trials] == [0, 1, 2, 3]
+    assert all(each.frames == 45 and 500 <= each.fixation_ms <= 1500 for each in listed.trials)
+    assert listed == store.trials(token, "test")
+    for word in ("tiny", "drop", "label", "true", "false", "full"):
+        assert word not in listed.model_dump_json().lower()
+    walk(store, token, "demographics")
+    given = [row.stimulus for row in rows(store) if row.phase == "test"]
+    from physion.experiment.media_links import read_media_path
+
+    files = {
+        str(read_media_path(store.study, store.secrets, each.movie)): trial
+        for trial, each in enumerate(listed.trials)
+    }
+    shown = {
+        stimulus.stimulus: files[str(store.study.folder / stimulus.movie)]
+        for stimulus in store.study.phase("drop", "test")
+    }
+    assert sorted(given, key=lambda name: shown[name]) == given
+
+
+def test_results_come_at_the_end_alone(store: Store) -> None:
+    token = enter(store, "Ada")
+    for stage in STAGES[:-1]:
+        walk(store, token, stage)
+        with pytest.raises(Refused) as caught:
+            store.result(token)
+        assert caught.value.code == "not_yet"
+
+
+def test_percentiles_are_among_finished_people_of_the_scenario(
+    small_study: Study, small_secrets: Secrets, database_url: str
+) -> None:
+    store = Store.open(replace(small_study, participants=9), small_secrets, database_url)
+
+    def finish(person: str, right: int, scenario: str = "drop", **more: Any) -> str:
+        token = walk(store, enter(store, person, scenario=scenario, **more), "test")
+        labels = [stimulus.label for stimulus in _order(store, person, scenario, more)]
+        for trial, label in enumerate(labels):
+            yes = label if trial < right else not label
+            give(store, token, trial, response="yes" if yes else "no")
+        return walk(store, token, "done")
+
+    first = finish("a", 1)
+    assert store.result(first).percentile is None  # percentile_from=2
+    simulated = {"pass": pass_word(small_secrets, "simulated")}
+    finish("s", 4, **simulated)
+    finish("other", 4, "collide")
+    walk(store, enter(store, "unfinished", scenario="drop"), "feedback")
+    assert store.result(first).percentile is None
+    second = finish("b", 3)
+    third = finish("c", 3)
+    found = [store.result(token) for token in (first, second, third)]
+    assert [each.correct for each in found] == [1, 3, 3]
+    # Midranks of 1, 3, 3: half of itself of 3, then 1 below and half of two ties.
+    assert [each.percentile for each in found] == pytest.approx([50 / 3, 200 / 3, 200 / 3])
+    store.close()
+
+
+def _order(store: Store, person: str, scenario: str, more: dict[str, Any]) -> tuple[Any, ...]:
+    from physion.experiment.orders import order_of, own_order_seed
+
+    source = "simulated link" if more else "link"
+    seed = own_order_seed(store.study, scenario, participant_hash(store.secrets, source, person))
+    return order_of(store.study, scenario, seed)["test"]
+
+
+def test_percentile_is_a_midrank() -> None:
+    assert percentile(3, [3]) == 50
+    assert percentile(1, [1, 2, 3, 4]) == 12.5
+    assert percentile(4, [1, 2, 3, 4]) == 87.5
+    assert percentile(2, [2, 2, 2, 2]) == 50
+
+
+def test_loads_are_counted_and_say_where(store: Store) -> None:
+    token = enter(store, "Ada")
+    run(store.state(token, True))
+    (session,) = rows(store, SESSIONS)
+    assert (session.loads, session.loaded_at_phase) == (1, None)
+    walk(store, token, "test")
+    give(store, token, 0)
+    run(store.state(token))
+    run(store.state(token, True))
+    (session,) = rows(store, SESSIONS)
+    assert (session.loads, session.loaded_at_phase, session.loaded_at_trial) == (2, "test", 1)
+    give(store, token, 1)
+    give(store, token, 2)
+    enter(store, "Ada")  # another browser
+    give(store, token, 3)
+    assert [row.resumed for row in rows(store) if row.phase == "test"] == [
+        False, True, False, True,
+    ]  # fmt: skip
+    (event,) = rows(store, EVENTS)
+    assert event.kind == "entered_again"
+
+
+def test_events_are_kept_up_to_a_limit(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("physion.experiment.store.MAX_EVENTS", 7)
+    token = enter(store)
+    some = Events(events=[Event(kind="hidden", at_ms=number) for number in range(5)])
+    assert [run(store.events(token, some)).stored for _ in range(3)] == [5, 2, 0]
+    assert [row.at_ms for row in rows(store, EVENTS)] == [0, 1, 2, 3, 4, 0, 1]
+
+
+@pytest.mark.parametrize(
+    ("value", "said"), [(10**5000, "plain JSON"), ("é" * 4000, "at most")], ids=["number", "text"]
+)
+def test_events_too_large_are_refused(sqlite_store: Store, value: Any, said: str) -> None:
+    token = enter(sqlite_store)
+    events = Events(events=[Event(kind="error", at_ms=0, data={"a": value})])
+    refused = refusal(sqlite_store.events(token, events))
+    assert refused.code == "bad_request" and said in refused.message
+    assert rows(sqlite_store, EVENTS) == []
+
+
+def test_everything_is_there_after_a_restart(
+    small_study: Study, small_secrets: Secrets, database_url: str
+) -> None:
+    store = Store.open(small_study, small_secrets, database_url)
+    token = walk(store, enter(store, "Ada"), "test")
+    give(store, token, 0)
+    listed = store.trials(token, "test")
+    store.close()
+    store = Store.open(small_study, small_secrets, database_url)
+    try:
+        state = run(store.state(token))
+        assert (state.stage, state.trial) == ("test", 1)
+        assert store.trials(token, "test") == listed
+        assert give(store, token, 0).duplicate
+        assert len(rows(store, STUDIES)) == 1
+    finally:
+        store.close()
+
+
+def test_one_store_at_a_time(
+    store: Store, small_study: Study, small_secrets: Secrets, database_url: str
+) -> None:
+    with pytest.raises(PhysionError, match="another"):
+        Store.open(small_study, small_secrets, database_url)
+    assert store.healthy()
+    store.close()
+    again = Store.open(small_study, small_secrets, database_url)
+    assert refusal(store.enter(Enter())).code == "unavailable"
+    again.close()
+
+
+def test_other_stimuli_are_refused_where_sessions_exist(
+    small_study: Study, small_secrets: Secrets, database_url: str
+) -> None:
+    def reopen(study: Study) -> Store:
+        return Store.open(study, small_secrets, database_url)
+
+    other = replace(small_study, stimuli_digest="0" * 64, digest="1" * 64)
+    store = reopen(small_study)
+    preview = enter(store, **{"pass": pass_word(small_secrets, "preview")})
+    store.close()
+    store = reopen(other)  # a preview is nobody's data
+    assert run(store.state(preview)).stage == "withdrawn"
+    enter(store, "Ada")
+    store.close()
+    with pytest.raises(BadInputError, match=r"1 sessions.*new study folder"):
+        reopen(small_study)
+    # Words and settings may change.
+    reworded = replace(other, digest="2" * 64, participants=50)
+    store = reopen(reworded)
+    assert [row.participants for row in map(_settings, rows(store, STUDIES))] == [3, 3, 50]
+    assert all("label" not in repr(row.settings) for row in rows(store, STUDIES))
+    store.close()
+
+
+def _settings(row: Any) -> Any:
+    from types import SimpleNamespace
+
+    return SimpleNamespace(**row.settings)
+
+
+def test_refusals_have_known_codes() -> None:
+    with pytest.raises(AssertionError):
+        Refused("no such code", "")
+    assert {"bad_link", "study_full", "unavailable"} <= set(REFUSALS)
