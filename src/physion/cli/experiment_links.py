@@ -24,16 +24,13 @@ class Options:
 
 def main(options: Options) -> int:
     """Print the links."""
-    from physion.errors import MissingExtraError
+    from physion.cli.experiment import require_extra
 
-    try:
-        from physion.experiment.identity import Secrets
-        from physion.experiment.recruitment import links
-        from physion.experiment.study import load_study
-    except ModuleNotFoundError as error:
-        if (error.name or "").startswith("physion"):
-            raise
-        raise MissingExtraError("physion experiment links", "experiment") from error
+    require_extra()
+    from physion.experiment.identity import Secrets
+    from physion.experiment.recruitment import links
+    from physion.experiment.study import load_study
+
     study = load_study(options.study)
     found = links(study, Secrets.load(options.study), options.base_url)
     if options.json:

@@ -42,14 +42,11 @@ class Options:
 
 def main(options: Options) -> int:
     """Serve; 0 after a stop that was asked for."""
-    from physion.errors import MissingExtraError
+    from physion.cli.experiment import require_extra
 
-    try:
-        from physion.experiment.server import Address, serve
-    except ModuleNotFoundError as error:
-        if (error.name or "").startswith("physion"):
-            raise
-        raise MissingExtraError("physion experiment serve", "experiment") from error
+    require_extra()
+    from physion.experiment.server import Address, serve
+
     address = Address(
         options.host,
         options.port,

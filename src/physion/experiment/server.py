@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ipaddress
 import logging
+import os
 import signal
 import socket
 import ssl
@@ -142,7 +143,8 @@ def _listen(address: Address) -> socket.socket:
         found = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM)[0]
         return socket.create_server(found[4][:2], family=found[0], backlog=2048)
     except (OSError, UnicodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
+        number = error.errno if isinstance(error, OSError) else None
+        reason = os.strerror(number) if number and number > 0 else error
         raise BadInputError(
             f"cannot listen on {address.host} port {address.port}: {reason}; "
             "another --port or --host may be free"
@@ -169,6 +171,9 @@ def _is_loopback(host: str) -> bool:
 
 
 def _as_host(host: str) -> str:
+    """The host as part of an address; for all addresses, the one of this machine itself."""
+    if host in ("", "0.0.0.0", "::"):
+        return "127.0.0.1"
     return f"[{host}]" if ":" in host else host
 
 
