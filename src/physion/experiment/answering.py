@@ -113,7 +113,7 @@ def _store(
         "details": details,
     }
     # A key of another trial is the one thing that can be in the way, and then nothing is written.
-    if connection.execute(insert_new(connection, ANSWERS), values).rowcount == 0:
+    if connection.execute(insert_new(connection, ANSWERS), values).rowcount != 1:
         raise Refused(
             "already_answered", "This key belongs to another trial.", state_of(session, trials)
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import cache
 from typing import Any, cast
 
 from sqlalchemy import Connection, Table, bindparam, select, update
@@ -135,10 +136,15 @@ def mark_loaded(session: Session, trials: Mapping[str, int]) -> dict[str, Any]:
 
 
 def insert_new(connection: Connection, table: Table) -> Any:
-    """An INSERT that leaves out what would break a UNIQUE constraint."""
-    postgres = connection.dialect.name == "postgresql"
-    insert = postgresql.insert if postgres else sqlite.insert
-    return insert(table).on_conflict_do_nothing()
+    """An INSERT that leaves out what would break a UNIQUE constraint; ``rowcount`` tells."""
+    return _insert_new(connection.dialect.name, table)
+
+
+@cache
+def _insert_new(dialect: str, table: Table) -> Any:
+    insert = postgresql.insert if dialect == "postgresql" else sqlite.insert
+    # Without the option an INSERT's count of rows is not to be relied on.
+    return insert(table).on_conflict_do_nothing().execution_options(preserve_rowcount=True)
 
 
 def plain(text: str) -> str:
