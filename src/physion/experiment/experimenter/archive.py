@@ -15,7 +15,7 @@ def export_archive(study: Study, engine: Engine, folder: Path) -> Path:
     from physion.experiment.export import export_study
 
     written = folder / f"{file_name(study)}"
-    export_study(study, engine, written)
+    export_study(engine, study, written)
     packed = folder / "export.zip"
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         for path in sorted(written.rglob("*")):
