@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -19,15 +20,18 @@ import pytest
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 import sqlalchemy as sa
+from postgres import Cluster
 from serving import stored_answers, stored_sessions
+from sqlalchemy.engine import make_url
 from tiny_study import make_tiny_study
 
+from physion.experiment.database import open_database, sqlite_url
 from physion.experiment.identity import Secrets
 from physion.experiment.own_server import OwnServer
 from physion.experiment.simulated import Plan, Visit, simulate
 from physion.experiment.study import Limits, Study
 
-KILLS = 50
+KILLS, POSTGRES_KILLS, DATABASE_CRASHES = 50, 8, 3
 PHASES = {"familiarization": 3, "test": 12}
 FAST = Limits(requests_per_second=10_000, burst=100_000, sessions_per_minute=100_000)
 """Limits that do not slow the load down; they are tested elsewhere."""
@@ -43,7 +47,7 @@ class Load:
         self._url, self._people = url, people
         self._stopping = threading.Event()
         self.waves: list[list[Visit]] = []
-        self._thread = threading.Thread(target=lambda: asyncio.run(self._run()))
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._run()), daemon=True)
         self.error: BaseException | None = None
 
     async def _run(self) -> None:
@@ -55,9 +59,10 @@ class Load:
     async def _come(self, place: int) -> None:
         wave = 0
         while not self._stopping.is_set():
+            # Asked again soon and often, but so that the server still gets the processor.
             plan = Plan(
                 self._url, self._people, seed=1000 * place + wave, dropouts=0.0, pace=0.01,
-                waits_s=(0.02, 0.2), patience_s=90.0, media=False,
+                waits_s=(0.05, 0.4), patience_s=90.0, media=False,
             )  # fmt: skip
             self.waves.append(await simulate(self._study, self._secrets, plan))
             wave += 1
@@ -66,8 +71,10 @@ class Load:
         self._thread.start()
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._stopping.set()
+        if kind is not None:  # there may be no server any more
+            return
         self._thread.join(120)
         assert not self._thread.is_alive(), "the participants did not get to the end"
         if self.error is not None:
@@ -121,13 +128,60 @@ def make_study(folder: Path) -> Study:
 @pytest.mark.slow
 def test_sqlite_loses_nothing_when_the_server_is_killed_fifty_times(tmp_path: Path) -> None:
     study = make_study(tmp_path / "study")
-    with OwnServer(study.folder) as server, Load(study, server.url, people=10) as load:
+    with OwnServer(study.folder) as server, Load(study, server.url, people=5) as load:
         kill_again_and_again(server, KILLS, seed=1)
-    retries = sum(visit.retries for visit in load.visits)
-    assert retries > KILLS, "the kills met no load"
+    assert sum(visit.retries for visit in load.visits) > KILLS, "the kills met no load"
     check(study, load.visits)
-    engine = sa.create_engine(f"sqlite:///{study.folder / 'responses.sqlite'}")
+    engine = open_database(sqlite_url(study.folder), must_exist=True)
     with engine.connect() as connection:
         assert connection.scalar(sa.text("PRAGMA integrity_check")) == "ok"
     engine.dispose()
-    print(f"{len(load.visits)} sessions, {retries} requests sent again")
+
+
+@pytest.mark.slow
+def test_postgresql_loses_nothing_when_the_server_is_killed(
+    tmp_path: Path, fresh_postgres: str
+) -> None:
+    study = make_study(tmp_path / "study")
+    with (
+        OwnServer(study.folder, fresh_postgres) as server,
+        Load(study, server.url, people=5) as load,
+    ):
+        kill_again_and_again(server, POSTGRES_KILLS, seed=2)
+    assert sum(visit.retries for visit in load.visits) > POSTGRES_KILLS
+    check(study, load.visits, fresh_postgres)
+
+
+@pytest.fixture
+def own_postgres(postgres_cluster: Cluster) -> Iterator[str]:
+    """A database on our own cluster, which may be crashed."""
+    server = make_url(postgres_cluster.url).set(drivername="postgresql+psycopg")
+    engine = sa.create_engine(server, isolation_level="AUTOCOMMIT", poolclass=sa.NullPool)
+    with engine.connect() as connection:
+        connection.execute(sa.text("CREATE DATABASE crashed"))
+    yield server.set(database="crashed").render_as_string(hide_password=False)
+    with engine.connect() as connection:
+        connection.execute(sa.text("DROP DATABASE crashed WITH (FORCE)"))
+
+
+@pytest.mark.slow
+def test_the_server_outlives_a_crash_of_postgresql_and_loses_nothing(
+    tmp_path: Path, postgres_cluster: Cluster, own_postgres: str
+) -> None:
+    study = make_study(tmp_path / "study")
+    rng = np.random.default_rng(3)
+    with (
+        OwnServer(study.folder, own_postgres) as server,
+        Load(study, server.url, people=5) as load,
+    ):
+        process = server.pid
+        for _ in range(DATABASE_CRASHES):
+            time.sleep(0.5 + rng.random())
+            postgres_cluster.stop("immediate")
+            time.sleep(rng.random())
+            postgres_cluster.start()
+        time.sleep(1)
+        assert server.pid == process and server.is_running, server.last_words()
+        before = sum(len(visit.answers) for visit in load.visits)
+    assert sum(len(visit.answers) for visit in load.visits) > before, "nobody went on"
+    check(study, load.visits, own_postgres)

@@ -47,6 +47,11 @@ class OwnServer:
         assert self._process is not None, "the server was not started"
         return self._process.pid
 
+    @property
+    def is_running(self) -> bool:
+        """Is the process alive?"""
+        return self._process is not None and self._process.poll() is None
+
     def start(self, patience_s: float = 60.0) -> float:
         """Start, wait until the server answers; returns the seconds that it took.
 
