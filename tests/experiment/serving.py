@@ -1,14 +1,86 @@
-"""Rows of a study's database, read apart from the server and its code."""
+"""Servers that start quickly, to be killed often, and the rows that they leave in the database."""
 
 from __future__ import annotations
 
+import os
+import select
+import signal
+import subprocess
+import sys
 from typing import Any
 
 import sqlalchemy as sa
 
 from physion.experiment.database import open_database, sqlite_url
+from physion.experiment.own_server import OwnServer
 from physion.experiment.study import Study
 from physion.experiment.tables import ANSWERS, SESSIONS
+
+MOTHER = """
+import os, sys
+import alembic.command, tyro
+import physion.cli.experiment_serve, physion.experiment.server
+from physion.cli.main import main
+while os.read(0, 1):
+    child = os.fork()
+    if child == 0:
+        os.dup2(2, 1)
+        os._exit(main(sys.argv[1:]))
+    os.write(1, b"%d\\n" % child)
+    os.write(1, b"%d\\n" % os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+"""Imports all that a server needs, and forks one for each byte that it reads."""
+
+
+class Forked:
+    """A child of the mother process, with what `OwnServer` asks of a process."""
+
+    def __init__(self, mother: subprocess.Popen[bytes]) -> None:
+        self._told, self._code = mother.stdout, None
+        os.write(mother.stdin.fileno(), b"1")
+        self.pid = int(self._told.readline())
+
+    def poll(self, timeout: float = 0.0) -> int | None:
+        if self._code is None and select.select([self._told], [], [], timeout)[0]:
+            self._code = int(self._told.readline())
+        return self._code
+
+    def wait(self, timeout: float = 60.0) -> int:
+        code = self.poll(timeout)
+        if code is None:
+            raise subprocess.TimeoutExpired("forked server", timeout)
+        return code
+
+    def kill(self) -> None:
+        self._signal(signal.SIGKILL)
+
+    def terminate(self) -> None:
+        self._signal(signal.SIGTERM)
+
+    def _signal(self, number: signal.Signals) -> None:
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+
+class QuickServer(OwnServer):
+    """`physion experiment serve` in a process that was forked after all imports."""
+
+    _mother: subprocess.Popen[bytes] | None = None
+
+    def _new_process(self) -> Any:
+        if self._mother is None:
+            words = [sys.executable, "-c", MOTHER, *self._command[3:]]
+            self._mother = subprocess.Popen(
+                words, bufsize=0, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._said
+            )
+        return Forked(self._mother)
+
+    def __exit__(self, *error: Any) -> None:
+        super().__exit__(*error)
+        if self._mother is not None:
+            self._mother.stdin.close()
+            self._mother.wait(10)
+            self._mother.stdout.close()
 
 
 def stored_sessions(study: Study, url: str | None = None) -> dict[str, Any]:

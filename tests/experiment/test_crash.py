@@ -21,13 +21,12 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 import sqlalchemy as sa
 from postgres import Cluster
-from serving import stored_answers, stored_sessions
+from serving import QuickServer, stored_answers, stored_sessions
 from sqlalchemy.engine import make_url
 from tiny_study import make_tiny_study
 
 from physion.experiment.database import open_database, sqlite_url
 from physion.experiment.identity import Secrets
-from physion.experiment.own_server import OwnServer
 from physion.experiment.simulated import Plan, Visit, simulate
 from physion.experiment.study import Limits, Study
 
@@ -86,7 +85,7 @@ class Load:
         return [visit for wave in self.waves for visit in wave]
 
 
-def kill_again_and_again(server: OwnServer, kills: int, seed: int) -> None:
+def kill_again_and_again(server: QuickServer, kills: int, seed: int) -> None:
     """Kill at random moments, most of them in work and some while the server starts."""
     rng = np.random.default_rng(seed)
     for number in range(kills):
@@ -94,7 +93,7 @@ def kill_again_and_again(server: OwnServer, kills: int, seed: int) -> None:
         server.kill()
         if number % 10 == 5:
             server.launch()
-            time.sleep(rng.random() * 1.0)
+            time.sleep(rng.random() * LONGEST_RUN_S)
             server.kill()
         server.start()
 
@@ -128,7 +127,7 @@ def make_study(folder: Path) -> Study:
 @pytest.mark.slow
 def test_sqlite_loses_nothing_when_the_server_is_killed_fifty_times(tmp_path: Path) -> None:
     study = make_study(tmp_path / "study")
-    with OwnServer(study.folder) as server, Load(study, server.url, people=5) as load:
+    with QuickServer(study.folder) as server, Load(study, server.url, people=5) as load:
         kill_again_and_again(server, KILLS, seed=1)
     assert sum(visit.retries for visit in load.visits) > KILLS, "the kills met no load"
     check(study, load.visits)
@@ -144,7 +143,7 @@ def test_postgresql_loses_nothing_when_the_server_is_killed(
 ) -> None:
     study = make_study(tmp_path / "study")
     with (
-        OwnServer(study.folder, fresh_postgres) as server,
+        QuickServer(study.folder, fresh_postgres) as server,
         Load(study, server.url, people=5) as load,
     ):
         kill_again_and_again(server, POSTGRES_KILLS, seed=2)
@@ -171,7 +170,7 @@ def test_the_server_outlives_a_crash_of_postgresql_and_loses_nothing(
     study = make_study(tmp_path / "study")
     rng = np.random.default_rng(3)
     with (
-        OwnServer(study.folder, own_postgres) as server,
+        QuickServer(study.folder, own_postgres) as server,
         Load(study, server.url, people=5) as load,
     ):
         process = server.pid

@@ -75,7 +75,10 @@ class OwnServer:
 
     def launch(self) -> None:
         """Start the process and wait for nothing."""
-        self._process = subprocess.Popen(
+        self._process = self._new_process()
+
+    def _new_process(self) -> subprocess.Popen[bytes]:
+        return subprocess.Popen(
             self._command, stdin=subprocess.DEVNULL, stdout=self._said, stderr=self._said
         )
 
