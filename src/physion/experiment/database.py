@@ -139,7 +139,15 @@ def one_server(engine: Engine) -> Iterator[None]:
         yield
         return
     assert engine.url.database is not None
-    with folder_lock(Path(engine.url.database).resolve().parent):
+    folder = Path(engine.url.database).resolve().parent
+    with contextlib.ExitStack() as held:
+        try:
+            held.enter_context(folder_lock(folder))
+        except PhysionError as error:
+            raise PhysionError(
+                f"another process writes into {folder}: stop the server that serves this study "
+                "first, or wait for what else is at work there"
+            ) from error
         yield
 
 
