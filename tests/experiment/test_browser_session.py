@@ -13,7 +13,7 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 from browser import Visit, chromium, rows_of, served
 
-from physion.experiment.study import Study
+from physion.experiment.study import Study, Timing
 
 __all__ = ["chromium"]
 pytestmark = pytest.mark.slow
@@ -39,7 +39,7 @@ def test_a_whole_session_by_mouse(chromium: Any, site: tuple[Study, str]) -> Non
             visit.picture("instructions")
             visit.main_button().click()
         told = []
-        for trial in range(2):
+        for _ in range(2):
             visit.page.locator(".fixation").wait_for()
             visit.picture("fixation")
             visit.page.locator(".screen-map:visible").wait_for()
@@ -49,7 +49,7 @@ def test_a_whole_session_by_mouse(chromium: Any, site: tuple[Study, str]) -> Non
             visit.picture("feedback")
             told.append(visit.see_feedback())
         # Labels of the tiny study alternate, the first with contact.
-        assert told == ["✓ Correct!", "✗ Not correct."] or told == ["Correct!", "Not correct."]
+        assert told == ["Correct!", "Not correct."]
         visit.picture("ready")
         visit.begin_test()
         for trial, response in enumerate(("yes", "no", "yes")):
@@ -135,9 +135,7 @@ def test_a_whole_session_by_keyboard_in_german(chromium: Any, site: tuple[Study,
 
 
 def test_timing_of_the_paper(chromium: Any, tmp_path: Path) -> None:
-    """Fixation, two seconds of flashing at 2 Hz, 45 frames and no later one, read off the pixels."""
-    from physion.experiment.study import Timing
-
+    """Fixation, 2 s of flashing at 2 Hz, 45 frames and no later one, read off the pixels."""
     with (
         served(tmp_path, test=4, familiarization=1, timing=Timing()) as (study, server),
         Visit(chromium, server.url) as visit,

@@ -61,8 +61,7 @@ export class Frame {
   languageChooser() {
     const { languages } = this.study;
     if (languages.length < 2) return el("span");
-    const names = { en: "English", de: "Deutsch" };
-    const name = (tag) => names[tag] ?? new Intl.DisplayNames([tag], { type: "language" }).of(tag);
+    const name = (tag) => new Intl.DisplayNames([tag], { type: "language" }).of(tag);
     const options = languages.map((tag) =>
       el("option", { value: tag, lang: tag, selected: tag === this.texts.language }, name(tag)),
     );
