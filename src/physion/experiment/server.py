@@ -22,6 +22,7 @@ from physion.errors import BadInputError
 from physion.experiment.app import build_app
 from physion.experiment.connections import CarefulProtocol
 from physion.experiment.identity import Secrets
+from physion.experiment.media_checks import check_media
 from physion.experiment.store import Store
 from physion.experiment.study import load_study
 
@@ -69,6 +70,7 @@ def serve(
     _check(address)
     _set_logging(log_requests)
     study = load_study(folder)
+    check_media(study)
     secrets = Secrets.load(folder)
     _allow_many_connections()
     with contextlib.closing(_listen(address)) as listening:
