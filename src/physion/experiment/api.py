@@ -89,6 +89,12 @@ def build_api(study: Study, secrets: Secrets, store: Store) -> APIRouter:
         for language, words in study.texts.items()
     }
 
+    # First, since routes are tried in order, and this one is asked for most.
+    @router.post("/answers")
+    async def post_answer(request: Request) -> Response:
+        answer = await read_message(request, Answer)
+        return Reply(await store.answer(token_of(request), answer))
+
     @router.get("/study")
     async def get_study(request: Request) -> Response:
         return Response(about, media_type="application/json")
@@ -124,11 +130,6 @@ def build_api(study: Study, secrets: Secrets, store: Store) -> APIRouter:
     async def post_page(request: Request) -> Response:
         page = await read_message(request, PageDone)
         return Reply(await store.page(token_of(request), page))
-
-    @router.post("/answers")
-    async def post_answer(request: Request) -> Response:
-        answer = await read_message(request, Answer)
-        return Reply(await store.answer(token_of(request), answer))
 
     @router.post("/events")
     async def post_events(request: Request) -> Response:

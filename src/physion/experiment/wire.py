@@ -27,10 +27,9 @@ Refusals are `Refusal` bodies with a status of 4xx; see `REFUSALS`.
 
 from __future__ import annotations
 
-import json
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 Phase = Literal["familiarization", "test"]
 Stage = Literal[
@@ -70,7 +69,6 @@ REFUSALS = {
 ``wrong_stage`` carry the state, from which the client goes on."""
 
 MAX_BODY = 64 * 1024
-MAX_DETAILS = 16 * 1024
 DAY_MS = 86_400_000.0
 Name = Annotated[str, StringConstraints(min_length=1, max_length=200)]
 RawId = Annotated[str, StringConstraints(min_length=1, max_length=200, strip_whitespace=True)]
@@ -79,12 +77,6 @@ Text = Annotated[str, StringConstraints(max_length=5000)]
 Milliseconds = Annotated[float, Field(ge=0, le=DAY_MS, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=0, le=1_000_000)]
 Pixels = Annotated[int, Field(ge=0, le=100_000)]
-
-
-def _small(details: dict[str, Any]) -> dict[str, Any]:
-    if len(json.dumps(details, ensure_ascii=False).encode("utf-8", "replace")) > MAX_DETAILS:
-        raise ValueError(f"more than {MAX_DETAILS} bytes of JSON")
-    return details
 
 
 class Message(BaseModel):
@@ -194,7 +186,7 @@ class Answer(Message):
     visibility_changes: Count | None = None
     window_width: Pixels | None = None
     window_height: Pixels | None = None
-    details: Annotated[dict[Name, Any], Field(max_length=30), AfterValidator(_small)] = {}
+    details: Annotated[dict[Name, Any], Field(max_length=30)] = {}
     """Moments of cue changes and frames, and what else there is; at most 16 KiB as JSON."""
 
 
