@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import html
+import io
 import os
 import re
 import signal
+import tempfile
 import time
+import zipfile
 from collections import Counter
 from collections.abc import Iterator
 from multiprocessing import active_children
 from pathlib import Path
 
+import pandas as pd
 import pytest
 import sqlalchemy as sa
 
@@ -23,6 +27,7 @@ from experimenter_rows import insert_sessions
 from physion.analysis.exclusions import PREREGISTERED, RULES, flag_sessions
 from physion.analysis.participants import clean
 from physion.experiment.answer_tables import read_tables
+from physion.experiment.export import export_study
 from physion.experiment.tables import ANSWERS, EVENTS, RAW_IDS, SESSIONS
 
 HOSTILE = (
@@ -264,6 +269,15 @@ def test_pages_of_one_hostile_session(tmp_path: Path, database_url: str) -> None
 # --- flags, deleting, the process that counts ----------------------------------------------------
 
 
+def with_flags(visitor: Visitor) -> str:
+    """The overview once flags are worked out, which it does not wait for."""
+    until = time.monotonic() + 60
+    while "being worked out" in (text := visitor.see().text):
+        assert time.monotonic() < until
+        time.sleep(0.2)
+    return str(text)
+
+
 def test_flags_are_those_of_the_analysis(busy: tuple[Lab, Visitor]) -> None:
     found, visitor = busy
     trials, sessions = read_tables(found.store.engine, found.study, kinds=("person",))
@@ -273,7 +287,7 @@ def test_flags_are_those_of_the_analysis(busy: tuple[Lab, Visitor]) -> None:
     finished = {row.session: row for row in rows_of(found) if row.finished_at}
     table = table[table["session"].isin(finished)]
     assert table["flagged"].any(), "else this shows nothing"
-    text = visitor.see().text
+    text = with_flags(visitor)
     counts = {line[0]: line[1:] for line in table_after(text, "Exclusion rules")[1:]}
     for rule in RULES:
         own = [int(table.loc[table["scenario"] == name, rule].sum()) for name in TWO]
@@ -324,3 +338,36 @@ def test_the_process_that_counts_may_die(tmp_path: Path) -> None:
         (second,) = counting() - others
         assert second != first
     assert counting() == others, "it ends with the server"
+
+
+# --- export --------------------------------------------------------------------------------------
+
+
+def test_the_export_is_that_of_the_command(
+    busy: tuple[Lab, Visitor], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found, visitor = busy
+    workplace = tmp_path / "workplace"
+    workplace.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(workplace))
+    token = visitor.token("/export")
+    answer = visitor.submit("/export", token, simulated="yes")
+    assert answer.status_code == 200 and answer.headers["content-type"] == "application/zip"
+    assert re.fullmatch(
+        r'attachment; filename="tiny-1-\d{4}-\d\d-\d\d\.zip"', answer.headers["content-disposition"]
+    )
+    packed = zipfile.ZipFile(io.BytesIO(answer.content))
+    export_study(found.store.engine, found.study, tmp_path / "tiny-1")
+    written = {
+        path.relative_to(tmp_path).as_posix(): path.read_bytes()
+        for path in tmp_path.rglob("*")
+        if path.is_file()
+    }
+    assert {name: packed.read(name) for name in packed.namelist()} == written
+    table = pd.read_csv(io.BytesIO(written["tiny-1/sessions.csv"]))
+    assert set(table["simulated"]) == {True, False}
+    people = visitor.submit("/export", token).content
+    content = zipfile.ZipFile(io.BytesIO(people)).read("tiny-1/sessions.csv")
+    table = pd.read_csv(io.BytesIO(content))
+    assert set(table["simulated"]) == {False}
+    assert not list(workplace.iterdir()), "nothing stays behind"

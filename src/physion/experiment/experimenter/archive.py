@@ -10,12 +10,15 @@ from sqlalchemy import Engine
 from physion.experiment.study import Study
 
 
-def export_archive(study: Study, engine: Engine, folder: Path) -> Path:
-    """Exports into a new folder below ``folder``, which must be private, and packs it."""
+def export_archive(study: Study, engine: Engine, folder: Path, simulated: bool) -> Path:
+    """Exports into a new folder below ``folder``, which must be private, and packs it.
+
+    ``simulated``: with simulated participants, who are marked as such.
+    """
     from physion.experiment.export import export_study
 
-    written = folder / f"{file_name(study)}"
-    export_study(engine, study, written)
+    written = folder / file_name(study)
+    export_study(engine, study, written, simulated=simulated)
     packed = folder / "export.zip"
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         for path in sorted(written.rglob("*")):

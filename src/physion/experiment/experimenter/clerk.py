@@ -57,16 +57,18 @@ class Clerk:
     def session(self, session: str) -> SessionPage | None:
         """All about one session; None where there is none of that name."""
         summaries = self._look()
+        if not any(summary.facts["session"] == session for summary in summaries):
+            summaries = self._look(fresh=0.0)  # it may have begun just now
         kinds = {str(s.facts["session"]): str(s.facts["kind"]) for s in summaries}
         flags = self._flags(kinds.get(session, ""))
         return read_session(self._study, self._engine, summaries, flags, session)
 
-    def export(self, folder: Path) -> Path:
+    def export(self, folder: Path, simulated: bool) -> Path:
         """Writes the export into ``folder`` and gives its zip file."""
-        return export_archive(self._study, self._engine, folder)
+        return export_archive(self._study, self._engine, folder, simulated)
 
-    def _look(self) -> list[Summary]:
-        if time.monotonic() - self._read_at > FRESH:
+    def _look(self, fresh: float = FRESH) -> list[Summary]:
+        if time.monotonic() - self._read_at > fresh:
             self._read = self._summaries.refresh(time.time())
             self._read_at = time.monotonic()
         return self._read

@@ -25,7 +25,7 @@ from physion.experiment.experimenter.gate import HEADERS, Gate, drop_cookie, set
 from physion.experiment.experimenter.login import PATH
 from physion.experiment.experimenter.pages import make_environment
 from physion.experiment.experimenter.payments import read_payments
-from physion.experiment.experimenter.session_list import KINDS, Choice
+from physion.experiment.experimenter.session_list import KINDS, Choice, page_number
 from physion.experiment.experimenter.summaries import ACTIVE_WITHIN, STATES
 from physion.experiment.identity import Secrets, check_password
 from physion.experiment.page_files import read_page_files
@@ -239,12 +239,11 @@ class _Pages:
 
     async def _payments(self, request: Request, said: str = "", status: int = 200) -> Response:
         query = request.query_params
-        page = query.get("page", "1")
         source = query.get("source", "")[:20]
         finished = query.get("who", "finished") != "all"
         found = await run_in_threadpool(
             read_payments, self._study, self._secrets, self._store.engine, source=source,
-            finished=finished, page=int(page) if page.isascii() and page.isdigit() else 1,
+            finished=finished, page=page_number(query.get("page", "")),
         )  # fmt: skip
         return self._show(
             request, "payments.html", status, here="payments", payments=found, source=source,
@@ -269,27 +268,38 @@ class _Pages:
     async def export(self, request: Request) -> Response:
         if self._gate.login(request) is None:
             return _go("/login")
-        if await self._gate.form(request) is None:
+        fields = await self._gate.form(request)
+        if fields is None:
             return self._export_refused(request, WRONG_FORM, 403)
         if self._exporting:
             return self._export_refused(request, "An export is being made already.", 409)
+        folder = Path(tempfile.mkdtemp(prefix="physion-export-"))
         self._exporting = True
-        folder = Path(await run_in_threadpool(tempfile.mkdtemp, prefix="physion-export-"))
-        clerk = Desk(self._study, self._url, EXPORT_PATIENCE)
         try:
-            packed = await clerk.ask("export", folder=folder)
+            packed = await self._pack(folder, fields.get("simulated") == "yes")
         except PhysionError as error:
             await run_in_threadpool(shutil.rmtree, folder, ignore_errors=True)
             return self._export_refused(request, str(error), 409)
+        except BaseException:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
         finally:
             self._exporting = False
-            await run_in_threadpool(clerk.close)
         day = time.strftime("%Y-%m-%d", time.gmtime())
         return FileResponse(
             packed, media_type="application/zip", headers=dict(HEADERS),
             filename=f"{file_name(self._study)}-{day}.zip",
             background=BackgroundTask(shutil.rmtree, folder, ignore_errors=True),
         )  # fmt: skip
+
+    async def _pack(self, folder: Path, simulated: bool) -> Path:
+        """The export as a zip file, made by a process of its own."""
+        clerk = Desk(self._study, self._url, EXPORT_PATIENCE)
+        try:
+            packed: Path = await clerk.ask("export", folder=folder, simulated=simulated)
+        finally:
+            await run_in_threadpool(clerk.close)
+        return packed
 
     def _export_refused(self, request: Request, problem: str, status: int) -> Response:
         return self._show(request, "export.html", status, here="export", problem=problem)

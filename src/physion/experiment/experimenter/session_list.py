@@ -42,7 +42,6 @@ class Choice:
             given = query.get(name, default)
             return given if given in known else default
 
-        page = query.get("page", "1")
         return cls(
             kind=one_of("kind", list(KINDS), "person"),
             scenario=one_of("scenario", scenarios, ""),
@@ -50,7 +49,7 @@ class Choice:
             flag=query.get("flag", "")[:40],
             sort=one_of("sort", SORTS, "started"),
             down=query.get("down", "1") != "0",
-            page=int(page) if page.isascii() and page.isdigit() and len(page) < 7 else 1,
+            page=page_number(query.get("page", "")),
         )
 
     def link(self, **changes: Any) -> str:
@@ -68,6 +67,11 @@ class Choice:
         """Sorts by ``column``, or the other way round where it is sorted by it already."""
         down = not self.down if column == self.sort else column in ("started", "flags", "frames")
         return self.link(sort=column, down=down, page=1)
+
+
+def page_number(given: str) -> int:
+    """The number of a page in an address; 1 where it is none."""
+    return int(given) if given.isascii() and given.isdigit() and len(given) < 7 else 1
 
 
 @dataclass(frozen=True)
