@@ -56,9 +56,13 @@ async function loop({ api, study }, media, place, signal) {
     for (;;) {
       const screen = new Screen(media, signal);
       place.replaceChildren(screen.element);
-      await screen.load({ movie, map });
-      await screen.flash({ ms: study.cue_ms, hz: study.flash_hz });
-      await screen.play({ hide: true });
+      try {
+        await screen.load({ movie, map });
+        await screen.flash({ ms: study.cue_ms, hz: study.flash_hz });
+        await screen.play({ hide: true });
+      } finally {
+        screen.release();
+      }
       await sleep(REST_MS);
       signal.throwIfAborted();
     }

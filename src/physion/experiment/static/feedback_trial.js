@@ -64,17 +64,15 @@ export class FeedbackTrial {
     } finally {
       URL.revokeObjectURL(address);
     }
+    const frames_shown = screen.record().shown;
     next.disabled = false;
     next.focus();
     await new Promise((resolve, reject) => {
       next.addEventListener("click", resolve);
       signal.addEventListener("abort", () => reject(signal.reason));
     });
-    return {
-      correct: feedback.correct,
-      contact: feedback.contact,
-      frames_shown: screen.record().shown,
-    };
+    screen.release();
+    return { correct: feedback.correct, contact: feedback.contact, frames_shown };
   }
 }
 

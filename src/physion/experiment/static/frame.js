@@ -44,6 +44,9 @@ export class Frame {
       tools.push(stop);
     }
     byId("tools").replaceChildren(...tools);
+    const title = [this.study.title];
+    if (state.kind === "preview") title.push(this.texts.t("common.preview"));
+    byId("title").textContent = title.join(" · ");
   }
 
   /** The trial that begins. @param {"familiarization"|"test"} phase @param {number} trial */

@@ -49,7 +49,8 @@ async function takePart(basis, arrival) {
   await queue.empty();
   try {
     const state = await enter(basis, arrival);
-    if (state.stage !== "consent") await speak(basis, state.language);
+    const asked = arrival.language ?? recall("language");
+    if (state.stage !== "consent" || !asked) await speak(basis, state.language);
     session = new Session(basis, queue);
     frame.onStop = () => session.askToStop();
     frame.onLanguage = (language) => changeLanguage(basis, session, language);

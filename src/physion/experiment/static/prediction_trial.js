@@ -10,6 +10,8 @@ import { MovieFailed, Screen, round } from "./screen.js";
 const { ParameterType } = window.jsPsychModule;
 const ATTEMPTS = 3;
 const DAY_MS = 86_400_000;
+/** Moments that are kept of each kind, so that an answer stays short. */
+const MOST_NOTED = 100;
 
 const info = {
   name: "physion-prediction",
@@ -100,6 +102,15 @@ async function show(display, trial, signal, visibility, on_load) {
     ),
   );
   on_load();
+  try {
+    return await run(screen, cross, buttons, trial, signal, visibility);
+  } finally {
+    screen.release();
+  }
+}
+
+/** What happens on the screen, in its order. */
+async function run(screen, cross, buttons, trial, signal, visibility) {
   const start = await nextFrame();
   const loaded = trial.load(trial.attempt).then((addresses) => screen.load(addresses));
   await Promise.all([loaded, reach(start + trial.fixation_ms, signal)]);
@@ -125,11 +136,11 @@ async function show(display, trial, signal, visibility, on_load) {
     details: {
       attempts: trial.attempt,
       flashes: cue.changes,
-      frames: frames.seen.map(([at, frame, count]) => [since(at), frame, count]),
+      frames: frames.seen.slice(-MOST_NOTED).map(([at, frame, count]) => [since(at), frame, count]),
       play_ms: movie.startMs,
       ended_ms: since(movie.ended),
       enabled_ms: since(answer.enabled),
-      visibility: visibility.changes.map(([at, state]) => [since(at), state]),
+      visibility: visibility.changes.slice(-MOST_NOTED).map(([at, state]) => [since(at), state]),
       shown_width: Math.round(screen.element.clientWidth),
       shown_height: Math.round(screen.element.clientHeight),
     },

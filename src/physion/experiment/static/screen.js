@@ -7,6 +7,7 @@
 import { el, nextFrame, sleep } from "./dom.js";
 
 const STALLED_MS = 3_000;
+const LOADED_MS = 10_000;
 const FIRST_FRAME_MS = 1_000;
 
 /** The movie could not be shown. `reason`: load, play, stalled. */
@@ -78,8 +79,9 @@ export class Screen {
     const loaded = new Promise((resolve, reject) => {
       this.video.onloadeddata = resolve;
       this.video.onerror = () => reject(new MovieFailed("load", this.video.error?.message));
-      setTimeout(() => reject(new MovieFailed("load", "timeout")), 10_000);
+      setTimeout(() => reject(new MovieFailed("load", "timeout")), LOADED_MS);
     });
+    loaded.catch(() => {}); // the map may fail first
     const painted = new Promise((resolve) => this.#watch(resolve));
     this.video.src = movie;
     if (map) {
@@ -148,7 +150,8 @@ export class Screen {
   /**
    * Play the loaded movie from its first frame to its end, and hide it in that moment if asked to.
    * @param {{hide: boolean}} options
-   * @returns {Promise<{ms: number, ended: number}>} How long it took, and the moment of the end.
+   * @returns {Promise<{ms: number, startMs: number, ended: number}>} How long it took from its
+   *   start, and to its start; the moment of its end.
    */
   async play({ hide }) {
     const video = this.video;
@@ -195,6 +198,13 @@ export class Screen {
       time = this.video.currentTime;
       if (now - moved > STALLED_MS) failed(new MovieFailed("stalled", `at ${time} s`));
     }, 250);
+  }
+
+  /** Give the decoder back: browsers allow only so many movies at a time. */
+  release() {
+    this.video.onerror = null;
+    this.video.removeAttribute("src");
+    this.video.load();
   }
 
   /**

@@ -211,14 +211,18 @@ export class Session {
     signal.throwIfAborted();
     const main = this.basis.frame.main;
     main.replaceChildren();
-    const jsPsych = window.initJsPsych({ display_element: main, use_webaudio: false });
+    const jsPsych = window.initJsPsych({
+      display_element: main,
+      use_webaudio: false,
+      // jsPsych makes its place a stop of the Tab key, at which there is nothing to do.
+      on_trial_start: () => (main.tabIndex = -1),
+    });
     const abort = () => jsPsych.abortExperiment();
     signal.addEventListener("abort", abort);
     try {
       await jsPsych.run([{ timeline: pieces, signal: () => signal }]);
     } finally {
       signal.removeEventListener("abort", abort);
-      main.tabIndex = -1;
     }
     signal.throwIfAborted();
     return jsPsych.data.get().values();
