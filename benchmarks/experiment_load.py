@@ -72,7 +72,8 @@ class Tally:
     """What is no error: connections that the server closed while idle."""
     fetched: int = 0
     fetched_bytes: int = 0
-    reloads: int = 0
+    reload_seconds: list[float] = field(default_factory=list)
+    """Of the experimenter's overview."""
 
     @property
     def failures(self) -> int:
@@ -213,9 +214,9 @@ async def experimenter(port: int, until: float, tally: Tally) -> None:
         await log_in(browser)
         while time.perf_counter() < until:
             page = await browser.get("/experimenter")
-            if page.status_code != 200:
+            if page.status_code != 200 or "/logout" not in page.text:
                 tally.errors[f"overview: {page.status_code}"] += 1
-            tally.reloads += 1
+            tally.reload_seconds.append(page.elapsed.total_seconds())
             await asyncio.sleep(2)
 
 
@@ -224,7 +225,7 @@ async def log_in(browser: Any) -> None:
     page = (await browser.get("/experimenter")).text
     form = dict(re.findall(r'<input[^>]*type="hidden"[^>]*name="(\w+)"[^>]*value="([^"]*)"', page))
     answer = await browser.post("/experimenter/login", data={**form, "password": PASSWORD})
-    if answer.status_code != 200 or 'type="password"' in answer.text:
+    if answer.status_code != 200 or "/logout" not in answer.text:
         raise ValueError(f"login: {answer.status_code}")
 
 
@@ -355,10 +356,11 @@ def report(rows: list[Row], options: argparse.Namespace) -> str:
         seen = {**row.tally.errors, **row.tally.notes}
         lines += [f"- {row.name}: {count} times {what}" for what, count in sorted(seen.items())]
         if row.tally.fetched:
+            reloads = row.tally.reload_seconds
             lines.append(
                 f"- {row.name}: {row.tally.fetched:,} files fetched "
-                f"({row.tally.fetched_bytes / 1e6:.0f} MB), {row.tally.reloads} reloads of the "
-                "overview"
+                f"({row.tally.fetched_bytes / 1e6:.0f} MB); {len(reloads)} reloads of the overview, "
+                f"slowest {max(reloads, default=0):.2f} s"
             )
     return "\n".join(lines) + "\n"
 
