@@ -19,6 +19,7 @@ from physion.analysis.exclusions import flag_sessions
 from physion.analysis.participants import read_responses
 from physion.analysis.response_schema import check_table
 from physion.cli import experiment_export
+from physion.cli.main import main
 from physion.errors import BadInputError, PhysionError
 from physion.experiment import export
 from physion.experiment.answer_tables import read_tables
@@ -365,6 +366,42 @@ def test_others_on_the_machine_cannot_read_it(
 ) -> None:
     out = export_study(small, study, tmp_path / "out").out
     assert out.stat().st_mode & 0o077 == 0
+
+
+@pytest.mark.slow
+def test_physion_compare_takes_the_export(
+    study: Study, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    engine = open_database(f"sqlite:///{tmp_path / 'people.sqlite'}")
+    upgrade(engine)
+    insert_sessions(engine, study, Secrets.load(study.folder), 24, ends=("finished",), now=NOW,
+                    feedback=NASTY)  # fmt: skip
+    insert_sessions(engine, study, Secrets.load(study.folder), 4, kind="simulated", seed=1)
+    out = export_study(engine, study, tmp_path / "out").out
+    rows = [
+        {
+            "Model": "guesser", "Readout Type": "C", "Readout Test Data": stimulus.scenario,
+            "Predicted Prob_true": 0.3 + 0.05 * (place % 10), "Predicted Outcome": place % 10 > 4,
+            "Actual Outcome": stimulus.label, "Stimulus Name": stimulus.stimulus,
+            "Dynamics Training Dataset": "all",
+        }
+        for place, stimulus in enumerate(study.stimuli)
+        if stimulus.phase == "test"
+    ]  # fmt: skip
+    pd.DataFrame(rows).to_csv(tmp_path / "predictions.csv", index=False)
+    words = ["compare", str(tmp_path / "predictions.csv"), "--responses", str(out / "trials.csv"),
+             "--sessions", str(out / "sessions.csv"), "--expected", str(out / "expected.csv"),
+             "--resamples", "50", "--out", str(tmp_path / "report"), "--json"]  # fmt: skip
+    assert main(words) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert Path(said["report"]).is_file()
+    assert [(row["scenario"], row["people"], row["stimuli"]) for row in said["people"]] == [
+        ("collide", 12, 6), ("drop", 12, 6)
+    ]  # fmt: skip
+    left_out = {row["reason"]: row["sessions"] for row in said["people_left_out"]}
+    assert left_out == {"session of a simulated participant": 2}
+    incomplete = [r for r in said["people_flag_counts"] if r["rule"] == "incomplete"]
+    assert [row["sessions"] for row in incomplete] == [0, 0]
 
 
 # --- the verb -----------------------------------------------------------------------------------
