@@ -359,8 +359,8 @@ def report(rows: list[Row], options: argparse.Namespace) -> str:
             reloads = row.tally.reload_seconds
             lines.append(
                 f"- {row.name}: {row.tally.fetched:,} files fetched "
-                f"({row.tally.fetched_bytes / 1e6:.0f} MB); {len(reloads)} reloads of the overview, "
-                f"slowest {max(reloads, default=0):.2f} s"
+                f"({row.tally.fetched_bytes / 1e6:.0f} MB); {len(reloads)} reloads of the "
+                f"overview, slowest {max(reloads, default=0):.2f} s"
             )
     return "\n".join(lines) + "\n"
 
