@@ -7,13 +7,11 @@ import contextlib
 import json
 import time
 from collections.abc import Callable
-from dataclasses import asdict
 from typing import Any, TypeVar
 
-from sqlalchemy import Connection, Engine, func, insert, select, text, update
+from sqlalchemy import Connection, Engine, func, insert, select, text
 from sqlalchemy.exc import OperationalError
 
-from physion.errors import BadInputError
 from physion.experiment.answering import store_answer, write_details
 from physion.experiment.database import (
     connect_writer,
@@ -33,7 +31,6 @@ from physion.experiment.sessions import (
     Session,
     Trials,
     change_session,
-    insert_new,
     mark_loaded,
     plain_values,
     read_session,
@@ -41,7 +38,8 @@ from physion.experiment.sessions import (
     state_of,
 )
 from physion.experiment.study import Study
-from physion.experiment.tables import EVENTS, RAW_IDS, SESSIONS, STUDIES
+from physion.experiment.study_record import register
+from physion.experiment.tables import EVENTS, RAW_IDS, SESSIONS
 from physion.experiment.wire import (
     Answer,
     AnswerStored,
@@ -92,7 +90,7 @@ class Store:
             upgrade(engine)
             writer = Writer(lambda: connect_writer(engine))
             held.callback(writer.close)
-            writer.submit(lambda connection: _register(connection, study, time.time())).result()
+            writer.submit(lambda connection: register(connection, study, time.time())).result()
             store = cls(study, secrets, engine, writer)
             store._held = held.pop_all()
         return store
@@ -267,47 +265,3 @@ def _event_data(data: dict[str, Any], index: int) -> dict[str, Any]:
     if size > MAX_EVENT:
         raise Refused("bad_request", f"events.{index}.data: at most {MAX_EVENT} characters")
     return plain_values(data)
-
-
-def _register(connection: Connection, study: Study, now: float) -> None:
-    """Note the state of the study folder; refuse stimuli that sessions were not made with."""
-    other = (
-        select(SESSIONS.c.session)
-        .join(STUDIES, STUDIES.c.digest == SESSIONS.c.study)
-        .where(STUDIES.c.stimuli_digest != study.stimuli_digest)
-    )
-    counted = other.where(SESSIONS.c.kind != "preview")
-    count = connection.scalar(select(func.count()).select_from(counted.subquery()))
-    if count:
-        raise BadInputError(
-            f"{count} sessions were made with another stimuli.csv or other media; their orders of "
-            "trials would change. Bring the old stimuli back, or make a new study folder (or give "
-            "another database) for the new ones"
-        )
-    # Previews are nobody's data: those of other stimuli simply end.
-    ended = SESSIONS.c.session.in_(other) & SESSIONS.c.finished_at.is_(None)
-    connection.execute(
-        update(SESSIONS).where(ended & SESSIONS.c.withdrawn_at.is_(None)).values(withdrawn_at=now)
-    )
-    connection.execute(
-        insert_new(connection, STUDIES),
-        {
-            "digest": study.digest,
-            "name": study.name,
-            "version": study.version,
-            "stimuli_digest": study.stimuli_digest,
-            "settings": _settings(study),
-            "first_served": now,
-        },
-    )
-
-
-def _settings(study: Study) -> dict[str, Any]:
-    """All that the study decides and says, without stimuli: labels stay in the folder."""
-    left_out = {"folder", "stimuli"}
-    shallow = {name: value for name, value in vars(study).items() if name not in left_out}
-    return json.loads(json.dumps(shallow, default=_plain))  # type: ignore[no-any-return]
-
-
-def _plain(value: Any) -> Any:
-    return dict(value) if hasattr(value, "items") else asdict(value)
