@@ -294,7 +294,8 @@ def measure(name: str, options: argparse.Namespace, folder: Path) -> Row:
         words += ["-m", "cProfile", "-o", str(options.profile)]
     word = pass_word(Secrets.load(study.folder), "simulated")
     with new_database(options.postgres) as database:
-        with OwnServer(study.folder, database, (*words, "-m", "physion.cli.main")) as server:
+        command = (*words, "-m", "physion.cli.main")
+        with OwnServer(study.folder, database, command=command) as server:
             row = uvloop.run(play(name, server, word, options))
         row.wrong = check(study, database, row.tally)
     return row

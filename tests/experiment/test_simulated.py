@@ -151,7 +151,7 @@ def test_another_study_s_server_refuses_the_pilot_link(
 @pytest.mark.parametrize(
     ("words", "told"),
     [(["--participants", "0"], "--participants"), (["--dropouts", "1.5"], "--dropouts"),
-     (["--pace", "-1"], "--pace")],
+     (["--pace", "-1"], "--pace"), (["--url", "x", "--database", "y"], "--database")],
 )  # fmt: skip
 def test_bad_options_are_refused(
     study: Study, words: list[str], told: str, capsys: pytest.CaptureFixture[str]

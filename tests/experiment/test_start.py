@@ -4,10 +4,17 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
+pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
+
+import httpx2
+from tiny_study import make_tiny_study
+
 from physion.analysis.exclusions import RULE_SETS
+from physion.experiment.own_server import OwnServer
 from physion.experiment.study_checks import EXCLUSIONS
 
 SLOW_TO_IMPORT = (
@@ -16,7 +23,6 @@ SLOW_TO_IMPORT = (
     "sklearn",
     "statsmodels",
     "matplotlib",
-    "av",
     "numba",
     "mujoco",
 )
@@ -27,8 +33,19 @@ def test_rules_are_those_of_the_analysis() -> None:
 
 
 def test_serving_imports_nothing_slow() -> None:
-    pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
     found = f"[name for name in {SLOW_TO_IMPORT} if name in sys.modules]"
     code = f"import sys, physion.experiment.server; print({found})"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_requests_are_logged_without_what_tells_who_comes(tmp_path: Path) -> None:
+    folder = make_tiny_study(tmp_path / "study", test=2, familiarization=1).folder
+    with OwnServer(folder, options=["--log-requests"]) as server:
+        asked = httpx2.get(f"{server.url}/?PROLIFIC_PID=SECRET", trust_env=False)
+        httpx2.get(f"{server.url}/no%0Asuch", trust_env=False)
+        lines = server.last_words().splitlines()
+    assert asked.status_code == 200
+    assert any(line.endswith("GET '/' 200") for line in lines)
+    assert any(line.endswith(r"GET '/no\nsuch' 404") for line in lines)
+    assert not [line for line in lines if "SECRET" in line]

@@ -37,6 +37,8 @@ class Options:
     """One scenario; all of the study if not given."""
     url: str | None = None
     """A running server, such as http://127.0.0.1:8000; if not given, one is started and stopped."""
+    database: str | None = None
+    """URL of a PostgreSQL database for the server that is started."""
     pace: float = 0.0
     """Seconds before each answer; people take about 6."""
     seed: int = 0
@@ -93,6 +95,8 @@ def _check(options: Options) -> None:
 
     if options.participants < 1 or options.at_once < 1:
         raise BadInputError("--participants and --at-once must be 1 or more")
+    if options.database is not None and options.url is not None:
+        raise BadInputError("--database goes with a server that is started here, not with --url")
     if not 0 <= options.dropouts <= 1:
         raise BadInputError(f"--dropouts must be from 0 to 1, not {options.dropouts:g}")
     if not 0 <= options.pace <= 3600:
@@ -106,7 +110,7 @@ def _server(options: Options) -> Iterator[str]:
         return
     from physion.experiment.own_server import OwnServer
 
-    with OwnServer(options.study) as server:
+    with OwnServer(options.study, options.database) as server:
         yield server.url
 
 

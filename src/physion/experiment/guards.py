@@ -153,6 +153,8 @@ class _Exchange:
         await self._send(message)
 
     def _with_headers(self, message: Message) -> Message:
+        # Without the query, which may tell who comes; %a: nobody writes lines of their own.
+        log.info("%s %a %d", self._scope["method"], self._path[:200], message["status"])
         headers = list(message.get("headers", ()))
         given = {name for name, _ in headers}
         headers += [pair for pair in self._extra if pair[0] not in given]

@@ -23,21 +23,22 @@ class OwnServer:
     """``physion experiment serve`` in a process of its own, on a free port of this machine alone.
 
     As a context manager it starts, waits until the server answers, and stops it in the end.
-    ``database``: its URL; the study's SQLite file where none is given. ``command``: other words in
-    place of ``python -m physion.cli.main``, for profilers.
+    ``database``: its URL; the study's SQLite file where none is given. ``options``: more words of
+    ``serve``. ``command``: other words in place of ``python -m physion.cli.main``, for profilers.
     """
 
     def __init__(
         self,
         folder: Path,
         database: str | None = None,
+        options: Sequence[str] = (),
         command: Sequence[str] = (sys.executable, "-m", "physion.cli.main"),
     ) -> None:
         self.port = _free_port()
         self.url = f"http://{HOST}:{self.port}"
         words = ["experiment", "serve", str(folder), "--host", HOST, "--port", str(self.port)]
         words += [] if database is None else ["--database", database]
-        self._command = [*command, *words]
+        self._command = [*command, *words, *options]
         self._process: subprocess.Popen[bytes] | None = None
         self._said = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as this object
 
