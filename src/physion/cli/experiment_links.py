@@ -41,4 +41,6 @@ def main(options: Options) -> int:
         for link in found:
             if link.scenario == scenario:
                 print(f"  {link.name}: {link.goes_to}\n    {link.address}")
+                if link.lacks:
+                    print(f"    study.toml lacks {link.lacks}")
     return 0

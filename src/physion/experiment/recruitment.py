@@ -105,12 +105,15 @@ def _with(address: str, **parameters: str) -> str:
 
 @dataclass(frozen=True)
 class Link:
-    """One address to hand out. ``goes_to``: who gets it, and where it is pasted."""
+    """One address to hand out. ``goes_to``: who gets it, and where it is pasted. ``lacks``: what
+    study.toml has to say before people who come by it get their credit; empty where nothing.
+    """
 
     name: str
     scenario: str
     address: str
     goes_to: str
+    lacks: str = ""
 
 
 PLACEHOLDERS = {
@@ -145,8 +148,22 @@ def links(study: Study, secrets: Secrets, base_url: str) -> tuple[Link, ...]:
                 words.append(f"pass={pass_word(secrets, name)}")  # type: ignore[arg-type]
             if name in PLACEHOLDERS:
                 words.append(PLACEHOLDERS[name])
-            found.append(Link(name, scenario, f"{root}/?{'&'.join(words)}", goes_to))
+            address = f"{root}/?{'&'.join(words)}"
+            found.append(Link(name, scenario, address, goes_to, _lacks(study, name)))
     return tuple(found)
+
+
+def _lacks(study: Study, name: str) -> str:
+    """What the study has not decided yet for a recruiter."""
+    decided = study.recruitment
+    if name == "prolific" and not decided.prolific_code:
+        return "prolific_code: the completion code that Prolific gives"
+    if name == "sona" and not decided.sona_address:
+        return "sona_address: the client-side completion address that SONA gives"
+    if name == "mturk" and not set(MTURK_HOSTS) & set(study.embed_from):
+        hosts = ", ".join(f'"{host}"' for host in MTURK_HOSTS)
+        return f"embed_from = [{hosts}]: MTurk shows the pages in a frame"
+    return ""
 
 
 def _root(base_url: str) -> str:
