@@ -38,9 +38,10 @@ def chromium_path() -> str | None:
     return next((found for name in names if (found := shutil.which(name))), None)
 
 
-@pytest.fixture(scope="session")
+# As long as it lives, its event loop runs in this thread, and others could not start theirs.
+@pytest.fixture(scope="module")
 def chromium() -> Iterator[Any]:
-    """A running browser; the test is skipped where there is none."""
+    """A running browser for one file of tests; they are skipped where there is none."""
     driver = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     path = chromium_path()
     if path is None:

@@ -39,15 +39,18 @@ def test_a_whole_session_by_mouse(chromium: Any, site: tuple[Study, str]) -> Non
             visit.picture("instructions")
             visit.main_button().click()
         told = []
-        for _ in range(2):
+        for trial in range(2):
             visit.page.locator(".fixation").wait_for()
             visit.picture("fixation")
             visit.page.locator(".screen-map:visible").wait_for()
             assert visit.page.locator(".answer:enabled").count() == 0
+            # The whole movie is asked for after the answer, and not before.
+            assert sum("-full-" in address for address in visit.requests) == trial
             visit.answer("yes")
             visit.page.locator(".verdict-correct, .verdict-incorrect").wait_for()
             visit.picture("feedback")
             told.append(visit.see_feedback())
+            assert sum("-full-" in address for address in visit.requests) == trial + 1
         # Labels of the tiny study alternate, the first with contact.
         assert told == ["Correct!", "Not correct."]
         visit.picture("ready")

@@ -17,8 +17,8 @@ NOT_NEEDED = ("accelerometer", "camera", "display-capture", "geolocation", "gyro
 def content_policy(study: Study) -> str:
     """Content security policy: our own files, and movies as blobs, which trials are preloaded as.
 
-    jspsych.css carries its fonts as data. Forms go to ourselves, and to MTurk where the study may
-    be shown in its frame, since that is how a task there is handed in.
+    Forms go to ourselves, and to MTurk where the study may be shown in its frame, since that is how
+    a task there is handed in.
     """
     frames = " ".join(study.embed_from) or "'none'"
     forms = " ".join(("'self'", *(MTURK_HOSTS if study.embed_from else ())))
@@ -26,9 +26,8 @@ def content_policy(study: Study) -> str:
         "default-src 'none'",
         "script-src 'self'",
         "style-src 'self'",
-        "img-src 'self' blob: data:",
+        "img-src 'self' blob:",
         "media-src 'self' blob:",
-        "font-src 'self' data:",
         "connect-src 'self'",
         f"frame-ancestors {frames}",
         "base-uri 'none'",

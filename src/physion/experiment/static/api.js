@@ -29,7 +29,10 @@ class Trouble extends Error {
   }
 }
 
-/** Waits, but not longer than until the browser is online again. */
+/**
+ * Waits, but not longer than until the browser is online again.
+ * @param {number} ms @param {AbortSignal} [signal] @returns {Promise<void>}
+ */
 function pause(ms, signal) {
   return new Promise((resolve, reject) => {
     const end = () => {
@@ -44,6 +47,11 @@ function pause(ms, signal) {
     signal?.addEventListener("abort", end);
   });
 }
+
+/**
+ * @typedef {{token?: string|null, signal?: AbortSignal}} Options
+ * `token`: of whom, where it is not the one who entered here.
+ */
 
 export class Api {
   /** @param {(troubled: boolean) => void} onTrouble Called as requests begin or cease to fail. */
@@ -75,12 +83,8 @@ export class Api {
     await this.#fetch(path, init);
   }
 
-  /**
-   * @typedef {{token?: string|null, signal?: AbortSignal}} Options
-   * `token`: of whom, where it is not the one who entered here.
-   */
-
-  async #json(method, path, body, { token = this.token, signal } = {}) {
+  /** @param {string} method @param {string} path @param {any} body @param {Options} options */
+  async #json(method, path, body, { token = this.token, signal }) {
     const response = await this.#fetch(path, this.#init(method, body, token), signal);
     return response.json();
   }

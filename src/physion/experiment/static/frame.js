@@ -16,6 +16,7 @@ export class Frame {
     this.study = study;
     this.main = byId("main");
     this.onStop = () => {};
+    /** @type {(language: string) => void} */
     this.onLanguage = () => {};
     this.state = null;
     this.speak(texts);
@@ -31,15 +32,19 @@ export class Frame {
     byId("skip").hidden = false;
   }
 
-  /** Show what belongs to a stage of the session. @param {{state: any}} context */
-  show({ state }) {
+  /**
+   * Show what belongs to a stage of the session.
+   * @param {{state: any}} context
+   * @param {boolean} leaving Is the participant asked whether to stop?
+   */
+  show({ state }, leaving) {
     this.state = state;
-    const inTrials = state.stage === "familiarization" || state.stage === "test";
+    const inTrials = !leaving && (state.stage === "familiarization" || state.stage === "test");
     document.body.classList.toggle("in-trials", inTrials);
     byId("progress").hidden = !inTrials;
     const tools = [];
     if (state.stage === "consent") tools.push(this.languageChooser());
-    if (STAGES_WITH_WAY_OUT.includes(state.stage)) {
+    if (STAGES_WITH_WAY_OUT.includes(state.stage) && !leaving) {
       const stop = button(this.texts.t("stop.open"), () => this.onStop(), { class: "link" });
       tools.push(stop);
     }

@@ -122,7 +122,7 @@ async function loadTexts(api, language) {
   return new Texts(language, await api.get(`/api/texts/${encodeURIComponent(language)}`));
 }
 
-/** Waits until the window is large enough. */
+/** Waits until the window is large enough. @returns {Promise<void>} */
 function largeWindow(basis) {
   const fits = () => windowFits(basis.study);
   if (fits()) return Promise.resolve();

@@ -112,7 +112,8 @@ export function readyPage(context) {
 }
 
 /** Shown until the next trials are loaded. @param {Context} context @returns {Render} */
-export function loadingPage({ texts, media }) {
+export function loadingPage(context) {
+  const { texts, media } = context;
   const { t } = bound(texts);
   return async (page, done, signal) => {
     const bar = el("progress", { "aria-label": t("trial.loading"), max: 1, value: 0 });
@@ -131,7 +132,7 @@ export function loadingPage({ texts, media }) {
       const again = button(t("trial.retry"), () => {
         media.retry();
         page.replaceChildren();
-        loadingPage({ texts, media })(page, done, signal);
+        loadingPage(context)(page, done, signal);
       });
       page.replaceChildren(heading, el("p", { role: "alert" }, t("trial.media_failed")), again);
       again.focus();

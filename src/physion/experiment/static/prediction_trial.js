@@ -217,7 +217,7 @@ async function tellTrouble(display, trial, attempt) {
   display.replaceChildren(box);
   if (attempt < ATTEMPTS) return new Promise((resolve) => setTimeout(resolve, 1500));
   return new Promise((resolve) => {
-    const retry = button(trial.words.retry, resolve);
+    const retry = button(trial.words.retry, () => resolve(null));
     box.append(retry);
     retry.focus();
   });

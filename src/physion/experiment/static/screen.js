@@ -157,8 +157,8 @@ export class Screen {
     const video = this.video;
     const watch = new AbortController();
     const signal = watch.signal;
-    let failed = () => {};
-    let ended = () => {};
+    let failed = (/** @type {any} */ error) => {};
+    let ended = (/** @type {number} */ at) => {};
     const end = new Promise((resolve, reject) => ([ended, failed] = [resolve, reject]));
     const on = (target, name, listener) => target.addEventListener(name, listener, { signal });
     on(this.#stop, "abort", () => failed(this.#stop.reason));

@@ -23,6 +23,9 @@ const PAGES = {
   feedback: feedbackPage,
 };
 
+const TRIAL_WORDS = ["prompt", "yes", "no", "trouble", "retry"];
+const FEEDBACK_WORDS = ["waiting", "correct", "incorrect", "contact", "no_contact", "next"];
+
 /** The stretch of the timeline that runs was left for another state. */
 class Left extends Error {}
 
@@ -40,6 +43,8 @@ export class Session {
     this.queue = queue;
     this.media = new Media(basis.api, basis.study.preload);
     this.state = null;
+    /** Has the participant asked to stop? */
+    this.asked = false;
   }
 
   /** Everything that pages need. @returns {import("./pages.js").Context} */
@@ -72,7 +77,7 @@ export class Session {
     this.state = state;
     while (!this.#closed) {
       this.#stretch = new AbortController();
-      this.basis.frame.show(this.context);
+      this.basis.frame.show(this.context, this.asked);
       if (this.state.stage === "done" || this.state.stage === "withdrawn") return this.#end();
       try {
         this.state = this.asked ? await this.#stop() : await this.#stage();
@@ -162,7 +167,7 @@ export class Session {
       cue_ms: study.cue_ms,
       flash_hz: study.flash_hz,
       choices: this.state.buttons.split("-"),
-      words: words(texts, "trial", ["prompt", "yes", "no", "trouble", "retry"]),
+      words: words(texts, "trial", TRIAL_WORDS),
       log: (kind, data) => log.add(kind, data),
       on_start: () => {
         this.media.advance(number);
@@ -179,9 +184,10 @@ export class Session {
       media,
       feedback: async () => (await stored).feedback,
       load: async (path) => URL.createObjectURL(await this.basis.api.blob(path)),
-      words: words(texts, "practice", [
-        ...["waiting", "correct", "incorrect", "contact", "no_contact", "next"],
-      ], { trouble: texts.t("trial.trouble") }),
+      words: {
+        ...words(texts, "practice", FEEDBACK_WORDS),
+        trouble: texts.t("trial.trouble"),
+      },
       log: (kind, data) => log.add(kind, data),
     };
     const small = () => {
@@ -240,9 +246,8 @@ export class Session {
 }
 
 /** Words of a table of the texts by their names there. */
-function words(texts, table, names, more = {}) {
-  const own = names.map((name) => [name, texts.t(`${table}.${name}`)]);
-  return { ...Object.fromEntries(own), ...more };
+function words(texts, table, names) {
+  return Object.fromEntries(names.map((name) => [name, texts.t(`${table}.${name}`)]));
 }
 
 /** An `Answer` from the data of a prediction trial. */
