@@ -116,9 +116,9 @@ class TestPasses:
             word = pass_word(secrets, kind)  # type: ignore[arg-type]
             assert kind_of_pass(secrets, word) == kind
         signature = pass_word(secrets, "preview").partition("-")[2]
-        wrong = ("", "preview", "preview-", f"simulated-{signature}", f"person-{signature}",
-                 signature, f"preview-{signature}0", f"preview-{signature[:-1]}", "é-é")  # fmt: skip
-        for word in wrong:
+        others = (f"simulated-{signature}", f"person-{signature}", signature, "é-é")
+        longer = (f"preview-{signature}0", f"preview-{signature[:-1]}")
+        for word in ("", "preview", "preview-", *others, *longer):
             assert kind_of_pass(secrets, word) is None, word
 
     def test_links_open_sessions_of_their_kinds(self, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import logging
 import math
 import time
 from typing import TYPE_CHECKING
+from urllib.parse import quote
 
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -85,7 +86,7 @@ class _Exchange:
             return
         except Exception:
             # Path and trace alone: query, headers and body may tell who takes part.
-            log.exception("%s %s failed", self._scope["method"], self._path[:200])
+            log.exception("%s %s failed", self._scope["method"], quote(self._path))
             if self._started:
                 raise
             self._refusal = refuse("server_error")
@@ -153,6 +154,8 @@ class _Exchange:
         await self._send(message)
 
     def _with_headers(self, message: Message) -> Message:
+        if log.isEnabledFor(logging.INFO):
+            log.info("%s %s %d", self._scope["method"], quote(self._path), message["status"])
         # Without the query, which may tell who comes; %a: nobody writes lines of their own.
         log.info("%s %a %d", self._scope["method"], self._path[:200], message["status"])
         headers = list(message.get("headers", ()))

@@ -26,8 +26,8 @@ from physion.experiment.media_checks import check_media
 from physion.experiment.store import Store
 from physion.experiment.study import load_study
 
-STOP_SECONDS = 10
-"""Requests in work are given so long to end."""
+STOP_SECONDS = 5
+"""Requests in work, and browsers that do not let go, are given so long to end."""
 KEEP_ALIVE_SECONDS = 75
 """Longer than a trial, so that a participant's browser keeps its connection."""
 OPEN_FILES = 65_536
