@@ -17,17 +17,20 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-import sqlalchemy as sa
 
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
-from experimenter_client import TWO, Lab, Visitor, lab
+import httpx2
+import sqlalchemy as sa
+from experimenter_client import BASE, TWO, Lab, Visitor, lab
 from experimenter_rows import insert_sessions
+from tiny_study import PASSWORD, make_tiny_study
 
 from physion.analysis.exclusions import PREREGISTERED, RULES, flag_sessions
 from physion.analysis.participants import clean
 from physion.experiment.answer_tables import read_tables
 from physion.experiment.export import export_study
+from physion.experiment.own_server import OwnServer
 from physion.experiment.tables import ANSWERS, EVENTS, RAW_IDS, SESSIONS
 
 HOSTILE = (
@@ -338,6 +341,34 @@ def test_the_process_that_counts_may_die(tmp_path: Path) -> None:
         (second,) = counting() - others
         assert second != first
     assert counting() == others, "it ends with the server"
+
+
+def is_alive(pid: int) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+    return state != "Z"
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="no /proc to look for processes in")
+def test_no_process_is_left_by_a_killed_server(tmp_path: Path) -> None:
+    study = make_tiny_study(tmp_path, size=64, languages=("en",))
+    with OwnServer(study.folder) as server:
+        with httpx2.Client(base_url=server.url, trust_env=False, follow_redirects=True) as client:
+            form = re.search(r'name="form_token" value="(\w+)"', client.get(f"{BASE}/login").text)
+            assert form is not None
+            fields = {"form_token": form[1], "password": PASSWORD}
+            assert "Log out" in client.post(f"{BASE}/login", data=fields, timeout=60).text
+        children = Path(f"/proc/{server.pid}/task/{server.pid}/children")
+        tasks = [path.read_text().split() for path in children.parents[1].glob("*/children")]
+        left = {int(pid) for pids in tasks for pid in pids}
+        assert left
+        server.kill()
+        until = time.monotonic() + 30
+        while any(map(is_alive, left)):
+            assert time.monotonic() < until, "a process outlives the server"
+            time.sleep(0.1)
 
 
 # --- export --------------------------------------------------------------------------------------
