@@ -34,7 +34,7 @@ from physion.experiment.stimuli import Stimulus
 from physion.experiment.study import Study
 from physion.experiment.tables import ANSWERS, EVENTS, PARTICIPANTS, SESSIONS, STUDIES
 
-RESULTS = Path(__file__).parent / "results" / "experiment_export.md"
+RESULTS = Path(__file__).parent / "results"
 PRACTICE, TEST = 10, 150
 AT_ONCE = 100
 AIM_S, AIM_BYTES = 20.0, 4 * 10**9
@@ -205,7 +205,7 @@ def main() -> None:
     parser.add_argument("--sessions", type=int, default=10_000)
     parser.add_argument("--database", help="URL of an empty PostgreSQL database")
     parser.add_argument("--folder", type=Path, help="an empty folder in which all stays")
-    parser.add_argument("--write", action="store_true", help=f"write {RESULTS.name}")
+    parser.add_argument("--write", action="store_true", help="write a page into results/")
     parser.add_argument("--measure", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.measure:
@@ -221,6 +221,7 @@ def main() -> None:
         done = subprocess.run(words, check=True, stdout=subprocess.PIPE)
         found = json.loads(done.stdout)
     options = "" if arguments.sessions == 10_000 else f" --sessions {arguments.sessions}"
+    options += " --database URL" if arguments.database else ""
     kind = "PostgreSQL" if url.startswith("postgres") else "SQLite"
     found |= {
         "details_bytes": size,
@@ -231,7 +232,8 @@ def main() -> None:
     }
     print(json.dumps(found, indent=2))
     if arguments.write:
-        RESULTS.write_text(as_markdown(found))
+        name = "experiment_export" + ("_postgresql" if arguments.database else "")
+        (RESULTS / f"{name}.md").write_text(as_markdown(found))
 
 
 if __name__ == "__main__":
