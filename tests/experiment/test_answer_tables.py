@@ -13,21 +13,14 @@ from tiny_study import make_tiny_study
 
 from physion.analysis.response_schema import SESSION_COLUMNS, TRIAL_COLUMNS, check_table
 from physion.errors import PhysionError, UnknownNameError
-from physion.experiment import answer_tables
-from physion.experiment.answer_tables import (
-    NO_CONSENT,
-    PREVIEW,
-    WITHDRAWN,
-    Wanted,
-    read_sessions,
-    read_tables,
-    read_trials,
-    snapshot,
-)
+from physion.experiment import trial_rows
+from physion.experiment.answer_tables import read_tables, snapshot
 from physion.experiment.database import open_database, upgrade
 from physion.experiment.identity import Secrets
+from physion.experiment.session_rows import NO_CONSENT, PREVIEW, WITHDRAWN, Wanted, read_sessions
 from physion.experiment.study import Study
 from physion.experiment.tables import ANSWERS, SESSIONS
+from physion.experiment.trial_rows import read_trials
 
 NOW = 1_790_000_000.0
 
@@ -166,7 +159,7 @@ def test_cells_that_are_not_known_are_empty(study: Study, database_url: str) -> 
 def test_what_is_written_meanwhile_is_not_seen(
     engine: sa.Engine, study: Study, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(answer_tables, "AT_ONCE", 5)
+    monkeypatch.setattr(trial_rows, "AT_ONCE", 5)
     before, _ = read_tables(engine, study)
     seen = 0
     with snapshot(engine) as connection:

@@ -25,10 +25,10 @@ import pyarrow.compute as pc
 from pyarrow import csv
 
 from physion.analysis.response_schema import SESSION_COLUMNS, TRIAL_COLUMNS, Column
-from physion.experiment.answer_tables import Trials
 from physion.experiment.column_words import labels_of, levels_of
 from physion.experiment.spreadsheet import guard_cell
 from physion.experiment.study import Study
+from physion.experiment.trial_rows import Trials
 
 VERSION = "1.10.0"
 EMPTY = "n/a"

@@ -36,15 +36,7 @@ from sqlalchemy import Connection, Engine, select
 
 import physion
 from physion.analysis.response_schema import SESSION_COLUMNS, TRIAL_COLUMNS, data_dictionary
-from physion.experiment.answer_tables import (
-    KINDS,
-    Sessions,
-    Trials,
-    Wanted,
-    read_sessions,
-    read_trials,
-    snapshot,
-)
+from physion.experiment.answer_tables import snapshot
 from physion.experiment.bids import BidsFolder
 from physion.experiment.export_folder import whole_folder, write_manifest
 from physion.experiment.export_words import STIMULI_COLUMNS, readme
@@ -56,10 +48,12 @@ from physion.experiment.further_tables import (
 )
 from physion.experiment.iso_times import iso_times
 from physion.experiment.psych_ds import write_psych_ds
+from physion.experiment.session_rows import KINDS, Sessions, Wanted, read_sessions
 from physion.experiment.spreadsheet import RULE
 from physion.experiment.study import Study
 from physion.experiment.table_files import TableFiles
 from physion.experiment.tables import STUDIES
+from physion.experiment.trial_rows import Trials, read_trials
 
 Layout = Literal["both", "psych-ds", "bids"]
 GONE = "answer to a stimulus that the study folder has no more"

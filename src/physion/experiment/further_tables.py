@@ -12,9 +12,10 @@ import pyarrow as pa
 from sqlalchemy import Connection, select
 
 from physion.analysis.response_schema import PHASES, Column
-from physion.experiment.answer_tables import AT_ONCE, Trials, arrow_schema
+from physion.experiment.arrow_types import arrow_schema
 from physion.experiment.iso_times import iso_times
 from physion.experiment.tables import EVENTS
+from physion.experiment.trial_rows import AT_ONCE, Trials
 
 _SESSION = Column("session", "text", "As in the sessions", required=True, may_be_empty=False)
 

@@ -16,7 +16,7 @@ from typing import Any
 from physion.analysis.response_schema import Column
 from physion.experiment.column_words import KIND_WORDS, label_of, levels_of
 
-VERSION = "Psych-DS 1.0.0"
+VERSION = "Psych-DS 0.4.0"
 
 
 def write_psych_ds(

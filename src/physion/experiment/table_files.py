@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 from pyarrow import csv
 
 from physion.analysis.response_schema import Column
-from physion.experiment.answer_tables import arrow_schema
+from physion.experiment.arrow_types import arrow_schema
 from physion.experiment.spreadsheet import guard_cell
 
 NAMES = frozenset({"participant", "session", "scenario", "stimulus", "kind"})
