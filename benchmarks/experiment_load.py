@@ -337,10 +337,12 @@ def table(rows: list[Row]) -> str:
 def report(rows: list[Row], options: argparse.Namespace) -> str:
     """What was found, as a page."""
     kind = "PostgreSQL" if options.postgres else "SQLite"
+    # A URL may hold a password.
+    words = ["URL" if word == options.postgres else word for word in sys.argv]
     lines = [
         f"# Load of the experiment's server, {kind}",
         "",
-        f"`{' '.join(['python', *sys.argv])}`, {datetime.now(UTC):%Y-%m-%d}, "
+        f"`{' '.join(['python', *words])}`, {datetime.now(UTC):%Y-%m-%d}, "
         f"{processor()}, {os.cpu_count()} cores for server and clients together, "
         f"Python {platform.python_version()}, load average before {options.load_before:.1f}. "
         f"{options.people} participants, {TEST_TRIALS} test trials each; a synced write of 4 KiB "
