@@ -18,6 +18,7 @@ from physion.experiment.own_server import OwnServer
 from physion.experiment.study_checks import EXCLUSIONS
 
 SLOW_TO_IMPORT = (
+    "numpy",
     "pandas",
     "scipy",
     "sklearn",
