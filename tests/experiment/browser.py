@@ -22,7 +22,7 @@ from tiny_study import make_tiny_study
 from physion.experiment.database import open_database, sqlite_url
 from physion.experiment.identity import Secrets, participant_hash
 from physion.experiment.own_server import OwnServer
-from physion.experiment.study import Limits, Recruitment, Study, Timing
+from physion.experiment.study import Recruitment, Study, Timing
 from physion.experiment.tables import ANSWERS, EVENTS, SESSIONS
 
 SIZE = {"width": 1280, "height": 800}
@@ -60,7 +60,6 @@ def served(folder: Path, **settings: Any) -> Iterator[tuple[Study, OwnServer]]:
         "familiarization": 2,
         "timing": SHORT,
         "recruitment": Recruitment(link_code="TINY-CODE", link_address="https://lab.example/done"),
-        "limits": Limits(requests_per_second=200.0, burst=1000),
     }
     study = make_tiny_study(folder, **{**given, **settings})
     with OwnServer(study.folder) as server:

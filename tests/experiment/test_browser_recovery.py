@@ -155,6 +155,7 @@ def test_the_second_tab_takes_over(chromium: Any, site: tuple[Study, str]) -> No
         visit.answer("no")
         visit.page.get_by_text("Trial 3 of 4").wait_for()
         second, visit.page = visit.page, first
+        visit.page.bring_to_front()
         visit.picture("first")
         visit.main_button().click()  # go on here
         second.get_by_text("The study goes on in another tab").wait_for()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -140,7 +141,7 @@ def test_a_whole_session_by_keyboard_in_german(chromium: Any, site: tuple[Study,
 def test_timing_of_the_paper(chromium: Any, tmp_path: Path) -> None:
     """Fixation, 2 s of flashing at 2 Hz, 45 frames and no later one, read off the pixels."""
     with (
-        served(tmp_path, test=4, familiarization=1, timing=Timing()) as (study, server),
+        served(tmp_path, test=4, familiarization=1, preload=2, timing=Timing()) as (study, server),
         Visit(chromium, server.url) as visit,
     ):
         visit.context.add_init_script(READ_FRAMES)
@@ -149,6 +150,8 @@ def test_timing_of_the_paper(chromium: Any, tmp_path: Path) -> None:
         visit.begin_test()
         for trial in range(4):
             visit.page.get_by_text(f"Trial {trial + 1} of 4").wait_for()
+            # Two trials are loaded ahead, and no more.
+            assert loaded_of_test(visit) == set(range(min(trial + 2, 4)))
             visit.answer("yes")
         visit.heading("About you")
         seen = visit.page.evaluate("window.framesRead")
@@ -172,6 +175,13 @@ def test_timing_of_the_paper(chromium: Any, tmp_path: Path) -> None:
         assert max(abs(at - 250 * i) for i, (at, _) in enumerate(flashes)) < 60
         assert 0 <= details["enabled_ms"] - details["ended_ms"] < 100
     assert max(row.frames_shown for row in answers) == 45
+
+
+def loaded_of_test(visit: Visit) -> set[int]:
+    """Trials of the test whose movies were asked for so far, a moment later."""
+    visit.page.wait_for_timeout(300)
+    found = (re.search(r"-t-(\d+)-movie", address) for address in visit.requests)
+    return {int(match[1]) for match in found if match}
 
 
 READ_FRAMES = """
