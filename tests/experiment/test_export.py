@@ -202,6 +202,11 @@ def test_what_was_left_out_is_said(small: sa.Engine, study: Study, tmp_path: Pat
     withdrew = sum(r.withdrawn_at is not None for r in agreed)
     assert counts["session", "person", "the participant withdrew"] == withdrew > 0
     assert sum(report.sessions["person"].values()) == len(agreed) - withdrew
+    trials, sessions = (
+        pd.read_parquet(tmp_path / "out" / f"{name}.parquet") for name in ("trials", "sessions")
+    )
+    latest = [trials["answered_at"].max(), sessions["finished_at"].dropna().max()]
+    assert report.until == max(latest)
     manifest = json.loads((tmp_path / "out" / "export.json").read_bytes())
     assert manifest["left_out"] == list(report.left_out)
     assert (

@@ -65,6 +65,7 @@ def test_psych_ds_has_the_files_and_metadata_that_it_asks_for(exported: Exported
     assert all(entry["@type"] == "PropertyValue" for entry in metadata["variableMeasured"])
     names = [entry["name"] for entry in metadata["variableMeasured"]]
     assert len(set(names)) == len(names)
+    assert "Keyed hash" in metadata["variableMeasured"][0]["description"]
     files = list((folder / "data").iterdir())
     assert len(files) == 3
     for path in files:

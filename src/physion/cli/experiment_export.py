@@ -48,15 +48,18 @@ def main(options: Options) -> int:
         raise MissingExtraError("physion experiment export", "experiment") from error
     study = load_study(options.study)
     engine = open_database(options.database or sqlite_url(options.study), must_exist=True)
-    check_version(engine)
-    report = export_study(
-        engine,
-        study,
-        options.out or options.study / "export",
-        simulated=options.simulated,
-        scenario=options.scenario,
-        layout=options.layout,
-    )
+    try:
+        check_version(engine)
+        report = export_study(
+            engine,
+            study,
+            options.out or options.study / "export",
+            simulated=options.simulated,
+            scenario=options.scenario,
+            layout=options.layout,
+        )
+    finally:
+        engine.dispose()
     if options.json:
         print(json_module.dumps({"out": str(report.out), **report.facts()}))
         return 0

@@ -22,8 +22,8 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -31,6 +31,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
 from sqlalchemy import Connection, Engine, select
 
@@ -115,9 +116,9 @@ def export_study(
             bids = None
             if layout != "psych-ds":
                 bids = BidsFolder(folder / "bids", study, sessions.table)
-            rows, gone = _write_tables(folder, connection, study, sessions, bids)
+            written = _write_tables(folder, connection, study, sessions, bids)
             states = _states(connection, sessions)
-        report = _report(out, sessions, rows, gone)
+        report = _report(out, sessions, written)
         _write_stimuli(folder, study)
         _write_json(folder / "study.json", {"states": states})
         dictionary: dict[str, Any] = {
@@ -130,11 +131,20 @@ def export_study(
             )
             report = _with_left_out(report, "session", "any", NO_FILE, without)
         if layout != "bids":
-            _write_psych_ds(folder, study, sessions)
+            _write_psych_ds(folder, study, sessions, report.until)
         (folder / "README.md").write_text(readme(study, "export", report.facts()), "utf-8")
         known = {"package": f"physion {physion.__version__}", "name": study.name}
         write_manifest(folder, known | {"version": study.version} | report.facts())
     return report
+
+
+@dataclass(frozen=True)
+class _Written:
+    """Rows by table, answers to stimuli that are gone, and the last moment in the data."""
+
+    rows: dict[str, int]
+    gone: int
+    until: str | None
 
 
 # --- tables -------------------------------------------------------------------------------------
@@ -146,9 +156,12 @@ def _write_tables(
     study: Study,
     sessions: Sessions,
     bids: BidsFolder | None,
-) -> tuple[dict[str, int], Counter[str]]:
-    """Rows by table, and names of stimuli that are gone with the answers to them."""
-    gone: Counter[str] = Counter()
+) -> _Written:
+    """Writes trials, sessions, events and details, in one go through the answers."""
+    gone, latest = (
+        0,
+        [_latest(sessions.table, "started_at"), _latest(sessions.table, "finished_at")],
+    )
     with ExitStack() as stack:
         files = {
             name: stack.enter_context(TableFiles(folder, name, TABLES[name]))
@@ -169,10 +182,16 @@ def _write_tables(
             files["events"].write(events)
         with _Behind(write) as behind:
             for part in read_trials(connection, study, sessions.table, details=True):
-                gone.update(part.unknown)
+                gone += len(part.unknown)
+                latest.append(_latest(part.table, "answered_at"))
                 behind(part)
         rows = {name: file.rows for name, file in (*files.items(), ("trial_details", details))}
-    return rows, gone
+    return _Written(rows, gone, max(latest) or None)
+
+
+def _latest(table: pa.Table, column: str) -> str:
+    """The last moment of a column; empty where it has none."""
+    return str(pc.max(table.column(column)).as_py() or "")
 
 
 class _Behind:
@@ -201,17 +220,16 @@ class _Behind:
 # --- what stands beside the tables --------------------------------------------------------------
 
 
-def _report(out: Path, sessions: Sessions, rows: dict[str, int], gone: Counter[str]) -> Report:
+def _report(out: Path, sessions: Sessions, written: _Written) -> Report:
     kinds: dict[str, dict[str, int]] = {}
     for kind in KINDS:
         states = {state: sessions.states[kind, state] for state in ("finished", "unfinished")}
         if any(states.values()):
             kinds[kind] = states
-    latest = [pc.max(sessions.table.column(name)).as_py() for name in ("started_at", "finished_at")]
-    report = Report(out, kinds, rows, (), max(filter(None, latest), default=None))
+    report = Report(out, kinds, written.rows, (), written.until)
     for (kind, reason), count in sorted(sessions.left_out.items()):
         report = _with_left_out(report, "session", kind, reason, count)
-    return _with_left_out(report, "answer", "any", GONE, sum(gone.values()))
+    return _with_left_out(report, "answer", "any", GONE, written.gone)
 
 
 def _with_left_out(report: Report, what: str, kind: str, reason: str, count: int) -> Report:
@@ -253,21 +271,16 @@ def _write_csv(path: Path, header: Sequence[str], rows: Sequence[Sequence[Any]])
     path.write_bytes(lines.getvalue().encode())
 
 
-def _write_psych_ds(folder: Path, study: Study, sessions: Sessions) -> None:
-    moments = sorted(filter(None, _moments(sessions)))
+def _write_psych_ds(folder: Path, study: Study, sessions: Sessions, until: str | None) -> None:
+    began = pc.min(sessions.table.column("started_at")).as_py()
     write_psych_ds(
         folder / "psych-ds",
         {name: (folder / f"{name}.csv", TABLES[name]) for name in ("trials", "sessions", "events")},
         name=study.name,
         description=study.title,
         readme=readme(study, "psych-ds"),
-        covers=(moments[0], moments[-1]) if moments else None,
+        covers=(began, until) if began and until else None,
     )
-
-
-def _moments(sessions: Sessions) -> Iterator[str | None]:
-    for name in ("started_at", "finished_at"):
-        yield from sessions.table.column(name).to_pylist()
 
 
 def _write_json(path: Path, values: Any) -> None:

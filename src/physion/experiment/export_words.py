@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from textwrap import fill
 from typing import Any, Literal
 
 from physion.analysis.response_schema import PHASES, Column
@@ -79,7 +80,7 @@ def readme(
         _TASK,
         special,
         _PEOPLE,
-        rule,
+        fill(rule, 100),
     ]
     if facts is not None:
         parts.append("## Counts\n\n" + "\n".join(count_lines(facts, "- ")))

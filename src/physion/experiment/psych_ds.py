@@ -39,7 +39,10 @@ def write_psych_ds(
     for word, (source, _) in tables.items():
         paths.append(data / f"study-{label_of(name)}_description-{label_of(word)}_data.csv")
         shutil.copyfile(source, paths[-1])
-    columns = {column.name: column for _, listed in tables.values() for column in listed}
+    columns: dict[str, Column] = {}
+    for _, listed in tables.values():
+        for column in listed:
+            columns.setdefault(column.name, column)  # the first table says it in full
     metadata: dict[str, Any] = {
         "@context": "https://schema.org/",
         "@type": "Dataset",
