@@ -14,6 +14,8 @@ from physion.experiment.tables import RAW_IDS, SESSIONS
 
 PAGE = 100
 """Rows on one page."""
+_SESSION = ("source", "session", "reference", "scenario", "finished_at", "withdrawn_at",
+            "answered_test")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -53,32 +55,34 @@ def read_payments(
 
     ``source``: of this recruiter alone, empty: of all. ``finished``: finished sessions alone.
     """
-    session = SESSIONS.c
-    joined = RAW_IDS.join(SESSIONS, session.participant == RAW_IDS.c.participant)
-    people = select(SESSIONS, RAW_IDS.c.raw_id, RAW_IDS.c.recruiter).select_from(joined)
-    people = people.where(session.kind == "person")
+    session, ids = SESSIONS.c, RAW_IDS.c
+    chosen = [session.kind == "person"]
     if source:
-        people = people.where(session.source == source)
+        chosen.append(session.source == source)
     if finished:
-        people = people.where(session.finished_at.is_not(None))
-    people = people.order_by(
-        session.finished_at.is_(None), session.finished_at.desc(), session.started_at.desc()
-    )
+        chosen.append(session.finished_at.is_not(None))
+    order = (session.finished_at.is_(None), session.finished_at.desc(), session.started_at.desc())
+    joined = RAW_IDS.join(SESSIONS, session.participant == ids.participant)
+    names = select(ids.raw_id).select_from(joined).where(*chosen).order_by(*order)
+    columns = [session[name] for name in _SESSION]
+    lines = select(*columns, ids.raw_id, ids.recruiter).select_from(joined).where(*chosen)
     with engine.connect() as connection:
-        rows = connection.execute(people).all()
+        all_names = connection.execute(names).scalars().all()
+        pages = max(1, -(-len(all_names) // PAGE))
+        page = min(max(1, page), pages)
+        part = lines.order_by(*order).limit(PAGE).offset((page - 1) * PAGE)
+        rows = connection.execute(part).all()
         stored = connection.execute(select(func.count()).select_from(RAW_IDS)).scalar_one()
-        sources = connection.execute(select(RAW_IDS.c.source).distinct()).scalars().all()
-    pages = max(1, -(-len(rows) // PAGE))
-    page = min(max(1, page), pages)
+        sources = connection.execute(select(ids.source).distinct()).scalars().all()
     shown = tuple(
         Payment(
             row.source, row.raw_id, row.session, row.reference, row.scenario, row.finished_at,
             row.withdrawn_at, row.answered_test, _code(study, secrets, row), row.recruiter,
         )
-        for row in rows[(page - 1) * PAGE : page * PAGE]
+        for row in rows
     )  # fmt: skip
-    ids = tuple(dict.fromkeys(row.raw_id for row in rows))
-    return Payments(shown, len(rows), page, pages, ids, tuple(sorted(sources)), stored)
+    ids_once = tuple(dict.fromkeys(all_names))
+    return Payments(shown, len(all_names), page, pages, ids_once, tuple(sorted(sources)), stored)
 
 
 def _code(study: Study, secrets: Secrets, row: object) -> str | None:
