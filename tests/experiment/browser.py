@@ -147,6 +147,8 @@ class Visit:
             self.press("f" if self.left() == response else "j")
         else:
             self.page.click(f".answer[data-response={response}]")
+        # Until the next page is there, so that nothing is pressed on this one again.
+        self.page.locator(".answer:enabled").first.wait_for(state="detached")
 
     def see_feedback(self) -> str:
         """See the whole movie and go on; what was said of the answer."""

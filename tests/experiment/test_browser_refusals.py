@@ -187,7 +187,7 @@ def test_a_page_that_is_hidden_is_noted(chromium: Any, site: tuple[Study, str]) 
     )
     with Visit(chromium, url) as visit:
         visit.begin("?participant=Hidden")
-        visit.page.locator(".screen-map:visible").wait_for()
+        visit.page.locator(".trial").wait_for()
         visit.page.evaluate(hide, True)
         visit.page.wait_for_timeout(200)
         visit.page.evaluate(hide, False)

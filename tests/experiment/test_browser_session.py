@@ -41,9 +41,8 @@ def test_a_whole_session_by_mouse(chromium: Any, site: tuple[Study, str]) -> Non
             visit.main_button().click()
         told = []
         for trial in range(2):
-            visit.page.locator(".fixation").wait_for()
-            visit.picture("fixation")
-            visit.page.locator(".screen-map:visible").wait_for()
+            visit.page.locator(".trial:not(.has-verdict)").wait_for()
+            visit.picture("cue")
             assert visit.page.locator(".answer:enabled").count() == 0
             # The whole movie is asked for after the answer, and not before.
             assert sum("-full-" in address for address in visit.requests) == trial
@@ -105,7 +104,7 @@ def test_a_whole_session_by_keyboard_in_german(chromium: Any, site: tuple[Study,
                 visit.picture("ready")
                 visit.press("Tab", "Enter")
             # Keys before their time are no answers.
-            page.locator(".fixation").wait_for()
+            page.locator(".trial:not(.has-verdict)").wait_for()
             visit.press("f", "j")
             visit.wait_for_answer()
             assert visit.page.evaluate("document.documentElement.scrollHeight") <= 600
