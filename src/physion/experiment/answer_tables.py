@@ -59,4 +59,7 @@ def snapshot(engine: Engine) -> Iterator[Connection]:
                 isolation_level="REPEATABLE READ", postgresql_readonly=True
             )
         with connection.begin():
+            if engine.dialect.name == "postgresql":
+                # Else it reads all answers for each few sessions where it has no statistics yet.
+                connection.exec_driver_sql("SET LOCAL enable_seqscan = off")
             yield connection

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-from sqlalchemy import Connection, Float, Integer, case, cast, func, select, type_coerce
+from sqlalchemy import Connection, Float, Integer, case, cast, func, select
 from sqlalchemy.sql import ColumnElement
 
 from physion.analysis.response_schema import TRIAL_COLUMNS
@@ -50,8 +50,9 @@ def _place(column: Any, words: Sequence[str]) -> ColumnElement[int]:
     return case({word: place for place, word in enumerate(words)}, value=column, else_=-1)
 
 
-def _or_absent(column: Any) -> ColumnElement[float]:
-    return func.coalesce(type_coerce(column, Float), _ABSENT)
+def _or_absent(column: Any) -> ColumnElement[Any]:
+    # Of the column's own type: PostgreSQL would make decimals of both, which are slow.
+    return func.coalesce(column, _ABSENT if isinstance(column.type, Float) else int(_ABSENT))
 
 
 _NUMBERS: dict[str, Any] = {
@@ -95,7 +96,8 @@ def _fetch(connection: Connection, names: Sequence[str], details: bool) -> list[
     query = select(*texts, *_NUMBERS.values()).where(ANSWERS.c.session.in_(names))
     text = query.compile(dialect=connection.dialect, compile_kwargs={"literal_binds": True})
     # The driver's own rows: a row object of the library for each answer would double the time.
-    cursor = connection.connection.cursor()
+    binary = {"binary": True} if connection.dialect.name == "postgresql" else {}
+    cursor = connection.connection.cursor(**binary)
     try:
         cursor.execute(str(text))
         return list(cursor.fetchall())
