@@ -73,6 +73,7 @@ DAY_MS = 86_400_000.0
 Name = Annotated[str, StringConstraints(min_length=1, max_length=200)]
 RawId = Annotated[str, StringConstraints(min_length=1, max_length=200, strip_whitespace=True)]
 Key = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9-]{8,64}$")]
+VisitWord = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9-]{16,64}$")]
 Text = Annotated[str, StringConstraints(max_length=5000)]
 Milliseconds = Annotated[float, Field(ge=0, le=DAY_MS, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=0, le=1_000_000)]
@@ -99,6 +100,9 @@ class Device(Message):
 class Enter(Message):
     """Who comes, from where. ``id`` is the recruiter's; without one, ``link`` gives a new person.
 
+    ``visit`` is a random word that the page makes once, before it asks for the first time, and
+    keeps in its storage. Where there is no ``id`` it tells who comes, so that asking again gives
+    the same session; where ``id`` is needed it is no id. Without both everybody is a new person.
     ``recruiter`` holds the further parameters of the address (study id, visit id, ...), kept beside
     the raw id alone. ``pass_`` (sent as ``pass``) is the signed word of a preview or pilot link.
     """
@@ -107,6 +111,7 @@ class Enter(Message):
 
     source: Source = "link"
     id: RawId | None = None
+    visit: VisitWord | None = None
     recruiter: Annotated[dict[Name, Annotated[str, StringConstraints(max_length=500)]],
                          Field(max_length=10)] = {}  # fmt: skip
     scenario: Name | None = None
@@ -216,8 +221,11 @@ class Event(Message):
 
 
 class Events(Message):
-    """Events of one load of the page."""
+    """Events of one load of the page. ``key`` is made once for each batch and kept over retries:
+    a batch that is there already is not stored twice.
+    """
 
+    key: Key | None = None
     events: Annotated[list[Event], Field(max_length=50)]
 
 
@@ -239,8 +247,10 @@ class Completion(Message):
 
 
 class Result(Message):
-    """What a participant is told at the end. ``percentile`` is None while too few have finished:
-    the share of finished people of the scenario who were less accurate, ties counting half, in %.
+    """What a participant is told at the end. ``percentile``: the share of the other finished people
+    of the scenario with fewer correct, plus half of those with as many, in %: alone at the top 100,
+    alone at the bottom 0. None while fewer than the study's ``percentile_from`` others have
+    finished.
     """
 
     correct: int
