@@ -10,6 +10,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import Response
 
+from physion.experiment.bearer import read_token
 from physion.experiment.bodies import read_message
 from physion.experiment.media_links import sign_media
 from physion.experiment.recruitment import RECRUITERS, begins_nothing
@@ -75,9 +76,7 @@ def _example(study: Study, secrets: Secrets, scenario: str) -> TrialMedia:
 
 def token_of(request: Request) -> str:
     """The token that a request carries; empty where there is none."""
-    scheme, _, token = request.headers.get("authorization", "").partition(" ")
-    token = token.strip()
-    return token if scheme.lower() == "bearer" and len(token) <= 200 else ""
+    return read_token(request.scope["headers"])
 
 
 def build_api(study: Study, secrets: Secrets, store: Store) -> APIRouter:

@@ -15,6 +15,7 @@ from urllib.parse import quote
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from physion.experiment.bearer import read_token
 from physion.experiment.rate_limits import RateLimits
 from physion.experiment.refusals import Reply, refuse
 from physion.experiment.security_headers import HTTPS_ONLY, security_headers
@@ -28,7 +29,6 @@ log = logging.getLogger("physion.experiment")
 MAX_TARGET = 4096
 """Bytes of path and query together."""
 MAX_HEADERS, MAX_HEADER_BYTES = 64, 16 * 1024
-MAX_TOKEN = 200
 BODY_SECONDS = 20.0
 """A body that takes longer is given up."""
 LINGER_BYTES, LINGER_SECONDS = 256 * 1024, 1.0
@@ -65,7 +65,7 @@ class _Exchange:
         self._scope, self._receive, self._send = scope, receive, send
         self._address = scope["client"][0] if scope.get("client") else ""
         self._path: str = scope["path"]
-        self._token = ""
+        self._token = read_token(scope["headers"])
         self._declared = 0
         self._deadline = 0.0
         self._taken = 0
@@ -108,8 +108,6 @@ class _Exchange:
                 self._body_ended = self._declared == 0
             elif name == b"transfer-encoding":
                 self._body_ended = False
-            elif name == b"authorization":
-                self._token = value[7 : 7 + MAX_TOKEN].decode("latin-1")
         if size > MAX_HEADER_BYTES:
             return refuse("too_large", "The address or the headers are too long.")
         return refuse("too_large") if self._declared > MAX_BODY else None
