@@ -287,7 +287,12 @@ def measure(name: str, options: argparse.Namespace, folder: Path) -> Row:
 
     from physion.experiment.study import Limits
 
-    fast = Limits(requests_per_second=10_000, burst=100_000, sessions_per_minute=100_000)
+    fast = Limits(
+        requests_per_second=10_000,
+        burst=100_000,
+        sessions_per_minute=100_000,
+        sessions_at_once=100_000,
+    )
     study = make_tiny_study(folder / name, test=TEST_TRIALS, limits=fast)
     words = [sys.executable]
     if options.profile:

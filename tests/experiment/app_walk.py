@@ -17,7 +17,9 @@ from physion.experiment.identity import Secrets
 from physion.experiment.store import Store
 from physion.experiment.study import Limits, Study
 
-FAST = Limits(requests_per_second=10_000, burst=100_000, sessions_per_minute=100_000)
+FAST = Limits(
+    requests_per_second=10_000, burst=100_000, sessions_per_minute=100_000, sessions_at_once=100_000
+)
 
 
 @dataclass

@@ -314,12 +314,12 @@ class TestRates:
         assert limits.before("GET", "/api/session", "good", "1.2.3.4", 0.0) == 0
 
     def test_new_sessions_are_counted_by_address(self) -> None:
-        client = TestClient(make_app(limits=Limits(sessions_per_minute=3)), client=("9.9.9.9", 1))
+        client = TestClient(make_app(limits=Limits(sessions_at_once=3)), client=("9.9.9.9", 1))
         assert [client.post("/api/enter").status_code for _ in range(4)] == [200] * 3 + [429]
         assert client.get("/echo").status_code == 200
 
     def test_a_refused_body_is_taken_so_that_the_connection_goes_on(self) -> None:
-        with running(make_app(limits=Limits(sessions_per_minute=1))) as port:
+        with running(make_app(limits=Limits(sessions_at_once=1))) as port:
             one = head("/api/enter", "Content-Length: 60000") + b"x" * 60000
             answer = exchange(port, one, one, head("/echo", method="GET"))
             assert re.findall(rb"HTTP/1.1 (\d+)", answer) == [b"200", b"429", b"200"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -11,6 +12,7 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 from app_walk import served
 
 from physion.experiment.bearer import read_token
+from physion.experiment.rate_limits import RateLimits
 from physion.experiment.study import Limits
 
 TINY = {"familiarization": 1, "test": 1}
@@ -47,3 +49,32 @@ def test_a_token_written_otherwise_avoids_no_limit(tmp_path: Path) -> None:
             assert ask(f"bearer {around}{token}") in (401, 429)
             assert ask(f"Bearer {token}{around}") in (401, 429)
             assert ask(f"Bearer {token}", f"Bearer {around}{spaces}") in (401, 429)
+
+
+@pytest.mark.parametrize(("request_", "refusal"), [
+    ({"method": "GET", "url": "/api/session"}, 401),
+    # What is no message is refused before its token is looked up.
+    ({"method": "POST", "url": "/api/page", "content": b"{}"}, 422),
+])  # fmt: skip
+def test_unknown_tokens_hold_up_nobody_who_entered(
+    tmp_path: Path, request_: dict[str, Any], refusal: int
+) -> None:
+    with served(tmp_path / "s", **TINY) as site:
+        statuses = []
+        while not statuses or (statuses[-1] == refusal and len(statuses) < 300):
+            headers = {"authorization": f"Bearer invented-{len(statuses)}"}
+            statuses.append(site.client.request(headers=headers, **request_).status_code)
+        assert len(statuses) > 60 and statuses[-1] == 429
+        assert site.person(id="from the same room").state()["stage"] == "consent"
+
+
+def test_a_class_behind_one_address_enters_at_once() -> None:
+    limits = RateLimits(Limits())
+
+    def enter(now: float) -> float:
+        return limits.before("POST", "/api/enter", "", "192.0.2.1", now)
+
+    assert [enter(0.0) for _ in range(200)] == [0.0] * 200
+    assert enter(0.0) == 1.0
+    # A script that goes on gets one a second.
+    assert [enter(1.0), enter(1.0), enter(2.0), enter(2.5)] == [0.0, 1.0, 0.0, 0.5]

@@ -146,7 +146,7 @@ def test_https_and_what_is_said(study: Study, certificate: tuple[Path, Path]) ->
 
 @pytest.mark.parametrize("trusted", [True, False])
 def test_a_proxys_word_counts_only_where_it_is_named(tmp_path: Path, trusted: bool) -> None:
-    limits = Limits(sessions_per_minute=1)
+    limits = Limits(sessions_per_minute=1, sessions_at_once=1)
     proxies = ["127.0.0.1"] if trusted else ["10.0.0.1"]
     settings = {"proxy_headers": True, "forwarded_allow_ips": proxies}
     with (

@@ -32,7 +32,9 @@ from physion.experiment.study import Limits, Study
 
 KILLS, POSTGRES_KILLS, DATABASE_CRASHES = 50, 8, 3
 PHASES = {"familiarization": 3, "test": 12}
-FAST = Limits(requests_per_second=10_000, burst=100_000, sessions_per_minute=100_000)
+FAST = Limits(
+    requests_per_second=10_000, burst=100_000, sessions_per_minute=100_000, sessions_at_once=100_000
+)
 """Limits that do not slow the load down; they are tested elsewhere."""
 LONGEST_RUN_S = 0.4
 """A kill comes at a random moment up to so long after the server is there."""

@@ -12,6 +12,7 @@ from starlette.responses import Response
 
 from physion.experiment.bearer import read_token
 from physion.experiment.bodies import read_message
+from physion.experiment.guards import GIVEN_TOKEN
 from physion.experiment.media_links import sign_media
 from physion.experiment.recruitment import RECRUITERS, begins_nothing
 from physion.experiment.refusals import Reply, refuse
@@ -111,7 +112,9 @@ def build_api(study: Study, secrets: Secrets, store: Store) -> APIRouter:
         if begins_nothing(enter):
             return refuse("not_yet", "Accept the task first.")
         address = request.client.host if request.client else ""
-        return Reply(await store.enter(enter, address))
+        entered = await store.enter(enter, address)
+        request.scope["state"][GIVEN_TOKEN] = entered.token
+        return Reply(entered)
 
     @router.get("/session")
     async def get_session(request: Request) -> Response:

@@ -29,6 +29,8 @@ log = logging.getLogger("physion.experiment")
 MAX_TARGET = 4096
 """Bytes of path and query together."""
 MAX_HEADERS, MAX_HEADER_BYTES = 64, 16 * 1024
+GIVEN_TOKEN = "given_token"
+"""State of a request under which the application says which new token its answer holds."""
 BODY_SECONDS = 20.0
 """A body that takes longer is given up."""
 LINGER_BYTES, LINGER_SECONDS = 256 * 1024, 1.0
@@ -63,6 +65,7 @@ class _Exchange:
                  scope: Scope, receive: Receive, send: Send) -> None:  # fmt: skip
         self._app, self._extra, self._limits = app, headers, limits
         self._scope, self._receive, self._send = scope, receive, send
+        scope.setdefault("state", {})
         self._address = scope["client"][0] if scope.get("client") else ""
         self._path: str = scope["path"]
         self._token = read_token(scope["headers"])
@@ -145,11 +148,16 @@ class _Exchange:
             return
         if message["type"] == "http.response.start":
             self._started = True
+            self._learn(message["status"])
             message = self._with_headers(message)
-            self._limits.after(
-                message["status"], self._path, self._token, self._address, time.monotonic()
-            )
         await self._send(message)
+
+    def _learn(self, status: int) -> None:
+        now = time.monotonic()
+        self._limits.after(status, self._path, self._token, self._address, now)
+        given = self._scope["state"].get(GIVEN_TOKEN)
+        if given is not None:
+            self._limits.gave_out(given, now)
 
     def _with_headers(self, message: Message) -> Message:
         if log.isEnabledFor(logging.INFO):

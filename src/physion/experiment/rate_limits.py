@@ -12,8 +12,8 @@ if TYPE_CHECKING:
 MAX_BUCKETS = 20_000
 """So many addresses or tokens are remembered; the one not seen for longest is forgotten first."""
 WRONG_TOKENS_PER_SECOND, WRONG_TOKENS_BURST = 2.0, 60.0
-
-
+WRONG = (401, 422)
+"""Answers to a token that opens nothing: it may be refused for what else is wrong before that."""
 WITH_TOKEN = frozenset(
     f"/api/{name}"
     for name in ("session", "trials/familiarization", "trials/test", "page", "answers", "events",
@@ -55,14 +55,15 @@ class Buckets:
 class RateLimits:
     """The limits of one server: by token, and by address for entering.
 
-    The experimenter's login has waits of its own. A token gets a bucket once it has opened a session, so that invented ones fill no memory; an address that sent many of those
-    is refused tokens that are not known yet.
+    A token is known, and has a bucket of its own, once the server has given it out or it has opened
+    a session: invented ones fill no memory. They spend from the bucket of unknown tokens of their
+    address, which keeps out nobody who is known. The experimenter's login has waits of its own.
     """
 
     def __init__(self, limits: Limits) -> None:
         per_second = limits.sessions_per_minute / 60.0
         self._tokens = Buckets(limits.requests_per_second, float(limits.burst))
-        self._entering = Buckets(per_second, max(1.0, limits.sessions_per_minute))
+        self._entering = Buckets(per_second, float(limits.sessions_at_once))
         self._wrong = Buckets(WRONG_TOKENS_PER_SECOND, WRONG_TOKENS_BURST)
 
     def before(self, method: str, path: str, token: str, address: str, now: float) -> float:
@@ -79,10 +80,16 @@ class RateLimits:
         """Learn from the status of the answer whether the token opens anything."""
         if path not in WITH_TOKEN:
             return
-        if status == 401:
-            self._wrong.take(network_of(address), now)
-        elif status == 200 and token not in self._tokens:
+        if token in self._tokens:
+            return
+        if status == 200:
             self._tokens.take(token, now)
+        elif status in WRONG:
+            self._wrong.take(network_of(address), now)
+
+    def gave_out(self, token: str, now: float) -> None:
+        """A token is known from the moment that it is given to somebody who entered."""
+        self._tokens.take(token, now)
 
 
 def network_of(address: str) -> str:

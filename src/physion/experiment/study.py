@@ -72,11 +72,14 @@ class Recruitment:
 
 @dataclass(frozen=True)
 class Limits:
-    """Requests that are let through: by session a second, by address new sessions a minute."""
+    """Requests that are let through: of a session and, for new sessions, of an address; so many at
+    once, then so many a second or minute. A class may sit behind one address.
+    """
 
     requests_per_second: float = 20.0
     burst: int = 100
     sessions_per_minute: float = 60.0
+    sessions_at_once: int = 200
 
 
 @dataclass(frozen=True)

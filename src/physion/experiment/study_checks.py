@@ -204,9 +204,13 @@ KEYS: tuple[Key, ...] = (
         "\"session\": each session gets a code of its own; any other word is everybody's code."),
     Key("recruitment", "link_code", _code, "Completion code of people who came by a plain link."),
     Key("recruitment", "link_address", address(), "Address that they are sent to at the end."),
-    Key("limits", "requests_per_second", number(0.1, 10_000), "Requests of one session."),
+    Key("limits", "requests_per_second", number(0.1, 10_000),
+        "Requests of one session, in the long run."),
     Key("limits", "burst", whole(1, 100_000), "Requests at once that are forgiven."),
-    Key("limits", "sessions_per_minute", number(0.1, 100_000), "New sessions from one address."),
+    Key("limits", "sessions_per_minute", number(0.1, 100_000),
+        "New sessions from one address, in the long run."),
+    Key("limits", "sessions_at_once", whole(1, 100_000),
+        "New sessions at once from one address that are forgiven, as of a class in one room."),
 )  # fmt: skip
 """All keys in the order in which they are written."""
 
