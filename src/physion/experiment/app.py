@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import TYPE_CHECKING
 
 from fastapi import FastAPI
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
     from physion.experiment.identity import Secrets
     from physion.experiment.store import Store
     from physion.experiment.study import Study
+
+log = logging.getLogger(__name__)
 
 
 def build_app(study: Study, secrets: Secrets, store: Store) -> FastAPI:
@@ -73,7 +76,11 @@ def _serve_media(app: FastAPI, study: Study, secrets: Secrets) -> None:
             path = read_media_path(study, secrets, request.scope["path"])
         except BadInputError:
             return refuse("not_found")
-        return await files.response(path)
+        try:
+            return await files.response(path)
+        except BadInputError as error:
+            log.error("a participant could not be shown a trial: %s", error)
+            return refuse("not_found", "This file is missing on the server.")
 
 
 async def _refused(request: Request, error: Exception) -> Response:

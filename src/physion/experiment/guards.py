@@ -161,9 +161,9 @@ class _Exchange:
 
     def _with_headers(self, message: Message) -> Message:
         if log.isEnabledFor(logging.INFO):
-            log.info("%s %s %d", self._scope["method"], quote(self._path), message["status"])
-        # Without the query, which may tell who comes; %a: nobody writes lines of their own.
-        log.info("%s %a %d", self._scope["method"], self._path[:200], message["status"])
+            # Without the query, which may tell who comes; quoted: nobody writes lines of their own.
+            path = quote(self._path[:200])
+            log.info("%s %s %d", self._scope["method"], path, message["status"])
         headers = list(message.get("headers", ()))
         given = {name for name, _ in headers}
         headers += [pair for pair in self._extra if pair[0] not in given]

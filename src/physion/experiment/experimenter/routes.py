@@ -114,12 +114,12 @@ class _Pages:
             return self._login_form(request, WRONG_FORM, 403)
         wait = await self._gate.try_password(request, fields.get("password", ""))
         if wait is None:
-            LOG.info("an experimenter logged in from %s", _address(request))
+            LOG.info("an experimenter logged in")
             self._gate.logins.close(self._gate.token(request))
             response = _go("")
             set_cookie(request, response, self._gate.logins.open(self._gate.clock()))
             return response
-        LOG.warning("a login from %s was refused", _address(request))
+        LOG.warning("a login of an experimenter was refused")
         return self._refuse_password(request, wait, self._login_form)
 
     async def logout(self, request: Request) -> Response:
@@ -337,7 +337,3 @@ class _Pages:
 
 def _go(place: str) -> Response:
     return RedirectResponse(f"{PATH}{place}", 303, headers=HEADERS)
-
-
-def _address(request: Request) -> str:
-    return request.client.host if request.client else "an unknown address"
