@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -22,7 +23,7 @@ from tiny_study import make_tiny_study
 
 from physion.experiment import wire
 from physion.experiment.bodies import BadBodyError, parse_message
-from physion.experiment.identity import Secrets, sign
+from physion.experiment.identity import Secrets
 from physion.experiment.media_links import sign_media
 from physion.experiment.tables import ANSWERS, EVENTS, RAW_IDS, SESSIONS
 
@@ -307,8 +308,12 @@ class TestSignatures:
         assert_refused(site.client.get(path), 404, "not_found")
 
     def test_unknown_trials_and_scenarios_are_not_found(self, site: Served) -> None:
-        for words in ("0-1-t-3-movie", "0-1-t-999999-movie", "1-1-t-0-movie", "0-1-f-1-full"):
-            path = f"/media/{words}-{sign(site.secrets, 'media', words)}"
+        more = replace(site.study, scenarios=("collide", "drop"))
+        for scenario, phase, trial in (
+            ("collide", "test", 3), ("collide", "test", 999_999), ("drop", "test", 0),
+            ("collide", "familiarization", 1),
+        ):  # fmt: skip
+            path = sign_media(more, site.secrets, scenario, 1, phase, trial, "movie")
             assert_refused(site.client.get(path), 404, "not_found")
 
 

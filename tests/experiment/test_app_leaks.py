@@ -15,15 +15,19 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 import av
 from app_walk import Person, Served, served
+from sqlalchemy import select
 from tiny_study import FULL, OBSERVED, read_number
 
 from physion.experiment.identity import sign
 from physion.experiment.media_links import sign_media
+from physion.experiment.orders import order_of
 from physion.experiment.page_files import PACKAGE
 from physion.experiment.stimuli import Stimulus
+from physion.experiment.tables import SESSIONS
 
 TRIALS = {"familiarization": 3, "test": 6}
 PHASES = ("familiarization", "test")
+ADDRESS = re.compile(r"/media/([tf]-\d+-(?:movie|map))-([0-9a-f]{16})-([0-9a-f]{32})")
 TELLING = {"contact", "correct", "accuracy", "percentile", "label", "outcome", "score", "stimulus",
            "full", "place", "answer", "feedback"}  # fmt: skip
 """Names in messages under which an end could be told."""
@@ -154,10 +158,34 @@ def test_trials_differ_by_nothing_that_follows_from_their_ends(site: Served) -> 
     without = [{k: v for k, v in one.items() if k not in ("trial", "movie", "map", "fixation_ms")}
                for one in listed]  # fmt: skip
     assert without == [without[0]] * len(without)
-    pattern = r"/media/0-(\d+)-t-(\d)-(movie|map)-[0-9a-f]{32}"
-    found = [re.fullmatch(pattern, one[kind]) for one in listed for kind in ("movie", "map")]
+    found = [ADDRESS.fullmatch(one[kind]) for one in listed for kind in ("movie", "map")]
     assert all(found)
-    assert {match[1] for match in found if match} == {found[0][1]}  # type: ignore[index]
+    assert len({match[3] for match in found if match}) == len(found)
+
+
+def test_nothing_tells_the_seed_of_the_order(site: Served) -> None:
+    """With a public list of stimuli, and this program, the seed would tell every end."""
+    person = site.person(id="seed").walk("test")
+    person.ask("GET", "/api/session")
+    for phase in PHASES:
+        person.ask("GET", f"/api/trials/{phase}")
+    person.answer(0)
+    with site.store.engine.connect() as connection:
+        kept = connection.execute(
+            select(SESSIONS.c.order_seed).where(SESSIONS.c.reference == person.state()["reference"])
+        )
+        seed = kept.scalar_one()
+    said = "".join(answer.text for _, answer in person.heard)
+    assert "/media/t-" in said and "/media/f-" in said
+    order = [one.stimulus for one in order_of(site.study, "collide", seed)["test"]]
+    for written in (str(seed), f"{seed:x}", f"{seed:016x}"):
+        assert written not in said
+    numbers_said = {int(word) for word in re.findall(r"\d+", said)}
+    numbers_said |= {int(word, 16) for word in re.findall(r"[0-9a-f]+", said)}
+    numbers_said |= {int(word[2], 16) ^ int(word[3][at : at + 16], 16)
+                     for word in ADDRESS.finditer(said) for at in (0, 16)}  # fmt: skip
+    assert seed not in numbers_said and len(numbers_said) > 50
+    assert all(name not in said for name in order)
 
 
 def test_media_have_no_headers_of_their_files(site: Served) -> None:
@@ -192,23 +220,25 @@ class TestWholeMovies:
 
     def test_nor_by_any_other_change(self, site: Served, listed: dict[str, list[Any]]) -> None:
         path: str = listed["test"][0]["movie"]
-        _, seed, letter, trial, kind, mac = path.removeprefix("/media/").split("-")
+        letter, trial, kind, hidden, mac = path.removeprefix("/media/").split("-")
         other = "0" if mac[0] != "0" else "1"
-        start, own = f"0-{seed}-{letter}-{trial}-{kind}", f"-{mac}"
+        start, own = f"{letter}-{trial}-{kind}", f"-{hidden}-{mac}"
         changed = [
-            f"0-{seed}-f-{trial}-full{own}", f"0-{seed}-f-{trial}-{kind}{own}",
-            f"0-{seed}-{letter}-1-{kind}{own}", f"0-{seed}-{letter}-0{trial}-{kind}{own}",
-            f"0-{int(seed) + 1}-{letter}-{trial}-{kind}{own}", f"1{start[1:]}{own}",
-            f"٠{start[1:]}{own}", f"{start}-", f"{start}-{other}{mac[1:]}",
-            f"{start}-{mac.upper()}", f"{start}{own}%0a", f"{start}{own}/", f"{start}{own}.mp4",
+            f"f-{trial}-full{own}", f"f-{trial}-{kind}{own}", f"{letter}-1-{kind}{own}",
+            f"{letter}-0{trial}-{kind}{own}", f"{letter}-٠-{kind}{own}", f"{start}-",
+            f"{start}-{int(hidden, 16) ^ 1:016x}-{mac}", f"{start}-{hidden}-{other}{mac[1:]}",
+            f"{start}-{mac[:16]}-{mac}", f"{start}-{mac}", f"{start}-{hidden}-{mac.upper()}",
+            f"{start}{own}%0a", f"{start}{own}/", f"{start}{own}.mp4",
         ]  # fmt: skip
         for name in changed:
             answer = site.client.get(f"/media/{name}")
             assert answer.status_code == 404, name
 
     def test_a_test_trial_has_none_even_with_the_key(self, site: Served) -> None:
-        words = "0-1-t-0-full"
-        path = f"/media/{words}-{sign(site.secrets, 'media', words)}"
+        words = ("media", site.study.stimuli_digest, "collide", "1", "t-0-full")
+        signature = sign(site.secrets, *words)
+        pad = int(sign(site.secrets, "hidden seed", signature)[:16], 16)
+        path = f"/media/t-0-full-{1 ^ pad:016x}-{signature}"
         assert site.client.get(path).status_code == 404
         with pytest.raises(ValueError, match="test trial"):
             sign_media(site.study, site.secrets, "collide", 1, "test", 0, "full")

@@ -7,6 +7,7 @@ import re
 import stat
 from collections import Counter
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import pytest
@@ -174,15 +175,60 @@ def test_no_full_movie_of_a_test_trial(small_study: Study) -> None:
 def test_other_addresses_lead_nowhere(small_study: Study) -> None:
     good = sign_media(small_study, KEYS, "drop", 77, "test", 0, "movie")
     practice = sign_media(small_study, KEYS, "drop", 77, "familiarization", 0, "movie")
+    *_, hidden, signature = good.split("-")
     bad = [
-        good.replace("-t-0-", "-t-1-"), good.replace("movie", "full"), good.replace("1-77", "0-77"),
+        good.replace("t-0-", "t-1-"), good.replace("t-0-", "t-00-"), good.replace("t-0-", "f-0-"),
+        good.replace("movie", "map"), good.replace("movie", "full"),
+        good.replace(hidden, f"{int(hidden, 16) ^ 1:016x}"), good.replace(hidden, "0" * 16),
+        good.replace(signature, f"{int(signature, 16) ^ 1:032x}"),
         practice.replace("movie", "full"), good + "0", good[:-1], good.upper(), good + "\n",
         good.replace("/media/", "/media/../"), "/media/../secret.json", "", "/media/", "\ud800",
-        good.replace("77", "٧٧"), "/media/media/00000.mp4",
-        sign_media(replace(small_study, scenarios=("a", "b", "drop")), KEYS, "drop", 1, "test", 0,
-                   "map"),
+        good.replace("t-0-", "t-٠-"), "/media/media/00000.mp4",
+        sign_media(replace(small_study, scenarios=("a", "b")), KEYS, "b", 1, "test", 0, "map"),
         sign_media(small_study, KEYS, "drop", 77, "test", 99, "map"),
+        sign_media(small_study, KEYS, "drop", 2**64 - 1, "test", 99, "map"),
     ]  # fmt: skip
+    assert len(set(bad)) == len(bad) and good not in bad
     for path in bad:
         with pytest.raises(BadInputError, match="no such"):
             read_media_path(small_study, KEYS, path)
+
+
+def test_an_address_never_means_another_movie(small_study: Study) -> None:
+    path = sign_media(small_study, KEYS, "drop", 77, "test", 0, "movie")
+    expected = read_media_path(small_study, KEYS, path)
+    # Scenarios in another order, one more of them: the same movie.
+    for scenarios in (("drop", "collide"), ("roll", "collide", "drop"), ("drop",)):
+        changed = replace(small_study, scenarios=scenarios)
+        assert read_media_path(changed, KEYS, path) == expected
+    # Without the scenario, or with other stimuli: none.
+    for other in (
+        replace(small_study, scenarios=("collide",)),
+        replace(small_study, stimuli_digest="0" * 64),
+    ):
+        with pytest.raises(BadInputError, match="no such"):
+            read_media_path(other, KEYS, path)
+
+
+def test_addresses_tell_nothing_of_the_seed(small_study: Study) -> None:
+    """What is hidden must look random, and differ where seed, place or key differ."""
+    hidden: dict[tuple[int, int, str], int] = {}
+    for seed in range(200):
+        for trial in range(4):
+            for kind in ("movie", "map"):
+                path = sign_media(small_study, KEYS, "drop", seed, "test", trial, kind)
+                place, trial_shown, kind_shown, word, _ = path[7:].split("-")
+                assert (place, trial_shown, kind_shown) == ("t", str(trial), kind)
+                hidden[seed, trial, kind] = int(word, 16)
+    words = list(hidden.values())
+    # Were a pad used twice, the difference of two words would be that of their seeds.
+    assert len(set(words)) == len(words)
+    pairs = list(combinations(list(hidden.items())[::7], 2))
+    assert all(one ^ two != a[0] ^ b[0] for (a, one), (b, two) in pairs)
+    # Each bit is set in half of 1600 words, whose seeds have 56 bits that are never set:
+    # 800 expected, standard deviation 20.
+    for bit in range(64):
+        assert 690 < sum(word >> bit & 1 for word in words) < 910
+    other_key = replace(KEYS, link_key=b"x" * 32)
+    again = sign_media(small_study, other_key, "drop", 3, "test", 0, "movie").split("-")
+    assert int(again[3], 16) != hidden[3, 0, "movie"]
