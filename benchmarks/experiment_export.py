@@ -145,6 +145,9 @@ def fill(study: Study, url: str, count: int) -> int:
         for rows in answers_of(study, sessions):
             size += sum(len(row["details"]) for row in rows)
             connection.execute(insert(ANSWERS), rows)
+    if engine.dialect.name == "postgresql":
+        with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
+            connection.exec_driver_sql("VACUUM ANALYZE")
     engine.dispose()
     return size
 
