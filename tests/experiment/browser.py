@@ -7,9 +7,9 @@ every page is also written there as a picture, to be looked at.
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import os
 import re
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from physion.experiment.identity import Secrets, participant_hash
 from physion.experiment.own_server import OwnServer
 from physion.experiment.study import Recruitment, Study, Timing
 from physion.experiment.tables import ANSWERS, EVENTS, SESSIONS
+from programs import absent, find_chromium
 
 SIZE = {"width": 1280, "height": 800}
 SHORT = Timing(fixation_ms=(60, 120), cue_ms=500, flash_hz=2.0)
@@ -31,21 +32,14 @@ OFFLINE = re.compile(r"ERR_(INTERNET_DISCONNECTED|CONNECTION_REFUSED)|status of 
 """What browsers say of requests that a test lets fail."""
 
 
-def chromium_path() -> str | None:
-    """The browser's program, None where there is none."""
-    named = os.environ.get("PHYSION_BROWSER")
-    names = [named] if named else ["chromium", "chromium-browser", "google-chrome"]
-    return next((found for name in names if (found := shutil.which(name))), None)
-
-
 # As long as it lives, its event loop runs in this thread, and others could not start theirs.
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Any]:
     """A running browser for one file of tests; they are skipped where there is none."""
-    driver = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    path = chromium_path()
-    if path is None:
-        pytest.skip("no Chromium on this machine: install it, or set PHYSION_BROWSER")
+    if importlib.util.find_spec("playwright") is None:
+        absent("playwright is absent: install the extra 'dev'")
+    driver = importlib.import_module("playwright.sync_api")
+    path = find_chromium()
     with driver.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
         yield browser

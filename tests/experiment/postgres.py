@@ -20,6 +20,8 @@ import pytest
 from sqlalchemy import create_engine, text
 from sqlalchemy.engine import make_url
 
+from programs import absent
+
 USER = "postgres"
 
 
@@ -78,9 +80,9 @@ def postgres_cluster() -> Iterator[Cluster]:
     """A running server of our own."""
     programs = _programs()
     if programs is None:
-        pytest.skip("PostgreSQL is absent: install it, or set PHYSION_POSTGRES to a server's URL")
+        absent("PostgreSQL is absent: install it, or set PHYSION_POSTGRES to a server's URL")
     if os.geteuid() == 0 and not _has_user():
-        pytest.skip("PostgreSQL does not run as root, and there is no user postgres")
+        absent("PostgreSQL does not run as root, and there is no user postgres")
     # Not below pytest's own folder, which the user postgres may not enter. initdb makes data.
     folder = Path(tempfile.mkdtemp(prefix="physion-postgres-"))
     try:

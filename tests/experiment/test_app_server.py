@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import http.client
 import json
-import shutil
 import signal
 import socket
 import ssl
@@ -28,6 +27,7 @@ from tiny_study import make_tiny_study
 from physion.cli.main import main
 from physion.experiment.server import Address
 from physion.experiment.study import Limits, Study
+from programs import find_program
 
 
 @pytest.fixture(scope="module")
@@ -39,12 +39,11 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Study:
 @pytest.fixture(scope="module")
 def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A certificate for localhost that signs itself, and its key."""
-    if shutil.which("openssl") is None:
-        pytest.skip("openssl is absent; install it to test https")
+    openssl = find_program("openssl")
     folder = tmp_path_factory.mktemp("https")
     certificate, key = folder / "cert.pem", folder / "key.pem"
     subprocess.run(
-        ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "1", "-subj",
+        [openssl, "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "1", "-subj",
          "/CN=localhost", "-addext", "subjectAltName=DNS:localhost,IP:127.0.0.1",
          "-keyout", key, "-out", certificate],
         check=True, capture_output=True,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import re
-import shutil
 import subprocess
 from pathlib import Path
 
@@ -22,9 +21,9 @@ from physion.experiment.export import export_study
 from physion.experiment.identity import Secrets
 from physion.experiment.spreadsheet import restore_cell
 from physion.experiment.tables import PARTICIPANTS, SESSIONS
+from programs import find_program
 
 NASTY = '=1+1\t"tab"\n-2;@SUM(1) \\ \r n/a'
-VALIDATOR = shutil.which("bids-validator-deno") or shutil.which("bids-validator")
 
 Exported = tuple[Path, pd.DataFrame, pd.DataFrame]
 
@@ -161,11 +160,11 @@ def test_labels_are_never_alike() -> None:
     }  # fmt: skip
 
 
-@pytest.mark.skipif(VALIDATOR is None, reason="no BIDS validator: pip install bids-validator-deno")
 def test_the_bids_validator_finds_no_error(exported: Exported) -> None:
-    assert VALIDATOR is not None
+    names, what = ("bids-validator-deno", "bids-validator"), "the BIDS validator"
+    validator = find_program(*names, variable="BIDS_VALIDATOR", what=what)
     done = subprocess.run(
-        [VALIDATOR, str(exported[0] / "bids"), "--json"],
+        [validator, str(exported[0] / "bids"), "--json"],
         stdin=subprocess.DEVNULL, capture_output=True, timeout=120, check=False,
     )  # fmt: skip
     issues = json.loads(done.stdout)["issues"]["issues"]

@@ -9,7 +9,6 @@ import itertools
 import json
 import os
 import select
-import shutil
 import subprocess
 import sys
 import time
@@ -24,19 +23,9 @@ from viewer_dataset import EVIL, Plan, make_dataset
 
 from physion.report.viewer import ViewerOptions, build_viewer
 from physion.trials.video import read_frames
+from programs import find_chromium
 
-CHROMIUM = next(
-    (
-        path
-        for name in ("chromium", "chromium-browser", "google-chrome")
-        if (path := shutil.which(name))
-    ),
-    None,
-)
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="no chromium is installed"),
-]
+pytestmark = pytest.mark.slow
 
 LAUNCH = """
 import fcntl, os, sys
@@ -52,12 +41,12 @@ class Browser:
     """A headless chromium that speaks its DevTools protocol through two pipes."""
 
     def __init__(self, profile: Path) -> None:
-        assert CHROMIUM is not None
+        chromium = find_chromium()
         to_child, self._write = os.pipe()
         self._read, from_child = os.pipe()
         flags = ["--headless", "--no-sandbox", "--remote-debugging-pipe", "--no-first-run"]
         flags += ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-extensions"]
-        command = [CHROMIUM, *flags, f"--user-data-dir={profile}", "about:blank"]
+        command = [chromium, *flags, f"--user-data-dir={profile}", "about:blank"]
         self._process = subprocess.Popen(
             [sys.executable, "-c", LAUNCH, str(to_child), str(from_child), *command],
             pass_fds=(to_child, from_child),

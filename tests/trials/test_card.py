@@ -7,7 +7,6 @@ import fnmatch
 import hashlib
 import json
 import os
-import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ from physion.trials.facts import MEANINGS, meaning
 from physion.trials.files import encode_png, write_files
 from physion.trials.index import COLUMNS, build_index, read_index, write_index
 from physion.trials.layout import TrialPaths, find_trials
+from programs import find_program
 
 RAI_WORDS = {
     "dataCollection", "dataCollectionType", "dataCollectionMissingData", "dataCollectionRawData",
@@ -280,9 +280,7 @@ def _validate(path: Path) -> str:
 
     It lives best in an environment of its own, as it brings type stubs that mypy would read.
     """
-    program = os.environ.get("MLCROISSANT") or shutil.which("mlcroissant")
-    if not program:
-        pytest.skip("mlcroissant is absent: pip install it anywhere, $MLCROISSANT is its path")
+    program = find_program("mlcroissant", variable="MLCROISSANT")
     nowhere = dict.fromkeys(("http_proxy", "https_proxy"), "http://127.0.0.1:9")
     done = subprocess.run(
         [program, "validate", "--jsonld", str(path)],
