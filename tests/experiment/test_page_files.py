@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from physion.experiment import texts
+from physion.experiment.wire import REFUSALS
 
 PACKAGE = Path(texts.__file__).parent
 STATIC = PACKAGE / "static"
@@ -55,6 +56,12 @@ def test_the_page_asks_no_other_host_and_has_nothing_inline() -> None:
     for name, code in CODE.items():
         assert not re.search(r"https?://(?!\S*\\/)[a-z]", code), name
     assert "url(" not in (STATIC / "pages.css").read_text(encoding="utf-8")
+
+
+def test_refusals_are_known_by_the_words_of_the_server() -> None:
+    (listed,) = re.findall(r"const CODES = new Set\(\[(.*?)\]\)", CODE["api.js"], re.DOTALL)
+    staying = {code for code, status in REFUSALS.items() if status < 500 and status != 429}
+    assert set(re.findall(r"\w+", listed)) == staying
 
 
 def test_no_value_can_become_markup() -> None:

@@ -1,6 +1,7 @@
 /**
- * Requests to the server. What fails on the way (no connection, timeout, 5xx, 429) is tried again,
- * with growing pauses, until it is answered; what the server refuses is thrown as `Refused`.
+ * Requests to the server. What fails on the way (no connection, timeout, 5xx, 429, or an answer of
+ * somebody else: a proxy, a firewall, a hotel's login page) is tried again, with growing pauses,
+ * until our server answers; what it refuses is thrown as `Refused`.
  * Every request may be repeated safely: answers have keys, pages can be sent twice.
  * @module api
  */
@@ -8,15 +9,32 @@
 const TIMEOUT_MS = 15_000;
 const FIRST_PAUSE_MS = 500;
 const LONGEST_PAUSE_MS = 8_000;
+/** Words for refusals that stay. Whatever else comes with a status of 4xx is not from our server. */
+const CODES = new Set([
+  "bad_request",
+  "too_large",
+  "unknown_token",
+  "bad_link",
+  "id_needed",
+  "already_took_part",
+  "study_full",
+  "wrong_stage",
+  "out_of_order",
+  "already_answered",
+  "not_yet",
+  "not_found",
+  "not_allowed",
+]);
+const PASSING = [408, 429];
 
 /** The server said no. `state`: where the session stands, where the server told it. */
 export class Refused extends Error {
-  /** @param {number} status @param {any} body A `Refusal`, or anything. */
+  /** @param {number} status @param {any} body A `Refusal`. */
   constructor(status, body) {
-    super(body?.message ?? `status ${status}`);
+    super(body.message ?? `status ${status}`);
     this.status = status;
-    this.code = body?.error ?? "bad_request";
-    this.state = body?.state ?? null;
+    this.code = body.error;
+    this.state = body.state ?? null;
   }
 }
 
@@ -49,8 +67,9 @@ function pause(ms, signal) {
 }
 
 /**
- * @typedef {{token?: string|null, signal?: AbortSignal}} Options
- * `token`: of whom, where it is not the one who entered here.
+ * @typedef {{token?: string|null, signal?: AbortSignal, expects?: string}} Options
+ * `token`: of whom, where it is not the one who entered here. `expects`: a name that the answer
+ * must have, else it is not our server's.
  */
 
 export class Api {
@@ -74,7 +93,12 @@ export class Api {
 
   /** @param {string} path @param {AbortSignal} [signal] @returns {Promise<Blob>} */
   blob(path, signal) {
-    return this.#repeat(async () => (await this.#fetch(path, {}, signal)).blob(), signal);
+    return this.#repeat(async () => {
+      const response = await this.#fetch(path, {}, signal);
+      const type = response.headers.get("Content-Type") ?? "";
+      if (!/^(video|image)\//.test(type)) throw new Trouble(`neither movie nor picture: ${type}`);
+      return response.blob();
+    }, signal);
   }
 
   /** One try alone, that outlives the page. @param {string} path @param {any} body */
@@ -84,9 +108,12 @@ export class Api {
   }
 
   /** @param {string} method @param {string} path @param {any} body @param {Options} options */
-  async #json(method, path, body, { token = this.token, signal }) {
+  async #json(method, path, body, { token = this.token, signal, expects }) {
     const response = await this.#fetch(path, this.#init(method, body, token), signal);
-    return response.json();
+    const answer = await response.json().catch(() => null);
+    const ours = answer && typeof answer === "object" && (!expects || expects in answer);
+    if (!ours) throw new Trouble(`status ${response.status}, but not our server's answer`);
+    return answer;
   }
 
   #init(method, body, token) {
@@ -107,12 +134,13 @@ export class Api {
       const response = await fetch(path, options);
       const whole = new Response(await response.blob(), response);
       if (response.ok) return whole;
+      const { status } = response;
       const body = await whole.json().catch(() => null);
-      if (response.status === 429 || response.status >= 500) {
-        const seconds = Number(response.headers.get("Retry-After")) || 0;
-        throw new Trouble(`status ${response.status}`, Math.min(seconds, 60) * 1000);
+      if (status < 500 && !PASSING.includes(status) && CODES.has(body?.error)) {
+        throw new Refused(status, body);
       }
-      throw new Refused(response.status, body);
+      const seconds = Number(response.headers.get("Retry-After")) || 0;
+      throw new Trouble(`status ${status}`, Math.min(Math.max(seconds, 0), 60) * 1000);
     } catch (error) {
       if (signal?.aborted) throw signal.reason;
       if (error instanceof Refused || error instanceof Trouble) throw error;

@@ -4,6 +4,8 @@
  * @module event_log
  */
 
+import { newKey } from "./random_key.js";
+
 const DAY_MS = 86_400_000;
 const BATCH = 50;
 const MOST_KEPT = 500;
@@ -11,6 +13,7 @@ const EVERY_MS = 5_000;
 
 export class EventLog {
   #events = [];
+  #batch = null;
   #sending = false;
 
   /** @param {import("./api.js").Api} api */
@@ -52,17 +55,27 @@ export class EventLog {
 
   /** Send what there is, if anybody has entered; what fails stays for the next time. */
   async send() {
-    if (this.#sending || this.#events.length === 0 || !this.api.token) return;
+    if (this.#sending || !this.api.token) return;
+    if (!this.#batch && this.#events.length > 0) {
+      // The same events under the same key, however often they are sent: they are stored once.
+      this.#batch = { key: newKey(), events: this.#events.slice(0, BATCH) };
+    }
+    const batch = this.#batch;
+    if (!batch) return;
     this.#sending = true;
-    const batch = this.#events.slice(0, BATCH);
     try {
-      await this.api.tell("/api/events", { events: batch });
-      this.#events = this.#events.filter((event) => !batch.includes(event));
+      await this.api.tell("/api/events", batch);
+      this.#sent(batch);
     } catch (error) {
-      // A refusal will not become better by trying again; anything else may.
-      if (error.code) this.#events = this.#events.filter((event) => !batch.includes(event));
+      // Another token may be let in; any other refusal will not become better by trying again.
+      if (error.code && error.code !== "unknown_token") this.#sent(batch);
     } finally {
       this.#sending = false;
     }
+  }
+
+  #sent({ events }) {
+    this.#events = this.#events.filter((event) => !events.includes(event));
+    this.#batch = null;
   }
 }

@@ -48,7 +48,11 @@ async function takePart(basis, arrival) {
   queue.load();
   await queue.empty();
   try {
-    const state = await enter(basis, arrival);
+    let state = await enter(basis, arrival);
+    if (queue.enter(api.token, state.reference)) {
+      await queue.empty();
+      state = await api.get("/api/session");
+    }
     const asked = arrival.language ?? recall("language");
     if (state.stage !== "consent" || !asked) await speak(basis, state.language);
     session = new Session(basis, queue);
@@ -57,7 +61,6 @@ async function takePart(basis, arrival) {
     await session.run(state);
   } catch (error) {
     if (!(error instanceof Refused)) throw error;
-    if (error.code === "unknown_token") keep("session", null);
     refuse(basis, error.code, error.message);
   }
 }

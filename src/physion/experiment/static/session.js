@@ -4,7 +4,6 @@
  * @module session
  */
 
-import { AnswerQueue, newKey } from "./answer_queue.js";
 import { Refused } from "./api.js";
 import { FeedbackTrial } from "./feedback_trial.js";
 import { demographicsPage, feedbackPage } from "./forms.js";
@@ -13,6 +12,7 @@ import { Media } from "./media.js";
 import { PageTrial, showPage } from "./page_trial.js";
 import * as pages from "./pages.js";
 import { PredictionTrial } from "./prediction_trial.js";
+import { newKey } from "./random_key.js";
 import { resultPage } from "./result_page.js";
 
 const PAGES = {
@@ -36,7 +36,7 @@ export class Session {
 
   /**
    * @param {any} basis api, texts, study, log, frame (see frame.js), address.
-   * @param {AnswerQueue} queue Its refusals come to `refused`.
+   * @param {import("./answer_queue.js").AnswerQueue} queue Its refusals come to `refused`.
    */
   constructor(basis, queue) {
     this.basis = basis;
@@ -54,7 +54,6 @@ export class Session {
 
   /** An answer was refused: go on from the state that the server told. */
   refused(error) {
-    this.basis.log.add("answer_refused", { code: error.code });
     this.#refused = error;
     this.#leave();
   }
@@ -100,7 +99,7 @@ export class Session {
   async #stateAfter(error) {
     const { api, log } = this.basis;
     const refused = error instanceof Refused ? error : this.#refused;
-    if (refused?.code === "unknown_token") throw refused;
+    if (refused?.code === "unknown_token" || this.queue.waits(api.token)) throw refused;
     if (!(error instanceof Refused) && !(error instanceof Left)) {
       log.add("error", { message: String(error) });
       throw error;
