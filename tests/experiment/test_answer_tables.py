@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
@@ -16,8 +17,16 @@ from physion.errors import PhysionError, UnknownNameError
 from physion.experiment import trial_rows
 from physion.experiment.answer_tables import read_tables, snapshot
 from physion.experiment.database import open_database, upgrade
+from physion.experiment.experimenter.summaries import Summaries
 from physion.experiment.identity import Secrets
-from physion.experiment.session_rows import NO_CONSENT, PREVIEW, WITHDRAWN, Wanted, read_sessions
+from physion.experiment.session_rows import (
+    GONE_SCENARIO,
+    NO_CONSENT,
+    PREVIEW,
+    WITHDRAWN,
+    Wanted,
+    read_sessions,
+)
 from physion.experiment.study import Study
 from physion.experiment.tables import ANSWERS, SESSIONS
 from physion.experiment.trial_rows import read_trials
@@ -154,6 +163,28 @@ def test_cells_that_are_not_known_are_empty(study: Study, database_url: str) -> 
     assert trials.loc[trials["trial"] != 2, list(absent)].notna().all(axis=None)
     assert_frame_equal(check_table(trials, TRIAL_COLUMNS, "trials"), trials)
     assert_frame_equal(check_table(sessions, SESSION_COLUMNS, "sessions"), sessions)
+
+
+def test_sessions_of_a_scenario_that_is_gone_are_left_out_by_name(
+    engine: sa.Engine, study: Study
+) -> None:
+    stimuli = tuple(s for s in study.stimuli if s.scenario == "collide")
+    fewer = replace(study, scenarios=("collide",), stimuli=stimuli)
+    _, before = read_tables(engine, study)
+    trials, sessions = read_tables(engine, fewer)
+    assert set(trials["scenario"]) == set(sessions["scenario"]) == {"collide"}
+    assert set(sessions["session"]) == set(before["session"][before["scenario"] == "collide"])
+    with snapshot(engine) as connection:
+        found = read_sessions(connection, fewer)
+    said = GONE_SCENARIO.format(scenario="drop")
+    for kind in ("person", "simulated"):
+        of_kind = before["simulated"] == (kind == "simulated")
+        count = (of_kind & (before["scenario"] == "drop")).sum()
+        assert found.left_out[kind, said] == count > 0
+    # The experimenter's pages go on.
+    summaries = Summaries(fewer, engine).refresh(NOW)
+    stages = {s.stage for s in summaries if s.facts["scenario"] == "drop"}
+    assert stages == {"done", "familiarization"}
 
 
 def test_what_is_written_meanwhile_is_not_seen(

@@ -523,6 +523,51 @@ def test_other_stimuli_are_refused_where_sessions_exist(
     store.close()
 
 
+def test_a_scenario_with_sessions_cannot_be_taken_out(
+    small_study: Study, small_secrets: Secrets, database_url: str
+) -> None:
+    def reopen(study: Study) -> Store:
+        return Store.open(study, small_secrets, database_url)
+
+    fewer = replace(
+        small_study,
+        scenarios=("collide",),
+        stimuli=tuple(s for s in small_study.stimuli if s.scenario == "collide"),
+        digest="3" * 64,
+    )
+    preview = {"pass": pass_word(small_secrets, "preview"), "scenario": "drop"}
+    store = reopen(small_study)
+    going = walk(store, enter(store, "P1", **preview), "test")
+    done = walk(store, enter(store, "P2", **preview), "done")
+    store.close()
+    store = reopen(fewer)  # previews are nobody's data, and end
+    for token in (going, done):
+        for asked in (store.state(token), store.state(token, True), store.answer(token, answer(0))):
+            assert refusal(asked).code == "unknown_token"
+        with pytest.raises(Refused, match="no more"):
+            store.result(token)
+    marks = {(row.finished_at is None, row.withdrawn_at is None) for row in rows(store, SESSIONS)}
+    assert marks == {(True, False), (False, True)}
+    assert run(store.enter(Enter.model_validate(preview | {"id": "P1", "scenario": None})))
+    store.close()
+    store = reopen(small_study)
+    token = walk(store, enter(store, "Ada", scenario="drop"), "test")
+    give(store, token, 0)
+    store.close()
+    with pytest.raises(BadInputError, match=r"1 sessions are of the scenario drop.*put drop back"):
+        reopen(fewer)
+    store = reopen(small_study)
+    assert run(store.state(token)).trial == 1
+    # A program's session is data, too; and the other one may go where it has none.
+    store.close()
+    with pytest.raises(BadInputError, match="scenario drop"):
+        reopen(replace(fewer, digest="4" * 64))
+    others = tuple(s for s in small_study.stimuli if s.scenario == "drop")
+    store = reopen(replace(small_study, scenarios=("drop",), stimuli=others, digest="5" * 64))
+    assert run(store.state(token)).trial == 1
+    store.close()
+
+
 def _settings(row: Any) -> Any:
     from types import SimpleNamespace
 

@@ -25,6 +25,7 @@ NO_CONSENT = "no consent was given"
 WITHDRAWN = "the participant withdrew"
 UNFINISHED = "not finished, and only finished ones were asked for"
 OTHER_KIND = "{kind}, which was not asked for"
+GONE_SCENARIO = "of {scenario}, which study.toml has no more: put it back to export them"
 OTHER_SCENARIO = "of a scenario that was not asked for"
 _Row = Any
 """A row of sessions with the study's name and version: the library's type lists all columns."""
@@ -68,7 +69,7 @@ def read_sessions(connection: Connection, study: Study, wanted: Wanted = Wanted(
     states: Counter[tuple[str, str]] = Counter()
     left_out: Counter[tuple[str, str]] = Counter()
     for row in connection.execute(query):
-        reason = _why_not(row, wanted)
+        reason = _why_not(row, wanted, study)
         if reason is not None:
             left_out[row.kind, reason] += 1
             continue
@@ -80,7 +81,7 @@ def read_sessions(connection: Connection, study: Study, wanted: Wanted = Wanted(
     return Sessions(_session_table(kept), states, left_out, digests)
 
 
-def _why_not(row: _Row, wanted: Wanted) -> str | None:
+def _why_not(row: _Row, wanted: Wanted, study: Study) -> str | None:
     """Why a session is in no table; None: it is in it."""
     if row.kind not in KINDS:
         return PREVIEW
@@ -92,6 +93,8 @@ def _why_not(row: _Row, wanted: Wanted) -> str | None:
         return NO_CONSENT
     if row.withdrawn_at is not None:
         return WITHDRAWN
+    if row.scenario not in study.scenarios:
+        return GONE_SCENARIO.format(scenario=row.scenario)
     if wanted.finished_only and row.finished_at is None:
         return UNFINISHED
     return None

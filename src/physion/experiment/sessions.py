@@ -66,8 +66,17 @@ class Trials:
         }
 
     def of(self, scenario: str) -> Mapping[str, int]:
-        """Counts by phase; none for a scenario that the study has no more."""
-        return self._counts.get(scenario, dict.fromkeys(PHASES, 0))
+        """Counts by phase; `Refused` for a scenario that the study has no more.
+
+        Only previews can be of one (`study_record.register`).
+        """
+        if scenario not in self._counts:
+            raise Refused("unknown_token", "The study has this part no more; open your link again.")
+        return self._counts[scenario]
+
+    def has(self, scenario: str) -> bool:
+        """Is this a scenario of the study as it is now?"""
+        return scenario in self._counts
 
 
 def read_session(connection: Connection, token_hash: str) -> Session:
@@ -80,6 +89,10 @@ def read_session(connection: Connection, token_hash: str) -> Session:
 
 def stage_of(session: Session, trials: Mapping[str, int]) -> Stage:
     """The stage that a session is in: the first that is not over."""
+    if session.withdrawn_at is not None:
+        return "withdrawn"
+    if session.finished_at is not None:
+        return "done"
     over = (
         session.consented_at is not None,
         session.instructed_at is not None,
@@ -87,11 +100,8 @@ def stage_of(session: Session, trials: Mapping[str, int]) -> Stage:
         session.ready_at is not None,
         session.answered_test >= trials["test"],
         session.demographics_at is not None,
-        session.finished_at is not None,
     )
-    if session.withdrawn_at is not None:
-        return "withdrawn"
-    return STAGES[over.index(False)] if False in over else "done"
+    return STAGES[over.index(False)] if False in over else "feedback"
 
 
 def answered(session: Session, phase: str) -> int:

@@ -10,6 +10,7 @@ from typing import Any
 from sqlalchemy import Connection, Engine, Row, select
 
 from physion.experiment.sessions import SESSION_COLUMNS, Session, Trials, stage_of
+from physion.experiment.stimuli import PHASES
 from physion.experiment.study import Study
 from physion.experiment.tables import ANSWERS, SESSIONS
 
@@ -175,7 +176,10 @@ class Summaries:
         """Where a session stands, or stood when it was withdrawn."""
         columns = {column.name: facts[column.name] for column in SESSION_COLUMNS}
         session = Session(**columns | {"withdrawn_at": None})
-        return stage_of(session, self._trials.of(session.scenario))
+        # How long the phases of a preview were whose scenario is gone is not known any more.
+        known = self._trials.has(session.scenario)
+        trials = self._trials.of(session.scenario) if known else dict.fromkeys(PHASES, 1_000_000)
+        return stage_of(session, trials)
 
 
 def labels_of(study: Study) -> dict[tuple[str, str], bool]:
