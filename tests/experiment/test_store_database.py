@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import stat
+import traceback
 from pathlib import Path
 
 import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
-from sqlalchemy import text
+from sqlalchemy import insert, text
+from sqlalchemy.exc import SQLAlchemyError
 
 from physion.errors import BadInputError, PhysionError
 from physion.experiment.database import (
@@ -19,7 +21,7 @@ from physion.experiment.database import (
     open_database,
     upgrade,
 )
-from physion.experiment.tables import METADATA
+from physion.experiment.tables import METADATA, RAW_IDS
 
 
 def test_upgrade_of_an_empty_database_gives_exactly_the_tables(database_url: str) -> None:
@@ -34,6 +36,29 @@ def test_upgrade_of_an_empty_database_gives_exactly_the_tables(database_url: str
             connection, opts={"compare_type": True, "compare_server_default": True}
         )
         assert compare_metadata(context, METADATA) == []
+    engine.dispose()
+
+
+def test_errors_tell_no_values(database_url: str) -> None:
+    """Ids of people must not come into a log with the text of an error."""
+    engine = open_database(database_url)
+    upgrade(engine)
+    row = {"participant": "0" * 32, "source": "sona", "raw_id": "Ada-5f1e", "seen": 1.0}
+    faults = (
+        lambda connection: connection.execute(insert(RAW_IDS), row | {"recruiter": {}}),
+        lambda connection: connection.execute(
+            text("INSERT INTO raw_ids VALUES (:a, :b, :c, NULL, NULL)"),
+            {"a": "1" * 32, "b": "sona", "c": "Ada-5f1e"},
+        ),
+        lambda connection: connection.execute(insert(RAW_IDS), [row | {"raw_id": object()}]),
+    )
+    with engine.begin() as connection:
+        faults[0](connection)
+    for fault in faults:
+        with pytest.raises(SQLAlchemyError) as caught, engine.begin() as connection:
+            fault(connection)
+        said = "".join(traceback.format_exception(caught.value)) + repr(caught.value)
+        assert "raw_ids" in said and "5f1e" not in said
     engine.dispose()
 
 

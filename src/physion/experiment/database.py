@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from sqlalchemy import Connection, Engine, create_engine, event, text
-from sqlalchemy.engine import URL, make_url
+from sqlalchemy.engine import URL, ExceptionContext, make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError, SQLAlchemyError
 
 from physion.atomic import folder_lock
@@ -36,8 +36,9 @@ def sqlite_url(folder: Path) -> str:
 def open_database(url: str, *, must_exist: bool = False) -> Engine:
     """An engine for ``sqlite:///FILE`` or ``postgresql://...``; nothing is asked of it yet.
 
-    A new SQLite file is readable by its owner alone. With ``must_exist`` a missing one is refused
-    with `BadInputError`, as is any other kind of address.
+    Errors tell statements without their values, for ids of people must reach no log. A new SQLite
+    file is readable by its owner alone. With ``must_exist`` a missing one is refused with
+    `BadInputError`, as is any other kind of address.
     """
     address = _address(url)
     if address.get_backend_name() == "postgresql":
@@ -67,7 +68,7 @@ def _open_sqlite(address: URL, path: Path) -> Engine:
         raise BadInputError(f"there is no folder {path.parent} for the database")
     # SQLite gives its log files the mode of the database.
     os.close(os.open(path, os.O_CREAT | os.O_RDWR | getattr(os, "O_NOFOLLOW", 0), 0o600))
-    engine = create_engine(address, connect_args={"timeout": BUSY_MS / 1000})
+    engine = create_engine(address, hide_parameters=True, connect_args={"timeout": BUSY_MS / 1000})
 
     @event.listens_for(engine, "connect")
     def prepare(connection: Any, _: Any) -> None:
@@ -88,7 +89,11 @@ def _open_sqlite(address: URL, path: Path) -> Engine:
 def _open_postgresql(address: URL) -> Engine:
     # A pooled connection may have died with a restart of the database: look before use.
     engine = create_engine(
-        address, pool_pre_ping=True, pool_size=8, connect_args={"connect_timeout": 10}
+        address,
+        hide_parameters=True,
+        pool_pre_ping=True,
+        pool_size=8,
+        connect_args={"connect_timeout": 10},
     )
 
     @event.listens_for(engine, "connect")
@@ -97,6 +102,13 @@ def _open_postgresql(address: URL) -> Engine:
         connection.execute("SET synchronous_commit = on")
         connection.execute("SET timezone = 'UTC'")
         connection.autocommit = False
+
+    @event.listens_for(engine, "handle_error")
+    def shorten(context: ExceptionContext) -> None:
+        # PostgreSQL's further lines hold whole rows.
+        for error in (context.original_exception, context.sqlalchemy_exception):
+            if error is not None and error.args:
+                error.args = (str(error.args[0]).partition("\n")[0], *error.args[1:])
 
     return engine
 
