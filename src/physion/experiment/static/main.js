@@ -6,9 +6,10 @@
 import { AnswerQueue } from "./answer_queue.js";
 import { Api, Refused } from "./api.js";
 import { readArrival } from "./arrival.js";
+import { anotherPerson, cameWithoutId, enter } from "./entering.js";
 import { EventLog } from "./event_log.js";
 import { Frame } from "./frame.js";
-import { deviceProblem, measureDevice, windowFits } from "./gate.js";
+import { deviceProblem, windowFits } from "./gate.js";
 import { showPage } from "./page_trial.js";
 import { messagePage, windowPage } from "./pages.js";
 import { Session } from "./session.js";
@@ -55,55 +56,16 @@ async function takePart(basis, arrival) {
     }
     const asked = arrival.language ?? recall("language");
     if (state.stage !== "consent" || !asked) await speak(basis, state.language);
+    basis.another = cameWithoutId() ? anotherPerson(basis.study, arrival) : null;
     session = new Session(basis, queue);
     frame.onStop = () => session.askToStop();
     frame.onLanguage = (language) => changeLanguage(basis, session, language);
     await session.run(state);
   } catch (error) {
     if (!(error instanceof Refused)) throw error;
-    refuse(basis, error.code, error.message);
-  }
-}
-
-/** Begin a session, or go on with the one that the address or the browser knows. */
-async function enter({ api, texts, log }, arrival) {
-  const remembered = recall("session");
-  const device = await measureDevice();
-  if (remembered && !arrival.named) {
-    const state = await resume(api, remembered, arrival.enter.scenario);
-    if (state) {
-      log.add("loaded", { ...device });
-      window.history.replaceState(null, "", window.location.pathname);
-      return state;
-    }
-  }
-  try {
-    const message = { ...arrival.enter, language: texts.language, device };
-    const entered = await api.post("/api/enter", message);
-    api.token = entered.token;
-    keep("session", entered.token);
-    window.history.replaceState(null, "", window.location.pathname);
-    return await api.get("/api/session?load=true");
-  } catch (error) {
-    if (error.code !== "already_took_part" || !remembered) throw error;
-    // In the browser in which they took part, people still find their result.
-    const state = await resume(api, remembered, arrival.enter.scenario);
-    if (state?.stage !== "done") throw error;
-    return state;
-  }
-}
-
-/** The state of a remembered session; null where there is none, or it is of another scenario. */
-async function resume(api, token, scenario) {
-  try {
-    const state = await api.get("/api/session?load=true", { token });
-    if (scenario && state.scenario !== scenario) return null;
-    api.token = token;
-    return state;
-  } catch (error) {
-    if (error.code !== "unknown_token") throw error;
-    keep("session", null);
-    return null;
+    const leave = error.code === "already_took_part" || !cameWithoutId();
+    const another = leave ? anotherPerson(basis.study, arrival) : null;
+    refuse(basis, error.code, error.message, another);
   }
 }
 
@@ -150,7 +112,7 @@ function tell({ texts, frame }, name, action = null) {
 }
 
 /** Why it does not work, by the name of a text of `refusal`, or else by the server's sentence. */
-function refuse({ texts, frame, study }, name, message = "") {
+function refuse({ texts, frame, study }, name, message = "", another = null) {
   const known = texts.has(`refusal.${name}`);
   const size = { width: study.min_width, height: study.min_height };
   const why = known ? texts.t(`refusal.${name}`, size) : texts.t("refusal.other", { message });
@@ -159,7 +121,8 @@ function refuse({ texts, frame, study }, name, message = "") {
   const action = known ? null : again;
   const title = texts.t(name === "already_took_part" ? "result.title" : "refusal.title");
   document.getElementById("tools").replaceChildren();
-  showPage(frame.main, messagePage({ title, text, action }));
+  const quiet = another && { label: texts.t("common.another_person"), run: another };
+  showPage(frame.main, messagePage({ title, text, action, quiet: known ? quiet : null }));
 }
 
 begin().catch((error) => {

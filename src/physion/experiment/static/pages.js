@@ -149,11 +149,15 @@ export function waitingPage({ texts }, waited) {
   };
 }
 
-/** A heading, text, and where given a button. */
-export function messagePage({ title, text, action = null }) {
+/** A heading, text, and where given a button, and one that matters less. */
+export function messagePage({ title, text, action = null, quiet = null }) {
   return (page) => {
     page.append(el("h1", {}, title), ...paragraphs(text));
-    if (action) page.append(el("div", { class: "buttons" }, button(action.label, action.run)));
+    const buttons = [
+      quiet && button(quiet.label, quiet.run, { class: "button quiet" }),
+      action && button(action.label, action.run),
+    ].filter(Boolean);
+    if (buttons.length > 0) page.append(el("div", { class: "buttons" }, ...buttons));
   };
 }
 

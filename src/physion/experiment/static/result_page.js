@@ -11,7 +11,7 @@ import { bound } from "./pages.js";
  * @param {any} result `Result`
  * @returns {(page: HTMLElement) => void}
  */
-export function resultPage({ texts, study, state }, result) {
+export function resultPage({ texts, study, state, another }, result) {
   const { t } = bound(texts);
   const percent = number(texts, 100 * result.accuracy);
   const { correct, trials, percentile, completion } = result;
@@ -31,6 +31,9 @@ export function resultPage({ texts, study, state }, result) {
     const contact = t("result.contact", { contact: study.contact });
     const reference = t("common.reference", { reference: state.reference });
     page.append(el("p", { class: "small" }, `${contact} · ${reference}`));
+    if (!another) return;
+    const next = button(t("common.another_person"), another, { class: "button quiet" });
+    page.append(el("div", { class: "buttons" }, next));
   };
 }
 

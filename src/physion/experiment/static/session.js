@@ -35,7 +35,8 @@ export class Session {
   #refused = null;
 
   /**
-   * @param {any} basis api, texts, study, log, frame (see frame.js), address.
+   * @param {any} basis api, texts, study, log, frame (see frame.js), address; `another` begins
+   *   anew for another person, null where that cannot be.
    * @param {import("./answer_queue.js").AnswerQueue} queue Its refusals come to `refused`.
    */
   constructor(basis, queue) {
@@ -234,10 +235,11 @@ export class Session {
   }
 
   async #end() {
-    const { texts, study, api, frame } = this.basis;
+    const { texts, study, api, frame, another } = this.basis;
     if (this.state.stage === "withdrawn") {
       const [title, text] = [texts.t("withdrawn.title"), texts.t("withdrawn.text", study)];
-      return showPage(frame.main, pages.messagePage({ title, text }));
+      const quiet = another && { label: texts.t("common.another_person"), run: another };
+      return showPage(frame.main, pages.messagePage({ title, text, quiet }));
     }
     const result = await api.get("/api/result");
     return showPage(frame.main, resultPage(this.context, result));
