@@ -47,6 +47,6 @@ def test_requests_are_logged_without_what_tells_who_comes(tmp_path: Path) -> Non
         httpx2.get(f"{server.url}/no%0Asuch", trust_env=False)
         lines = server.last_words().splitlines()
     assert asked.status_code == 200
-    assert any(line.endswith("GET '/' 200") for line in lines)
-    assert any(line.endswith(r"GET '/no\nsuch' 404") for line in lines)
+    for request in ("GET / 200", "GET /no%0Asuch 404"):
+        assert sum(line.endswith(request) for line in lines) == 1
     assert not [line for line in lines if "SECRET" in line]
