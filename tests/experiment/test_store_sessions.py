@@ -404,11 +404,13 @@ def test_percentiles_are_among_finished_people_of_the_scenario(
     walk(store, enter(store, "unfinished", scenario="drop"), "feedback")
     assert store.result(first).percentile is None
     second = finish("b", 3)
+    assert store.result(first).percentile is store.result(second).percentile is None  # one other
     third = finish("c", 3)
-    found = [store.result(token) for token in (first, second, third)]
-    assert [each.correct for each in found] == [1, 3, 3]
-    # Midranks of 1, 3, 3: half of itself of 3, then 1 below and half of two ties.
-    assert [each.percentile for each in found] == pytest.approx([50 / 3, 200 / 3, 200 / 3])
+    best = finish("d", 4)
+    found = [store.result(token) for token in (first, second, third, best)]
+    assert [each.correct for each in found] == [1, 3, 3, 4]
+    # Among three others: none had fewer; one had, and one as many; all had.
+    assert [each.percentile for each in found] == pytest.approx([0, 50, 50, 100])
     store.close()
 
 
@@ -420,11 +422,40 @@ def _order(store: Store, person: str, scenario: str, more: dict[str, Any]) -> tu
     return order_of(store.study, scenario, seed)["test"]
 
 
-def test_percentile_is_a_midrank() -> None:
+def test_percentile_is_among_the_others() -> None:
     assert percentile(3, [3]) == 50
-    assert percentile(1, [1, 2, 3, 4]) == 12.5
-    assert percentile(4, [1, 2, 3, 4]) == 87.5
-    assert percentile(2, [2, 2, 2, 2]) == 50
+    assert percentile(0, [1, 2, 3]) == 0
+    assert percentile(4, [1, 2, 3]) == 100
+    assert percentile(2, [2, 2, 2]) == 50
+    assert percentile(2, [1, 2, 3, 3]) == 37.5
+
+
+def test_previews_of_other_stimuli_are_in_no_result(
+    small_study: Study, small_secrets: Secrets, database_url: str
+) -> None:
+    word = {"pass": pass_word(small_secrets, "preview"), "scenario": "drop"}
+    store = Store.open(small_study, small_secrets, database_url)
+    old = [walk(store, enter(store, f"old{number}", **word), "done") for number in range(3)]
+    assert store.result(old[0]).percentile == 50
+    store.close()
+    gone = small_study.phase("drop", "test")[1]
+    stimuli = tuple(
+        replace(each, stimulus="drop_other_name") if each is gone else each
+        for each in small_study.stimuli
+    )
+    changed = replace(small_study, stimuli=stimuli, stimuli_digest="0" * 64, digest="1" * 64)
+    store = Store.open(changed, small_secrets, database_url)
+    try:
+        new = walk(store, enter(store, "new", **word), "done")
+        result = store.result(new)
+        assert (result.correct, result.trials, result.percentile) == (2, 4, None)
+        for token in old:
+            assert run(store.state(token)).stage == "done"
+            with pytest.raises(Refused, match="stimuli have changed") as caught:
+                store.result(token)
+            assert caught.value.code == "unknown_token"
+    finally:
+        store.close()
 
 
 def test_loads_are_counted_and_say_where(store: Store) -> None:

@@ -4,19 +4,26 @@ from __future__ import annotations
 
 import threading
 from collections import defaultdict
+from collections.abc import Sequence
 from itertools import islice
 
 from sqlalchemy import Connection, bindparam, select
 
 from physion.experiment.study import Study
-from physion.experiment.tables import ANSWERS, SESSIONS
+from physion.experiment.tables import ANSWERS, SESSIONS, STUDIES
 
 _CHUNK = 500
-_FINISHED = select(SESSIONS.c.session).where(
-    SESSIONS.c.scenario == bindparam("of_scenario"),
-    SESSIONS.c.kind == bindparam("of_kind"),
-    SESSIONS.c.finished_at.is_not(None),
-    SESSIONS.c.withdrawn_at.is_(None),
+_FINISHED = (
+    select(SESSIONS.c.session)
+    .join(STUDIES, STUDIES.c.digest == SESSIONS.c.study)
+    .where(
+        SESSIONS.c.scenario == bindparam("of_scenario"),
+        SESSIONS.c.kind == bindparam("of_kind"),
+        SESSIONS.c.finished_at.is_not(None),
+        SESSIONS.c.withdrawn_at.is_(None),
+        # Previews may be of other stimuli, whose ends nobody knows any more.
+        STUDIES.c.stimuli_digest == bindparam("of_stimuli"),
+    )
 )
 _TEST = select(ANSWERS.c.session, ANSWERS.c.stimulus, ANSWERS.c.response).where(
     ANSWERS.c.session.in_(bindparam("sessions", expanding=True)), ANSWERS.c.phase == "test"
@@ -32,12 +39,16 @@ class Scores:
             for stimulus in study.stimuli
             if stimulus.phase == "test"
         }
+        self._stimuli = study.stimuli_digest
         self._correct: dict[str, int] = {}
         self._lock = threading.Lock()
 
     def of(self, connection: Connection, scenario: str, kind: str) -> dict[str, int]:
-        """Correct answers by session, of the finished sessions of one scenario and kind."""
-        rows = connection.execute(_FINISHED, {"of_scenario": scenario, "of_kind": kind})
+        """Correct answers by session, of the finished sessions of one scenario and kind that were
+        made with the present stimuli.
+        """
+        values = {"of_scenario": scenario, "of_kind": kind, "of_stimuli": self._stimuli}
+        rows = connection.execute(_FINISHED, values)
         finished = [session for (session,) in rows]
         with self._lock:
             new = iter([session for session in finished if session not in self._correct])
@@ -52,8 +63,8 @@ class Scores:
         self._correct.update({session: correct[session] for session in sessions})
 
 
-def percentile(correct: int, all_correct: list[int]) -> float:
-    """The share (%) of ``all_correct`` below ``correct``, ties counting half; oneself is a tie."""
-    below = sum(other < correct for other in all_correct)
-    ties = sum(other == correct for other in all_correct)
-    return 100 * (below + ties / 2) / len(all_correct)
+def percentile(correct: int, others: Sequence[int]) -> float:
+    """The share (%) of the ``others`` with fewer correct, plus half of those with as many."""
+    fewer = sum(other < correct for other in others)
+    as_many = sum(other == correct for other in others)
+    return 100 * (fewer + as_many / 2) / len(others)

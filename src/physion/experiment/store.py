@@ -239,9 +239,12 @@ class Store:
         if stage != "done":
             code = "wrong_stage" if stage == "withdrawn" else "not_yet"
             raise Refused(code, "The result comes at the end.", state_of(session, trials))
-        scores = self._scores.of(connection, session.scenario, session.kind)
-        correct, all_correct = scores[session.session], list(scores.values())
-        enough = len(all_correct) >= self.study.percentile_from
+        scores = dict(self._scores.of(connection, session.scenario, session.kind))
+        correct = scores.pop(session.session, None)
+        if correct is None:  # a preview of other stimuli: nobody knows any more what was right
+            raise Refused("unknown_token", "The stimuli have changed since; open your link again.")
+        others = list(scores.values())
+        enough = len(others) >= self.study.percentile_from
         row = connection.execute(
             select(SESSIONS).where(SESSIONS.c.session == session.session)
         ).one()
@@ -252,7 +255,7 @@ class Store:
             correct=correct,
             trials=trials["test"],
             accuracy=correct / trials["test"],
-            percentile=percentile(correct, all_correct) if enough else None,
+            percentile=percentile(correct, others) if enough else None,
             completion=completion(self.study, self.secrets, row, raw),
         )
 
