@@ -180,7 +180,7 @@ KEYS: tuple[Key, ...] = (
     Key("", "exclusions", _rules,
         f"Rules by which sessions are flagged: {', '.join(EXCLUSIONS)}."),
     Key("", "percentile_from", whole(1, 1_000_000),
-        "Finished people that it takes before anyone is told a percentile."),
+        "Other finished people that it takes before anyone is told a percentile."),
     Key("", "preload", whole(1, 1000), "Trials that are loaded before they are shown."),
     Key("", "embed_from", listed(_site, 0),
         "Sites that may show the pages in a frame (MTurk: https://www.mturk.com); mostly none."),
