@@ -137,8 +137,11 @@ def test_seeds_differ_by_study_scenario_and_participant(small_study: Study) -> N
         for study in (small_study, other)
         for scenario in ("collide", "drop")
         for person in ("a", "b")
-    } | {prepared_order_seed(small_study, "drop", number) for number in range(1, 126)}
+    } | {prepared_order_seed(small_study, KEYS, "drop", number) for number in range(1, 126)}
     assert len(seeds) == 8 + 125
+    # Few as they are, nobody without the key may try them all against what is shown.
+    other_key = replace(KEYS, link_key=b"x" * 32)
+    assert prepared_order_seed(small_study, other_key, "drop", 1) not in seeds
 
 
 def test_fixations_lie_within_the_timing(small_study: Study) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pydantic import ValidationError
 from sqlalchemy import update
 from store_walk import (
     PAGES,
@@ -24,10 +25,10 @@ from store_walk import (
 )
 
 from physion.errors import BadInputError, PhysionError
-from physion.experiment.entering import ACTIVE_S
 from physion.experiment.identity import Secrets, participant_hash
 from physion.experiment.recruitment import pass_word
 from physion.experiment.scores import percentile
+from physion.experiment.sessions import ACTIVE_WITHIN
 from physion.experiment.store import Refused, Store
 from physion.experiment.study import Recruitment, Study
 from physion.experiment.tables import EVENTS, PARTICIPANTS, RAW_IDS, SESSIONS, STUDIES, TOKENS
@@ -120,20 +121,49 @@ def test_sources_keep_ids_apart(store: Store) -> None:
 
 
 def test_least_filled_scenario_first_until_the_study_is_full(store: Store) -> None:
-    # participants=3: one of drop has finished, one of collide withdrew, one left long ago.
+    # participants=3: one of drop has finished, one of collide withdrew, one left a while ago.
     walk(store, enter(store, "done", scenario="drop"), "done")
     page(store, enter(store, "gone", scenario="collide"), "withdraw")
-    enter(store, "asleep", scenario="collide")
-    sleeps = update(SESSIONS).where(SESSIONS.c.withdrawn_at.is_(None))
-    sleeps = sleeps.where(SESSIONS.c.scenario == "collide")
-    with store.engine.begin() as connection:
-        connection.execute(sleeps.values(last_seen=SESSIONS.c.last_seen - ACTIVE_S - 1))
-    given = [run(store.enter(Enter(id=f"p{i}"))).state.scenario for i in range(5)]
+    page(store, enter(store, "asleep", scenario="collide"), "consent")
+    _let_time_pass(store, "asleep")
+    tokens = [enter(store, f"p{i}") for i in range(5)]
+    given = [run(store.state(token)).scenario for token in tokens]
     assert given == ["collide", "collide", "drop", "collide", "drop"]
+    # Who only opened the page takes no place.
+    early = enter(store, "early", scenario="drop")
+    for token in tokens:
+        page(store, token, "consent")
     assert refusal(store.enter(Enter(id="late"))).code == "study_full"
     assert refusal(store.enter(Enter(id="late", scenario="drop"))).code == "study_full"
-    # Who has begun may finish.
+    # Whoever has begun may finish, even one more than there are places for.
     assert run(store.enter(Enter(id="asleep"))).state.scenario == "collide"
+    assert run(store.enter(Enter(id="early"))).state.stage == "consent"
+    for token in (early, *tokens, enter(store, "asleep")):
+        walk(store, token, "done")
+    finished = Counter(row.scenario for row in rows(store, SESSIONS) if row.finished_at)
+    assert finished == {"drop": 4, "collide": 4}
+
+
+def test_who_leaves_gives_the_place_back_and_may_return(store: Store) -> None:
+    tokens = [enter(store, f"p{i}", scenario="drop") for i in range(3)]
+    for token in tokens:
+        walk(store, token, "test")
+    assert refusal(store.enter(Enter(id="late", scenario="drop"))).code == "study_full"
+    _let_time_pass(store, "p0", ACTIVE_WITHIN - 30)
+    assert refusal(store.enter(Enter(id="late", scenario="drop"))).code == "study_full"
+    _let_time_pass(store, "p0", 60)
+    walk(store, enter(store, "late", scenario="drop"), "test")
+    assert refusal(store.enter(Enter(id="later", scenario="drop"))).code == "study_full"
+    for token in (*tokens, enter(store, "p0")):
+        walk(store, token, "done")
+
+
+def _let_time_pass(store: Store, person: str, seconds: float = ACTIVE_WITHIN + 1) -> None:
+    """Nothing is heard of someone for a while."""
+    own = SESSIONS.c.participant == participant_hash(store.secrets, "link", person)
+    with store.engine.begin() as connection:
+        earlier = SESSIONS.c.last_seen - seconds
+        connection.execute(update(SESSIONS).where(own).values(last_seen=earlier))
 
 
 def test_previews_and_programs_take_nobodys_place(store: Store, small_secrets: Secrets) -> None:
@@ -182,6 +212,75 @@ def test_ids_where_they_are_needed(
         assert run(strict.enter(preview)).state.kind == "preview"
     finally:
         strict.close()
+
+
+WORD = "3f6c1d2e-0000-4000-8000-abcdefABCDEF"
+
+
+def test_a_visits_word_gives_the_same_session_again(
+    store: Store, small_study: Study, small_secrets: Secrets, tmp_path: Path
+) -> None:
+    tokens = [enter(store, visit=WORD) for _ in range(3)]
+    assert len(set(tokens)) == 3
+    assert len(rows(store, SESSIONS)) == 1
+    walk(store, tokens[0], "test")
+    assert {run(store.state(token)).stage for token in tokens} == {"test"}
+    # Another word, an id beside it, another way to come: somebody else each.
+    simulated = {"pass": pass_word(small_secrets, "simulated")}
+    preview = {"pass": pass_word(small_secrets, "preview")}
+    for _ in range(2):
+        enter(store, visit=WORD[:-1])
+        enter(store, "Ada", visit=WORD)
+        enter(store, visit=WORD, **simulated)
+        enter(store, visit=WORD, **preview)
+    enter(store, WORD)
+    found = rows(store, SESSIONS)
+    assert len(found) == 6 == len({row.participant for row in found})
+    assert enter(store, "Ada") and len(rows(store, SESSIONS)) == 6
+    # The word is not kept, and is no id.
+    assert {row.raw_id for row in rows(store, RAW_IDS)} == {"Ada", WORD}
+    for table in (SESSIONS, TOKENS, EVENTS, PARTICIPANTS):
+        assert WORD not in repr(rows(store, table))
+    assert refusal(store.enter(Enter(source="sona", visit=WORD))).code == "id_needed"
+    needed = replace(small_study, recruitment=Recruitment(id_needed=True))
+    strict = Store.open(needed, small_secrets, f"sqlite:///{tmp_path / 'strict.sqlite'}")
+    assert refusal(strict.enter(Enter(visit=WORD))).code == "id_needed"
+    strict.close()
+
+
+def test_without_id_and_word_everybody_is_new(store: Store) -> None:
+    for _ in range(3):
+        enter(store)
+    assert len({row.participant for row in rows(store, SESSIONS)}) == 3
+
+
+@pytest.mark.parametrize(
+    "word", ["", "a" * 15, "a" * 65, "a" * 16 + "_", "ä" * 20, "a" * 20 + "\n"]
+)
+def test_other_words_are_no_visit(word: str) -> None:
+    with pytest.raises(ValidationError):
+        Enter(visit=word)
+
+
+def test_a_language_that_is_gone_locks_nobody_out(
+    small_study: Study, small_secrets: Secrets, database_url: str
+) -> None:
+    store = Store.open(small_study, small_secrets, database_url)
+    token = walk(store, enter(store, "Ada", language="de", scenario="drop"), "test")
+    store.close()
+    store = Store.open(replace(small_study, languages=("en",)), small_secrets, database_url)
+    states = [
+        run(store.state(token)),
+        run(store.state(token, True)),
+        give(store, token, 0).state,
+        page(store, token, "ready"),
+        run(store.enter(Enter(id="Ada"))).state,
+        refusal(store.answer(token, answer(3))).state,
+    ]
+    assert [state.language for state in states if state is not None] == ["en"] * 6
+    (session,) = rows(store, SESSIONS)
+    assert session.language == "de"  # what it began in stays known
+    store.close()
 
 
 @pytest.mark.parametrize("scenario", ["none", "Drop", HOSTILE])

@@ -111,8 +111,7 @@ def build_api(study: Study, secrets: Secrets, store: Store) -> APIRouter:
         enter = await read_message(request, Enter)
         if begins_nothing(enter):
             return refuse("not_yet", "Accept the task first.")
-        address = request.client.host if request.client else ""
-        entered = await store.enter(enter, address)
+        entered = await store.enter(enter)
         request.scope["state"][GIVEN_TOKEN] = entered.token
         return Reply(entered)
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import time
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from secrets import token_hex
+from typing import NamedTuple
 
-from sqlalchemy import Connection, func, insert, or_, select
+from sqlalchemy import Connection, case, func, insert, or_, select
 
 from physion.experiment.identity import (
     Secrets,
@@ -18,8 +20,10 @@ from physion.experiment.identity import (
     participant_hash,
 )
 from physion.experiment.orders import draw_buttons, own_order_seed, prepared_order_seed
+from physion.experiment.recruitment import kind_of_pass
 from physion.experiment.refused import Refused
 from physion.experiment.sessions import (
+    ACTIVE_WITHIN,
     SESSION_COLUMNS,
     Session,
     Trials,
@@ -28,14 +32,12 @@ from physion.experiment.sessions import (
     mark_loaded,
     plain,
     plain_values,
+    served_session,
     state_of,
 )
 from physion.experiment.study import Study
 from physion.experiment.tables import EVENTS, PARTICIPANTS, RAW_IDS, SESSIONS, TOKENS
 from physion.experiment.wire import Enter, Entered, Kind
-
-ACTIVE_S = 2 * 3600.0
-"""Who was here so long ago at most is expected to finish, and counts when scenarios are filled."""
 
 
 @dataclass(frozen=True)
@@ -53,9 +55,10 @@ class Visitor:
 
 
 def receive(study: Study, secrets: Secrets, enter: Enter) -> Visitor:
-    """Who comes, from link and id; `Refused` for a word that we never gave, or a missing id."""
-    from physion.experiment.recruitment import kind_of_pass
+    """Who comes, from link and id, else from the visit's word; without both a new person.
 
+    `Refused` for a word of a link that we never gave, or a missing id.
+    """
     kind: Kind | None = "person"
     if enter.pass_ is not None:
         kind = kind_of_pass(secrets, enter.pass_)
@@ -69,16 +72,20 @@ def receive(study: Study, secrets: Secrets, enter: Enter) -> Visitor:
         raise Refused("bad_link", "This link names a part that the study does not have.")
     # Sessions of programs and previews must not stand in the way of a person with the same id.
     source = enter.source if kind == "person" else f"{kind} {enter.source}"
-    participant = participant_hash(
-        secrets, source if raw_id else f"{source} without id", raw_id or token_hex(16)
-    )
+    if raw_id is not None:
+        participant = participant_hash(secrets, source, raw_id)
+    else:
+        # A visit's word is as secret as a token: nobody but its browser knows it.
+        participant = participant_hash(secrets, f"{source} visit", enter.visit or token_hex(16))
     return Visitor(enter, kind, participant, raw_id if kind == "person" else None)
 
 
-def let_in(connection: Connection, study: Study, trials: Trials, visitor: Visitor) -> Entered:
+def let_in(
+    connection: Connection, study: Study, secrets: Secrets, trials: Trials, visitor: Visitor
+) -> Entered:
     """Begin a session, or give a further token for the one that the visitor has begun."""
     own = [
-        Session(*row)
+        served_session(study, row)
         for row in connection.execute(
             select(*SESSION_COLUMNS).where(SESSIONS.c.participant == visitor.participant)
         )
@@ -89,7 +96,7 @@ def let_in(connection: Connection, study: Study, trials: Trials, visitor: Visito
     else:
         done = {each.scenario for each in own}
         scenario = _choose(connection, study, visitor, done)
-        session = _begin(connection, study, scenario, visitor)
+        session = _begin(connection, study, secrets, scenario, visitor)
     connection.execute(
         insert_new(connection, TOKENS),
         {"token_hash": hash_token(visitor.token), "session": session.session, "made": visitor.now},
@@ -120,32 +127,49 @@ def _choose(connection: Connection, study: Study, visitor: Visitor, done: set[st
     ]
     if not open_to:
         raise Refused("already_took_part", "You have taken part already. Thank you!")
-    counts = _filled(connection, visitor)
+    filled = _filled(connection, visitor)
     if visitor.kind == "person":
-        open_to = [each for each in open_to if counts.get(each, 0) < study.participants]
+        open_to = [each for each in open_to if filled[each].taken < study.participants]
     if not open_to:
         raise Refused("study_full", "The study has all the participants that it needs. Thank you!")
-    return min(open_to, key=lambda scenario: counts.get(scenario, 0))
+    return min(open_to, key=lambda scenario: filled[scenario].begun)
 
 
-def _filled(connection: Connection, visitor: Visitor) -> Mapping[str, int]:
-    """Sessions of the visitor's kind that are finished or will be, by scenario."""
+class _Filled(NamedTuple):
+    """Sessions of a scenario: ``taken`` are finished, or agreed to and going on; ``begun`` are
+    these and those that are at the consent just now.
+    """
+
+    taken: int = 0
+    begun: int = 0
+
+
+def _filled(connection: Connection, visitor: Visitor) -> Mapping[str, _Filled]:
+    """How full each scenario is of sessions of the visitor's kind."""
+    found: dict[str, _Filled] = defaultdict(_Filled)
     if visitor.kind != "person" and visitor.enter.scenario is not None:
-        return {}  # nobody asks
+        return found  # nobody asks
     columns = SESSIONS.c
+    finished = columns.finished_at.is_not(None)
+    # Whoever only opened the page may never agree, and must not keep others away.
+    taken = case((or_(finished, columns.consented_at.is_not(None)), 1), else_=0)
     statement = (
-        select(columns.scenario, func.count())
+        select(columns.scenario, func.sum(taken), func.count())
         .where(
             columns.kind == visitor.kind,
             columns.withdrawn_at.is_(None),
-            or_(columns.finished_at.is_not(None), columns.last_seen > visitor.now - ACTIVE_S),
+            or_(finished, columns.last_seen >= visitor.now - ACTIVE_WITHIN),
         )
         .group_by(columns.scenario)
     )
-    return dict(connection.execute(statement).all())
+    for scenario, *counts in connection.execute(statement):
+        found[scenario] = _Filled(*counts)
+    return found
 
 
-def _begin(connection: Connection, study: Study, scenario: str, visitor: Visitor) -> Session:
+def _begin(
+    connection: Connection, study: Study, secrets: Secrets, scenario: str, visitor: Visitor
+) -> Session:
     number = _least_used(connection, study, scenario, visitor.kind) if study.orders else 0
     connection.execute(
         insert_new(connection, PARTICIPANTS),
@@ -159,7 +183,7 @@ def _begin(connection: Connection, study: Study, scenario: str, visitor: Visitor
         "source": visitor.enter.source,
         "study": study.digest,
         "reference": visitor.reference,
-        "order_seed": prepared_order_seed(study, scenario, number)
+        "order_seed": prepared_order_seed(study, secrets, scenario, number)
         if number
         else own_order_seed(study, scenario, visitor.participant),
         "order_number": number,
@@ -173,7 +197,7 @@ def _begin(connection: Connection, study: Study, scenario: str, visitor: Visitor
     row = connection.execute(
         select(*SESSION_COLUMNS).where(SESSIONS.c.session == visitor.session)
     ).one()
-    return Session(*row)
+    return served_session(study, row)
 
 
 def _least_used(connection: Connection, study: Study, scenario: str, kind: str) -> int:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Literal
 
+from physion.experiment.identity import Secrets, sign
 from physion.experiment.stimuli import PHASES, Stimulus
 from physion.experiment.study import Study
 from physion.seeds import stable_hash
@@ -22,9 +23,14 @@ def own_order_seed(study: Study, scenario: str, participant: str) -> int:
     return stable_hash("own order", study.seed, scenario, participant) >> 65
 
 
-def prepared_order_seed(study: Study, scenario: str, number: int) -> int:
-    """Seed (63 bits) of a prepared order, from number 1."""
-    return stable_hash("prepared order", study.seed, scenario, number) >> 65
+def prepared_order_seed(study: Study, secrets: Secrets, scenario: str, number: int) -> int:
+    """Seed (63 bits) of a prepared order, from number 1.
+
+    It depends on the study's key: there are so few that else the lengths of the crosses would tell
+    which one it is, and with a public list of stimuli so the outcomes.
+    """
+    word = sign(secrets, "prepared order", scenario, str(number))
+    return stable_hash("prepared order", study.seed, scenario, number, word) >> 65
 
 
 def order_of(study: Study, scenario: str, order_seed: int) -> Order:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
 from typing import Any, cast
@@ -16,6 +16,8 @@ from physion.experiment.study import Study
 from physion.experiment.tables import SESSIONS, TOKENS
 from physion.experiment.wire import Stage, State
 
+ACTIVE_WITHIN = 15 * 60.0
+"""Seconds since a session was last heard of within which it counts as going on."""
 STAGES: tuple[Stage, ...] = (
     "consent", "instructions", "familiarization", "ready", "test", "demographics", "feedback",
     "done", "withdrawn",
@@ -79,12 +81,23 @@ class Trials:
         return scenario in self._counts
 
 
-def read_session(connection: Connection, token_hash: str) -> Session:
+def served_session(study: Study, row: Sequence[Any]) -> Session:
+    """A session from its `SESSION_COLUMNS`, in a language that the study has, as it is served now.
+
+    The row keeps the language in which the session began.
+    """
+    session = Session(*row)
+    if session.language not in study.languages:
+        session.language = study.languages[0]
+    return session
+
+
+def read_session(connection: Connection, study: Study, token_hash: str) -> Session:
     """The session that a token opens; `Refused` where it opens none."""
     row = connection.execute(_BY_TOKEN, {"token_hash": token_hash}).first()
     if row is None:
         raise Refused("unknown_token", "This session is not known here; open your link again.")
-    return Session(*row)
+    return served_session(study, row)
 
 
 def stage_of(session: Session, trials: Mapping[str, int]) -> Stage:

@@ -24,6 +24,7 @@ from physion.experiment.entering import let_in, receive
 from physion.experiment.identity import Secrets, hash_token
 from physion.experiment.media_links import sign_media
 from physion.experiment.orders import fixations, order_of
+from physion.experiment.recruitment import completion
 from physion.experiment.refused import Refused
 from physion.experiment.scores import Scores, percentile
 from physion.experiment.sent_pages import check_page, turn_page
@@ -99,12 +100,11 @@ class Store:
         """Write what waits, then let go of the database."""
         self._held.close()
 
-    async def enter(self, enter: Enter, address: str = "") -> Entered:
-        """Begin a session or go on with one. ``address`` is the visitor's; it is not kept."""
-        del address
+    async def enter(self, enter: Enter) -> Entered:
+        """Begin a session or go on with one."""
         visitor = receive(self.study, self.secrets, enter)
         return await self._writer.run(
-            lambda connection: let_in(connection, self.study, self._trials, visitor)
+            lambda connection: let_in(connection, self.study, self.secrets, self._trials, visitor)
         )
 
     async def state(self, token: str, load: bool = False) -> State:
@@ -114,7 +114,7 @@ class Store:
         now = time.time()
 
         def count(connection: Connection) -> State:
-            session = read_session(connection, hash_token(token))
+            session = read_session(connection, self.study, hash_token(token))
             trials = self._trials.of(session.scenario)
             if stage_of(session, trials) != "withdrawn":
                 marks = mark_loaded(session, trials)
@@ -152,7 +152,7 @@ class Store:
         details, token_hash, now = write_details(answer), hash_token(token), time.time()
 
         def store(connection: Connection) -> AnswerStored:
-            session = read_session(connection, token_hash)
+            session = read_session(connection, self.study, token_hash)
             trials = self._trials.of(session.scenario)
             return store_answer(
                 connection, self.study, self.secrets, trials, session, answer, details, now
@@ -208,7 +208,7 @@ class Store:
             raise Refused("unavailable", "The server cannot reach its database.") from error
 
     def _session(self, connection: Connection, token: str) -> tuple[Session, Any]:
-        session = read_session(connection, hash_token(token))
+        session = read_session(connection, self.study, hash_token(token))
         return session, self._trials.of(session.scenario)
 
     def _state(self, connection: Connection, token: str) -> State:
@@ -232,8 +232,6 @@ class Store:
         ]
 
     def _result(self, connection: Connection, token: str) -> Result:
-        from physion.experiment.recruitment import completion
-
         session, trials = self._session(connection, token)
         stage = stage_of(session, trials)
         if stage != "done":

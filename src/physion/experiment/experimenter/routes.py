@@ -26,9 +26,10 @@ from physion.experiment.experimenter.login import PATH
 from physion.experiment.experimenter.pages import make_environment
 from physion.experiment.experimenter.payments import read_payments
 from physion.experiment.experimenter.session_list import KINDS, Choice, page_number
-from physion.experiment.experimenter.summaries import ACTIVE_WITHIN, STATES
+from physion.experiment.experimenter.summaries import STATES
 from physion.experiment.identity import Secrets, check_password
 from physion.experiment.page_files import read_page_files
+from physion.experiment.sessions import ACTIVE_WITHIN
 from physion.experiment.study import Study
 
 if TYPE_CHECKING:

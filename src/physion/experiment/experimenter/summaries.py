@@ -9,13 +9,10 @@ from typing import Any
 
 from sqlalchemy import Connection, Engine, Row, select
 
-from physion.experiment.sessions import SESSION_COLUMNS, Session, Trials, stage_of
+from physion.experiment.sessions import ACTIVE_WITHIN, SESSION_COLUMNS, Session, Trials, stage_of
 from physion.experiment.stimuli import PHASES
 from physion.experiment.study import Study
 from physion.experiment.tables import ANSWERS, SESSIONS
-
-ACTIVE_WITHIN = 15 * 60.0
-"""Seconds since a session was last heard of within which it counts as going on."""
 
 STATES = {
     "finished": "Finished",
