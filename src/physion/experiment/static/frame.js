@@ -32,19 +32,15 @@ export class Frame {
     byId("skip").hidden = false;
   }
 
-  /**
-   * Show what belongs to a stage of the session.
-   * @param {{state: any}} context
-   * @param {boolean} leaving Is the participant asked whether to stop?
-   */
-  show({ state }, leaving) {
+  /** Show what belongs to a stage of the session. @param {{state: any}} context */
+  show({ state }) {
     this.state = state;
-    const inTrials = !leaving && (state.stage === "familiarization" || state.stage === "test");
+    const inTrials = state.stage === "familiarization" || state.stage === "test";
     document.body.classList.toggle("in-trials", inTrials);
     byId("progress").hidden = !inTrials;
     const tools = [];
     if (state.stage === "consent") tools.push(this.languageChooser());
-    if (STAGES_WITH_WAY_OUT.includes(state.stage) && !leaving) {
+    if (STAGES_WITH_WAY_OUT.includes(state.stage)) {
       const stop = button(this.texts.t("stop.open"), () => this.onStop(), { class: "link" });
       tools.push(stop);
     }

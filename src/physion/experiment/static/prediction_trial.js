@@ -4,6 +4,7 @@
  * @module prediction_trial
  */
 
+import { isAsked } from "./dialog.js";
 import { button, el, nextFrame, pageVisible } from "./dom.js";
 import { MovieFailed, Screen, round } from "./screen.js";
 
@@ -32,6 +33,10 @@ const info = {
     keys: { type: ParameterType.KEYS, array: true, default: ["f", "j"] },
     /** Words by name: prompt, yes, no, trouble, retry. */
     words: { type: ParameterType.OBJECT, default: undefined },
+    /** So often was the trial shown before, and left without an answer. */
+    before: { type: ParameterType.INT, default: 0 },
+    /** Called when the participant begins to see the scene. */
+    shown: { type: ParameterType.FUNCTION, default: () => {} },
     /** Called with the kind and data of what went wrong. */
     log: { type: ParameterType.FUNCTION, default: () => {} },
     /** Gives the AbortSignal that ends the trial. */
@@ -116,6 +121,7 @@ async function run(screen, cross, buttons, trial, signal, visibility) {
   await Promise.all([loaded, reach(start + trial.fixation_ms, signal)]);
   const fixation_ms = round((await nextFrame()) - start);
   cross.remove();
+  trial.shown();
   const cue = await screen.flash({ ms: trial.cue_ms, hz: trial.flash_hz });
   const movie = await screen.play({ hide: true });
   const answer = await answered(buttons, trial, signal);
@@ -134,7 +140,7 @@ async function run(screen, cross, buttons, trial, signal, visibility) {
     window_width: window.innerWidth,
     window_height: window.innerHeight,
     details: {
-      attempts: trial.attempt,
+      attempts: trial.before + trial.attempt,
       flashes: cue.changes,
       frames: frames.seen.slice(-MOST_NOTED).map(([at, frame, count]) => [since(at), frame, count]),
       play_ms: movie.startMs,
@@ -183,7 +189,7 @@ function answered(buttons, trial, signal) {
       );
       const pressed = (event) => {
         const side = sideOf(event, trial.keys);
-        if (side >= 0) give(event, side, "keyboard");
+        if (side >= 0 && !isAsked()) give(event, side, "keyboard");
       };
       document.addEventListener("keydown", pressed, options);
     });

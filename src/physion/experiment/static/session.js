@@ -5,6 +5,7 @@
  */
 
 import { Refused } from "./api.js";
+import { ask } from "./dialog.js";
 import { FeedbackTrial } from "./feedback_trial.js";
 import { demographicsPage, feedbackPage } from "./forms.js";
 import { windowFits } from "./gate.js";
@@ -33,6 +34,13 @@ export class Session {
   #stretch = new AbortController();
   #closed = false;
   #refused = null;
+  /** The question whether to stop, while it is asked. */
+  #question = null;
+  #withdraws = false;
+  /** The trial that runs, and how often the question was asked during it. */
+  #running = { phase: null, trial: null, asked: 0 };
+  /** How often the scene of a trial was begun to be seen, by phase and trial. */
+  #shown = new Map();
 
   /**
    * @param {any} basis api, texts, study, log, frame (see frame.js), address; `another` begins
@@ -44,8 +52,6 @@ export class Session {
     this.queue = queue;
     this.media = new Media(basis.api, basis.study.preload);
     this.state = null;
-    /** Has the participant asked to stop? */
-    this.asked = false;
   }
 
   /** Everything that pages need. @returns {import("./pages.js").Context} */
@@ -62,13 +68,25 @@ export class Session {
   /** Another tab has taken over. */
   close() {
     this.#closed = true;
+    this.#question?.abort();
     this.queue.close();
     this.#leave();
   }
 
-  /** The participant asks to stop: the trial that runs is left, and begins anew otherwise. */
-  askToStop() {
-    this.asked = true;
+  /** The participant asks to stop: what runs goes on below the question, and so does its clock. */
+  async askToStop() {
+    if (this.#question) return;
+    this.#question = new AbortController();
+    const { phase, trial } = this.#running;
+    const { log } = this.basis;
+    log.add("stop_asked", { stage: this.state.stage, phase, trial });
+    this.#running.asked += 1;
+    const answer = await ask(pages.stopPage(this.context), this.#question.signal);
+    this.#question = null;
+    const stop = Boolean(answer?.stop);
+    log.add("stop_answered", { stage: this.state.stage, phase, trial, stop });
+    if (!stop) return;
+    this.#withdraws = true;
     this.#leave();
   }
 
@@ -77,10 +95,10 @@ export class Session {
     this.state = state;
     while (!this.#closed) {
       this.#stretch = new AbortController();
-      this.basis.frame.show(this.context, this.asked);
+      this.basis.frame.show(this.context);
       if (this.state.stage === "done" || this.state.stage === "withdrawn") return this.#end();
       try {
-        this.state = this.asked ? await this.#stop() : await this.#stage();
+        this.state = await this.#stage();
       } catch (error) {
         if (this.#closed) return;
         this.state = await this.#stateAfter(error);
@@ -106,10 +124,32 @@ export class Session {
       throw error;
     }
     // Answers that are still on their way come first: the state then counts them.
+    if (this.queue.length > 0) showPage(this.basis.frame.main, this.#waiting());
     await this.queue.empty();
-    const state = this.#refused?.state ?? refused?.state;
+    if (this.#withdraws) return this.#withdraw();
+    const told = this.#refused?.state ?? refused?.state;
     this.#refused = null;
-    return this.queue.length === 0 && state && !this.asked ? state : api.get("/api/session");
+    const state = this.queue.length === 0 && told ? told : await api.get("/api/session");
+    // What was seen already is marked in the answer as after a reload.
+    const seen = this.#shown.has(`${state.stage} ${state.trial}`);
+    return seen ? api.get("/api/session?load=true") : state;
+  }
+
+  async #withdraw() {
+    const { api, log } = this.basis;
+    this.#withdraws = false;
+    await log.send();
+    try {
+      return await api.post("/api/page", { page: "withdraw", data: {} });
+    } catch (error) {
+      if (!error.state) throw error;
+      return error.state;
+    }
+  }
+
+  #waiting() {
+    const render = pages.waitingPage(this.context, () => this.queue.empty());
+    return (page, done = () => {}) => render(page, done);
   }
 
   #stage() {
@@ -126,15 +166,6 @@ export class Session {
     return this.basis.api.post("/api/page", { page, data }, { signal });
   }
 
-  async #stop() {
-    const [result] = await this.#timeline([
-      { type: PageTrial, render: pages.stopPage(this.context) },
-    ]);
-    this.asked = false;
-    if (result.values.stop) return this.basis.api.post("/api/page", { page: "withdraw", data: {} });
-    return this.state;
-  }
-
   /** All trials of a phase that are not answered yet, and then the state after them. */
   async #phase(phase) {
     const { api } = this.basis;
@@ -142,11 +173,10 @@ export class Session {
     const { trials } = await api.get(`/api/trials/${phase}`, { signal });
     this.media.start(trials, this.state.trial);
     const left = trials.filter((trial) => trial.trial >= this.state.trial);
-    const waiting = pages.waitingPage(this.context, () => this.queue.empty());
     await this.#timeline([
       ...left.flatMap((media) => this.#trial(phase, media)),
       {
-        timeline: [{ type: PageTrial, render: waiting }],
+        timeline: [{ type: PageTrial, render: this.#waiting() }],
         conditional_function: () => this.queue.length > 0,
       },
     ]);
@@ -158,6 +188,7 @@ export class Session {
     const { study, texts, frame, log } = this.basis;
     const fits = () => windowFits(study);
     const number = media.trial;
+    const place = `${phase} ${number}`;
     let stored = null;
     const prediction = {
       type: PredictionTrial,
@@ -168,14 +199,18 @@ export class Session {
       flash_hz: study.flash_hz,
       choices: this.state.buttons.split("-"),
       words: words(texts, "trial", TRIAL_WORDS),
+      before: () => this.#shown.get(place) ?? 0,
+      shown: () => this.#shown.set(place, (this.#shown.get(place) ?? 0) + 1),
       log: (kind, data) => log.add(kind, data),
       on_start: () => {
+        this.#running = { phase, trial: number, asked: 0 };
         this.media.advance(number);
         frame.progress(phase, number);
       },
       on_finish: (data) => {
         if (!data.response) return; // left before the answer
-        stored = this.queue.add(answerOf(phase, number, data));
+        const details = { ...data.details, stop_asked: this.#running.asked };
+        stored = this.queue.add(answerOf(phase, number, { ...data, details }));
         this.state = { ...this.state, trial: number + 1 };
       },
     };
@@ -230,11 +265,13 @@ export class Session {
     } finally {
       signal.removeEventListener("abort", abort);
     }
+    this.#running = { phase: null, trial: null, asked: 0 };
     signal.throwIfAborted();
     return jsPsych.data.get().values();
   }
 
   async #end() {
+    this.#question?.abort();
     const { texts, study, api, frame, another } = this.basis;
     if (this.state.stage === "withdrawn") {
       const [title, text] = [texts.t("withdrawn.title"), texts.t("withdrawn.text", study)];
