@@ -156,7 +156,10 @@ class TestSession:
         person.page("demographics")
         person.page("feedback")
         result = wire.Result.model_validate(person.ask("GET", "/api/result"))
-        assert result.trials == 3 and result.percentile is not None
+        assert (result.trials, result.correct, result.percentile) == (3, 2, None)  # nobody else
+        site.person(id="p-other", scenario="collide").walk("done")
+        result = wire.Result.model_validate(person.ask("GET", "/api/result"))
+        assert result.percentile == 50
         assert result.completion.code == "C0DE"
         assert result.completion.url == "https://app.prolific.com/submissions/complete?cc=C0DE"
         refusal = person.ask(

@@ -13,7 +13,9 @@ from experimenter_rows import BROWSERS, insert_sessions
 from tiny_study import make_tiny_study
 
 from physion.experiment.database import open_database, upgrade
+from physion.experiment.experimenter.clerk import Clerk
 from physion.experiment.experimenter.figures import HEIGHT, WIDTH, accuracy_histogram, rt_histogram
+from physion.experiment.experimenter.flagging import Flags
 from physion.experiment.experimenter.overview import browser_of, expected_end, funnel, rate_of
 from physion.experiment.experimenter.pages import minutes
 from physion.experiment.experimenter.summaries import Answered, Summaries, Summary, state_of
@@ -98,6 +100,40 @@ def test_states_of_sessions() -> None:
     assert state_of(facts | {"withdrawn_at": 5.0}, 1000.0) == "withdrawn"
     assert state_of(facts | {"withdrawn_at": 5.0, "consented_at": None}, 10.0) == "declined"
     assert state_of(facts | {"finished_at": 5.0}, 1e9) == "finished"
+
+
+def test_flags_are_found_anew_whenever_the_rules_would_read_something_else(
+    tmp_path: Path, database_url: str
+) -> None:
+    study = make_tiny_study(tmp_path, size=64, languages=("en",))
+    engine = open_database(database_url)
+    upgrade(engine)
+    names = insert_sessions(engine, study, Secrets.load(tmp_path), 20)
+    asked: list[object] = []
+
+    class Listening:
+        def flags(self, kind: str, state: object) -> Flags:
+            asked.append(state)
+            return Flags("preregistered")
+
+    clerk = Clerk(study, engine)
+    clerk._flagger = Listening()  # type: ignore[assignment]
+
+    def look(**values: float | None) -> None:
+        with engine.connect().execution_options(physion_writes=True) as connection:
+            if values:
+                own = SESSIONS.c.session == names[0]
+                connection.execute(sa.update(SESSIONS).where(own).values(**values))
+                connection.commit()
+        clerk._read_at = -1e9
+        clerk.overview("person")
+
+    look(finished_at=None, withdrawn_at=None)
+    look()
+    look(finished_at=2.0)
+    look(finished_at=None, withdrawn_at=2.0)
+    assert asked[0] == asked[1] and len(set(asked)) == 3
+    engine.dispose()
 
 
 def test_summaries_grow_as_answers_come(tmp_path: Path, database_url: str) -> None:

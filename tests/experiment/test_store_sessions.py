@@ -360,6 +360,33 @@ def test_pages_come_in_their_order_and_twice_is_once(store: Store) -> None:
     assert (session.difficulty, session.feedback) == (2, "fine")
 
 
+@pytest.mark.parametrize("how", ["withdraw", "consent"])
+def test_who_does_not_agree_leaves_nothing_behind(store: Store, how: str) -> None:
+    data = {} if how == "withdraw" else {"agreed": False}
+    device = Device(user_agent="Mozilla", screen_width=1920)
+    more: dict[str, Any] = {"source": "prolific", "device": device, "recruiter": {"STUDY_ID": "s"}}
+    enter(store, "Ada", **more)
+    for person in ("Ada", "Bob", "Cy"):
+        token = enter(store, person, scenario="drop", **more)
+        enter(store, person, scenario="drop", **more)
+        if person == "Bob":
+            page(store, token, "consent")
+        page(store, token, how, **data)
+    # Ada has another session, and Bob withdrew: they may have to be paid.
+    assert {row.raw_id for row in rows(store, RAW_IDS)} == {"Ada", "Bob"}
+    by_participant = {(row.participant, row.scenario): row.device for row in rows(store, SESSIONS)}
+    kept = device.model_dump()
+    ada, bob, cy = (
+        participant_hash(store.secrets, "prolific", name) for name in ("Ada", "Bob", "Cy")
+    )
+    assert by_participant == {
+        (ada, "collide"): kept, (ada, "drop"): {}, (bob, "drop"): kept, (cy, "drop"): {},
+    }  # fmt: skip
+    assert sorted(row.data.get("user_agent", "") for row in rows(store, EVENTS)) == [
+        "", "", "Mozilla",
+    ]  # fmt: skip
+
+
 @pytest.mark.parametrize("stage", STAGES[:-1])
 @pytest.mark.parametrize("how", ["withdraw", "consent"])
 def test_who_withdraws_is_left_alone(sqlite_store: Store, stage: str, how: str) -> None:
@@ -585,6 +612,20 @@ def test_events_are_kept_up_to_a_limit(store: Store, monkeypatch: pytest.MonkeyP
     some = Events(events=[Event(kind="hidden", at_ms=number) for number in range(5)])
     assert [run(store.events(token, some)).stored for _ in range(3)] == [5, 2, 0]
     assert [row.at_ms for row in rows(store, EVENTS)] == [0, 1, 2, 3, 4, 0, 1]
+
+
+def test_a_batch_of_events_is_stored_once(store: Store) -> None:
+    token, other = enter(store, "Ada"), enter(store, "Bob")
+    some = [Event(kind="hidden", at_ms=number) for number in range(3)]
+
+    def send(token: str, key: str | None) -> int:
+        return run(store.events(token, Events(key=key, events=some))).stored
+
+    assert [send(token, "batch-01") for _ in range(3)] == [3, 0, 0]
+    assert [send(token, "batch-02"), send(other, "batch-01")] == [3, 3]
+    assert [send(token, None) for _ in range(2)] == [3, 3]
+    assert len(rows(store, EVENTS)) == 15
+    assert {row.batch for row in rows(store, EVENTS)} == {"batch-01", "batch-02", None}
 
 
 @pytest.mark.parametrize(

@@ -24,6 +24,7 @@ from physion.experiment.recruitment import kind_of_pass
 from physion.experiment.refused import Refused
 from physion.experiment.sessions import (
     ACTIVE_WITHIN,
+    ENTERED_AGAIN,
     SESSION_COLUMNS,
     Session,
     Trials,
@@ -224,7 +225,7 @@ def _go_on(connection: Connection, trials: Trials, session: Session, visitor: Vi
     change_session(connection, session, last_seen=visitor.now, **marks)
     event = {
         "session": session.session,
-        "kind": "entered_again",
+        "kind": ENTERED_AGAIN,
         "at_ms": 0.0,
         "stored_at": visitor.now,
         "data": plain_values(visitor.enter.device.model_dump()),

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from sqlalchemy import Connection
+from sqlalchemy import Connection, delete, select, update
 
 from physion.experiment.refused import Refused
 from physion.experiment.sessions import (
+    ENTERED_AGAIN,
     STAGES,
     Session,
     change_session,
@@ -17,6 +18,7 @@ from physion.experiment.sessions import (
     state_of,
 )
 from physion.experiment.study import Study
+from physion.experiment.tables import EVENTS, RAW_IDS, SESSIONS
 from physion.experiment.wire import PageDone, State
 
 MIN_AGE, MAX_AGE = 18, 130
@@ -111,12 +113,28 @@ def turn_page(
             raise Refused("wrong_stage", "This session is finished.", state_of(session, trials))
         if stage != "withdrawn":
             change_session(connection, session, withdrawn_at=now, last_seen=now)
+            if session.consented_at is None:
+                _forget(connection, session)
         return state_of(session, trials)
     if stage == "withdrawn" or STAGES.index(stage) < STAGES.index(page):  # type: ignore[arg-type]
         raise Refused("wrong_stage", "This page does not come now.", state_of(session, trials))
     if stage == page:
         change_session(connection, session, last_seen=now, **_columns(study, page, values, now))
     return state_of(session, trials)
+
+
+def _forget(connection: Connection, session: Session) -> None:
+    """Delete what came with who did not agree: browser and screen, and the recruiter's id where it
+    belongs to no other session.
+    """
+    change_session(connection, session, device={})
+    again = (EVENTS.c.session == session.session) & (EVENTS.c.kind == ENTERED_AGAIN)
+    connection.execute(update(EVENTS).where(again).values(data={}))
+    other = select(SESSIONS.c.session).where(
+        SESSIONS.c.participant == session.participant, SESSIONS.c.session != session.session
+    )
+    own = RAW_IDS.c.participant == session.participant
+    connection.execute(delete(RAW_IDS).where(own, ~other.exists()))
 
 
 def _columns(study: Study, page: str, values: Mapping[str, Any], now: float) -> dict[str, Any]:

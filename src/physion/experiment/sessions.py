@@ -18,6 +18,8 @@ from physion.experiment.wire import Stage, State
 
 ACTIVE_WITHIN = 15 * 60.0
 """Seconds since a session was last heard of within which it counts as going on."""
+ENTERED_AGAIN = "entered_again"
+"""The event of someone who goes on with a session; its data are the device."""
 STAGES: tuple[Stage, ...] = (
     "consent", "instructions", "familiarization", "ready", "test", "demographics", "feedback",
     "done", "withdrawn",

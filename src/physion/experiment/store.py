@@ -161,10 +161,12 @@ class Store:
         return await self._writer.run(store)
 
     async def events(self, token: str, events: Events) -> Stored:
-        """Store what happened in the browser, up to MAX_EVENTS a session."""
+        """Store what happened in the browser, up to MAX_EVENTS a session; a batch under the same
+        key is not stored again.
+        """
         now = time.time()
         rows = [
-            {"kind": event.kind, "at_ms": event.at_ms, "stored_at": now,
+            {"batch": events.key, "kind": event.kind, "at_ms": event.at_ms, "stored_at": now,
              "data": _event_data(event.data, index)}
             for index, event in enumerate(events.events)
         ]  # fmt: skip
@@ -174,6 +176,10 @@ class Store:
             if stage_of(session, trials) == "withdrawn":
                 raise Refused("wrong_stage", "This session has ended.", state_of(session, trials))
             of_session = EVENTS.c.session == session.session
+            if events.key is not None:
+                same = select(EVENTS.c.event).where(of_session, EVENTS.c.batch == events.key)
+                if connection.execute(same.limit(1)).first() is not None:
+                    return Stored(stored=0)
             known = connection.scalar(select(func.count()).where(of_session)) or 0
             kept = rows[: max(0, MAX_EVENTS - known)]
             if kept:

@@ -151,9 +151,11 @@ EVENTS = Table(
     METADATA,
     Column("event", Integer, primary_key=True, autoincrement=True),
     Column("session", ForeignKey("sessions.session"), nullable=False, index=True),
+    Column("batch", String(64)),
     Column("kind", String(40), nullable=False),
     Column("at_ms", Float, nullable=False),
     Column("stored_at", Float, nullable=False),
     Column("data", JSON, nullable=False),
 )
-"""What happened in the browser or to the session besides answers."""
+"""What happened in the browser or to the session besides answers. ``batch`` is the key under which
+the browser sent some events together."""

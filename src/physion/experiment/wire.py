@@ -222,7 +222,7 @@ class Event(Message):
 
 class Events(Message):
     """Events of one load of the page. ``key`` is made once for each batch and kept over retries:
-    a batch that is there already is not stored twice.
+    a batch that is there already is not stored twice (``stored`` is 0).
     """
 
     key: Key | None = None

@@ -74,8 +74,11 @@ class Clerk:
         return self._read
 
     def _flags(self, kind: str) -> Flags:
-        state = (len(self._read), sum(summary.answered.trials for summary in self._read))
-        return self._flagger.flags(kind, state)
+        # Sessions change no more once they have ended, but leave the rules' tables by withdrawing.
+        ended = sum(s.facts["finished_at"] is not None for s in self._read)
+        withdrawn = sum(s.facts["withdrawn_at"] is not None for s in self._read)
+        trials = sum(s.answered.trials for s in self._read)
+        return self._flagger.flags(kind, (len(self._read), trials, ended, withdrawn))
 
 
 def serve_questions(study: Study, url: str, connection: Connection) -> None:

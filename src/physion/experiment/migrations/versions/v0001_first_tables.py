@@ -118,6 +118,7 @@ def upgrade() -> None:
         "events",
         sa.Column("event", sa.Integer(), autoincrement=True, nullable=False),
         sa.Column("session", sa.String(length=32), nullable=False),
+        sa.Column("batch", sa.String(length=64), nullable=True),
         sa.Column("kind", sa.String(length=40), nullable=False),
         sa.Column("at_ms", sa.Float(), nullable=False),
         sa.Column("stored_at", sa.Float(), nullable=False),
