@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 from experimenter_client import BASE, Lab, lab
+from starlette.requests import Request
 from tiny_study import PASSWORD
 
 from physion.experiment.experimenter import gate as gates
@@ -23,7 +25,7 @@ from physion.experiment.experimenter.login import (
     LONGEST,
     Logins,
 )
-from physion.experiment.identity import set_password
+from physion.experiment.identity import Secrets, check_password, set_password
 
 PAGES = ("", "/", "/sessions", "/sessions/abc", "/payments", "/export", "?auto=1")
 ACTIONS = ("/logout", "/payments", "/payments/forget", "/export")
@@ -261,6 +263,42 @@ def test_a_new_password_counts_at_once(tmp_path: Path) -> None:
         visitor = own.visitor()
         assert visitor.log_in().status_code == 403
         assert visitor.log_in("another password").status_code == 303
+
+
+def test_a_new_password_ends_all_logins(tmp_path: Path) -> None:
+    with lab(tmp_path) as own:
+        visitors = [own.experimenter(), own.experimenter()]
+        visitors[0].open_payments()
+        set_password(tmp_path, PASSWORD)  # the same words are another hash, too
+        for place in ("", "/sessions", "/payments"):
+            assert [v.see(place).headers.get("location") for v in visitors] == [BASE + "/login"] * 2
+        form = visitors[0].token("/login")
+        assert visitors[0].submit("/export", form).headers["location"] == BASE + "/login"
+        assert visitors[1].log_in().status_code == 303
+        assert [v.see("/sessions").status_code for v in visitors] == [303, 200]
+
+
+def test_a_password_that_changes_while_it_is_looked_at_opens_nothing(tmp_path: Path) -> None:
+    """In three steps: it is right, then changed, and someone else's page tells the server."""
+    set_up = Secrets.create(tmp_path, PASSWORD)
+    kept = [set_up]
+    gate = gates.Gate(lambda: kept[0])
+    token = gate.logins.open(0.0)
+
+    def change(secrets: Secrets, password: str) -> bool:
+        right = check_password(secrets, password)
+        kept[0] = set_password(tmp_path, "another password")
+        gate.login(request)
+        return right
+
+    request = Request({"type": "http", "headers": [(b"cookie", f"{COOKIE}={token}".encode())]})
+    try:
+        assert asyncio.run(gate.try_password(request, PASSWORD)) is None
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(gates, "check_password", change)
+            assert asyncio.run(gate.try_password(request, PASSWORD)) == 0.0
+    finally:
+        gate.close()
 
 
 def test_every_page_has_a_strict_policy_and_is_not_kept(served: Lab) -> None:

@@ -1,6 +1,6 @@
 """Give the experimenter's pages a new password, asked for at the terminal or read from a file.
 
-A server that runs takes it when it is started again.
+A server that runs takes it at once: whoever is logged in has to give the new one.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def main(options: Options) -> int:
     if options.json:
         print(json_module.dumps({"password": "set"}))
     else:
-        print("the new password holds from the next start of the server")
+        print("the new password holds from now on; whoever was logged in has to give it")
     return 0
 
 

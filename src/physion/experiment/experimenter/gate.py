@@ -13,6 +13,7 @@ from starlette.responses import Response
 
 from physion.experiment.experimenter.attempts import Attempts
 from physion.experiment.experimenter.login import COOKIE, LONGEST, PATH, Login, Logins, new_visit
+from physion.experiment.identity import Secrets, check_password
 
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
@@ -38,15 +39,16 @@ class Gate:
     """Who may see the pages. One for a server process; used from its event loop alone."""
 
     def __init__(
-        self, check_password: Callable[[str], bool], clock: Callable[[], float] = time.monotonic
+        self, read_secrets: Callable[[], Secrets], clock: Callable[[], float] = time.monotonic
     ) -> None:
         self.logins, self.clock = Logins(), clock
-        self._check, self._attempts = check_password, Attempts()
+        self._read_secrets, self._attempts = read_secrets, Attempts()
         self._threads = ThreadPoolExecutor(CHECKS_AT_ONCE, thread_name_prefix="password")
         self._waiting = 0
 
     def login(self, request: Request, by_person: bool = True) -> Login | None:
         """The login of the browser; None where it has to give the password first."""
+        self.logins.password_is(self._read_secrets().password_hash)
         return self.logins.find(self.token(request), self.clock(), by_person)
 
     def token(self, request: Request) -> str:
@@ -72,13 +74,16 @@ class Gate:
         wait = self._attempts.begin(address, self.clock())
         if wait > 0:
             return wait
+        secrets = self._read_secrets()
+        self.logins.password_is(secrets.password_hash)
         self._waiting += 1
         try:
             loop = asyncio.get_running_loop()
-            right = await loop.run_in_executor(self._threads, self._check, password)
+            right = await loop.run_in_executor(self._threads, check_password, secrets, password)
         finally:
             self._waiting -= 1
-        if not right:
+        # It may have been changed meanwhile.
+        if not right or self.logins.under != secrets.password_hash:
             return 0.0
         self._attempts.succeeded(address)
         return None

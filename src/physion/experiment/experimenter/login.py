@@ -1,6 +1,7 @@
 """Who is logged in: sessions in memory, their cookie, and the tokens of forms.
 
-Nothing is written to disk: a restart of the server logs everybody out.
+Nothing is written to disk: a restart of the server logs everybody out, and so does another
+password.
 """
 
 from __future__ import annotations
@@ -46,6 +47,14 @@ class Logins:
     def __init__(self) -> None:
         self._open: OrderedDict[str, Login] = OrderedDict()
         self._form_key = secrets.token_bytes(32)
+        self.under = ""
+        """The hash of the password with which all of them were opened."""
+
+    def password_is(self, under: str) -> None:
+        """The password has this hash now: with another one than before, all logins end."""
+        if under != self.under:
+            self._open.clear()
+            self.under = under
 
     def open(self, now: float) -> str:
         """A new login; its token goes into the cookie and is not kept."""
