@@ -2,15 +2,14 @@
 
 They enter with the signed word of the pilot link, which marks their sessions as simulated for good,
 load the pages' data and media, answer every trial with a key that is kept over retries, and fill in
-the pages. Where the server does not answer they ask again. What they answer is
-`SimulatedPerson`'s: the outcomes come from the study folder, never from the server. Nothing is
-waited for but ``pace``; the times of cue, movie and frames that they report are the wanted ones.
+the pages, each with a `SimulatedBrowser`. What they answer is `SimulatedPerson`'s: the outcomes
+come from the study folder, never from the server. Nothing is waited for but ``pace``; the times of
+cue, movie and frames that they report are the wanted ones.
 """
 
 from __future__ import annotations
 
 import asyncio
-import time
 import uuid
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -23,12 +22,11 @@ from physion.experiment import wire
 from physion.experiment.identity import Secrets
 from physion.experiment.media_links import read_media_path
 from physion.experiment.recruitment import pass_word
+from physion.experiment.simulated_browser import RefusedError, SimulatedBrowser, state_after
 from physion.experiment.simulated_person import SimulatedPerson
 from physion.experiment.stimuli import Stimulus
 from physion.experiment.study import Study
 
-GO_ON = ("out_of_order", "already_answered", "wrong_stage")
-"""Refusals that carry the state from which a session goes on."""
 DEVICE = wire.Device(
     user_agent="physion simulate",
     refresh_hz=60.0,
@@ -38,14 +36,6 @@ DEVICE = wire.Device(
     touch=False,
 )
 WINDOW = (1280, 720)
-
-
-class RefusedError(PhysionError):
-    """The server said no: a ``code`` of `wire.REFUSALS`, and where the session stands, if told."""
-
-    def __init__(self, refusal: wire.Refusal) -> None:
-        super().__init__(refusal.message)
-        self.code, self.state = refusal.error, refusal.state
 
 
 @dataclass(frozen=True)
@@ -94,47 +84,6 @@ class Plan:
     media: bool = True
 
 
-class Browser:
-    """One visitor's requests, sent again until the server answers."""
-
-    def __init__(self, client: httpx2.AsyncClient, plan: Plan) -> None:
-        self._client, self._plan = client, plan
-        self.token = ""
-        self.retries = 0
-
-    async def ask(self, method: str, path: str, body: wire.Message | None = None) -> bytes:
-        """The body of the answer. `RefusedError` for a no, `PhysionError` when out of patience."""
-        content = None if body is None else body.model_dump_json(by_alias=True, exclude_none=True)
-        headers = {"Authorization": f"Bearer {self.token}"} if self.token else {}
-        if content is not None:
-            headers["Content-Type"] = "application/json"
-        (wait, longest), until = self._plan.waits_s, time.monotonic() + self._plan.patience_s
-        while True:
-            trouble = "the server does not answer"
-            try:
-                answer = await self._client.request(method, path, content=content, headers=headers)
-            except httpx2.TransportError as error:
-                trouble = f"the server does not answer ({type(error).__name__})"
-            else:
-                if answer.is_success:
-                    return answer.content
-                if answer.status_code != 429 and answer.status_code < 500:
-                    raise RefusedError(_refusal(answer))
-                trouble = f"the server answers {answer.status_code}"
-            if time.monotonic() > until:
-                raise PhysionError(f"{method} {path}: {trouble} for {self._plan.patience_s:g} s")
-            self.retries += 1
-            await asyncio.sleep(wait)
-            wait = min(2 * wait, longest)
-
-
-def _refusal(answer: httpx2.Response) -> wire.Refusal:
-    try:
-        return wire.Refusal.model_validate_json(answer.content)
-    except ValueError:
-        return wire.Refusal(error="bad_request", message=f"status {answer.status_code}")
-
-
 class Participation:
     """One simulated person's way through the study, from wherever the session stands."""
 
@@ -144,7 +93,7 @@ class Participation:
 
     async def go(self, client: httpx2.AsyncClient) -> None:
         """Go through; what came of it is in the visit."""
-        self._browser = Browser(client, self._plan)
+        self._browser = SimulatedBrowser(client, self._plan.waits_s, self._plan.patience_s)
         try:
             await self._walk()
         except RefusedError as refused:
@@ -205,7 +154,7 @@ class Participation:
         try:
             answer = await self._browser.ask("POST", "/api/page", done)
         except RefusedError as refused:
-            return _go_on(refused)
+            return state_after(refused)
         return wire.State.model_validate_json(answer)
 
     async def _phase(self, state: wire.State, leaves: int | None) -> wire.State:
@@ -227,7 +176,7 @@ class Participation:
         try:
             answer = await self._browser.ask("POST", "/api/answers", body)
         except RefusedError as refused:
-            return _go_on(refused)
+            return state_after(refused)
         stored = wire.AnswerStored.model_validate_json(answer)
         self._visit.answers.append(
             Acknowledged(phase, body.trial, body.key, stimulus.stimulus, body.response, body.rt_ms)
@@ -248,12 +197,6 @@ class Participation:
         for path in paths if self._plan.media else ():
             if not await self._browser.ask("GET", path):
                 raise PhysionError(f"{path}: the server sent an empty file")
-
-
-def _go_on(refused: RefusedError) -> wire.State:
-    if refused.code in GO_ON and refused.state is not None:
-        return refused.state
-    raise refused
 
 
 def answer_to(
