@@ -22,52 +22,32 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections import deque
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.compute as pc
 from sqlalchemy import Connection, Engine, select
 
 import physion
-from physion.analysis.response_schema import SESSION_COLUMNS, TRIAL_COLUMNS, data_dictionary
+from physion.analysis.response_schema import data_dictionary
 from physion.experiment.answer_tables import snapshot
 from physion.experiment.bids import BidsFolder
 from physion.experiment.export_folder import whole_folder, write_manifest
+from physion.experiment.export_tables import TABLES, Written, write_tables
 from physion.experiment.export_words import STIMULI_COLUMNS, readme
-from physion.experiment.further_tables import (
-    DETAIL_COLUMNS,
-    EVENT_COLUMNS,
-    detail_table,
-    read_events,
-)
 from physion.experiment.iso_times import iso_times
 from physion.experiment.psych_ds import write_psych_ds
 from physion.experiment.session_rows import KINDS, Sessions, Wanted, read_sessions
 from physion.experiment.spreadsheet import RULE
 from physion.experiment.study import Study
-from physion.experiment.table_files import TableFiles
 from physion.experiment.tables import STUDIES
-from physion.experiment.trial_rows import Trials, read_trials
 
 Layout = Literal["both", "psych-ds", "bids"]
 GONE = "answer to a stimulus that the study folder has no more"
 NO_FILE = "no answer yet, and so no file in bids/"
-WAITING = 2
-"""Parts that may wait for being written, so that memory stays bounded."""
-TABLES = {
-    "trials": TRIAL_COLUMNS,
-    "sessions": SESSION_COLUMNS,
-    "events": EVENT_COLUMNS,
-    "trial_details": DETAIL_COLUMNS,
-    "stimuli": STIMULI_COLUMNS,
-}
 _SECRET_SETTINGS = ("recruitment", "folder", "stimuli")
 
 
@@ -116,7 +96,7 @@ def export_study(
             bids = None
             if layout != "psych-ds":
                 bids = BidsFolder(folder / "bids", study, sessions.table)
-            written = _write_tables(folder, connection, study, sessions, bids)
+            written = write_tables(folder, connection, study, sessions, bids)
             states = _states(connection, sessions)
         report = _report(out, sessions, written)
         _write_stimuli(folder, study)
@@ -138,89 +118,7 @@ def export_study(
     return report
 
 
-@dataclass(frozen=True)
-class _Written:
-    """Rows by table, answers to stimuli that are gone, and the last moment in the data."""
-
-    rows: dict[str, int]
-    gone: int
-    until: str | None
-
-
-# --- tables -------------------------------------------------------------------------------------
-
-
-def _write_tables(
-    folder: Path,
-    connection: Connection,
-    study: Study,
-    sessions: Sessions,
-    bids: BidsFolder | None,
-) -> _Written:
-    """Writes trials, sessions, events and details, in one go through the answers."""
-    gone, latest = (
-        0,
-        [_latest(sessions.table, "started_at"), _latest(sessions.table, "finished_at")],
-    )
-    with ExitStack() as stack:
-        files = {
-            name: stack.enter_context(TableFiles(folder, name, TABLES[name]))
-            for name in ("trials", "sessions", "events")
-        }
-        details = stack.enter_context(
-            TableFiles(folder, "trial_details", DETAIL_COLUMNS, with_csv=False, level=1)
-        )
-
-        def write(part: Trials) -> None:
-            files["trials"].write(part.table)
-            details.write(detail_table(part))
-            if bids is not None:
-                bids.write(part)
-
-        files["sessions"].write(sessions.table)
-        for events in read_events(connection, sessions.table):
-            files["events"].write(events)
-        with _Behind(write) as behind:
-            for part in read_trials(connection, study, sessions.table, details=True):
-                gone += len(part.unknown)
-                latest.append(_latest(part.table, "answered_at"))
-                behind(part)
-        rows = {name: file.rows for name, file in (*files.items(), ("trial_details", details))}
-    return _Written(rows, gone, max(latest) or None)
-
-
-def _latest(table: pa.Table, column: str) -> str:
-    """The last moment of a column; empty where it has none."""
-    return str(pc.max(table.column(column)).as_py() or "")
-
-
-class _Behind:
-    """Calls a function in one other thread, in order, while this one fetches what comes next."""
-
-    def __init__(self, function: Callable[[Trials], None]) -> None:
-        self._function = function
-        self._pool = ThreadPoolExecutor(1)
-        self._waiting: deque[Future[None]] = deque()
-
-    def __call__(self, part: Trials) -> None:
-        self._waiting.append(self._pool.submit(self._function, part))
-        while len(self._waiting) > WAITING:
-            self._waiting.popleft().result()
-
-    def __enter__(self) -> _Behind:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        self._pool.shutdown(cancel_futures=kind is not None)
-        if kind is None:
-            for future in self._waiting:
-                future.result()
-
-
-# --- what stands beside the tables --------------------------------------------------------------
-
-
-def _report(out: Path, sessions: Sessions, written: _Written) -> Report:
+def _report(out: Path, sessions: Sessions, written: Written) -> Report:
     kinds: dict[str, dict[str, int]] = {}
     for kind in KINDS:
         states = {state: sessions.states[kind, state] for state in ("finished", "unfinished")}
