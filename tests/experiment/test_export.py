@@ -21,7 +21,7 @@ from physion.analysis.response_schema import check_table
 from physion.cli import experiment_export
 from physion.cli.main import main
 from physion.errors import BadInputError, PhysionError
-from physion.experiment import export
+from physion.experiment import export, export_tables
 from physion.experiment.answer_tables import read_tables
 from physion.experiment.database import open_database, sqlite_url, upgrade
 from physion.experiment.export import GONE, NO_FILE, TABLES, export_study
@@ -283,9 +283,9 @@ def test_a_failure_leaves_nothing_and_the_old_export(
     assert not list(tmp_path.glob("*out*"))
     export_study(small, study, out)
     before = contents(out)
-    for name in ("write_manifest", "read_trials"):
+    for module, name in ((export, "write_manifest"), (export_tables, "read_trials")):
         with monkeypatch.context() as broken:
-            broken.setattr(export, name, fails)
+            broken.setattr(module, name, fails)
             with pytest.raises(OSError, match="No space"):
                 export_study(small, study, out)
         assert contents(out) == before
