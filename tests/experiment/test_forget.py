@@ -30,6 +30,7 @@ def fill(store: Store, count: int = 60) -> None:
         more = {"STUDY_ID": f"visit-first-{number:04d}"}
         token = enter(store, raw_id(number), source="prolific", recruiter=more, scenario="drop")
         if number % 5 == 0:
+            page(store, token, "consent")
             page(store, token, "withdraw")
     for number in range(1, count, 3):
         if number % 5:
@@ -48,8 +49,12 @@ def database(tmp_path: Path, small_study: Study, small_secrets: Secrets) -> str:
     url = f"sqlite:///{tmp_path / 'responses.sqlite'}"
     store = Store.open(replace(small_study, participants=1000), small_secrets, url)
     fill(store)
+    declined = enter(store, "did-not-agree-0001", source="sona", scenario="drop")
+    assert b"did-not-agree" in bytes_of(tmp_path)
+    page(store, declined, "consent", agreed=False)
     store.close()
     found = bytes_of(tmp_path)
+    assert b"did-not-agree" not in found
     assert b"5f1eada" in found and b"visit-first" in found and b"visit-again" in found
     return url
 
@@ -63,10 +68,10 @@ def test_no_byte_of_the_ids_stays(
     assert forget(database, None) == 0
     store = Store.open(small_study, small_secrets, database)
     try:
-        assert len(rows(store, SESSIONS)) == 60 and rows(store, RAW_IDS) == []
+        assert len(rows(store, SESSIONS)) == 61 and rows(store, RAW_IDS) == []
         # People are still recognised by their hash.
         entered = enter(store, raw_id(1), source="prolific", scenario="drop")
-        assert len(rows(store, SESSIONS)) == 60
+        assert len(rows(store, SESSIONS)) == 61
         assert run(store.state(entered)).stage == "consent"
     finally:
         store.close()

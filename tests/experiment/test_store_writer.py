@@ -7,10 +7,10 @@ import contextlib
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from concurrent.futures import Future
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import pytest
 from postgres import Cluster
@@ -20,10 +20,14 @@ from store_walk import answer, enter, give, rows, run, walk
 
 from physion.experiment.database import connect_writer, open_database
 from physion.experiment.identity import Secrets
+from physion.experiment.recruitment import pass_word
 from physion.experiment.store import Refused, Store
 from physion.experiment.study import Study
 from physion.experiment.tables import EVENTS
+from physion.experiment.wire import Enter, PageDone
 from physion.experiment.writer import Writer
+
+T = TypeVar("T")
 
 
 @pytest.fixture
@@ -276,23 +280,36 @@ def test_restarts_of_postgresql_lose_nothing(
     acknowledged: set[tuple[str, int]] = set()
     stop = threading.Event()
 
-    async def person(number: int) -> None:
-        from physion.experiment.wire import Enter, PageDone
+    async def until_there(ask: Callable[[], Awaitable[T]]) -> T:
+        """As browsers do: whoever is told that the database is away asks again."""
+        until = time.monotonic() + 60
+        while True:
+            try:
+                return await ask()
+            except Refused as refused:
+                if refused.code != "unavailable" or time.monotonic() > until:
+                    raise
+            await asyncio.sleep(0.1)
 
+    async def person(number: int) -> None:
         while not stop.is_set():
             name = f"{number}-{time.monotonic_ns()}"
             visit = Enter.model_validate({"id": name, "scenario": "drop", "pass": word})
-            token = (await store.enter(visit)).token
-            await store.page(token, PageDone(page="consent", data={"agreed": True}))
-            await store.page(token, PageDone(page="instructions"))
+            token = (await until_there(lambda visit=visit: store.enter(visit))).token
+
+            async def send(token: str = token, **page: Any) -> None:
+                await until_there(lambda: store.page(token, PageDone(**page)))
+
+            await send(page="consent", data={"agreed": True})
+            await send(page="instructions")
             for phase, count in (("familiarization", 3), ("test", 4)):
                 for trial in range(count):
-                    key = f"{name}-{phase[0]}{trial}"
-                    await store.answer(token, answer(trial, phase, key=key))
-                    acknowledged.add((key, trial))
+                    given = answer(trial, phase, key=f"{name}-{phase[0]}{trial}")
+                    await until_there(lambda token=token, given=given: store.answer(token, given))
+                    acknowledged.add((given.key, trial))
                     await asyncio.sleep(0.002)
                 if phase == "familiarization":
-                    await store.page(token, PageDone(page="ready"))
+                    await send(page="ready")
 
     async def everybody() -> None:
         people = [asyncio.ensure_future(person(number)) for number in range(8)]
@@ -301,7 +318,7 @@ def test_restarts_of_postgresql_lose_nothing(
             before = len(acknowledged)
             await asyncio.to_thread(postgres_cluster.stop, mode)
             await asyncio.to_thread(postgres_cluster.start)
-            for _ in range(100):
+            for _ in range(600):
                 await asyncio.sleep(0.1)
                 if len(acknowledged) > before + 50:
                     break
@@ -309,11 +326,11 @@ def test_restarts_of_postgresql_lose_nothing(
         stop.set()
         await asyncio.gather(*people)
 
-    from physion.experiment.recruitment import pass_word
-
     word = pass_word(small_secrets, "simulated")
-    asyncio.run(everybody())
-    stored = [(row.key, row.trial) for row in rows(store)]
+    try:
+        asyncio.run(everybody())
+        stored = [(row.key, row.trial) for row in rows(store)]
+    finally:
+        store.close()
     assert len(stored) == len(set(stored))
     assert set(stored) == acknowledged
-    store.close()
