@@ -18,7 +18,7 @@ from physion.experiment.experimenter.figures import HEIGHT, WIDTH, accuracy_hist
 from physion.experiment.experimenter.flagging import Flags
 from physion.experiment.experimenter.overview import browser_of, expected_end, funnel, rate_of
 from physion.experiment.experimenter.pages import minutes
-from physion.experiment.experimenter.summaries import Answered, Summaries, Summary, state_of
+from physion.experiment.experimenter.summaries import Answered, Summaries, Summary, standing_of
 from physion.experiment.identity import Secrets
 from physion.experiment.tables import ANSWERS, SESSIONS
 
@@ -96,10 +96,10 @@ def test_spans_of_time_in_words() -> None:
 
 def test_states_of_sessions() -> None:
     facts = {"finished_at": None, "withdrawn_at": None, "consented_at": 1.0, "last_seen": 100.0}
-    assert state_of(facts, 1000.0) == "going" and state_of(facts, 1001.0) == "left"
-    assert state_of(facts | {"withdrawn_at": 5.0}, 1000.0) == "withdrawn"
-    assert state_of(facts | {"withdrawn_at": 5.0, "consented_at": None}, 10.0) == "declined"
-    assert state_of(facts | {"finished_at": 5.0}, 1e9) == "finished"
+    assert standing_of(facts, 1000.0) == "going" and standing_of(facts, 1001.0) == "left"
+    assert standing_of(facts | {"withdrawn_at": 5.0}, 1000.0) == "withdrawn"
+    assert standing_of(facts | {"withdrawn_at": 5.0, "consented_at": None}, 10.0) == "declined"
+    assert standing_of(facts | {"finished_at": 5.0}, 1e9) == "finished"
 
 
 def test_flags_are_found_anew_whenever_the_rules_would_read_something_else(

@@ -18,7 +18,7 @@ from sqlalchemy import Connection, Engine
 from physion.analysis.response_schema import SESSION_COLUMNS, TRIAL_COLUMNS
 from physion.errors import PhysionError
 from physion.experiment.arrow_types import arrow_schema, as_frame
-from physion.experiment.session_rows import KINDS, Wanted, read_sessions
+from physion.experiment.session_rows import EXPORTED_KINDS, Wanted, read_sessions
 from physion.experiment.study import Study
 from physion.experiment.trial_rows import read_trials
 
@@ -27,7 +27,7 @@ def read_tables(
     engine: Engine,
     study: Study,
     *,
-    kinds: Sequence[str] = KINDS,
+    kinds: Sequence[str] = EXPORTED_KINDS,
     scenario: str | None = None,
     finished_only: bool = False,
 ) -> tuple[pd.DataFrame, pd.DataFrame]:

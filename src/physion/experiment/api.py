@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from physion.experiment.store import Store
     from physion.experiment.study import Study
 
-KINDS: tuple[Literal["movie"], Literal["map"]] = ("movie", "map")
+SHOWN: tuple[Literal["movie"], Literal["map"]] = ("movie", "map")
 
 
 def public_study(study: Study, secrets: Secrets) -> PublicStudy:
@@ -61,7 +61,7 @@ def _example(study: Study, secrets: Secrets, scenario: str) -> TrialMedia:
     trial = len(study.phase(scenario, "familiarization")) - 1
     shown = study.phase(scenario, "familiarization")[trial]
     movie, picture = (
-        sign_media(study, secrets, scenario, 0, "familiarization", trial, kind) for kind in KINDS
+        sign_media(study, secrets, scenario, 0, "familiarization", trial, kind) for kind in SHOWN
     )
     return TrialMedia(
         trial=0,

@@ -40,7 +40,7 @@ from physion.experiment.export_tables import TABLES, Written, write_tables
 from physion.experiment.export_words import STIMULI_COLUMNS, readme
 from physion.experiment.iso_times import iso_times
 from physion.experiment.psych_ds import write_psych_ds
-from physion.experiment.session_rows import KINDS, Sessions, Wanted, read_sessions
+from physion.experiment.session_rows import EXPORTED_KINDS, Sessions, Wanted, read_sessions
 from physion.experiment.spreadsheet import RULE
 from physion.experiment.study import Study
 from physion.experiment.tables import STUDIES
@@ -89,7 +89,7 @@ def export_study(
     A server may run meanwhile. An ``out`` that is there is replaced where it is an export that
     nobody added anything to; `BadInputError` otherwise. Without ``simulated``, people alone.
     """
-    kinds = KINDS if simulated else ("person",)
+    kinds = EXPORTED_KINDS if simulated else ("person",)
     with whole_folder(out) as folder:
         with snapshot(engine) as connection:
             sessions = read_sessions(connection, study, Wanted(kinds, scenario))
@@ -120,7 +120,7 @@ def export_study(
 
 def _report(out: Path, sessions: Sessions, written: Written) -> Report:
     kinds: dict[str, dict[str, int]] = {}
-    for kind in KINDS:
+    for kind in EXPORTED_KINDS:
         states = {state: sessions.states[kind, state] for state in ("finished", "unfinished")}
         if any(states.values()):
             kinds[kind] = states

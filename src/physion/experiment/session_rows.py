@@ -18,7 +18,7 @@ from physion.experiment.iso_times import iso_times
 from physion.experiment.study import Study
 from physion.experiment.tables import SESSIONS, STUDIES
 
-KINDS = ("person", "simulated")
+EXPORTED_KINDS = ("person", "simulated")
 """Kinds of sessions that can be asked for; previews cannot."""
 PREVIEW = "preview by the experimenter"
 NO_CONSENT = "no consent was given"
@@ -35,7 +35,7 @@ _Row = Any
 class Wanted:
     """Which sessions: of these ``kinds``, of one scenario (None: all), finished ones alone?"""
 
-    kinds: Sequence[str] = KINDS
+    kinds: Sequence[str] = EXPORTED_KINDS
     scenario: str | None = None
     finished_only: bool = False
 
@@ -58,8 +58,8 @@ class Sessions:
 def read_sessions(connection: Connection, study: Study, wanted: Wanted = Wanted()) -> Sessions:
     """The table of sessions, and what is left out of it, for which reason."""
     for kind in wanted.kinds:
-        if kind not in KINDS:
-            raise UnknownNameError("kind of session", kind, KINDS)
+        if kind not in EXPORTED_KINDS:
+            raise UnknownNameError("kind of session", kind, EXPORTED_KINDS)
     if wanted.scenario is not None and wanted.scenario not in study.scenarios:
         raise UnknownNameError("scenario", wanted.scenario, study.scenarios)
     query = select(*SESSIONS.c, STUDIES.c.name, STUDIES.c.version).join(
@@ -83,7 +83,7 @@ def read_sessions(connection: Connection, study: Study, wanted: Wanted = Wanted(
 
 def _why_not(row: _Row, wanted: Wanted, study: Study) -> str | None:
     """Why a session is in no table; None: it is in it."""
-    if row.kind not in KINDS:
+    if row.kind not in EXPORTED_KINDS:
         return PREVIEW
     if row.kind not in wanted.kinds:
         return OTHER_KIND.format(kind=row.kind)

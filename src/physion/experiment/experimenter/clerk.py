@@ -19,7 +19,7 @@ from physion.experiment.experimenter.archive import export_archive
 from physion.experiment.experimenter.flagging import Flagger, Flags, find_flags
 from physion.experiment.experimenter.overview import Overview, look_over
 from physion.experiment.experimenter.session_list import Choice, SessionList, list_sessions
-from physion.experiment.experimenter.session_page import SessionPage, read_session
+from physion.experiment.experimenter.session_page import SessionPage, read_session_page
 from physion.experiment.experimenter.summaries import Summaries, Summary
 from physion.experiment.study import Study
 
@@ -61,7 +61,7 @@ class Clerk:
             summaries = self._look(fresh=0.0)  # it may have begun just now
         kinds = {str(s.facts["session"]): str(s.facts["kind"]) for s in summaries}
         flags = self._flags(kinds.get(session, ""))
-        return read_session(self._study, self._engine, summaries, flags, session)
+        return read_session_page(self._study, self._engine, summaries, flags, session)
 
     def export(self, folder: Path, simulated: bool) -> Path:
         """Writes the export into ``folder`` and gives its zip file."""

@@ -68,7 +68,7 @@ class SessionPage:
     others: tuple[tuple[str, str, str], ...]
 
 
-def read_session(
+def read_session_page(
     study: Study, engine: Engine, summaries: Sequence[Summary], flags: Flags, session: str
 ) -> SessionPage | None:
     """The page of a session; None where there is none of that name."""

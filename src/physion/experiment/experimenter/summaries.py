@@ -143,7 +143,7 @@ class Summaries:
         facts = row._asdict()
         return Summary(
             facts,
-            state_of(facts, now),
+            standing_of(facts, now),
             self._stage(facts),
             self._answered.get(row.session, _NOTHING),
         )
@@ -184,7 +184,7 @@ def labels_of(study: Study) -> dict[tuple[str, str], bool]:
     return {(each.scenario, each.stimulus): each.label for each in study.stimuli}
 
 
-def state_of(facts: Mapping[str, Any], now: float) -> str:
+def standing_of(facts: Mapping[str, Any], now: float) -> str:
     """A word of `STATES`. Who leaves before agreeing to take part has declined."""
     if facts["finished_at"] is not None:
         return "finished"
