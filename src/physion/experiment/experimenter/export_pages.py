@@ -15,7 +15,7 @@ from starlette.responses import FileResponse, Response
 from physion.errors import PhysionError
 from physion.experiment.experimenter.archive import file_name
 from physion.experiment.experimenter.desk import Desk
-from physion.experiment.experimenter.front import WRONG_FORM, Front, go
+from physion.experiment.experimenter.front import Front, go
 from physion.experiment.experimenter.gate import HEADERS
 
 EXPORT_PATIENCE = 900.0
@@ -35,11 +35,10 @@ class ExportPages:
         return self._front.show(request, "export.html", here="export", problem="")
 
     async def make(self, request: Request) -> Response:
-        if self._front.gate.login(request) is None:
-            return go("/login")
-        fields = await self._front.gate.form(request)
-        if fields is None:
-            return self._refuse(request, WRONG_FORM, 403)
+        sent = await self._front.sent(request, self._refuse)
+        if isinstance(sent, Response):
+            return sent
+        _, fields = sent
         if self.running:
             return self._refuse(request, "An export is being made already.", 409)
         folder = Path(tempfile.mkdtemp(prefix="physion-export-"))

@@ -14,7 +14,7 @@ from starlette.responses import RedirectResponse, Response
 from physion.errors import PhysionError
 from physion.experiment.experimenter.desk import Desk
 from physion.experiment.experimenter.gate import HEADERS, Gate
-from physion.experiment.experimenter.login import PATH
+from physion.experiment.experimenter.login import PATH, Login
 from physion.experiment.experimenter.pages import make_environment
 from physion.experiment.experimenter.session_list import KINDS
 from physion.experiment.experimenter.summaries import STATES
@@ -53,6 +53,18 @@ class Front:
             return Secrets.load(self.study.folder)
         except PhysionError:
             return self.secrets
+
+    async def sent(
+        self, request: Request, form: Callable[..., Response]
+    ) -> tuple[Login, dict[str, str]] | Response:
+        """Who sent a form, and its fields; the way to the login, or the form again, where it came
+        from nobody or from no page of ours.
+        """
+        login = self.gate.login(request)
+        if login is None:
+            return go("/login")
+        fields = await self.gate.form(request)
+        return form(request, WRONG_FORM, 403) if fields is None else (login, fields)
 
     async def ask(self, request: Request, question: str, **arguments: Any) -> Any:
         """The clerk's answer, or a page that says why there is none."""

@@ -12,7 +12,7 @@ from starlette.responses import Response
 
 from physion.errors import PhysionError
 from physion.experiment.experimenter.export_pages import ExportPages
-from physion.experiment.experimenter.front import FORGET_WORD, WRONG_FORM, Front, go
+from physion.experiment.experimenter.front import FORGET_WORD, Front, go
 from physion.experiment.experimenter.payments import read_payments
 from physion.experiment.experimenter.session_list import page_number
 
@@ -37,12 +37,10 @@ class PaymentPages:
         return await self._list(request)
 
     async def confirm(self, request: Request) -> Response:
-        login = self._front.gate.login(request)
-        if login is None:
-            return go("/login")
-        fields = await self._front.gate.form(request)
-        if fields is None:
-            return self._confirm_form(request, WRONG_FORM, 403)
+        sent = await self._front.sent(request, self._confirm_form)
+        if isinstance(sent, Response):
+            return sent
+        login, fields = sent
         wait = await self._front.gate.try_password(request, fields.get("password", ""))
         if wait is not None:
             return self._front.refuse_password(request, wait, self._confirm_form)
@@ -50,12 +48,10 @@ class PaymentPages:
         return go("/payments")
 
     async def forget(self, request: Request) -> Response:
-        login = self._front.gate.login(request)
-        if login is None:
-            return go("/login")
-        fields = await self._front.gate.form(request)
-        if fields is None:
-            return self._confirm_form(request, WRONG_FORM, 403)
+        sent = await self._front.sent(request, self._confirm_form)
+        if isinstance(sent, Response):
+            return sent
+        login, fields = sent
         if not login.may_see_payments(self._front.gate.clock()):
             return self._confirm_form(request)
         if fields.get("word", "").strip().lower() != FORGET_WORD:
