@@ -6,6 +6,9 @@
 import { button, el } from "./dom.js";
 import { bound } from "./pages.js";
 
+/** Hosts of the marketplace and of its place to try things. */
+const MTURK = ["www.mturk.com", "workersandbox.mturk.com"];
+
 /**
  * @param {import("./pages.js").Context} context
  * @param {any} result `Result`
@@ -62,9 +65,10 @@ async function copied(code, shown) {
   }
 }
 
-/** A link, or a form where the recruiter takes one. Only web addresses are ever followed. */
+/** A link, or a form where MTurk takes one. Only web addresses are ever followed. */
 function wayBack({ url, post }, t) {
-  if (!/^https?:\/\//i.test(url)) return el("p", {}, t("result.close"));
+  const web = /^https?:\/\//i.test(url);
+  if (!web || (post && !isMTurk(url))) return el("p", {}, t("result.close"));
   if (!post) {
     const link = { class: "button", href: url, rel: "noreferrer", id: "go" };
     return el("div", { class: "buttons" }, el("a", link, t("result.go")));
@@ -73,6 +77,16 @@ function wayBack({ url, post }, t) {
     el("input", { type: "hidden", name, value }),
   );
   const send = el("button", { type: "submit", class: "button", id: "go" }, t("result.go"));
-  const target = { method: "post", action: url, target: "_top" };
-  return el("form", target, ...fields, el("div", { class: "buttons" }, send));
+  // In the frame in which MTurk shows us, as the form in its documentation of ExternalQuestion.
+  return el(
+    "form",
+    { method: "post", action: url },
+    ...fields,
+    el("div", { class: "buttons" }, send),
+  );
+}
+
+function isMTurk(url) {
+  const { protocol, host, pathname } = new URL(url);
+  return protocol === "https:" && MTURK.includes(host) && pathname === "/mturk/externalSubmit";
 }
