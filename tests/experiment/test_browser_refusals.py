@@ -149,11 +149,12 @@ def test_movies_that_fail_are_shown_again(chromium: Any, site: tuple[Study, str]
 
         def spoil(route: Any) -> None:
             asked.append(route.request.url)
-            first = asked.count(route.request.url) == 1
-            if "-t-0-movie" in route.request.url and first:
+            times = asked.count(route.request.url)
+            if "/t-0-movie-" in route.request.url and times == 1:
                 route.fulfill(body=b"no movie", content_type="video/mp4")
-            elif "-t-1-map" in route.request.url and first:
-                route.fulfill(status=404, body="{}", content_type="application/json")
+            elif "/t-1-map-" in route.request.url and times <= 2:
+                refusal = {"error": "not_found", "message": "no such movie or picture"}
+                route.fulfill(status=404, json=refusal)
             else:
                 route.continue_()
 

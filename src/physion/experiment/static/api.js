@@ -40,10 +40,15 @@ export class Refused extends Error {
 
 /** A failure that may pass: the request is tried again. */
 class Trouble extends Error {
-  /** @param {string} message @param {number} [pauseMs] What the server asks to wait. */
-  constructor(message, pauseMs = 0) {
+  /**
+   * @param {string} message
+   * @param {number} [pauseMs] What the server asks to wait.
+   * @param {boolean} [busy] Did the server answer that there are too many requests?
+   */
+  constructor(message, pauseMs = 0, busy = false) {
     super(message);
     this.pauseMs = pauseMs;
+    this.busy = busy;
   }
 }
 
@@ -67,9 +72,12 @@ function pause(ms, signal) {
 }
 
 /**
- * @typedef {{token?: string|null, signal?: AbortSignal, expects?: string}} Options
- * `token`: of whom, where it is not the one who entered here. `expects`: a name that the answer
- * must have, else it is not our server's.
+ * @typedef {Object} Options
+ * @property {string|null} [token] Of whom, where it is not the one who entered here.
+ * @property {AbortSignal} [signal]
+ * @property {string} [expects] A name that the answer must have, else it is not our server's.
+ * @property {(ms: number) => void} [onBusy] Told that there are too many requests, and when it is
+ *   tried again; without it that counts as lost connection.
  */
 
 export class Api {
@@ -88,7 +96,8 @@ export class Api {
 
   /** @param {string} path @param {any} body @param {Options} [options] @returns {Promise<any>} */
   post(path, body, options = {}) {
-    return this.#repeat(() => this.#json("POST", path, body, options), options.signal);
+    const { signal, onBusy } = options;
+    return this.#repeat(() => this.#json("POST", path, body, options), signal, onBusy);
   }
 
   /** @param {string} path @param {AbortSignal} [signal] @returns {Promise<Blob>} */
@@ -140,7 +149,8 @@ export class Api {
         throw new Refused(status, body);
       }
       const seconds = Number(response.headers.get("Retry-After")) || 0;
-      throw new Trouble(`status ${status}`, Math.min(Math.max(seconds, 0), 60) * 1000);
+      const pauseMs = Math.min(Math.max(seconds, 0), 60) * 1000;
+      throw new Trouble(`status ${status}`, pauseMs, status === 429);
     } catch (error) {
       if (signal?.aborted) throw signal.reason;
       if (error instanceof Refused || error instanceof Trouble) throw error;
@@ -151,7 +161,7 @@ export class Api {
     }
   }
 
-  async #repeat(attempt, signal) {
+  async #repeat(attempt, signal, onBusy = null) {
     let wait = FIRST_PAUSE_MS;
     let failed = false;
     try {
@@ -160,10 +170,15 @@ export class Api {
           return await attempt();
         } catch (error) {
           if (!(error instanceof Trouble)) throw error;
-          if (!failed) this.#troubled(1);
-          failed = true;
+          const busy = error.busy && onBusy;
+          if (!busy && !failed) {
+            this.#troubled(1);
+            failed = true;
+          }
           // Spread over time, so that a room of participants does not come back in one moment.
-          await pause(Math.max(error.pauseMs, wait * (0.5 + Math.random() / 2)), signal);
+          const ms = Math.max(error.pauseMs, wait / 2) + (Math.random() * wait) / 2;
+          if (busy) onBusy(ms);
+          await pause(ms, signal);
           wait = Math.min(wait * 2, LONGEST_PAUSE_MS);
         }
       }

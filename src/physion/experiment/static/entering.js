@@ -4,6 +4,8 @@
  */
 
 import { measureDevice } from "./gate.js";
+import { showPage } from "./page_trial.js";
+import { busyPage } from "./pages.js";
 import {
   forgetPerson,
   forgetSession,
@@ -19,7 +21,7 @@ import {
  * @param {ReturnType<typeof import("./arrival.js").readArrival>} arrival
  * @returns {Promise<any>} `State`
  */
-export async function enter({ api, texts, study, log }, arrival) {
+export async function enter({ api, texts, study, log, frame }, arrival) {
   const device = await measureDevice();
   const who = await whoOf(arrival.enter);
   const known = remembered();
@@ -34,9 +36,10 @@ export async function enter({ api, texts, study, log }, arrival) {
     }
   }
   try {
+    const onBusy = (ms) => showPage(frame.main, busyPage({ texts }, ms));
     const message = { ...arrival.enter, language: texts.language, device };
     if (who === null) message.visit = visitWord(study);
-    const entered = await api.post("/api/enter", message);
+    const entered = await api.post("/api/enter", message, { onBusy });
     api.token = entered.token;
     remember({ token: entered.token, who, link: linkOf(arrival) });
     hideAddress();

@@ -15,7 +15,7 @@ import { messagePage, windowPage } from "./pages.js";
 import { Session } from "./session.js";
 import { keep, recall } from "./storage.js";
 import { takeOver } from "./tabs.js";
-import { Texts, chooseLanguage } from "./texts.js";
+import { Texts, chooseLanguage, offeredLanguage } from "./texts.js";
 
 async function begin() {
   const address = window.location.href;
@@ -54,8 +54,10 @@ async function takePart(basis, arrival) {
       await queue.empty();
       state = await api.get("/api/session");
     }
-    const asked = arrival.language ?? recall("language");
-    if (state.stage !== "consent" || !asked) await speak(basis, state.language);
+    const asked = [arrival.language, recall("language")];
+    const chosen = asked.some((tag) => offeredLanguage(basis.study.languages, tag));
+    if (!chosen) await speak(basis, state.language);
+    basis.speak = (language) => speak(basis, language);
     basis.another = cameWithoutId() ? anotherPerson(basis.study, arrival) : null;
     session = new Session(basis, queue);
     frame.onStop = () => session.askToStop();
@@ -76,10 +78,16 @@ async function changeLanguage(basis, session, language) {
   session.restart();
 }
 
-/** Go on in a language. */
+/** Go on in a language; in that of before where the study has this one no more. */
 async function speak(basis, language) {
   if (language === basis.texts.language) return;
-  basis.texts = await loadTexts(basis.api, language);
+  try {
+    basis.texts = await loadTexts(basis.api, language);
+  } catch (error) {
+    if (!(error instanceof Refused)) throw error;
+    basis.log.add("no_texts", { language });
+    return;
+  }
   basis.frame.speak(basis.texts);
 }
 

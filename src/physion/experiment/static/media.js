@@ -3,6 +3,8 @@
  * @module media
  */
 
+import { Refused } from "./api.js";
+
 const AT_ONCE = 2;
 
 /** @typedef {{movie: string, map: string}} Addresses Blob addresses of one trial. */
@@ -12,6 +14,8 @@ export class Media {
   #entries = new Map();
   #loading = 0;
   #from = 0;
+  #renew = async () => [];
+  #renewal = null;
 
   /**
    * @param {import("./api.js").Api} api
@@ -26,10 +30,13 @@ export class Media {
    * Begin with a list of trials; what another list held is freed.
    * @param {Array<{trial: number, movie: string, map: string}>} trials
    * @param {number} from First trial to be shown.
+   * @param {() => Promise<any[]>} renew Asks for the list anew: after the server was started again
+   *   it may have other addresses.
    */
-  start(trials, from) {
+  start(trials, from, renew) {
     for (const trial of [...this.#entries.keys()]) this.#free(trial);
-    this.#trials = new Map(trials.map((trial) => [trial.trial, trial]));
+    this.#trials = byNumber(trials);
+    this.#renew = renew;
     this.advance(from);
   }
 
@@ -94,10 +101,9 @@ export class Media {
 
   #load(trial) {
     const stop = new AbortController();
-    const { movie, map } = this.#trials.get(trial);
     const entry = { stop, addresses: null, failed: false, promise: null };
     this.#loading += 1;
-    entry.promise = Promise.all([movie, map].map((path) => this.api.blob(path, stop.signal)))
+    entry.promise = this.#blobs(trial, stop.signal)
       .then(([movieBlob, mapBlob]) => {
         entry.addresses = {
           movie: URL.createObjectURL(movieBlob),
@@ -114,6 +120,29 @@ export class Media {
     this.#entries.set(trial, entry);
   }
 
+  /** Movie and map, by new addresses where the server does not take those that it gave. */
+  async #blobs(trial, signal) {
+    const fetched = ({ movie, map }) =>
+      Promise.all([movie, map].map((path) => this.api.blob(path, signal)));
+    const old = this.#trials.get(trial);
+    try {
+      return await fetched(old);
+    } catch (error) {
+      if (!(error instanceof Refused)) throw error;
+      if (this.#trials.get(trial) === old) await this.#askAnew();
+      return fetched(this.#trials.get(trial) ?? old);
+    }
+  }
+
+  /** Once for all trials that fail at the same time. */
+  #askAnew() {
+    const trials = this.#trials;
+    this.#renewal ??= this.#renew()
+      .then((list) => this.#trials === trials && (this.#trials = byNumber(list)))
+      .finally(() => (this.#renewal = null));
+    return this.#renewal;
+  }
+
   #free(trial) {
     const entry = this.#entries.get(trial);
     if (!entry) return;
@@ -122,3 +151,5 @@ export class Media {
     this.#entries.delete(trial);
   }
 }
+
+const byNumber = (trials) => new Map(trials.map((trial) => [trial.trial, trial]));

@@ -149,6 +149,20 @@ export function waitingPage({ texts }, waited) {
   };
 }
 
+/** Shown while many begin at once; counts down to the next try. */
+export function busyPage({ texts }, ms) {
+  const { t } = bound(texts);
+  return async (page) => {
+    const left = el("p", { class: "small", role: "timer" });
+    page.append(el("h1", {}, t("busy.title")), ...paragraphs(t("busy.text")), left);
+    for (let seconds = Math.ceil(ms / 1000); seconds > 0; seconds--) {
+      left.textContent = t("busy.again", { seconds });
+      await sleep(1000);
+      if (!page.isConnected) return;
+    }
+  };
+}
+
 /** A heading, text, and where given a button, and one that matters less. */
 export function messagePage({ title, text, action = null, quiet = null }) {
   return (page) => {

@@ -43,8 +43,8 @@ export class Session {
   #shown = new Map();
 
   /**
-   * @param {any} basis api, texts, study, log, frame (see frame.js), address; `another` begins
-   *   anew for another person, null where that cannot be.
+   * @param {any} basis api, texts, study, log, frame (see frame.js), address; `speak` goes on in
+   *   another language; `another` begins anew for another person, null where that cannot be.
    * @param {import("./answer_queue.js").AnswerQueue} queue Its refusals come to `refused`.
    */
   constructor(basis, queue) {
@@ -95,6 +95,8 @@ export class Session {
     this.state = state;
     while (!this.#closed) {
       this.#stretch = new AbortController();
+      // The consent is read in any language, and then the session is in that one.
+      if (this.state.stage !== "consent") await this.basis.speak(this.state.language);
       this.basis.frame.show(this.context);
       if (this.state.stage === "done" || this.state.stage === "withdrawn") return this.#end();
       try {
@@ -170,8 +172,9 @@ export class Session {
   async #phase(phase) {
     const { api } = this.basis;
     const { signal } = this.#stretch;
-    const { trials } = await api.get(`/api/trials/${phase}`, { signal });
-    this.media.start(trials, this.state.trial);
+    const list = async () => (await api.get(`/api/trials/${phase}`, { signal })).trials;
+    const trials = await list();
+    this.media.start(trials, this.state.trial, list);
     const left = trials.filter((trial) => trial.trial >= this.state.trial);
     await this.#timeline([
       ...left.flatMap((media) => this.#trial(phase, media)),
@@ -189,6 +192,7 @@ export class Session {
     const fits = () => windowFits(study);
     const number = media.trial;
     const place = `${phase} ${number}`;
+    let answer = null;
     let stored = null;
     const prediction = {
       type: PredictionTrial,
@@ -210,7 +214,8 @@ export class Session {
       on_finish: (data) => {
         if (!data.response) return; // left before the answer
         const details = { ...data.details, stop_asked: this.#running.asked };
-        stored = this.queue.add(answerOf(phase, number, { ...data, details }));
+        answer = answerOf(phase, number, { ...data, details });
+        stored = this.queue.add(answer);
         this.state = { ...this.state, trial: number + 1 };
       },
     };
@@ -218,7 +223,7 @@ export class Session {
       type: FeedbackTrial,
       media,
       feedback: async () => (await stored).feedback,
-      load: async (path) => URL.createObjectURL(await this.basis.api.blob(path)),
+      load: async (path) => URL.createObjectURL(await this.#fullMovie(path, answer)),
       words: {
         ...words(texts, "practice", FEEDBACK_WORDS),
         trouble: texts.t("trial.trouble"),
@@ -244,6 +249,18 @@ export class Session {
       prediction,
       ...(phase === "familiarization" ? [feedback] : []),
     ];
+  }
+
+  /** The whole movie; the same answer sent again gives a new address where this one is refused. */
+  async #fullMovie(path, answer) {
+    const { api } = this.basis;
+    try {
+      return await api.blob(path);
+    } catch (error) {
+      if (!(error instanceof Refused)) throw error;
+      const { feedback } = await api.post("/api/answers", answer);
+      return api.blob(feedback.movie);
+    }
   }
 
   /** Run a timeline; gives what its trials gave. */

@@ -44,9 +44,14 @@ export class Texts {
  */
 export function chooseLanguage(offered, wanted) {
   for (const tag of [...wanted, ...(navigator.languages ?? [])]) {
-    const short = (tag ?? "").toLowerCase().split("-")[0];
-    const found = offered.find((language) => language === tag || language === short);
+    const found = offeredLanguage(offered, tag);
     if (found) return found;
   }
   return offered[0];
+}
+
+/** The one that a tag means: `de-AT` means `de`. @returns {string|undefined} */
+export function offeredLanguage(offered, tag) {
+  const short = (tag ?? "").toLowerCase().split("-")[0];
+  return offered.find((language) => language === tag || language === short);
 }
