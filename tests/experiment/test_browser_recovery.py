@@ -54,12 +54,12 @@ def test_a_reload_goes_on_at_the_same_trial(chromium: Any, site: tuple[Study, st
         sides = visit.left()
         visit.answer("yes")
         visit.page.get_by_text("Trial 2 of 4").wait_for()
-        before = [path for path in visit.requests if "-t-1-movie" in path]
+        before = [path for path in visit.requests if "/t-1-movie-" in path]
         visit.requests.clear()
         visit.page.reload()
         visit.page.get_by_text("Trial 2 of 4").wait_for()
-        assert [path for path in visit.requests if "-t-1-movie" in path] == before
-        assert not any("-t-0-" in path for path in visit.requests)
+        assert [path for path in visit.requests if "/t-1-movie-" in path] == before
+        assert not any("/t-0-" in path for path in visit.requests)
         assert visit.left() == sides
         visit.answer("no")
         visit.page.get_by_text("Trial 3 of 4").wait_for()

@@ -179,7 +179,7 @@ def test_timing_of_the_paper(chromium: Any, tmp_path: Path) -> None:
 def loaded_of_test(visit: Visit) -> set[int]:
     """Trials of the test whose movies were asked for so far, a moment later."""
     visit.page.wait_for_timeout(300)
-    found = (re.search(r"-t-(\d+)-movie", address) for address in visit.requests)
+    found = (re.search(r"/t-(\d+)-movie-", address) for address in visit.requests)
     return {int(match[1]) for match in found if match}
 
 
