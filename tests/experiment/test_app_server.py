@@ -91,6 +91,7 @@ def ask(port: int, method: str, path: str, body: Any = None, token: str = "") ->
     return json.loads(connection.getresponse().read())
 
 
+@pytest.mark.slow
 def test_a_stop_ends_requests_in_work_and_keeps_every_answer(study: Study) -> None:
     with started(study.folder) as server:
         entered = ask(server.port, "POST", "/api/enter", {})

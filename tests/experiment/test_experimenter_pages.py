@@ -302,6 +302,7 @@ def test_flags_are_those_of_the_analysis(busy: tuple[Lab, Visitor]) -> None:
     assert '<span class="flag">' in one
 
 
+@pytest.mark.slow
 def test_deleting_ids_needs_the_word_and_leaves_answers(tmp_path: Path, database_url: str) -> None:
     with lab(tmp_path, database_url) as own:
         engine = own.store.engine
@@ -329,6 +330,7 @@ def counting() -> set[int | None]:
     return {each.pid for each in active_children() if each.name == "physion-experimenter"}
 
 
+@pytest.mark.slow
 def test_the_process_that_counts_may_die(tmp_path: Path) -> None:
     others = counting()
     with lab(tmp_path) as own:
@@ -351,6 +353,7 @@ def is_alive(pid: int) -> bool:
     return state != "Z"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="no /proc to look for processes in")
 def test_no_process_is_left_by_a_killed_server(tmp_path: Path) -> None:
     study = make_tiny_study(tmp_path, size=64, languages=("en",))
@@ -374,6 +377,7 @@ def test_no_process_is_left_by_a_killed_server(tmp_path: Path) -> None:
 # --- export --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_export_is_that_of_the_command(
     busy: tuple[Lab, Visitor], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -326,6 +326,7 @@ def test_a_missing_extra_is_said_in_one_line(
     assert ".[experiment]" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="kills a process group")
 def test_a_killed_command_is_taken_up_again(tmp_path: Path) -> None:
     data, folder = tmp_path / "dataset", tmp_path / "study"

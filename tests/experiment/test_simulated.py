@@ -122,6 +122,7 @@ def test_simulated_is_written_in_the_data_for_good(
             assert visit.result.correct == sum(right)
 
 
+@pytest.mark.slow
 def test_the_verb_serves_by_itself_and_prints(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
