@@ -95,7 +95,7 @@ def test_every_text_is_there_and_used() -> None:
         for template in re.findall(r"t\(`([^`]*\.[^`]*)`", code)
     ]
     assert len(composed) >= 4
-    of_trials = set(re.findall(r'"(\w+)"', CODE["session.js"]))
+    of_trials = set(re.findall(r'"(\w+)"', CODE["trial_pieces.js"]))
     for key in set(TEXTS["en"]) - literal:
         table, name = key.split(".")
         by_name = table in ("trial", "practice") and name in of_trials

@@ -9,7 +9,7 @@
 const TIMEOUT_MS = 15_000;
 const FIRST_PAUSE_MS = 500;
 const LONGEST_PAUSE_MS = 8_000;
-/** Words for refusals that stay. Whatever else comes with a status of 4xx is not from our server. */
+/** Words for refusals that stay. What else comes with a status of 4xx is not from our server. */
 const CODES = new Set([
   "bad_request",
   "too_large",

@@ -6,15 +6,14 @@
 
 import { Refused } from "./api.js";
 import { ask } from "./dialog.js";
-import { FeedbackTrial } from "./feedback_trial.js";
 import { demographicsPage, feedbackPage } from "./forms.js";
-import { windowFits } from "./gate.js";
 import { Media } from "./media.js";
 import { PageTrial, showPage } from "./page_trial.js";
 import * as pages from "./pages.js";
 import { PredictionTrial } from "./prediction_trial.js";
 import { newKey } from "./random_key.js";
 import { resultPage } from "./result_page.js";
+import { trialPieces } from "./trial_pieces.js";
 
 const PAGES = {
   consent: pages.consentPage,
@@ -23,9 +22,6 @@ const PAGES = {
   demographics: demographicsPage,
   feedback: feedbackPage,
 };
-
-const TRIAL_WORDS = ["prompt", "yes", "no", "trouble", "retry"];
-const FEEDBACK_WORDS = ["waiting", "correct", "incorrect", "contact", "no_contact", "next"];
 
 /** The stretch of the timeline that runs was left for another state. */
 class Left extends Error {}
@@ -120,7 +116,9 @@ export class Session {
   async #stateAfter(error) {
     const { api, log } = this.basis;
     const refused = error instanceof Refused ? error : this.#refused;
-    if (refused?.code === "unknown_token" || this.queue.waits(api.token)) throw refused;
+    if (refused?.code === "unknown_token" || this.queue.waits(api.token)) {
+      throw refused ?? error;
+    }
     if (!(error instanceof Refused) && !(error instanceof Left)) {
       log.add("error", { message: String(error) });
       throw error;
@@ -186,81 +184,18 @@ export class Session {
     return api.get("/api/session", { signal });
   }
 
-  /** One trial, before which the window and the media are seen to, as pieces of a timeline. */
   #trial(phase, media) {
-    const { study, texts, frame, log } = this.basis;
-    const fits = () => windowFits(study);
-    const number = media.trial;
-    const place = `${phase} ${number}`;
-    let answer = null;
-    let stored = null;
-    const prediction = {
-      type: PredictionTrial,
-      media,
-      load: (attempt) => (attempt > 1 ? this.media.reload(number) : this.media.get(number)),
-      fixation_ms: media.fixation_ms,
-      cue_ms: study.cue_ms,
-      flash_hz: study.flash_hz,
-      choices: this.state.buttons.split("-"),
-      words: words(texts, "trial", TRIAL_WORDS),
-      before: () => this.#shown.get(place) ?? 0,
-      shown: () => this.#shown.set(place, (this.#shown.get(place) ?? 0) + 1),
-      log: (kind, data) => log.add(kind, data),
-      on_start: () => {
-        this.#running = { phase, trial: number, asked: 0 };
-        this.media.advance(number);
-        frame.progress(phase, number);
-      },
-      on_finish: (data) => {
-        if (!data.response) return; // left before the answer
+    const { trial } = media;
+    return trialPieces(this.context, phase, media, {
+      shown: this.#shown,
+      started: () => (this.#running = { phase, trial, asked: 0 }),
+      answered: (data) => {
         const details = { ...data.details, stop_asked: this.#running.asked };
-        answer = answerOf(phase, number, { ...data, details });
-        stored = this.queue.add(answer);
-        this.state = { ...this.state, trial: number + 1 };
+        const answer = answerOf(phase, trial, { ...data, details });
+        this.state = { ...this.state, trial: trial + 1 };
+        return { answer, stored: this.queue.add(answer) };
       },
-    };
-    const feedback = {
-      type: FeedbackTrial,
-      media,
-      feedback: async () => (await stored).feedback,
-      load: async (path) => URL.createObjectURL(await this.#fullMovie(path, answer)),
-      words: {
-        ...words(texts, "practice", FEEDBACK_WORDS),
-        trouble: texts.t("trial.trouble"),
-      },
-      log: (kind, data) => log.add(kind, data),
-    };
-    const small = () => {
-      if (!fits()) log.add("too_small", { width: innerWidth, height: innerHeight });
-      return !fits();
-    };
-    return [
-      {
-        timeline: [{ type: PageTrial, render: pages.windowPage(this.context, fits) }],
-        conditional_function: small,
-      },
-      {
-        timeline: [{ type: PageTrial, render: pages.loadingPage(this.context) }],
-        conditional_function: () => {
-          this.media.advance(number);
-          return !this.media.isReady(number);
-        },
-      },
-      prediction,
-      ...(phase === "familiarization" ? [feedback] : []),
-    ];
-  }
-
-  /** The whole movie; the same answer sent again gives a new address where this one is refused. */
-  async #fullMovie(path, answer) {
-    const { api } = this.basis;
-    try {
-      return await api.blob(path);
-    } catch (error) {
-      if (!(error instanceof Refused)) throw error;
-      const { feedback } = await api.post("/api/answers", answer);
-      return api.blob(feedback.movie);
-    }
+    });
   }
 
   /** Run a timeline; gives what its trials gave. */
@@ -298,11 +233,6 @@ export class Session {
     const result = await api.get("/api/result");
     return showPage(frame.main, resultPage(this.context, result));
   }
-}
-
-/** Words of a table of the texts by their names there. */
-function words(texts, table, names) {
-  return Object.fromEntries(names.map((name) => [name, texts.t(`${table}.${name}`)]));
 }
 
 /** An `Answer` from the data of a prediction trial. */
