@@ -190,6 +190,31 @@ def test_words_that_we_never_gave_are_refused(
     assert rows(sqlite_store, SESSIONS) == []
 
 
+@pytest.mark.parametrize(
+    "value",
+    [
+        "{{%PROLIFIC_PID%}}", "%7B%7B%25PROLIFIC_PID%25%7D%7D", "{{%25PROLIFIC_PID%25}}",
+        "%SURVEY_CODE%", "%25SURVEY_CODE%25", "%2525SURVEY_CODE%2525", " {{id}} ", "${workerId}",
+    ],
+)  # fmt: skip
+def test_placeholders_that_the_recruiter_left_are_nobodys_id(
+    sqlite_store: Store, value: str
+) -> None:
+    for asked in (
+        Enter(source="prolific", id=value),
+        Enter(source="prolific", id="5f1e", recruiter={"SESSION_ID": value}),
+    ):
+        refused = refusal(sqlite_store.enter(asked))
+        assert refused.code == "bad_link" and "did not fill in your id" in refused.message
+    assert rows(sqlite_store, SESSIONS) == []
+
+
+def test_ids_that_only_resemble_placeholders_are_ids(sqlite_store: Store) -> None:
+    for name in ("100%", "%41da", "{0}", "a%20b"):
+        enter(sqlite_store, name, source="sona")
+    assert len(rows(sqlite_store, SESSIONS)) == 4
+
+
 def test_what_a_session_is_never_changes(store: Store, small_secrets: Secrets) -> None:
     token = enter(store, "Ada", scenario="drop", **{"pass": pass_word(small_secrets, "simulated")})
     walk(store, token, "done")

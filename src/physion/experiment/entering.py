@@ -20,7 +20,7 @@ from physion.experiment.identity import (
     participant_hash,
 )
 from physion.experiment.orders import draw_buttons, own_order_seed, prepared_order_seed
-from physion.experiment.recruitment import kind_of_pass
+from physion.experiment.recruitment import is_unfilled, kind_of_pass
 from physion.experiment.refused import Refused
 from physion.experiment.sessions import (
     ACTIVE_WITHIN,
@@ -58,13 +58,20 @@ class Visitor:
 def receive(study: Study, secrets: Secrets, enter: Enter) -> Visitor:
     """Who comes, from link and id, else from the visit's word; without both a new person.
 
-    `Refused` for a word of a link that we never gave, or a missing id.
+    `Refused` for a word of a link that we never gave, an id that the recruiter did not fill in, or
+    a missing one.
     """
     kind: Kind | None = "person"
     if enter.pass_ is not None:
         kind = kind_of_pass(secrets, enter.pass_)
     if kind is None:
         raise Refused("bad_link", "This link is not complete; copy all of it and try again.")
+    if is_unfilled(enter):
+        raise Refused(
+            "bad_link",
+            "The recruiter did not fill in your id: this link has only the placeholder for it. "
+            "Open the study from the recruiter's own page.",
+        )
     raw_id = plain(enter.id or "").strip() or None
     needed = study.recruitment.id_needed or enter.source != "link"
     if raw_id is None and kind == "person" and needed:

@@ -8,10 +8,11 @@ client-side completion address; MTurk: ExternalQuestion and its ``externalSubmit
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
-from urllib.parse import parse_qsl, quote, urlencode, urlsplit, urlunsplit
+from urllib.parse import parse_qsl, quote, unquote, urlencode, urlsplit, urlunsplit
 
 from physion.errors import BadInputError
 from physion.experiment.identity import REFERENCE_LETTERS, check_signature, sign
@@ -42,6 +43,25 @@ PROLIFIC_COMPLETION = "https://app.prolific.com/submissions/complete"
 def begins_nothing(enter: Enter) -> bool:
     """Is this the look of someone at MTurk who has not accepted the task?"""
     return enter.source == "mturk" and enter.recruiter.get("assignmentId") == NO_ASSIGNMENT
+
+
+_UNFILLED = re.compile(r"\{\{|\}\}|^%.*%$|\$\{", re.DOTALL)
+"""Prolific's ``{{%PROLIFIC_PID%}}``, SONA's ``%SURVEY_CODE%``, and what looks like them."""
+
+
+def is_unfilled(enter: Enter) -> bool:
+    """Is the id, or another value of a recruiter, still the placeholder that stands for it?
+
+    Everybody who comes by such an address would be one and the same person.
+    """
+    for value in (enter.id or "", *enter.recruiter.values()):
+        decoded = value
+        # Pages and recruiters may each have encoded it once more.
+        for _ in range(3):
+            if _UNFILLED.search(decoded.strip()):
+                return True
+            decoded = unquote(decoded)
+    return False
 
 
 def pass_word(secrets: Secrets, kind: Kind) -> str:
