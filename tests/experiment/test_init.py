@@ -315,15 +315,18 @@ def test_the_verb_alone_says_which_words_there_are(capsys: pytest.CaptureFixture
     assert "closest: serve" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("word", list(SUBVERBS))
 def test_a_missing_extra_is_said_in_one_line(
-    dataset: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
+    word: str,
 ) -> None:
     monkeypatch.setattr("physion.cli.experiment.NEEDED", ("no_such_module",))
-    assert main(["experiment", "init", str(tmp_path / "s"), "--trials", str(dataset)]) == 2
-    assert ".[experiment]" in capsys.readouterr().err
+    more = ["--all"] if word == "forget" else []
+    assert main(["experiment", word, str(tmp_path / "s"), *more]) == 2
+    said = capsys.readouterr().err
+    assert ".[experiment]" in said and said.count("\n") == 1
 
 
 @pytest.mark.slow

@@ -35,17 +35,14 @@ class Options:
 
 def main(options: Options) -> int:
     """Export, and say how many sessions there are and what was left out."""
-    from physion.errors import MissingExtraError
+    from physion.cli.experiment import require_extra
 
-    try:
-        from physion.experiment.database import check_version, open_database, sqlite_url
-        from physion.experiment.export import export_study
-        from physion.experiment.export_words import count_lines
-        from physion.experiment.study import load_study
-    except ModuleNotFoundError as error:
-        if (error.name or "").startswith("physion"):
-            raise
-        raise MissingExtraError("physion experiment export", "experiment") from error
+    require_extra()
+    from physion.experiment.database import check_version, open_database, sqlite_url
+    from physion.experiment.export import export_study
+    from physion.experiment.export_words import count_lines
+    from physion.experiment.study import load_study
+
     study = load_study(options.study)
     engine = open_database(options.database or sqlite_url(options.study), must_exist=True)
     try:

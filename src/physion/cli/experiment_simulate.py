@@ -53,6 +53,9 @@ class Options:
 
 def main(options: Options) -> int:
     """Simulate; 1 if someone was refused or got no answer."""
+    from physion.cli.experiment import require_extra
+
+    require_extra()
     from physion.experiment.identity import Secrets
     from physion.experiment.simulated import Plan, simulate
     from physion.experiment.study import load_study
