@@ -18,6 +18,7 @@ import pytest
 from tiny_dataset import is_marked, make_tiny_dataset
 from tiny_study import OBSERVED, make_tiny_study, read_number
 
+from physion.cli.experiment import SUBVERBS
 from physion.cli.main import main
 from physion.errors import BadInputError, UnknownNameError
 from physion.experiment import study_folder
@@ -306,8 +307,6 @@ def test_bad_commands_are_one_line_and_leave_nothing(
 
 
 def test_the_verb_alone_says_which_words_there_are(capsys: pytest.CaptureFixture[str]) -> None:
-    from physion.cli.experiment import SUBVERBS
-
     assert main(["experiment"]) == 2
     out = capsys.readouterr().out
     assert all(f"physion experiment {word} DIR" in out for word in SUBVERBS)
