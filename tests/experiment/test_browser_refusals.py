@@ -177,21 +177,23 @@ def test_movies_that_fail_are_shown_again(chromium: Any, site: tuple[Study, str]
     assert "movie_failed" in {event.kind for event in events}
 
 
+HIDE = (
+    "hidden => {"
+    "const set = (name, value) =>"
+    " Object.defineProperty(document, name, {value, configurable: true});"
+    "set('hidden', hidden); set('visibilityState', hidden ? 'hidden' : 'visible');"
+    "document.dispatchEvent(new Event('visibilitychange')); }"
+)
+
+
 def test_a_page_that_is_hidden_is_noted(chromium: Any, site: tuple[Study, str]) -> None:
     study, url = site
-    hide = (
-        "hidden => {"
-        "const set = (name, value) =>"
-        " Object.defineProperty(document, name, {value, configurable: true});"
-        "set('hidden', hidden); set('visibilityState', hidden ? 'hidden' : 'visible');"
-        "document.dispatchEvent(new Event('visibilitychange')); }"
-    )
     with Visit(chromium, url) as visit:
         visit.begin("?participant=Hidden")
         visit.page.locator(".trial").wait_for()
-        visit.page.evaluate(hide, True)
+        visit.page.evaluate(HIDE, True)
         visit.page.wait_for_timeout(200)
-        visit.page.evaluate(hide, False)
+        visit.page.evaluate(HIDE, False)
         visit.practise(1)
         visit.begin_test()
         visit.answer("yes")
@@ -202,6 +204,67 @@ def test_a_page_that_is_hidden_is_noted(chromium: Any, site: tuple[Study, str]) 
     changes = json.loads(answers[0].details)["visibility"]
     assert [state for _, state in changes] == ["hidden", "visible"]
     assert {"hidden", "visible"} <= {event.kind for event in events}
+
+
+def test_a_trial_that_was_hidden_is_shown_again(chromium: Any, site: tuple[Study, str]) -> None:
+    """From the cross with its whole cue; hidden once the movie is over, it is not."""
+    study, url = site
+    with Visit(chromium, url) as visit:
+        visit.begin("?participant=Again")
+        visit.practise(1)
+        visit.begin_test()
+        for where in (".fixation", ".screen-cover[hidden]"):  # the cross; the cue
+            visit.page.locator(where).wait_for(state="attached")
+            visit.page.evaluate(HIDE, True)
+            visit.page.wait_for_timeout(700)
+            visit.page.evaluate(HIDE, False)
+        visit.wait_for_answer()
+        visit.page.evaluate(HIDE, True)
+        visit.page.evaluate(HIDE, False)
+        visit.answer("yes")
+        for time in range(6):  # the last time it goes on
+            visit.page.locator(".fixation").wait_for(state="attached")
+            visit.page.evaluate(HIDE, True)
+            visit.page.wait_for_timeout(100)
+            visit.page.evaluate(HIDE, False)
+            if time < 5:
+                visit.page.locator(".fixation").wait_for(state="attached")
+        visit.answer("no")
+        visit.heading("About you")
+        assert visit.unexpected() == []
+    answers = [row for row in rows_of(study, "Again")[1] if row.phase == "test"]
+    details = [json.loads(row.details) for row in answers]
+    assert [(one["attempts"], one["hidden"]) for one in details] == [(3, 2), (6, 6)]
+    assert [row.visibility_changes for row in answers] == [6, 12]
+    for row, one in zip(answers, details, strict=True):
+        assert abs(row.cue_ms - 500) < 60
+        assert [on for _, on in one["flashes"]] == [True, False]
+        assert row.frames_shown > 30
+
+
+def test_a_press_that_began_before_is_no_answer(chromium: Any, site: tuple[Study, str]) -> None:
+    study, url = site
+    with Visit(chromium, url) as visit:
+        visit.begin("?participant=Press")
+        visit.practise(1)
+        visit.begin_test()
+        box = visit.page.locator(".answer").first.bounding_box()
+        visit.page.mouse.move(box["x"] + 20, box["y"] + 20)
+        visit.page.mouse.down()
+        visit.wait_for_answer()
+        visit.page.mouse.up()
+        visit.page.wait_for_timeout(300)
+        assert visit.page.locator(".answer:enabled").count() == 2
+        # The press counts, not the release.
+        visit.page.mouse.down()
+        visit.page.wait_for_timeout(1500)
+        visit.page.mouse.up()
+        visit.page.get_by_text("Trial 2 of 2").wait_for()
+        visit.answer("no")
+        visit.heading("About you")
+        assert visit.unexpected() == []
+    first = next(row for row in rows_of(study, "Press")[1] if row.phase == "test")
+    assert first.input == "mouse" and 300 <= first.rt_ms < 1500
 
 
 def test_stopping_for_good(chromium: Any, site: tuple[Study, str]) -> None:

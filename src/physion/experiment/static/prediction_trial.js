@@ -1,6 +1,7 @@
 /**
  * A jsPsych plugin: one trial of object contact prediction. Fixation cross; first frame with the
  * flashing map of agent and patient; the observed movie; then, with the movie hidden, YES or NO.
+ * Where the page is hidden before the movie has ended, all of it is shown again.
  * @module prediction_trial
  */
 
@@ -10,6 +11,8 @@ import { MovieFailed, Screen, round } from "./screen.js";
 
 const { ParameterType } = window.jsPsychModule;
 const ATTEMPTS = 3;
+/** So often is a trial shown again because the page was hidden; then it goes on as it can. */
+const REPEATS = 5;
 const DAY_MS = 86_400_000;
 /** Moments that are kept of each kind, so that an answer stays short. */
 const MOST_NOTED = 100;
@@ -18,7 +21,7 @@ const info = {
   name: "physion-prediction",
   version: "1.0.0",
   parameters: {
-    /** Gives the addresses of movie and map, as a promise; told which attempt it is, from 1. */
+    /** Gives the addresses of movie and map, as a promise; told how often they failed before. */
     load: { type: ParameterType.FUNCTION, default: undefined },
     /** Size and rate of the movie, its number of frames: a `TrialMedia`. */
     media: { type: ParameterType.OBJECT, default: undefined },
@@ -56,10 +59,13 @@ const info = {
     visibility_changes: { type: ParameterType.INT },
     window_width: { type: ParameterType.INT },
     window_height: { type: ParameterType.INT },
-    /** Moments of flashes and frames, in ms since the fixation cross; attempts; keys. */
+    /** Moments of flashes and frames, in ms since the last cross; how often it was shown. */
     details: { type: ParameterType.OBJECT },
   },
 };
+
+/** The page was hidden before the movie had ended. */
+class PageHidden extends Error {}
 
 export class PredictionTrial {
   static info = info;
@@ -74,15 +80,25 @@ export class PredictionTrial {
     const signal = trial.signal();
     const over = new AbortController();
     const visibility = watchVisibility(over.signal);
+    let [failed, hidden] = [0, 0];
     try {
       for (let attempt = 1; ; attempt++) {
         await pageVisible();
+        const seen = whileSeen(signal, hidden < REPEATS);
+        const showing = { ...trial, attempt, failed, hidden, seen };
         try {
-          return await show(display, { ...trial, attempt }, signal, visibility, on_load);
+          return await show(display, showing, signal, visibility, on_load);
         } catch (error) {
-          if (!(error instanceof MovieFailed) || signal.aborted) throw error;
-          trial.log("movie_failed", { trial: trial.media.trial, attempt, reason: error.message });
-          await tellTrouble(display, trial, attempt);
+          if (signal.aborted) throw error;
+          if (error instanceof PageHidden) hidden += 1;
+          else if (error instanceof MovieFailed) {
+            failed += 1;
+            const { trial: number } = trial.media;
+            trial.log("movie_failed", { trial: number, attempt, reason: error.message });
+            await tellTrouble(display, trial, failed);
+          } else throw error;
+        } finally {
+          seen.end();
         }
       }
     } finally {
@@ -93,7 +109,7 @@ export class PredictionTrial {
 
 /** One showing of the trial, from the fixation cross to the answer. */
 async function show(display, trial, signal, visibility, on_load) {
-  const screen = new Screen(trial.media, signal);
+  const screen = new Screen(trial.media, trial.seen.signal);
   const buttons = trial.choices.map((choice, side) => answerButton(trial, choice, side));
   const cross = el("div", { class: "fixation", "aria-hidden": "true" });
   if (trial.fixation_ms > 0) screen.element.append(cross);
@@ -117,13 +133,14 @@ async function show(display, trial, signal, visibility, on_load) {
 /** What happens on the screen, in its order. */
 async function run(screen, cross, buttons, trial, signal, visibility) {
   const start = await nextFrame();
-  const loaded = trial.load(trial.attempt).then((addresses) => screen.load(addresses));
-  await Promise.all([loaded, reach(start + trial.fixation_ms, signal)]);
+  const loaded = trial.load(trial.failed).then((addresses) => screen.load(addresses));
+  await Promise.all([loaded, reach(start + trial.fixation_ms, trial.seen.signal)]);
   const fixation_ms = round((await nextFrame()) - start);
   cross.remove();
   trial.shown();
   const cue = await screen.flash({ ms: trial.cue_ms, hz: trial.flash_hz });
   const movie = await screen.play({ hide: true });
+  trial.seen.end();
   const answer = await answered(buttons, trial, signal);
   const frames = screen.record();
   const since = (moment) => round(moment - start);
@@ -141,6 +158,7 @@ async function run(screen, cross, buttons, trial, signal, visibility) {
     window_height: window.innerHeight,
     details: {
       attempts: trial.before + trial.attempt,
+      hidden: trial.hidden + (trial.seen.wasHidden() ? 1 : 0),
       flashes: cue.changes,
       frames: frames.seen.slice(-MOST_NOTED).map(([at, frame, count]) => [since(at), frame, count]),
       play_ms: movie.startMs,
@@ -169,8 +187,9 @@ function answerButton(trial, choice, side) {
 }
 
 /**
- * Enable the buttons in the next frame of the screen and wait for one of them, or its key. Presses
- * that began before do not count, nor do keys held down.
+ * Enable the buttons in the next frame of the screen and wait for one of them, or its key. The time
+ * is that of the press, by mouse, finger or key. Presses that began before do not count, nor do
+ * keys held down.
  */
 function answered(buttons, trial, signal) {
   const over = new AbortController();
@@ -184,9 +203,15 @@ function answered(buttons, trial, signal) {
         const rt_ms = event.timeStamp - enabled;
         if (rt_ms >= 0) resolve({ response: trial.choices[side], rt_ms, input, enabled });
       };
-      buttons.forEach((one, side) =>
-        one.addEventListener("click", (event) => give(event, side, inputOf(event)), options),
-      );
+      buttons.forEach((one, side) => {
+        let down = null;
+        one.addEventListener("pointerdown", (event) => (down = event), options);
+        const clicked = (event) => {
+          if (event.detail === 0) give(event, side, "keyboard");
+          else if (down) give(down, side, inputOf(down));
+        };
+        one.addEventListener("click", clicked, options);
+      });
       const pressed = (event) => {
         const side = sideOf(event, trial.keys);
         if (side >= 0 && !isAsked()) give(event, side, "keyboard");
@@ -204,9 +229,29 @@ function sideOf(event, keys) {
   return keys.findIndex((key) => event.code === `Key${key.toUpperCase()}`);
 }
 
-function inputOf(event) {
-  if (event.pointerType === "touch" || event.pointerType === "pen") return "touch";
-  return event.detail === 0 ? "keyboard" : "mouse";
+function inputOf({ pointerType }) {
+  return pointerType === "touch" || pointerType === "pen" ? "touch" : "mouse";
+}
+
+/**
+ * A signal that also ends what runs when the page is hidden, where `repeat` says so, until `end`.
+ * @param {AbortSignal} signal @param {boolean} repeat
+ */
+function whileSeen(signal, repeat) {
+  const seen = new AbortController();
+  const over = new AbortController();
+  const options = { signal: over.signal };
+  let was = false;
+  const stop = () => seen.abort(signal.reason);
+  const changed = () => {
+    if (!document.hidden) return;
+    was = true;
+    if (repeat) seen.abort(new PageHidden("the page was hidden"));
+  };
+  signal.addEventListener("abort", stop, options);
+  document.addEventListener("visibilitychange", changed, options);
+  if (signal.aborted) stop();
+  return { signal: seen.signal, end: () => over.abort(), wasHidden: () => was };
 }
 
 function watchVisibility(signal) {

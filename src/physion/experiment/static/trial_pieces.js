@@ -66,7 +66,7 @@ function predictionOf({ study, texts, frame, log, state, ...context }, phase, me
   return {
     type: PredictionTrial,
     media,
-    load: (attempt) => (attempt > 1 ? context.media.reload(number) : context.media.get(number)),
+    load: (failed) => (failed > 0 ? context.media.reload(number) : context.media.get(number)),
     fixation_ms: media.fixation_ms,
     cue_ms: study.cue_ms,
     flash_hz: study.flash_hz,
