@@ -8,16 +8,17 @@ import sqlite3
 from pathlib import Path
 
 import pytest
-from store_walk import enter, give, page, rows, run, walk
+from store_walk import enter, give, page, refusal, rows, run, walk
 from tiny_study import PASSWORD
 
 from physion.cli.main import main
 from physion.errors import BadInputError, PhysionError
-from physion.experiment.forget import forget, forget_raw_ids
+from physion.experiment.forget import forget, forget_raw_ids, forget_sessions
 from physion.experiment.identity import Secrets, check_password, participant_hash
 from physion.experiment.store import Store
 from physion.experiment.study import Study
-from physion.experiment.tables import RAW_IDS, SESSIONS
+from physion.experiment.tables import ANSWERS, EVENTS, RAW_IDS, SESSIONS, TOKENS
+from physion.experiment.wire import Device, Enter, Event, Events
 
 
 def raw_id(number: int) -> str:
@@ -137,6 +138,68 @@ def test_forget_on_postgresql(
     store = Store.open(small_study, small_secrets, fresh_postgres)
     assert rows(store, RAW_IDS) == [] and len(rows(store, SESSIONS)) == 1
     store.close()
+
+
+def test_all_of_a_session_is_forgotten(
+    database_url: str, small_study: Study, small_secrets: Secrets
+) -> None:
+    store = Store.open(small_study, small_secrets, database_url)
+    seen = Device(user_agent="TellingBrowser")
+    tokens = {
+        scenario: enter(store, raw_id(1), source="sona", scenario=scenario, device=seen)
+        for scenario in ("drop", "collide")
+    }
+    other = walk(store, enter(store, raw_id(2), source="sona", scenario="drop"), "demographics")
+    for token in tokens.values():
+        walk(store, token, "feedback")
+        run(store.events(token, Events(events=[Event(kind="x", at_ms=1, data={"a": "TellingE"})])))
+        page(store, token, "feedback", difficulty=2, technical_problems=False, text="TellingText")
+    references = {one: run(store.state(token)).reference for one, token in tokens.items()}
+    store.close()
+
+    with pytest.raises(BadInputError, match="no sessions have the reference 'K7QF-29XM'"):
+        forget_sessions(database_url, [references["drop"], "k7qf-29xm"])
+    assert forget_sessions(database_url, [references["drop"].lower()]) == 1
+    store = Store.open(small_study, small_secrets, database_url)
+    gone, kept = (
+        next(row for row in rows(store, SESSIONS) if row.reference == references[scenario])
+        for scenario in ("drop", "collide")
+    )
+    assert gone.withdrawn_at is not None and gone.consented_at is not None
+    assert (gone.answered_test, gone.finished_at, gone.age, gone.gender) == (0, None, None, None)
+    assert (gone.feedback, gone.device) == (None, {})
+    assert kept.feedback == "TellingText" and kept.withdrawn_at is None and kept.answered_test == 4
+    for table in (ANSWERS, EVENTS, TOKENS):
+        sessions = {row.session for row in rows(store, table)}
+        assert gone.session not in sessions and (table is EVENTS or len(sessions) == 2)
+    assert len(rows(store, RAW_IDS)) == 2  # the id is that of the other session, too
+    again = Enter(source="sona", id=raw_id(1), scenario="drop")
+    assert refusal(store.enter(again)).code == "already_took_part"
+    assert run(store.state(other)).stage == "demographics"
+    store.close()
+
+    assert forget_sessions(database_url, [references["collide"], references["drop"]]) == 2
+    store = Store.open(small_study, small_secrets, database_url)
+    assert [row.raw_id for row in rows(store, RAW_IDS)] == [raw_id(2)]
+    store.close()
+    if database_url.startswith("sqlite"):
+        found = bytes_of(Path(database_url.removeprefix("sqlite:///")).parent)
+        assert b"Telling" not in found and raw_id(1).encode() not in found
+        assert raw_id(2).encode() in found
+
+
+def test_the_verb_forgets_a_session(
+    database: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with sqlite3.connect(tmp_path / "responses.sqlite") as connection:
+        (reference,) = connection.execute("SELECT reference FROM sessions LIMIT 1").fetchone()
+    study = str(tmp_path)
+    assert main(["experiment", "forget", study, "--session", reference]) == 0
+    assert capsys.readouterr().out == "forgotten: 1 session\n"
+    assert main(["experiment", "forget", study, "--session", "'; --"]) == 2
+    said = capsys.readouterr().err
+    assert "no sessions have the reference" in said and said.count("\n") == 1
+    assert main(["experiment", "forget", study, "--session", reference, "--all"]) == 2
 
 
 def test_the_verb_forget(database: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,7 +12,7 @@
 
 `physion experiment password DIR`: a new password for the experimenter's pages.
 
-`physion experiment forget DIR`: delete the ids that recruiters gave.
+`physion experiment forget DIR`: delete the ids that recruiters gave, or all of a session.
 
 Each says more with --help.
 """

@@ -1,6 +1,7 @@
 """Delete the ids that recruiters gave, of some participants or of all; answers stay.
 
-Stop the server first. Ids that are gone cannot be brought back: pay the participants before.
+With --session all of a session goes, answers too; the row stays, as of somebody who withdrew.
+Stop the server first. What is gone cannot be brought back: pay the participants before.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import tyro
 
 @dataclass(frozen=True)
 class Options:
-    """Whose ids."""
+    """Whose ids, or which sessions."""
 
     study: Annotated[Path, tyro.conf.Positional]
     """Folder of the study."""
@@ -23,6 +24,8 @@ class Options:
     """Participants, as an export names them (32 digits)."""
     all: bool = False
     """The ids of all participants."""
+    session: tuple[str, ...] = ()
+    """References (as K7QF-29XM) of sessions of which all is deleted."""
     database: str | None = None
     """URL of a PostgreSQL database; responses.sqlite in the folder if not given."""
     json: bool = False
@@ -30,20 +33,25 @@ class Options:
 
 
 def main(options: Options) -> int:
-    """Delete, and say how many ids there were."""
+    """Delete, and say how many ids or sessions there were."""
     from physion.cli.experiment import require_extra
     from physion.errors import BadInputError
 
-    if bool(options.participant) == options.all:
-        raise BadInputError("say whose ids: --participant HASH, or --all")
+    if [bool(options.participant), options.all, bool(options.session)].count(True) != 1:
+        raise BadInputError(
+            "say whose ids: --participant HASH, or --all; or which session: --session REFERENCE"
+        )
     require_extra()
     from physion.experiment.database import sqlite_url
-    from physion.experiment.forget import forget
+    from physion.experiment.forget import forget, forget_sessions
 
     url = options.database or sqlite_url(options.study)
-    count = forget(url, None if options.all else options.participant)
+    if options.session:
+        count, what = forget_sessions(url, options.session), "session"
+    else:
+        count, what = forget(url, None if options.all else options.participant), "id"
     if options.json:
         print(json_module.dumps({"forgotten": count}))
     else:
-        print(f"forgotten: {count} {'id' if count == 1 else 'ids'}")
+        print(f"forgotten: {count} {what}{'' if count == 1 else 's'}")
     return 0
