@@ -108,7 +108,10 @@ def test_a_stop_ends_requests_in_work_and_keeps_every_answer(study: Study) -> No
             socket.create_connection((HOST, server.port), timeout=10) as connection,
         ):
             idle.sendall(b"GET /api/health HTTP/1.1\r\nHost: x\r\n\r\n")
-            assert idle.recv(65536).startswith(b"HTTP/1.1 200")
+            heard = b""
+            while not heard.endswith(b'{"ok":true}'):
+                heard += idle.recv(65536)
+            assert heard.startswith(b"HTTP/1.1 200")
             connection.sendall(head.encode() + body[:10])
             ended: list[tuple[int, str]] = []
             thread = threading.Thread(target=lambda: ended.append(server.end(signal.SIGTERM)))
@@ -229,6 +232,43 @@ class TestFaults:
 ])  # fmt: skip
 def test_who_could_read_along(address: Address, readable: bool) -> None:
     assert address.is_readable_on_the_way() == readable
+
+
+@pytest.mark.parametrize("port", ["80000", "65536", "-1"])
+def test_ports_that_there_are_not_are_refused(
+    study: Study, capsys: pytest.CaptureFixture[str], port: str
+) -> None:
+    assert main(["experiment", "serve", str(study.folder), f"--port={port}"]) == 2
+    said = capsys.readouterr().err
+    assert f"--port must be from 0 to 65535, not {port}" in said and said.count("\n") == 1
+
+
+def test_a_folder_without_a_study_is_none(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert main(["experiment", "serve", str(tmp_path)]) == 2
+    said = capsys.readouterr().err
+    assert "this is no study folder; make one with physion experiment init" in said
+    assert said.count("\n") == 1
+
+
+def test_what_is_not_filled_in_is_said_when_it_is_served(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def said(**settings: Any) -> str:
+        folder = tmp_path / str(len(list(tmp_path.iterdir())))
+        make_tiny_study(folder, test=2, familiarization=1, size=64, **settings)
+        (folder / "secret.json").unlink()  # so that it ends after the study was read
+        assert main(["experiment", "serve", str(folder)]) == 2
+        return capsys.readouterr().err
+
+    early = said(contact=Options(Path("x")).contact)
+    assert "physion: warning: contact in study.toml is not filled in" in early
+    for lacks in ("prolific, study.toml lacks prolific_code", "sona, study.toml", "mturk, study"):
+        assert f"note: if you recruit by {lacks}" in early
+    code = Recruitment(prolific_code="C0DE")
+    late = said(contact="Ada, ada@example.org", recruitment=code)
+    assert "contact" not in late and "prolific" not in late and "recruit by sona" in late
 
 
 def test_the_warning_is_printed(
