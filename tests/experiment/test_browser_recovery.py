@@ -87,6 +87,25 @@ def test_a_reload_goes_on_at_the_same_trial(chromium: Any, site: tuple[Study, st
         assert visit.page.locator("#code").count() == 0
 
 
+def test_a_reload_where_the_browser_keeps_nothing(chromium: Any, site: tuple[Study, str]) -> None:
+    """The address still says who takes part, so that no second participation begins."""
+    study, url = site
+    with Visit(chromium, url) as visit:
+        visit.context.add_init_script(
+            "Object.defineProperty(window, 'localStorage',"
+            " { get() { throw new DOMException('forbidden', 'SecurityError'); } });"
+        )
+        to_the_test(visit, "Forbidden")
+        assert visit.page.url.endswith("?participant=Forbidden")
+        visit.answer("no")
+        visit.page.get_by_text("Trial 2 of 4").wait_for()
+        while len(rows_of(study, "Forbidden")[1]) < 2:
+            visit.page.wait_for_timeout(50)
+        visit.page.reload()
+        visit.page.get_by_text("Trial 2 of 4").wait_for()
+        assert visit.unexpected() == []
+
+
 def test_twenty_seconds_offline(chromium: Any, site: tuple[Study, str]) -> None:
     study, url = site
     with Visit(chromium, url, "offline") as visit:

@@ -9,6 +9,7 @@ import { busyPage } from "./pages.js";
 import {
   forgetPerson,
   forgetSession,
+  isFoundAgain,
   remember,
   remembered,
   visitWord,
@@ -31,7 +32,7 @@ export async function enter({ api, texts, study, log, frame }, arrival) {
     const state = await resume(api, own, arrival.enter.scenario);
     if (state) {
       log.add("loaded", { ...device });
-      hideAddress();
+      hideAddress(api.token);
       return state;
     }
   }
@@ -42,7 +43,7 @@ export async function enter({ api, texts, study, log, frame }, arrival) {
     const entered = await api.post("/api/enter", message, { onBusy });
     api.token = entered.token;
     remember({ token: entered.token, who, link: linkOf(arrival) });
-    hideAddress();
+    hideAddress(api.token);
     return await api.get("/api/session?load=true");
   } catch (error) {
     if (error.code !== "already_took_part" || !own) throw error;
@@ -93,6 +94,8 @@ function linkOf({ enter, language }) {
   return query && `?${query}`;
 }
 
-function hideAddress() {
+/** Where the browser keeps nothing, a reload needs the address to find the session again. */
+function hideAddress(token) {
+  if (!isFoundAgain(token)) return;
   window.history.replaceState(null, "", window.location.pathname);
 }

@@ -19,11 +19,12 @@ export function deviceProblem(study) {
     return "browser";
   }
   if (!video.canPlayType(H264)) return "movies";
-  const touchAlone = navigator.maxTouchPoints > 0 && !matchMedia("(any-pointer: fine)").matches;
-  if (touchAlone) return "device";
+  if (navigator.maxTouchPoints === 0) return null;
+  if (!matchMedia("(any-pointer: fine)").matches) return "device";
+  // Computers say how small the window is where it matters: zooming out helps there.
   const { width, height } = window.screen;
-  if (width < study.min_width || height < study.min_height) return "screen";
-  return null;
+  const small = width < study.min_width || height < study.min_height;
+  return small && matchMedia("(pointer: coarse)").matches ? "screen" : null;
 }
 
 /** Is the window as large as the movies need it? @param {any} study @returns {boolean} */

@@ -9,9 +9,9 @@ import { readArrival } from "./arrival.js";
 import { anotherPerson, cameWithoutId, enter } from "./entering.js";
 import { EventLog } from "./event_log.js";
 import { Frame } from "./frame.js";
-import { deviceProblem, windowFits } from "./gate.js";
+import { deviceProblem } from "./gate.js";
 import { showPage } from "./page_trial.js";
-import { messagePage, windowPage } from "./pages.js";
+import { messagePage } from "./pages.js";
 import { Session } from "./session.js";
 import { keep, recall } from "./storage.js";
 import { takeOver } from "./tabs.js";
@@ -31,7 +31,6 @@ async function begin() {
   const problem = deviceProblem(study);
   if (problem) return refuse(basis, problem);
   if (arrival.preview) return tell(basis, "information");
-  await largeWindow(basis);
   return takePart(basis, arrival);
 }
 
@@ -93,20 +92,6 @@ async function speak(basis, language) {
 
 async function loadTexts(api, language) {
   return new Texts(language, await api.get(`/api/texts/${encodeURIComponent(language)}`));
-}
-
-/** Waits until the window is large enough. @returns {Promise<void>} */
-function largeWindow(basis) {
-  const fits = () => windowFits(basis.study);
-  if (fits()) return Promise.resolve();
-  return new Promise((resolve) => {
-    const over = new AbortController();
-    const done = () => {
-      over.abort();
-      resolve();
-    };
-    showPage(basis.frame.main, (page) => windowPage(basis, fits)(page, done, over.signal));
-  });
 }
 
 /** One of the pages that only say something. */

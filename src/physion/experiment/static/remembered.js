@@ -5,7 +5,7 @@
  */
 
 import { newKey } from "./random_key.js";
-import { keep, recall } from "./storage.js";
+import { keep, outlivesPage, recall } from "./storage.js";
 
 /**
  * @typedef {{token: string, who: string|null, link: string}} Remembered `who`: see `whoOf`; `link`:
@@ -22,6 +22,9 @@ export function remembered() {
 export function remember(session) {
   keep("session", session);
 }
+
+/** Does a reload find the session of this token? @param {string} token @returns {boolean} */
+export const isFoundAgain = (token) => outlivesPage("session") && remembered()?.token === token;
 
 /** Forget the session that is remembered, and no more. */
 export function forgetSession() {

@@ -17,6 +17,16 @@ export function recall(name) {
   return memory.get(name) ?? null;
 }
 
+/** Would it still be there after a reload? @param {string} name @returns {boolean} */
+export function outlivesPage(name) {
+  try {
+    const text = window.localStorage.getItem(`physion:${name}`);
+    return text !== null && text === JSON.stringify(recall(name));
+  } catch {
+    return false;
+  }
+}
+
 /** @param {string} name @param {any} value null forgets it. */
 export function keep(name, value) {
   memory.set(name, value);
