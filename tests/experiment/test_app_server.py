@@ -24,9 +24,10 @@ from app_walk import answer_body, served
 from live_app import HOST, read_all, running
 from tiny_study import make_tiny_study
 
+from physion.cli.experiment_init import Options
 from physion.cli.main import main
 from physion.experiment.server import Address
-from physion.experiment.study import Limits, Study
+from physion.experiment.study import Limits, Recruitment, Study
 from programs import find_program
 
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from physion.errors import BadInputError
+from physion.experiment.study_checks import NO_CONTACT
 
 if TYPE_CHECKING:
     from physion.experiment.init_trials import Choice
@@ -51,7 +52,7 @@ class Options:
     """Short name of the study; that of the folder if not given."""
     title: str = "Predict what happens"
     """What participants see above everything."""
-    contact: str = "(name and e-mail address: fill in contact in study.toml)"
+    contact: str = NO_CONTACT
     """Whom participants can ask."""
     participants: int = 100
     """Complete sessions wanted for each scenario."""

@@ -55,11 +55,14 @@ def main(options: Options) -> int:
         options.https_cert,
         options.https_key,
     )
+
+    def warn(line: str) -> None:
+        print(f"physion: {line}", file=sys.stderr, flush=True)
+
     if address.is_readable_on_the_way():
-        print(
-            "physion: warning: answers and ids travel unencrypted; give --https-cert and "
-            "--https-key, or put a proxy with https in front and name it by --behind-proxy",
-            file=sys.stderr,
+        warn(
+            "warning: answers and ids travel unencrypted; give --https-cert and --https-key, or "
+            "put a proxy with https in front and name it by --behind-proxy"
         )
 
     def say(url: str) -> None:
@@ -73,5 +76,5 @@ def main(options: Options) -> int:
             f"links:        physion experiment links {options.study} --base-url {url}", flush=True
         )
 
-    serve(options.study, address, options.database, options.log_requests, say)
+    serve(options.study, address, options.database, options.log_requests, say, warn)
     return 0

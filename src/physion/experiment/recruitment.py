@@ -16,6 +16,7 @@ from urllib.parse import parse_qsl, quote, unquote, urlencode, urlsplit, urlunsp
 
 from physion.errors import BadInputError
 from physion.experiment.identity import REFERENCE_LETTERS, check_signature, sign
+from physion.experiment.study_checks import NO_CONTACT
 from physion.experiment.wire import Completion, Enter, Kind, Recruiter
 
 if TYPE_CHECKING:
@@ -170,6 +171,22 @@ def links(study: Study, secrets: Secrets, base_url: str) -> tuple[Link, ...]:
                 words.append(PLACEHOLDERS[name])
             address = f"{root}/?{'&'.join(words)}"
             found.append(Link(name, scenario, address, goes_to, _lacks(study, name)))
+    return tuple(found)
+
+
+def undecided(study: Study) -> tuple[str, ...]:
+    """What should be filled in before people come, a line each; the contact first."""
+    found = []
+    if study.contact == NO_CONTACT:
+        found.append(
+            "warning: contact in study.toml is not filled in: nobody who takes part can ask you or "
+            "have their data deleted; fill it in before people come"
+        )
+    found += [
+        f"note: if you recruit by {name}, study.toml lacks {lacks}"
+        for name in GOES_TO
+        if (lacks := _lacks(study, name))
+    ]
     return tuple(found)
 
 

@@ -23,6 +23,7 @@ from physion.experiment.app import build_app
 from physion.experiment.connections import CarefulProtocol
 from physion.experiment.identity import Secrets
 from physion.experiment.media_checks import check_media
+from physion.experiment.recruitment import undecided
 from physion.experiment.store import Store
 from physion.experiment.study import load_study
 
@@ -60,8 +61,11 @@ def serve(
     database: str | None = None,
     log_requests: bool = False,
     ready: Callable[[str], None] = lambda url: None,
+    warn: Callable[[str], None] = lambda line: None,
 ) -> None:
     """Serve the study in ``folder`` until SIGTERM or SIGINT. ``ready`` is told the address.
+
+    ``warn`` is told, a line each, what should be filled in before people come (`undecided`).
 
     Raises:
         PhysionError: no such study, a fault in it, a port in use, a bad certificate, a database
@@ -71,6 +75,8 @@ def serve(
     _set_logging(log_requests)
     study = load_study(folder)
     check_media(study)
+    for line in undecided(study):
+        warn(line)
     secrets = Secrets.load(folder)
     _allow_many_connections()
     with contextlib.closing(_listen(address)) as listening:
@@ -154,6 +160,9 @@ def _listen(address: Address) -> socket.socket:
 
 
 def _check(address: Address) -> None:
+    if not 0 <= address.port <= 65535:
+        # The system would take what is left of it by 65536.
+        raise BadInputError(f"--port must be from 0 to 65535, not {address.port}")
     if (address.certificate is None) != (address.key is None):
         raise BadInputError("--https-cert and --https-key belong together; give both or none")
     for proxy in address.proxies:

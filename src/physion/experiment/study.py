@@ -14,6 +14,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -138,6 +139,10 @@ def load_study(folder: Path | str) -> Study:
     if not folder.is_dir():
         raise BadInputError(f"there is no study folder {folder}; make one: physion experiment init")
     path = folder / STUDY_FILE
+    if not os.path.lexists(path):
+        raise BadInputError(
+            f"{path} is missing: this is no study folder; make one with physion experiment init"
+        )
     content = read_plain(path, MAX_BYTES)
     study = replace(study_of(parse_toml(path, content), path), folder=folder)
     texts, written = {}, []

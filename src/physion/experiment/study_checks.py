@@ -22,6 +22,8 @@ LANGUAGE = r"[a-z]{2,3}(-[A-Za-z0-9]{2,8})?"
 """Names of languages and of their files, as in HTML: en, de, pt-BR."""
 
 
+NO_CONTACT = "(name and e-mail address: fill in contact in study.toml)"
+"""What a new study has for a contact until somebody fills it in."""
 EXCLUSIONS = ("preregistered", "official-code")
 """Names of `physion.analysis.exclusions.RULE_SETS`, whose import takes seconds (pandas, SciPy)."""
 
@@ -162,7 +164,8 @@ KEYS: tuple[Key, ...] = (
         required=True),
     Key("", "title", text(200, 1), "What participants see above everything.", required=True),
     Key("", "contact", text(500, 1),
-        "Whom participants can ask: a name and an e-mail address, shown on every page.",
+        "Whom participants can ask: a name and an e-mail address, shown with the consent and the\n"
+        "result, and where something goes wrong.",
         required=True),
     Key("", "scenarios", listed(_name, 1),
         "Scenarios that people can take part in, each with its stimuli in stimuli.csv.",
@@ -195,7 +198,8 @@ KEYS: tuple[Key, ...] = (
     Key("screen", "min_width", whole(320, 10_000), "Smallest window, in CSS pixels."),
     Key("screen", "min_height", whole(320, 10_000), ""),
     Key("recruitment", "id_needed", flag,
-        "Refuse who comes without an id of Prolific, SONA or MTurk."),
+        "Refuse who comes without an id: one of Prolific, SONA or MTurk, or participant=ID in a\n"
+        "plain link."),
     Key("recruitment", "prolific_code", _code, "Prolific's completion code."),
     Key("recruitment", "sona_address", address("experiment_id", "credit_token"),
         "SONA's address for granting credit, with experiment_id and credit_token."),
