@@ -107,6 +107,35 @@ def test_missing_movies_are_named_all_at_once(
     assert "3 of 12 files are missing" in error and f"{ids[0]}.mp4" not in error
 
 
+def test_many_missing_movies_are_three_and_a_count(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ids = _ids(8)
+    stimuli = _write_list(tmp_path / LIST, ids)
+    (tmp_path / "movies").mkdir()
+    words = ["--stimuli", str(stimuli), "--familiarization", str(stimuli)]
+    words += ["--movies", str(tmp_path / "movies")]
+    assert main(["experiment", "init", str(tmp_path / "study"), *words]) == 2
+    error = capsys.readouterr().err
+    assert "16 of 16 files are missing" in error and error.endswith(", and 13 more\n")
+    assert error.count(str(tmp_path / "movies")) == 3
+
+
+def test_names_that_are_one_to_the_analysis_are_refused_before_movies_are_cut(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ids = _ids(2)
+    looks = [name.replace("_0", "-redyellow_0", 1) for name in ids]
+    lists = [_write_list(tmp_path / LIST, ids), _write_list(tmp_path / f"looks_{LIST}", looks)]
+    _write_media(tmp_path / "movies", ids + looks)
+    words = ["--stimuli", str(lists[0]), "--familiarization", str(lists[1])]
+    words += ["--movies", str(tmp_path / "movies")]
+    assert main(["experiment", "init", str(tmp_path / "study"), *words]) == 2
+    error = capsys.readouterr().err
+    assert "one stimulus to the analysis" in error and error.count("\n") == 1
+    assert looks[0].removesuffix("_img") in error and not (tmp_path / "study").exists()
+
+
 def test_a_stimulus_in_both_lists_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

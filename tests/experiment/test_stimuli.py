@@ -11,8 +11,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from physion.analysis.stimuli import canonical_name
 from physion.errors import BadInputError
-from physion.experiment.stimuli import COLUMNS, Stimulus, read_stimuli, write_stimuli
+from physion.experiment.stimuli import COLUMNS, Stimulus, analysis_name, read_stimuli, write_stimuli
 
 NAMES = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,30}", fullmatch=True)
 FILES = st.from_regex(r"media/[A-Za-z0-9][A-Za-z0-9_-]{0,20}", fullmatch=True)
@@ -149,6 +150,30 @@ def test_what_would_be_refused_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="frames"):
         write_stimuli(tmp_path / "stimuli.csv", bad)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [("s_1", "s-redyellow_1"), ("s_1", "s_1_img"), ("s_1_img.mp4", "s_1.hdf5")],
+)
+def test_names_that_are_one_to_the_analysis_are_refused(
+    tmp_path: Path, first: str, second: str
+) -> None:
+    names = [first, "other", "a", second]
+    rows = [dataclasses.replace(s, stimulus=n) for s, n in zip(_stimuli(), names, strict=True)]
+    with pytest.raises(BadInputError, match="one stimulus to the analysis") as raised:
+        write_stimuli(tmp_path / "stimuli.csv", rows)
+    assert first in str(raised.value) and second in str(raised.value)
+    rows[3] = dataclasses.replace(rows[3], scenario="drop")
+    write_stimuli(tmp_path / "stimuli.csv", rows)
+
+
+PARTS = st.sampled_from(["-redyellow", "_img", ".mp4", ".hdf5", "s", "_0001"])
+
+
+@given(st.lists(PARTS, max_size=6).map("".join))
+def test_names_are_those_of_the_analysis(name: str) -> None:
+    assert analysis_name(name) == canonical_name(name)
 
 
 def _stimuli() -> list[Stimulus]:

@@ -168,7 +168,28 @@ def check_stimuli(rows: list[tuple[int, Stimulus]], path: Path) -> None:
                 f"{path}, row {row}: place {s.place} of {s.phase} of {s.scenario} is taken by "
                 f"row {first}"
             )
+    check_apart(((s.scenario, s.stimulus) for _, s in rows), path)
     _check_futures(rows, path)
+
+
+def check_apart(names: Iterable[tuple[str, str]], where: Path) -> None:
+    """`BadInputError` where two (scenario, stimulus) are one and the same to the analysis."""
+    seen: dict[tuple[str, str], str] = {}
+    for scenario, name in names:
+        first = seen.setdefault((scenario, analysis_name(name)), name)
+        if first == name:
+            continue
+        raise BadInputError(
+            f"{where}: {first} and {name} of {scenario} are one stimulus to the analysis, which "
+            "takes off -redyellow, _img, .mp4 and .hdf5; leave one of them out, or rename it"
+        )
+
+
+def analysis_name(stimulus: str) -> str:
+    """What `physion.analysis.stimuli.canonical_name` gives, whose import takes seconds."""
+    for ending in (".mp4", ".hdf5", "_img"):
+        stimulus = stimulus.removesuffix(ending)
+    return stimulus.replace("-redyellow", "")
 
 
 def _faults(s: Stimulus) -> Iterable[tuple[str, str]]:

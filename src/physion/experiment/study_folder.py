@@ -16,7 +16,13 @@ from physion.atomic import folder_lock, remove_leftovers, write_atomic
 from physion.errors import BadInputError
 from physion.experiment.identity import SECRET_FILE, Secrets, set_password
 from physion.experiment.media import Source, take_stimulus
-from physion.experiment.stimuli import MEDIA_FOLDER, STIMULI_FILE, Stimulus, write_stimuli
+from physion.experiment.stimuli import (
+    MEDIA_FOLDER,
+    STIMULI_FILE,
+    Stimulus,
+    check_apart,
+    write_stimuli,
+)
 from physion.experiment.study import (
     STUDY_FILE,
     Study,
@@ -27,7 +33,7 @@ from physion.experiment.study import (
 from physion.experiment.texts import TEXTS_FOLDER, shipped_file
 
 JOURNAL = "init.journal"
-SHOWN = 20
+SHOWN = 3
 """Missing files that an error names."""
 Track = Callable[[Iterable[Stimulus], str, int], Iterator[Stimulus]]
 """Passes stimuli on and shows how far it is, as `physion.cli.output.track` does."""
@@ -43,6 +49,7 @@ def make_study(
     the next try.
     """
     check_sources(sources)
+    check_apart(((s.scenario, s.stimulus) for s in sources), study.folder / STIMULI_FILE)
     study_to_toml(study)
     texts = {language: shipped_file(language) for language in study.languages}
     folder = study.folder
