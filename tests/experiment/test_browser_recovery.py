@@ -135,6 +135,37 @@ def test_twenty_seconds_offline(chromium: Any, site: tuple[Study, str]) -> None:
     assert {"offline", "online"} <= kinds
 
 
+def test_a_form_stays_until_it_is_stored(chromium: Any, site: tuple[Study, str]) -> None:
+    study, url = site
+    with Visit(chromium, url, "form") as visit:
+        to_the_test(visit, "Form")
+        for _ in range(TEST):
+            visit.answer("yes")
+        visit.heading("About you")
+        visit.page.fill("#age", "47")
+        times: list[int] = []
+
+        def busy(route: Any) -> None:
+            times.append(1)
+            if len(times) == 1:
+                route.fulfill(status=503, body="busy")
+            elif len(times) == 2:
+                route.abort()
+            else:
+                route.continue_()
+
+        visit.context.route("**/api/page", busy)
+        visit.main_button().click()
+        visit.page.get_by_text("The server is busy.").wait_for()
+        visit.page.get_by_text("Your answers are being sent").wait_for()
+        visit.picture("busy")
+        assert visit.page.input_value("#age") == "47"
+        assert visit.main_button().count() == 0
+        visit.heading("How was it?")
+        assert len(times) == 3
+    assert rows_of(study, "Form")[0].age == 47
+
+
 def test_a_browser_that_is_closed_offline(chromium: Any, site: tuple[Study, str]) -> None:
     """The answers are sent when the page is opened again, before it asks where to go on."""
     study, url = site

@@ -6,7 +6,8 @@
  * @module api
  */
 
-const TIMEOUT_MS = 15_000;
+/** So long nothing may arrive; a slow connection is none the worse for being slow. */
+const STALLED_MS = 15_000;
 const FIRST_PAUSE_MS = 500;
 const LONGEST_PAUSE_MS = 8_000;
 /** Words for refusals that stay. What else comes with a status of 4xx is not from our server. */
@@ -43,12 +44,14 @@ class Trouble extends Error {
   /**
    * @param {string} message
    * @param {number} [pauseMs] What the server asks to wait.
-   * @param {boolean} [busy] Did the server answer that there are too many requests?
+   * @param {number} [status] Of the answer, where there was one.
    */
-  constructor(message, pauseMs = 0, busy = false) {
+  constructor(message, pauseMs = 0, status = 0) {
     super(message);
     this.pauseMs = pauseMs;
-    this.busy = busy;
+    /** Too many requests: who enters is told when it is tried again. */
+    this.crowd = status === 429;
+    this.busy = this.crowd || status >= 500;
   }
 }
 
@@ -81,12 +84,17 @@ function pause(ms, signal) {
  */
 
 export class Api {
-  /** @param {(troubled: boolean) => void} onTrouble Called as requests begin or cease to fail. */
+  /**
+   * @param {(trouble: "lost"|"busy"|null) => void} onTrouble Called as requests begin to fail, fail
+   *   in the other way, or cease to fail.
+   */
   constructor(onTrouble) {
     this.onTrouble = onTrouble;
     /** @type {string|null} */
     this.token = null;
-    this.failing = 0;
+    /** How each request fails that fails now. @type {Map<symbol, "lost"|"busy">} */
+    this.failing = new Map();
+    this.trouble = null;
   }
 
   /** @param {string} path @param {Options} [options] @returns {Promise<any>} */
@@ -135,13 +143,18 @@ export class Api {
   /** A whole answer, so that one that breaks off midway counts as failed. */
   async #fetch(path, init, signal) {
     const timeout = new AbortController();
-    const timer = setTimeout(() => timeout.abort(), TIMEOUT_MS);
+    let timer = 0;
+    const arrived = () => {
+      clearTimeout(timer);
+      timer = setTimeout(() => timeout.abort(), STALLED_MS);
+    };
+    arrived();
     const stop = () => timeout.abort();
     signal?.addEventListener("abort", stop);
     try {
       const options = { credentials: "omit", signal: timeout.signal, ...init };
       const response = await fetch(path, options);
-      const whole = new Response(await response.blob(), response);
+      const whole = new Response(await bodyOf(response, arrived), response);
       if (response.ok) return whole;
       const { status } = response;
       const body = await whole.json().catch(() => null);
@@ -150,7 +163,7 @@ export class Api {
       }
       const seconds = Number(response.headers.get("Retry-After")) || 0;
       const pauseMs = Math.min(Math.max(seconds, 0), 60) * 1000;
-      throw new Trouble(`status ${status}`, pauseMs, status === 429);
+      throw new Trouble(`status ${status}`, pauseMs, status);
     } catch (error) {
       if (signal?.aborted) throw signal.reason;
       if (error instanceof Refused || error instanceof Trouble) throw error;
@@ -163,32 +176,46 @@ export class Api {
 
   async #repeat(attempt, signal, onBusy = null) {
     let wait = FIRST_PAUSE_MS;
-    let failed = false;
+    const request = Symbol("request");
     try {
       for (;;) {
         try {
           return await attempt();
         } catch (error) {
           if (!(error instanceof Trouble)) throw error;
-          const busy = error.busy && onBusy;
-          if (!busy && !failed) {
-            this.#troubled(1);
-            failed = true;
-          }
+          const crowd = error.crowd && onBusy;
+          if (!crowd) this.#troubled(request, error.busy ? "busy" : "lost");
           // Spread over time, so that a room of participants does not come back in one moment.
           const ms = Math.max(error.pauseMs, wait / 2) + (Math.random() * wait) / 2;
-          if (busy) onBusy(ms);
+          if (crowd) onBusy(ms);
           await pause(ms, signal);
           wait = Math.min(wait * 2, LONGEST_PAUSE_MS);
         }
       }
     } finally {
-      if (failed) this.#troubled(-1);
+      this.#troubled(request, null);
     }
   }
 
-  #troubled(change) {
-    this.failing += change;
-    this.onTrouble(this.failing > 0);
+  #troubled(request, how) {
+    if (how) this.failing.set(request, how);
+    else this.failing.delete(request);
+    const all = [...this.failing.values()];
+    const trouble = all.includes("lost") ? "lost" : (all[0] ?? null);
+    if (trouble !== this.trouble) this.onTrouble(trouble);
+    this.trouble = trouble;
   }
+}
+
+/** What is in an answer; tells of each piece that arrives. @returns {Promise<Blob>} */
+async function bodyOf(response, arrived) {
+  const pieces = [];
+  const reader = response.body?.getReader();
+  while (reader) {
+    const { done, value } = await reader.read();
+    if (done) break;
+    arrived();
+    pieces.push(value);
+  }
+  return new Blob(pieces, { type: response.headers.get("Content-Type") ?? "" });
 }

@@ -20,7 +20,7 @@ export class EventLog {
   constructor(api) {
     this.api = api;
     setInterval(() => this.send(), EVERY_MS);
-    window.addEventListener("pagehide", () => this.send());
+    window.addEventListener("pagehide", () => this.leave());
     document.addEventListener("visibilitychange", () => {
       this.add(document.hidden ? "hidden" : "visible");
       if (document.hidden) this.send();
@@ -56,26 +56,46 @@ export class EventLog {
   /** Send what there is, if anybody has entered; what fails stays for the next time. */
   async send() {
     if (this.#sending || !this.api.token) return;
-    if (!this.#batch && this.#events.length > 0) {
-      // The same events under the same key, however often they are sent: they are stored once.
-      this.#batch = { key: newKey(), events: this.#events.slice(0, BATCH) };
-    }
-    const batch = this.#batch;
-    if (!batch) return;
     this.#sending = true;
     try {
-      await this.api.tell("/api/events", batch);
-      this.#sent(batch);
-    } catch (error) {
-      // Another token may be let in; any other refusal will not become better by trying again.
-      if (error.code && error.code !== "unknown_token") this.#sent(batch);
+      while (this.#next()) await this.#sendBatch(this.#batch);
+    } catch {
+      // The same batch goes the next time.
     } finally {
       this.#sending = false;
     }
   }
 
-  #sent({ events }) {
-    this.#events = this.#events.filter((event) => !events.includes(event));
-    this.#batch = null;
+  /** Send everything at once, since the page goes. */
+  leave() {
+    if (!this.api.token) return;
+    while (this.#next()) {
+      const batch = this.#batch;
+      this.#sent(batch);
+      this.#sendBatch(batch).catch(() => {});
+    }
+  }
+
+  /** The batch that goes next: the same under the same key until it is stored, which it is once. */
+  #next() {
+    if (!this.#batch && this.#events.length > 0) {
+      this.#batch = { key: newKey(), events: this.#events.slice(0, BATCH) };
+    }
+    return this.#batch;
+  }
+
+  async #sendBatch(batch) {
+    try {
+      await this.api.tell("/api/events", batch);
+    } catch (error) {
+      // Another token may be let in; any other refusal will not become better by trying again.
+      if (!error.code || error.code === "unknown_token") throw error;
+    }
+    this.#sent(batch);
+  }
+
+  #sent(batch) {
+    this.#events = this.#events.filter((event) => !batch.events.includes(event));
+    if (this.#batch === batch) this.#batch = null;
   }
 }

@@ -5,7 +5,14 @@
 
 import { button, el } from "./dom.js";
 
-const STAGES_WITH_WAY_OUT = ["instructions", "familiarization", "ready", "test"];
+const STAGES_WITH_WAY_OUT = [
+  "instructions",
+  "familiarization",
+  "ready",
+  "test",
+  "demographics",
+  "feedback",
+];
 const BACK_SHOWN_MS = 4_000;
 
 const byId = (id) => document.getElementById(id);
@@ -75,12 +82,12 @@ export class Frame {
     return el("span", { class: "language" }, label, select);
   }
 
-  /** Say that the connection is lost, or back again. @param {boolean} lost */
-  connection(lost) {
+  /** Say how requests fail, or that they do no more. @param {"lost"|"busy"|null} trouble */
+  connection(trouble) {
     const status = byId("status");
     clearTimeout(this.timer);
-    status.textContent = this.texts.t(lost ? "connection.lost" : "connection.back");
-    status.classList.toggle("status-lost", lost);
-    if (!lost) this.timer = setTimeout(() => (status.textContent = ""), BACK_SHOWN_MS);
+    status.textContent = this.texts.t(`connection.${trouble ?? "back"}`);
+    status.classList.toggle("status-lost", trouble !== null);
+    if (!trouble) this.timer = setTimeout(() => (status.textContent = ""), BACK_SHOWN_MS);
   }
 }

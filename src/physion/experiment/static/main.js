@@ -10,8 +10,8 @@ import { anotherPerson, cameWithoutId, enter } from "./entering.js";
 import { EventLog } from "./event_log.js";
 import { Frame } from "./frame.js";
 import { deviceProblem } from "./gate.js";
-import { showPage } from "./page_trial.js";
-import { messagePage } from "./pages.js";
+import { patiently, showPage } from "./page_trial.js";
+import { messagePage, openingPage } from "./pages.js";
 import { Session } from "./session.js";
 import { keep, recall } from "./storage.js";
 import { takeOver } from "./tabs.js";
@@ -19,7 +19,7 @@ import { Texts, chooseLanguage, offeredLanguage } from "./texts.js";
 
 async function begin() {
   const address = window.location.href;
-  const api = new Api((lost) => frame?.connection(lost));
+  const api = new Api((trouble) => frame?.connection(trouble));
   let frame = null;
   const study = await api.get("/api/study");
   const arrival = readArrival(window.location.search, study.recruiters);
@@ -48,7 +48,7 @@ async function takePart(basis, arrival) {
   queue.load();
   await queue.empty();
   try {
-    let state = await enter(basis, arrival);
+    let state = await patiently(frame.main, openingPage(basis), enter(basis, arrival));
     if (queue.enter(api.token, state.reference)) {
       await queue.empty();
       state = await api.get("/api/session");

@@ -5,6 +5,8 @@
 
 const { ParameterType } = window.jsPsychModule;
 
+const LATE_MS = 500;
+
 const info = {
   name: "physion-page",
   version: "1.0.0",
@@ -63,6 +65,24 @@ export function showPage(place, render) {
   place.replaceChildren(page);
   window.scrollTo(0, 0);
   focusHeading(page);
+}
+
+/**
+ * What is awaited. Where it takes long, an empty place says so meanwhile.
+ * @template T
+ * @param {HTMLElement} place
+ * @param {(page: HTMLElement) => void} render
+ * @param {Promise<T>} awaited
+ * @returns {Promise<T>}
+ */
+export async function patiently(place, render, awaited) {
+  const say = () => place.querySelector("h1") ?? showPage(place, render);
+  const timer = setTimeout(say, LATE_MS);
+  try {
+    return await awaited;
+  } finally {
+    clearTimeout(timer);
+  }
 }
 
 /** @param {HTMLElement} page */

@@ -7,6 +7,8 @@ import { button, el, paragraphs, sleep } from "./dom.js";
 import { showExample } from "./example.js";
 import { focusHeading } from "./page_trial.js";
 
+const LATE_MS = 500;
+
 /**
  * @typedef {Object} Context What every page may need.
  * @property {import("./texts.js").Texts} texts
@@ -146,6 +148,37 @@ export function waitingPage({ texts }, waited) {
   return (page, done) => {
     page.append(el("h1", {}, t("saving.title")), el("p", {}, t("saving.text")));
     waited().then(() => done());
+  };
+}
+
+/** Shown where an answer of the server takes long. @param {{texts: any}} context */
+export function openingPage({ texts }) {
+  const { t } = bound(texts);
+  return messagePage({ title: t("saving.title"), text: t("saving.opening") });
+}
+
+/**
+ * A page that stays, with all that was filled in, until it is stored; it takes no input meanwhile.
+ * @param {{texts: any}} context @param {Render} render
+ * @param {(values: any) => Promise<any>} store Called once. @returns {Render}
+ */
+export function storedPage({ texts }, render, store) {
+  const { t } = bound(texts);
+  return (page, done, signal) => {
+    const told = el("span", { class: "small", role: "status" });
+    const late = () => (told.textContent = t("saving.sending"));
+    let sent = false;
+    const send = async (values = {}) => {
+      if (sent) return;
+      sent = true;
+      const controls = page.querySelectorAll("button, input, select, textarea");
+      for (const control of controls) control.disabled = true;
+      page.querySelector(".buttons")?.prepend(told);
+      const timer = setTimeout(late, LATE_MS);
+      await store(values).finally(() => clearTimeout(timer));
+      done(values);
+    };
+    render(page, send, signal);
   };
 }
 

@@ -8,7 +8,7 @@ import { Refused } from "./api.js";
 import { ask } from "./dialog.js";
 import { demographicsPage, feedbackPage } from "./forms.js";
 import { Media } from "./media.js";
-import { PageTrial, showPage } from "./page_trial.js";
+import { PageTrial, patiently, showPage } from "./page_trial.js";
 import * as pages from "./pages.js";
 import { PredictionTrial } from "./prediction_trial.js";
 import { newKey } from "./random_key.js";
@@ -129,18 +129,19 @@ export class Session {
     if (this.#withdraws) return this.#withdraw();
     const told = this.#refused?.state ?? refused?.state;
     this.#refused = null;
-    const state = this.queue.length === 0 && told ? told : await api.get("/api/session");
+    const ask = (path) => this.#patiently(api.get(path));
+    const state = this.queue.length === 0 && told ? told : await ask("/api/session");
     // What was seen already is marked in the answer as after a reload.
     const seen = this.#shown.has(`${state.stage} ${state.trial}`);
-    return seen ? api.get("/api/session?load=true") : state;
+    return seen ? ask("/api/session?load=true") : state;
   }
 
   async #withdraw() {
     const { api, log } = this.basis;
     this.#withdraws = false;
-    await log.send();
+    await this.#patiently(log.send());
     try {
-      return await api.post("/api/page", { page: "withdraw", data: {} });
+      return await this.#patiently(api.post("/api/page", { page: "withdraw", data: {} }));
     } catch (error) {
       if (!error.state) throw error;
       return error.state;
@@ -159,11 +160,23 @@ export class Session {
   }
 
   async #page(page, render) {
-    const [result] = await this.#timeline([{ type: PageTrial, render }]);
-    const data = result.values;
-    if (page === "consent") data.language = this.basis.texts.language;
     const { signal } = this.#stretch;
-    return this.basis.api.post("/api/page", { page, data }, { signal });
+    let told = null;
+    const store = async (data) => {
+      if (page === "consent") data.language = this.basis.texts.language;
+      const post = this.basis.api.post("/api/page", { page, data }, { signal });
+      // Refusals are for `run`; the page has ended either way.
+      told = await post.catch((error) => ({ error }));
+    };
+    const stored = pages.storedPage(this.context, render, store);
+    await this.#timeline([{ type: PageTrial, render: stored }]);
+    if (told.error) throw told.error;
+    return told;
+  }
+
+  /** What is awaited, with a page in between where it takes long. */
+  #patiently(awaited) {
+    return patiently(this.basis.frame.main, pages.openingPage(this.context), awaited);
   }
 
   /** All trials of a phase that are not answered yet, and then the state after them. */
@@ -171,7 +184,7 @@ export class Session {
     const { api } = this.basis;
     const { signal } = this.#stretch;
     const list = async () => (await api.get(`/api/trials/${phase}`, { signal })).trials;
-    const trials = await list();
+    const trials = await this.#patiently(list());
     this.media.start(trials, this.state.trial, list);
     const left = trials.filter((trial) => trial.trial >= this.state.trial);
     await this.#timeline([
@@ -181,7 +194,7 @@ export class Session {
         conditional_function: () => this.queue.length > 0,
       },
     ]);
-    return api.get("/api/session", { signal });
+    return this.#patiently(api.get("/api/session", { signal }));
   }
 
   #trial(phase, media) {
@@ -230,7 +243,7 @@ export class Session {
       const quiet = another && { label: texts.t("common.another_person"), run: another };
       return showPage(frame.main, pages.messagePage({ title, text, quiet }));
     }
-    const result = await api.get("/api/result");
+    const result = await this.#patiently(api.get("/api/result"));
     return showPage(frame.main, resultPage(this.context, result));
   }
 }
