@@ -202,6 +202,7 @@ def test_wrong_passwords_bring_waits_that_growing_tries_cannot_pass(
         assert [visitor.log_in("wrong").status_code for _ in range(5)] == [403] * 5
         refused = visitor.log_in()
         assert refused.status_code == 429 and refused.headers["retry-after"] == "1"
+        assert "Please wait 1 second and" in refused.text
         assert visitor.see().status_code == 303, "not even the right one is looked at"
         clock[0] += 1.0
         assert visitor.log_in().status_code == 303

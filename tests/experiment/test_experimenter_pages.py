@@ -237,6 +237,19 @@ def test_pages_of_an_empty_study(tmp_path: Path, database_url: str) -> None:
         assert table_after(visitor.see().text, "Progress")[1][2] == "0 of 100"
 
 
+def test_one_id_and_two(tmp_path: Path) -> None:
+    with lab(tmp_path) as few:
+        visitor, said = few.experimenter(), []
+        for seed in (1, 2):
+            insert_sessions(
+                few.store.engine, few.study, few.secrets, 1, ends=("finished",), seed=seed
+            )
+            said.append(visitor.open_payments().text)
+    assert "The id to copy" in said[0] and "the stored id should go. It is removed" in said[0]
+    assert "All 2 ids, one a line, to copy" in said[1]
+    assert "the 2 stored ids should go. They are removed" in said[1]
+
+
 def test_pages_of_one_hostile_session(tmp_path: Path, database_url: str) -> None:
     """Script and SQL in every text that a browser or recruiter can give."""
     device = {"user_agent": HOSTILE, "refresh_hz": None, HOSTILE: HOSTILE, "touch": True}

@@ -101,7 +101,9 @@ class Front:
         """The form again after `Gate.try_password`, and why."""
         if wait == 0:
             return form(request, WRONG_PASSWORD, 403)
-        problem = f"Too many tries. Please wait {math.ceil(wait)} seconds and try again."
+        seconds = math.ceil(wait)
+        unit = "second" if seconds == 1 else "seconds"
+        problem = f"Too many tries. Please wait {seconds} {unit} and try again."
         return form(request, problem, 429, wait)
 
 
