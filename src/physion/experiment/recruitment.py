@@ -175,19 +175,16 @@ def links(study: Study, secrets: Secrets, base_url: str) -> tuple[Link, ...]:
 
 
 def undecided(study: Study) -> tuple[str, ...]:
-    """What should be filled in before people come, a line each; the contact first."""
-    found = []
-    if study.contact == NO_CONTACT:
-        found.append(
-            "warning: contact in study.toml is not filled in: nobody who takes part can ask you or "
-            "have their data deleted; fill it in before people come"
-        )
-    found += [
-        f"note: if you recruit by {name}, study.toml lacks {lacks}"
-        for name in GOES_TO
-        if (lacks := _lacks(study, name))
-    ]
-    return tuple(found)
+    """What must be filled in before people come, a line each.
+
+    What single recruiters lack is said with their links, of which a study needs but some.
+    """
+    if study.contact != NO_CONTACT:
+        return ()
+    return (
+        "warning: contact in study.toml is not filled in: nobody who takes part can ask you or "
+        "have their data deleted; fill it in before people come",
+    )
 
 
 def _lacks(study: Study, name: str) -> str:
