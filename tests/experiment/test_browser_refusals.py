@@ -284,6 +284,7 @@ def test_stopping_for_good(chromium: Any, site: tuple[Study, str]) -> None:
         visit.page.get_by_text("Stop for good").click()
         visit.heading("You have stopped")
         visit.picture("stopped")
+        assert rows_of(study, "Stop")[0].reference in visit.page.inner_text("main")
         visit.page.reload()
         visit.heading("You have stopped")
         assert visit.unexpected() == []
@@ -299,7 +300,7 @@ def test_declining_the_consent(chromium: Any, site: tuple[Study, str]) -> None:
         visit.page.select_option("#language", "de")
         visit.heading("Teilnahme an dieser Studie")
         visit.page.get_by_text("Ich möchte nicht teilnehmen").click()
-        visit.heading("Sie haben aufgehört")
+        visit.heading("Sie nehmen nicht teil")
         assert visit.unexpected() == []
     session, answers, _ = rows_of(study, "Decline")
     assert session.withdrawn_at is not None and session.consented_at is None

@@ -131,7 +131,7 @@ def test_the_next_person_at_this_computer(chromium: Any, site: tuple[Study, str]
         assert visit.requests.count(link) == 2
         assert len(references(study)) == before + 2
         visit.page.get_by_text("I do not want to take part").click()
-        visit.heading("You have stopped")
+        visit.heading("You do not take part")
         visit.page.get_by_text(NEXT).click()
         visit.heading("Taking part in this study")
         assert visit.unexpected() == []

@@ -19,7 +19,7 @@ const info = {
     load: { type: ParameterType.FUNCTION, default: undefined },
     /** Size and rate of the movie: a `TrialMedia`. */
     media: { type: ParameterType.OBJECT, default: undefined },
-    /** Words by name: waiting, correct, incorrect, contact, no_contact, next, trouble, retry. */
+    /** Words by name: prompt, waiting, correct, incorrect, contact, no_contact, next, trouble, retry. */
     words: { type: ParameterType.OBJECT, default: undefined },
     /** Called with the kind and data of what went wrong. */
     log: { type: ParameterType.FUNCTION, default: () => {} },
@@ -46,34 +46,51 @@ export class FeedbackTrial {
     const { words } = trial;
     const signal = trial.signal();
     const screen = new Screen(trial.media, signal);
-    const verdict = el("p", { class: "verdict", role: "status" }, words.waiting);
-    const outcome = el("p", { class: "prompt" }, "\u00a0");
+    const verdict = el("span", { class: "verdict", role: "status" }, words.waiting);
+    const outcome = el("span", {});
     const next = button(words.next, () => {}, { disabled: true });
     const row = el("div", { class: "answers" }, next);
+    // The scene stands where it stood in the trial.
     display.replaceChildren(
-      el("div", { class: "trial has-verdict" }, verdict, screen.element, row, outcome),
+      el(
+        "div",
+        { class: "trial has-verdict" },
+        el("h1", { class: "unseen" }, words.prompt),
+        screen.element,
+        row,
+        el("p", { class: "prompt" }, verdict, " ", outcome),
+      ),
     );
     on_load();
-    const feedback = await trial.feedback();
-    const address = await trial.load(feedback.movie);
-    verdict.textContent = feedback.correct ? words.correct : words.incorrect;
-    verdict.classList.add(feedback.correct ? "verdict-correct" : "verdict-incorrect");
-    outcome.textContent = feedback.contact ? words.contact : words.no_contact;
     try {
-      await playOnce(screen, address, trial, outcome);
+      return await feedbackOn(screen, { verdict, outcome, next }, trial, signal);
     } finally {
-      URL.revokeObjectURL(address);
+      screen.release();
     }
-    const frames_shown = screen.record().shown;
-    next.disabled = false;
-    next.focus();
-    await new Promise((resolve, reject) => {
-      next.addEventListener("click", resolve);
-      signal.addEventListener("abort", () => reject(signal.reason));
-    });
-    screen.release();
-    return { correct: feedback.correct, contact: feedback.contact, frames_shown };
   }
+}
+
+/** What was right and the whole movie, until the participant goes on. */
+async function feedbackOn(screen, { verdict, outcome, next }, trial, signal) {
+  const { words } = trial;
+  const feedback = await trial.feedback();
+  const address = await trial.load(feedback.movie);
+  verdict.textContent = feedback.correct ? words.correct : words.incorrect;
+  verdict.classList.add(feedback.correct ? "verdict-correct" : "verdict-incorrect");
+  outcome.textContent = feedback.contact ? words.contact : words.no_contact;
+  try {
+    await playOnce(screen, address, trial, outcome);
+  } finally {
+    URL.revokeObjectURL(address);
+  }
+  const frames_shown = screen.record().shown;
+  next.disabled = false;
+  next.focus();
+  await new Promise((resolve, reject) => {
+    next.addEventListener("click", resolve);
+    signal.addEventListener("abort", () => reject(signal.reason));
+  });
+  return { correct: feedback.correct, contact: feedback.contact, frames_shown };
 }
 
 /** Play the movie; where it fails, say so and try again twice, then let the participant go on. */

@@ -29,10 +29,14 @@ export function demographicsPage({ texts }) {
     const choice = (name, words) => selectOf(name, words, t);
     const gender = choice("gender", GENDERS);
     const education = choice("education", EDUCATIONS);
+    const check = (isWrong) => {
+      wrong.textContent = isWrong ? t("demographics.age_wrong") : "";
+      age.setAttribute("aria-invalid", String(isWrong));
+    };
+    age.addEventListener("input", () => Number.isNaN(readAge(age.value)) || check(false));
     const send = () => {
       const years = readAge(age.value);
-      wrong.textContent = Number.isNaN(years) ? t("demographics.age_wrong") : "";
-      age.setAttribute("aria-invalid", String(Number.isNaN(years)));
+      check(Number.isNaN(years));
       if (Number.isNaN(years)) return age.focus();
       return done({ age: years, gender: gender.value, education: education.value });
     };
@@ -126,7 +130,7 @@ function selectOf(name, words, t) {
 
 /** A group of which one has to be chosen. */
 function radios(name, question, choices, t) {
-  const wrong = el("p", { class: "wrong", role: "alert" });
+  const wrong = el("p", { class: "wrong", id: `${name}-wrong`, role: "alert" });
   const inputs = choices.map(([value]) =>
     el("input", { type: "radio", name, value, id: `${name}-${value}` }),
   );
@@ -134,14 +138,20 @@ function radios(name, question, choices, t) {
     el("label", { class: "radio", for: `${name}-${value}` }, inputs[place], word),
   );
   const row = el("div", { class: `radios radios-${choices.length}` }, ...labels);
-  const element = el("fieldset", {}, el("legend", {}, question), row, wrong);
+  const described = { role: "radiogroup", "aria-describedby": wrong.id };
+  const element = el("fieldset", described, el("legend", {}, question), row, wrong);
   const chosen = () => inputs.find((input) => input.checked);
+  const say = (text) => {
+    wrong.textContent = text;
+    element.setAttribute("aria-invalid", String(text !== ""));
+  };
+  element.addEventListener("change", () => say(""));
   return {
     element,
     value: () => chosen()?.value ?? "",
     focus: () => inputs[0].focus(),
     check() {
-      wrong.textContent = chosen() ? "" : t("common.required");
+      say(chosen() ? "" : t("common.required"));
       return Boolean(chosen());
     },
   };

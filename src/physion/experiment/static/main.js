@@ -105,15 +105,19 @@ function tell({ texts, frame }, name, action = null) {
 }
 
 /** Why it does not work, by the name of a text of `refusal`, or else by the server's sentence. */
-function refuse({ texts, frame, study }, name, message = "", another = null) {
+function refuse({ texts, frame, study, address }, name, message = "", another = null) {
   const known = texts.has(`refusal.${name}`);
   const size = { width: study.min_width, height: study.min_height };
   const why = known ? texts.t(`refusal.${name}`, size) : texts.t("refusal.other", { message });
   const text = `${why}\n\n${texts.t("refusal.contact", study)}`;
   const again = { label: texts.t("refusal.again"), run: () => window.location.reload() };
-  const action = known ? null : again;
+  // Where the browser was told the address first, a person is known by it.
+  const anew = { label: texts.t("refusal.again"), run: () => window.location.replace(address) };
+  const action = name === "unknown_token" ? anew : known ? null : again;
   const title = texts.t(name === "already_took_part" ? "result.title" : "refusal.title");
+  document.body.classList.remove("in-trials");
   document.getElementById("tools").replaceChildren();
+  document.getElementById("progress").hidden = true;
   const quiet = another && { label: texts.t("common.another_person"), run: another };
   showPage(frame.main, messagePage({ title, text, action, quiet: known ? quiet : null }));
 }

@@ -119,7 +119,7 @@ async function show(display, trial, signal, visibility, on_load) {
       { class: "trial" },
       screen.element,
       el("div", { class: "answers", role: "group", "aria-label": trial.words.prompt }, ...buttons),
-      el("p", { class: "prompt", id: "prompt" }, trial.words.prompt),
+      el("h1", { class: "prompt", id: "prompt" }, trial.words.prompt),
     ),
   );
   on_load();

@@ -13,6 +13,7 @@ import * as pages from "./pages.js";
 import { PredictionTrial } from "./prediction_trial.js";
 import { newKey } from "./random_key.js";
 import { resultPage } from "./result_page.js";
+import { keep, recall } from "./storage.js";
 import { trialPieces } from "./trial_pieces.js";
 
 const PAGES = {
@@ -92,7 +93,8 @@ export class Session {
     while (!this.#closed) {
       this.#stretch = new AbortController();
       // The consent is read in any language, and then the session is in that one.
-      if (this.state.stage !== "consent") await this.basis.speak(this.state.language);
+      const reading = this.state.stage === "consent" || this.#declined();
+      if (!reading) await this.basis.speak(this.state.language);
       this.basis.frame.show(this.context);
       if (this.state.stage === "done" || this.state.stage === "withdrawn") return this.#end();
       try {
@@ -102,6 +104,11 @@ export class Session {
         this.state = await this.#stateAfter(error);
       }
     }
+  }
+
+  /** Was the consent declined, in this browser? The server keeps no language of who did. */
+  #declined() {
+    return this.state.stage === "withdrawn" && recall("declined") === this.state.reference;
   }
 
   /** Show the page that is shown anew, in another language. */
@@ -164,6 +171,7 @@ export class Session {
     let told = null;
     const store = async (data) => {
       if (page === "consent") data.language = this.basis.texts.language;
+      if (data.agreed === false) keep("declined", this.state.reference);
       const post = this.basis.api.post("/api/page", { page, data }, { signal });
       // Refusals are for `run`; the page has ended either way.
       told = await post.catch((error) => ({ error }));
@@ -239,7 +247,13 @@ export class Session {
     this.#question?.abort();
     const { texts, study, api, frame, another } = this.basis;
     if (this.state.stage === "withdrawn") {
-      const [title, text] = [texts.t("withdrawn.title"), texts.t("withdrawn.text", study)];
+      const { reference } = this.state;
+      const declined = this.#declined();
+      const named = `\n\n${texts.t("common.reference", { reference })}`;
+      const title = texts.t(declined ? "declined.title" : "withdrawn.title");
+      const text = declined
+        ? texts.t("declined.text", study)
+        : texts.t("withdrawn.text", study) + named;
       const quiet = another && { label: texts.t("common.another_person"), run: another };
       return showPage(frame.main, pages.messagePage({ title, text, quiet }));
     }

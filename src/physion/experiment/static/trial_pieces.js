@@ -93,6 +93,7 @@ function feedbackOf({ api, texts, log }, media, given) {
     words: {
       ...words(texts, "practice", FEEDBACK_WORDS),
       trouble: texts.t("trial.trouble"),
+      prompt: texts.t("trial.prompt"),
     },
     log: (kind, data) => log.add(kind, data),
   };
