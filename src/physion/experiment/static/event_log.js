@@ -25,7 +25,10 @@ export class EventLog {
       this.add(document.hidden ? "hidden" : "visible");
       if (document.hidden) this.send();
     });
-    window.addEventListener("online", () => this.add("online"));
+    window.addEventListener("online", () => {
+      this.add("online");
+      this.send();
+    });
     window.addEventListener("offline", () => this.add("offline"));
     window.addEventListener("error", (event) => this.add("error", { message: event.message }));
     window.addEventListener("unhandledrejection", (event) =>
