@@ -33,7 +33,7 @@ NASTY = (
     '" OR ""="',
     "=cmd|' /C calc'!A0",
     "../../secret.json",
-    "{{7*7}} ${7*7} %s %(x)s",
+    "{7*7} {%7*7%} $(7*7) %s %(x)s",
     "a\r\nSet-Cookie: x=1",
     "\u202eright to left\u0085\ufeff",
     "\U0001f41b" * 20,

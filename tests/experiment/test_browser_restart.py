@@ -22,7 +22,7 @@ pytestmark = pytest.mark.slow
 
 
 def test_who_comes_in_a_crowd_waits(chromium: Any, tmp_path: Path) -> None:
-    limits = replace(Limits(), sessions_per_minute=20.0, sessions_at_once=1)
+    limits = replace(Limits(), sessions_per_minute=8.0, sessions_at_once=1)
     with served(tmp_path, test=1, familiarization=1, limits=limits) as (study, server):
         with Visit(chromium, server.url) as first, Visit(chromium, server.url, "crowd") as visit:
             first.go("?participant=One")
@@ -31,8 +31,7 @@ def test_who_comes_in_a_crowd_waits(chromium: Any, tmp_path: Path) -> None:
             visit.heading("One moment, please")
             visit.picture("waiting")
             told = visit.page.locator("[role=timer]").inner_text()
-            assert re.fullmatch(r"It tries again in [1-5] s\.", told)
-            visit.page.get_by_text("tries again in 1 s.").wait_for()
+            assert re.fullmatch(r"It tries again in [1-9] s\.", told)
             assert visit.page.locator("#status").inner_text() == ""
             visit.heading("Taking part in this study")
         assert rows_of(study, "Two")[0].finished_at is None
