@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.rendering.kernel import kernel, step
+from physion.numerics.kernel import kernel
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -30,7 +30,7 @@ NOTHING = -1
 """Triangle index of a sample where nothing is seen."""
 
 
-@step
+@kernel
 def _bounds(points: F64, face: I32, near: float) -> tuple[float, float, float, float]:
     """Smallest box of pixels around the part of a triangle that lies beyond ``near``."""
     left, right, top, bottom = np.inf, -np.inf, np.inf, -np.inf
@@ -220,7 +220,7 @@ def measure(
                 flow[row, column, 1] = np.nan
 
 
-@step
+@kernel
 def _is_back(edges: F64, t: int) -> bool:
     """Whether the triangle shows its back: its corners run clockwise (y points down).
 

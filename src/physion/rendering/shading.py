@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.rendering.kernel import kernel, step
+from physion.numerics.kernel import kernel
 from physion.rendering.rasterizer import SAMPLES
 
 F32 = NDArray[np.float32]
@@ -33,7 +33,7 @@ WHITEST = 4.0
 """Linear light beyond which the tone table is white."""
 
 
-@step
+@kernel
 def _texel(
     texels: U8, start: int, side: int, u: float, v: float
 ) -> tuple[float, float, float, float, float]:
@@ -55,7 +55,7 @@ def _texel(
     return r, g, b, p, q
 
 
-@step
+@kernel
 def _texture(
     texels: U8, starts: NDArray[np.int64], row: int, u: float, v: float, level: float
 ) -> tuple[float, float, float, float, float]:
@@ -72,7 +72,7 @@ def _texture(
     return r * r * unit, g * g * unit, b * b * unit, (p - 128.0) / 64.0, (q - 128.0) / 64.0
 
 
-@step
+@kernel
 def _shade_point(
     t: int,
     x: float,
@@ -173,7 +173,7 @@ def _shade_point(
         out[at, 6 + k] = room * light[1, k] * (matte * direct + tint * shine)
 
 
-@step
+@kernel
 def _window_share(
     px: float, py: float, pz: float, rx: float, ry: float, rz: float, light: F64
 ) -> float:
@@ -190,7 +190,7 @@ def _window_share(
     return float(u * u * (3.0 - 2.0 * u) * v * v * (3.0 - 2.0 * v))
 
 
-@step
+@kernel
 def _room_shade(
     px: float, py: float, pz: float, nx: float, ny: float, nz: float, light: F64
 ) -> float:
@@ -206,7 +206,7 @@ def _room_shade(
     return float(left)
 
 
-@step
+@kernel
 def _lit(px: float, py: float, pz: float, m: F64, shadow: F32, busy: NDArray[np.bool_]) -> float:
     """Share of the lamp that reaches a world point: a soft-edged look into the shadow map."""
     x = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3] - 0.5
@@ -233,7 +233,7 @@ def _lit(px: float, py: float, pz: float, m: F64, shadow: F32, busy: NDArray[np.
     return float(total / 25.0)
 
 
-@step
+@kernel
 def _crowded(
     px: float, py: float, pz: float, m: F64, contact: F32, busy: NDArray[np.bool_], reach: float
 ) -> float:
@@ -259,7 +259,7 @@ def _crowded(
     return float(total / 49.0)
 
 
-@step
+@kernel
 def _tone(tones: U8, light: float) -> int:
     """The byte of a linear light; black for what is no number (a normal of no length)."""
     at = light * ((TONES - 1) / WHITEST)

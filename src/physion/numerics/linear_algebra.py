@@ -1,0 +1,100 @@
+"""Sums and products of small arrays in a fixed order, in place of BLAS and LAPACK.
+
+BLAS chooses its kernel, and with it the order of a sum, by processor and by the shape of the
+arrays. Here every sum runs over one axis from the first to the last entry.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from physion.numerics.kernel import kernel
+
+F64 = NDArray[np.float64]
+
+
+def ordered_sum(values: ArrayLike, axis: int = -1) -> F64:
+    """Return the sum along ``axis``, added one after the other; 0 along an axis without entries."""
+    array = np.asarray(values, np.float64)
+    if array.shape[axis] == 0:
+        return np.zeros(np.delete(array.shape, axis))
+    return np.asarray(np.add.accumulate(array, axis=axis).take(-1, axis=axis))
+
+
+def ordered_mean(values: ArrayLike, axis: int = -1) -> F64:
+    """Return the mean along ``axis`` of a sum in order; NaN along an axis without entries."""
+    array = np.asarray(values, np.float64)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(ordered_sum(array, axis) / np.float64(array.shape[axis]))
+
+
+def dot(a: ArrayLike, b: ArrayLike) -> F64:
+    """Return the sums of products along the last axis of arrays that broadcast, (..., n)."""
+    return ordered_sum(np.multiply(a, b, dtype=np.float64))
+
+
+def norm(vectors: ArrayLike) -> F64:
+    """Return the lengths (...) of vectors (..., n)."""
+    return np.asarray(np.sqrt(dot(vectors, vectors)))
+
+
+def unit(vectors: ArrayLike) -> F64:
+    """Return vectors (..., n) divided by their lengths; NaN for a vector of length 0."""
+    array = np.asarray(vectors, np.float64)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(array / norm(array)[..., None])
+
+
+def multiply(a: ArrayLike, b: ArrayLike) -> F64:
+    """Return matrix products (..., n, m) of (..., n, k) and (..., k, m)."""
+    left, right = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    total = left[..., :, 0, None] * right[..., None, 0, :]
+    for k in range(1, left.shape[-1]):
+        total = total + left[..., :, k, None] * right[..., None, k, :]
+    return np.asarray(total)
+
+
+def apply(matrix: ArrayLike, vectors: ArrayLike) -> F64:
+    """Return matrices (..., m, n) times vectors (..., n), leading axes broadcast: (..., m).
+
+    For points (P, 3) and one matrix (3, 3) this is ``points @ matrix.T``.
+    """
+    rows, columns = np.asarray(matrix, np.float64), np.asarray(vectors, np.float64)
+    total = rows[..., :, 0] * columns[..., 0, None]
+    for k in range(1, columns.shape[-1]):
+        total = total + rows[..., :, k] * columns[..., k, None]
+    return np.asarray(total)
+
+
+def outer(a: ArrayLike, b: ArrayLike) -> F64:
+    """Return the products (..., n, m) of all entries of vectors (..., n) and (..., m)."""
+    left, right = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    return np.asarray(left[..., :, None] * right[..., None, :])
+
+
+def determinant(matrices: ArrayLike) -> F64:
+    """Return the determinants (...) of matrices (..., 3, 3), a . (b x c) of their rows."""
+    m = np.asarray(matrices, np.float64)
+    return dot(m[..., 0, :], np.cross(m[..., 1, :], m[..., 2, :]))
+
+
+@kernel
+def inverse(m: Any) -> Any:
+    """Return the inverse (3, 3) of a matrix (3, 3), its adjugate over its determinant.
+
+    Infinite or NaN entries for a singular matrix.
+    """
+    adjugate = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            a, b = (j + 1) % 3, (j + 2) % 3
+            c, d = (i + 1) % 3, (i + 2) % 3
+            adjugate[i, j] = m[a, c] * m[b, d] - m[a, d] * m[b, c]
+    size = m[0, 0] * adjugate[0, 0] + m[0, 1] * adjugate[1, 0] + m[0, 2] * adjugate[2, 0]
+    for i in range(3):
+        for j in range(3):
+            adjugate[i, j] /= size
+    return adjugate
