@@ -57,29 +57,71 @@ def test_modules_have_names_that_say_something() -> None:
     assert not [path for path in SOURCES if {path.stem, path.parent.name} & vague]
 
 
-def _compiled(path: Path) -> set[str]:
-    """Names of the functions of a file that numba compiles."""
-    return {
-        node.name
-        for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.FunctionDef)
-        and any("njit" in (text := ast.unparse(d)) or text in {"kernel", "step"}
-                for d in node.decorator_list)
-    }  # fmt: skip
+SAME_BYTES = [
+    path
+    for path in SOURCES
+    if path.relative_to(ROOT / "src" / "physion").parts[0]
+    in {"numerics", "scenes", "physics", "rendering"}
+]
+"""What lies between a seed and the stored bytes."""
+ANY_ORDER = {
+    *("sum", "nansum", "mean", "nanmean", "average", "std", "var", "prod", "trace", "reduceat"),
+    *("dot", "vdot", "inner", "outer", "matmul", "tensordot", "einsum", "kron"),
+    *("linalg", "fft", "convolve", "correlate", "interp", "polyfit", "partition", "argpartition"),
+}
+BY_LIBRARY = {
+    *("sin", "cos", "tan", "arcsin", "arccos", "arctan", "arctan2", "asin", "acos", "atan"),
+    *("atan2", "sinh", "cosh", "tanh", "exp", "exp2", "expm1", "log", "log2", "log10", "log1p"),
+    *("power", "pow", "hypot", "dist", "cbrt", "float_power", "logaddexp", "sinc"),
+}
+BY_TAILS = {"normal", "lognormal", "exponential", "gamma", "beta", "dirichlet"}
+METHODS = {"sum", "mean", "std", "var", "prod", "trace", "dot"}
+LIBRARIES = {"np", "numpy", "math", "scipy"}
 
 
-def test_compiled_code_calls_its_own_file_alone() -> None:
-    """Numba asks only a kernel's own file whether the machine code on disk is outdated."""
-    owners = {name: path for path in SOURCES for name in _compiled(path)}
-    strangers = []
-    for path in SOURCES:
-        mine = _compiled(path)
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.FunctionDef) and node.name in mine:
-                called = {name for name, _ in _calls(node)}
-                strangers += [
-                    f"{path.name}: {node.name} calls {name} of {owners[name].name}"
-                    for name in called
-                    if name in owners and name not in mine
-                ]
-    assert owners and not strangers
+@pytest.mark.parametrize("path", SAME_BYTES, ids=lambda path: str(path.relative_to(ROOT / "src")))
+def test_nothing_between_seed_and_bytes_depends_on_the_processor(path: Path) -> None:
+    """BLAS, the C library and numpy's SIMD loops choose their algorithms by processor."""
+    found = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.BinOp | ast.AugAssign):
+            if isinstance(node.op, ast.MatMult):
+                found.append(f"line {node.lineno}: @")
+            if isinstance(node.op, ast.Pow) and not _small_power(node):
+                found.append(f"line {node.lineno}: ** {ast.unparse(node)}")
+        if isinstance(node, ast.Attribute):
+            library = isinstance(node.value, ast.Name) and node.value.id in LIBRARIES
+            banned = ANY_ORDER | BY_LIBRARY if library else METHODS
+            if node.attr in banned and ast.unparse(node) != "math.prod":
+                found.append(f"line {node.lineno}: {ast.unparse(node)}")
+        if isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] in BY_TAILS:
+            found.append(f"line {node.lineno}: {ast.unparse(node.func)}")
+        if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("argsort"):
+            kinds = {ast.unparse(w.value) for w in node.keywords if w.arg == "kind"}
+            if not kinds & {"'stable'", "'mergesort'"}:
+                found.append(f"line {node.lineno}: argsort without kind='stable'")
+        if isinstance(node, ast.ImportFrom) and node.module in {"math", "numpy", "scipy"}:
+            found.append(f"line {node.lineno}: from {node.module} import")
+    assert not found
+
+
+def _small_power(node: ast.BinOp | ast.AugAssign) -> bool:
+    """Squares and cubes are products; powers of two literals are computed once, exactly."""
+    if isinstance(node, ast.AugAssign):
+        return False
+    if ast.unparse(node.left) == "-1":
+        return True
+    if isinstance(node.left, ast.Constant) and isinstance(node.right, ast.Constant | ast.Name):
+        return float(node.left.value) in {2.0, -1.0}
+    return isinstance(node.right, ast.Constant) and node.right.value in {2, 3}
+
+
+def test_random_numbers_come_from_seeds() -> None:
+    makers = ("default_rng", "SeedSequence", "RandomState", "random.seed", "Random")
+    found = [
+        f"{path.relative_to(ROOT)}: line {call.lineno}"
+        for path in SOURCES
+        for name, call in _calls(ast.parse(path.read_text()))
+        if name.endswith(makers) and path.name != "seeds.py"
+    ]
+    assert not found

@@ -22,10 +22,15 @@ def trial_seed(
 
     ``attempt`` counts the draws that were refused before: each has a seed of its own.
     """
+    parts = (dataset, scenario, split, index)
+    return named_seed(*parts, attempt) if attempt else named_seed(*parts)
+
+
+def named_seed(*parts: str | int) -> np.random.SeedSequence:
+    """Return the seed that these parts name, for `child_generator`."""
     import numpy as np  # here, since `stable_hash` alone serves programs that should start quickly
 
-    parts = (dataset, scenario, split, index)
-    return np.random.SeedSequence(stable_hash(*parts, attempt) if attempt else stable_hash(*parts))
+    return np.random.SeedSequence(stable_hash(*parts))
 
 
 def child_generator(seed: np.random.SeedSequence, name: str) -> np.random.Generator:
@@ -37,5 +42,12 @@ def child_generator(seed: np.random.SeedSequence, name: str) -> np.random.Genera
     import numpy as np
 
     entropy = seed.entropy
-    assert isinstance(entropy, int), "trial seeds are made by trial_seed"
+    assert isinstance(entropy, int), "seeds are made by named_seed"
     return np.random.default_rng(np.random.SeedSequence([entropy, stable_hash(name)]))
+
+
+def generator(*parts: str | int) -> np.random.Generator:
+    """Return the random stream that these parts name."""
+    import numpy as np
+
+    return np.random.default_rng(stable_hash(*parts))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from physion.rendering.assembly import rotation_matrix
+from physion.numerics.rotations import rotation_matrix
 from physion.rendering.camera import View
 from physion.rendering.rasterizer import NOTHING, SAMPLES, rasterize
 from physion.rendering.renderer import Frame, Renderer

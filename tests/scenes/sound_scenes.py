@@ -9,8 +9,9 @@ from functools import cache
 import numpy as np
 from scipy.optimize import linprog
 
+from physion.numerics.rotations import rotate_vectors
 from physion.scenes.looks import TEXTURES
-from physion.scenes.placement import on_screen, rotate, world_bounds
+from physion.scenes.placement import on_screen, world_bounds
 from physion.scenes.scene import Body, Cloth, Scene
 from physion.scenes.shapes import shape
 
@@ -35,7 +36,7 @@ def bounds(one: Body | Cloth) -> np.ndarray:
 
 def sheet(cloth: Cloth) -> np.ndarray:
     flat = [(x, y, 0.0) for x in (-0.5, 0.5) for y in (-0.5, 0.5)]
-    return rotate(cloth.rotation, np.array(flat) * cloth.size) + cloth.position
+    return rotate_vectors(cloth.rotation, np.array(flat) * cloth.size) + cloth.position
 
 
 @cache
@@ -47,7 +48,7 @@ def hulls(one: Body | Cloth) -> list[np.ndarray]:
     """World corners of all pieces, a hair smaller so that touching is not overlapping."""
     if isinstance(one, Cloth):
         return [sheet(one)]
-    corners = [rotate(one.rotation, piece * one.scale) for piece in unit_corners(one.shape)]
+    corners = [rotate_vectors(one.rotation, piece * one.scale) for piece in unit_corners(one.shape)]
     return [c.mean(axis=0) + 0.998 * (c - c.mean(axis=0)) + one.position for c in corners]
 
 

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from hypothesis.strategies import SearchStrategy
 
 from physion.errors import BadInputError, BadSceneError
+from physion.numerics.rotations import rotate_vectors
 from physion.scenes.parameters import (
     Angle,
     Axes,
@@ -40,7 +41,6 @@ from physion.scenes.parameters import (
     read_params,
     uniform,
 )
-from physion.scenes.placement import rotate
 from physion.scenes.rules import (
     BodyRule,
     PushRule,
@@ -121,9 +121,9 @@ def test_three_angles_turn_as_unity_does() -> None:
     rng = np.random.default_rng(0)
     turn = draw_turn(rng, ((90.0, 90.0), (0.0, 0.0), (90.0, 90.0)))
     # About x first, which lays z along -y, then about z, which brings that along x.
-    assert rotate(turn, (0, 0, 1)) == pytest.approx([1, 0, 0], abs=1e-12)
+    assert rotate_vectors(turn, (0, 0, 1)) == pytest.approx([1, 0, 0], abs=1e-12)
     turn = draw_turn(rng, ((90.0, 90.0), (90.0, 90.0), (0.0, 0.0)))
-    assert rotate(turn, (0, 0, 1)) == pytest.approx([1, 0, 0], abs=1e-12)
+    assert rotate_vectors(turn, (0, 0, 1)) == pytest.approx([1, 0, 0], abs=1e-12)
 
 
 @given(SEEDS, st.lists(st.sampled_from(SOLIDS), min_size=1, max_size=5))
@@ -165,7 +165,7 @@ def test_bodies_are_as_their_rule_says(
     assert body.contact.static_friction >= body.contact.dynamic_friction
     assert within(body.contact.static_friction, (static[0], max(static[1], dynamic[1])))
     raised = above_floor(body)
-    corners = rotate(raised.rotation, shape(kind).mesh.vertices * raised.scale)
+    corners = rotate_vectors(raised.rotation, shape(kind).mesh.vertices * raised.scale)
     lowest = corners[:, 2].min() + raised.position[2]
     assert lowest > -1e-9 and raised.position[:2] == body.position[:2]
     assert raised.position[2] == 0.0 or abs(lowest) < 1e-9, "no higher than needed"

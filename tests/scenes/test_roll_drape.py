@@ -15,13 +15,14 @@ import numpy as np
 import pytest
 
 from physion.errors import BadInputError, BadSceneError
+from physion.numerics.rotations import rotate_vectors
 from physion.physics.cloth import settle_solids
 from physion.physics.collision_hulls import collision_hulls
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
 from physion.scenes import drape, roll
 from physion.scenes.parameters import three_turns
-from physion.scenes.placement import on_screen, rotate, world_bounds, world_corners
+from physion.scenes.placement import on_screen, world_bounds, world_corners
 from physion.scenes.preset import Preset, load_presets, parse_presets
 from physion.scenes.rules import BodyRule
 from physion.scenes.scenarios import sample_scene
@@ -169,7 +170,7 @@ def in_ramp(points: np.ndarray, ramp: Body) -> np.ndarray:
     """Which points (K, 3) are inside a ramp: by the half-spaces of its hull's sides."""
     found = np.ones(len(points), bool)
     (hull,) = collision_hulls(ramp.shape, ramp.scale)
-    corners = rotate(ramp.rotation, hull.corners) + ramp.position
+    corners = rotate_vectors(ramp.rotation, hull.corners) + ramp.position
     middle = corners.mean(axis=0)
     for face in hull.faces:
         a, b, c = corners[face[:3]]

@@ -13,11 +13,12 @@ import pytest
 from sound_scenes import assert_seen, assert_valid, body, bounds, overlap, overlapping, thing
 
 from physion.errors import BadInputError, BadSceneError, UnknownNameError
+from physion.numerics.rotations import rotate_vectors
 from physion.scenes.collide import Params as Collide
 from physion.scenes.dominoes import Params as Dominoes
 from physion.scenes.drop import Params as Drop
 from physion.scenes.looks import RED, YELLOW, mistakable, with_role_colors
-from physion.scenes.placement import CameraRule, SceneryRule, place_camera, rotate, world_bounds
+from physion.scenes.placement import CameraRule, SceneryRule, place_camera, world_bounds
 from physion.scenes.preset import get_preset, parse_presets
 from physion.scenes.props import expand_props
 from physion.scenes.scenarios import Scenario, sample_scene, scenarios
@@ -282,7 +283,7 @@ def test_drop_turns_as_it_is_told() -> None:
     ups = []
     for index in range(300):
         scene = sample_scene("drop", trial_seed("test", "drop", "train", index), even)
-        ups.append(rotate(body(scene, "target").rotation, (0, 0, 1))[2])
+        ups.append(rotate_vectors(body(scene, "target").rotation, (0, 0, 1))[2])
     # On a ball every height is as likely; three even angles give a variance of 1/4.
     assert np.var(ups) == pytest.approx(1 / 3, abs=0.05) and abs(np.mean(ups)) < 0.1
 

@@ -161,7 +161,7 @@ def test_meshes_boxes_and_poses_belong_together(exported: Path, rigid: Trial) ->
             )
             # The renderer draws the same surface.
             mesh = shape(body.shape).mesh
-            from physion.rendering.assembly import rotation_matrix
+            from physion.numerics.rotations import rotation_matrix
 
             ours = (mesh.vertices * body.scale) @ rotation_matrix(
                 rigid.trajectory.rotations[frame, index]

@@ -20,7 +20,7 @@ from PIL import Image
 from physion.cli import import_trials as import_verb
 from physion.compute.local import SerialExecutor
 from physion.errors import BadInputError, UnknownNameError
-from physion.rendering.assembly import rotation_matrix
+from physion.numerics.rotations import rotation_matrix
 from physion.rendering.camera import View
 from physion.scenes.shapes import shape
 from physion.trials.dataset import Dataset
@@ -185,7 +185,7 @@ def test_scene_camera_labels_and_origin_come_back(dataset: Path, imported: Path)
 
 
 def test_the_dataset_is_whole(imported: Path) -> None:
-    assert verify_dataset(imported) == []
+    assert verify_dataset(imported).faults == []
     index = Dataset(imported).index
     assert index["recorded_contact"].all() and set(index["split"]) == {"testing"}
 
@@ -238,7 +238,7 @@ def test_our_own_trials_come_back_whole(dataset: Path, restored: Path) -> None:
             if what != "trial_file":  # packed anew
                 assert other.all(free=True)[what].read_bytes() == path.read_bytes(), what
     # These scenes are of no sampler, so that they cannot be drawn again.
-    assert verify_dataset(restored, again=0) == []
+    assert verify_dataset(restored, again=0).faults == []
     packed = ["trial_file_bytes", "trial_file_sha256"]
     before, after = (Dataset(d).index.drop(columns=packed) for d in (dataset, restored))
     assert after.equals(before)
@@ -269,7 +269,7 @@ def test_splits_come_back(dataset: Path, tmp_path: Path) -> None:
     back = Dataset(tmp_path / "x-in")
     assert back.index["split"].tolist() == ["readout"] and not back.trial(RIGID).metadata.movies
     same_trial(Dataset(folder).trial(RIGID), back.trial(RIGID))
-    assert verify_dataset(tmp_path / "x-in", again=0) == []
+    assert verify_dataset(tmp_path / "x-in", again=0).faults == []
 
 
 def test_without_movies_beside_they_are_made_again(
@@ -697,7 +697,7 @@ def test_core_folders_become_trials_without_motion(core: Path, dataset: Path) ->
     assert paths.free_movie.read_bytes() == ours.free_movie.read_bytes()
     assert count_frames(paths.observed_movie) == OBSERVED
     assert paths.map.read_bytes() == ours.map.read_bytes()
-    assert verify_dataset(out) == []
+    assert verify_dataset(out).faults == []
     assert len(Dataset(out).observed.frames(RIGID)) == OBSERVED
 
 
@@ -765,7 +765,7 @@ def test_official_example_movies_are_read(official: Path, tmp_path: Path) -> Non
         assert trial.metadata.frames == record["num_frames"]
         assert trial.labels.contact == record["does_target_contact_zone"]
         assert trial.labels.first_frame == record["first_target_contact_zone_frame"]
-    assert verify_dataset(tmp_path / "out") == []
+    assert verify_dataset(tmp_path / "out").faults == []
 
 
 def test_broken_movies(core: Path) -> None:

@@ -30,7 +30,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_an_untouched_dataset_has_no_fault(folder: Path) -> None:
-    assert verify_dataset(folder, again=0) == []
+    assert verify_dataset(folder, again=0).faults == []
 
 
 @pytest.mark.parametrize("name", ["trial_file", "movie", "observed_movie", "map"])
@@ -39,7 +39,7 @@ def test_one_changed_byte_in_any_file_is_found(name: str, folder: Path) -> None:
     data = bytearray(path.read_bytes())
     data[-20] ^= 1
     path.write_bytes(data)
-    faults = verify_dataset(folder, again=0)
+    faults = verify_dataset(folder, again=0).faults
     assert faults and all("b" in fault for fault in faults)
     if name != "trial_file":
         assert any(f"b: {name}_sha256 is" in fault for fault in faults)
@@ -52,7 +52,7 @@ def test_missing_unlisted_and_relabelled_trials_are_found(folder: Path) -> None:
     table = Dataset(folder).index
     table.loc[table["trial"] == "b", "contact"] = False
     write_index(folder, table)
-    faults = "\n".join(verify_dataset(folder, again=0))
+    faults = "\n".join(verify_dataset(folder, again=0).faults)
     assert "c.h5 is not in the index" in faults
     assert "a_map.png cannot be read" in faults
     assert "b: contact is True, the index says False" in faults
@@ -61,7 +61,7 @@ def test_missing_unlisted_and_relabelled_trials_are_found(folder: Path) -> None:
 def test_movies_of_a_wrong_length_are_found(folder: Path) -> None:
     paths = Dataset(folder).paths("a")
     paths.observed_movie.write_bytes(encode_movie(read_frames(paths.movie, count=50)))
-    assert any("has 50 frames, not 45" in fault for fault in verify_dataset(folder, again=0))
+    assert any("has 50 frames, not 45" in fault for fault in verify_dataset(folder, again=0).faults)
 
 
 def test_simulating_again_finds_another_motion(folder: Path, tmp_path: Path) -> None:
@@ -71,12 +71,14 @@ def test_simulating_again_finds_another_motion(folder: Path, tmp_path: Path) -> 
     from physion.trials.index import build_index
 
     write_index(tmp_path / "r", build_index(tmp_path / "r")[0])
-    assert verify_dataset(tmp_path / "r", again=-1) == []
+    assert verify_dataset(tmp_path / "r", again=-1).faults == []
     parts = make_parts("a")
     lie = dataclasses.replace(parts.metadata, digest="0" * 64)
     paths = Dataset(folder).paths("a")
     paths.trial_file.write_bytes(parts._replace(metadata=lie).pack())
-    assert any("does not fit its digest" in fault for fault in verify_dataset(folder, again=0))
+    assert any(
+        "does not fit its digest" in fault for fault in verify_dataset(folder, again=0).faults
+    )
 
 
 def test_a_folder_without_index_is_refused(tmp_path: Path) -> None:
@@ -92,7 +94,7 @@ def test_a_label_that_the_contacts_contradict_is_found(folder: Path) -> None:
     paths.trial_file.write_bytes(parts._replace(labels=wrong).pack())
     table, _ = build_index(folder)
     write_index(folder, table)
-    assert any("labels/contact" in fault for fault in verify_dataset(folder, again=0))
+    assert any("labels/contact" in fault for fault in verify_dataset(folder, again=0).faults)
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +108,7 @@ def sampled(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_sampled_dataset_comes_out_the_same_again(sampled: Path) -> None:
-    assert verify_dataset(sampled, again=-1) == []
+    assert verify_dataset(sampled, again=-1).faults == []
 
 
 @pytest.mark.parametrize(
@@ -128,7 +130,7 @@ def test_one_changed_byte_beside_the_trials_is_found(
         changed[place] ^= 1
         (folder / name).write_bytes(changed)
         try:
-            faults = verify_dataset(folder, again=0)
+            faults = verify_dataset(folder, again=0).faults
         except BadInputError as error:
             faults = [str(error)]
         assert any(says in fault or name in fault for fault in faults), place
@@ -143,7 +145,7 @@ def test_strangers_and_trials_of_other_splits_are_named(sampled: Path, tmp_path:
     index["contact"] = ~index["contact"]
     index["scene_digest"] = "0" * 64
     write_index(folder, index)
-    faults = "\n".join(verify_dataset(folder, again=0))
+    faults = "\n".join(verify_dataset(folder, again=0).faults)
     assert "stray_img.mp4 belongs to no trial" in faults
     assert "its physics belongs to training" in faults
     assert "the balance of its split wants the other" in faults
@@ -162,4 +164,4 @@ def test_a_trial_made_again_is_indexed_again(sampled: Path, tmp_path: Path) -> N
     tasks = plan_dataset("verify", ["collide"], {"testing": 2}, {"collide": ["default"]})
     settings = Settings(width=64, height=64, jitters=2, passes=("depth", "flow"))
     report = generate(folder, tasks, settings, executor=SerialExecutor())
-    assert len(report.made) == 1 and verify_dataset(folder, again=0) == []
+    assert len(report.made) == 1 and verify_dataset(folder, again=0).faults == []

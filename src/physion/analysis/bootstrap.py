@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from physion.errors import BadInputError
-from physion.seeds import stable_hash
+from physion.seeds import generator
 
 Array = npt.NDArray[np.float64]
 
@@ -56,8 +56,8 @@ class Bootstrap:
 
 @lru_cache(maxsize=64)
 def _weights(resamples: int, seed: int, stratum: str, n: int) -> Array:
-    generator = np.random.default_rng(stable_hash("bootstrap", seed, stratum, n))
-    drawn = generator.integers(0, n, size=(resamples, n)) if n else np.zeros((resamples, 0), int)
+    rng = generator("bootstrap", seed, stratum, n)
+    drawn = rng.integers(0, n, size=(resamples, n)) if n else np.zeros((resamples, 0), int)
     rows = np.arange(resamples)[:, None] * n
     counts = np.bincount((drawn + rows).ravel(), minlength=resamples * n)
     weights = counts.reshape(resamples, n).astype(np.float64)

@@ -20,7 +20,7 @@ from physion.analysis.participants import Responses
 from physion.analysis.session_measures import longest_streak, session_measures
 from physion.analysis.tables import in_order
 from physion.errors import BadInputError
-from physion.seeds import stable_hash
+from physion.seeds import generator
 
 RULES = (
     "streak",
@@ -97,8 +97,8 @@ def streak_limit(
     while 96.6 % do not exceed 11). The thousand simulations of the released code gave 11 or 13 now
     and then; ten thousand do not.
     """
-    generator = np.random.default_rng(stable_hash("streak", seed, trials, simulations))
-    answers = generator.random((simulations, trials)) < p_yes
+    rng = generator("streak", seed, trials, simulations)
+    answers = rng.random((simulations, trials)) < p_yes
     return float(np.percentile([longest_streak(row) for row in answers], percentile))
 
 

@@ -14,7 +14,7 @@ import pandas as pd
 
 from physion.analysis.stimuli import SCENARIOS
 from physion.errors import BadInputError
-from physion.seeds import child_generator, stable_hash
+from physion.seeds import child_generator, named_seed
 
 Array = npt.NDArray[np.float64]
 
@@ -55,7 +55,7 @@ def simulate_answers(design: AnswerDesign, seed: int = 0) -> pd.DataFrame:
     of the participant and the stimulus. A function of the design and the seed.
     """
     trials = _trials(design)
-    draw = child_generator(np.random.SeedSequence(stable_hash("answers", seed)), "effects")
+    draw = child_generator(named_seed("answers", seed), "effects")
     scenario, participant, stimulus = (trials[name].to_numpy() for name in _CODES)
     people = draw.normal(0, 1, participant.max() + 1)
     stimuli = draw.normal(0, 1, stimulus.max() + 1)

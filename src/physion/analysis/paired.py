@@ -16,7 +16,7 @@ from physion.analysis.agreement import pearson
 from physion.analysis.bootstrap import Bootstrap
 from physion.analysis.correlation import correlate_resampled, from_sums
 from physion.errors import BadInputError
-from physion.seeds import stable_hash
+from physion.seeds import generator
 
 Array = npt.NDArray[np.float64]
 
@@ -85,8 +85,8 @@ def r_permutation_p(
 @lru_cache(maxsize=2)
 def _coins(permutations: int, n: int, seed: int) -> Array:
     """0 or 1 for each permutation and stimulus; kept, since all pairs of models toss the same."""
-    generator = np.random.default_rng(stable_hash("swap", seed, n))
-    coins = (generator.random((permutations, n)) < 0.5).astype(np.float64)
+    rng = generator("swap", seed, n)
+    coins = (rng.random((permutations, n)) < 0.5).astype(np.float64)
     coins.flags.writeable = False
     return coins
 

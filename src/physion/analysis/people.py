@@ -25,7 +25,7 @@ from physion.analysis.kappa import (
 )
 from physion.analysis.tables import MEAN, in_order
 from physion.errors import BadInputError
-from physion.seeds import stable_hash
+from physion.seeds import generator
 
 Array = npt.NDArray[np.float64]
 
@@ -211,8 +211,8 @@ def split_halves(yes: Array, halves: int = HALVES, seed: int = 0) -> Array:
     n = len(yes)
     if n < 2:
         return np.empty(0)
-    generator = np.random.default_rng(stable_hash("halves", seed, n))
-    order = generator.permuted(np.tile(np.arange(n), (halves, 1)), axis=1)
+    rng = generator("halves", seed, n)
+    order = rng.permuted(np.tile(np.arange(n), (halves, 1)), axis=1)
     first = (order < n // 2).astype(np.float64)
     return correlate_rows(share(yes, first), share(yes, 1 - first))
 

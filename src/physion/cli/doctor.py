@@ -35,6 +35,8 @@ class Options:
 
     folder: Path = Path()
     """Where trials would be written."""
+    reproduce: bool = False
+    """Also make a known trial of each scenario and compare its bytes with those of this version."""
     json: bool = False
     """Print one JSON object instead of lines."""
 
@@ -53,6 +55,8 @@ class Check:
 def main(options: Options) -> int:
     """Print the checks; 1 if something that the core needs is missing."""
     checks = [*machine(), *core(), *extras(), gpu(), codec(), writable(options.folder)]
+    if options.reproduce:
+        checks += reproduction()
     if options.json:
         print(json_module.dumps([asdict(check) for check in checks], indent=1))
     else:
@@ -135,6 +139,20 @@ def codec() -> Check:
     except Exception as error:  # PyAV raises its own kinds, and ImportError without its library
         return Check("codec", f"H.264: {error}", False, remedy="pip install --force-reinstall av")
     return Check("codec", f"H.264 through PyAV {av.__version__}")
+
+
+def reproduction() -> list[Check]:
+    """Whether trials made on this machine have the bytes that this version promises."""
+    from physion.golden import golden_digests
+    from physion.trials.reproduce import differences
+
+    checks = []
+    for scenario in sorted(golden_digests()):
+        parts = differences(scenario)
+        value = f"other bytes: {', '.join(parts)}" if parts else "the same bytes"
+        remedy = "pip install -c requirements.lock -e ." if parts else ""
+        checks.append(Check(f"bytes of {scenario}", value, not parts, remedy=remedy))
+    return checks
 
 
 def writable(folder: Path) -> Check:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json as json_module
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -22,16 +22,19 @@ class Options:
     again: int = SAMPLE
     """Trials to simulate and render again and compare to the bit; -1 takes all."""
     json: bool = False
-    """Print the faults as one JSON list."""
+    """Print one JSON object: faults, and differences from trials of another version."""
 
 
 def main(options: Options) -> int:
-    """Print the faults; 1 if there is one."""
-    faults = verify_dataset(options.folder, again=options.again, track=track)
+    """Print faults and notes; return 1 if there is a fault."""
+    result = verify_dataset(options.folder, again=options.again, track=track)
     if options.json:
-        print(json_module.dumps(faults, indent=1))
-        return 1 if faults else 0
-    for fault in faults:
-        console.print(fault, markup=False, soft_wrap=True)
-    console.print(f"{options.folder}: {len(faults)} faults", markup=False, soft_wrap=True)
-    return 1 if faults else 0
+        print(json_module.dumps(asdict(result), indent=1))
+        return 1 if result.faults else 0
+    for line in (*result.other_versions, *result.faults):
+        console.print(line, markup=False, soft_wrap=True)
+    others = result.other_versions
+    differ = f", {len(others)} differences from another version" if others else ""
+    line = f"{options.folder}: {len(result.faults)} faults{differ}"
+    console.print(line, markup=False, soft_wrap=True)
+    return 1 if result.faults else 0

@@ -22,7 +22,7 @@ from physion.experiment.init_trials import Choice, check_even
 from physion.experiment.media import Source
 from physion.experiment.plain_files import read_plain
 from physion.experiment.stimuli import is_name
-from physion.seeds import stable_hash
+from physion.seeds import generator
 from physion.trials.official_layout import FOLDERS, plain_name
 
 MAX_LIST_BYTES = 50_000_000
@@ -164,7 +164,7 @@ def _chosen(
             f"{path} has {len(kinds[0])} stimuli with and {len(kinds[1])} without contact, not "
             f"{count // 2} of each"
         )
-    draws = np.random.default_rng(stable_hash("study list", seed, scenario))
+    draws = generator("study list", seed, scenario)
     kept = {row for kind in kinds for row in _some(kind, count // 2, draws)}
     return [row for row in rows if row in kept]
 

@@ -11,13 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import pandas as pd
 
 from physion.analysis.stimuli import SCENARIOS
 from physion.errors import BadInputError, UnknownNameError
 from physion.experiment.media import Source
-from physion.seeds import stable_hash
+from physion.seeds import generator
 from physion.trials.dataset import Dataset
 from physion.trials.layout import TrialPaths
 
@@ -117,7 +116,7 @@ def _draw(
         )
     # Each kind has a stream of its own, so that more trials of the one do not redraw the other.
     chosen = pd.concat([_sample(kind, half, scenario, phase, seed) for kind in kinds])
-    order = np.random.default_rng(stable_hash("study places", seed, scenario, phase))
+    order = generator("study places", seed, scenario, phase)
     rows = chosen.iloc[order.permutation(len(chosen))].to_dict("records")
     note = ""
     if 2 * half < count:
@@ -127,7 +126,7 @@ def _draw(
 
 def _sample(kind: pd.DataFrame, half: int, scenario: str, phase: str, seed: int) -> pd.DataFrame:
     contact = str(bool(kind["contact"].iloc[0]))
-    draws = np.random.default_rng(stable_hash("study trials", seed, scenario, phase, contact))
+    draws = generator("study trials", seed, scenario, phase, contact)
     return kind.iloc[draws.permutation(len(kind))[:half]]
 
 

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from physion.experiment.stimuli import Stimulus
-from physion.seeds import stable_hash
+from physion.seeds import generator
 
 ABILITY = (1.2, 0.35)
 """Mean and standard deviation over people, in log odds of a correct answer."""
@@ -48,12 +48,12 @@ class SimulatedPerson:
     number: int
 
     def _draws(self, *what: str | int) -> np.random.Generator:
-        return np.random.default_rng(stable_hash("simulated", self.seed, self.number, *what))
+        return generator("simulated", self.seed, self.number, *what)
 
     def chance(self, stimulus: Stimulus) -> float:
         """Probability of a correct answer, before any leaning."""
         ability = self._draws("ability").normal(*ABILITY)
-        hard = np.random.default_rng(stable_hash("easiness", stimulus.stimulus))
+        hard = generator("easiness", stimulus.stimulus)
         return float(_logistic(ability + hard.normal(0, EASINESS_SD)))
 
     def predict(self, stimulus: Stimulus) -> Prediction:

@@ -56,16 +56,18 @@ ARCTAN_EIGHTHS = np.array(
 """Arc tangents of 0/8, 1/8, ..., 8/8."""
 
 
-
-SINE = tuple((-1.0) ** k / math.factorial(2 * k + 1) for k in range(8, 0, -1))
+SINE = tuple((-1) ** k / math.factorial(2 * k + 1) for k in range(8, 0, -1))
 """Coefficients of x^17, x^15, ..., x^3 of the sine; the term left out is below 1e-19."""
-COSINE = tuple((-1.0) ** k / math.factorial(2 * k) for k in range(9, 1, -1))
+COSINE = tuple((-1) ** k / math.factorial(2 * k) for k in range(9, 1, -1))
 """Coefficients of x^18, x^16, ..., x^4 of the cosine."""
 EXPONENTIAL = tuple(1.0 / math.factorial(k) for k in range(14, 1, -1))
 """Coefficients of x^14, x^13, ..., x^2 of the exponential."""
 LOGARITHM = tuple(1.0 / (2 * k + 1) for k in range(11, 0, -1))
 """Coefficients of s^22, s^20, ..., s^2 of log((1 + s) / (1 - s)) / (2 s)."""
-ARCTANGENT = tuple((-1.0) ** k / (2 * k + 1) for k in range(7, 0, -1))
+COARSE_LOGARITHM = (-0.04514903, 0.14842661, -0.26717939, 0.44191704)
+"""Coefficients of t^3, ..., 1 of (log2(1 + t) - t) / (t (1 - t)) for 0 <= t <= 1: such that the
+largest error of log2(1 + t) is least."""
+ARCTANGENT = tuple((-1) ** k / (2 * k + 1) for k in range(7, 0, -1))
 """Coefficients of t^15, t^13, ..., t^3 of the arc tangent."""
 
 
@@ -154,7 +156,7 @@ def arctan_of(x: float) -> float:
     angle = ARCTAN_EIGHTHS[eighth] + (t + t * z * _horner(ARCTANGENT, z))
     if inverted:
         angle = HALF_PI_HIGH - (angle - HALF_PI_LOW)
-    return -angle if x < 0.0 else angle
+    return float(-angle if x < 0.0 else angle)
 
 
 @kernel
@@ -204,7 +206,8 @@ def exp_of(x: float) -> float:
     value = 1.0 + (r + (r * r * _horner(EXPONENTIAL, r) + tail))
     # In two steps, since 2^k itself may overflow where the result does not.
     half = int(k) // 2
-    return value * POWERS_OF_2[half + POWERS_BELOW] * POWERS_OF_2[int(k) - half + POWERS_BELOW]
+    first = POWERS_OF_2[half + POWERS_BELOW]
+    return float(value * first * POWERS_OF_2[int(k) - half + POWERS_BELOW])
 
 
 @kernel
@@ -231,9 +234,14 @@ def log_of(x: float) -> float:
 
 
 @kernel
-def log2_of(x: float) -> float:
-    """The logarithm to base 2."""
-    return log_of(x) * LOG2_E
+def coarse_log2_of(x: float) -> float:
+    """The logarithm to base 2 of a positive number, cheaper than `log_of` but only to 2e-5.
+
+    It is exact at powers of 2, and continuous.
+    """
+    m, e = math.frexp(x)
+    t = 2.0 * m - 1.0
+    return (e - 1) + (t + t * (1.0 - t) * _horner(COARSE_LOGARITHM, t))
 
 
 @kernel

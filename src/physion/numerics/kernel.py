@@ -33,7 +33,9 @@ def kernel(function: Function) -> Function:
     return cast(Function, dispatcher)
 
 
-def _files_called(function: Callable[..., Any], seen: frozenset[str] = frozenset()) -> Iterator[str]:
+def _files_called(
+    function: Callable[..., Any], seen: frozenset[str] = frozenset()
+) -> Iterator[str]:
     """Files of all compiled functions that ``function`` calls, directly or through others."""
     for name in function.__code__.co_names:
         called = function.__globals__.get(name)

@@ -14,14 +14,23 @@ from numpy.typing import ArrayLike, NDArray
 from physion.numerics.kernel import kernel
 
 F64 = NDArray[np.float64]
+SHORT = 8
+"""Entries up to which a loop over them is faster than running sums."""
 
 
 def ordered_sum(values: ArrayLike, axis: int = -1) -> F64:
     """Return the sum along ``axis``, added one after the other; 0 along an axis without entries."""
     array = np.asarray(values, np.float64)
-    if array.shape[axis] == 0:
+    count = array.shape[axis]
+    if count == 0:
         return np.zeros(np.delete(array.shape, axis))
-    return np.asarray(np.add.accumulate(array, axis=axis).take(-1, axis=axis))
+    if count > SHORT:
+        return np.asarray(np.add.accumulate(array, axis=axis).take(-1, axis=axis))
+    entries = np.moveaxis(array, axis, 0)  # the same order, and faster on a short axis
+    total = entries[0]
+    for k in range(1, count):
+        total = total + entries[k]
+    return np.array(total)
 
 
 def ordered_mean(values: ArrayLike, axis: int = -1) -> F64:

@@ -22,7 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.errors import BadInputError
-from physion.physics.cloth_sheet import rotate, sheet_springs, sheet_vertices
+from physion.numerics.linear_algebra import unit
+from physion.numerics.rotations import rotate_vectors
+from physion.physics.cloth_sheet import sheet_springs, sheet_vertices
 from physion.physics.cloth_solids import fill_bodies, particles_of, surface_particles
 from physion.physics.cloth_solver import Record, Rules, Solids, run_cloth
 from physion.physics.trajectory import ENVIRONMENT, Contacts, Floats, State, Trajectory
@@ -150,7 +152,7 @@ def settle_solids(scene: Scene, settings: ClothSettings | None = None) -> Scene:
 def _stand(body: Body, floor: float, settings: ClothSettings) -> Body:
     if body.scenery or not body.kinematic:
         return body
-    particles = rotate(body.rotation, particles_of(body, settings.particle_spacing))
+    particles = rotate_vectors(unit(body.rotation), particles_of(body, settings.particle_spacing))
     x, y, _ = body.position
     height = floor + settings.floor_gap - float(particles[:, 2].min())
     return replace(body, position=(x, y, height))

@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.errors import BadInputError
+from physion.numerics.linear_algebra import norm, unit
+from physion.numerics.rotations import rotate_vectors
 from physion.physics.cloth_solver import Springs
-from physion.scenes.scene import Cloth, Quat
+from physion.scenes.scene import Cloth
 
 Points = NDArray[np.float64]
 Indices = NDArray[np.int32]
@@ -25,13 +27,7 @@ def sheet_vertices(cloth: Cloth) -> Points:
     along_x, along_y = (np.linspace(-s / 2, s / 2, cloth.resolution) for s in cloth.size[:2])
     x, y = np.meshgrid(along_x, along_y, indexing="ij")
     flat = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
-    return np.asarray(rotate(cloth.rotation, flat) + np.asarray(cloth.position))
-
-
-def rotate(rotation: Quat, points: Points) -> Points:
-    """Turn ``points`` (P, 3) by a quaternion (w, x, y, z) of any length."""
-    w, *axis = np.asarray(rotation) / np.linalg.norm(rotation)
-    return np.asarray(points + 2 * np.cross(axis, np.cross(axis, points) + w * points))
+    return np.asarray(rotate_vectors(unit(cloth.rotation), flat) + np.asarray(cloth.position))
 
 
 @lru_cache(maxsize=8)
@@ -59,7 +55,7 @@ def sheet_springs(cloth: Cloth) -> Springs:
     edges, across = _spring_pairs(cloth.resolution)
     ends = np.concatenate([edges, across]) if cloth.bend > 0 else edges
     vertices = sheet_vertices(cloth)
-    lengths = np.linalg.norm(vertices[ends[:, 0]] - vertices[ends[:, 1]], axis=1)
+    lengths = norm(vertices[ends[:, 0]] - vertices[ends[:, 1]])
     stiffness = np.full(len(ends), cloth.stretch)
     stiffness[len(edges) :] = cloth.bend
     return Springs(ends.astype(np.int64), lengths, stiffness)

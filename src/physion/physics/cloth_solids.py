@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from physion.numerics.linear_algebra import dot, multiply, norm
 from physion.physics.cloth_solver import Solids
 from physion.scenes.scene import Body, Vec3
 from physion.scenes.shapes import Piece, shape
@@ -36,7 +37,7 @@ def fill_shape(name: str, scale: Vec3, spacing: float) -> tuple[Points, Filled]:
     for piece in found.pieces:
         filled |= _inside(piece, grid / np.asarray(scale))
     if not filled.any():
-        filled[np.argmin(((grid - (low + high) / 2) ** 2).sum(axis=1))] = True
+        filled[np.argmin(norm(grid - (low + high) / 2))] = True
     return origin, filled.reshape(tuple(int(n) for n in sizes))
 
 
@@ -44,13 +45,13 @@ def _inside(piece: Piece, points: Points) -> Filled:
     """Which ``points`` (P, 3) of the shape's frame at unit scale lie in a convex piece."""
     if piece.kind == "convex":
         planes = ConvexHull(piece.vertices).equations
-        return np.asarray((points @ planes[:, :3].T + planes[:, 3] <= 1e-9).all(axis=1))
-    local = (points - np.asarray(piece.center)) @ piece.turn / np.asarray(piece.half)
+        return np.asarray((multiply(points, planes[:, :3].T) + planes[:, 3] <= 1e-9).all(axis=1))
+    local = multiply(points - np.asarray(piece.center), piece.turn) / np.asarray(piece.half)
     if piece.kind == "box":
         return np.asarray((np.abs(local) <= 1 + 1e-9).all(axis=1))
     if piece.kind == "sphere":
-        return np.asarray((local**2).sum(axis=1) <= 1 + 1e-9)
-    round_ = (local[:, :2] ** 2).sum(axis=1) <= 1 + 1e-9
+        return np.asarray(dot(local, local) <= 1 + 1e-9)
+    round_ = dot(local[:, :2], local[:, :2]) <= 1 + 1e-9
     return np.asarray(round_ & (np.abs(local[:, 2]) <= 1 + 1e-9))
 
 

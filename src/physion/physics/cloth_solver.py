@@ -8,8 +8,10 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from physion.numerics.kernel import kernel
+from physion.numerics.rotations import rotation_matrix
 
 Array = NDArray[Any]
 
@@ -94,23 +96,7 @@ class Record(NamedTuple):
     pushed: Array
 
 
-@njit(cache=True)
-def rotation_matrix(q: Array, out: Array) -> None:
-    """Fill ``out`` (3, 3) from the quaternion ``q`` (w, x, y, z), which is normalised first."""
-    length = np.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-    w, x, y, z = q[0] / length, q[1] / length, q[2] / length, q[3] / length
-    out[0, 0] = 1 - 2 * (y * y + z * z)
-    out[0, 1] = 2 * (x * y - w * z)
-    out[0, 2] = 2 * (x * z + w * y)
-    out[1, 0] = 2 * (x * y + w * z)
-    out[1, 1] = 1 - 2 * (x * x + z * z)
-    out[1, 2] = 2 * (y * z - w * x)
-    out[2, 0] = 2 * (x * z - w * y)
-    out[2, 1] = 2 * (y * z + w * x)
-    out[2, 2] = 1 - 2 * (x * x + y * y)
-
-
-@njit(cache=True)
+@kernel
 def pose_between(positions: Array, rotations: Array, frame: int, share: float, out: Poses) -> None:
     """Fill ``out`` with the poses a ``share`` of the way from the frame before ``frame`` to it.
 
@@ -123,13 +109,16 @@ def pose_between(positions: Array, rotations: Array, frame: int, share: float, o
         sign = 1.0 if dot >= 0 else -1.0
         for k in range(4):
             mixed[k] = (1 - share) * old[k] + share * sign * new[k]
-        rotation_matrix(mixed, out.turn[body])
+        length = np.sqrt(mixed[0] ** 2 + mixed[1] ** 2 + mixed[2] ** 2 + mixed[3] ** 2)
+        for k in range(4):
+            mixed[k] /= length
+        out.turn[body] = rotation_matrix(mixed)
         for k in range(3):
             out.place[body, k] = (1 - share) * positions[frame - 1, body, k]
             out.place[body, k] += share * positions[frame, body, k]
 
 
-@njit(cache=True)
+@kernel
 def to_local(point: Array, place: Array, turn: Array, out: Array) -> None:
     """Fill ``out`` (3,) with a world point as seen in the frame of a body."""
     for k in range(3):
@@ -138,7 +127,7 @@ def to_local(point: Array, place: Array, turn: Array, out: Array) -> None:
             out[k] += turn[j, k] * (point[j] - place[j])
 
 
-@njit(cache=True)
+@kernel
 def find_neighbours(
     points: Array, reach: float, solids: Solids, poses: Poses, old: Poses, near: Near
 ) -> None:
@@ -178,7 +167,7 @@ def find_neighbours(
                             _add_neighbour(v, body, spot, poses, old, near)
 
 
-@njit(cache=True)
+@kernel
 def _add_neighbour(v: int, body: int, spot: Array, poses: Poses, old: Poses, near: Near) -> None:
     found = near.counts[v]
     if found == near.owner.shape[1]:
@@ -194,7 +183,7 @@ def _add_neighbour(v: int, body: int, spot: Array, poses: Poses, old: Poses, nea
         near.moved[v, found, m] = now - then
 
 
-@njit(cache=True)
+@kernel
 def push_out(
     points: Array,
     start: Array,
@@ -240,7 +229,7 @@ def push_out(
             shares[v] += 1
 
 
-@njit(cache=True)
+@kernel
 def add_load(points: Array, near: Near, rules: Rules, shares: Array, pushed: Array) -> None:
     """Add to ``pushed`` (N + 1,) how far each body and, last, the floor are about to push points.
 
@@ -259,7 +248,7 @@ def add_load(points: Array, near: Near, rules: Rules, shares: Array, pushed: Arr
             pushed[-1] += depth / shares[v]
 
 
-@njit(cache=True)
+@kernel
 def pull_springs(points: Array, springs: Springs, shift: Array, shares: Array) -> None:
     """Add to ``shift`` what brings each spring back to its length, scaled by its stiffness."""
     for s in range(len(springs.ends)):
@@ -281,7 +270,7 @@ def pull_springs(points: Array, springs: Springs, shift: Array, shares: Array) -
         shares[b] += 1
 
 
-@njit(cache=True)
+@kernel
 def apply_average(points: Array, shift: Array, shares: Array) -> None:
     """Move every point by the mean of its corrections and clear them."""
     for v in range(len(points)):
@@ -292,7 +281,7 @@ def apply_average(points: Array, shift: Array, shares: Array) -> None:
             shares[v] = 0.0
 
 
-@njit(cache=True)
+@kernel
 def keep_closest(points: Array, near: Near, rules: Rules, gap: Array, contact: Array) -> None:
     """Note in ``gap`` (N + 1,) the smallest gap to each body and, last, to the floor, in metres.
 
@@ -318,7 +307,7 @@ def keep_closest(points: Array, near: Near, rules: Rules, gap: Array, contact: A
                 contact[-1, 1, k] = 0.0 if k < 2 else 1.0
 
 
-@njit(cache=True)
+@kernel
 def smallest_distance(points: Array, particles: Array, place: Array, turn: Array) -> float:
     """Smallest distance in metres between ``points`` (V, 3) and the particles of one body.
 
@@ -335,7 +324,7 @@ def smallest_distance(points: Array, particles: Array, place: Array, turn: Array
     return float(np.sqrt(smallest))
 
 
-@njit(cache=True)
+@kernel
 def run_cloth(
     points: Array,
     velocities: Array,

@@ -6,7 +6,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.physics.contact_solver import ContactSet, rotation_matrices
+from physion.numerics.rotations import rotation_matrices
+from physion.physics.contact_solver import ContactSet
 from physion.physics.manifold import collect_contacts
 from physion.physics.rigid_model import RigidModel
 from physion.physics.settings import Settings

@@ -30,7 +30,7 @@ class ContactRecord:
         touch = (load > 0.0) | (contacts.separation <= TOUCH_GAP)
         if not touch.any():
             return
-        self._frames.append(np.full(int(touch.sum()), frame))
+        self._frames.append(np.full(np.count_nonzero(touch), frame))
         self._pairs.append(pairs[touch])
         self._rows.append(
             np.column_stack([contacts.point, contacts.normal, load, contacts.separation])[touch]
@@ -65,5 +65,13 @@ class ContactRecord:
             bodies=pair[first].astype(np.int32),
             point=row[first, 0:3].astype(np.float32),
             normal=row[first, 3:6].astype(np.float32),
-            impulse=np.add.reduceat(row[:, 6], first).astype(np.float32),
+            impulse=_sums(row[:, 6], first).astype(np.float32),
         )
+
+
+def _sums(values: NDArray[np.float64], starts: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Sums of the values from each start to the next, added in order."""
+    total = np.zeros(len(starts))
+    group = np.cumsum(np.isin(np.arange(len(values)), starts)) - 1
+    np.add.at(total, group, values)
+    return total

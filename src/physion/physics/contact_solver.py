@@ -20,8 +20,11 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from physion.numerics.elementary import cos_of, sin_of
+from physion.numerics.kernel import kernel
+from physion.numerics.rotations import rotation_matrix
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -73,51 +76,36 @@ def no_anchors() -> AnchorMemory:
     )
 
 
-@njit(cache=True)
-def rotation_matrix(q: Any) -> Any:
-    """Rotation matrix (3, 3) of a unit quaternion (w, x, y, z)."""
-    w, x, y, z = q[0], q[1], q[2], q[3]
-    m = np.empty((3, 3))
-    m[0, 0] = 1 - 2 * (y * y + z * z)
-    m[0, 1] = 2 * (x * y - w * z)
-    m[0, 2] = 2 * (x * z + w * y)
-    m[1, 0] = 2 * (x * y + w * z)
-    m[1, 1] = 1 - 2 * (x * x + z * z)
-    m[1, 2] = 2 * (y * z - w * x)
-    m[2, 0] = 2 * (x * z - w * y)
-    m[2, 1] = 2 * (y * z + w * x)
-    m[2, 2] = 1 - 2 * (x * x + y * y)
-    return m
-
-
-@njit(cache=True)
-def rotation_matrices(q: Any) -> Any:
-    """Rotation matrices (B, 3, 3) of unit quaternions (B, 4)."""
-    turns = np.empty((len(q), 3, 3))
-    for b in range(len(q)):
-        turns[b] = rotation_matrix(q[b])
-    return turns
-
-
-@njit(cache=True)
+@kernel
 def _to_world(rot: Any, x: Any, local: Any, out: Any) -> None:
     for i in range(3):
         out[i] = x[i] + rot[i, 0] * local[0] + rot[i, 1] * local[1] + rot[i, 2] * local[2]
 
 
-@njit(cache=True)
+@kernel
 def _to_local(rot: Any, x: Any, world: Any, out: Any) -> None:
     a, b, c = world[0] - x[0], world[1] - x[1], world[2] - x[2]
     for i in range(3):
         out[i] = rot[0, i] * a + rot[1, i] * b + rot[2, i] * c
 
 
-@njit(cache=True)
+@kernel
+def _to_world_axes(rot: Any, local: Any, out: Any) -> None:
+    """Fill ``out`` with R L R^T: a matrix (3, 3) of the body's frame in the axes of the world."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = 0.0
+            for k in range(3):
+                along = rot[i, 0] * local[0, k] + rot[i, 1] * local[1, k] + rot[i, 2] * local[2, k]
+                out[i, j] += along * rot[j, k]
+
+
+@kernel
 def _squared_distance(a: Any, b: Any) -> Any:
     return (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2
 
 
-@njit(cache=True)
+@kernel
 def _fill_row(
     row: Any, a: int, b: int, ra: Any, rb: Any, d: Any, inv_mass: Any, inv_inertia: Any
 ) -> Any:
@@ -141,7 +129,7 @@ def _fill_row(
     return response
 
 
-@njit(cache=True)
+@kernel
 def _speed(row: Any, a: int, b: int, v: Any, w: Any) -> Any:
     s = 0.0
     for i in range(3):
@@ -150,7 +138,7 @@ def _speed(row: Any, a: int, b: int, v: Any, w: Any) -> Any:
     return s
 
 
-@njit(cache=True)
+@kernel
 def _push(row: Any, a: int, b: int, impulse: float, v: Any, w: Any, inv_mass: Any) -> None:
     for i in range(3):
         v[a, i] -= row[DIRECTION + i] * impulse * inv_mass[a]
@@ -159,7 +147,7 @@ def _push(row: Any, a: int, b: int, impulse: float, v: Any, w: Any, inv_mass: An
         w[b, i] += row[TURN_B + i] * impulse
 
 
-@njit(cache=True)
+@kernel
 def _tangent(normal: Any, relative: Any, out: Any) -> None:
     """First friction direction: along the slip of the centres, or an axis when there is little."""
     along = normal[0] * relative[0] + normal[1] * relative[1] + normal[2] * relative[2]
@@ -178,7 +166,7 @@ def _tangent(normal: Any, relative: Any, out: Any) -> None:
         out[i] *= scale
 
 
-@njit(cache=True)
+@kernel
 def find_patches(
     contacts: Any, memory: Any, x: Any, rot: Any, patch_cosine: float, anchor_distance: float
 ) -> Any:
@@ -249,7 +237,7 @@ def find_patches(
     return first[:used], bodies[:used], normals[:used], count[:used], anchors[:used], patch_of
 
 
-@njit(cache=True)
+@kernel
 def place_anchors(
     contacts: Any,
     patch_of: Any,
@@ -311,7 +299,7 @@ def place_anchors(
     count[patch] = have
 
 
-@njit(cache=True)
+@kernel
 def normal_rows(
     contacts: Any,
     x: Any,
@@ -347,7 +335,7 @@ def normal_rows(
     return rows
 
 
-@njit(cache=True)
+@kernel
 def friction_rows(
     bodies: Any,
     normals: Any,
@@ -388,7 +376,7 @@ def friction_rows(
     return rows
 
 
-@njit(cache=True)
+@kernel
 def solving_order(key: Any, bodies: Any, still: int) -> Any:
     """The order of patches: pairs of moving bodies first, what rests on still things last.
 
@@ -429,7 +417,7 @@ def solving_order(key: Any, bodies: Any, still: int) -> Any:
     return np.argsort(rounds, kind="mergesort")
 
 
-@njit(cache=True)
+@kernel
 def _sweep(
     order: Any,
     starts: Any,
@@ -481,7 +469,7 @@ def _sweep(
         slipped[p] = broken
 
 
-@njit(cache=True)
+@kernel
 def solve_step(
     contacts: Any,
     memory: Any,
@@ -514,7 +502,7 @@ def solve_step(
     inv_inertia = np.zeros((still + 1, 3, 3))
     for i in range(still + 1):
         rot[i] = rotation_matrix(q[i])
-        inv_inertia[i] = rot[i] @ inv_inertia_body[i] @ rot[i].T
+        _to_world_axes(rot[i], inv_inertia_body[i], inv_inertia[i])
     first, bodies, normals, count, anchors, patch_of = find_patches(
         contacts, memory, x, rot, patch_cosine, anchor_distance
     )
@@ -577,7 +565,7 @@ def solve_step(
     return move_v, move_w, load, key[holds], count[holds], local, anchors[holds]
 
 
-@njit(cache=True)
+@kernel
 def move_poses(x: Any, q: Any, v: Any, w: Any, dt: float) -> None:
     """Move centres of mass and turn orientations by constant velocities over a step."""
     for i in range(len(x) - 1):
@@ -587,7 +575,7 @@ def move_poses(x: Any, q: Any, v: Any, w: Any, dt: float) -> None:
         if speed == 0.0:
             continue
         half = 0.5 * speed * dt
-        c, s = np.cos(half), np.sin(half) / speed
+        c, s = cos_of(half), sin_of(half) / speed
         dx, dy, dz = w[i, 0] * s, w[i, 1] * s, w[i, 2] * s
         qw, qx, qy, qz = q[i, 0], q[i, 1], q[i, 2], q[i, 3]
         q[i, 0] = c * qw - dx * qx - dy * qy - dz * qz

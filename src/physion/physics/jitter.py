@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from physion.numerics.random_normals import standard_normal
 from physion.scenes.scene import Scene, Vec3
 
 
@@ -18,7 +19,8 @@ def jitter_scene(scene: Scene, distance: float, generator: np.random.Generator) 
     leaders = {joint.child: joint.parent for joint in scene.joints}
     moving = [body.name for body in scene.bodies if not (body.kinematic or body.scenery)]
     moving += [cloth.name for cloth in scene.cloths]
-    shifts = {name: (*generator.normal(0.0, distance, 2).tolist(), 0.0) for name in moving}
+    draws = (distance * standard_normal(generator, (len(moving), 2))).tolist()
+    shifts = {name: (x, y, 0.0) for name, (x, y) in zip(moving, draws, strict=True)}
 
     def moved(name: str, position: Vec3) -> Vec3:
         passed = {name}

@@ -11,9 +11,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
+
+from physion.numerics.elementary import arctan2
+from physion.numerics.kernel import kernel
+from physion.numerics.linear_algebra import dot, ordered_mean, unit
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -35,21 +38,26 @@ def hull_faces(corners: Array) -> list[Index]:
     for t in range(len(normals)):
         if face_of[t] >= 0:
             continue
-        same = (normals @ normals[t] > 1 - 1e-7) & (np.abs(offsets - offsets[t]) < 1e-5 * size)
+        same = (dot(normals, normals[t]) > 1 - 1e-7) & (np.abs(offsets - offsets[t]) < 1e-5 * size)
         # Triangles of one plane are one face.
         same &= face_of < 0
         face_of[same] = len(faces)
         used = np.unique(hull.simplices[same])
-        points = corners[used] - corners[used].mean(axis=0)
+        points = corners[used] - ordered_mean(corners[used], axis=0)
         normal = normals[t]
-        first = points[0] - normal * (points[0] @ normal)
-        first /= np.linalg.norm(first)
+        first = unit(points[0] - normal * dot(points[0], normal))
         second = np.cross(normal, first)
-        faces.append(used[np.argsort(np.arctan2(points @ second, points @ first))].astype(np.int64))
+        angle = arctan2(dot(points, second), dot(points, first))
+        faces.append(used[np.argsort(angle, kind="stable")].astype(np.int64))
     return faces
 
 
-@njit(cache=True)
+@kernel
+def _dot(a: Any, b: Any) -> Any:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@kernel
 def facing(
     corners: Any,
     loops: Any,
@@ -93,10 +101,14 @@ def facing(
                 chosen_normal = n
         if best > -2.0:
             break
-    return chosen, rot @ chosen_normal, best
+    world = np.zeros(3)
+    for i in range(3):
+        for j in range(3):
+            world[i] += rot[i, j] * chosen_normal[j]
+    return chosen, world, best
 
 
-@njit(cache=True)
+@kernel
 def face_normal(corners: Any, loops: Any, first_loop: Any, f: int) -> Any:
     """Unit normal of a face, outward, from its first corner and the two that span most."""
     a = corners[loops[first_loop[f]]]
@@ -107,10 +119,10 @@ def face_normal(corners: Any, loops: Any, first_loop: Any, f: int) -> Any:
         total[0] += u[1] * w[2] - u[2] * w[1]
         total[1] += u[2] * w[0] - u[0] * w[2]
         total[2] += u[0] * w[1] - u[1] * w[0]
-    return total / np.sqrt(np.sum(total**2))
+    return total / np.sqrt(_dot(total, total))
 
 
-@njit(cache=True)
+@kernel
 def _flatten(corners: Any, loops: Any, start: int, stop: int, rot: Any, x: Any, axes: Any) -> Any:
     """Corners of a face as (u, v, height) along the three ``axes``."""
     out = np.zeros((stop - start, 3))
@@ -128,7 +140,7 @@ def _flatten(corners: Any, loops: Any, start: int, stop: int, rot: Any, x: Any, 
     return out
 
 
-@njit(cache=True)
+@kernel
 def _inside(polygon: Any, u: float, v: float, slack: float) -> Any:
     """Whether (u, v) lies in a convex polygon of either winding."""
     sign = 0.0
@@ -145,7 +157,7 @@ def _inside(polygon: Any, u: float, v: float, slack: float) -> Any:
     return True
 
 
-@njit(cache=True)
+@kernel
 def clip_faces(reference: Any, incident: Any, reach: float) -> Any:
     """Points (K, 4) where two flattened faces come closer than ``reach``.
 
@@ -213,7 +225,7 @@ def clip_faces(reference: Any, incident: Any, reach: float) -> Any:
     return out[:used]
 
 
-@njit(cache=True)
+@kernel
 def face_contacts(
     corners: Any,
     loops: Any,
@@ -251,7 +263,7 @@ def face_contacts(
     least = np.argmin(np.abs(lead))
     axes[0, least] = 1.0
     axes[0] -= lead * lead[least]
-    axes[0] /= np.sqrt(np.sum(axes[0] ** 2))
+    axes[0] /= np.sqrt(_dot(axes[0], axes[0]))
     axes[1, 0] = lead[1] * axes[0, 2] - lead[2] * axes[0, 1]
     axes[1, 1] = lead[2] * axes[0, 0] - lead[0] * axes[0, 2]
     axes[1, 2] = lead[0] * axes[0, 1] - lead[1] * axes[0, 0]
@@ -271,26 +283,27 @@ def face_contacts(
     return (-lead if b_leads else lead), points, separation
 
 
-@njit(cache=True)
+@kernel
 def spread_points(points: Any, separation: Any) -> Any:
     """Indices of up to four points that stand for all: the deepest, then the farthest apart."""
     chosen = np.zeros(4, np.int64)
     chosen[0] = np.argmin(separation)
     best = -1.0
     for i in range(len(points)):
-        d = np.sum((points[i] - points[chosen[0]]) ** 2)
+        off = points[i] - points[chosen[0]]
+        d = _dot(off, off)
         if d > best:
             best = d
             chosen[1] = i
     a, b = points[chosen[0]], points[chosen[1]]
     along = b - a
-    length = max(np.sum(along**2), 1e-20)
+    length = max(_dot(along, along), 1e-20)
     reference = np.zeros(3)
     best = -1.0
     for i in range(len(points)):
         p = points[i] - a
-        off = p - along * (np.sum(p * along) / length)
-        d = np.sum(off**2)
+        off = p - along * (_dot(p, along) / length)
+        d = _dot(off, off)
         if d > best:
             best = d
             chosen[2] = i
@@ -299,15 +312,15 @@ def spread_points(points: Any, separation: Any) -> Any:
     best = -np.inf
     for i in range(len(points)):
         p = points[i] - a
-        off = p - along * (np.sum(p * along) / length)
-        d = -np.sum(off * reference)
+        off = p - along * (_dot(p, along) / length)
+        d = -_dot(off, reference)
         if d > best:
             best = d
             chosen[3] = i
     return np.unique(chosen)
 
 
-@njit(cache=True)
+@kernel
 def collect_contacts(
     geoms: Any,
     distance: Any,
@@ -328,10 +341,7 @@ def collect_contacts(
     height: float,
     parallel: float,
 ) -> Any:
-    """Contacts between geoms and with the floor, sorted by pair; the floor is the last geom.
-
-    It lives beside what it calls: numba asks only a kernel's own file whether it is outdated.
-    """
+    """Contacts between geoms and with the floor, sorted by pair; the floor is the last geom."""
     total = len(geom_body)
     still = len(x) - 1
     room = MANIFOLD_SIZE * (len(geoms) + len(moving_geoms)) + len(geoms)
@@ -407,7 +417,7 @@ def collect_contacts(
     return contacts, bodies
 
 
-@njit(cache=True)
+@kernel
 def touching_floor(corners: Any, x: Any, rot: Any, height: float, reach: float) -> Any:
     """World positions of at most four corners lower than ``reach`` above the floor."""
     low = np.zeros((len(corners), 3))

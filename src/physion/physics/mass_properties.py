@@ -8,6 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from physion.numerics.linear_algebra import (
+    apply,
+    determinant,
+    dot,
+    multiply,
+    ordered_mean,
+    ordered_sum,
+    outer,
+)
+from physion.numerics.rotations import rotation_matrices
+
 Array = NDArray[np.float64]
 
 
@@ -21,18 +32,11 @@ class MassProperties:
 
     def moved(self, position: Array, turn: Array) -> MassProperties:
         """The same thing turned by the quaternion ``turn``, then put at ``position``."""
-        w, x, y, z = turn
-        rotation = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
+        rotation = rotation_matrices(turn)
         return MassProperties(
             self.mass,
-            np.asarray(position) + rotation @ self.center,
-            rotation @ self.inertia @ rotation.T,
+            np.asarray(position) + apply(rotation, self.center),
+            multiply(multiply(rotation, self.inertia), rotation.T),
         )
 
 
@@ -43,7 +47,7 @@ def merge_masses(parts: list[MassProperties]) -> MassProperties:
     inertia = np.zeros((3, 3))
     for part in parts:
         arm = part.center - center
-        inertia += part.inertia + part.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+        inertia += part.inertia + part.mass * (dot(arm, arm) * np.eye(3) - outer(arm, arm))
     return MassProperties(mass, center, inertia)
 
 
@@ -61,19 +65,18 @@ def hull_mass(hulls: list[Array], mass: float) -> MassProperties:
 
 def _solid(corners: Array) -> MassProperties:
     """A convex hull of density 1, as a sum of tetrahedra from a point inside."""
-    inside = corners.mean(axis=0)
+    inside = ordered_mean(corners, axis=0)
     hull = ConvexHull(corners)
     triangles = corners[hull.simplices] - inside
     # The volume of a tetrahedron does not depend on the winding once its sign is dropped, and all
     # are positive because the apex lies inside.
-    volumes = np.abs(np.linalg.det(triangles)) / 6.0
-    volume = volumes.sum()
-    centers = triangles.sum(axis=1) / 4.0
-    center = volumes @ centers / volume
+    volumes = np.abs(determinant(triangles)) / 6.0
+    volume = ordered_sum(volumes)
+    sums = ordered_sum(triangles, axis=1)
+    center = ordered_sum(volumes[:, None] * sums / 4.0, axis=0) / volume
     # Second moments of a tetrahedron with one corner at the origin.
-    sums = triangles.sum(axis=1)
-    second = np.einsum("tki,tkj->tij", triangles, triangles) + np.einsum("ti,tj->tij", sums, sums)
-    moments = np.einsum("t,tij->ij", volumes, second) / 20.0
-    moments -= volume * np.outer(center, center)
-    inertia = np.trace(moments) * np.eye(3) - moments
+    second = ordered_sum(outer(triangles, triangles), axis=1) + outer(sums, sums)
+    moments = ordered_sum(volumes[:, None, None] * second, axis=0) / 20.0
+    moments -= volume * outer(center, center)
+    inertia = ordered_sum(np.diagonal(moments)) * np.eye(3) - moments
     return MassProperties(float(volume), inside + center, inertia)

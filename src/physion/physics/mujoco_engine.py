@@ -13,16 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.errors import BadInputError
+from physion.golden import version_digest
+from physion.numerics.linear_algebra import apply, norm, unit
+from physion.numerics.rotations import conjugate, multiply_quaternions, rotate_vectors
 from physion.physics.cloth import ClothSettings, add_cloth, settle_solids
 from physion.physics.contact_finder import ContactFinder
 from physion.physics.contact_record import ContactRecord
 from physion.physics.contact_solver import AnchorMemory, move_poses, no_anchors, solve_step
-from physion.physics.rigid_model import (
-    build_model,
-    conjugate,
-    multiply_quaternions,
-    rotate_vectors,
-)
+from physion.physics.rigid_model import build_model
 from physion.physics.settings import Settings
 from physion.physics.sleeping import find_islands, update_sleep, wake_touched
 from physion.physics.trajectory import State, Trajectory
@@ -30,8 +28,8 @@ from physion.scenes.scene import Scene
 
 Array = NDArray[np.float64]
 
-VERSION = 1
-"""Raised whenever the same scene could move differently."""
+VERSION = 2
+"""Raised whenever a scene may move differently, together with the golden digests."""
 
 
 class MujocoEngine:
@@ -45,9 +43,13 @@ class MujocoEngine:
 
     @property
     def name(self) -> str:
-        """``mujoco-<version>+physion-<version of this engine>.<settings>.<cloth settings>``."""
+        """``physion-<version>.<digest>+mujoco-<version>.<settings>.<cloth settings>``.
+
+        The digest is that of the golden motions: engines of one name move scenes alike.
+        """
+        engine = f"physion-{VERSION}.{version_digest('motion')}"
         tags = f"{self.settings.tag()}.{self.cloth.tag()}"
-        return f"mujoco-{mujoco.__version__}+physion-{VERSION}.{tags}"
+        return f"{engine}+mujoco-{mujoco.__version__}.{tags}"
 
     def simulate(
         self,
@@ -171,7 +173,7 @@ class RigidRun:
             if push.point is not None:
                 turning = np.cross(np.asarray(push.point) - self.x[actor], impulse)
                 local = rotate_vectors(conjugate(self.q[actor]), turning)
-                spin = self.model.inv_inertia[actor] @ local
+                spin = apply(self.model.inv_inertia[actor], local)
                 self.w[actor] += rotate_vectors(self.q[actor], spin)
             self.asleep[actor] = False
             self.counter[actor] = self.settings.wake_time
@@ -183,7 +185,7 @@ class RigidRun:
         keep = np.maximum(1.0 - self.model.drag * s.dt, 0.0)
         self.v[:-1] *= keep[:, :1]
         self.w[:-1] *= keep[:, 1:]
-        speed = np.linalg.norm(self.w, axis=1, keepdims=True)
+        speed = norm(self.w)[:, None]
         self.w *= np.minimum(1.0, s.max_angular_velocity / np.maximum(speed, 1e-12))
 
     def _take(self, start: State) -> None:
@@ -192,7 +194,7 @@ class RigidRun:
         for actor in range(model.actors):
             i = int(np.flatnonzero(model.actor_of == actor)[0])
             turn = np.asarray(start.rotations[i], np.float64)
-            q = multiply_quaternions(turn / np.linalg.norm(turn), conjugate(model.turn[i]))
+            q = multiply_quaternions(unit(turn), conjugate(model.turn[i]))
             self.q[actor] = q
             self.x[actor] = start.positions[i] - rotate_vectors(q, model.pivot[i])
             self.w[actor] = start.angular_velocities[i]

@@ -6,6 +6,7 @@ fills the drawn solid: bowls, tori, pipes and vases keep their hollows, and thin
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -14,12 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.errors import BadInputError
-from physion.physics.rigid_model import rotate_vectors
+from physion.numerics.linear_algebra import norm
+from physion.numerics.rotations import rotate_vectors
 from physion.physics.trajectory import Trajectory
 from physion.scenes.scene import Scene, Vec3
 from physion.scenes.shapes import shape
 from physion.scenes.solids import Mesh
-from physion.seeds import child_generator, stable_hash
+from physion.seeds import child_generator, named_seed
 
 SPACING, CLOTH_SPACING = 0.05, 0.035
 """Metres between particles, and those of scenes with cloth (official-system.md, section 6)."""
@@ -74,7 +76,7 @@ def sample_particles(
     points = _fill(shape_name, tuple(scale), float(spacing))
     if limit is not None and len(points) > limit:
         # A thinned lattice would keep planes of the body and lose others.
-        seed = np.random.SeedSequence(stable_hash(shape_name, repr(scale), repr(spacing), limit))
+        seed = named_seed(shape_name, repr(scale), repr(spacing), limit)
         kept = child_generator(seed, "particles").choice(len(points), limit, replace=False)
         points = points[np.sort(kept)]
     return points.copy()
@@ -120,9 +122,9 @@ def _fill(shape_name: str, scale: Vec3, spacing: float) -> Floats:
     low, high = mesh.bounds
     # Rounded, so that on average the cubes fill the bounds; points stay inside them.
     counts = np.maximum(np.rint((high - low) / spacing), 1)
-    if np.prod(counts) > MAX_LATTICE:
+    if math.prod(counts) > MAX_LATTICE:
         raise BadInputError(
-            f"{shape_name!r} of {np.round(high - low, 3).tolist()} m needs {counts.prod():.0f} "
+            f"{shape_name!r} of {np.round(high - low, 3).tolist()} m needs {math.prod(counts):.0f} "
             f"lattice points at a spacing of {spacing} m; at most {MAX_LATTICE}: widen it"
         )
     sizes = counts.astype(int)
@@ -147,13 +149,13 @@ def _close_thin(solid: Filled, matter: Filled) -> Filled:
     ``solid`` cells have their centre inside; ``matter`` also holds those that a surface crosses,
     as walls thinner than a cell may miss all centres.
     """
-    share = solid.mean(axis=-1)
+    share = np.count_nonzero(solid, axis=-1) / solid.shape[-1]
     filled = np.pad(share >= 0.5, 1)
     offsets = (np.indices((FINE,) * 3).reshape(3, -1).T + 0.5) / FINE - 0.5
     near = np.indices((3, 3, 3)).reshape(3, -1).T - 1
-    covers = np.linalg.norm(offsets[:, None] - near, axis=-1) <= REACH
+    covers = norm(offsets[:, None] - near) <= REACH
     thin = np.argwhere(matter.any(axis=-1) & (share < 0.5))
-    fullness = (share + matter.mean(axis=-1))[tuple(thin.T)]
+    fullness = (share + np.count_nonzero(matter, axis=-1) / matter.shape[-1])[tuple(thin.T)]
     for i, j, k in thin[np.argsort(-fullness, kind="stable")]:
         around = filled[i : i + 3, j : j + 3, k : k + 3].ravel()
         if not covers[matter[i, j, k]][:, around].any(axis=1).all():
@@ -168,7 +170,7 @@ def _surface_cells(
     cells = np.zeros(counts, np.bool_)
     points = (mesh.vertices - corner) / size
     for a, b, c in points[mesh.faces]:
-        longest = max(np.linalg.norm(b - a), np.linalg.norm(c - a), np.linalg.norm(c - b))
+        longest = max(norm(b - a), norm(c - a), norm(c - b))
         steps = int(np.ceil(longest)) + 1
         u, v = (np.indices((steps + 1, steps + 1)) / steps).reshape(2, -1, 1)
         on = (a + u * (b - a) + v * (c - a))[u[:, 0] + v[:, 0] <= 1 + 1e-9]

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
+from statistics import fmean
 
 import numpy as np
 from scipy.stats import rankdata
@@ -116,6 +118,7 @@ def summarise(replays: Iterable[Replay]) -> list[ReplayRow]:
 
 def _row(scenario: str, group: list[Replay]) -> ReplayRow:
     recorded = np.array([replay.recorded for replay in group])
+    rate = fmean(recorded.tolist())
     both = [
         abs(replay.simulated_frame - replay.recorded_frame)
         for replay in group
@@ -127,15 +130,15 @@ def _row(scenario: str, group: list[Replay]) -> ReplayRow:
     return ReplayRow(
         scenario=scenario,
         trials=len(group),
-        base_rate=float(max(recorded.mean(), 1 - recorded.mean())),
-        agreement=float(np.mean([replay.agrees for replay in group])),
+        base_rate=max(rate, 1 - rate),
+        agreement=fmean(replay.agrees for replay in group),
         frame_difference=float(np.median(both)) if both else float("nan"),
         auc=area_under_curve(-np.array(distances), recorded)
         if len(distances) == len(group)
         else float("nan"),
         milliseconds=1000 * spent / len(group),
         real_time=sum(replay.physics_seconds for replay in group) / max(spent, 1e-9),
-        ceiling=float(np.mean(ceilings)) if group[0].jittered else float("nan"),
+        ceiling=fmean(ceilings) if group[0].jittered else float("nan"),
     )
 
 
@@ -144,10 +147,10 @@ def area_under_curve(scores: np.ndarray, truth: np.ndarray) -> float:
 
     ``scores`` (n,) any real, ``truth`` (n,) bool. NaN if only one class is there.
     """
-    positives = int(truth.sum())
+    positives = np.count_nonzero(truth)
     negatives = len(truth) - positives
     if not (positives and negatives):
         return float("nan")
     ranks = rankdata(scores)
-    above = float(ranks[truth].sum()) - positives * (positives + 1) / 2
+    above = math.fsum(ranks[truth]) - positives * (positives + 1) / 2
     return above / (positives * negatives)

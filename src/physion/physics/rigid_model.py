@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.errors import BadSceneError
+from physion.numerics.linear_algebra import inverse, unit
+from physion.numerics.rotations import conjugate, multiply_quaternions, rotate_vectors
 from physion.physics.collision_hulls import collision_hulls
 from physion.physics.mass_properties import MassProperties, hull_mass, merge_masses
 from physion.physics.settings import Settings
@@ -69,33 +71,6 @@ class RigidModel:
         return len(self.inv_mass) - 1
 
 
-def multiply_quaternions(a: Array, b: Array) -> Array:
-    """Hamilton product of (w, x, y, z) quaternions, broadcast over leading axes."""
-    aw, ax, ay, az = np.moveaxis(a, -1, 0)
-    bw, bx, by, bz = np.moveaxis(b, -1, 0)
-    return np.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        axis=-1,
-    )
-
-
-def rotate_vectors(q: Array, v: Array) -> Array:
-    """Vectors turned by unit quaternions, broadcast over leading axes."""
-    axis = q[..., 1:]
-    twice = 2.0 * np.cross(axis, v)
-    return np.asarray(v + q[..., :1] * twice + np.cross(axis, twice))
-
-
-def conjugate(q: Array) -> Array:
-    """The opposite turn."""
-    return np.asarray(q * np.array([1.0, -1.0, -1.0, -1.0]))
-
-
 def group_bodies(scene: Scene) -> list[list[int]]:
     """Indices of the bodies of every actor, in the order of their first body."""
     moving = [i for i, body in enumerate(scene.bodies) if not (body.kinematic or body.scenery)]
@@ -122,7 +97,7 @@ def build_model(scene: Scene, settings: Settings) -> RigidModel:
     actors, count = len(groups), len(scene.bodies)
     positions = np.array([b.position for b in scene.bodies], dtype=np.float64).reshape(-1, 3)
     turns = np.array([b.rotation for b in scene.bodies], dtype=np.float64).reshape(-1, 4)
-    turns = turns / np.linalg.norm(turns, axis=1, keepdims=True)
+    turns = unit(turns)
     hulls = [[] if b.scenery else collision_hulls(b.shape, b.scale) for b in scene.bodies]
     masses = [
         hull_mass([piece.corners for piece in pieces], body.mass)
@@ -143,7 +118,7 @@ def build_model(scene: Scene, settings: Settings) -> RigidModel:
             parts.append(masses[i].moved(pivot[i], turn[i]))
         whole = merge_masses(parts)
         inv_mass[actor] = 1.0 / whole.mass
-        inv_inertia[actor] = np.linalg.inv(whole.inertia)
+        inv_inertia[actor] = inverse(whole.inertia)
         start_x[actor] = positions[group[0]] + rotate_vectors(frame, whole.center)
         start_q[actor] = frame
         for i, part in zip(group, parts, strict=True):

@@ -5,10 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
+
+from physion.numerics.kernel import kernel
+from physion.numerics.linear_algebra import inverse
+from physion.numerics.rotations import rotate_vector
 
 
-@njit(cache=True)
+@kernel
 def find_islands(bodies: Any, actors: int) -> Any:
     """(A,) for every actor the lowest actor that it touches, directly or through others.
 
@@ -26,7 +29,7 @@ def find_islands(bodies: Any, actors: int) -> Any:
     return island
 
 
-@njit(cache=True)
+@kernel
 def wake_touched(island: Any, asleep: Any, counter: Any, wake_time: float) -> None:
     """Wake every sleeping actor whose island holds one that is awake."""
     for i in range(len(island)):
@@ -38,7 +41,7 @@ def wake_touched(island: Any, asleep: Any, counter: Any, wake_time: float) -> No
                 counter[j] = wake_time
 
 
-@njit(cache=True)
+@kernel
 def update_sleep(
     bodies: Any,
     island: Any,
@@ -64,6 +67,7 @@ def update_sleep(
     """
     actors = len(counter)
     touching = np.zeros((actors, actors + 1), np.bool_)
+    opposite = np.zeros(4)
     for c in range(len(bodies)):
         a, b = bodies[c, 0], bodies[c, 1]
         if a < actors:
@@ -79,12 +83,20 @@ def update_sleep(
                 still_v[i, j] += v[i, j]
                 energy += still_v[i, j] ** 2
             # Spins add up in the body's own axes, so that a steady roll is not taken for rest.
-            local = _rotate(q[i] * np.array([1.0, -1.0, -1.0, -1.0]), w[i])
+            opposite[:] = -q[i]
+            opposite[0] = q[i, 0]
+            local = rotate_vector(opposite, w[i])
             for j in range(3):
                 still_w[i, j] += local[j]
-            inertia = np.linalg.inv(inv_inertia[i])
-            energy += inv_mass[i] * (still_w[i] @ (inertia @ still_w[i]))
-            neighbours = np.sum(touching[i])
+            inertia = inverse(inv_inertia[i])
+            spin = 0.0
+            for j in range(3):
+                for k in range(3):
+                    spin += still_w[i, j] * inertia[j, k] * still_w[i, k]
+            energy += inv_mass[i] * spin
+            neighbours = 0
+            for j in range(actors + 1):
+                neighbours += touching[i, j]
             limit = (1.0 + neighbours) * threshold
             if 0.5 * energy >= limit:
                 still_v[i] = 0.0
@@ -107,10 +119,3 @@ def update_sleep(
                 asleep[j] = True
                 still_v[j] = 0.0
                 still_w[j] = 0.0
-
-
-@njit(cache=True)
-def _rotate(q: Any, v: Any) -> Any:
-    axis = q[1:]
-    twice = 2.0 * np.cross(axis, v)
-    return v + q[0] * twice + np.cross(axis, twice)

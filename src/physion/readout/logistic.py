@@ -25,6 +25,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from physion.errors import BadInputError
+from physion.seeds import generator
 
 Array = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
@@ -122,7 +123,7 @@ def undersample(labels: Booleans, seed: int) -> NDArray[np.int64]:
     count = min(len(yes), len(no))
     if count == 0:
         return np.arange(len(labels))
-    rng = np.random.default_rng(seed)
+    rng = generator("undersample", seed)
     picked = [rng.choice(rows, count, replace=False) for rows in (yes, no)]
     return np.sort(np.concatenate(picked))
 

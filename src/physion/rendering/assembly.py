@@ -5,11 +5,14 @@ The order lets the renderer draw and shade the first two once.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from physion.numerics.linear_algebra import apply, dot, norm, unit
+from physion.numerics.rotations import rotation_matrices
 from physion.physics.trajectory import Trajectory
 from physion.rendering.geometry import F32, F64, I32, Part, sheet, solid
 from physion.rendering.light import to_linear
@@ -55,17 +58,23 @@ class _Materials:
     """Rows of the material table, and which textures they use."""
 
     def __init__(self) -> None:
-        self.rows: list[list[float]] = []
+        self._rows: list[list[float]] = []
         self.textures: list[str] = []
 
     def add(self, look: Look, glow: float = 0.0, room: bool = False) -> int:
+        """Add a row for ``look`` and return its index."""
         kind = finish(look.texture)
         if kind.texture not in self.textures:
             self.textures.append(kind.texture)
-        row = [*to_linear(look.color), self.textures.index(kind.texture), kind.gloss]
-        row += [kind.sharpness, kind.mirror, kind.metal, kind.relief, glow, float(room), 0.0]
-        self.rows.append([float(value) for value in row])
-        return len(self.rows) - 1
+        row = [*look.color, self.textures.index(kind.texture), kind.gloss, kind.sharpness]
+        self._rows.append([*row, kind.mirror, kind.metal, kind.relief, glow, float(room), 0.0])
+        return len(self._rows) - 1
+
+    def table(self) -> F64:
+        """Return the rows as `physion.rendering.shading.shade` reads them: (M, 12)."""
+        table = np.array(self._rows, np.float64)
+        table[:, :3] = to_linear(table[:, :3])
+        return table
 
 
 def assemble(scene: Scene, room: Room) -> Assembly:
@@ -113,7 +122,7 @@ def _concatenate(parts: list[tuple[Part, int]], first: int, materials: _Material
         uv=np.concatenate([part.uv for part, _ in parts]),
         tangents=np.concatenate([part.tangents for part, _ in parts]),
         material=np.concatenate([part.materials for part, _ in parts]),
-        materials=np.array(materials.rows),
+        materials=materials.table(),
         atlas=build_atlas(tuple(materials.textures)),
         first_vertex=end.vertices.stop,
         first_triangle=end.triangles.stop,
@@ -127,9 +136,9 @@ def _panels(panels: tuple[Panel, ...], materials: _Materials) -> Part:
     corner, u, v = (np.array([getattr(p, name) for p in panels]) for name in ("corner", "u", "v"))
     count = len(panels)
     quad = np.stack([corner, corner + u, corner + u + v, corner + v], axis=1)
-    along = np.stack([a / np.linalg.norm(a, axis=1, keepdims=True) for a in (u, v)], axis=1)
+    along = np.stack([unit(u), unit(v)], axis=1)
     tile = np.array([p.tile for p in panels])
-    at = np.einsum("pqk,pak->pqa", quad, along) / tile[:, None, None]
+    at = dot(quad[:, :, None], along[:, None]) / tile[:, None, None]
     index = np.array([0, 1, 2, 0, 2, 3])
     normal = np.cross(along[:, 0], along[:, 1])
     rows = [materials.add(Look(p.color, p.texture), p.glow, p.shaded) for p in panels]
@@ -147,13 +156,14 @@ def _panels(panels: tuple[Panel, ...], materials: _Materials) -> Part:
 def place(
     assembly: Assembly, scene: Scene, trajectory: Trajectory, frame: int, moving: bool
 ) -> tuple[F64, F32]:
-    """World vertices (V, 3) and corner normals (T, 9) of one frame.
+    """Return world vertices (V, 3) and corner normals (T, 9) of one frame.
 
     Only the moving pieces, or only the others; the rest of the arrays is zero.
     """
     vertices = np.zeros((assembly.vertex_count, 3))
     normals = np.zeros((len(assembly.faces), 9), np.float32)
     bodies, offset = len(scene.bodies), 0
+    turns = rotation_matrices(trajectory.rotations[frame])
     for piece in assembly.pieces:
         part, index = piece.part, piece.index
         is_moving = piece.vertices.start >= assembly.first_vertex
@@ -161,10 +171,9 @@ def place(
         if is_moving == moving and index < 0:
             vertices[piece.vertices], normals[piece.triangles] = part.vertices, part.normals
         elif is_moving == moving and index < bodies:
-            rotation = rotation_matrix(trajectory.rotations[frame, index])
             at = trajectory.positions[frame, index].astype(np.float64)
-            vertices[piece.vertices] = transform(part.vertices, rotation, at)
-            turned = transform(part.normals.reshape(-1, 3), rotation, np.zeros(3))
+            vertices[piece.vertices] = apply(turns[index], part.vertices) + at
+            turned = apply(turns[index], part.normals.reshape(-1, 3))
             normals[piece.triangles] = turned.reshape(-1, 9)
         elif is_moving == moving:
             cloth = trajectory.cloth_vertices[frame, offset : offset + size].astype(np.float64)
@@ -175,33 +184,12 @@ def place(
     return vertices, normals
 
 
-def rotation_matrix(quaternion: NDArray[np.floating]) -> F64:
-    """Rotation (3, 3) of a unit quaternion (w, x, y, z)."""
-    w, x, y, z = (float(q) for q in quaternion)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-def transform(points: NDArray[np.floating], matrix: F64, shift: F64) -> F64:
-    """Apply a (3, 3) matrix and a shift (3,) to points (V, 3).
-
-    Written as sums of columns: a matrix product may round differently with the number of points.
-    """
-    x, y, z = (points[:, k : k + 1] for k in range(3))
-    return np.asarray(x * matrix[:, 0] + y * matrix[:, 1] + z * matrix[:, 2] + shift)
-
-
 def _sheet_normals(vertices: F64) -> F32:
-    """Corner normals (T, 9) of a square sheet: means over the triangles at a vertex, by area.
+    """Return corner normals (T, 9) of a square sheet: means by area over the triangles there.
 
     The triangles are those of `sheet`: all that lie left of the diagonals, then all others.
     """
-    side = round(len(vertices) ** 0.5)
+    side = math.isqrt(len(vertices))
     p = vertices.reshape(side, side, 3)
     a, b, c, d = p[:-1, :-1], p[1:, :-1], p[1:, 1:], p[:-1, 1:]
     left, right = np.cross(b - a, c - a), np.cross(c - a, d - a)
@@ -210,7 +198,7 @@ def _sheet_normals(vertices: F64) -> F32:
     total[1:, :-1] += left
     total[1:, 1:] += left + right
     total[:-1, 1:] += right
-    length = np.linalg.norm(total, axis=-1, keepdims=True)
+    length = norm(total)[..., None]
     n = np.where(length > 0, total / np.where(length > 0, length, 1.0), (0.0, 0.0, 1.0))
     a, b, c, d = n[:-1, :-1], n[1:, :-1], n[1:, 1:], n[:-1, 1:]
     corners = [np.concatenate([a, b, c], -1), np.concatenate([a, c, d], -1)]

@@ -8,13 +8,14 @@ the ray.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from physion.errors import BadInputError
+from physion.numerics.elementary import tan
+from physion.numerics.linear_algebra import apply, multiply, norm, unit
 from physion.scenes.scene import Camera
 
 Floats = NDArray[np.float64]
@@ -26,14 +27,14 @@ def axes(camera: Camera) -> Floats:
     A camera that looks straight up or down has no upright direction; +y is then up in the picture.
     """
     forward = np.subtract(camera.target, camera.position).astype(np.float64)
-    length = float(np.linalg.norm(forward))
+    length = float(norm(forward))
     if length == 0.0:
         raise BadInputError("camera: position and target are the same point; move one of them")
     forward /= length
     right = np.cross(forward, (0.0, 0.0, 1.0))
-    if np.linalg.norm(right) < 1e-9:
+    if norm(right) < 1e-9:
         right = np.cross(forward, (0.0, 1.0, 0.0))
-    right /= np.linalg.norm(right)
+    right = unit(right)
     return np.stack([right, np.cross(forward, right), forward])
 
 
@@ -41,13 +42,13 @@ def view_matrix(camera: Camera) -> Floats:
     """World to camera coordinates, (4, 4), applied to column vectors (x, y, z, 1)."""
     matrix = np.eye(4)
     matrix[:3, :3] = axes(camera)
-    matrix[:3, 3] = -matrix[:3, :3] @ np.asarray(camera.position)
+    matrix[:3, 3] = apply(-matrix[:3, :3], camera.position)
     return matrix
 
 
 def intrinsics(camera: Camera, width: int, height: int) -> Floats:
     """Camera coordinates to homogeneous pixels, (3, 3); the third coordinate is the depth."""
-    focal = 0.5 * height / math.tan(0.5 * camera.fov)
+    focal = 0.5 * height / tan(0.5 * camera.fov)
     return np.array([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]])
 
 
@@ -56,7 +57,7 @@ def projection_matrix(camera: Camera, width: int, height: int) -> Floats:
 
     It is what a viewer of another program needs; the rasteriser uses `intrinsics`.
     """
-    scale = 1.0 / math.tan(0.5 * camera.fov)
+    scale = 1.0 / tan(0.5 * camera.fov)
     near, far = camera.near, camera.far
     return np.array(
         [
@@ -84,7 +85,7 @@ class View:
     def to_pixels(self) -> Floats:
         """World to homogeneous pixels, (3, 4)."""
         camera = self.camera
-        return np.asarray(intrinsics(camera, self.width, self.height) @ view_matrix(camera)[:3])
+        return multiply(intrinsics(camera, self.width, self.height), view_matrix(camera)[:3])
 
     def project(self, points: ArrayLike) -> tuple[Floats, Floats]:
         """Pixel coordinates (..., 2) and depths (...) in metres of world points (..., 3).
@@ -93,7 +94,7 @@ class View:
         """
         world = np.asarray(points, np.float64)
         matrix = self.to_pixels
-        homogeneous = world @ matrix[:, :3].T + matrix[:, 3]
+        homogeneous = apply(matrix[:, :3], world) + matrix[:, 3]
         depth = homogeneous[..., 2]
         with np.errstate(divide="ignore", invalid="ignore"):
             return homogeneous[..., :2] / depth[..., None], depth
@@ -101,11 +102,13 @@ class View:
     def unproject(self, pixels: ArrayLike, depth: ArrayLike) -> Floats:
         """World points (..., 3) seen at pixel coordinates (..., 2) at a planar depth (...)."""
         at = np.asarray(pixels, np.float64)
-        rays = np.concatenate([at, np.ones_like(at[..., :1])], axis=-1) @ self.ray_matrix.T
+        rays = apply(self.ray_matrix, np.concatenate([at, np.ones_like(at[..., :1])], axis=-1))
         return np.asarray(np.asarray(self.camera.position) + rays * np.asarray(depth)[..., None])
 
     @property
     def ray_matrix(self) -> Floats:
-        """Takes (x, y, 1) in pixels to the world vector that reaches depth 1 there, (3, 3)."""
-        pixel_to_camera = np.linalg.inv(intrinsics(self.camera, self.width, self.height))
-        return np.asarray(axes(self.camera).T @ pixel_to_camera)
+        """Return the matrix (3, 3) from pixels (x, y, 1) to the world vector of depth 1 there."""
+        matrix = intrinsics(self.camera, self.width, self.height)
+        focal, x, y = matrix[0, 0], matrix[0, 2], matrix[1, 2]
+        pixel_to_camera = [[1.0, 0.0, -x], [0.0, 1.0, -y], [0.0, 0.0, focal]]
+        return multiply(axes(self.camera).T, np.array(pixel_to_camera) / focal)

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from physion.numerics.elementary import arccos, cos
+from physion.numerics.linear_algebra import dot, norm
+
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
@@ -39,10 +42,10 @@ class Part:
 
 
 def face_normals(vertices: F64, faces: I32) -> F64:
-    """Unit normals (T, 3); zero for a triangle without area."""
+    """Return the unit normals (T, 3); zero for a triangle without area."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     cross = np.cross(b - a, c - a)
-    length = np.linalg.norm(cross, axis=1, keepdims=True)
+    length = norm(cross)[:, None]
     return np.asarray(np.divide(cross, length, out=np.zeros_like(cross), where=length > 0))
 
 
@@ -55,7 +58,7 @@ def solid(vertices: F64, faces: I32, scale: F64, crease: float, material: int) -
     """
     unit, faces = _merge(np.asarray(vertices, np.float64), np.asarray(faces, np.int32))
     scaled = unit * scale
-    surfaces = _surfaces(faces, face_normals(unit, faces), float(np.cos(max(crease, FLAT))))
+    surfaces = _surfaces(faces, face_normals(unit, faces), cos(max(crease, FLAT)))
     normals = face_normals(scaled, faces)
     key = faces.astype(np.int64) + len(unit) * surfaces[:, None].astype(np.int64)
     _, group = np.unique(key.ravel(), return_inverse=True)
@@ -64,7 +67,7 @@ def solid(vertices: F64, faces: I32, scale: F64, crease: float, material: int) -
     total = np.zeros((int(group.max()) + 1, 3))
     np.add.at(total, group, weighted)
     corner = total[group]
-    length = np.linalg.norm(corner, axis=1, keepdims=True)
+    length = norm(corner)[:, None]
     flat = np.repeat(normals, 3, axis=0)
     corner = np.where(length > 1e-12, corner / np.maximum(length, 1e-12), flat)
     count = len(faces)
@@ -123,7 +126,7 @@ def _surfaces(faces: I32, normals: F64, threshold: float) -> I32:
     edges, owner = edges[order], owner[order]
     same = (edges[1:] == edges[:-1]).all(axis=1)
     a, b = owner[:-1][same], owner[1:][same]
-    soft = (normals[a] * normals[b]).sum(axis=1) > threshold
+    soft = dot(normals[a], normals[b]) > threshold
     return _components(count, a[soft], b[soft])
 
 
@@ -145,13 +148,13 @@ def _components(count: int, a: NDArray[np.intp], b: NDArray[np.intp]) -> I32:
 
 
 def _corner_angles(vertices: F64, faces: I32) -> F64:
-    """Angle in radians of each corner of each triangle, (T, 3)."""
+    """Return the angle in radians of each corner of each triangle, (T, 3)."""
     corners = vertices[faces]
     ahead = np.roll(corners, -1, axis=1) - corners
     behind = np.roll(corners, 1, axis=1) - corners
-    scale = np.linalg.norm(ahead, axis=2) * np.linalg.norm(behind, axis=2)
-    cosine = (ahead * behind).sum(axis=2) / np.maximum(scale, 1e-300)
-    return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    scale = norm(ahead) * norm(behind)
+    cosine = dot(ahead, behind) / np.maximum(scale, 1e-300)
+    return arccos(np.clip(cosine, -1.0, 1.0))
 
 
 def _box_uv(unit: F64, faces: I32) -> F32:

@@ -5,12 +5,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from physion.numerics.elementary import exp, power
+from physion.numerics.linear_algebra import apply, norm, unit
 from physion.rendering.camera import View
 from physion.rendering.rooms import Room
 from physion.rendering.shading import BLOCK, TONES, WHITEST
-from physion.scenes.scene import Scene, Vec3
+from physion.scenes.scene import Scene
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -81,9 +83,8 @@ def still_maps(scene: Scene, room: Room) -> tuple[StillMap, StillMap]:
 
 def pack_light(room: Room, view: View) -> tuple[F64, F64, F64]:
     """The camera, the light and its settings as `shade` reads them."""
-    direction = np.asarray(room.lamp_direction)
     light = Light(
-        lamp=np.stack([direction / np.linalg.norm(direction), room.lamp]),
+        lamp=np.stack([unit(room.lamp_direction), room.lamp]),
         around=np.asarray(room.around),
         mirrored=np.asarray(room.mirrored),
         window=np.asarray(room.window),
@@ -105,7 +106,7 @@ def _region(scene: Scene) -> tuple[F64, float]:
     at += [(*cloth.position[:2], max(cloth.size)) for cloth in scene.cloths]
     target = np.array(scene.camera.target[:2])
     spots = np.array([[*target, 0.0], *at])
-    spots = spots[np.linalg.norm(spots[:, :2] - target, axis=1) < REACH]
+    spots = spots[norm(spots[:, :2] - target) < REACH]
     low = (spots[:, :2] - spots[:, 2:]).min(axis=0)
     high = (spots[:, :2] + spots[:, 2:]).max(axis=0)
     half = float(np.clip(0.5 * (high - low).max() + 1.0, 2.5, REACH + 1.0))
@@ -113,10 +114,9 @@ def _region(scene: Scene) -> tuple[F64, float]:
 
 
 def _lamp_rows(direction: F64) -> F64:
-    """Axes (3, 3) of the lamp's picture: right, up, and away from the lamp."""
-    toward = direction / np.linalg.norm(direction)
-    right = np.cross((0.0, 1.0, 0.0), toward)
-    right /= np.linalg.norm(right)
+    """Return the axes (3, 3) of the lamp's picture: right, up, and away from the lamp."""
+    toward = unit(direction)
+    right = unit(np.cross((0.0, 1.0, 0.0), toward))
     return np.stack([right, np.cross(toward, right), -toward])
 
 
@@ -124,7 +124,7 @@ def _empty_map(rows: F64, center: F64, half: float, texel: float) -> StillMap:
     size = BLOCK * int(np.ceil(2.0 * half / texel / BLOCK))
     matrix = np.zeros((3, 4))
     matrix[:2, :3] = rows[:2] / texel
-    matrix[:2, 3] = 0.5 * size - matrix[:2, :3] @ center
+    matrix[:2, 3] = 0.5 * size - apply(matrix[:2, :3], center)
     matrix[2, :3] = rows[2]
     return StillMap(matrix, np.full((size, size), np.inf, np.float32))
 
@@ -132,24 +132,25 @@ def _empty_map(rows: F64, center: F64, half: float, texel: float) -> StillMap:
 def _busy_blocks(depth: F32) -> NDArray[np.bool_]:
     """Which blocks of a depth map hold something, they or one of their eight neighbours."""
     rows, columns = (size // BLOCK for size in depth.shape)
-    used = np.isfinite(depth).reshape(rows, BLOCK, columns, BLOCK).any(axis=(1, 3))
+    used = np.isfinite(depth).reshape(rows, BLOCK, -1).any(axis=1)
+    used = used.reshape(rows, columns, BLOCK).any(axis=2)
     wide = np.pad(used, 1)
     wide = wide[:-2] | wide[1:-1] | wide[2:]
     return np.asarray(wide[:, :-2] | wide[:, 1:-1] | wide[:, 2:])
 
 
 def tone_table(exposure: float) -> U8:
-    """Bytes of the picture for linear light 0..WHITEST: filmic shoulder, then the sRGB curve."""
+    """Return the bytes of linear light 0..WHITEST: a filmic shoulder, then the sRGB curve."""
     x = np.linspace(0.0, WHITEST, TONES) * exposure
     # Straight below the knee, then bending towards white without ever reaching it.
     knee = 0.55
-    bent = knee + (1.0 - knee) * (1.0 - np.exp(-(x - knee) / (1.0 - knee)))
+    bent = knee + (1.0 - knee) * (1.0 - exp(-(x - knee) / (1.0 - knee)))
     y = np.where(x < knee, x, bent)
-    curve = np.where(y <= 0.0031308, 12.92 * y, 1.055 * np.maximum(y, 1e-9) ** (1 / 2.4) - 0.055)
+    curve = np.where(y <= 0.0031308, 12.92 * y, 1.055 * power(np.maximum(y, 1e-9), 1 / 2.4) - 0.055)
     return np.clip(np.round(255.0 * curve), 0, 255).astype(np.uint8)
 
 
-def to_linear(color: Vec3) -> F64:
-    """Linear light of an sRGB colour in 0..1, (3,)."""
-    value = np.asarray(color, np.float64)
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+def to_linear(colors: ArrayLike) -> F64:
+    """Return the linear light (..., 3) of sRGB colours (..., 3) in 0..1."""
+    value = np.asarray(colors, np.float64)
+    return np.where(value <= 0.04045, value / 12.92, power((value + 0.055) / 1.055, 2.4))

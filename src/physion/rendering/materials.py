@@ -4,7 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from physion.rendering.noise import F32, SIZE, Painter, cells, flat, grid, noise, smooth, tint
+from physion.numerics.elementary import cos, exp, power, sin
+from physion.numerics.random_normals import standard_normal
+from physion.rendering.noise import (
+    F32,
+    SIZE,
+    Painter,
+    cells,
+    flat,
+    grid,
+    noise,
+    smooth,
+    tint,
+    uniform,
+)
 
 GREY = (1.0, 1.0, 1.0)
 
@@ -22,7 +35,7 @@ def _metal(rng: np.random.Generator) -> tuple[F32, F32]:
 def _cloth(rng: np.random.Generator) -> tuple[F32, F32]:
     """Fine weave, visible from near only."""
     u, v = grid()
-    weave = np.sin(2 * np.pi * 128 * u) * np.sin(2 * np.pi * 128 * v)
+    weave = sin(2 * np.pi * 128 * u) * sin(2 * np.pi * 128 * v)
     value = 0.88 + 0.05 * weave + 0.02 * noise(rng, 12, 12)
     return tint(np.clip(value, 0, 1), (1, 1, 1)), flat()
 
@@ -60,9 +73,9 @@ def _matte(rng: np.random.Generator) -> tuple[F32, F32]:
 def _speckled(rng: np.random.Generator) -> tuple[F32, F32]:
     """Pressed from shredded plastic: flakes of many shades in a pale ground."""
     near, _, which = cells(rng, 900)
-    shade = rng.uniform(0.12, 1.0, (901, 3)).astype(np.float32) * rng.uniform(0.3, 1, (901, 1))
+    shade = uniform(rng, 0.12, 1.0, (901, 3)).astype(np.float32) * uniform(rng, 0.3, 1, (901, 1))
     flake = rng.random(901) < 0.42
-    size = rng.uniform(0.006, 0.020, 901).astype(np.float32)
+    size = uniform(rng, 0.006, 0.020, 901).astype(np.float32)
     inside = 1.0 - smooth(near / size[which], 0.85, 1.0)
     share = (inside * flake[which])[..., None]
     color = 0.86 * (1.0 - share) + share * shade[which]
@@ -74,7 +87,7 @@ def _granite(rng: np.random.Generator) -> tuple[F32, F32]:
     _, _, which = cells(rng, 5200)
     kinds = np.array([0.86, 0.52, 0.10], np.float32)
     kind = rng.choice(3, 5201, p=[0.46, 0.34, 0.2])
-    shade = (kinds[kind] + rng.normal(0, 0.05, 5201)).astype(np.float32)
+    shade = (kinds[kind] + 0.05 * standard_normal(rng, 5201)).astype(np.float32)
     value = shade[which] + 0.03 * noise(rng, 6, 6)
     return tint(np.clip(value, 0.03, 1), (1.0, 0.97, 0.95)), flat()
 
@@ -84,8 +97,8 @@ def _marble(rng: np.random.Generator) -> tuple[F32, F32]:
     clouds = noise(rng, 3, 3)
     bent = noise(rng, 2.2, 2.2) + 0.30 * noise(rng, 7, 7) + 0.07 * noise(rng, 24, 24)
     fine = noise(rng, 3.2, 3.2) + 0.35 * noise(rng, 11, 11)
-    veins = np.exp(-np.abs(bent) / 0.10) * np.clip(0.65 + 0.35 * clouds, 0.1, 1)
-    hair = np.exp(-np.abs(fine - 0.3) / 0.035)
+    veins = exp(-np.abs(bent) / 0.10) * np.clip(0.65 + 0.35 * clouds, 0.1, 1)
+    hair = exp(-np.abs(fine - 0.3) / 0.035)
     value = 0.94 - 0.52 * veins - 0.22 * hair + 0.025 * clouds
     return tint(np.clip(value, 0.1, 1), (1.0, 0.985, 0.97)), flat()
 
@@ -94,10 +107,10 @@ def _sandstone(rng: np.random.Generator) -> tuple[F32, F32]:
     """Grains of sand in wavy layers."""
     _, v = grid()
     height = v + 0.012 * noise(rng, 2, 2) + 0.004 * noise(rng, 9, 9)
-    layers = np.sin(2 * np.pi * 7 * height) + 0.7 * np.sin(2 * np.pi * (17 * height + 0.3))
+    layers = sin(2 * np.pi * 7 * height) + 0.7 * sin(2 * np.pi * (17 * height + 0.3))
     value = 0.74 + 0.08 * layers + 0.07 * noise(rng, 170, 170) + 0.03 * noise(rng, 30, 30)
     value = np.clip(value, 0.1, 1.0)
-    return np.stack([value, 0.86 * value**1.1, 0.66 * value**1.2], -1), flat()
+    return np.stack([value, 0.86 * power(value, 1.1), 0.66 * power(value, 1.2)], -1), flat()
 
 
 def _slate(rng: np.random.Generator) -> tuple[F32, F32]:
@@ -114,8 +127,8 @@ def _linen(rng: np.random.Generator) -> tuple[F32, F32]:
     """Plain weave of uneven threads, thick and thin ones both ways."""
     u, v = grid()
     weft, warp = noise(rng, 4, 44), noise(rng, 44, 4)
-    over = np.sin(2 * np.pi * 56 * u) * np.sin(2 * np.pi * 56 * v)
-    gaps = np.abs(np.cos(2 * np.pi * 56 * u)) * np.abs(np.cos(2 * np.pi * 56 * v))
+    over = sin(2 * np.pi * 56 * u) * sin(2 * np.pi * 56 * v)
+    gaps = np.abs(cos(2 * np.pi * 56 * u)) * np.abs(cos(2 * np.pi * 56 * v))
     value = 0.72 + 0.075 * weft + 0.075 * warp + 0.09 * over - 0.10 * gaps
     return tint(np.clip(value, 0.1, 1), (1.0, 0.98, 0.94)), flat()
 
@@ -127,8 +140,8 @@ def _canvas(rng: np.random.Generator) -> tuple[F32, F32]:
     x, y = (u * count) % 1.0, (v * count) % 1.0
     lying = (np.floor(u * count) + np.floor(v * count)) % 2 == 0
     across = np.where(lying, y, x)
-    threads = np.abs(np.sin(2 * np.pi * across))
-    swell = np.sin(np.pi * np.where(lying, x, y))
+    threads = np.abs(sin(2 * np.pi * across))
+    swell = sin(np.pi * np.where(lying, x, y))
     value = (0.28 + 0.5 * threads * (0.45 + 0.55 * swell)) * np.where(lying, 1.08, 0.92)
     value = value + 0.04 * noise(rng, 60, 60) + 0.02 * noise(rng, 6, 6)
     return tint(np.clip(value, 0.05, 1).astype(np.float32), (1.0, 0.98, 0.95)), flat()
@@ -137,7 +150,7 @@ def _canvas(rng: np.random.Generator) -> tuple[F32, F32]:
 def _denim(rng: np.random.Generator) -> tuple[F32, F32]:
     """Twill: diagonal ridges with white threads between them."""
     u, v = grid()
-    ridge = 0.5 + 0.5 * np.sin(2 * np.pi * (22 * (u + v) + 0.06 * noise(rng, 30, 30)))
+    ridge = 0.5 + 0.5 * sin(2 * np.pi * (22 * (u + v) + 0.06 * noise(rng, 30, 30)))
     weft = np.clip(0.6 + 0.4 * noise(rng, 150, 25), 0, 1)
     worn = 0.50 + 0.04 * noise(rng, 5, 3)
     value = worn * (0.45 + 0.55 * ridge) + 0.42 * weft * (1 - ridge)
@@ -162,12 +175,12 @@ def _wicker(rng: np.random.Generator) -> tuple[F32, F32]:
     u, v = grid()
     canes, strips = 12, 20
     row = (v * strips).astype(int)
-    over = np.cos(2 * np.pi * (u * canes / 2 + 0.5 * (row % 2)))
-    across = np.sin(np.pi * ((v * strips) % 1.0))
-    shade = rng.uniform(0.8, 1.1, (strips, 1))[row[:, 0]]
+    over = cos(2 * np.pi * (u * canes / 2 + 0.5 * (row % 2)))
+    across = sin(np.pi * ((v * strips) % 1.0))
+    shade = uniform(rng, 0.8, 1.1, (strips, 1))[row[:, 0]]
     value = shade * (0.42 + 0.38 * over) * (0.35 + 0.65 * across) + 0.18
     value = np.clip(value + 0.04 * noise(rng, 8, 120), 0.04, 1.0).astype(np.float32)
-    return np.stack([value, 0.88 * value**1.1, 0.72 * value**1.2], -1), flat()
+    return np.stack([value, 0.88 * power(value, 1.1), 0.72 * power(value, 1.2)], -1), flat()
 
 
 def _fur(rng: np.random.Generator) -> tuple[F32, F32]:
@@ -181,9 +194,9 @@ def _moon(rng: np.random.Generator) -> tuple[F32, F32]:
     """Grey dust, dark seas, craters with bright rims."""
     seas = smooth(noise(rng, 2.5, 2.5), 0.1, 0.9)
     near, _, which = cells(rng, 90)
-    size = rng.uniform(0.008, 0.035, 91).astype(np.float32)
+    size = uniform(rng, 0.008, 0.035, 91).astype(np.float32)
     inside = near / size[which]
-    rim = np.exp(-(((inside - 1.0) / 0.18) ** 2))
+    rim = exp(-(((inside - 1.0) / 0.18) ** 2))
     pit = 1.0 - smooth(inside, 0.6, 1.0)
     value = 0.78 - 0.38 * seas + 0.16 * rim - 0.14 * pit + 0.03 * noise(rng, 30, 30)
     return tint(np.clip(value, 0.05, 1), GREY), flat()

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.errors import BadInputError, UnknownNameError
+from physion.numerics.linear_algebra import apply
 from physion.physics.trajectory import Trajectory
-from physion.rendering.assembly import assemble, place, transform
+from physion.rendering.assembly import assemble, place
 from physion.rendering.camera import View
 from physion.rendering.light import ShadeMap, StillMap, pack_light, still_maps, tone_table
 from physion.rendering.rasterizer import (
@@ -32,6 +33,8 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 
+VERSION = 2
+"""Raised whenever a frame may look different, together with the golden digests."""
 PASSES = ("color", "depth", "normals", "ids", "flow")
 
 
@@ -88,11 +91,12 @@ class Renderer:
         self.width, self.height = width, height
         self._check()
         self.room: Room = rooms.get(scene.room)
-        self._view = View(scene.camera, width, height)
+        view = View(scene.camera, width, height)
+        self._projection = view.to_pixels
         self._assembly = assembly = assemble(scene, self.room)
         self._first = assembly.first_triangle if settings.still_layer else 0
         self._tones = tone_table(self.room.exposure)
-        self._sight, self._light, self._settings = pack_light(self.room, self._view)
+        self._sight, self._light, self._settings = pack_light(self.room, view)
         self._still_vertices, self._still_normals = place(assembly, scene, trajectory, 0, False)
         self._corners = pack_corners(
             self._still_normals, assembly.uv, assembly.tangents, assembly.material
@@ -129,7 +133,7 @@ class Renderer:
     def _draw_map(self, depth: F32, matrix: F64, vertices: F64, moving: bool) -> None:
         """Add the moving bodies, or the others without the room, to a depth map."""
         assembly = self._assembly
-        points = transform(vertices, matrix[:, :3], matrix[:, 3])
+        points = apply(matrix[:, :3], vertices) + matrix[:, 3]
         first, last = assembly.room_triangles, assembly.first_triangle
         if moving:
             first, last = assembly.first_triangle, len(assembly.faces)
@@ -146,8 +150,7 @@ class Renderer:
         return ids, inverse, points
 
     def _to_pixels(self, vertices: F64) -> F64:
-        matrix = self._view.to_pixels
-        return transform(vertices, matrix[:, :3], matrix[:, 3])
+        return apply(self._projection[:, :3], vertices) + self._projection[:, 3]
 
     def _draw(self, points: F64, faces: I32, first: int, ids: I32, inverse: F32) -> None:
         camera, two_sided = self.scene.camera, self._assembly.two_sided

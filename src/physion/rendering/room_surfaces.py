@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from physion.rendering.noise import F32, Painter, flat, grid, noise, tint
+from physion.numerics.elementary import exp, power, sin
+from physion.rendering.noise import F32, Painter, flat, grid, noise, tint, uniform
 
 
 def _carpet(rng: np.random.Generator) -> tuple[F32, F32]:
     """Loops of wool in rows, some of them paler."""
     u, v = grid()
-    rows = np.sin(2 * np.pi * 70 * v) * np.sin(2 * np.pi * (70 * u + 0.5 * np.floor(70 * v)))
+    rows = sin(2 * np.pi * 70 * v) * sin(2 * np.pi * (70 * u + 0.5 * np.floor(70 * v)))
     fleck = noise(rng, 110, 90)
     height = 0.3 * rows + 0.8 * fleck + 0.4 * noise(rng, 45, 36)
-    value = 0.52 * np.exp(0.48 * height + 0.03 * noise(rng, 4, 4))
+    value = 0.52 * exp(0.48 * height + 0.03 * noise(rng, 4, 4))
     return np.clip(tint(value, (1.0, 1.0, 1.0)), 0.02, 1), 0.0002 * height
 
 
@@ -38,10 +39,10 @@ def _tiles(rng: np.random.Generator) -> tuple[F32, F32]:
     u, v = grid()
     count = 4
     column, row = (u * count).astype(int), (v * count).astype(int)
-    shade = rng.uniform(0.74, 1.2, (count, count))[row, column]
+    shade = uniform(rng, 0.74, 1.2, (count, count))[row, column]
     clouds = 0.5 * noise(rng, 9, 9) + 0.35 * noise(rng, 26, 26) + 0.15 * noise(rng, 80, 80)
     value = shade * np.clip(1.0 + 0.30 * clouds, 0.2, None)
-    color = np.stack([0.150 * value, 0.058 * value**1.15, 0.040 * value**1.2], -1)
+    color = np.stack([0.150 * value, 0.058 * power(value, 1.15), 0.040 * power(value, 1.2)], -1)
     du = np.abs(u * count - np.round(u * count))
     dv = np.abs(v * count - np.round(v * count))
     joint = np.clip(1.5 - np.minimum(du, dv) / 0.008, 0.0, 1.0)[..., None]
@@ -54,7 +55,7 @@ def _paving(rng: np.random.Generator) -> tuple[F32, F32]:
     u, v = grid()
     row = (v * 16).astype(int)
     shifted = (u * 8 + 0.5 * (row % 2)) % 8
-    shade = rng.uniform(0.7, 1.1, (16, 8))[row, shifted.astype(int)]
+    shade = uniform(rng, 0.7, 1.1, (16, 8))[row, shifted.astype(int)]
     du, dv = np.abs(shifted - np.round(shifted)), np.abs(v * 16 - np.round(v * 16))
     joint = (np.minimum(du, dv) < 0.06) * 0.35
     value = 0.55 * shade * (1 + 0.12 * noise(rng, 60, 60)) * (1 - joint)

@@ -12,6 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from physion.numerics.linear_algebra import norm, unit
 from physion.registry import Registry
 from physion.scenes.scene import Vec3
 
@@ -62,7 +63,7 @@ def _wall(
 ) -> Iterator[Panel]:
     """A wall with rectangular openings (u from, u to, v from, v to), in metres along u and v."""
     start, du, dv = (np.asarray(x, np.float64) for x in (corner, u, v))
-    width, height = np.linalg.norm(du), np.linalg.norm(dv)
+    width, height = norm(du), norm(dv)
     du, dv = du / width, dv / height
     across = sorted({0.0, float(width), *(x for o in openings for x in o[:2])})
     upward = sorted({0.0, float(height), *(y for o in openings for y in o[2:])})
@@ -87,7 +88,7 @@ def _reveal(
 ) -> Iterator[Panel]:
     """The four sides of an opening through a wall ``depth`` metres thick."""
     start, du, dv = (np.asarray(x, np.float64) for x in (corner, u, v))
-    du, dv = du / np.linalg.norm(du), dv / np.linalg.norm(dv)
+    du, dv = unit(du), unit(dv)
     back = -depth * np.cross(du, dv)
     a, b, c, d = opening
     p = [start + x * du + y * dv for x, y in ((a, c), (b, c), (b, d), (a, d))]
@@ -177,7 +178,7 @@ def _pane(
 ) -> Panel:
     """What is seen through an opening: a plane of light behind it."""
     start, du, dv = (np.asarray(x, np.float64) for x in (corner, u, v))
-    du, dv = du / np.linalg.norm(du), dv / np.linalg.norm(dv)
+    du, dv = unit(du), unit(dv)
     a, b, c, d = opening
     at = start + a * du + c * dv - depth * np.cross(du, dv)
     return Panel(_vec(at), _vec((b - a) * du), _vec((d - c) * dv), color, "glow", 2.0, glow, False)

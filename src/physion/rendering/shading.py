@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from physion.numerics.elementary import coarse_log2_of, exp_of
 from physion.numerics.kernel import kernel
 from physion.rendering.rasterizer import SAMPLES
 
@@ -29,6 +30,7 @@ CORNERS = 22
 row of its material."""
 SHARPEN = 0.64
 """Share of the area of a pixel over which textures are averaged: below 1 is crisper."""
+LN2 = 0.6931471805599453
 WHITEST = 4.0
 """Linear light beyond which the tone table is white."""
 
@@ -119,7 +121,7 @@ def _shade_point(
     # The square of the mean of both sides' lengths (geometric: between blur and flicker).
     square = np.sqrt((du_dx * du_dx + dv_dx * dv_dx) * (du_dy * du_dy + dv_dy * dv_dy))
     side = 1 << (starts.shape[1] - 1)
-    level = 0.5 * np.log2(max(SHARPEN * side * side * w * w * square, 1.0))
+    level = 0.5 * coarse_log2_of(max(SHARPEN * side * side * w * w * square, 1.0))
     ar, ag, ab, slope_u, slope_v = _texture(texels, starts, int(materials[m, 3]), u, v, level)
     ar, ag, ab = ar * materials[m, 0], ag * materials[m, 1], ab * materials[m, 2]
 
@@ -148,7 +150,8 @@ def _shade_point(
         hx, hy, hz = lx + vx, ly + vy, lz + vz
         half = (nx * hx + ny * hy + nz * hz) / np.sqrt(hx * hx + hy * hy + hz * hz)
         if half > 0.5:
-            shine = materials[m, 4] * half ** materials[m, 5]
+            # half ** sharpness, to 3e-4.
+            shine = materials[m, 4] * exp_of(LN2 * materials[m, 5] * coarse_log2_of(half))
     metal = materials[m, 7]
     graze = (1.0 - toward) * (1.0 - toward)
     mirror = materials[m, 6] * (1.0 + (3.0 - 2.0 * metal) * graze * graze)
@@ -201,8 +204,8 @@ def _room_shade(
         n = nx if k == 0 else (ny if k == 1 else nz)
         flat = 1.0 - abs(n)
         low, high = max(p - light[12, k], 0.0), max(light[13, k] - p, 0.0)
-        left *= 1.0 - 0.22 * flat * np.exp(-low / 0.6)
-        left *= 1.0 - 0.22 * flat * np.exp(-high / 0.6)
+        left *= 1.0 - 0.22 * flat * exp_of(-low / 0.6)
+        left *= 1.0 - 0.22 * flat * exp_of(-high / 0.6)
     return float(left)
 
 

@@ -19,6 +19,7 @@ from physion.rendering.materials import MATERIAL_PAINTERS
 from physion.rendering.noise import SIZE, Painter
 from physion.rendering.room_surfaces import ROOM_PAINTERS
 from physion.rendering.woods import WOOD_PAINTERS
+from physion.seeds import child_generator, named_seed
 
 U8 = NDArray[np.uint8]
 
@@ -114,8 +115,9 @@ def build_atlas(names: tuple[str, ...]) -> Atlas:
 
 @lru_cache(maxsize=64)
 def _levels(name: str) -> tuple[U8, ...]:
-    """Mip levels of one texture, each (side * side, 5) bytes, averaged in linear light."""
-    albedo, height = PAINTERS[name](np.random.default_rng(list(name.encode())))
+    """Return the mip levels of one texture, each (side * side, 5) bytes, means of linear light."""
+    seed = named_seed(name)
+    albedo, height = PAINTERS[name](child_generator(seed, "painting"))
     image = np.empty((5, SIZE, SIZE), np.float32)
     image[:3] = np.moveaxis(albedo, -1, 0)
     image[3] = (np.roll(height, -1, 1) - np.roll(height, 1, 1)) * (SIZE / 2)

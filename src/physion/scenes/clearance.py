@@ -9,9 +9,11 @@ from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
-from scipy.optimize import linprog
 
-from physion.scenes.placement import rotate, world_bounds
+from physion.numerics.elementary import cos, sin, tan
+from physion.numerics.linear_algebra import apply, inverse, multiply, norm
+from physion.numerics.rotations import rotate_vectors
+from physion.scenes.placement import world_bounds
 from physion.scenes.scene import Body
 from physion.scenes.shapes import shape
 from physion.scenes.solids import Points
@@ -21,12 +23,17 @@ GAP = 0.001
 """Metres left free where a body had to be raised off another one."""
 TOUCH = 1e-6
 """Metres: bodies that overlap by less only touch."""
+EXACT = 1e-12
+"""Metres above a plane, at right angles to it, that count as nothing: rounding."""
+DEEP = 1e6
+"""Metres below everything; walls with a slope of more than this count as upright."""
+MOST_EXCHANGES = 200
 
 
 def _slope_grid() -> Points:
     turns = 2 * np.pi * np.arange(16) / 16
-    tilts = np.tan(np.radians([0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0, 87.0, 89.5]))
-    ways = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    tilts = tan(np.radians([0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0, 87.0, 89.5]))
+    ways = np.stack([cos(turns), sin(turns)], axis=1)
     return np.asarray((tilts[:, None, None] * ways).reshape(-1, 2))
 
 
@@ -71,7 +78,8 @@ def _corners(body: Body) -> list[Points]:
     """World corners (K, 3) of each convex piece."""
     place = np.array(body.position)
     return [
-        rotate(body.rotation, piece * body.scale) + place for piece in _unit_corners(body.shape)
+        rotate_vectors(body.rotation, piece * body.scale) + place
+        for piece in _unit_corners(body.shape)
     ]
 
 
@@ -87,21 +95,33 @@ def _rough_rise(under: Points, part: Points) -> float:
     max(z - ux - vy) of the one plus max(ux + vy - z) of the other. The least over all slopes (u, v)
     is the answer; that over a few slopes is on the safe side.
     """
-    over = (under[:, 2:] - under[:, :2] @ SLOPES.T).max(axis=0)
-    return float((over + (part[:, :2] @ SLOPES.T - part[:, 2:]).max(axis=0)).min())
+    over = (under[:, 2:] - multiply(under[:, :2], SLOPES.T)).max(axis=0)
+    return float((over + (multiply(part[:, :2], SLOPES.T) - part[:, 2:]).max(axis=0)).min())
 
 
 def _rise(under: Points, part: Points) -> float:
-    """The least over all slopes, by a linear program; minus infinity where no rise is needed."""
-    one, none = np.ones((len(under), 1)), np.zeros((len(under), 1))
-    other, nought = np.ones((len(part), 1)), np.zeros((len(part), 1))
-    rows = np.vstack(
-        [
-            np.hstack([-under[:, :2], -one, none]),
-            np.hstack([part[:, :2], nought, -other]),
-        ]
-    )
-    limits = np.concatenate([-under[:, 2], part[:, 2]])
-    found = linprog([0, 0, 1, 1], A_ub=rows, b_ub=limits, bounds=(None, None), method="highs")
-    # Without a bound below, the two are beside each other.
-    return float(found.fun) if found.status == 0 else -np.inf
+    """Find that least rise over all slopes; minus infinity where the two are beside each other.
+
+    The differences between points of ``under`` and of ``part`` fill a convex body, and the answer
+    is the height at which the upright line through the origin leaves it. The simplex method finds
+    it: of three differences that surround the line, one gives way to that difference which is
+    farthest above the plane through them, until none is above.
+    """
+    corners = np.array([[1.0, 0.0, -DEEP], [-0.5, 0.75, -DEEP], [-0.5, -0.75, -DEEP]])
+    for _ in range(MOST_EXCHANGES):
+        # Row i gives the share of corner i in a level place (x, y, 1), so that shares add up to 1.
+        shares = inverse(np.vstack([corners[:, :2].T, np.ones(3)]))
+        u, v, height = apply(shares.T, corners[:, 2])
+        over = under[:, 2] - u * under[:, 0] - v * under[:, 1]
+        below = part[:, 2] - u * part[:, 0] - v * part[:, 1]
+        top, bottom = over.argmax(), below.argmin()
+        rise = float(over[top] - below[bottom])
+        if rise <= height + EXACT * norm((u, v, 1.0)):
+            return -np.inf if (corners[:, 2] == -DEEP).any() else rise
+        found = under[top] - part[bottom]
+        step = apply(shares, (found[0], found[1], 1.0))
+        # The corner whose share of the origin is the first to be used up.
+        here = np.maximum(shares[:, 2], 0.0)
+        limits = np.divide(here, step, out=np.full(3, np.inf), where=step > 1e-12)
+        corners[limits.argmin()] = found
+    return _rough_rise(under, part)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from physion.numerics.elementary import arctan2
+from physion.numerics.rotations import rotate_vectors
 from physion.scenes.parameters import Count, Length, Room, Share, place, uniform
-from physion.scenes.placement import CameraRule, SceneryRule, rotate, world_bounds
+from physion.scenes.placement import CameraRule, SceneryRule, world_bounds
 from physion.scenes.rules import (
     BodyRule,
     PushRule,
@@ -105,8 +106,8 @@ def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
 
 def heading(body: Body) -> float:
     """Radians from +x, towards +y, of where the body's own x axis points."""
-    x, y, _ = rotate(body.rotation, (1.0, 0.0, 0.0))
-    return math.atan2(float(y), float(x))
+    x, y, _ = rotate_vectors(body.rotation, (1.0, 0.0, 0.0))
+    return arctan2(float(y), float(x))
 
 
 def _row(

@@ -6,7 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from physion.scenes.parameters import Length, Lengths, Multiples, Room, uniform
+from physion.numerics.linear_algebra import unit
+from physion.numerics.random_normals import standard_normal
+from physion.scenes.parameters import Length, Lengths, Multiples, Room, as_quaternion, uniform
 from physion.scenes.placement import CameraRule, SceneryRule, world_bounds
 from physion.scenes.rules import BodyRule, ZoneRule, above_floor, draw_body, draw_zone
 from physion.scenes.scenarios import scenario
@@ -117,7 +119,7 @@ def _standing(lower: Body, zone: Body) -> Body:
 
 def _hung(params: Params, rng: np.random.Generator, palette: Palette, lower: Body) -> Body:
     """What falls, high enough to fall at least `FALL` metres."""
-    x, y = (float(aside) for aside in rng.uniform(-params.jitter, params.jitter, 2))
+    x, y = (uniform(rng, (-params.jitter, params.jitter)) for _ in range(2))
     place = (x, y, uniform(rng, params.height))
     look = palette.agent_look(params.dropped.textures)
     target = draw_body(rng, params.dropped, "target", place, look)
@@ -129,7 +131,5 @@ def _hung(params: Params, rng: np.random.Generator, palette: Palette, lower: Bod
 
 
 def random_rotation(rng: np.random.Generator) -> Quat:
-    """An even random rotation."""
-    parts = rng.standard_normal(4)
-    w, x, y, z = (float(part) for part in parts / np.linalg.norm(parts))
-    return (w, x, y, z)
+    """Draw a rotation, all orientations as likely."""
+    return as_quaternion(unit(standard_normal(rng, 4)))

@@ -11,7 +11,7 @@ import numpy as np
 
 from physion.errors import BadInputError, UnknownNameError
 from physion.scenes.scene import Body, Cloth, Look, Scene, Vec3
-from physion.seeds import child_generator, stable_hash
+from physion.seeds import child_generator, named_seed
 
 MATERIALS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
@@ -144,9 +144,7 @@ def with_role_colors(scene: Scene) -> Scene:
     Nothing but colours changes. New colours depend on the physics of the scene alone, so that
     the same trial always looks the same.
     """
-    rng = child_generator(
-        np.random.SeedSequence(stable_hash(scene.physics_digest())), "role colors"
-    )
+    rng = child_generator(named_seed(scene.physics_digest()), "role colors")
 
     def color_of(thing: Body | Cloth) -> Vec3:
         if thing.name == scene.roles.agent:

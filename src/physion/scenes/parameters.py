@@ -17,8 +17,10 @@ from dataclasses import dataclass
 from typing import Annotated, Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from physion.errors import BadInputError, BadSceneError, UnknownNameError
+from physion.numerics.rotations import axis_angle_quaternion, multiply_quaternions
 from physion.scenes.scene import Ending, Quat, Vec3
 
 ROOMS = ("box", "bright", "empty")
@@ -96,7 +98,9 @@ Room = Annotated[str, NamesOf("room")]
 
 def uniform(rng: np.random.Generator, interval: Range) -> float:
     """An even draw from ``interval``; always one number of the stream, also if it is a point."""
-    return float(rng.uniform(*interval))
+    low, high = interval
+    # Not `Generator.uniform`: compilers for some processors fuse its product and sum.
+    return low + (high - low) * rng.random()
 
 
 def draw_count(rng: np.random.Generator, counts: tuple[int, int]) -> int:
@@ -140,32 +144,23 @@ def draw_turn(rng: np.random.Generator, turn: Axes) -> Quat:
 
 def three_turns(x_deg: float, y_deg: float, z_deg: float) -> Quat:
     """The rotation by degrees about y, then about x, then about z: Unity's order."""
-    about_x = axis_turn((1.0, 0.0, 0.0), math.radians(x_deg))
-    about_y = axis_turn((0.0, 1.0, 0.0), math.radians(y_deg))
-    return multiply(yaw(math.radians(z_deg)), multiply(about_x, about_y))
+    about_x, about_y, about_z = (
+        axis_angle_quaternion(axis, math.radians(angle))
+        for axis, angle in zip(np.eye(3), (x_deg, y_deg, z_deg), strict=True)
+    )
+    tilted = multiply_quaternions(about_x, about_y)
+    return as_quaternion(multiply_quaternions(about_z, tilted))
 
 
 def yaw(angle: float) -> Quat:
     """The rotation by ``angle`` radians about z."""
-    return axis_turn((0.0, 0.0, 1.0), angle)
+    return as_quaternion(axis_angle_quaternion((0.0, 0.0, 1.0), angle))
 
 
-def axis_turn(axis: Vec3, angle: float) -> Quat:
-    """The rotation by ``angle`` radians about a unit axis."""
-    sine = math.sin(angle / 2)
-    return (math.cos(angle / 2), axis[0] * sine, axis[1] * sine, axis[2] * sine)
-
-
-def multiply(second: Quat, first: Quat) -> Quat:
-    """The rotation ``first`` followed by ``second``."""
-    w, x, y, z = second
-    a, b, c, d = first
-    return (
-        w * a - x * b - y * c - z * d,
-        w * b + x * a + y * d - z * c,
-        w * c - x * d + y * a + z * b,
-        w * d + x * c - y * b + z * a,
-    )
+def as_quaternion(values: NDArray[np.float64]) -> Quat:
+    """Turn an array (4,) into the tuple of floats that scenes hold and JSON can keep."""
+    w, x, y, z = values.tolist()
+    return (w, x, y, z)
 
 
 def read_params(kind: type[Any], table: Mapping[str, Any], where: str, base: Any = None) -> Any:

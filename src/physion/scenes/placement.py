@@ -16,6 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from physion.errors import BadSceneError
+from physion.numerics.elementary import arctan2, cos, sin, tan
+from physion.numerics.linear_algebra import dot, norm, ordered_mean, unit
+from physion.numerics.rotations import rotate_vectors
 from physion.scenes.looks import prop_look
 from physion.scenes.parameters import (
     Angle,
@@ -34,7 +37,7 @@ from physion.scenes.parameters import (
 )
 from physion.scenes.prop_shapes import NATURAL_SIZES
 from physion.scenes.props import expand_props
-from physion.scenes.scene import Body, Camera, Look, Quat
+from physion.scenes.scene import Body, Camera, Look
 from physion.scenes.shapes import shape
 
 CLEARANCE = 0.25
@@ -93,18 +96,10 @@ class SceneryRule:
     occlusion: Share = 0.75
 
 
-def rotate(rotation: Quat, points: ArrayLike) -> NDArray[np.float64]:
-    """Turn ``points`` (..., 3) by a unit quaternion (w, x, y, z)."""
-    w, axis = rotation[0], np.array(rotation[1:])
-    vectors = np.asarray(points, np.float64)
-    across = 2.0 * np.cross(axis, vectors)
-    return np.asarray(vectors + w * across + np.cross(axis, across))
-
-
 def world_corners(body: Body) -> NDArray[np.float64]:
     """(V, 3): the corners of a body's drawn mesh in the world, metres."""
     corners = shape(body.shape).mesh.vertices * body.scale
-    return np.asarray(rotate(body.rotation, corners) + np.array(body.position))
+    return np.asarray(rotate_vectors(body.rotation, corners) + np.array(body.position))
 
 
 def world_bounds(body: Body) -> NDArray[np.float64]:
@@ -115,16 +110,14 @@ def world_bounds(body: Body) -> NDArray[np.float64]:
 
 def on_screen(camera: Camera, point: ArrayLike) -> tuple[float, float]:
     """Where a square picture shows ``point``: right and up, from -1 to 1; infinite if behind."""
-    forward = np.subtract(camera.target, camera.position)
-    forward = forward / np.linalg.norm(forward)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right = right / np.linalg.norm(right)
+    forward = unit(np.subtract(camera.target, camera.position))
+    right = unit(np.cross(forward, [0.0, 0.0, 1.0]))
     ray = np.subtract(point, camera.position)
-    depth = float(ray @ forward)
+    depth = float(dot(ray, forward))
     if not camera.near < depth < camera.far:
         return (math.inf, math.inf)
-    size = depth * math.tan(camera.fov / 2)
-    return (float(ray @ right) / size, float(ray @ np.cross(right, forward)) / size)
+    size = depth * tan(camera.fov / 2)
+    return (float(dot(ray, right)) / size, float(dot(ray, np.cross(right, forward))) / size)
 
 
 def place_camera(
@@ -134,11 +127,11 @@ def place_camera(
 
     Raises `BadSceneError` if `CAMERA_TRIES` draws show none such.
     """
-    centers = [world_bounds(body).mean(axis=0) for body in seen]
+    centers = [ordered_mean(world_bounds(body), axis=0) for body in seen]
     for _ in range(CAMERA_TRIES):
         distance = uniform(rng, rule.radius) * math.sqrt(2)
         azimuth = math.radians(uniform(rng, rule.angle_deg) + 45.0)
-        x, y = distance * math.cos(azimuth), distance * math.sin(azimuth)
+        x, y = distance * cos(azimuth), distance * sin(azimuth)
         if rule.mirror and rng.random() < rule.mirror:
             x = -x
         camera = Camera((x, y, uniform(rng, rule.height)), (0.0, 0.0, aim_height))
@@ -217,7 +210,7 @@ def _first_free(
     """The prop at its angle or, where another prop is, steps of ``spacing`` beside it or behind."""
     for times, step in itertools.product(FARTHER, STEPS_ASIDE):
         at = turn + step * spacing
-        if abs(step) > 3 and abs(math.cos(at)) < math.cos(FARTHEST_ASIDE):
+        if abs(step) > 3 and abs(cos(at)) < cos(FARTHEST_ASIDE):
             continue
         body = _standing(replace(drawn, share=drawn.share * times), camera, keep_out, at)
         if not any(_footprints_meet(body, other) for other in placed):
@@ -230,7 +223,7 @@ def _first_free(
 
 def _standing(drawn: _Drawn, camera: Camera, keep_out: NDArray[np.float64], turn: float) -> Body:
     place = _place(drawn, camera, keep_out, turn)
-    azimuth = math.atan2(camera.position[1], camera.position[0])
+    azimuth = arctan2(camera.position[1], camera.position[0])
     return Body(
         name=drawn.name,
         shape=drawn.shape,
@@ -248,11 +241,11 @@ def _place(
 ) -> NDArray[np.float64]:
     """Where (2,) a prop stands: clear of the scene, and not in the camera's face."""
     x, y, _ = camera.position
-    azimuth, whole = math.atan2(y, x) + turn, math.hypot(x, y)
-    way = np.array([math.cos(azimuth), math.sin(azimuth)])
+    azimuth, whole = arctan2(y, x) + turn, math.sqrt(x * x + y * y)
+    way = np.array([cos(azimuth), sin(azimuth)])
     place = _clear(way, drawn.share * whole / math.sqrt(2), drawn.size, keep_out)
-    if math.cos(turn) > 0:
-        place *= min(1.0, NEAREST_OCCLUDER * whole / float(np.hypot(*place)))
+    if cos(turn) > 0:
+        place *= min(1.0, NEAREST_OCCLUDER * whole / float(norm(place)))
     return place
 
 
@@ -265,7 +258,7 @@ def _occluding_size(
 ) -> NDArray[np.float64]:
     """A size whose top ends at its share of the line of sight; width grows along within limits."""
     place = _place(drawn, camera, keep_out, turn)
-    along = float(np.hypot(*place)) / math.hypot(*camera.position[:2])
+    along = float(norm(place) / norm(camera.position[:2]))
     sight = camera.target[2] + (camera.position[2] - camera.target[2]) * along
     top = max(rule.occlusion * sight, 0.05)
     factor = min(top / drawn.size[2], rule.occluder_size[1] / max(drawn.size))
@@ -274,8 +267,8 @@ def _occluding_size(
 
 def _footprints_meet(body: Body, other: Body) -> bool:
     """Whether the circles round two props' floor plans meet."""
-    reach = (math.hypot(*body.scale[:2]) + math.hypot(*other.scale[:2])) / 2
-    return math.dist(body.position[:2], other.position[:2]) < reach
+    reach = (norm(body.scale[:2]) + norm(other.scale[:2])) / 2
+    return bool(norm(np.subtract(body.position[:2], other.position[:2])) < reach)
 
 
 def _clear(
@@ -285,7 +278,7 @@ def _clear(
     keep_out: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """The first place along ``way`` from ``distance`` on that is clear of the scene's rectangle."""
-    room = CLEARANCE + math.hypot(size[0], size[1]) / 2
+    room = CLEARANCE + float(norm(size[:2])) / 2
     low, high = keep_out[0, :2] - room, keep_out[1, :2] + room
     with np.errstate(divide="ignore"):
         exits = np.where(way > 0, high / way, low / way)

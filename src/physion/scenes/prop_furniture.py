@@ -8,6 +8,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from physion.numerics.elementary import cos, sin
 from physion.scenes.prop_parts import Part, prop
 from physion.scenes.prop_solids import (
     arc,
@@ -132,7 +133,7 @@ def _side_table() -> Iterable[Part]:
     yield turned([(0.215, 0.52), (0.23, 0.53), (0.23, 0.545), (0.22, 0.55)], sides=32)
     yield turned([(0.12, 0.495), (0.12, 0.52)], sides=16)
     for turn in np.arange(3) * 2 * math.pi / 3 + math.pi / 2:
-        x, y = math.cos(turn), math.sin(turn)
+        x, y = cos(turn), sin(turn)
         yield tube([(0.205 * x, 0.205 * y, 0.0), (0.1 * x, 0.1 * y, 0.52)], [0.011, 0.019])
 
 

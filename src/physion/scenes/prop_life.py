@@ -8,10 +8,13 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from physion.numerics.elementary import cos, sin
+from physion.numerics.linear_algebra import norm, ordered_mean, unit
 from physion.scenes.prop_parts import Part, prop
 from physion.scenes.prop_solids import ball, curve, limb, loft, ring, tube, turned
 from physion.scenes.scene import Look
 from physion.scenes.solids import Points
+from physion.seeds import child_generator, named_seed
 
 CLAY = Look((0.66, 0.42, 0.31), "plain")
 GLAZED = Look((0.82, 0.82, 0.8), "plastic_glossy")
@@ -31,12 +34,8 @@ def _leaf(path: ArrayLike, widths: ArrayLike, fold: float = 0.25) -> Part:
     points = np.asarray(path, np.float64)
     way = points[-1] - points[0]
     across = np.cross(way, (0.0, 0.0, 1.0))
-    if np.linalg.norm(across) < 1e-6:
-        across = np.array([1.0, 0.0, 0.0])
-    across /= np.linalg.norm(across)
-    ahead = np.gradient(points, axis=0)
-    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
-    up = np.cross(across, ahead)
+    across = unit(across) if norm(across) >= 1e-6 else np.array([1.0, 0.0, 0.0])
+    up = np.cross(across, unit(np.gradient(points, axis=0)))
     width = np.maximum(np.asarray(widths, np.float64), 0.002)[:, None]
     thick = 0.002 * up
     rim = points + fold * width * up
@@ -60,12 +59,14 @@ def _pot(radius: float, height: float, look: Look) -> Iterable[Part]:
 def _plant() -> Iterable[Part]:
     """A garden plant: a tuft of arching blades in a clay pot."""
     yield from _pot(0.14, 0.22, CLAY)
-    rng = np.random.default_rng(7)  # the same plant for everybody
+    # The same plant for everybody.
+    seed = named_seed("prop", "plant")
+    rng = child_generator(seed, "blades")
     for i in range(34):
         turn = i * math.pi * (3 - math.sqrt(5))
         reach = 0.04 + 0.22 * math.sqrt((i + 0.5) / 34)
         rise = 0.62 - 1.0 * reach + 0.1 * rng.random()
-        way = np.array([math.cos(turn), math.sin(turn), 0.0])
+        way = np.array([cos(turn), sin(turn), 0.0])
         stations = [(0.02, 0.19), (0.3 * reach, 0.19 + 0.6 * rise), (0.7 * reach, 0.16 + rise)]
         stations.append((reach, 0.19 + rise - 0.6 * reach))
         path = curve([r * way + [0, 0, z * 0.82 + 0.03] for r, z in stations], 2)
@@ -81,7 +82,7 @@ def _houseplant() -> Iterable[Part]:
     for i in range(17):
         turn, share = i * math.pi * (3 - math.sqrt(5)), i / 16
         size = 0.27 - 0.12 * share
-        way = np.array([math.cos(turn), math.sin(turn), 0.0])
+        way = np.array([cos(turn), sin(turn), 0.0])
         lift = 0.25 + 0.75 * share
         start = np.array([0, 0, 0.34 + 0.4 * share])
         bend = [
@@ -110,7 +111,7 @@ def _ribbed(path: Points, radius: float) -> Part:
     part = tube(path, radius, sides=20, rounded=True)
     count = (len(part.mesh.vertices) - 2) // 20
     rings = part.mesh.vertices[:-2].reshape(count, 20, 3)
-    middle = rings.mean(axis=1, keepdims=True)
+    middle = ordered_mean(rings, axis=1)[:, None]
     star = np.where(np.arange(20) % 2 == 0, 1.0, 0.8)[:, None]
     return Part(loft(middle + star * (rings - middle)).mesh, part.pieces)
 

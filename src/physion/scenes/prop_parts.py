@@ -6,13 +6,14 @@ A prop is modelled in metres at its natural size, front towards +y, and then fit
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from physion.numerics.linear_algebra import apply, ordered_mean, unit
+from physion.numerics.rotations import axis_angle_matrix
 from physion.scenes.props import PREFIX
 from physion.scenes.scene import Look, Vec3
 from physion.scenes.shapes import CURVED, Shape, convex, shapes
@@ -56,17 +57,16 @@ class Part:
 
     def turned(self, axis: ArrayLike, angle: float, about: ArrayLike = (0, 0, 0)) -> Part:
         """The part turned by ``angle`` radians about ``axis`` through the point ``about``."""
-        matrix, center = _rotation(axis, angle), np.asarray(about, np.float64)
-        shift = center - matrix @ center
-        pieces = tuple(piece @ matrix.T + shift for piece in self.pieces)
+        matrix, center = axis_angle_matrix(axis, angle), np.asarray(about, np.float64)
+        shift = center - apply(matrix, center)
+        pieces = tuple(apply(matrix, piece) + shift for piece in self.pieces)
         return replace(self, mesh=self.mesh.turned(matrix).moved(offset=shift), pieces=pieces)
 
     def patched(self, where: Callable[[Points, Points], NDArray[np.bool_]], look: Look) -> Part:
         """The part with ``look`` on the triangles whose centres and normals (F, 3) are so."""
         corners = self.mesh.vertices[self.mesh.faces]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        mask = np.asarray(where(corners.mean(axis=1), normals), np.bool_)
+        mask = np.asarray(where(ordered_mean(corners, axis=1), unit(normals)), np.bool_)
         return replace(self, patches=(*self.patches, (mask, look)))
 
 
@@ -111,9 +111,3 @@ def _paint(part: Part, own: tuple[Look, ...]) -> NDArray[np.int32]:
     for mask, look in part.patches:
         paint[mask] = 1 + own.index(look)
     return paint
-
-
-def _rotation(axis: ArrayLike, angle: float) -> Points:
-    x, y, z = np.asarray(axis, np.float64) / np.linalg.norm(axis)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.asarray(np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross)

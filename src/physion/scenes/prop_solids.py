@@ -10,6 +10,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from physion.numerics.elementary import cos, sin
+from physion.numerics.linear_algebra import dot, multiply, norm, ordered_mean, unit
 from physion.scenes.prop_parts import Part
 from physion.scenes.scene import Look, Vec3
 from physion.scenes.shapes import CURVED, ball_mesh
@@ -108,7 +110,7 @@ def curve(points: Sequence[Sequence[float]] | Sequence[Points], steps: int = 5) 
     t = np.linspace(0, 1, steps, endpoint=False)[:, None]
     spans = []
     for a, b, c, d in zip(p, p[1:], p[2:], p[3:], strict=False):
-        bend = (2 * a - 5 * b + 4 * c - d) * t**2 + (3 * b - a - 3 * c + d) * t**3
+        bend = (2 * a - 5 * b + 4 * c - d) * t**2 + (3 * b - a - 3 * c + d) * (t * t * t)
         spans.append(0.5 * (2 * b + (c - a) * t + bend))
     return np.concatenate([*spans, p[-1:]])
 
@@ -141,9 +143,9 @@ def tube(
     if rounded:
         points, sizes, across, up = _domed(points, sizes, across, up, ways)
     turns = 2 * math.pi * np.arange(sides) / sides
-    section = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    section = np.stack([cos(turns), sin(turns)], axis=1)
     spokes = np.stack([across * sizes[:, :1], up * sizes[:, 1:]], axis=1)
-    rings = points[:, None] + np.einsum("sk,pkd->psd", section, spokes)
+    rings = points[:, None] + multiply(section, spokes)
     part = loft(rings, look, closed=closed)
     if not rounded:
         return part
@@ -164,7 +166,7 @@ def loft(rings: Points, look: Look | None = None, *, closed: bool = False) -> Pa
     faces = [np.stack(x, axis=-1).reshape(-1, 3) for x in ((low, ahead, above), (low, above, high))]
     vertices = rings.reshape(-1, 3)
     if not closed:
-        vertices = np.concatenate([vertices, rings[[0, -1]].mean(axis=1)])
+        vertices = np.concatenate([vertices, ordered_mean(rings[[0, -1]], axis=1)])
         first, last = count * sides, count * sides + 1
         faces.append(np.stack([np.full(sides, first), np.roll(at[0], -1), at[0]], axis=1))
         faces.append(np.stack([np.full(sides, last), at[-1], np.roll(at[-1], -1)], axis=1))
@@ -182,13 +184,13 @@ def arc(
     """``count`` points (K, 3) of an ellipse with these half axes, between two angles in radians."""
     turns = np.linspace(first, last, count)[:, None]
     middle, x, y = (np.asarray(v, np.float64) for v in (center, right, up))
-    return np.asarray(middle + np.cos(turns) * x + np.sin(turns) * y)
+    return np.asarray(middle + cos(turns) * x + sin(turns) * y)
 
 
 def ring(x: float, y: float, z: float, sides: int = 12) -> list[Vec3]:
     """Corners of a level ellipse at height ``z``."""
     turns = 2 * math.pi * np.arange(sides) / sides
-    return [(x * math.cos(t), y * math.sin(t), z) for t in turns]
+    return [(x * cos(t), y * sin(t), z) for t in turns]
 
 
 def _frames(points: Points, closed: bool) -> tuple[Points, Points, Points]:
@@ -197,16 +199,12 @@ def _frames(points: Points, closed: bool) -> tuple[Points, Points, Points]:
     behind = points - np.roll(points, 1, axis=0)
     if not closed:
         ahead[-1], behind[0] = behind[-1], ahead[0]
-    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
-    behind /= np.linalg.norm(behind, axis=1, keepdims=True)
-    ways = ahead + behind
-    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    ways = unit(unit(ahead) + unit(behind))
     level = np.cross(ways[0], (0.0, 0.0, 1.0))
-    across = level if np.linalg.norm(level) > 0.2 else np.array([1.0, 0.0, 0.0])
+    across = level if norm(level) > 0.2 else np.array([1.0, 0.0, 0.0])
     found = []
     for way in ways:
-        across = across - way * (across @ way)
-        across = across / np.linalg.norm(across)
+        across = unit(across - way * dot(across, way))
         found.append(across)
     sideways = np.array(found)
     return sideways, np.cross(sideways, ways), ways
@@ -217,11 +215,11 @@ def _domed(
 ) -> tuple[Points, Points, Points, Points]:
     """The path with three more rings at each end, which close it like half a ball."""
     turns = np.radians([84.0, 60.0, 30.0])[:, None]
-    first = points[0] - ways[0] * np.sin(turns) * sizes[0].min()
-    last = points[-1] + ways[-1] * np.sin(turns[::-1]) * sizes[-1].min()
+    first = points[0] - ways[0] * sin(turns) * sizes[0].min()
+    last = points[-1] + ways[-1] * sin(turns[::-1]) * sizes[-1].min()
     return (
         np.concatenate([first, points, last]),
-        np.concatenate([sizes[0] * np.cos(turns), sizes, sizes[-1] * np.cos(turns[::-1])]),
+        np.concatenate([sizes[0] * cos(turns), sizes, sizes[-1] * cos(turns[::-1])]),
         np.concatenate([across[:1].repeat(3, 0), across, across[-1:].repeat(3, 0)]),
         np.concatenate([up[:1].repeat(3, 0), up, up[-1:].repeat(3, 0)]),
     )

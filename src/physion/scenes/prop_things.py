@@ -7,8 +7,8 @@ from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
+from physion.numerics.elementary import arctan2, cos, power, sin
 from physion.scenes.prop_parts import Part, prop
 from physion.scenes.prop_solids import (
     arc,
@@ -76,12 +76,17 @@ def _world(centers: NDArray[np.float64], kind: str) -> NDArray[np.bool_]:
     """Which points about the middle of the earth lie on ``kind`` of ground."""
     ground = np.array([[mark == kind for mark in row] for row in WORLD.split()], np.float64)
     x, y, z = centers.T
-    row = (90 - np.degrees(np.arctan2(z, np.hypot(x, y)))) / 10 - 0.5
+    row = (90 - np.degrees(arctan2(z, np.sqrt(x * x + y * y)))) / 10 - 0.5
     # The Atlantic faces +y.
-    column = (np.degrees(np.arctan2(y, x)) + 60.0) / 10 - 0.5
-    # Between the squares of the map, so that coasts are not all steps.
-    between = ndimage.map_coordinates(ground, [row, column], order=1, mode="grid-wrap")
-    return np.asarray(between > 0.5)
+    column = (np.degrees(arctan2(y, x)) + 60.0) / 10 - 0.5
+    # Between the squares of the map, so that coasts are not all steps; beyond its edges it repeats.
+    rows, columns = ground.shape
+    south, east = row - np.floor(row), column - np.floor(column)
+    i, j = np.floor(row).astype(int) % rows, np.floor(column).astype(int) % columns
+    below, right = (i + 1) % rows, (j + 1) % columns
+    upper = (1 - east) * ground[i, j] + east * ground[i, right]
+    lower = (1 - east) * ground[below, j] + east * ground[below, right]
+    return np.asarray((1 - south) * upper + south * lower > 0.5)
 
 
 @prop("moon_globe", (0.3, 0.3, 0.36))
@@ -143,10 +148,11 @@ def _pillow() -> Iterable[Part]:
     """A throw pillow: plump in the middle, thin at the seams, drawn out at the corners."""
     sides, rings = 32, []
     turns = 2 * math.pi * (np.arange(sides) + 0.5) / sides
-    c, s = np.cos(turns), np.sin(turns)
-    square = np.stack([np.sign(c) * abs(c) ** 0.45, np.sign(s) * abs(s) ** 0.45], axis=1)
-    for depth in (-0.98, -0.85, -0.6, -0.3, 0.0, 0.3, 0.6, 0.85, 0.98):
-        width = 0.21 * (1 - abs(depth) ** 1.6) ** 0.55 / np.abs(square).max()
+    c, s = cos(turns), sin(turns)
+    square = np.stack([np.sign(c) * power(abs(c), 0.45), np.sign(s) * power(abs(s), 0.45)], axis=1)
+    depths = np.array([-0.98, -0.85, -0.6, -0.3, 0.0, 0.3, 0.6, 0.85, 0.98])
+    widths = 0.21 * power(1 - power(abs(depths), 1.6), 0.55) / np.abs(square).max()
+    for depth, width in zip(depths, widths, strict=True):
         x = np.full((sides, 1), 0.08 * depth / 0.98)
         rings.append(np.concatenate([x, width * square], axis=1))
     mesh = loft(np.array(rings)).mesh
@@ -173,9 +179,10 @@ def _sculpture() -> Iterable[Part]:
 def _boat() -> Iterable[Part]:
     """A kayak with a cockpit."""
     rings = []
-    for y in np.linspace(-1, 1, 15):
-        beam = 0.28 * (1 - abs(y) ** 2.2) + 0.012
-        keel, deck = 0.06 * y * y + 0.1 * max(abs(y) - 0.8, 0), 0.26 + 0.1 * y**4
+    stations = np.linspace(-1, 1, 15)
+    beams = 0.28 * (1 - power(abs(stations), 2.2)) + 0.012
+    for y, beam in zip(stations, beams, strict=True):
+        keel, deck = 0.06 * y * y + 0.1 * max(abs(y) - 0.8, 0), 0.26 + 0.1 * (y * y) * (y * y)
         section = [(-0.45, keel), (0.45, keel), (0.9, 0.4), (1.0, 0.75), (0.6, 0.93), (0.0, 1.0)]
         heights = [keel, keel] + [keel + f * (deck - keel) for _, f in section[2:]]
         points = [(x * beam, 1.4 * y, z) for (x, _), z in zip(section, heights, strict=True)]

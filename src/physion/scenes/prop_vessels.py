@@ -58,8 +58,8 @@ def _jug() -> Iterable[Part]:
     # The rim is drawn out to a lip.
     vertices = part.mesh.vertices.copy()
     high = np.clip((vertices[:, 2] - 0.2) / 0.06, 0.0, 1.0) ** 2
-    ahead = np.clip(vertices[:, 1] / 0.078, 0.0, 1.0) ** 6
-    vertices[:, 1] += 0.045 * high * ahead
+    ahead = np.clip(vertices[:, 1] / 0.078, 0.0, 1.0) ** 2
+    vertices[:, 1] += 0.045 * high * (ahead * ahead * ahead)
     yield Part(type(part.mesh)(vertices, part.mesh.faces, part.mesh.smooth), part.pieces)
     path = arc((0, -0.085, 0.145), (0, -0.065, 0), (0, 0, 0.08), -0.55 * math.pi, 0.5 * math.pi, 8)
     yield tube(path, 0.011)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from physion.errors import BadSceneError
+from physion.numerics.elementary import cos, sin
 from physion.scenes.parameters import (
     Angles,
     EarlyFrames,
@@ -174,14 +175,14 @@ def draw_push(rng: np.random.Generator, rule: PushRule, body: Body, turn: float 
     """
     speed, rise = uniform(rng, rule.speed), uniform(rng, rule.rise)
     heading = math.radians(uniform(rng, rule.heading_deg)) + turn
-    jitter = rng.uniform(-rule.point_jitter, rule.point_jitter, 3)
+    right, ahead, up = draw_axes(rng, ((-rule.point_jitter, rule.point_jitter),) * 3)
     frame = draw_frame(rng, rule.frame)
     height = min(rule.height, float(shape(body.shape).bounds[1, 2])) * body.scale[2]
     impulse = speed * body.mass
     x, y, z = body.position
     return Push(
         body.name,
-        (impulse * math.cos(heading), impulse * math.sin(heading), impulse * rise),
-        (x + float(jitter[0]), y + float(jitter[1]), z + height + float(jitter[2])),
+        (impulse * cos(heading), impulse * sin(heading), impulse * rise),
+        (x + right, y + ahead, z + height + up),
         frame,
     )

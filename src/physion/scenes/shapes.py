@@ -20,6 +20,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from physion.numerics.elementary import arctan2, cos, sin
+from physion.numerics.linear_algebra import ordered_sum, outer
 from physion.registry import Registry
 from physion.scenes.props import PREFIX, PROPS
 from physion.scenes.scene import Vec3
@@ -148,14 +150,15 @@ class Shape:
         parts = [self.mesh] if of == "solid" else [piece.mesh for piece in self.pieces]
         found = [solid_properties(part.moved(scale)) for part in parts]
         volumes = np.array([volume for volume, _, _ in found])
-        shares = volumes / volumes.sum()
+        volume = float(ordered_sum(volumes))
+        shares = volumes / volume
         centers = np.stack([center for _, center, _ in found])
-        center = shares @ centers
+        center = ordered_sum(shares[:, None] * centers, axis=0)
         inertia = np.zeros((3, 3))
         for share, part_center, (_, _, own) in zip(shares, centers, found, strict=True):
             arm = part_center - center
-            inertia += share * (own + inertia_from_second_moment(np.outer(arm, arm)))
-        return MassProperties(float(volumes.sum()), center, inertia)
+            inertia += share * (own + inertia_from_second_moment(outer(arm, arm)))
+        return MassProperties(volume, center, inertia)
 
 
 Outline = list[tuple[float, float]]
@@ -189,7 +192,7 @@ def ball_mesh(radius: float, segments: int = ROUND_SEGMENTS) -> Mesh:
     """A sphere about the origin, in ``segments`` meridians and half as many bands."""
     bands = segments // 2
     turns = [-math.pi / 2 + math.pi * i / bands for i in range(bands + 1)]
-    rings = [(radius * math.cos(t), radius * math.sin(t)) for t in turns[1:-1]]
+    rings = [(radius * cos(t), radius * sin(t)) for t in turns[1:-1]]
     return revolve([(0.0, -radius), *rings, (0.0, radius)], segments, smooth=CURVED)
 
 
@@ -202,7 +205,7 @@ def ring_pieces(sections: list[NDArray[np.float64]], sectors: int, steps: int) -
     for section in sections:
         for sector in range(sectors):
             turns = 2 * math.pi * (sector + np.arange(steps + 1) / steps) / sectors
-            circle = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+            circle = np.stack([cos(turns), sin(turns)], axis=1)
             points = [
                 np.column_stack([circle * r, np.full(len(circle), z)]) for r, z in section if r > 0
             ]
@@ -234,7 +237,7 @@ def _cylinder() -> Shape:
 def _half_cylinder() -> Shape:
     # Not an official shape: the official ledge is a stretched ball, sunk by half into the floor.
     turns = np.linspace(0, math.pi, 9)
-    points = [(math.cos(t) / 2, y, math.sin(t) / 2) for t in turns for y in (-0.5, 0.5)]
+    points = [(cos(t) / 2, y, sin(t) / 2) for t in turns for y in (-0.5, 0.5)]
     return _solid("half:cylinder", hull(points, CURVED))
 
 
@@ -261,7 +264,7 @@ def _octahedron() -> Shape:
 def _platonic() -> Shape:
     turns = 2 * np.pi * np.arange(5) / 5
     radius, rise = 1 / math.sqrt(5), 0.5 / math.sqrt(5)
-    upper = np.column_stack([radius * np.cos(turns), radius * np.sin(turns), np.full(5, rise)])
+    upper = np.column_stack([radius * cos(turns), radius * sin(turns), np.full(5, rise)])
     poles = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, -0.5]])
     corners = np.concatenate([upper, -upper, poles])
     return _solid("platonic", hull(corners).moved(offset=(0, 0, 0.5)))
@@ -270,7 +273,7 @@ def _platonic() -> Shape:
 @shapes.register("pentagon")
 def _pentagon() -> Shape:
     turns = -np.pi / 2 + 2 * np.pi * np.arange(5) / 5
-    corners = 0.5 * np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    corners = 0.5 * np.stack([cos(turns), sin(turns)], axis=1)
     return _solid("pentagon", extrude(corners, 0.0, 1.0))
 
 
@@ -320,11 +323,11 @@ def bowl_outline(radius: float, height: float, flat: float, points: int) -> Outl
 
     Of all circles through both ends, that which a round bottom at z = 0 would have.
     """
-    middle = (radius**2 + height**2 - flat**2) / (2 * height)
-    size = math.hypot(flat, middle)
-    first, last = math.atan2(-middle, flat), math.atan2(height - middle, radius)
+    middle = (radius * radius + height * height - flat * flat) / (2 * height)
+    size = math.sqrt(flat * flat + middle * middle)
+    first, last = arctan2(-middle, flat), arctan2(height - middle, radius)
     turns = np.linspace(first, last, points)
-    return [(size * math.cos(t), middle + size * math.sin(t)) for t in turns]
+    return [(size * cos(t), middle + size * sin(t)) for t in turns]
 
 
 @shapes.register("bowl")

@@ -10,6 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull
 
+from physion.numerics.elementary import cos, sin
+from physion.numerics.linear_algebra import apply, dot, ordered_sum, outer
+
 Points = NDArray[np.float64]
 Faces = NDArray[np.int32]
 
@@ -39,7 +42,7 @@ class Mesh:
 
     def turned(self, matrix: Points) -> Mesh:
         """The mesh turned by the rotation ``matrix`` (3, 3)."""
-        return Mesh(self.vertices @ matrix.T, self.faces, self.smooth)
+        return Mesh(apply(matrix, self.vertices), self.faces, self.smooth)
 
 
 def hull(points: ArrayLike, smooth: float = 0.0) -> Mesh:
@@ -49,7 +52,7 @@ def hull(points: ArrayLike, smooth: float = 0.0) -> Mesh:
     faces = convex.simplices.astype(np.int32)
     corners = cloud[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    inward = np.einsum("ij,ij->i", normals, convex.equations[:, :3]) < 0
+    inward = dot(normals, convex.equations[:, :3]) < 0
     faces[inward] = faces[inward][:, ::-1]
     used, renumbered = np.unique(faces, return_inverse=True)
     return Mesh(cloud[used], renumbered.reshape(-1, 3).astype(np.int32), smooth)
@@ -70,7 +73,7 @@ def revolve(
     ``phase`` turns the first of ``segments`` corners away from the x axis (radians).
     """
     angles = phase + 2 * math.pi * np.arange(segments) / segments
-    circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    circle = np.stack([cos(angles), sin(angles)], axis=1)
     vertices: list[Points] = []
     rings: list[NDArray[np.int64]] = []
     count = 0
@@ -124,17 +127,18 @@ def solid_properties(mesh: Mesh) -> tuple[float, Points, Points]:
     so that the result is exact (Tonon, Journal of Mathematics and Statistics 1, 2005).
     """
     a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
-    volumes = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0
-    volume = float(volumes.sum())
+    volumes = dot(a, np.cross(b, c)) / 6.0
+    volume = float(ordered_sum(volumes))
     total = a + b + c
-    center = (volumes[:, None] * total).sum(axis=0) / (4.0 * volume)
+    center = ordered_sum(volumes[:, None] * total, axis=0) / (4.0 * volume)
     second = np.zeros((3, 3))
     for point in (a, b, c, total):
-        second += np.einsum("i,ij,ik->jk", volumes, point, point)
+        second += ordered_sum(outer(volumes[:, None] * point, point), axis=0)
     second /= 20.0 * volume
-    return volume, center, inertia_from_second_moment(second - np.outer(center, center))
+    return volume, center, inertia_from_second_moment(second - outer(center, center))
 
 
 def inertia_from_second_moment(second: Points) -> Points:
     """Inertia tensor (3, 3) of a unit mass with the second moments ``second`` about its centre."""
-    return np.asarray(np.trace(second) * np.eye(3) - second)
+    trace = second[0, 0] + second[1, 1] + second[2, 2]
+    return np.asarray(trace * np.eye(3) - second)

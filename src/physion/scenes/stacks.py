@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from physion.numerics.linear_algebra import norm
 from physion.scenes.clearance import GAP, cleared
 from physion.scenes.parameters import (
     LEAST_MASS,
@@ -167,7 +168,7 @@ def draw_stand(
     pole = cleared(weighed(pole, ATTACHMENT_SHARES.get(pole.shape, 1.0)), (zone, base))
     joints = [Joint("base", "attachment")] if rule.joined else []
     if pole.shape == "cone":
-        start += CONE_RISE * math.hypot(*pole.scale[:2]) / pole.scale[2]
+        start += CONE_RISE * float(norm(pole.scale[:2])) / pole.scale[2]
     if not rule.capped:
         return Stand((base, pole), None, tuple(joints), top, start)
     cap = weighed(_draw_part(rng, rule.base, "cap", top_of(pole), base_look))

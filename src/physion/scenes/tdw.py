@@ -13,9 +13,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from physion.errors import BadInputError, PhysionError, UnknownNameError
+from physion.numerics.rotations import rotate_vectors
 from physion.scenes.looks import prop_look
 from physion.scenes.props import ModelBounds, prop_for, read_model_bounds
 from physion.scenes.scene import (
@@ -31,14 +30,14 @@ from physion.scenes.scene import (
     Vec3,
 )
 from physion.scenes.shapes import shapes
-from physion.scenes.tdw_commands import CommandReader, LoggedObject, rotate, vector
+from physion.scenes.tdw_commands import CommandReader, LoggedObject, vector
 from physion.scenes.tdw_log import (
     ImportFailure,
     find_logs,
     read_command_log,
     read_metadata,
 )
-from physion.seeds import stable_hash
+from physion.seeds import generator
 
 SCENARIOS = {
     "MultiDominoes": "dominoes",
@@ -254,7 +253,7 @@ class _SceneBuilder:
     def _look(self, thing: LoggedObject) -> Look:
         if thing.color is None and thing.model not in shapes:
             # Library models bring their own pictures: a model looks the same in every trial.
-            chance = np.random.default_rng(stable_hash("library model", thing.model))
+            chance = generator("library model", thing.model)
             return prop_look(chance, prop_for(thing.category, thing.model))
         return Look(thing.color or (0.8, 0.8, 0.8), thing.texture)
 
@@ -287,7 +286,7 @@ class _SceneBuilder:
             bounds = ModelBounds((0.0, 0.0, 0.0), (0.5, 0.5, 0.5))
         size = tuple(a * b for a, b in zip(bounds.size, thing.scale, strict=True))
         shift = tuple(a * b for a, b in zip(bounds.bottom, thing.scale, strict=True))
-        x, y, z = rotate(thing.rotation, shift)  # type: ignore[arg-type]
+        x, y, z = rotate_vectors(thing.rotation, shift).tolist()
         px, py, pz = thing.position
         return prop_for(thing.category, thing.model), size, (px + x, py + y, pz + z)  # type: ignore[return-value]
 

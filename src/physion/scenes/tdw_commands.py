@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from physion.errors import BadInputError, PhysionError
+from physion.numerics.rotations import multiply_quaternions
+from physion.scenes.parameters import as_quaternion, three_turns
 from physion.scenes.scene import Contact, Push, Quat, Vec3
 from physion.scenes.tdw_log import Command
 
@@ -76,34 +78,15 @@ def vector(value: Any) -> Vec3:
 
 def quaternion_from_euler(degrees: Any) -> Quat:
     """Unity's Euler angles (turn about z, then x, then y) as a quaternion in our axes."""
-    x, z, y = (math.radians(angle) / 2 for angle in vector(degrees))
-    qx: Quat = (math.cos(x), math.sin(x), 0.0, 0.0)
-    qy: Quat = (math.cos(y), 0.0, math.sin(y), 0.0)
-    qz: Quat = (math.cos(z), 0.0, 0.0, math.sin(z))
-    return _to_our_axes(_multiply(_multiply(qy, qx), qz))
+    # Swapping y and z mirrors space, so that turns go the other way; two whole turns are none.
+    x, y, z = (-math.fmod(angle, 720.0) for angle in vector(degrees))
+    return three_turns(x, y, z)
 
 
 def _to_our_axes(unity: Quat) -> Quat:
-    # Swapping y and z mirrors space, so that the turn's direction flips as well.
+    # As in `quaternion_from_euler`, the direction of the turn flips.
     w, x, y, z = unity
     return (w, -x, -z, -y)
-
-
-def _multiply(a: Quat, b: Quat) -> Quat:
-    (aw, ax, ay, az), (bw, bx, by, bz) = a, b
-    return (
-        aw * bw - ax * bx - ay * by - az * bz,
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-    )
-
-
-def rotate(q: Quat, v: Vec3) -> Vec3:
-    """Turn ``v`` by the unit quaternion ``q``."""
-    w, x, y, z = q
-    turned = _multiply(_multiply(q, (0.0, *v)), (w, -x, -y, -z))
-    return turned[1:]
 
 
 @dataclass
@@ -249,7 +232,8 @@ class CommandReader:
         turn = {"x": 0.0, "y": 0.0, "z": 0.0, axis: float(command["angle"])}
         thing, by = self._object(command), quaternion_from_euler(turn)
         world = bool(command.get("is_world", True))
-        thing.rotation = _multiply(by, thing.rotation) if world else _multiply(thing.rotation, by)
+        turns = (by, thing.rotation) if world else (thing.rotation, by)
+        thing.rotation = as_quaternion(multiply_quaternions(*turns))
 
     def do_set_mass(self, command: Command) -> None:
         self._at_start()

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from physion.errors import BadInputError
-from physion.seeds import stable_hash
+from physion.seeds import generator
 
 Floats = NDArray[np.float32]
 
@@ -39,7 +39,7 @@ class WindowBatches:
 
     def __call__(self, step: int) -> dict[str, Tensor]:
         """``features`` (size, length, features) of the step."""
-        rng = np.random.default_rng(stable_hash("batch", self.seed, step))
+        rng = generator("batch", self.seed, step)
         trials = rng.integers(len(self.features), size=self.size)
         starts = rng.integers(self.features.shape[1] - self.length + 1, size=self.size)
         moments = starts[:, None] + np.arange(self.length)
@@ -61,7 +61,7 @@ def hold_out(count: int, share: float, seed: int) -> tuple[NDArray[np.int64], ND
         rows = np.arange(count)
         return rows, rows
     held = min(count - 1, max(1, round(share * count)))
-    order = np.random.default_rng(stable_hash("hold out", seed)).permutation(count)
+    order = generator("hold out", seed).permutation(count)
     return np.sort(order[held:]), np.sort(order[:held])
 
 

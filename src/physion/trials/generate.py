@@ -18,6 +18,7 @@ from typing import Any
 from physion.atomic import folder_lock, remove_leftovers, write_atomic
 from physion.compute.executor import Executor, Outcome
 from physion.errors import BadInputError, PhysionError
+from physion.physics.engine import engines
 from physion.scenes.preset import get_preset
 from physion.scenes.scenarios import as_record
 from physion.seeds import stable_hash
@@ -205,8 +206,13 @@ def _fix_settings(folder: Path, dataset: str, settings: Settings, tasks: Sequenc
 
     Each split of a scenario keeps the presets, with all their values, that it began with.
     """
+    # Compiled code, which is loaded by whoever makes trials.
+    from physion.trials.make import RENDERER
+
     path = folder / SETTINGS
-    wanted = json.loads(json.dumps({"dataset": dataset, "settings": dataclasses.asdict(settings)}))
+    made_by = {"engine": engines.get("mujoco")().name, "renderer": RENDERER}
+    plain = {"dataset": dataset, "settings": dataclasses.asdict(settings), "made_by": made_by}
+    wanted = json.loads(json.dumps(plain))
     presets = _presets_in_use(tasks)
     if path.is_file():
         known = read_sealed(path)
@@ -215,7 +221,7 @@ def _fix_settings(folder: Path, dataset: str, settings: Settings, tasks: Sequenc
         differs += [name for name in presets if before.get(name, presets[name]) != presets[name]]
         if differs or known.keys() != wanted.keys():
             raise BadInputError(
-                f"{folder} was made with another dataset name or other settings "
+                f"{folder} was made with another dataset name, other settings or other versions "
                 f"({', '.join(differs)}), see {path}; choose another folder"
             )
         presets = {**before, **presets}

@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 import physion
 from physion.errors import BadInputError, PhysionError
+from physion.golden import version_digest
 from physion.physics.engine import simulate
 from physion.physics.labels import Labels, label_contact
 from physion.physics.trajectory import Trajectory
-from physion.rendering.renderer import Frame, Renderer, role_map
+from physion.rendering.renderer import PASSES, Frame, Renderer, role_map
+from physion.rendering.renderer import VERSION as RENDERER_VERSION
 from physion.scenes.preset import get_preset
 from physion.scenes.scenarios import sample_scene
 from physion.scenes.scene import FRAME_TIME, OBSERVED_FRAMES, Scene
@@ -23,8 +25,12 @@ from physion.trials.plan import Job, Task
 from physion.trials.trial_file import Metadata, TrialWriter, in_look
 from physion.trials.video import MovieEncoder
 
-RENDERER = f"physion {physion.__version__}, numba {version('numba')}, av {version('av')}"
-"""Name and versions of what renders, as stored with every trial."""
+RENDERER = (
+    f"physion-{RENDERER_VERSION}.{version_digest(*PASSES)}, "
+    f"av {version('av')}, pillow {version('pillow')}"
+)
+"""Versions of the renderer, with the digest of the golden pictures, and of what writes movies and
+maps; stored with every trial."""
 
 
 def make_trial(job: Job) -> str:

@@ -35,7 +35,7 @@ from physion.scenes.shapes import shapes
 from physion.scenes.stage import FLOORS
 from physion.scenes.tdw_commands import ROOMS as SCENE_ROOMS
 from physion.scenes.tdw_commands import UNSET_CONTACT, VANISHING_SCALE
-from physion.seeds import stable_hash
+from physion.seeds import generator
 from physion.trials.official_axes import (
     from_official_camera,
     from_official_rotation,
@@ -210,7 +210,7 @@ class SceneReader:
         look = Look(_vector(np.clip(color, 0, 1)), _TEXTURES["zone" if zone else "other"])
         scenery = self._is_scenery(place)
         if scenery and shape.startswith("prop:"):
-            chance = np.random.default_rng(stable_hash("library model", model))
+            chance = generator("library model", model)
             look = prop_look(chance, shape)
         mass = float(self._physics("mass", 1.0)[place])
         still = self._never_moves(place)

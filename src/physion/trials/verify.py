@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +31,30 @@ SAMPLE = 4
 Track = Callable[[Iterable[Any], str, int], Iterator[Any]]
 
 
-def verify_dataset(folder: Path, *, again: int = SAMPLE, track: Track | None = None) -> list[str]:
-    """What is wrong with the dataset in ``folder``, one line each; empty where all is right.
+@dataclass
+class Verification:
+    """What was found in a dataset, one line each.
+
+    ``faults`` is empty where all is right. ``other_versions`` names what comes out differently
+    because another version of engine, renderer or encoder made it, which is no fault.
+    """
+
+    faults: list[str] = field(default_factory=list)
+    other_versions: list[str] = field(default_factory=list)
+
+    def add(self, found: list[str], stored: str = "", here: str = "") -> None:
+        """Add what was found in something that the version ``stored`` made; ours is ``here``."""
+        if stored == here:
+            self.faults += found
+        else:
+            note = f"made by another version, {stored}; this is {here}"
+            self.other_versions += [f"{line}: {note}" for line in found]
+
+
+def verify_dataset(
+    folder: Path, *, again: int = SAMPLE, track: Track | None = None
+) -> Verification:
+    """Compare a dataset with its index and with itself, and make a part of it again.
 
     Every file is compared with the index byte for byte (by SHA-256), the index with the trial
     files, the labels with the contacts, the movies' lengths with the trials', the trajectories
@@ -42,27 +65,29 @@ def verify_dataset(folder: Path, *, again: int = SAMPLE, track: Track | None = N
     """
     table = read_index(folder)
     listed = set(table["trial"])
-    faults = [
-        f"{paths.trial_file} is not in the index"
-        for paths in find_trials(folder)
-        if paths.trial not in listed
-    ]
-    faults += _check_folder(folder, table)
-    faults += _copies(table)
+    result = Verification(
+        [
+            f"{paths.trial_file} is not in the index"
+            for paths in find_trials(folder)
+            if paths.trial not in listed
+        ]
+    )
+    result.faults += _check_folder(folder, table)
+    result.faults += _copies(table)
     settings = _settings(folder)
     remade = _sample(table, again)
     rows = [row for _, row in table.iterrows()]
     for row in track(rows, "verifying", len(rows)) if track else rows:
         paths = TrialPaths(folder, row["split"], row["scenario"], row["trial"])
         try:
-            faults += _compare(row, paths)
-            faults += _check_trial(paths)
-            faults += _check_split(row, settings)
+            result.faults += _compare(row, paths)
+            result.faults += _check_trial(paths)
+            result.faults += _check_split(row, settings)
             if row["trial"] in remade:
-                faults += _make_again(paths, settings)
+                _make_again(paths, settings, result)
         except BadInputError as error:
-            faults.append(str(error))
-    return faults
+            result.faults.append(str(error))
+    return result
 
 
 def _settings(folder: Path) -> Mapping[str, Any]:
@@ -168,37 +193,43 @@ def _check_trial(paths: TrialPaths) -> list[str]:
     if meta.engine.startswith("imported"):
         return faults  # labels and movies of other simulators are theirs
     labels = label_contact(trial.scene, trial.trajectory)
-    for field in ("contact", "first_frame", "observed", "min_distance"):
-        is_now, stored = getattr(labels, field), getattr(trial.labels, field)
+    for name in ("contact", "first_frame", "observed", "min_distance"):
+        is_now, stored = getattr(labels, name), getattr(trial.labels, name)
         if is_now != stored:
             faults.append(
-                f"{paths.trial_file}: labels/{field} is {stored}, the contacts say {is_now}"
+                f"{paths.trial_file}: labels/{name} is {stored}, the contacts say {is_now}"
             )
     return faults
 
 
-def _make_again(paths: TrialPaths, settings: Mapping[str, Any]) -> list[str]:
-    """What comes out differently when the trial is drawn, simulated and rendered again."""
+def _make_again(paths: TrialPaths, settings: Mapping[str, Any], result: Verification) -> None:
+    """Draw, simulate and render the trial again, and add to ``result`` what comes out otherwise."""
     from physion.physics.engine import simulate
-    from physion.rendering.renderer import role_map
-    from physion.trials.files import encode_png
-    from physion.trials.make import RENDERER, make_movies
+    from physion.trials.make import RENDERER
 
     trial = Trial.open(paths.trial_file)
-    meta, faults = trial.metadata, []
+    meta = trial.metadata
     if meta.engine.startswith("imported"):
-        return []
-    faults += _draw_again(paths, trial, settings)
+        return
     motion = simulate(trial.scene)
+    found = _draw_again(paths, trial, settings)
     if motion.digest() != meta.digest:
-        faults.append(
-            f"{paths.trial_file}: field 'trajectory': {motion.engine} moves the scene differently "
-            f"from the stored {meta.engine}"
-        )
+        found.append(f"{paths.trial_file}: field 'trajectory': the scene moves differently")
+    result.add(found, meta.engine, motion.engine)
+    result.add(_render_again(paths, trial), meta.renderer, RENDERER)
+
+
+def _render_again(paths: TrialPaths, trial: Trial) -> list[str]:
+    """What comes out differently when the trial is rendered again."""
+    from physion.rendering.renderer import role_map
+    from physion.trials.files import encode_png
+    from physion.trials.make import make_movies
+
+    meta, faults = trial.metadata, []
     ids = trial.render(0, ("ids",)).ids
     assert ids is not None, "ids were asked for"
     if not np.array_equal(ids, trial.ids):
-        faults.append(f"{paths.trial_file}: field 'first_frame/ids': {RENDERER} renders others")
+        faults.append(f"{paths.trial_file}: field 'first_frame/ids' is rendered differently")
     counts = np.bincount(ids.ravel(), minlength=len(trial.scene.names()) + 1)[1:]
     if not np.array_equal((counts / ids.size).astype(np.float32), trial.shares):
         faults.append(f"{paths.trial_file}: field 'first_frame/shares' does not fit the ids")
@@ -216,7 +247,7 @@ def _make_again(paths: TrialPaths, settings: Mapping[str, Any]) -> list[str]:
         made |= zip((f"{prefix}movie", f"{prefix}observed_movie"), both, strict=True)
     files = paths.all(meta.movies, meta.free_movies)
     faults += [
-        f"{files[name]}: {RENDERER} renders other bytes than the stored {meta.renderer}"
+        f"{files[name]}: other bytes are rendered than the stored ones"
         for name, content in made.items()
         if files[name].read_bytes() != content
     ]

@@ -23,10 +23,18 @@ CRF = 18
 """x264's quality; below it yuv420p, not the codec, decides (reference: engines, section 6)."""
 GROUP = 15
 """Frames from one key frame to the next, so that a seek decodes at most half a second."""
+X264 = "cpu-independent=1"
+"""Without it one movie in a hundred came out a little different from the same frames."""
 _BT709 = 1
 """Number of ITU-R BT.709 in the H.264 tables for matrix, primaries and transfer alike."""
-_SCALING = Interpolation.AREA | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
-"""Without exact rounding swscale, when it scales, darkens a flat grey by 2 of 255."""
+_CONVERSION = int(
+    Interpolation.AREA
+    | Interpolation.FULL_CHR_H_INT
+    | Interpolation.ACCURATE_RND
+    | Interpolation.BITEXACT
+)
+"""How swscale scales pictures and converts their colours. Without exact rounding it darkens a flat
+grey by 2 of 255 when it scales; without ``BITEXACT`` its results depend on the processor."""
 _INDEX_BYTES = (2048, 24)
 """Room for the movie's index at its start: bytes for the header, and for each frame."""
 
@@ -58,8 +66,7 @@ class MovieEncoder:
             "preset": "veryfast",
             "g": str(GROUP),
             "threads": "1",
-            # Without it one movie in a hundred came out a little different from the same frames.
-            "x264-params": "cpu-independent=1",
+            "x264-params": X264,
         }
         # Without these tags players guess the matrix, and saturated red comes out orange.
         context = stream.codec_context
@@ -80,6 +87,7 @@ class MovieEncoder:
             dst_colorspace=Colorspace.ITU709,
             src_color_range=ColorRange.JPEG,
             dst_color_range=ColorRange.MPEG,
+            interpolation=_CONVERSION,
         )
         picture.pts = self._added
         self._container.mux(self._stream.encode(picture))
@@ -123,8 +131,7 @@ def read_frames(
     for index, picture in _decode(path):
         if index < start or (index - start) % stride:
             continue
-        own = (picture.height, picture.width)
-        height, width = size or own
+        height, width = size or (picture.height, picture.width)
         # Conversion costs three times the decoding, so it is done for kept frames alone.
         rgb = reformatter.reformat(
             picture,
@@ -134,7 +141,7 @@ def read_frames(
             src_colorspace=Colorspace.ITU709,
             src_color_range=ColorRange.MPEG,
             dst_color_range=ColorRange.JPEG,
-            interpolation=int(_SCALING) if (height, width) != own else None,
+            interpolation=_CONVERSION,
         )
         kept.append(rgb.to_ndarray())  # type: ignore[arg-type]
         if len(kept) == count:
