@@ -51,15 +51,18 @@ def rotate_vector(q: Any, v: Any) -> Any:
     return out
 
 
+@kernel
+def _fill_matrices(q: Any, out: Any) -> None:
+    for i in range(len(q)):
+        out[i] = rotation_matrix(q[i])
+
+
 def rotation_matrices(q: ArrayLike) -> F64:
     """Return the matrices (..., 3, 3) of unit quaternions (..., 4)."""
-    w, x, y, z = np.moveaxis(np.asarray(q, np.float64), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    rotations = np.asarray(q, np.float64)
+    out = np.empty((rotations.size // 4, 3, 3))
+    _fill_matrices(np.ascontiguousarray(rotations).reshape(-1, 4), out)
+    return out.reshape(*rotations.shape[:-1], 3, 3)
 
 
 def multiply_quaternions(a: ArrayLike, b: ArrayLike) -> F64:

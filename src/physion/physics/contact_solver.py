@@ -566,6 +566,28 @@ def solve_step(
 
 
 @kernel
+def move_freely(
+    v: Any, w: Any, awake: Any, drag: Any, gravity: float, max_angular_velocity: float, dt: float
+) -> None:
+    """Change ``v`` and ``w`` (A + 1, 3) by a step of gravity and drag, and cap the spin.
+
+    v <- (v - g dt z) max(1 - c dt, 0), w <- w max(1 - d dt, 0) with the linear and angular drag
+    ``drag`` (A, 2) per second; gravity acts where ``awake`` (A,).
+    """
+    for i in range(len(awake)):
+        if awake[i]:
+            v[i, 2] -= gravity * dt
+        keep_v, keep_w = max(1.0 - drag[i, 0] * dt, 0.0), max(1.0 - drag[i, 1] * dt, 0.0)
+        for j in range(3):
+            v[i, j] *= keep_v
+            w[i, j] *= keep_w
+        speed = np.sqrt(w[i, 0] * w[i, 0] + w[i, 1] * w[i, 1] + w[i, 2] * w[i, 2])
+        factor = min(1.0, max_angular_velocity / max(speed, 1e-12))
+        for j in range(3):
+            w[i, j] *= factor
+
+
+@kernel
 def move_poses(x: Any, q: Any, v: Any, w: Any, dt: float) -> None:
     """Move centres of mass and turn orientations by constant velocities over a step."""
     for i in range(len(x) - 1):

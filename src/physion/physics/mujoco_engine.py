@@ -14,12 +14,18 @@ from numpy.typing import NDArray
 
 from physion.errors import BadInputError
 from physion.golden import version_digest
-from physion.numerics.linear_algebra import apply, norm, unit
+from physion.numerics.linear_algebra import apply, unit
 from physion.numerics.rotations import conjugate, multiply_quaternions, rotate_vectors
 from physion.physics.cloth import ClothSettings, add_cloth, settle_solids
 from physion.physics.contact_finder import ContactFinder
 from physion.physics.contact_record import ContactRecord
-from physion.physics.contact_solver import AnchorMemory, move_poses, no_anchors, solve_step
+from physion.physics.contact_solver import (
+    AnchorMemory,
+    move_freely,
+    move_poses,
+    no_anchors,
+    solve_step,
+)
 from physion.physics.rigid_model import build_model
 from physion.physics.settings import Settings
 from physion.physics.sleeping import find_islands, update_sleep, wake_touched
@@ -180,13 +186,8 @@ class RigidRun:
 
     def _free_motion(self, awake: NDArray[np.bool_]) -> None:
         """Gravity, drag, and the cap of the angular velocity, for everything awake."""
-        s = self.settings
-        self.v[:-1][awake, 2] -= s.gravity * s.dt
-        keep = np.maximum(1.0 - self.model.drag * s.dt, 0.0)
-        self.v[:-1] *= keep[:, :1]
-        self.w[:-1] *= keep[:, 1:]
-        speed = norm(self.w)[:, None]
-        self.w *= np.minimum(1.0, s.max_angular_velocity / np.maximum(speed, 1e-12))
+        s, drag = self.settings, self.model.drag
+        move_freely(self.v, self.w, awake, drag, s.gravity, s.max_angular_velocity, s.dt)
 
     def _take(self, start: State) -> None:
         """Set the actors from the state of the first body of each."""
