@@ -1,8 +1,8 @@
 """How long statistics of agreement take: ``OMP_NUM_THREADS=1 python benchmarks/agreement.py``.
 
 Side by side in one run: Cohen's kappa of every pair of 100 people who answered 150 stimuli, by
-scikit-learn pair by pair and by `physion.analysis.kappa` at once, with the largest difference of
-the two; then 1000 bootstraps of the mean pairwise kappa, drawing people, stimuli or both; then 20
+scikit-learn pair by pair and by `physion.analysis.statistics.kappa` at once, with the largest
+difference of the two; then 1000 bootstraps of the mean pairwise kappa, drawing people, stimuli or both; then 20
 models beside the 100 people with every interval; then the same in eight scenarios, from tables,
 with the tests of all pairs of models, zones and calibration. Times are the best of several runs,
 but for the loop and the eight scenarios, which run once. ``--write`` puts them into
@@ -26,12 +26,12 @@ import pandas as pd
 import sklearn
 from sklearn.metrics import cohen_kappa_score
 
-from physion.analysis.answers import Answers
-from physion.analysis.bootstrap import Bootstrap
-from physion.analysis.kappa import pair_values, pairwise_kappa, resampled_mean_kappa
-from physion.analysis.model_people import Models, compare_with_people
-from physion.analysis.people_comparison import compare_everywhere
-from physion.analysis.stimuli import SCENARIOS
+from physion.analysis.models.model_people import Models, compare_with_people
+from physion.analysis.models.people_comparison import compare_everywhere
+from physion.analysis.people.answers import Answers
+from physion.analysis.statistics.bootstrap import Bootstrap
+from physion.analysis.statistics.kappa import pair_values, pairwise_kappa, resampled_mean_kappa
+from physion.analysis.tables.stimuli import SCENARIOS
 
 RESULTS = Path(__file__).parent / "results" / "agreement.json"
 PEOPLE, STIMULI, MODELS, RESAMPLES = 100, 150, 20, 1000

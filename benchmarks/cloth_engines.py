@@ -18,12 +18,12 @@ import mujoco
 import numpy as np
 from scipy.spatial import cKDTree
 
-from physion.physics.cloth import ClothSettings, settle_solids, simulate_cloth
-from physion.physics.cloth_solids import particles_of
+from physion.physics.cloth.simulate import ClothSettings, settle_solids, simulate_cloth
+from physion.physics.cloth.solids import particles_of
 from physion.physics.replay import area_under_curve
 from physion.scenes.scene import Body, Scene
-from physion.scenes.shapes import shape
-from physion.scenes.tdw import read_scenes
+from physion.scenes.shapes.primitives import shape
+from physion.scenes.tdw.read_logs import read_scenes
 
 FRAMES = 151
 

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from physion.analysis.stimuli import SCENARIOS
+from physion.analysis.tables.stimuli import SCENARIOS
 from physion.report import assembly, build
 
 RESULTS = Path(__file__).parent / "results"

@@ -44,12 +44,12 @@ import sqlalchemy as sa
 import uvloop
 
 from light_http import Connection, request
-from physion.experiment.database import open_database, sqlite_url
-from physion.experiment.identity import Secrets
-from physion.experiment.own_server import HOST, OwnServer
-from physion.experiment.recruitment import pass_word
-from physion.experiment.study import Study
-from physion.experiment.tables import ANSWERS, SESSIONS
+from physion.experiment.simulated.server_process import HOST, OwnServer
+from physion.experiment.store.database import open_database, sqlite_url
+from physion.experiment.store.tables import ANSWERS, SESSIONS
+from physion.experiment.study.identity import Secrets
+from physion.experiment.study.recruitment import pass_word
+from physion.experiment.study.study import Study
 
 ROOT = Path(__file__).parents[1]
 RESULTS = Path(__file__).parent / "results"
@@ -285,7 +285,7 @@ def measure(name: str, options: argparse.Namespace, folder: Path) -> Row:
     """Make a study, serve it, load it, stop, and look everything up."""
     from tiny_study import make_tiny_study
 
-    from physion.experiment.study import Limits
+    from physion.experiment.study.study import Limits
 
     fast = Limits(
         requests_per_second=10_000,

@@ -22,11 +22,11 @@ from pathlib import Path
 
 import numpy as np
 
-from physion.experiment.identity import Secrets
-from physion.experiment.recruitment import pass_word
-from physion.experiment.store import Store
-from physion.experiment.study import Study, Timing
-from physion.experiment.wire import Answer, Enter, PageDone, Phase
+from physion.experiment.protocol.messages import Answer, Enter, PageDone, Phase
+from physion.experiment.store.store import Store
+from physion.experiment.study.identity import Secrets
+from physion.experiment.study.recruitment import pass_word
+from physion.experiment.study.study import Study, Timing
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "experiment"))
 TEST_TRIALS = 150

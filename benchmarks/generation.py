@@ -26,10 +26,10 @@ from pathlib import Path
 import numpy as np
 
 import physion
-from physion.scenes.scenarios import scenarios
-from physion.trials.choose import Slot, choose
-from physion.trials.make import make_trial
-from physion.trials.plan import FULL_COUNTS, Job, Settings, plan_dataset
+from physion.scenes.sampling.registry import scenarios
+from physion.trials.making.choose import Slot, choose
+from physion.trials.making.make import make_trial
+from physion.trials.making.plan import FULL_COUNTS, Job, Settings, plan_dataset
 from physion.trials.trial_file import Trial
 
 RESULTS = Path(__file__).parent / "results"

@@ -30,10 +30,10 @@ import numpy as np
 import pandas as pd
 
 from mixed_fixtures import CASES, as_csv, ask_r
-from physion.analysis.mixed_linear import fit_linear
-from physion.analysis.mixed_logistic import fit_logistic
-from physion.analysis.mixed_result import MixedFit
-from physion.analysis.mixed_simulation import AnswerDesign, simulate_answers
+from physion.analysis.mixed.linear import fit_linear
+from physion.analysis.mixed.logistic import fit_logistic
+from physion.analysis.mixed.result import MixedFit
+from physion.analysis.mixed.simulation import AnswerDesign, simulate_answers
 from replay import RESULTS, processor
 
 GOAL = 15.0

@@ -27,7 +27,7 @@ import json, sys, time
 try:
     from physion.scenes.sampling.registry import sample_scene, scenarios
 except ModuleNotFoundError:
-    from physion.scenes.scenarios import sample_scene, scenarios
+    from physion.scenes.sampling.registry import sample_scene, scenarios
 from physion.physics.engine import simulate
 from physion.rendering.renderer import Renderer
 from physion.seeds import trial_seed

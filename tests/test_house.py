@@ -21,7 +21,7 @@ def test_import_arrows_hold() -> None:
 
 @pytest.mark.parametrize(
     "module",
-    ["physion.physics.mujoco_engine", "physion.trials.generate", "physion.analysis",
+    ["physion.physics.rigid.engine", "physion.trials.making.generate", "physion.analysis",
      "physion.report", "physion.models.noisy_simulation"],
 )  # fmt: skip
 def test_the_core_runs_without_torch(module: str) -> None:

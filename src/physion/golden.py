@@ -1,6 +1,7 @@
 """Digests that a known trial of each scenario must have, on every machine.
 
-`physion.trials.reproduce` computes them; the file beside this module holds those of this version.
+`physion.trials.making.reproduce` computes them; the file beside this module holds those of this
+version.
 They are part of the names of engine and renderer: whoever reads a trial can tell whether the
 software that made it would make the same bytes as their own.
 """

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from conftest import official_folder
-from physion.analysis.mixed_simulation import AnswerDesign, simulate_answers
+from physion.analysis.mixed.simulation import AnswerDesign, simulate_answers
 
 STORED = Path(__file__).parent / "fixtures" / "mixed_r.csv"
 

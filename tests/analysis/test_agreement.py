@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import stats
 
-from physion.analysis import agreement
-from physion.analysis.bootstrap import Bootstrap
-from physion.analysis.scores import scores, summands, why_no_r
+from physion.analysis.models.scores import scores, summands, why_no_r
+from physion.analysis.statistics import agreement
+from physion.analysis.statistics.bootstrap import Bootstrap
 
 Array = npt.NDArray[np.float64]
 

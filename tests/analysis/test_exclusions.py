@@ -13,8 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from simulated_people import as_responses, simulate_study, study
 
-from physion.analysis.clustered_logit import clustered_logit
-from physion.analysis.exclusions import (
+from physion.analysis.people.exclusions import (
     BY_CONSTRUCTION,
     OFFICIAL_CODE,
     PREREGISTERED,
@@ -27,9 +26,10 @@ from physion.analysis.exclusions import (
     streak_limit,
     with_and_without,
 )
-from physion.analysis.participants import DROPPED_COLUMNS, Responses, missing_times
-from physion.analysis.people import accuracy_by_scenario
-from physion.analysis.session_measures import longest_alternation, longest_streak
+from physion.analysis.people.participants import DROPPED_COLUMNS, Responses, missing_times
+from physion.analysis.people.people import accuracy_by_scenario
+from physion.analysis.people.session_measures import longest_alternation, longest_streak
+from physion.analysis.statistics.clustered_logit import clustered_logit
 from physion.errors import BadInputError
 
 answers = st.lists(st.booleans(), max_size=60)

@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from physion.analysis import agreement
-from physion.analysis.responses import read_human_zone, read_humans, read_labels, with_labels
-from physion.analysis.stimuli import (
+from physion.analysis.statistics import agreement
+from physion.analysis.tables.responses import read_human_zone, read_humans, read_labels, with_labels
+from physion.analysis.tables.stimuli import (
     OFFICIAL_SCENARIOS,
     SCENARIOS,
     canonical_name,

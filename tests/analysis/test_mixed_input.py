@@ -6,11 +6,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from physion.analysis.mixed_design import build_design
-from physion.analysis.mixed_formula import split_formula
-from physion.analysis.mixed_linear import fit_linear
-from physion.analysis.mixed_logistic import fit_logistic
-from physion.analysis.mixed_simulation import AnswerDesign, simulate_answers
+from physion.analysis.mixed.design import build_design
+from physion.analysis.mixed.formula import split_formula
+from physion.analysis.mixed.linear import fit_linear
+from physion.analysis.mixed.logistic import fit_logistic
+from physion.analysis.mixed.simulation import AnswerDesign, simulate_answers
 from physion.errors import BadInputError, UnknownNameError
 
 CROSSED = "(1|participant) + (1|stimulus)"

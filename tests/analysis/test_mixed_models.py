@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 from scipy.stats import multivariate_normal
 
-from physion.analysis.mixed_design import build_design
-from physion.analysis.mixed_factor import Factor
-from physion.analysis.mixed_groupings import Groupings
-from physion.analysis.mixed_linear import LinearModel, fit_linear
-from physion.analysis.mixed_logistic import LogisticModel, fit_logistic
-from physion.analysis.mixed_simulation import AnswerDesign, simulate_answers
+from physion.analysis.mixed.design import build_design
+from physion.analysis.mixed.factor import Factor
+from physion.analysis.mixed.groupings import Groupings
+from physion.analysis.mixed.linear import LinearModel, fit_linear
+from physion.analysis.mixed.logistic import LogisticModel, fit_logistic
+from physion.analysis.mixed.simulation import AnswerDesign, simulate_answers
 
 CROSSED = "(1|participant) + (1|stimulus)"
 THREE = "(1|participant) + (1|stimulus) + (1|scenario)"

@@ -15,9 +15,9 @@ import pytest
 from mixed_cases import CASES, STORED, digest, published
 
 from conftest import official_folder
-from physion.analysis.mixed_linear import fit_linear
-from physion.analysis.mixed_logistic import fit_logistic
-from physion.analysis.mixed_result import MixedFit
+from physion.analysis.mixed.linear import fit_linear
+from physion.analysis.mixed.logistic import fit_logistic
+from physion.analysis.mixed.result import MixedFit
 
 BIG = {"big", "times big"}
 SHARE = {"glmmTMB": 1e-3, "lme4": 1e-2}

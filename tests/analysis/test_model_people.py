@@ -16,20 +16,28 @@ from sklearn.metrics import brier_score_loss, cohen_kappa_score
 from statsmodels.stats.contingency_tables import mcnemar
 from statsmodels.stats.multitest import multipletests
 
-from physion.analysis import agreement
-from physion.analysis.answers import Answers, answers_of
-from physion.analysis.bootstrap import Bootstrap
-from physion.analysis.calibration import brier, calibration_table, decompose, reliability_curve
-from physion.analysis.difficulty import difficulty_third, r_by_third
-from physion.analysis.kappa import correctness
-from physion.analysis.model_people import (
+from physion.analysis.models.model_people import (
     MEASURES,
     Models,
     compare_with_people,
     model_pairs,
     models_of,
 )
-from physion.analysis.paired import (
+from physion.analysis.models.people_comparison import PeopleComparison, compare_everywhere
+from physion.analysis.models.zones import RELEASED_R, human_zones, released_r_zone, released_zone
+from physion.analysis.people.answers import Answers, answers_of
+from physion.analysis.people.difficulty import difficulty_third, r_by_third
+from physion.analysis.people.people import draws_of_people, split_halves
+from physion.analysis.statistics import agreement
+from physion.analysis.statistics.bootstrap import Bootstrap
+from physion.analysis.statistics.calibration import (
+    brier,
+    calibration_table,
+    decompose,
+    reliability_curve,
+)
+from physion.analysis.statistics.kappa import correctness
+from physion.analysis.statistics.paired import (
     _coins,
     benjamini_hochberg,
     compare_models,
@@ -37,9 +45,6 @@ from physion.analysis.paired import (
     mcnemar_exact,
     r_permutation_p,
 )
-from physion.analysis.people import draws_of_people, split_halves
-from physion.analysis.people_comparison import PeopleComparison, compare_everywhere
-from physion.analysis.zones import RELEASED_R, human_zones, released_r_zone, released_zone
 from physion.errors import BadInputError
 
 Array = npt.NDArray[np.float64]

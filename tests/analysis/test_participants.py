@@ -10,9 +10,9 @@ import pandas as pd
 import pytest
 from simulated_people import as_responses, simulate_study, study
 
-from physion.analysis.answers import answers_of, share
-from physion.analysis.official_responses import read_official_responses
-from physion.analysis.participants import (
+from physion.analysis.people.answers import answers_of, share
+from physion.analysis.people.official_responses import read_official_responses
+from physion.analysis.people.participants import (
     CONFLICT,
     COPY,
     EXCLUDED,
@@ -23,7 +23,7 @@ from physion.analysis.participants import (
     check_labels,
     read_responses,
 )
-from physion.analysis.response_schema import (
+from physion.analysis.people.response_schema import (
     SESSION_COLUMNS,
     TRIAL_COLUMNS,
     check_table,

@@ -16,35 +16,23 @@ from hypothesis.extra import numpy as hnp
 from scipy import stats
 from simulated_people import study
 
-from physion.analysis import agreement
-from physion.analysis.answers import answers_of
-from physion.analysis.attributes import (
-    ATTRIBUTES,
-    MISLABELLED,
-    attributes_from_metadata,
-    attributes_from_names,
-    attributes_from_table,
-    better_attributes,
-)
-from physion.analysis.biases import (
+from physion.analysis.people.answers import answers_of
+from physion.analysis.people.biases import (
     accuracy_by_background,
     background,
     learning,
     side_bias,
     yes_bias,
 )
-from physion.analysis.bootstrap import Bootstrap
-from physion.analysis.correlation import correlate_resampled, correlate_rows
-from physion.analysis.difficulty import below_chance, below_chance_p, difficulty_third
-from physion.analysis.hypotheses import (
+from physion.analysis.people.difficulty import below_chance, below_chance_p, difficulty_third
+from physion.analysis.people.hypotheses import (
     HYPOTHESES,
     answer_rows,
     regress_hypotheses,
     with_attributes,
 )
-from physion.analysis.kappa import pair_values, pairwise_kappa
-from physion.analysis.participants import Responses
-from physion.analysis.people import (
+from physion.analysis.people.participants import Responses
+from physion.analysis.people.people import (
     accuracy_by_participant,
     accuracy_by_scenario,
     accuracy_by_stimulus,
@@ -52,7 +40,19 @@ from physion.analysis.people import (
     spearman_brown,
     split_halves,
 )
-from physion.analysis.responses import read_humans, read_labels, with_labels
+from physion.analysis.statistics import agreement
+from physion.analysis.statistics.bootstrap import Bootstrap
+from physion.analysis.statistics.correlation import correlate_resampled, correlate_rows
+from physion.analysis.statistics.kappa import pair_values, pairwise_kappa
+from physion.analysis.tables.attributes import (
+    ATTRIBUTES,
+    MISLABELLED,
+    attributes_from_metadata,
+    attributes_from_names,
+    attributes_from_table,
+    better_attributes,
+)
+from physion.analysis.tables.responses import read_humans, read_labels, with_labels
 from physion.errors import BadInputError
 
 Array = npt.NDArray[np.float64]

@@ -9,23 +9,23 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from physion.analysis.bootstrap import Bootstrap
-from physion.analysis.published import TITLES, PublishedResults, results_of
-from physion.analysis.published_cells import (
+from physion.analysis.published.cells import (
     averaged_in_words,
     copies_of_observed,
     count_tested,
     grid,
     wilson,
 )
-from physion.analysis.published_panels import panel_a
-from physion.analysis.published_tables import (
+from physion.analysis.published.panels import panel_a
+from physion.analysis.published.summary import TITLES, PublishedResults, results_of
+from physion.analysis.published.tables import (
     MODELS,
     OBSERVED_AGAIN,
     PublishedTables,
     read_published,
 )
-from physion.analysis.stimuli import SCENARIOS
+from physion.analysis.statistics.bootstrap import Bootstrap
+from physion.analysis.tables.stimuli import SCENARIOS
 from physion.errors import BadInputError
 
 

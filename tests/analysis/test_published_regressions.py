@@ -8,15 +8,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from physion.analysis.published_claims import CLAIMS, END_TO_END, VISION, Contrast
-from physion.analysis.published_regressions import (
+from physion.analysis.published.claims import CLAIMS, END_TO_END, VISION, Contrast
+from physion.analysis.published.regressions import (
     _meets,
     contrast_rows,
     fit_contrast,
     published_regressions,
     released_state,
 )
-from physion.analysis.published_tables import PARTICLES, PublishedTables, read_published
+from physion.analysis.published.tables import PARTICLES, PublishedTables, read_published
 from physion.errors import BadInputError
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from physion.cli.compare import SUBVERBS
+from physion.cli.compare.compare import SUBVERBS
 from physion.cli.main import main
 from physion.trials.index import COLUMNS
 from physion.trials.layout import TrialPaths

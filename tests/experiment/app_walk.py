@@ -13,9 +13,9 @@ from store_walk import PAGES, STAGES
 from tiny_study import make_tiny_study
 
 from physion.experiment.app import build_app
-from physion.experiment.identity import Secrets
-from physion.experiment.store import Store
-from physion.experiment.study import Limits, Study
+from physion.experiment.store.store import Store
+from physion.experiment.study.identity import Secrets
+from physion.experiment.study.study import Limits, Study
 
 FAST = Limits(
     requests_per_second=10_000, burst=100_000, sessions_per_minute=100_000, sessions_at_once=100_000

@@ -19,11 +19,11 @@ import pytest
 import sqlalchemy as sa
 from tiny_study import make_tiny_study
 
-from physion.experiment.database import open_database, sqlite_url
-from physion.experiment.identity import Secrets, participant_hash
-from physion.experiment.own_server import OwnServer
-from physion.experiment.study import Recruitment, Study, Timing
-from physion.experiment.tables import ANSWERS, EVENTS, SESSIONS
+from physion.experiment.simulated.server_process import OwnServer
+from physion.experiment.store.database import open_database, sqlite_url
+from physion.experiment.store.tables import ANSWERS, EVENTS, SESSIONS
+from physion.experiment.study.identity import Secrets, participant_hash
+from physion.experiment.study.study import Recruitment, Study, Timing
 from programs import absent, find_chromium
 
 SIZE = {"width": 1280, "height": 800}

@@ -12,9 +12,9 @@ from starlette.testclient import TestClient
 from tiny_study import PASSWORD, make_tiny_study
 
 from physion.experiment.app import build_app
-from physion.experiment.identity import Secrets
-from physion.experiment.store import Store
-from physion.experiment.study import Study
+from physion.experiment.store.store import Store
+from physion.experiment.study.identity import Secrets
+from physion.experiment.study.study import Study
 
 BASE = "/experimenter"
 TWO = ("collide", "drop")

@@ -8,9 +8,16 @@ from typing import Any
 import numpy as np
 import sqlalchemy as sa
 
-from physion.experiment.identity import Secrets, new_reference, new_session, participant_hash
-from physion.experiment.study import Study
-from physion.experiment.tables import ANSWERS, EVENTS, PARTICIPANTS, RAW_IDS, SESSIONS, STUDIES
+from physion.experiment.store.tables import (
+    ANSWERS,
+    EVENTS,
+    PARTICIPANTS,
+    RAW_IDS,
+    SESSIONS,
+    STUDIES,
+)
+from physion.experiment.study.identity import Secrets, new_reference, new_session, participant_hash
+from physion.experiment.study.study import Study
 
 BROWSERS = (
     "Mozilla/5.0 (X11; Linux x86_64) AppleWebKit/537.36 (KHTML, like Gecko) Chrome/150.0.0.0 "

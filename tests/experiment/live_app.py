@@ -11,7 +11,7 @@ from typing import Any
 
 import uvicorn
 
-from physion.experiment.connections import CarefulProtocol
+from physion.experiment.web.connections import CarefulProtocol
 
 HOST = "127.0.0.1"
 

@@ -11,15 +11,15 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from physion.experiment.database import open_database, sqlite_url
-from physion.experiment.own_server import OwnServer
-from physion.experiment.study import Study
-from physion.experiment.tables import ANSWERS, SESSIONS
+from physion.experiment.simulated.server_process import OwnServer
+from physion.experiment.store.database import open_database, sqlite_url
+from physion.experiment.store.tables import ANSWERS, SESSIONS
+from physion.experiment.study.study import Study
 
 MOTHER = """
 import os, sys
 import alembic.command, tyro
-import physion.cli.experiment_serve, physion.experiment.server
+import physion.cli.experiment.serve, physion.experiment.server
 from physion.cli.main import main
 while os.read(0, 1):
     child = os.fork()

@@ -11,11 +11,11 @@ import pytest
 from sqlalchemy import select
 from tiny_study import make_tiny_study
 
-from physion.experiment.identity import Secrets
-from physion.experiment.store import Refused, Store
-from physion.experiment.study import Study
-from physion.experiment.tables import ANSWERS
-from physion.experiment.wire import Answer, AnswerStored, Enter, PageDone, State
+from physion.experiment.protocol.messages import Answer, AnswerStored, Enter, PageDone, State
+from physion.experiment.store.store import Refused, Store
+from physion.experiment.store.tables import ANSWERS
+from physion.experiment.study.identity import Secrets
+from physion.experiment.study.study import Study
 
 T = TypeVar("T")
 PAGES: dict[str, dict[str, Any]] = {

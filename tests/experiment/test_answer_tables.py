@@ -12,14 +12,12 @@ from experimenter_rows import insert_sessions
 from pandas.testing import assert_frame_equal
 from tiny_study import make_tiny_study
 
-from physion.analysis.response_schema import SESSION_COLUMNS, TRIAL_COLUMNS, check_table
+from physion.analysis.people.response_schema import SESSION_COLUMNS, TRIAL_COLUMNS, check_table
 from physion.errors import PhysionError, UnknownNameError
-from physion.experiment import trial_rows
-from physion.experiment.answer_tables import read_tables, snapshot
-from physion.experiment.database import open_database, upgrade
-from physion.experiment.experimenter.summaries import Summaries
-from physion.experiment.identity import Secrets
-from physion.experiment.session_rows import (
+from physion.experiment.experimenter.statistics.summaries import Summaries
+from physion.experiment.export import trial_rows
+from physion.experiment.export.answer_tables import read_tables, snapshot
+from physion.experiment.export.session_rows import (
     GONE_SCENARIO,
     NO_CONSENT,
     PREVIEW,
@@ -27,9 +25,11 @@ from physion.experiment.session_rows import (
     Wanted,
     read_sessions,
 )
-from physion.experiment.study import Study
-from physion.experiment.tables import ANSWERS, SESSIONS
-from physion.experiment.trial_rows import read_trials
+from physion.experiment.export.trial_rows import read_trials
+from physion.experiment.store.database import open_database, upgrade
+from physion.experiment.store.tables import ANSWERS, SESSIONS
+from physion.experiment.study.identity import Secrets
+from physion.experiment.study.study import Study
 
 NOW = 1_790_000_000.0
 

@@ -13,9 +13,9 @@ import sqlalchemy as sa
 from app_walk import Person, Served, answer_body, served
 from sqlalchemy.exc import OperationalError
 
-from physion.experiment import wire
-from physion.experiment.study import Recruitment
-from physion.experiment.tables import ANSWERS, RAW_IDS, SESSIONS
+from physion.experiment.protocol import messages as wire
+from physion.experiment.store.tables import ANSWERS, RAW_IDS, SESSIONS
+from physion.experiment.study.study import Recruitment
 
 TRIALS = {"familiarization": 2, "test": 3}
 OPEN = ("study", "texts/en", "enter", "health")

@@ -23,12 +23,12 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 from starlette.testclient import TestClient
 
-from physion.experiment import connections, guards
-from physion.experiment.guards import Guards
-from physion.experiment.rate_limits import Buckets, RateLimits, network_of
-from physion.experiment.security_headers import content_policy
-from physion.experiment.study import Limits, Study
-from physion.experiment.wire import MAX_BODY
+from physion.experiment.protocol.messages import MAX_BODY
+from physion.experiment.study.study import Limits, Study
+from physion.experiment.web import connections, guards
+from physion.experiment.web.guards import Guards
+from physion.experiment.web.rate_limits import Buckets, RateLimits, network_of
+from physion.experiment.web.security_headers import content_policy
 
 TOKENS = {"good", "other"}
 SECRET = "a word of the request that no answer may hold"

@@ -21,11 +21,11 @@ from hypothesis import strategies as st
 from live_app import exchange, running
 from tiny_study import make_tiny_study
 
-from physion.experiment import wire
-from physion.experiment.bodies import BadBodyError, parse_message
-from physion.experiment.identity import Secrets
-from physion.experiment.media_links import sign_media
-from physion.experiment.tables import ANSWERS, EVENTS, RAW_IDS, SESSIONS
+from physion.experiment.protocol import messages as wire
+from physion.experiment.store.tables import ANSWERS, EVENTS, RAW_IDS, SESSIONS
+from physion.experiment.study.identity import Secrets
+from physion.experiment.web.bodies import BadBodyError, parse_message
+from physion.experiment.web.media_links import sign_media
 
 NASTY = (
     "<script>alert(1)</script>",

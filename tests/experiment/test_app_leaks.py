@@ -18,12 +18,12 @@ from app_walk import Person, Served, served
 from sqlalchemy import select
 from tiny_study import FULL, OBSERVED, read_number
 
-from physion.experiment.identity import sign
-from physion.experiment.media_links import sign_media
-from physion.experiment.orders import order_of
-from physion.experiment.page_files import MEDIA_TYPES, PACKAGE
-from physion.experiment.stimuli import Stimulus
-from physion.experiment.tables import SESSIONS
+from physion.experiment.store.tables import SESSIONS
+from physion.experiment.study.identity import sign
+from physion.experiment.study.orders import order_of
+from physion.experiment.study.stimuli import Stimulus
+from physion.experiment.web.media_links import sign_media
+from physion.experiment.web.page_files import MEDIA_TYPES, PACKAGE
 
 TRIALS = {"familiarization": 3, "test": 6}
 PHASES = ("familiarization", "test")

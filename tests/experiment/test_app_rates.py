@@ -11,9 +11,9 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 from app_walk import served
 
-from physion.experiment.bearer import read_token
-from physion.experiment.rate_limits import RateLimits
-from physion.experiment.study import Limits
+from physion.experiment.study.study import Limits
+from physion.experiment.web.bearer import read_token
+from physion.experiment.web.rate_limits import RateLimits
 
 TINY = {"familiarization": 1, "test": 1}
 

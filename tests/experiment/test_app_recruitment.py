@@ -18,8 +18,8 @@ from tiny_study import make_tiny_study
 
 from physion.cli.main import main
 from physion.errors import BadInputError
-from physion.experiment.identity import Secrets
-from physion.experiment.recruitment import (
+from physion.experiment.study.identity import Secrets
+from physion.experiment.study.recruitment import (
     MTURK_HOSTS,
     RECRUITERS,
     completion,
@@ -28,7 +28,7 @@ from physion.experiment.recruitment import (
     pass_word,
     session_code,
 )
-from physion.experiment.study import Recruitment, Study
+from physion.experiment.study.study import Recruitment, Study
 
 SONA = "https://uni.sona-systems.com/webstudy_credit.aspx?experiment_id=12&credit_token=ab9"
 

@@ -24,10 +24,10 @@ from app_walk import answer_body, served
 from live_app import HOST, read_all, running
 from tiny_study import make_tiny_study
 
-from physion.cli.experiment_init import Options
+from physion.cli.experiment.init import Options
 from physion.cli.main import main
 from physion.experiment.server import Address
-from physion.experiment.study import Limits, Study
+from physion.experiment.study.study import Limits, Study
 from programs import find_program
 
 
@@ -211,8 +211,8 @@ class TestFaults:
             assert "--behind-proxy" in self.fail(capsys, str(study.folder), "--behind-proxy", name)
 
     def test_a_second_server(self, study: Study, capsys: pytest.CaptureFixture[str]) -> None:
-        from physion.experiment.identity import Secrets
-        from physion.experiment.store import Store
+        from physion.experiment.store.store import Store
+        from physion.experiment.study.identity import Secrets
 
         store = Store.open(study, Secrets.load(study.folder))
         try:

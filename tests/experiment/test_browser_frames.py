@@ -11,7 +11,7 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 from browser import Visit, chromium, rows_of, served
 
-from physion.experiment.study import Timing
+from physion.experiment.study.study import Timing
 
 __all__ = ["chromium"]
 pytestmark = [pytest.mark.slow, pytest.mark.alone]

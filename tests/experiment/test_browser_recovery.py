@@ -12,8 +12,8 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 from browser import Visit, chromium, rows_of, served
 
-from physion.experiment.orders import order_of
-from physion.experiment.study import Recruitment, Study
+from physion.experiment.study.orders import order_of
+from physion.experiment.study.study import Recruitment, Study
 
 __all__ = ["chromium"]
 pytestmark = pytest.mark.slow

@@ -13,11 +13,11 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 import sqlalchemy as sa
 from browser import Visit, chromium, rows_of, served
 
-from physion.experiment.database import open_database, sqlite_url
-from physion.experiment.identity import Secrets
-from physion.experiment.recruitment import pass_word
-from physion.experiment.study import Recruitment, Study
-from physion.experiment.tables import RAW_IDS, SESSIONS
+from physion.experiment.store.database import open_database, sqlite_url
+from physion.experiment.store.tables import RAW_IDS, SESSIONS
+from physion.experiment.study.identity import Secrets
+from physion.experiment.study.recruitment import pass_word
+from physion.experiment.study.study import Recruitment, Study
 
 __all__ = ["chromium"]
 pytestmark = pytest.mark.slow

@@ -14,8 +14,8 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 from browser import Visit, chromium, rows_of, served
 
-from physion.experiment.identity import SECRET_FILE
-from physion.experiment.study import Limits
+from physion.experiment.study.identity import SECRET_FILE
+from physion.experiment.study.study import Limits
 
 __all__ = ["chromium"]
 pytestmark = pytest.mark.slow

@@ -12,7 +12,7 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 from browser import Visit, chromium, rows_of, served
 
-from physion.experiment.study import Study
+from physion.experiment.study.study import Study
 
 __all__ = ["chromium"]
 pytestmark = pytest.mark.slow

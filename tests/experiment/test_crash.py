@@ -25,10 +25,10 @@ from serving import QuickServer, stored_answers, stored_sessions
 from sqlalchemy.engine import make_url
 from tiny_study import make_tiny_study
 
-from physion.experiment.database import open_database, sqlite_url
-from physion.experiment.identity import Secrets
-from physion.experiment.simulated import Plan, Visit, simulate
-from physion.experiment.study import Limits, Study
+from physion.experiment.simulated.participants import Plan, Visit, simulate
+from physion.experiment.store.database import open_database, sqlite_url
+from physion.experiment.study.identity import Secrets
+from physion.experiment.study.study import Limits, Study
 
 KILLS, POSTGRES_KILLS, DATABASE_CRASHES = 50, 8, 3
 PHASES = {"familiarization": 3, "test": 12}

@@ -12,9 +12,9 @@ import pytest
 
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
-from physion.cli.experiment import SUBVERBS
-from physion.experiment.study_checks import KEYS
-from physion.experiment.tables import METADATA
+from physion.cli.experiment.experiment import SUBVERBS
+from physion.experiment.store.tables import METADATA
+from physion.experiment.study.study_checks import KEYS
 
 PAGE = (Path(__file__).parents[2] / "docs" / "experiment.md").read_text()
 

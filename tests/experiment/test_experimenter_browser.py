@@ -16,10 +16,10 @@ from experimenter_client import BASE, TWO
 from experimenter_rows import insert_sessions
 from tiny_study import PASSWORD, make_tiny_study
 
-from physion.experiment.database import open_database, sqlite_url
-from physion.experiment.identity import Secrets
-from physion.experiment.own_server import OwnServer
-from physion.experiment.study import Study
+from physion.experiment.simulated.server_process import OwnServer
+from physion.experiment.store.database import open_database, sqlite_url
+from physion.experiment.study.identity import Secrets
+from physion.experiment.study.study import Study
 
 __all__ = ["chromium"]
 pytestmark = pytest.mark.slow

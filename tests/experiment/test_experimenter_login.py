@@ -15,9 +15,9 @@ from experimenter_client import BASE, Lab, lab
 from starlette.requests import Request
 from tiny_study import PASSWORD
 
-from physion.experiment.experimenter import gate as gates
-from physion.experiment.experimenter.attempts import ADDRESSES, BY_ADDRESS, OVERALL, Attempts
-from physion.experiment.experimenter.login import (
+from physion.experiment.experimenter.access import gate as gates
+from physion.experiment.experimenter.access.attempts import ADDRESSES, BY_ADDRESS, OVERALL, Attempts
+from physion.experiment.experimenter.access.login import (
     AT_MOST,
     CONFIRMED_FOR,
     COOKIE,
@@ -25,7 +25,7 @@ from physion.experiment.experimenter.login import (
     LONGEST,
     Logins,
 )
-from physion.experiment.identity import Secrets, check_password, set_password
+from physion.experiment.study.identity import Secrets, check_password, set_password
 
 PAGES = ("", "/", "/sessions", "/sessions/abc", "/payments", "/export", "?auto=1")
 ACTIONS = ("/logout", "/payments", "/payments/forget", "/export")

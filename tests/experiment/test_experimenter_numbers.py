@@ -12,15 +12,20 @@ pytest.importorskip("sqlalchemy", reason="the extra 'experiment' is not installe
 from experimenter_rows import BROWSERS, insert_sessions
 from tiny_study import make_tiny_study
 
-from physion.experiment.database import open_database, upgrade
-from physion.experiment.experimenter.clerk import Clerk
 from physion.experiment.experimenter.figures import HEIGHT, WIDTH, accuracy_histogram, rt_histogram
-from physion.experiment.experimenter.flagging import Flags
 from physion.experiment.experimenter.overview import browser_of, expected_end, funnel, rate_of
 from physion.experiment.experimenter.pages import minutes
-from physion.experiment.experimenter.summaries import Answered, Summaries, Summary, standing_of
-from physion.experiment.identity import Secrets
-from physion.experiment.tables import ANSWERS, SESSIONS
+from physion.experiment.experimenter.statistics.flagging import Flags
+from physion.experiment.experimenter.statistics.summaries import (
+    Answered,
+    Summaries,
+    Summary,
+    standing_of,
+)
+from physion.experiment.experimenter.statistics.worker import Clerk
+from physion.experiment.store.database import open_database, upgrade
+from physion.experiment.store.tables import ANSWERS, SESSIONS
+from physion.experiment.study.identity import Secrets
 
 
 def test_the_expected_end_follows_the_rate_of_late() -> None:

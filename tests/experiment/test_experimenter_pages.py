@@ -26,12 +26,12 @@ from experimenter_client import BASE, TWO, Lab, Visitor, lab
 from experimenter_rows import insert_sessions
 from tiny_study import PASSWORD, make_tiny_study
 
-from physion.analysis.exclusions import PREREGISTERED, RULES, flag_sessions
-from physion.analysis.participants import clean
-from physion.experiment.answer_tables import read_tables
-from physion.experiment.export import export_study
-from physion.experiment.own_server import OwnServer
-from physion.experiment.tables import ANSWERS, EVENTS, RAW_IDS, SESSIONS
+from physion.analysis.people.exclusions import PREREGISTERED, RULES, flag_sessions
+from physion.analysis.people.participants import clean
+from physion.experiment.export.answer_tables import read_tables
+from physion.experiment.export.export_study import export_study
+from physion.experiment.simulated.server_process import OwnServer
+from physion.experiment.store.tables import ANSWERS, EVENTS, RAW_IDS, SESSIONS
 
 HOSTILE = (
     "<script>alert(1)</script>\"'><img src=x onerror=alert(2)>'; DROP TABLE answers; --{{7*7}}"

@@ -14,21 +14,22 @@ from experimenter_rows import insert_sessions
 from pandas.testing import assert_frame_equal
 from tiny_study import make_tiny_study
 
-from physion.analysis.csv_table import read_table
-from physion.analysis.exclusions import flag_sessions
-from physion.analysis.participants import read_responses
-from physion.analysis.response_schema import check_table
-from physion.cli import experiment_export
+from physion.analysis.people.exclusions import flag_sessions
+from physion.analysis.people.participants import read_responses
+from physion.analysis.people.response_schema import check_table
+from physion.analysis.tables.csv_table import read_table
+from physion.cli.experiment import export as experiment_export
 from physion.cli.main import main
 from physion.errors import BadInputError, PhysionError
-from physion.experiment import export, export_tables
-from physion.experiment.answer_tables import read_tables
-from physion.experiment.database import open_database, sqlite_url, upgrade
-from physion.experiment.export import GONE, NO_FILE, TABLES, export_study
-from physion.experiment.identity import Secrets
-from physion.experiment.spreadsheet import restore_cell
-from physion.experiment.study import Recruitment, Study
-from physion.experiment.tables import ANSWERS, RAW_IDS, SESSIONS, STUDIES
+from physion.experiment.export import export_study as export
+from physion.experiment.export import large_tables as export_tables
+from physion.experiment.export.answer_tables import read_tables
+from physion.experiment.export.export_study import GONE, NO_FILE, TABLES, export_study
+from physion.experiment.export.spreadsheet import restore_cell
+from physion.experiment.store.database import open_database, sqlite_url, upgrade
+from physion.experiment.store.tables import ANSWERS, RAW_IDS, SESSIONS, STUDIES
+from physion.experiment.study.identity import Secrets
+from physion.experiment.study.study import Recruitment, Study
 from physion.report.people_results import read_expected
 
 NOW = 1_790_000_000.0

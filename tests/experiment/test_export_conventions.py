@@ -13,14 +13,14 @@ import pytest
 from experimenter_rows import insert_sessions
 from tiny_study import make_tiny_study
 
-from physion.experiment.answer_tables import read_tables
-from physion.experiment.bids import BEH_COLUMNS
-from physion.experiment.column_words import labels_of
-from physion.experiment.database import open_database, upgrade
-from physion.experiment.export import export_study
-from physion.experiment.identity import Secrets
-from physion.experiment.spreadsheet import restore_cell
-from physion.experiment.tables import PARTICIPANTS, SESSIONS
+from physion.experiment.export.answer_tables import read_tables
+from physion.experiment.export.bids import BEH_COLUMNS
+from physion.experiment.export.column_words import labels_of
+from physion.experiment.export.export_study import export_study
+from physion.experiment.export.spreadsheet import restore_cell
+from physion.experiment.store.database import open_database, upgrade
+from physion.experiment.store.tables import PARTICIPANTS, SESSIONS
+from physion.experiment.study.identity import Secrets
 from programs import find_program
 
 NASTY = '=1+1\t"tab"\n-2;@SUM(1) \\ \r n/a'

@@ -13,12 +13,12 @@ from tiny_study import PASSWORD
 
 from physion.cli.main import main
 from physion.errors import BadInputError, PhysionError
-from physion.experiment.forget import forget, forget_raw_ids, forget_sessions
-from physion.experiment.identity import Secrets, check_password, participant_hash
-from physion.experiment.store import Store
-from physion.experiment.study import Study
-from physion.experiment.tables import ANSWERS, EVENTS, RAW_IDS, SESSIONS, TOKENS
-from physion.experiment.wire import Device, Enter, Event, Events
+from physion.experiment.protocol.messages import Device, Enter, Event, Events
+from physion.experiment.store.forget import forget, forget_raw_ids, forget_sessions
+from physion.experiment.store.store import Store
+from physion.experiment.store.tables import ANSWERS, EVENTS, RAW_IDS, SESSIONS, TOKENS
+from physion.experiment.study.identity import Secrets, check_password, participant_hash
+from physion.experiment.study.study import Study
 
 
 def raw_id(number: int) -> str:
@@ -117,7 +117,7 @@ def test_a_served_study_and_a_busy_reader_are_named(
         forget(database, None)
     assert len(rows(store, RAW_IDS)) == 60
     store.close()
-    monkeypatch.setattr("physion.experiment.database.BUSY_MS", 200)
+    monkeypatch.setattr("physion.experiment.store.database.BUSY_MS", 200)
     reader = sqlite3.connect(tmp_path / "responses.sqlite", isolation_level=None)
     reader.execute("BEGIN")
     reader.execute("SELECT count(*) FROM raw_ids").fetchone()

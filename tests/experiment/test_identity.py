@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from physion.errors import BadInputError
-from physion.experiment.identity import (
+from physion.experiment.study.identity import (
     SECRET_FILE,
     Secrets,
     check_password,
@@ -27,15 +27,15 @@ from physion.experiment.identity import (
     set_password,
     sign,
 )
-from physion.experiment.media_links import read_media_path, sign_media
-from physion.experiment.orders import (
+from physion.experiment.study.orders import (
     draw_buttons,
     fixations,
     order_of,
     own_order_seed,
     prepared_order_seed,
 )
-from physion.experiment.study import Study, Timing
+from physion.experiment.study.study import Study, Timing
+from physion.experiment.web.media_links import read_media_path, sign_media
 
 KEYS = Secrets(b"a" * 32, b"b" * 32)
 

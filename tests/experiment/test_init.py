@@ -18,15 +18,15 @@ import pytest
 from tiny_dataset import is_marked, make_tiny_dataset
 from tiny_study import OBSERVED, make_tiny_study, read_number
 
-from physion.cli.experiment import SUBVERBS
+from physion.cli.experiment.experiment import SUBVERBS
 from physion.cli.main import main
 from physion.errors import BadInputError, UnknownNameError
-from physion.experiment import study_folder
-from physion.experiment.identity import Secrets, check_password
-from physion.experiment.init_trials import choose_familiarization, choose_trials
-from physion.experiment.media import Source, take_stimulus
-from physion.experiment.study import Study, load_study
-from physion.experiment.study_folder import JOURNAL, make_study
+from physion.experiment.study import study_folder
+from physion.experiment.study.identity import Secrets, check_password
+from physion.experiment.study.init_trials import choose_familiarization, choose_trials
+from physion.experiment.study.media import Source, take_stimulus
+from physion.experiment.study.study import Study, load_study
+from physion.experiment.study.study_folder import JOURNAL, make_study
 from physion.trials.index import write_index
 from physion.trials.video import read_frames
 
@@ -321,7 +321,7 @@ def test_a_missing_extra_is_said_in_one_line(
     monkeypatch: pytest.MonkeyPatch,
     word: str,
 ) -> None:
-    monkeypatch.setattr("physion.cli.experiment.NEEDED", ("no_such_module",))
+    monkeypatch.setattr("physion.cli.experiment.experiment.NEEDED", ("no_such_module",))
     more = ["--all"] if word == "forget" else []
     assert main(["experiment", word, str(tmp_path / "s"), *more]) == 2
     said = capsys.readouterr().err

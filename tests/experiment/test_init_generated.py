@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from physion.cli.main import main
-from physion.experiment.study import load_study
+from physion.experiment.study.study import load_study
 from physion.trials.dataset import Dataset
 from physion.trials.layout import TrialPaths
 from physion.trials.video import read_frames

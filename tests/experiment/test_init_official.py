@@ -12,11 +12,11 @@ import pytest
 from tiny_dataset import make_tiny_dataset
 from tiny_study import FULL, OBSERVED, draw, draw_map, read_number
 
-from physion.analysis.stimuli import OFFICIAL_SCENARIOS, canonical_name
+from physion.analysis.tables.stimuli import OFFICIAL_SCENARIOS, canonical_name
 from physion.cli.main import main
 from physion.errors import BadInputError
-from physion.experiment.init_official import choose_listed, list_scenario, read_list
-from physion.experiment.study import load_study
+from physion.experiment.study.init_official import choose_listed, list_scenario, read_list
+from physion.experiment.study.study import load_study
 from physion.trials.video import encode_movie, read_frames
 
 LIST = "human-physics-benchmarking-collision-pilot_production_2_experimental_stims.json"

@@ -14,7 +14,7 @@ from PIL import Image
 from tiny_study import FULL, OBSERVED, draw, draw_map, read_number
 
 from physion.errors import BadInputError
-from physion.experiment.media import Source, clean_map, take_stimulus
+from physion.experiment.study.media import Source, clean_map, take_stimulus
 from physion.trials.video import encode_movie, read_frames
 
 SIZE = 64

@@ -11,8 +11,8 @@ from tiny_study import FULL, OBSERVED, draw, draw_map, make_tiny_study
 
 from physion.cli.main import main
 from physion.errors import BadInputError
-from physion.experiment.media_checks import check_media
-from physion.experiment.study import Study, load_study
+from physion.experiment.study.media_checks import check_media
+from physion.experiment.study.study import Study, load_study
 from physion.trials.video import encode_movie
 
 

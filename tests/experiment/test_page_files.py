@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from physion.experiment import texts
-from physion.experiment.wire import REFUSALS
+from physion.experiment.protocol.messages import REFUSALS
+from physion.experiment.study import texts
 
 PACKAGE = Path(texts.__file__).parent
 STATIC = PACKAGE / "static"

@@ -17,12 +17,12 @@ from tiny_study import make_tiny_study
 
 from physion.cli.main import main
 from physion.errors import UnknownNameError
-from physion.experiment.identity import Secrets
-from physion.experiment.own_server import OwnServer
-from physion.experiment.simulated import Plan, Visit, simulate
-from physion.experiment.simulated_person import SimulatedPerson
-from physion.experiment.stimuli import Stimulus
-from physion.experiment.study import Study
+from physion.experiment.simulated.participants import Plan, Visit, simulate
+from physion.experiment.simulated.person import SimulatedPerson
+from physion.experiment.simulated.server_process import OwnServer
+from physion.experiment.study.identity import Secrets
+from physion.experiment.study.stimuli import Stimulus
+from physion.experiment.study.study import Study
 
 
 def _stimulus(number: int, label: bool) -> Stimulus:

@@ -13,11 +13,11 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from physion.analysis.csv_table import read_csv
-from physion.analysis.response_schema import Column
-from physion.experiment.spreadsheet import guard_cell, restore_cell
-from physion.experiment.stimuli import LOOKS, NAME
-from physion.experiment.table_files import TableFiles
+from physion.analysis.people.response_schema import Column
+from physion.analysis.tables.csv_table import read_csv
+from physion.experiment.export.spreadsheet import guard_cell, restore_cell
+from physion.experiment.export.table_files import TableFiles
+from physion.experiment.study.stimuli import LOOKS, NAME
 
 FORMULA = tuple("=+-@＝＋－＠")
 TEXTS = st.text(

@@ -13,9 +13,9 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 import httpx2
 from tiny_study import make_tiny_study
 
-from physion.analysis.exclusions import RULE_SETS
-from physion.experiment.own_server import OwnServer
-from physion.experiment.study_checks import EXCLUSIONS
+from physion.analysis.people.exclusions import RULE_SETS
+from physion.experiment.simulated.server_process import OwnServer
+from physion.experiment.study.study_checks import EXCLUSIONS
 
 SLOW_TO_IMPORT = (
     "numpy",

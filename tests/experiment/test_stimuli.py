@@ -11,9 +11,15 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from physion.analysis.stimuli import canonical_name
+from physion.analysis.tables.stimuli import canonical_name
 from physion.errors import BadInputError
-from physion.experiment.stimuli import COLUMNS, Stimulus, analysis_name, read_stimuli, write_stimuli
+from physion.experiment.study.stimuli import (
+    COLUMNS,
+    Stimulus,
+    analysis_name,
+    read_stimuli,
+    write_stimuli,
+)
 
 NAMES = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,30}", fullmatch=True)
 FILES = st.from_regex(r"media/[A-Za-z0-9][A-Za-z0-9_-]{0,20}", fullmatch=True)

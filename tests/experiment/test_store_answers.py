@@ -17,13 +17,13 @@ from hypothesis import strategies as st
 from sqlalchemy import delete
 from store_walk import answer, enter, give, page, refusal, rows, run, walk
 
-from physion.experiment.identity import Secrets
-from physion.experiment.media_links import read_media_path
-from physion.experiment.orders import order_of
-from physion.experiment.store import Refused, Store
-from physion.experiment.study import Study
-from physion.experiment.tables import ANSWERS, METADATA, SESSIONS, STUDIES
-from physion.experiment.wire import Answer, Enter, PageDone
+from physion.experiment.protocol.messages import Answer, Enter, PageDone
+from physion.experiment.store.store import Refused, Store
+from physion.experiment.store.tables import ANSWERS, METADATA, SESSIONS, STUDIES
+from physion.experiment.study.identity import Secrets
+from physion.experiment.study.orders import order_of
+from physion.experiment.study.study import Study
+from physion.experiment.web.media_links import read_media_path
 
 HOSTILE = "'; DROP TABLE answers; -- \"<script>alert(1)</script>\\ %s {0} \0 é ☃ 🎲"
 

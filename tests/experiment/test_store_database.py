@@ -14,14 +14,14 @@ from sqlalchemy import insert, text
 from sqlalchemy.exc import SQLAlchemyError
 
 from physion.errors import BadInputError, PhysionError
-from physion.experiment.database import (
+from physion.experiment.store.database import (
     check_version,
     connect_writer,
     one_server,
     open_database,
     upgrade,
 )
-from physion.experiment.tables import METADATA, RAW_IDS
+from physion.experiment.store.tables import METADATA, RAW_IDS
 
 
 def test_upgrade_of_an_empty_database_gives_exactly_the_tables(database_url: str) -> None:

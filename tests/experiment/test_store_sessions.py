@@ -25,14 +25,14 @@ from store_walk import (
 )
 
 from physion.errors import BadInputError, PhysionError
-from physion.experiment.identity import Secrets, participant_hash
-from physion.experiment.recruitment import pass_word
-from physion.experiment.scores import percentile
-from physion.experiment.sessions import ACTIVE_WITHIN
-from physion.experiment.store import Refused, Store
-from physion.experiment.study import Recruitment, Study
-from physion.experiment.tables import EVENTS, PARTICIPANTS, RAW_IDS, SESSIONS, STUDIES, TOKENS
-from physion.experiment.wire import REFUSALS, Device, Enter, Event, Events, PageDone
+from physion.experiment.protocol.messages import REFUSALS, Device, Enter, Event, Events, PageDone
+from physion.experiment.store.scores import percentile
+from physion.experiment.store.sessions import ACTIVE_WITHIN
+from physion.experiment.store.store import Refused, Store
+from physion.experiment.store.tables import EVENTS, PARTICIPANTS, RAW_IDS, SESSIONS, STUDIES, TOKENS
+from physion.experiment.study.identity import Secrets, participant_hash
+from physion.experiment.study.recruitment import pass_word
+from physion.experiment.study.study import Recruitment, Study
 
 HOSTILE = "'; DROP TABLE sessions; -- \"<script>alert(1)</script>\\ %s {0} \0 é ☃ 🎲"
 
@@ -512,7 +512,7 @@ def test_trials_come_after_the_consent_in_the_sessions_order(store: Store) -> No
         assert word not in listed.model_dump_json().lower()
     walk(store, token, "demographics")
     given = [row.stimulus for row in rows(store) if row.phase == "test"]
-    from physion.experiment.media_links import read_media_path
+    from physion.experiment.web.media_links import read_media_path
 
     files = {
         str(read_media_path(store.study, store.secrets, each.movie)): trial
@@ -566,7 +566,7 @@ def test_percentiles_are_among_finished_people_of_the_scenario(
 
 
 def _order(store: Store, person: str, scenario: str, more: dict[str, Any]) -> tuple[Any, ...]:
-    from physion.experiment.orders import order_of, own_order_seed
+    from physion.experiment.study.orders import order_of, own_order_seed
 
     source = "simulated link" if more else "link"
     seed = own_order_seed(store.study, scenario, participant_hash(store.secrets, source, person))
@@ -632,7 +632,7 @@ def test_loads_are_counted_and_say_where(store: Store) -> None:
 
 
 def test_events_are_kept_up_to_a_limit(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("physion.experiment.store.MAX_EVENTS", 7)
+    monkeypatch.setattr("physion.experiment.store.store.MAX_EVENTS", 7)
     token = enter(store)
     some = Events(events=[Event(kind="hidden", at_ms=number) for number in range(5)])
     assert [run(store.events(token, some)).stored for _ in range(3)] == [5, 2, 0]

@@ -18,14 +18,14 @@ from sqlalchemy import Connection, Engine, create_engine, event, text
 from sqlalchemy.engine import make_url
 from store_walk import answer, enter, give, rows, run, walk
 
-from physion.experiment.database import connect_writer, open_database
-from physion.experiment.identity import Secrets
-from physion.experiment.recruitment import pass_word
-from physion.experiment.store import Refused, Store
-from physion.experiment.study import Study
-from physion.experiment.tables import EVENTS
-from physion.experiment.wire import Enter, PageDone
-from physion.experiment.writer import Writer
+from physion.experiment.protocol.messages import Enter, PageDone
+from physion.experiment.store.database import connect_writer, open_database
+from physion.experiment.store.store import Refused, Store
+from physion.experiment.store.tables import EVENTS
+from physion.experiment.store.writer import Writer
+from physion.experiment.study.identity import Secrets
+from physion.experiment.study.recruitment import pass_word
+from physion.experiment.study.study import Study
 
 T = TypeVar("T")
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from tiny_study import make_tiny_study
 
 from physion.errors import BadInputError
-from physion.experiment.study import (
+from physion.experiment.study.study import (
     Limits,
     Recruitment,
     Screen,
@@ -25,7 +25,7 @@ from physion.experiment.study import (
     study_to_toml,
     write_settings,
 )
-from physion.experiment.study_checks import KEYS, TABLES
+from physion.experiment.study.study_checks import KEYS, TABLES
 
 NAMES = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,40}", fullmatch=True)
 CODES = st.from_regex(r"[A-Za-z0-9_-]{0,30}", fullmatch=True)

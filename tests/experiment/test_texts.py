@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from physion.errors import BadInputError, UnknownNameError
-from physion.experiment.texts import (
+from physion.experiment.study.texts import (
     read_texts,
     shipped_file,
     shipped_languages,

@@ -21,10 +21,10 @@ from argon2 import PasswordHasher
 from numpy.typing import NDArray
 from PIL import Image
 
-from physion.experiment.identity import SECRET_FILE, Secrets
-from physion.experiment.stimuli import STIMULI_FILE, Stimulus, write_stimuli
-from physion.experiment.study import Study, load_study, write_settings
-from physion.experiment.texts import TEXTS_FOLDER, shipped_file
+from physion.experiment.study.identity import SECRET_FILE, Secrets
+from physion.experiment.study.stimuli import STIMULI_FILE, Stimulus, write_stimuli
+from physion.experiment.study.study import Study, load_study, write_settings
+from physion.experiment.study.texts import TEXTS_FOLDER, shipped_file
 from physion.trials.video import encode_movie
 
 OBSERVED, FULL, RATE, BLOCKS = 45, 60, 30, 6

@@ -87,7 +87,7 @@ def test_the_coarse_logarithm_is_near_exact_at_powers_of_2_and_never_falls() -> 
 
 
 def test_bits_stay_what_they_are() -> None:
-    """Whoever changes a last bit changes every scene: see `physion.trials.reproduce`."""
+    """Whoever changes a last bit changes every scene: see `physion.trials.making.reproduce`."""
     assert elementary.sin(1.0).hex() == "0x1.aed548f090ceep-1"
     assert elementary.cos(1.0).hex() == "0x1.14a280fb5068cp-1"
     assert elementary.exp(1.0).hex() == "0x1.5bf0a8b14576ap+1"

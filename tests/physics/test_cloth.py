@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 
 from physion.errors import BadInputError
-from physion.physics.cloth import ClothMotion, ClothSettings, settle_solids, simulate_cloth
-from physion.physics.cloth_sheet import sheet_springs, sheet_triangles, sheet_vertices
-from physion.physics.cloth_solids import fill_shape, particles_of, surface_particles
-from physion.physics.cloth_solver import smallest_distance
+from physion.physics.cloth.sheet import sheet_springs, sheet_triangles, sheet_vertices
+from physion.physics.cloth.simulate import ClothMotion, ClothSettings, settle_solids, simulate_cloth
+from physion.physics.cloth.solids import fill_shape, particles_of, surface_particles
+from physion.physics.cloth.solver import smallest_distance
 from physion.physics.engine import simulate
 from physion.physics.labels import CLOTH_CONTACT_GAP, label_contact
 from physion.physics.replay import area_under_curve
 from physion.physics.trajectory import ENVIRONMENT, Contacts, Trajectory
 from physion.scenes.scene import Body, Camera, Cloth, Roles, Scene
-from physion.scenes.tdw import read_scenes
+from physion.scenes.tdw.read_logs import read_scenes
 
 REST = ClothSettings().rest_distance
 SPACING = ClothSettings().particle_spacing

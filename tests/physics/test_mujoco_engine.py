@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from physion.errors import BadInputError, BadSceneError
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
-from physion.physics.mujoco_engine import MujocoEngine, RigidRun
-from physion.physics.settings import Settings
+from physion.physics.rigid.engine import MujocoEngine, RigidRun
+from physion.physics.rigid.settings import Settings
 from physion.physics.trajectory import ENVIRONMENT, Trajectory
-from physion.scenes.scenarios import sample_scene
+from physion.scenes.sampling.registry import sample_scene
 from physion.scenes.scene import Body, Camera, Contact, Ending, Joint, Push, Roles, Scene
 from physion.seeds import trial_seed
 
@@ -268,7 +268,7 @@ def test_same_bytes_in_every_process() -> None:
     here = [MujocoEngine().simulate(scene, frames=90).digest() for _ in range(2)]
     code = (
         "import sys; from physion.scenes.scene import Scene; "
-        "from physion.physics.mujoco_engine import MujocoEngine; "
+        "from physion.physics.rigid.engine import MujocoEngine; "
         "print(MujocoEngine().simulate(Scene.from_json(sys.stdin.read()), frames=90).digest())"
     )
     there = subprocess.run(

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from physion.physics.labels import label_contact
-from physion.physics.mujoco_engine import MujocoEngine
-from physion.scenes.tdw import read_scenes
+from physion.physics.rigid.engine import MujocoEngine
+from physion.scenes.tdw.read_logs import read_scenes
 
 
 def agreement(official: Path, folder: str, limit: int) -> float:

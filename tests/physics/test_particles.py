@@ -19,8 +19,8 @@ from physion.physics.particles import (
 )
 from physion.physics.trajectory import Contacts, Trajectory
 from physion.scenes.scene import Body, Camera, Cloth, Roles, Scene
-from physion.scenes.shapes import PIPE_INNER, TORUS_INNER, shape, shapes
-from physion.scenes.solids import box, merge
+from physion.scenes.shapes.meshes import box, merge
+from physion.scenes.shapes.primitives import PIPE_INNER, TORUS_INNER, shape, shapes
 
 SPACING = 0.05
 PRIMITIVES = [name for name in shapes.names() if not name.startswith("prop:")]

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from moving_dots import make_dots
-from physion.analysis.predictions import check_predictions
+from physion.analysis.tables.predictions import check_predictions
 from physion.errors import BadInputError, UnknownNameError
 from physion.models import build_model, models
 from physion.readout import Evaluation, EvaluationConfig, evaluate, evaluate_model

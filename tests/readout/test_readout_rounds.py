@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 
 from physion.errors import BadInputError
-from physion.readout.rounds import deal, plan_rounds
+from physion.readout.folds import deal, plan_rounds
 from physion.training.protocols import Training
 
 

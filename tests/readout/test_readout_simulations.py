@@ -16,7 +16,7 @@ from physion.models import Provenance, Spec
 from physion.models.noisy_simulation import Config, NoisySimulation
 from physion.physics.trajectory import Contacts, State, Trajectory
 from physion.readout import EvaluationConfig, evaluate, evaluate_model
-from physion.readout.rounds import plan_rounds
+from physion.readout.folds import plan_rounds
 from physion.readout.simulations import SimulationReadout
 from physion.scenes.scene import Body, Camera, Roles, Scene
 from physion.training.protocols import Training
@@ -208,8 +208,8 @@ def test_the_road_on_real_trials(tmp_path: Path) -> None:
     """Sampled, simulated, rendered; seen by an encoder, and simulated again."""
     from physion.compute.local import LocalExecutor, SerialExecutor
     from physion.trials.dataset import Dataset
-    from physion.trials.generate import generate
-    from physion.trials.plan import Settings, plan_dataset
+    from physion.trials.making.generate import generate
+    from physion.trials.making.plan import Settings, plan_dataset
 
     tasks = plan_dataset("road", ("drop",), {"readout": 4, "testing": 3})
     report = generate(

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 
 from physion.physics.trajectory import Contacts, Trajectory
 from physion.scenes.scene import Body, Camera, Cloth, Look, Roles, Scene, Vec3
-from physion.scenes.shapes import Shape, shapes
-from physion.scenes.solids import Mesh
+from physion.scenes.shapes.meshes import Mesh
+from physion.scenes.shapes.primitives import Shape, shapes
 
 CAMERA = Camera((2.4, 1.9, 1.3), (0.0, 0.0, 0.4))
 ALL = ("color", "depth", "normals", "ids", "flow")

@@ -13,7 +13,7 @@ from physion.rendering.camera import View
 from physion.rendering.rasterizer import NOTHING, SAMPLES, rasterize
 from physion.rendering.renderer import Frame, Renderer
 from physion.scenes.scene import Camera, Cloth, Scene
-from physion.scenes.shapes import shape, shapes
+from physion.scenes.shapes.primitives import shape, shapes
 
 from .scenes import CAMERA, body, flat_sheet, resting, scene_of, trajectory_of, tumbling
 

@@ -22,7 +22,7 @@ from physion.rendering.renderer import (
     role_map,
 )
 from physion.rendering.rooms import rooms
-from physion.rendering.textures import FINISHES, SIZE, build_atlas, finish
+from physion.rendering.textures.atlas import FINISHES, SIZE, build_atlas, finish
 from physion.scenes.scene import Camera, Look
 
 from .scenes import ALL, body, resting, scene_of, tumbling

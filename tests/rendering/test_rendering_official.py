@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from physion.rendering.renderer import Renderer
-from physion.scenes.tdw import read_scenes
+from physion.scenes.tdw.read_logs import read_scenes
 
 from .scenes import resting
 

@@ -8,17 +8,17 @@ import math
 import numpy as np
 import pytest
 
-from physion.rendering import textures
-from physion.rendering.assembly import assemble
-from physion.rendering.noise import F32, Painter
 from physion.rendering.renderer import Renderer
 from physion.rendering.rooms import rooms
-from physion.rendering.textures import FINISHES, LEVELS, PAINTERS, SIZE, build_atlas, finish
+from physion.rendering.textures import atlas as textures
+from physion.rendering.textures.atlas import FINISHES, LEVELS, PAINTERS, SIZE, build_atlas, finish
+from physion.rendering.textures.noise import F32, Painter
+from physion.rendering.triangles import assemble
 from physion.scenes.looks import MATERIALS, RED, TEXTURES
-from physion.scenes.prop_parts import Prop
-from physion.scenes.props import PREFIX, PROPS
 from physion.scenes.scene import Camera, Look, Scene
-from physion.scenes.shapes import shape
+from physion.scenes.shapes.primitives import shape
+from physion.scenes.shapes.prop_names import PREFIX, PROPS
+from physion.scenes.shapes.prop_parts import Prop
 
 from .scenes import body, resting, scene_of
 

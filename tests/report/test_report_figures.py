@@ -16,16 +16,19 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from physion.analysis import Comparison
-from physion.analysis.difficulty import below_chance
-from physion.analysis.stimuli import SCENARIOS
-from physion.analysis.tables import MEAN
-from physion.report import blocks, figure_tables, figures, figures_stimuli, theme
-from physion.report.blocks import protocol_names
-from physion.report.document import Picture
+from physion.analysis.people.difficulty import below_chance
+from physion.analysis.tables.score_tables import MEAN
+from physion.analysis.tables.stimuli import SCENARIOS
+from physion.report.figures import by_scenario as figures
+from physion.report.figures import by_stimulus as figures_stimuli
+from physion.report.figures import figure_tables, theme
+from physion.report.figures.plots import plots
 from physion.report.inputs import ReportInputs
 from physion.report.mixed_fits import fits_of_models
-from physion.report.page import render_page
-from physion.report.plots import plots
+from physion.report.page import blocks
+from physion.report.page.blocks import protocol_names
+from physion.report.page.document import Picture
+from physion.report.page.page import render_page
 
 Maker = Callable[..., Comparison]
 

@@ -14,13 +14,13 @@ import pandas as pd
 import pytest
 
 from physion.analysis import Bootstrap, Comparison
-from physion.analysis.tables import MEAN
+from physion.analysis.tables.score_tables import MEAN
 from physion.errors import BadInputError
 from physion.report import ReportInputs, build_report, compare_files
-from physion.report.document import Picture
 from physion.report.inputs import EXPECTED_METHODS
-from physion.report.movies import widest_gaps
-from physion.report.page import render_page
+from physion.report.page.document import Picture
+from physion.report.page.movies import widest_gaps
+from physion.report.page.page import render_page
 
 Maker = Callable[..., Comparison]
 VOID = {"meta", "img", "source", "br", "hr", "link", "input"}

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from physion.analysis import Bootstrap
-from physion.analysis.kappa import cohen_kappa
+from physion.analysis.statistics.kappa import cohen_kappa
 from physion.errors import BadInputError, UnknownNameError
 from physion.report import compare_files
 from physion.report.inputs import permutations_of

@@ -19,13 +19,14 @@ from viewer_dataset import EVIL, FRAMES, PLANS, Plan, make_dataset, make_scene, 
 from physion.cli import view
 from physion.cli.main import main as cli
 from physion.errors import BadInputError, UnknownNameError
-from physion.report import viewer, viewer_facts
-from physion.report.viewer import ViewerOptions, build_viewer, choose_trials
-from physion.report.viewer_motion import STEPS, pack_grid, pack_motion, pack_shapes
-from physion.report.viewer_movies import fitted
-from physion.report.viewer_page import embed_json
-from physion.scenes.shapes import shape
-from physion.scenes.solids import Mesh, solid_properties
+from physion.report.viewer import facts as viewer_facts
+from physion.report.viewer import write_viewer as viewer
+from physion.report.viewer.motion import STEPS, pack_grid, pack_motion, pack_shapes
+from physion.report.viewer.text import embed_json
+from physion.report.viewer.viewer_movies import fitted
+from physion.report.viewer.write_viewer import ViewerOptions, build_viewer, choose_trials
+from physion.scenes.shapes.meshes import Mesh, solid_properties
+from physion.scenes.shapes.primitives import shape
 from physion.trials.dataset import Dataset
 from physion.trials.video import read_frames
 

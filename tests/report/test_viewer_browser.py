@@ -21,7 +21,7 @@ import pytest
 from PIL import Image
 from viewer_dataset import EVIL, Plan, make_dataset
 
-from physion.report.viewer import ViewerOptions, build_viewer
+from physion.report.viewer.write_viewer import ViewerOptions, build_viewer
 from physion.trials.video import read_frames
 from programs import find_chromium
 

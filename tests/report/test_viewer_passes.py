@@ -7,7 +7,7 @@ import pytest
 from viewer_dataset import PLANS, make_scene
 
 from physion.rendering.renderer import PASSES, Frame
-from physion.report.viewer_passes import (
+from physion.report.viewer.passes import (
     AGENT,
     NOWHERE,
     OTHERS,

@@ -11,9 +11,9 @@ from scipy.optimize import linprog
 
 from physion.numerics.rotations import rotate_vectors
 from physion.scenes.looks import TEXTURES
-from physion.scenes.placement import on_screen, world_bounds
+from physion.scenes.sampling.placement import on_screen, world_bounds
 from physion.scenes.scene import Body, Cloth, Scene
-from physion.scenes.shapes import shape
+from physion.scenes.shapes.primitives import shape
 
 
 def thing(scene: Scene, name: str) -> Body | Cloth:

@@ -16,7 +16,7 @@ from hypothesis.strategies import SearchStrategy
 
 from physion.errors import BadInputError, BadSceneError
 from physion.numerics.rotations import rotate_vectors
-from physion.scenes.parameters import (
+from physion.scenes.sampling.parameters import (
     Angle,
     Axes,
     Count,
@@ -41,7 +41,8 @@ from physion.scenes.parameters import (
     read_params,
     uniform,
 )
-from physion.scenes.rules import (
+from physion.scenes.sampling.registry import as_record, sample_scene, scenarios
+from physion.scenes.sampling.rules import (
     BodyRule,
     PushRule,
     ZoneRule,
@@ -51,9 +52,8 @@ from physion.scenes.rules import (
     draw_zone,
     require_apart,
 )
-from physion.scenes.scenarios import as_record, sample_scene, scenarios
 from physion.scenes.scene import Body, Look
-from physion.scenes.shapes import shape, shapes
+from physion.scenes.shapes.primitives import shape, shapes
 
 SOLIDS = tuple(name for name in shapes.names() if not name.startswith(("prop:", "ramp")))
 SEEDS = st.integers(0, 2**32 - 1).map(np.random.default_rng)

@@ -14,8 +14,8 @@ from sound_scenes import assert_seen, assert_valid, overlapping
 from physion.errors import BadInputError, UnknownNameError
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
-from physion.scenes.parameters import check_params
-from physion.scenes.preset import (
+from physion.scenes.sampling.parameters import check_params
+from physion.scenes.sampling.preset import (
     DEBUG,
     DEFAULT,
     FAMILIARIZATION,
@@ -26,7 +26,7 @@ from physion.scenes.preset import (
     parse_presets,
     read_preset_file,
 )
-from physion.scenes.scenarios import sample_scene, scenarios
+from physion.scenes.sampling.registry import sample_scene, scenarios
 from physion.seeds import trial_seed
 
 SCENARIOS = (

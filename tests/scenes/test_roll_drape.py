@@ -16,19 +16,19 @@ import pytest
 
 from physion.errors import BadInputError, BadSceneError
 from physion.numerics.rotations import rotate_vectors
-from physion.physics.cloth import settle_solids
-from physion.physics.collision_hulls import collision_hulls
+from physion.physics.cloth.simulate import settle_solids
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
-from physion.scenes import drape, roll
-from physion.scenes.parameters import three_turns
-from physion.scenes.placement import on_screen, world_bounds, world_corners
-from physion.scenes.preset import Preset, load_presets, parse_presets
-from physion.scenes.rules import BodyRule
-from physion.scenes.scenarios import sample_scene
+from physion.physics.rigid.hulls import collision_hulls
+from physion.scenes.sampling.parameters import three_turns
+from physion.scenes.sampling.placement import on_screen, world_bounds, world_corners
+from physion.scenes.sampling.preset import Preset, load_presets, parse_presets
+from physion.scenes.sampling.registry import sample_scene
+from physion.scenes.sampling.rules import BodyRule
+from physion.scenes.scenarios import drape, roll
 from physion.scenes.scene import Body, Scene
-from physion.scenes.shapes import shape
-from physion.scenes.tdw import read_scenes
+from physion.scenes.shapes.primitives import shape
+from physion.scenes.tdw.read_logs import read_scenes
 from physion.seeds import trial_seed
 
 ROLL = Path("scenes") / "roll"

@@ -20,9 +20,8 @@ from physion.scenes.looks import (
     pick_material,
     prop_look,
 )
-from physion.scenes.prop_parts import Prop
-from physion.scenes.prop_shapes import NATURAL_SIZES
-from physion.scenes.props import (
+from physion.scenes.shapes.primitives import shape, shapes
+from physion.scenes.shapes.prop_names import (
     _MODELS,
     FALLBACK,
     PREFIX,
@@ -31,8 +30,9 @@ from physion.scenes.props import (
     prop_for,
     read_model_bounds,
 )
-from physion.scenes.props import PROPS as NAMES
-from physion.scenes.shapes import shape, shapes
+from physion.scenes.shapes.prop_names import PROPS as NAMES
+from physion.scenes.shapes.prop_parts import Prop
+from physion.scenes.shapes.props import NATURAL_SIZES
 
 PROPS = [name for name in shapes.names() if name.startswith("prop:")]
 OFFICIAL = (

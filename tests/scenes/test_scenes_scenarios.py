@@ -14,16 +14,16 @@ from sound_scenes import assert_seen, assert_valid, body, bounds, overlap, overl
 
 from physion.errors import BadInputError, BadSceneError, UnknownNameError
 from physion.numerics.rotations import rotate_vectors
-from physion.scenes.collide import Params as Collide
-from physion.scenes.dominoes import Params as Dominoes
-from physion.scenes.drop import Params as Drop
 from physion.scenes.looks import RED, YELLOW, mistakable, with_role_colors
-from physion.scenes.placement import CameraRule, SceneryRule, place_camera, world_bounds
-from physion.scenes.preset import get_preset, parse_presets
-from physion.scenes.props import expand_props
-from physion.scenes.scenarios import Scenario, sample_scene, scenarios
+from physion.scenes.sampling.placement import CameraRule, SceneryRule, place_camera, world_bounds
+from physion.scenes.sampling.preset import get_preset, parse_presets
+from physion.scenes.sampling.registry import Scenario, sample_scene, scenarios
+from physion.scenes.scenarios.collide import Params as Collide
+from physion.scenes.scenarios.dominoes import Params as Dominoes
+from physion.scenes.scenarios.drop import Params as Drop
 from physion.scenes.scene import Body, Scene
-from physion.scenes.shapes import shape
+from physion.scenes.shapes.primitives import shape
+from physion.scenes.shapes.prop_names import expand_props
 from physion.seeds import child_generator, trial_seed
 
 TRIALS = range(12)

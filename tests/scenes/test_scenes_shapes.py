@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from physion.errors import UnknownNameError
-from physion.scenes.shapes import Shape, shape, shapes
-from physion.scenes.solids import Mesh, hull, solid_properties
+from physion.scenes.shapes.meshes import Mesh, hull, solid_properties
+from physion.scenes.shapes.primitives import Shape, shape, shapes
 
 NAMES = [name for name in shapes.names() if ":" not in name]
 """The official shapes; props and shapes of other tests have a prefix."""

@@ -16,17 +16,17 @@ from sound_scenes import body, hulls, overlap
 
 from physion.errors import BadInputError, BadSceneError
 from physion.physics.engine import simulate
-from physion.scenes import contain, link, support
-from physion.scenes.clearance import GAP, beside, cleared, needed_rise
-from physion.scenes.parameters import LEAST_MASS, Range, yaw
-from physion.scenes.placement import world_bounds
-from physion.scenes.preset import get_preset, load_presets, parse_presets
-from physion.scenes.prop_shapes import NATURAL_SIZES
-from physion.scenes.scenarios import sample_scene
+from physion.scenes.sampling.clearance import GAP, beside, cleared, needed_rise
+from physion.scenes.sampling.parameters import LEAST_MASS, Range, yaw
+from physion.scenes.sampling.placement import world_bounds
+from physion.scenes.sampling.preset import get_preset, load_presets, parse_presets
+from physion.scenes.sampling.registry import sample_scene
+from physion.scenes.sampling.stacks import SMALLEST, StackRule, choose, top_of, weighed
+from physion.scenes.scenarios import contain, link, support
 from physion.scenes.scene import Body, Scene
-from physion.scenes.shapes import TORUS_INNER
-from physion.scenes.stacks import SMALLEST, StackRule, choose, top_of, weighed
-from physion.scenes.tdw import read_scenes
+from physion.scenes.shapes.primitives import TORUS_INNER
+from physion.scenes.shapes.props import NATURAL_SIZES
+from physion.scenes.tdw.read_logs import read_scenes
 from physion.seeds import trial_seed
 
 

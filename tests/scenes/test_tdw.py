@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from physion.errors import BadInputError
 from physion.scenes.scene import Scene
-from physion.scenes.tdw import read_scenes
-from physion.scenes.tdw_commands import quaternion_from_euler, vector
+from physion.scenes.tdw.commands import quaternion_from_euler, vector
+from physion.scenes.tdw.read_logs import read_scenes
 
 Command = dict[str, Any]
 

@@ -17,7 +17,7 @@ from physion.physics.labels import Labels, label_contact
 from physion.physics.trajectory import Contacts, Trajectory
 from physion.scenes.scene import Body, Camera, Cloth, Roles, Scene
 from physion.trials.files import encode_png, write_files
-from physion.trials.plan import Job
+from physion.trials.making.plan import Job
 from physion.trials.trial_file import Metadata, TrialWriter
 from physion.trials.video import encode_movie
 

@@ -95,7 +95,7 @@ def make_trajectory(scene: Scene) -> Trajectory:
 def _cloth(scene: Scene, rng: np.random.Generator) -> np.ndarray:
     if not scene.cloths:
         return np.zeros((FRAMES, 0, 3), np.float32)
-    from physion.physics.cloth_sheet import sheet_vertices
+    from physion.physics.cloth.sheet import sheet_vertices
 
     flat = sheet_vertices(scene.cloths[0])
     wave = rng.normal(size=flat.shape) * 0.05

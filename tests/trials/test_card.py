@@ -18,11 +18,11 @@ from hand_made import SIZE, make_parts
 
 from physion.cli.main import main as cli
 from physion.errors import BadInputError
-from physion.trials.card import write_card
-from physion.trials.facts import MEANINGS, meaning
 from physion.trials.files import encode_png, write_files
 from physion.trials.index import COLUMNS, build_index, read_index, write_index
 from physion.trials.layout import TrialPaths, find_trials
+from physion.trials.publishing.card import write_card
+from physion.trials.publishing.facts import MEANINGS, meaning
 from programs import find_program
 
 RAI_WORDS = {

@@ -12,10 +12,11 @@ from physion.compute.local import SerialExecutor
 from physion.errors import BadInputError, BadSceneError, PhysionError
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
-from physion.scenes.scenarios import sample_scene
+from physion.scenes.sampling.registry import sample_scene
 from physion.seeds import trial_seed
-from physion.trials import choose as choosing
-from physion.trials.choose import (
+from physion.trials.dataset import Dataset
+from physion.trials.making import choose as choosing
+from physion.trials.making.choose import (
     Choice,
     Choices,
     Slot,
@@ -26,10 +27,9 @@ from physion.trials.choose import (
     split_of,
     wanted_contact,
 )
-from physion.trials.dataset import Dataset
-from physion.trials.generate import generate
-from physion.trials.make import scene_of
-from physion.trials.plan import SPLITS, Settings, Task, plan_dataset
+from physion.trials.making.generate import generate
+from physion.trials.making.make import scene_of
+from physion.trials.making.plan import SPLITS, Settings, Task, plan_dataset
 
 QUICK = Settings(width=64, height=64, jitters=0, min_visible=0.0, movies=False)
 

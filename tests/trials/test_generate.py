@@ -21,10 +21,10 @@ from physion.atomic import folder_lock, write_atomic
 from physion.compute.local import LocalExecutor, SerialExecutor
 from physion.errors import BadInputError, PhysionError, UnknownNameError
 from physion.trials.dataset import Dataset
-from physion.trials.generate import Report, generate
 from physion.trials.index import build_index, index_row
 from physion.trials.layout import TrialPaths, find_trials
-from physion.trials.plan import Settings, Task, plan_dataset, plan_scenes
+from physion.trials.making.generate import Report, generate
+from physion.trials.making.plan import Settings, Task, plan_dataset, plan_scenes
 from physion.trials.trial_file import Trial
 from physion.trials.video import count_frames, read_frames
 
@@ -217,8 +217,8 @@ from pathlib import Path
 from hand_made import make_by_hand, make_scene
 from physion.compute.local import SerialExecutor
 from physion.errors import PhysionError
-from physion.trials.generate import generate
-from physion.trials.plan import plan_scenes
+from physion.trials.making.generate import generate
+from physion.trials.making.plan import plan_scenes
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 tasks = plan_scenes("tests", [make_scene("a")])
 try:
@@ -250,8 +250,8 @@ from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from hand_made import make_by_hand, make_scene
 from physion.compute.local import LocalExecutor
-from physion.trials.generate import generate
-from physion.trials.plan import plan_scenes
+from physion.trials.making.generate import generate
+from physion.trials.making.plan import plan_scenes
 def track(outcomes, what, total):
     for outcome in outcomes:
         print(outcome.key, flush=True)

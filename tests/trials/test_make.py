@@ -18,14 +18,14 @@ from physion.compute.local import LocalExecutor, SerialExecutor
 from physion.errors import BadInputError, UnknownNameError
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
-from physion.scenes.scenarios import scenarios
+from physion.scenes.sampling.registry import scenarios
 from physion.scenes.scene import Ending
-from physion.scenes.tdw import read_scenes
+from physion.scenes.tdw.read_logs import read_scenes
 from physion.trials.dataset import Dataset
-from physion.trials.generate import generate
 from physion.trials.index import index_row
-from physion.trials.make import make_trial
-from physion.trials.plan import Job, Settings, Task, plan_dataset
+from physion.trials.making.generate import generate
+from physion.trials.making.make import make_trial
+from physion.trials.making.plan import Job, Settings, Task, plan_dataset
 from physion.trials.trial_file import Trial
 from physion.trials.video import read_frames
 
@@ -132,7 +132,8 @@ def test_fresh_processes_make_the_same_bytes_whatever_their_environment(
 ) -> None:
     script = (
         "import sys; from pathlib import Path\n"
-        "from physion.trials.make import make_trial; from physion.trials.plan import *\n"
+        "from physion.trials.making.make import make_trial\n"
+        "from physion.trials.making.plan import *\n"
         f"make_trial(Job({TASK!r}, Path(sys.argv[1]), {SMALL!r}))\n"
     )
     strange = {

@@ -13,8 +13,8 @@ from hypothesis.extra.numpy import arrays
 from physion.errors import BadInputError
 from physion.rendering.camera import View
 from physion.scenes.scene import Camera
-from physion.scenes.tdw_commands import quaternion_from_euler, vector
-from physion.trials.official_axes import (
+from physion.scenes.tdw.commands import quaternion_from_euler, vector
+from physion.trials.official.axes import (
     from_official_camera,
     from_official_rotation,
     rotation_matrices,

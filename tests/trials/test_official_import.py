@@ -22,16 +22,16 @@ from physion.compute.local import SerialExecutor
 from physion.errors import BadInputError, UnknownNameError
 from physion.numerics.rotations import rotation_matrix
 from physion.rendering.camera import View
-from physion.scenes.shapes import shape
+from physion.scenes.shapes.primitives import shape
 from physion.trials.dataset import Dataset
 from physion.trials.files import write_files
 from physion.trials.index import build_index, write_index
 from physion.trials.layout import TrialPaths
-from physion.trials.official_export import export_official
-from physion.trials.official_import import import_official
-from physion.trials.official_run import OfficialReport
+from physion.trials.making.verify import verify_dataset
+from physion.trials.official.export_folder import export_official
+from physion.trials.official.import_folder import import_official
+from physion.trials.official.run import OfficialReport
 from physion.trials.trial_file import Trial, TrialWriter
-from physion.trials.verify import verify_dataset
 from physion.trials.video import count_frames, encode_movie, read_frames
 
 Edit = Callable[[h5py.File], None]

@@ -16,7 +16,7 @@ from PIL import Image
 from physion.errors import BadInputError
 from physion.rendering.camera import axes
 from physion.scenes.scene import Camera
-from physion.trials.official_layout import (
+from physion.trials.official.names import (
     CONTROLLERS,
     decode_depth,
     decode_picture,

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from physion.golden import golden_digests
-from physion.scenes.scenarios import scenarios
-from physion.trials.reproduce import trial_digests
+from physion.scenes.sampling.registry import scenarios
+from physion.trials.making.reproduce import trial_digests
 
 AVX512 = (
     "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR "
@@ -41,7 +41,7 @@ ENVIRONMENTS = {
 
 @pytest.mark.parametrize("scenario", sorted(scenarios.names()))
 def test_trials_are_those_of_this_version(scenario: str) -> None:
-    """A change that moves a scene raises the engine's version: see `physion.trials.reproduce`."""
+    """Raise the engine's version with a change that moves a scene: see `reproduce`."""
     assert trial_digests(scenario) == golden_digests()[scenario]
 
 
@@ -50,7 +50,7 @@ def test_trials_are_those_of_this_version(scenario: str) -> None:
 def test_other_processors_give_the_same_bytes(name: str) -> None:
     settings = _possible(ENVIRONMENTS[name])
     process = subprocess.run(
-        [sys.executable, "-W", "ignore", "-m", "physion.trials.reproduce"],
+        [sys.executable, "-W", "ignore", "-m", "physion.trials.making.reproduce"],
         env={**os.environ, **settings},
         capture_output=True,
         text=True,

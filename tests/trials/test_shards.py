@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from hand_made import FRAMES, SIZE, images, make_parts, tree_digest
 
-import physion.trials.shards as shards_module
+import physion.trials.publishing.shards as shards_module
 from physion.cli.main import main as cli
 from physion.errors import BadInputError, UnknownNameError
 from physion.trials.files import encode_png, write_files
 from physion.trials.index import build_index, write_index
 from physion.trials.layout import TrialPaths
-from physion.trials.shards import SEEN_PARTS, SHARD_BYTES, export_shards
+from physion.trials.publishing.shards import SEEN_PARTS, SHARD_BYTES, export_shards
 from physion.trials.trial_file import Trial
 from physion.trials.video import encode_movie
 

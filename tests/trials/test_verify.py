@@ -13,12 +13,12 @@ from hand_made import make_by_hand, make_parts, make_scene
 from physion.compute.local import SerialExecutor
 from physion.errors import BadInputError
 from physion.trials.dataset import Dataset
-from physion.trials.generate import generate
 from physion.trials.index import build_index, read_index, write_index
 from physion.trials.layout import TrialPaths
-from physion.trials.make import make_trial
-from physion.trials.plan import Job, Settings, Task, plan_dataset, plan_scenes
-from physion.trials.verify import verify_dataset
+from physion.trials.making.generate import generate
+from physion.trials.making.make import make_trial
+from physion.trials.making.plan import Job, Settings, Task, plan_dataset, plan_scenes
+from physion.trials.making.verify import verify_dataset
 from physion.trials.video import encode_movie, read_frames
 
 

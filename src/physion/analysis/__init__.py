@@ -1,9 +1,9 @@
 """How alike are models and people? Tables in, tables out; no trial is opened."""
 
-from physion.analysis.bootstrap import Bootstrap
-from physion.analysis.comparison import Comparison, compare
-from physion.analysis.predictions import read_predictions
-from physion.analysis.responses import read_human_zone, read_humans, read_labels
+from physion.analysis.models.comparison import Comparison, compare
+from physion.analysis.statistics.bootstrap import Bootstrap
+from physion.analysis.tables.predictions import read_predictions
+from physion.analysis.tables.responses import read_human_zone, read_humans, read_labels
 
 __all__ = [
     "Bootstrap",

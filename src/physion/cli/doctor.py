@@ -144,7 +144,7 @@ def codec() -> Check:
 def reproduction() -> list[Check]:
     """Whether trials made on this machine have the bytes that this version promises."""
     from physion.golden import golden_digests
-    from physion.trials.reproduce import differences
+    from physion.trials.making.reproduce import differences
 
     checks = []
     for scenario in sorted(golden_digests()):

@@ -69,7 +69,7 @@ def main(options: Options) -> int:
 
 
 def _card(options: Options) -> int:
-    from physion.trials.card import write_card
+    from physion.trials.publishing.card import write_card
 
     if options.split or options.scenario:
         raise BadInputError("a card describes a whole dataset: leave out --split and --scenario")
@@ -86,7 +86,7 @@ def _card(options: Options) -> int:
 
 
 def _webdataset(options: Options, out: Path) -> int:
-    from physion.trials.shards import PARTS, SEEN_PARTS, export_shards
+    from physion.trials.publishing.shards import PARTS, SEEN_PARTS, export_shards
 
     report = export_shards(
         options.folder,
@@ -106,7 +106,7 @@ def _webdataset(options: Options, out: Path) -> int:
 
 
 def _official(options: Options, out: Path) -> int:
-    from physion.trials.official_export import export_official
+    from physion.trials.official.export_folder import export_official
 
     report = export_official(
         options.folder,

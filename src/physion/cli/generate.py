@@ -13,9 +13,9 @@ import tyro
 from physion.cli.output import console, track
 from physion.compute.local import LocalExecutor
 from physion.errors import BadInputError
-from physion.scenes.scenarios import scenarios
-from physion.trials.generate import Report, generate
-from physion.trials.plan import FULL_COUNTS, SPLITS, Settings, plan_dataset
+from physion.scenes.sampling.registry import scenarios
+from physion.trials.making.generate import Report, generate
+from physion.trials.making.plan import FULL_COUNTS, SPLITS, Settings, plan_dataset
 
 
 @dataclass(frozen=True)

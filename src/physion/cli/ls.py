@@ -15,11 +15,11 @@ from physion.errors import BadInputError
 from physion.models.interface import models
 from physion.physics.engine import engines
 from physion.scenes.looks import MATERIALS
-from physion.scenes.parameters import drawn_limits
-from physion.scenes.preset import Preset, get_preset, load_presets
-from physion.scenes.prop_shapes import NATURAL_SIZES
-from physion.scenes.scenarios import as_record, scenarios
-from physion.scenes.shapes import shapes
+from physion.scenes.sampling.parameters import drawn_limits
+from physion.scenes.sampling.preset import Preset, get_preset, load_presets
+from physion.scenes.sampling.registry import as_record, scenarios
+from physion.scenes.shapes.primitives import shapes
+from physion.scenes.shapes.props import NATURAL_SIZES
 
 Names = list[str] | dict[str, list[str]]
 LISTS: Mapping[str, Callable[[], Names]] = {

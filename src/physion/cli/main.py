@@ -24,8 +24,12 @@ VERBS = {
     "doctor": "check this machine and say what to install",
 }
 
-MODULES = {"import": "import_trials"}
-"""Modules of verbs whose names Python keeps for itself."""
+MODULES = {
+    "import": "import_trials",
+    "compare": "compare.compare",
+    "experiment": "experiment.experiment",
+}
+"""Modules of verbs whose names are keywords, or that have verbs of their own."""
 
 
 def _usage() -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from physion.cli.output import console
 
 if TYPE_CHECKING:
-    from physion.trials.official_run import OfficialReport
+    from physion.trials.official.run import OfficialReport
 
 SHOWN_NOTES = 5
 

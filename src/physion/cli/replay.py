@@ -17,7 +17,7 @@ from physion.cli.output import console, track, write_text
 from physion.compute.local import LocalExecutor
 from physion.errors import BadInputError
 from physion.physics.replay import Replay, ReplayRow, ReplayTask, replay_trial, summarise
-from physion.scenes.tdw import TrialSet, read_scenes
+from physion.scenes.tdw.read_logs import TrialSet, read_scenes
 
 SHOWN_FAILURES = 5
 

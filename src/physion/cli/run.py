@@ -18,8 +18,8 @@ from physion.cli.output import Stages, console, track
 from physion.errors import BadInputError
 
 if TYPE_CHECKING:
-    from physion.scenes.tdw import ImportedTrial
-    from physion.trials.plan import Task
+    from physion.scenes.tdw.read_logs import ImportedTrial
+    from physion.trials.making.plan import Task
 
 SAMPLED_SCENARIOS = ("dominoes", "collide", "drop")
 
@@ -98,7 +98,7 @@ def folder(options: Options) -> Path:
 
 def plan_sampled(options: Options) -> Plan:
     """A small set of sampled trials: testing, and as many again for the readout."""
-    from physion.trials.plan import plan_dataset
+    from physion.trials.making.plan import plan_dataset
 
     count = 12 if options.limit is None else options.limit
     tasks = plan_dataset("sampled", SAMPLED_SCENARIOS, {"readout": 2 * count, "testing": count})
@@ -107,10 +107,10 @@ def plan_sampled(options: Options) -> Plan:
 
 def plan_official(options: Options) -> Plan:
     """The official scenes: those that people saw for testing, the others for the readout."""
-    from physion.analysis.responses import read_humans
-    from physion.analysis.stimuli import canonical_name
-    from physion.scenes.tdw import read_scenes
-    from physion.trials.plan import check_names, plan_scenes
+    from physion.analysis.tables.responses import read_humans
+    from physion.analysis.tables.stimuli import canonical_name
+    from physion.scenes.tdw.read_logs import read_scenes
+    from physion.trials.making.plan import check_names, plan_scenes
 
     assert options.scenes is not None
     seen = set(read_humans(options.humans)["stimulus"]) if options.humans is not None else None
@@ -152,8 +152,8 @@ def few(trials: Iterable[ImportedTrial], limit: int | None) -> list[ImportedTria
 def make_trials(options: Options, tasks: list[Task]) -> list[str]:
     """Simulate, label, render and store what is missing; why some trials failed."""
     from physion.compute.local import LocalExecutor
-    from physion.trials.generate import generate
-    from physion.trials.plan import Settings
+    from physion.trials.making.generate import generate
+    from physion.trials.making.plan import Settings
 
     report = generate(
         folder(options) / "trials",
@@ -216,9 +216,9 @@ def write_report(
     """The report's page and its table of scores."""
     import pandas as pd
 
-    from physion.analysis.stimuli import canonical_name
+    from physion.analysis.tables.stimuli import canonical_name
     from physion.report.build import compare_files
-    from physion.report.movies import movies_of
+    from physion.report.page.movies import movies_of
     from physion.trials.dataset import Dataset
 
     dataset = Dataset(folder(options) / "trials")

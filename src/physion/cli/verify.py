@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from physion.cli.output import console, track
-from physion.trials.verify import SAMPLE, verify_dataset
+from physion.trials.making.verify import SAMPLE, verify_dataset
 
 
 @dataclass(frozen=True)

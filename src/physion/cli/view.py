@@ -11,7 +11,7 @@ from typing import Annotated
 import tyro
 
 from physion.cli.output import console, track
-from physion.report.viewer import ViewerOptions, build_viewer
+from physion.report.viewer.write_viewer import ViewerOptions, build_viewer
 
 
 @dataclass(frozen=True)

@@ -13,20 +13,20 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from physion.errors import BadInputError
-from physion.experiment.api import build_api
-from physion.experiment.bodies import BadBodyError
 from physion.experiment.experimenter.routes import build_router
-from physion.experiment.guards import Guards
-from physion.experiment.media_links import read_media_path
-from physion.experiment.media_serving import MediaFiles
-from physion.experiment.page_files import PACKAGE, read_page_file, read_page_files
-from physion.experiment.refusals import code_of, refuse
-from physion.experiment.refused import Refused
+from physion.experiment.protocol.refused import Refused
+from physion.experiment.web.api import build_api
+from physion.experiment.web.bodies import BadBodyError
+from physion.experiment.web.guards import Guards
+from physion.experiment.web.media_links import read_media_path
+from physion.experiment.web.media_serving import MediaFiles
+from physion.experiment.web.page_files import PACKAGE, read_page_file, read_page_files
+from physion.experiment.web.refusals import code_of, refuse
 
 if TYPE_CHECKING:
-    from physion.experiment.identity import Secrets
-    from physion.experiment.store import Store
-    from physion.experiment.study import Study
+    from physion.experiment.store.store import Store
+    from physion.experiment.study.identity import Secrets
+    from physion.experiment.study.study import Study
 
 log = logging.getLogger(__name__)
 

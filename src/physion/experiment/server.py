@@ -20,12 +20,12 @@ from fastapi import FastAPI
 
 from physion.errors import BadInputError
 from physion.experiment.app import build_app
-from physion.experiment.connections import CarefulProtocol
-from physion.experiment.identity import Secrets
-from physion.experiment.media_checks import check_media
-from physion.experiment.recruitment import undecided
-from physion.experiment.store import Store
-from physion.experiment.study import load_study
+from physion.experiment.store.store import Store
+from physion.experiment.study.identity import Secrets
+from physion.experiment.study.media_checks import check_media
+from physion.experiment.study.recruitment import undecided
+from physion.experiment.study.study import load_study
+from physion.experiment.web.connections import CarefulProtocol
 
 STOP_SECONDS = 5
 """Requests in work, and browsers that do not let go, are given so long to end."""

@@ -36,7 +36,7 @@ class Engine(Protocol):
 
 
 engines: Registry[type] = Registry(
-    "engine", {"mujoco": "physion.physics.mujoco_engine:MujocoEngine"}
+    "engine", {"mujoco": "physion.physics.rigid.engine:MujocoEngine"}
 )
 
 

@@ -1,6 +1,6 @@
 """Bodies as clouds of particles, the way particle models see them.
 
-Unlike `physion.physics.cloth_solids`, which packs the collision pieces as NVIDIA Flex does, this
+Unlike `physion.physics.cloth.solids`, which packs the collision pieces as NVIDIA Flex does, this
 fills the drawn solid: bowls, tori, pipes and vases keep their hollows, and thin walls stay closed.
 """
 
@@ -19,8 +19,8 @@ from physion.numerics.linear_algebra import norm
 from physion.numerics.rotations import rotate_vectors
 from physion.physics.trajectory import Trajectory
 from physion.scenes.scene import Scene, Vec3
-from physion.scenes.shapes import shape
-from physion.scenes.solids import Mesh
+from physion.scenes.shapes.meshes import Mesh
+from physion.scenes.shapes.primitives import shape
 from physion.seeds import child_generator, named_seed
 
 SPACING, CLOTH_SPACING = 0.05, 0.035

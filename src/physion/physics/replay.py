@@ -15,7 +15,7 @@ from physion.physics.engine import simulate
 from physion.physics.jitter import jitter_scene, pair_agreement
 from physion.physics.labels import label_contact
 from physion.scenes.scene import FRAME_TIME
-from physion.scenes.tdw import ImportedTrial
+from physion.scenes.tdw.read_logs import ImportedTrial
 from physion.seeds import child_generator, trial_seed
 
 

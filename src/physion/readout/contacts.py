@@ -10,8 +10,8 @@ import numpy as np
 from physion.errors import BadInputError
 from physion.models.interface import PredictsContact
 from physion.models.observed import cut_to_observed
+from physion.readout.folds import Asked, Round
 from physion.readout.protocols import Readout
-from physion.readout.rounds import Asked, Round
 from physion.readout.table import Answers
 from physion.trials.dataset import Dataset
 

@@ -18,9 +18,9 @@ from physion.errors import BadInputError, MissingExtraError
 from physion.models.interface import Encodes, Model, PredictsContact, Simulates, build_model
 from physion.models.noisy_simulation import NoisySimulation
 from physion.readout.contacts import ContactReadout
+from physion.readout.folds import Round, plan_rounds
 from physion.readout.logistic import ReadoutConfig
 from physion.readout.protocols import Readout
-from physion.readout.rounds import Round, plan_rounds
 from physion.readout.simulations import SimulationReadout
 from physion.readout.table import Answers, make_table, read_table, write_table
 from physion.training.protocols import Training

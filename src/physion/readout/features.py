@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from torch import nn
 
 from physion.models.interface import Learns, Model
+from physion.readout.folds import Asked, Round
 from physion.readout.logistic import ReadoutConfig, fit_readout
 from physion.readout.protocols import Readout, flatten_time
-from physion.readout.rounds import Asked, Round
 from physion.readout.table import Answers
 from physion.seeds import stable_hash
 from physion.training.clips import FeatureStore, FullClips, Progress, observed_clips

@@ -23,8 +23,8 @@ from physion.models.noisy_simulation import (
     fit_scale,
     run_task,
 )
+from physion.readout.folds import Asked, Round
 from physion.readout.protocols import Readout
-from physion.readout.rounds import Asked, Round
 from physion.readout.table import Answers
 from physion.trials.dataset import Dataset
 

@@ -11,9 +11,9 @@ from collections.abc import Callable
 import numpy as np
 
 from physion.rendering.geometry import Part
-from physion.scenes.prop_parts import Prop
 from physion.scenes.scene import Look
-from physion.scenes.shapes import Shape
+from physion.scenes.shapes.primitives import Shape
+from physion.scenes.shapes.prop_parts import Prop
 
 
 def painted(part: Part, shape: Shape, add: Callable[[Look], int]) -> Part:

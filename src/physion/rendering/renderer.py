@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from physion.errors import BadInputError, UnknownNameError
 from physion.numerics.linear_algebra import apply
 from physion.physics.trajectory import Trajectory
-from physion.rendering.assembly import assemble, place
 from physion.rendering.camera import View
 from physion.rendering.light import ShadeMap, StillMap, pack_light, still_maps, tone_table
 from physion.rendering.rasterizer import (
@@ -27,6 +26,7 @@ from physion.rendering.rasterizer import (
 )
 from physion.rendering.rooms import Room, rooms
 from physion.rendering.shading import POINT, pack_corners, shade
+from physion.rendering.triangles import assemble, place
 from physion.scenes.scene import Scene
 
 F32 = NDArray[np.float32]

@@ -10,15 +10,15 @@ from typing import Any
 import pandas as pd
 
 from physion.analysis import Bootstrap, compare
-from physion.analysis.calibration import calibration_table
-from physion.analysis.comparison import Comparison
-from physion.analysis.paired import compare_models
-from physion.analysis.participants import check_labels
-from physion.analysis.people import accuracy_by_stimulus
-from physion.analysis.people_comparison import compare_everywhere
-from physion.report.blocks import plural
+from physion.analysis.models.comparison import Comparison
+from physion.analysis.models.people_comparison import compare_everywhere
+from physion.analysis.people.participants import check_labels
+from physion.analysis.people.people import accuracy_by_stimulus
+from physion.analysis.statistics.calibration import calibration_table
+from physion.analysis.statistics.paired import compare_models
 from physion.report.inputs import ReportInputs, permutations_of
 from physion.report.mixed_fits import fits_of_models, fits_of_people
+from physion.report.page.blocks import plural
 from physion.report.people_results import (
     PeopleResults,
     analyse_people,

@@ -17,10 +17,10 @@ from physion.analysis import (
     read_labels,
     read_predictions,
 )
-from physion.analysis.comparison import Comparison
-from physion.analysis.exclusions import PREREGISTERED
-from physion.analysis.responses import LABELS_FILE, DominoesLook, find_beside
-from physion.analysis.stimuli import read_stimulus_list
+from physion.analysis.models.comparison import Comparison
+from physion.analysis.people.exclusions import PREREGISTERED
+from physion.analysis.tables.responses import LABELS_FILE, DominoesLook, find_beside
+from physion.analysis.tables.stimuli import read_stimulus_list
 from physion.atomic import write_atomic
 from physion.errors import BadInputError
 from physion.report.assembly import (
@@ -31,11 +31,11 @@ from physion.report.assembly import (
     people_in_words,
     with_participants,
 )
+from physion.report.figures.plots import plots
 from physion.report.inputs import ReportInputs
-from physion.report.movies import check_movies
-from physion.report.page import render_page
+from physion.report.page.movies import check_movies
+from physion.report.page.page import render_page
 from physion.report.people_results import read_attributes, read_expected
-from physion.report.plots import plots
 from physion.report.write import prepare_folder, write_csv, write_plot
 
 ZONE_FILE = "human_accuracy_by_scenario.csv"

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pandas as pd
 
-from physion.analysis.comparison import Comparison
-from physion.analysis.people_comparison import PeopleComparison
+from physion.analysis.models.comparison import Comparison
+from physion.analysis.models.people_comparison import PeopleComparison
 from physion.report.mixed_fits import MixedTable
 from physion.report.people_results import PeopleResults
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import pandas as pd
 
-from physion.analysis.comparison import Comparison
-from physion.analysis.hypotheses import HYPOTHESES, answer_rows, with_attributes
-from physion.analysis.mixed_linear import fit_linear
-from physion.analysis.mixed_logistic import fit_logistic
-from physion.analysis.mixed_result import MixedFit
-from physion.analysis.tables import MEAN, POOLED
+from physion.analysis.mixed.linear import fit_linear
+from physion.analysis.mixed.logistic import fit_logistic
+from physion.analysis.mixed.result import MixedFit
+from physion.analysis.models.comparison import Comparison
+from physion.analysis.people.hypotheses import HYPOTHESES, answer_rows, with_attributes
+from physion.analysis.tables.score_tables import MEAN, POOLED
 from physion.errors import PhysionError
 from physion.report.people_results import PeopleResults
 

@@ -9,22 +9,14 @@ from pathlib import Path
 import pandas as pd
 
 from physion.analysis import Bootstrap
-from physion.analysis.attributes import (
-    ATTRIBUTES,
-    attributes_from_names,
-    attributes_from_table,
-    better_attributes,
-)
-from physion.analysis.attributes import COLUMNS as ATTRIBUTE_COLUMNS
-from physion.analysis.biases import (
+from physion.analysis.people.biases import (
     accuracy_by_background,
     background,
     learning,
     side_bias,
     yes_bias,
 )
-from physion.analysis.csv_table import read_csv, read_table
-from physion.analysis.exclusions import (
+from physion.analysis.people.exclusions import (
     PREREGISTERED,
     RULE_SETS,
     RULES,
@@ -35,16 +27,24 @@ from physion.analysis.exclusions import (
     with_and_without,
     without_flagged,
 )
-from physion.analysis.hypotheses import regress_hypotheses, with_attributes
-from physion.analysis.official_responses import read_official_responses
-from physion.analysis.participants import Responses, missing_times, read_responses
-from physion.analysis.people import (
+from physion.analysis.people.hypotheses import regress_hypotheses, with_attributes
+from physion.analysis.people.official_responses import read_official_responses
+from physion.analysis.people.participants import Responses, missing_times, read_responses
+from physion.analysis.people.people import (
     accuracy_by_participant,
     accuracy_by_scenario,
     accuracy_by_stimulus,
     agreement_by_scenario,
 )
-from physion.analysis.stimuli import OFFICIAL_SCENARIOS, canonical_name, scenario_of
+from physion.analysis.tables.attributes import (
+    ATTRIBUTES,
+    attributes_from_names,
+    attributes_from_table,
+    better_attributes,
+)
+from physion.analysis.tables.attributes import COLUMNS as ATTRIBUTE_COLUMNS
+from physion.analysis.tables.csv_table import read_csv, read_table
+from physion.analysis.tables.stimuli import OFFICIAL_SCENARIOS, canonical_name, scenario_of
 from physion.errors import BadInputError, UnknownNameError
 
 

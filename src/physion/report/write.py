@@ -8,9 +8,9 @@ import pandas as pd
 
 from physion.atomic import write_atomic
 from physion.errors import BadInputError
-from physion.report import theme
-from physion.report.document import Picture, page_kind
-from physion.report.theme import Plot
+from physion.report.figures import theme
+from physion.report.figures.theme import Plot
+from physion.report.page.document import Picture, page_kind
 
 
 def prepare_folder(folder: Path) -> Path:

@@ -20,14 +20,14 @@ from numpy.typing import NDArray
 
 from physion.errors import BadInputError
 from physion.numerics.rotations import rotate_vectors
-from physion.physics.cloth_sheet import sheet_triangles, sheet_vertices
-from physion.physics.collision_hulls import collision_hulls
-from physion.physics.mass_properties import hull_mass
+from physion.physics.cloth.sheet import sheet_triangles, sheet_vertices
 from physion.physics.particles import Particles, particles_over_time
+from physion.physics.rigid.hulls import collision_hulls
+from physion.physics.rigid.mass import hull_mass
 from physion.physics.trajectory import ENVIRONMENT
 from physion.rendering.camera import intrinsics, view_matrix
 from physion.scenes.scene import FRAME_TIME, Body, Cloth, Contact, Scene, Vec3
-from physion.scenes.shapes import shape
+from physion.scenes.shapes.primitives import shape
 from physion.trials.trial_file import Trial
 
 Floats = NDArray[np.float32]

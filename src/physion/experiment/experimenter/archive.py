@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sqlalchemy import Engine
 
-from physion.experiment.study import Study
+from physion.experiment.study.study import Study
 
 
 def export_archive(study: Study, engine: Engine, folder: Path, simulated: bool) -> Path:
@@ -15,7 +15,7 @@ def export_archive(study: Study, engine: Engine, folder: Path, simulated: bool) 
 
     ``simulated``: with simulated participants, who are marked as such.
     """
-    from physion.experiment.export import export_study
+    from physion.experiment.export.export_study import export_study
 
     written = folder / file_name(study)
     export_study(engine, study, written, simulated=simulated)

@@ -13,10 +13,10 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, Response
 
 from physion.errors import PhysionError
+from physion.experiment.experimenter.access.gate import HEADERS
 from physion.experiment.experimenter.archive import file_name
-from physion.experiment.experimenter.desk import Desk
 from physion.experiment.experimenter.front import Front, go
-from physion.experiment.experimenter.gate import HEADERS
+from physion.experiment.experimenter.statistics.process import Desk
 
 EXPORT_PATIENCE = 900.0
 """Seconds that an export may take."""

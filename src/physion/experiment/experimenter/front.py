@@ -12,15 +12,15 @@ from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 
 from physion.errors import PhysionError
-from physion.experiment.experimenter.desk import Desk
-from physion.experiment.experimenter.gate import HEADERS, Gate
-from physion.experiment.experimenter.login import PATH, Login
+from physion.experiment.experimenter.access.gate import HEADERS, Gate
+from physion.experiment.experimenter.access.login import PATH, Login
 from physion.experiment.experimenter.pages import make_environment
 from physion.experiment.experimenter.session_list import KINDS
-from physion.experiment.experimenter.summaries import STATES
-from physion.experiment.identity import Secrets
-from physion.experiment.sessions import ACTIVE_WITHIN
-from physion.experiment.study import Study
+from physion.experiment.experimenter.statistics.process import Desk
+from physion.experiment.experimenter.statistics.summaries import STATES
+from physion.experiment.store.sessions import ACTIVE_WITHIN
+from physion.experiment.study.identity import Secrets
+from physion.experiment.study.study import Study
 
 REFRESH_SECONDS = 30
 """How often the overview refreshes by itself."""

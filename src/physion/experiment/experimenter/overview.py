@@ -11,9 +11,9 @@ from itertools import chain
 from statistics import fmean, median, stdev
 
 from physion.experiment.experimenter.figures import Histogram, accuracy_histogram, rt_histogram
-from physion.experiment.experimenter.flagging import Flags
-from physion.experiment.experimenter.summaries import STAGES, STATES, Summary
-from physion.experiment.study import Study
+from physion.experiment.experimenter.statistics.flagging import Flags
+from physion.experiment.experimenter.statistics.summaries import STAGES, STATES, Summary
+from physion.experiment.study.study import Study
 
 RATE_OVER = 20
 """So many of the last finishers tell the present rate, ..."""

@@ -7,7 +7,7 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
-from physion.experiment.experimenter.login import PATH
+from physion.experiment.experimenter.access.login import PATH
 
 NONE = "–"
 

@@ -17,7 +17,7 @@ from physion.experiment.experimenter.payments import read_payments
 from physion.experiment.experimenter.session_list import page_number
 
 if TYPE_CHECKING:
-    from physion.experiment.store import Store
+    from physion.experiment.store.store import Store
 
 LOG = logging.getLogger(__name__)
 
@@ -57,7 +57,7 @@ class PaymentPages:
         if fields.get("word", "").strip().lower() != FORGET_WORD:
             problem = f"Nothing was deleted: write the word “{FORGET_WORD}” first."
             return await self._list(request, problem, 422)
-        from physion.experiment.forget import forget_raw_ids
+        from physion.experiment.store.forget import forget_raw_ids
 
         if self._exports.running:
             return await self._list(request, "An export is being made; wait for its end.", 409)

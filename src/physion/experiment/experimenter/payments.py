@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 from sqlalchemy import Engine, func, select
 
-from physion.experiment.identity import Secrets
-from physion.experiment.recruitment import completion
-from physion.experiment.study import Study
-from physion.experiment.tables import RAW_IDS, SESSIONS
+from physion.experiment.store.tables import RAW_IDS, SESSIONS
+from physion.experiment.study.identity import Secrets
+from physion.experiment.study.recruitment import completion
+from physion.experiment.study.study import Study
 
 PAGE = 100
 """Rows on one page."""

@@ -13,17 +13,17 @@ from fastapi import APIRouter, FastAPI
 from starlette.requests import Request
 from starlette.responses import Response
 
+from physion.experiment.experimenter.access.gate import drop_cookie, set_cookie
 from physion.experiment.experimenter.export_pages import ExportPages
 from physion.experiment.experimenter.front import WRONG_FORM, Front, go
-from physion.experiment.experimenter.gate import drop_cookie, set_cookie
 from physion.experiment.experimenter.payment_pages import PaymentPages
 from physion.experiment.experimenter.session_list import KINDS, Choice
-from physion.experiment.identity import Secrets
-from physion.experiment.page_files import read_page_files
-from physion.experiment.study import Study
+from physion.experiment.study.identity import Secrets
+from physion.experiment.study.study import Study
+from physion.experiment.web.page_files import read_page_files
 
 if TYPE_CHECKING:
-    from physion.experiment.store import Store
+    from physion.experiment.store.store import Store
 
 LOG = logging.getLogger(__name__)
 

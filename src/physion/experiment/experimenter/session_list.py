@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 from urllib.parse import urlencode
 
-from physion.experiment.experimenter.flagging import Flags
-from physion.experiment.experimenter.summaries import STAGES, STATES, Summary
+from physion.experiment.experimenter.statistics.flagging import Flags
+from physion.experiment.experimenter.statistics.summaries import STAGES, STATES, Summary
 
 PAGE = 50
 """Sessions on one page."""

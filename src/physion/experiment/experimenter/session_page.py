@@ -9,11 +9,11 @@ from typing import Any
 
 from sqlalchemy import Connection, Engine, select
 
-from physion.experiment.experimenter.flagging import Flags
 from physion.experiment.experimenter.session_list import flags_shown
-from physion.experiment.experimenter.summaries import Summary, labels_of
-from physion.experiment.study import Study
-from physion.experiment.tables import ANSWERS, EVENTS, SESSIONS, STUDIES
+from physion.experiment.experimenter.statistics.flagging import Flags
+from physion.experiment.experimenter.statistics.summaries import Summary, labels_of
+from physion.experiment.store.tables import ANSWERS, EVENTS, SESSIONS, STUDIES
+from physion.experiment.study.study import Study
 
 EVENTS_SHOWN = 500
 """Events of one session that its page shows, from the first on."""

@@ -1,0 +1,107 @@
+"""The equations of random intercepts, solved exactly: no general sparse library is needed.
+
+With random effects b = Lambda u, u standard normal, Lambda the diagonal of standard deviations,
+every step needs H = I + Lambda Z'WZ Lambda. Its cost is (wide + narrow) * narrow^2 within each
+block of `Groupings`, which explains the words.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import cho_solve, cholesky
+
+from physion.analysis.mixed.groupings import Counts, Groupings
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Inverse:
+    """What is needed of H^-1: its diagonal (q,), and the blocks wide x narrow, narrow x narrow."""
+
+    diagonal: Array
+    cross: list[Array]
+    narrow: list[Array]
+
+
+class Factor:
+    """H = I + Lambda Z'WZ Lambda, factorised; ``scale`` is Lambda's diagonal by slot (q,)."""
+
+    def __init__(self, groupings: Groupings, counts: Counts, scale: Array) -> None:
+        self._groupings, self._counts, self._scale = groupings, counts, scale
+        self._wide = 1 + scale[: groupings.q_wide] ** 2 * counts.wide
+        self._places, self._ratio, self._lower = [], [], []
+        self.log_determinant = float(np.log(self._wide).sum())
+        for (wide, narrow), cross, square in groupings.blocks(counts):
+            scaled = scale[wide, None] * cross * scale[narrow]
+            ratio = scaled / self._wide[wide, None]
+            schur = np.eye(len(square)) + scale[narrow, None] * square * scale[narrow]
+            schur -= scaled.T @ ratio
+            lower = cholesky(schur, lower=True, check_finite=False) if len(schur) else schur
+            self.log_determinant += 2 * float(np.log(np.diag(lower)).sum())
+            self._places.append((wide, narrow))
+            self._ratio.append(ratio)
+            self._lower.append(lower)
+
+    def solve(self, right: Array) -> Array:
+        """H^-1 times ``right``, of shape (q,) or (q, p)."""
+        found = np.empty_like(right)
+        for (wide, narrow), ratio, lower in self._parts():
+            below = right[narrow] - ratio.T @ right[wide]
+            solved = cho_solve((lower, True), below, check_finite=False) if len(lower) else below
+            found[narrow] = solved
+            found[wide] = (right[wide].T / self._wide[wide]).T - ratio @ solved
+        return found
+
+    def inverse(self) -> Inverse:
+        """The parts of H^-1 that belong to cells that rows can fill."""
+        diagonal, cross, square = np.empty(self._groupings.q), [], []
+        for (wide, narrow), ratio, lower in self._parts():
+            unit = np.eye(len(lower))
+            inner = cho_solve((lower, True), unit, check_finite=False) if len(lower) else unit
+            outer = ratio @ inner
+            diagonal[narrow] = np.diag(inner)
+            diagonal[wide] = 1 / self._wide[wide] + np.einsum("de,de->d", outer, ratio)
+            cross.append(-outer)
+            square.append(inner)
+        return Inverse(diagonal, cross, square)
+
+    def slopes(self, inverse: Inverse) -> Array:
+        """Half the derivative of log|H| by each grouping's standard deviation: shape (groupings,).
+
+        It is the trace of that grouping's part of H^-1 Lambda Z'WZ, which stays exact at zero.
+        """
+        scale, counts = self._scale, self._counts
+        by_slot = np.empty(len(scale))
+        by_slot[: self._groupings.q_wide] = (
+            inverse.diagonal[: self._groupings.q_wide] * counts.wide
+        ) * scale[: self._groupings.q_wide]
+        blocks = self._groupings.blocks(counts)
+        for k, ((wide, narrow), cross, square) in enumerate(blocks):
+            linked = inverse.cross[k] * cross
+            by_slot[wide] += linked @ scale[narrow]
+            by_slot[narrow] = scale[wide] @ linked
+            by_slot[narrow] += (inverse.narrow[k] * square) @ scale[narrow]
+        return self._groupings.by_grouping(by_slot)
+
+    def at_rows(self, inverse: Inverse) -> Array:
+        """z'Lambda H^-1 Lambda z for each row's indicators z, shape (n,)."""
+        scale, groupings = self._scale, self._groupings
+        found = groupings.spread(inverse.diagonal * scale**2)
+        cross = np.concatenate([block.ravel() for block in inverse.cross])
+        wide = scale[groupings.rows[groupings.wide]]
+        for k, cells in groupings.cells.items():
+            found += 2 * wide * scale[groupings.rows[k]] * cross[cells]
+        square = np.concatenate([block.ravel() for block in inverse.narrow])
+        for (k, m), pairs in groupings.pairs.items():
+            if k != m:
+                product = scale[groupings.rows[k]] * scale[groupings.rows[m]]
+                found += 2 * product * square[pairs]
+        return found
+
+    def _parts(self) -> Iterator[tuple[tuple[slice, slice], Array, Array]]:
+        return zip(self._places, self._ratio, self._lower, strict=True)

@@ -1,0 +1,248 @@
+"""The comparison of models with people: which trials, then every table that a report needs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from physion.analysis.people.participants import EXCLUDED, LEDGE
+from physion.analysis.statistics.bootstrap import Bootstrap
+from physion.analysis.tables.predictions import check_predictions, name_models
+from physion.analysis.tables.responses import with_labels
+from physion.analysis.tables.score_tables import people_table, score_table
+from physion.analysis.tables.stimuli import canonical_name, is_ledge
+from physion.errors import BadInputError
+
+NO_LABEL = "no official outcome is known"
+NOT_SEEN = "people did not see it"
+NOT_PREDICTED = "the model does not predict it"
+NO_SCENARIO = "its scenario is not known"
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Models beside people, as tables.
+
+    - ``scores``: see `tables.score_table`.
+    - ``people``: see `tables.people_table`, on the stimuli that any model predicts; empty when no
+      people were given.
+    - ``stimuli``: one row a model and stimulus that both answered: ``agent``, ``model``,
+      ``readout``, ``scenario``, ``stimulus``, ``p_contact``, ``predicted``, ``label`` (official),
+      ``simulated``, ``human_accuracy``, ``count``, ``p_yes``, ``gap`` (p_contact - p_yes).
+    - ``changed``: the stimuli whose simulated outcome is not the official one, one row each.
+    - ``dropped``: ``agent`` (empty: people's side), ``scenario``, ``reason``, ``stimuli`` (count).
+    - ``settings``: each choice in words, for the report.
+    """
+
+    scores: pd.DataFrame
+    people: pd.DataFrame
+    stimuli: pd.DataFrame
+    changed: pd.DataFrame
+    dropped: pd.DataFrame
+    settings: Mapping[str, str]
+
+    @property
+    def agents(self) -> list[str]:
+        """The models in the order of the predictions."""
+        return [str(name) for name in self.stimuli["agent"].unique()]
+
+    @property
+    def has_people(self) -> bool:
+        """Were people given at all?"""
+        return not self.people.empty
+
+
+def compare(
+    predictions: pd.DataFrame,
+    humans: pd.DataFrame | None,
+    labels: Mapping[str, bool] | None = None,
+    *,
+    zone: pd.DataFrame | None = None,
+    zone_origin: str = "",
+    participants: bool = False,
+    exclude: Iterable[str] = (),
+    exclude_ledge: bool = True,
+    bootstrap: Bootstrap | None = None,
+) -> Comparison:
+    """Compare models with people on the stimuli that people saw and the model predicts.
+
+    ``predictions``: official column names (`predictions.check_predictions`); *Actual Outcome* is
+    the outcome of the trial that the model was shown. ``humans``: from `responses.read_humans`, or
+    None to have the models' accuracies alone. ``labels``: official outcome by stimulus; where it is
+    silent the column *Recorded Outcome* of the predictions speaks, and without people the simulated
+    outcome. ``zone``: from `responses.read_human_zone` or from single participants' accuracies,
+    with ``scenario``, ``low`` and ``high``; ``zone_origin`` says in words where it comes from.
+    ``participants``: the answers of single participants are known and are drawn for the intervals
+    of other tables, which the settings then say. ``exclude``: stimuli to leave out.
+    ``exclude_ledge``: leave out the Roll stimuli with a ledge, as the study does.
+
+    Everything left out is counted in ``dropped``. Raises `BadInputError` where nothing is left, or
+    where a model or the tables contradict themselves.
+    """
+    draws = bootstrap or Bootstrap()
+    rows = predictions if "agent" in predictions else name_models(check_predictions(predictions))
+    unwanted = {canonical_name(name) for name in exclude}
+    known = _recorded(rows)
+    known |= {canonical_name(name): bool(value) for name, value in (labels or {}).items()}
+    if humans is None:
+        people = _nobody(rows, known)
+    elif known:
+        people = with_labels(humans, known)
+    else:
+        raise BadInputError("people's answers need the official outcomes: give the labels")
+    people, dropped_people = _drop(people, unwanted, exclude_ledge)
+    stimuli = _join(rows, people)
+    dropped = [dropped_people, *_unmatched(rows, people, unwanted, exclude_ledge)]
+    if stimuli.empty:
+        seen = people["stimulus"].iloc[0] if len(people) else "nothing"
+        raise BadInputError(
+            "no stimulus was both seen by people and predicted; people saw for instance "
+            f"{seen!r}, the predictions name {rows['stimulus'].iloc[0]!r}"
+        )
+    answered = people[people["stimulus"].isin(stimuli["stimulus"])]
+    return Comparison(
+        scores=score_table(stimuli, draws),
+        people=people.iloc[:0]
+        if humans is None
+        else people_table(answered, _whole(zone, people, stimuli), draws),
+        stimuli=stimuli,
+        changed=_changed(stimuli),
+        dropped=pd.concat(dropped, ignore_index=True),
+        settings=_settings(humans is not None, unwanted, exclude_ledge, draws)
+        | (_intervals_with_participants(draws) if participants else {})
+        | (_zone_in_words(zone, zone_origin) if humans is not None else {}),
+    )
+
+
+def _recorded(rows: pd.DataFrame) -> dict[str, bool]:
+    """The official outcomes that the predictions themselves carry."""
+    given = rows[rows["recorded"].notna()].drop_duplicates("stimulus")
+    pairs = zip(given["stimulus"], given["recorded"], strict=True)
+    return {str(stimulus): bool(value) for stimulus, value in pairs}
+
+
+def _nobody(rows: pd.DataFrame, known: Mapping[str, bool]) -> pd.DataFrame:
+    """The stimuli of the predictions as if people had seen them, with NaN for their answers."""
+    people = rows.drop_duplicates("stimulus")[["stimulus", "scenario", "actual"]]
+    label = people["stimulus"].map(known).astype(object)
+    people = people.assign(
+        label=label.where(label.notna(), people["actual"]),
+        accuracy=np.nan,
+        count=np.nan,
+        p_yes=np.nan,
+    )
+    return people.drop(columns="actual")
+
+
+def _drop(
+    people: pd.DataFrame, unwanted: set[str], exclude_ledge: bool
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """``people`` without what is left out on purpose or for want of a label, and the counts."""
+    reason = pd.Series("", index=people.index, dtype=object)
+    reason = reason.mask(people["scenario"].isna(), NO_SCENARIO)
+    reason = reason.mask(people["label"].isna(), NO_LABEL)
+    purpose = _purpose(people["stimulus"], unwanted, exclude_ledge)
+    reason = reason.mask(purpose != "", purpose)
+    kept = reason == ""
+    left_out = people[~kept].assign(reason=reason[~kept], agent="")
+    return people[kept].reset_index(drop=True), _count(left_out)
+
+
+def _purpose(stimulus: pd.Series, unwanted: set[str], exclude_ledge: bool) -> pd.Series:
+    """Why a stimulus is left out on purpose, empty where it is not."""
+    reason = pd.Series("", index=stimulus.index, dtype=object)
+    reason = reason.mask(stimulus.isin(unwanted), EXCLUDED)
+    return reason.mask(stimulus.map(is_ledge).astype(bool) & exclude_ledge, LEDGE)
+
+
+def _join(rows: pd.DataFrame, people: pd.DataFrame) -> pd.DataFrame:
+    left = rows[["agent", "model", "readout", "stimulus", "p_contact", "predicted", "actual"]]
+    joined = left.merge(people, on="stimulus", how="inner", validate="many_to_one")
+    joined = joined.rename(columns={"actual": "simulated", "accuracy": "human_accuracy"})
+    joined["label"] = joined["label"].astype(bool)
+    joined["gap"] = joined["p_contact"] - joined["p_yes"]
+    columns = ["agent", "model", "readout", "scenario", "stimulus", "p_contact", "predicted"]
+    columns += ["label", "simulated", "human_accuracy", "count", "p_yes", "gap"]
+    return joined[columns]
+
+
+def _unmatched(
+    rows: pd.DataFrame, people: pd.DataFrame, unwanted: set[str], exclude_ledge: bool
+) -> list[pd.DataFrame]:
+    """Counts of predictions that people have no answer to, and the other way round."""
+    extra = rows[~rows["stimulus"].isin(people["stimulus"])]
+    reason = _purpose(extra["stimulus"], unwanted, exclude_ledge)
+    parts = [_count(extra.assign(reason=reason.mask(reason == "", NOT_SEEN)))]
+    for agent, own in rows.groupby("agent", sort=False):
+        missing = people[~people["stimulus"].isin(own["stimulus"])]
+        parts.append(_count(missing.assign(reason=NOT_PREDICTED, agent=agent)))
+    return parts
+
+
+def _count(rows: pd.DataFrame) -> pd.DataFrame:
+    keys = ["agent", "scenario", "reason"]
+    if rows.empty:
+        return pd.DataFrame(columns=[*keys, "stimuli"])
+    filled = rows.assign(scenario=rows["scenario"].fillna("unknown"))
+    return filled.groupby(keys, sort=False).size().rename("stimuli").reset_index()
+
+
+def _whole(
+    zone: pd.DataFrame | None, people: pd.DataFrame, stimuli: pd.DataFrame
+) -> pd.DataFrame | None:
+    """``zone`` of the scenarios that are there in full: it says nothing about a part of them."""
+    missing = people[~people["stimulus"].isin(stimuli["stimulus"])]["scenario"]
+    return zone if zone is None else zone[~zone["scenario"].isin(missing)]
+
+
+def _changed(stimuli: pd.DataFrame) -> pd.DataFrame:
+    rows = stimuli[stimuli["label"] != stimuli["simulated"]].drop_duplicates("stimulus")
+    columns = ["scenario", "stimulus", "label", "simulated", "human_accuracy", "p_yes"]
+    return rows.sort_values(["scenario", "stimulus"])[columns].reset_index(drop=True)
+
+
+def _settings(
+    has_people: bool,
+    unwanted: set[str],
+    exclude_ledge: bool,
+    draws: Bootstrap,
+) -> dict[str, str]:
+    words = {
+        "Stimuli": "those that people saw and the model predicts, each model on its own set; "
+        "what is left out is counted below"
+        if has_people
+        else "all that the models predict; no people were given",
+        "Roll stimuli with a ledge": "left out, as in the study" if exclude_ledge else "kept",
+        "Further stimuli left out": f"{len(unwanted)} on a list" if unwanted else "none",
+        "Intervals": f"{draws.level:.0%} percentile bootstrap over stimuli within each scenario, "
+        f"{draws.resamples} resamples, seed {draws.seed}; people's averages stay as they are",
+        "Overall": "“mean” averages the scores of the scenarios, each counting the same; “pooled” "
+        "takes all stimuli together",
+    }
+    if has_people:
+        words["Ceiling of r"] = (
+            "expected r of a model that knows the true share of yes: square root of the "
+            "reliability that binomial sampling noise leaves, from accuracy and number of people"
+        )
+    return words
+
+
+def _intervals_with_participants(draws: Bootstrap) -> dict[str, str]:
+    return {
+        "Intervals with participants": f"{draws.level:.0%} percentile bootstrap, three of them: by "
+        "drawing participants, stimuli, or both with replacement within each scenario, "
+        f"{draws.resamples} resamples, seed {draws.seed}"
+    }
+
+
+def _zone_in_words(zone: pd.DataFrame | None, origin: str) -> dict[str, str]:
+    if zone is None:
+        return {"Human zone": "not given: it needs the answers of single participants"}
+    return {
+        "Human zone": "2.5th to 97.5th percentile of participants' accuracies"
+        + (f", {origin}" if origin else "")
+        + "; only for scenarios of which all stimuli that people saw are predicted"
+    }

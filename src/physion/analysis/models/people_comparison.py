@@ -1,0 +1,164 @@
+"""All models beside all people: every scenario, their mean, and what was left out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from physion.analysis.models.model_people import (
+    MEASURES,
+    RESAMPLED,
+    Measured,
+    interval_columns,
+    measure_models,
+    measure_table,
+    model_pairs,
+    models_of,
+)
+from physion.analysis.models.zones import human_zones, released_r_zone
+from physion.analysis.people.people import HALVES, all_answers, split_halves
+from physion.analysis.statistics.bootstrap import Bootstrap
+from physion.analysis.statistics.calibration import calibration_table
+from physion.analysis.statistics.kappa import correctness
+from physion.analysis.statistics.paired import compare_models
+from physion.analysis.tables.csv_table import require_columns
+from physion.analysis.tables.score_tables import MEAN
+
+
+@dataclass(frozen=True)
+class PeopleComparison:
+    """Models beside single people, as tables.
+
+    - ``scores``: `model_people.measure_table` of every scenario, then of their mean (each scenario
+      counts the same; NaN where one of them is undefined), with ``zone_low``, ``zone_high`` (of
+      single participants) and ``in_zone`` (yes, no, or empty where either is not defined).
+    - ``zones``: `zones.human_zones` of every scenario, and of several also the paper's band of r
+      (`zones.released_r_zone`), whose scenario is the mean.
+    - ``pairs``: `model_people.model_pairs` of every scenario.
+    - ``tests``: `paired.compare_models` on the stimuli of all scenarios together.
+    - ``calibration``: `calibration.calibration_table`, likewise.
+    - ``dropped``: ``agent``, ``scenario``, ``reason``, ``stimuli``.
+    """
+
+    scores: pd.DataFrame
+    zones: pd.DataFrame
+    pairs: pd.DataFrame
+    tests: pd.DataFrame
+    calibration: pd.DataFrame
+    dropped: pd.DataFrame
+
+
+def compare_everywhere(
+    predictions: pd.DataFrame,
+    test: pd.DataFrame,
+    bootstrap: Bootstrap | None = None,
+    *,
+    halves: int = HALVES,
+    permutations: int = 2000,
+) -> PeopleComparison:
+    """Compare the models of ``predictions`` with the people of ``test`` in every scenario.
+
+    ``predictions``: one row a model and stimulus with ``agent``, ``stimulus`` (canonical name),
+    ``p_contact``, ``predicted``; ``test``: test rows of `participants.Responses`. Predictions of
+    stimuli that no one saw are counted as dropped.
+    """
+    columns = ["agent", "stimulus", "p_contact", "predicted"]
+    require_columns(predictions, columns, "the predictions")
+    draws = bootstrap or Bootstrap()
+    home = test.drop_duplicates("stimulus").set_index("stimulus")["scenario"]
+    rows = predictions[columns].assign(scenario=predictions["stimulus"].map(home))
+    agents = list(rows["agent"].unique())
+    dropped = [_unseen(rows)]
+    measured, zones, pairs = [], [], []
+    for answers in all_answers(test):
+        own = rows[rows["scenario"] == answers.scenario]
+        models, lost = models_of(own, answers, agents)
+        dropped.append(lost.assign(scenario=answers.scenario))
+        measured.append(measure_models(models, answers, draws))
+        zones.append(human_zones(answers, split_halves(answers.yes, halves, draws.seed)))
+        pairs.append(model_pairs(models, answers).assign(scenario=answers.scenario))
+    zone = pd.concat(zones, ignore_index=True)
+    if len(measured) > 1:
+        zone = pd.concat([zone, released_r_zone(zone)], ignore_index=True)
+    tables = [measure_table(one, draws) for one in measured]
+    if len(measured) > 1:
+        tables.append(_mean_table(measured, draws))
+    return PeopleComparison(
+        scores=_with_zone(pd.concat(tables, ignore_index=True), zone),
+        zones=zone,
+        pairs=pd.concat(pairs, ignore_index=True),
+        tests=_tests(measured, draws, permutations),
+        calibration=_calibration(measured),
+        dropped=pd.concat(dropped, ignore_index=True)[["agent", "scenario", "reason", "stimuli"]],
+    )
+
+
+def _unseen(rows: pd.DataFrame) -> pd.DataFrame:
+    counts = rows[rows["scenario"].isna()].groupby("agent", sort=False).size()
+    table = pd.DataFrame({"agent": counts.index, "stimuli": counts.to_numpy()})
+    return table.assign(scenario="unknown", reason="people did not see it")
+
+
+def _mean_table(measured: Sequence[Measured], bootstrap: Bootstrap) -> pd.DataFrame:
+    """The mean over scenarios; their people and stimuli are drawn independently."""
+    records = []
+    for k, name in enumerate(measured[0].models.names):
+        for measure in MEASURES:
+            values = [float(one.values[measure][k]) for one in measured]
+            draws = {}
+            for what in RESAMPLED:
+                parts = [one.draws[what].get(measure) for one in measured]
+                known = [part[:, k] for part in parts if part is not None]
+                draws[what] = np.mean(known, axis=0) if len(known) == len(parts) else None
+            record, reasons = interval_columns(float(np.mean(values)), draws, bootstrap)
+            undefined = [one.answers.scenario for one, value in zip(measured, values, strict=True)
+                         if not np.isfinite(value)]  # fmt: skip
+            if undefined:
+                reasons.insert(0, f"undefined in {', '.join(undefined)}")
+            stimuli = sum(int(np.sum(~np.isnan(one.models.p_contact[k]))) for one in measured)
+            records.append(
+                {
+                    "model": name,
+                    "scenario": MEAN,
+                    "measure": measure,
+                    "stimuli": stimuli,
+                    **record,
+                    "reason": "; ".join(reasons),
+                }
+            )
+    return pd.DataFrame(records)
+
+
+def _with_zone(scores: pd.DataFrame, zones: pd.DataFrame) -> pd.DataFrame:
+    own = zones.loc[zones["of"] == "participants", ["scenario", "measure", "low", "high"]]
+    own = own.rename(columns={"low": "zone_low", "high": "zone_high"})
+    joined = scores.merge(own, on=["scenario", "measure"], how="left")
+    known = joined[["value", "zone_low", "zone_high"]].notna().all(axis=1)
+    inside = joined["value"].between(joined["zone_low"], joined["zone_high"])
+    words = inside.map({True: "yes", False: "no"})
+    return joined.assign(in_zone=words.where(known, ""))
+
+
+def _tests(measured: Sequence[Measured], bootstrap: Bootstrap, permutations: int) -> pd.DataFrame:
+    right = [correctness(one.models.predicted, one.answers.label) for one in measured]
+    p_contact = [one.models.p_contact for one in measured]
+    shares = [one.answers.shares() for one in measured]
+    return compare_models(
+        list(measured[0].models.names),
+        np.concatenate(right, axis=1),
+        np.concatenate(p_contact, axis=1),
+        np.concatenate(shares),
+        bootstrap,
+        strata=[one.answers.scenario for one in measured for _ in one.answers.stimuli],
+        permutations=permutations,
+    )
+
+
+def _calibration(measured: Sequence[Measured]) -> pd.DataFrame:
+    p_contact: Any = np.concatenate([one.models.p_contact for one in measured], axis=1)
+    label = np.concatenate([one.answers.label for one in measured])
+    return calibration_table(list(measured[0].models.names), p_contact, label)

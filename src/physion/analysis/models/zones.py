@@ -1,0 +1,106 @@
+"""What people themselves reach: the zones that a model's measures are set beside."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from physion.analysis.people.answers import Answers, share
+from physion.analysis.statistics.agreement import rmsd
+from physion.analysis.statistics.bootstrap import Bootstrap
+from physion.analysis.statistics.correlation import correlate_rows
+from physion.analysis.statistics.kappa import cross_kappa
+from physion.analysis.tables.score_tables import MEAN
+from physion.errors import BadInputError
+
+Array = npt.NDArray[np.float64]
+
+RELEASED_R = "halves, mean of scenarios (the paper's band)"
+"""Whose values the paper's grey band for r is made of; see `released_r_zone`."""
+
+
+def human_zones(answers: Answers, halves: Array | None = None) -> pd.DataFrame:
+    """What single people reach in each measure: ``scenario``, ``measure``, ``of``, ``values``,
+    ``mean``, ``low``, ``median``, ``high`` (2.5th, 50th, 97.5th percentile), ``undefined``.
+
+    ``of`` says whose values they are: ``participants`` (one against the average of the others, or
+    their mean kappa with the others: what a model would have to reach to pass for a participant),
+    ``pairs`` (kappa of two people: beside a model's kappa with single people) and ``halves`` (r of
+    two halves of the people; ``halves`` is from `people.split_halves`). A person says 0 or 1 and
+    no probability, which costs r and rmsd; halves are averages and reach more.
+    """
+    yes, n = answers.yes, len(answers.sessions)
+    others = share(yes, 1 - np.eye(n))
+    right = answers.correct
+    kappa, errors = cross_kappa(yes, yes), cross_kappa(right, right)
+    for matrix in (kappa, errors):
+        np.fill_diagonal(matrix, np.nan)
+    apart = [rmsd_of(own, rest) for own, rest in zip(yes, others, strict=True)]
+    upper = np.triu_indices(n, 1)
+    found: list[tuple[str, str, npt.ArrayLike]] = [
+        ("accuracy", "participants", share(right.T)),
+        ("r", "participants", correlate_rows(yes, others)),
+        ("rmsd", "participants", apart),
+        ("euclid_over_n", "participants", apart / np.sqrt(np.sum(~np.isnan(yes), axis=1))),
+        ("kappa", "participants", share(kappa)),
+        ("error_consistency", "participants", share(errors)),
+        ("kappa", "pairs", kappa[upper]),
+        ("error_consistency", "pairs", errors[upper]),
+    ]
+    if halves is not None:
+        found.append(("r", "halves", halves))
+    return pd.DataFrame(
+        [
+            {"scenario": answers.scenario, "measure": measure, "of": of, **_zone(values)}
+            for measure, of, values in found
+        ]
+    )
+
+
+def rmsd_of(own: Array, rest: Array) -> float:
+    """RMSD of two vectors on what both have."""
+    known = np.isfinite(own) & np.isfinite(rest)
+    return rmsd(own[known], rest[known])
+
+
+def _zone(values: npt.ArrayLike) -> dict[str, float]:
+    array = np.asarray(values, dtype=np.float64)
+    known = array[np.isfinite(array)]
+    low, median, high = np.percentile(known, [2.5, 50, 97.5]) if len(known) else [np.nan] * 3
+    return {"values": len(array), "mean": float(np.mean(known)) if len(known) else np.nan,
+            "low": float(low), "median": float(median), "high": float(high),
+            "undefined": len(array) - len(known)}  # fmt: skip
+
+
+def released_zone(
+    scenario_values: Sequence[float], bootstrap: Bootstrap | None = None
+) -> tuple[float, float, float]:
+    """The grey band of the published panels for accuracy and kappa: mean, low, high.
+
+    It is the bootstrap over the values of the eight scenarios, so it tells how far their mean would
+    move with other scenarios, and nothing about how participants differ: no human zone, though it
+    bears the name. The released code drew without a seed.
+    """
+    values = np.asarray(scenario_values, dtype=np.float64)
+    if not len(values) or not np.isfinite(values).all():
+        raise BadInputError("the released zone needs one defined value for each scenario")
+    draws = bootstrap or Bootstrap()
+    low, high = draws.interval(draws.weights("scenarios", len(values)) @ values / len(values))
+    return float(np.mean(values)), low, high
+
+
+def released_r_zone(zones: pd.DataFrame) -> pd.DataFrame:
+    """The grey band of the published panel for r, as one row with the columns of `human_zones`.
+
+    ``zones`` holds the rows of `human_zones` of several scenarios. The band is the mean over them
+    of the 2.5th and of the 97.5th percentile of r between random halves of the people, uncorrected
+    for their halved number; NaN where a scenario has none. ``values`` counts the scenarios.
+    """
+    halves = zones[(zones["measure"] == "r") & (zones["of"] == "halves")]
+    bounds = halves[["mean", "low", "median", "high"]].mean(skipna=False)
+    counts = {"values": len(halves), "undefined": int(halves["low"].isna().sum())}
+    names = {"scenario": MEAN, "measure": "r", "of": RELEASED_R}
+    return pd.DataFrame([names | bounds.to_dict() | counts])[list(zones.columns)]

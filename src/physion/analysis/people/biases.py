@@ -1,0 +1,226 @@
+"""What else moves answers: a liking for yes or for one side, practice, who the people are."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+from scipy import stats
+
+from physion.analysis.people.answers import Answers, share
+from physion.analysis.people.people import accuracy_by_participant, all_answers, draws_of_people
+from physion.analysis.statistics.bootstrap import Bootstrap
+from physion.analysis.statistics.clustered_logit import clustered_logit
+from physion.analysis.tables.csv_table import require_columns
+from physion.analysis.tables.score_tables import in_order
+
+Array = npt.NDArray[np.float64]
+
+BACKGROUND = ("age", "gender", "education", "difficulty", "technical_problems")
+"""Columns of the sessions that say who took part and how it went."""
+
+
+# --- yes or no ----------------------------------------------------------------------------------
+
+
+def yes_bias(test: pd.DataFrame, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
+    """Do people say yes too often? One row a scenario.
+
+    Columns: ``scenario``, ``people``, ``base_rate`` (share of stimuli with contact, each answer
+    counted), ``yes`` (share of yes), ``bias`` (yes - base_rate) with ``_low``, ``_high``,
+    ``d_prime`` and ``criterion`` (means over people; below 0: inclined to yes) with intervals,
+    ``reason``. Intervals draw people. Hit and false-alarm rates of a person add half an answer to
+    each side (log-linear), so that all-right people have a finite d'.
+    """
+    draws = bootstrap or Bootstrap()
+    records = []
+    for answers in all_answers(test):
+        weights = draws_of_people(answers, draws)
+        given = ~np.isnan(answers.yes)
+        own_base = np.array([answers.label[row].mean() for row in given])
+        own_yes = np.nanmean(answers.yes, axis=1)
+        d_prime, criterion, reason = _signal_detection(answers)
+        record: dict[str, Any] = {
+            "scenario": answers.scenario,
+            "people": len(own_yes),
+            "base_rate": float(np.mean(own_base)),
+            "yes": float(np.mean(own_yes)),
+        }
+        values = {"bias": own_yes - own_base, "d_prime": d_prime, "criterion": criterion}
+        for name, own in values.items():
+            record |= _mean_with_interval(name, own, weights, draws)
+        records.append({**record, "reason": reason})
+    return pd.DataFrame(records)
+
+
+def _signal_detection(answers: Answers) -> tuple[Array, Array, str]:
+    """d' and criterion of each person; NaN where the stimuli seen have one outcome only."""
+    given = ~np.isnan(answers.yes)
+    touch = given & (answers.label == 1)
+    miss = given & (answers.label == 0)
+    said = np.where(given, answers.yes, 0.0)
+    hits, of_hits = np.sum(said * touch, axis=1), touch.sum(axis=1)
+    alarms, of_alarms = np.sum(said * miss, axis=1), miss.sum(axis=1)
+    z_hit = stats.norm.ppf((hits + 0.5) / (of_hits + 1))
+    z_alarm = stats.norm.ppf((alarms + 0.5) / (of_alarms + 1))
+    undefined = (of_hits == 0) | (of_alarms == 0)
+    d_prime = np.where(undefined, np.nan, z_hit - z_alarm)
+    criterion = np.where(undefined, np.nan, -(z_hit + z_alarm) / 2)
+    reason = "d' and criterion: stimuli of one outcome alone" if undefined.any() else ""
+    return d_prime, criterion, reason
+
+
+def _mean_with_interval(
+    name: str, own: Array, weights: Array, draws: Bootstrap
+) -> dict[str, float]:
+    known = np.isfinite(own)
+    drawn = share(own[:, None], weights)[:, 0]
+    low, high = draws.interval(drawn) if known.sum() > 1 else (np.nan, np.nan)
+    mean = float(np.mean(own[known])) if known.any() else np.nan
+    return {name: mean, f"{name}_low": low, f"{name}_high": high}
+
+
+# --- left or right ------------------------------------------------------------------------------
+
+
+def side_bias(test: pd.DataFrame, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
+    """Do people press the left button too often? One row a scenario.
+
+    A person keeps one order of buttons, so that side and answer are mixed up within people; between
+    people they are not. Columns: ``scenario``, ``yes_left``, ``yes_right`` (people of either
+    order), ``left`` (share of left presses, mean of the two groups, so that saying yes often
+    cancels) with ``_low``, ``_high`` (people drawn within each group) and ``p`` (Welch's test of
+    the share of yes in the two groups), ``unknown`` (people whose order is not known), ``reason``.
+    """
+    draws = bootstrap or Bootstrap()
+    records = []
+    for scenario in in_order(test["scenario"]):
+        rows = test[test["scenario"] == scenario]
+        order = rows["buttons"] if "buttons" in rows else pd.Series("", index=rows.index)
+        own = rows.assign(order=order).groupby("session")[["yes", "order"]].agg(
+            {"yes": "mean", "order": "first"}
+        )  # fmt: skip
+        groups = {name: own.loc[own["order"] == name, "yes"].to_numpy(dtype=np.float64)
+                  for name in ("yes-no", "no-yes")}  # fmt: skip
+        record = {"scenario": scenario} | _side_record(groups, scenario, draws)
+        known = len(groups["yes-no"]) + len(groups["no-yes"])
+        records.append({**record, "unknown": len(own) - known})
+    return pd.DataFrame(records)
+
+
+def _side_record(groups: dict[str, Array], scenario: str, draws: Bootstrap) -> dict[str, Any]:
+    first, second = groups["yes-no"], groups["no-yes"]
+    record: dict[str, Any] = {"yes_left": len(first), "yes_right": len(second)}
+    nothing = dict.fromkeys(("left", "left_low", "left_high", "p"), np.nan)
+    if min(len(first), len(second)) < 2:
+        return {**record, **nothing, "reason": "fewer than two people of one order of buttons"}
+    # Left presses are the yes of one group and the no of the other.
+    drawn = [
+        draws.weights(f"{name} of {scenario}", len(own)) @ own / len(own)
+        for name, own in groups.items()
+    ]
+    low, high = draws.interval((drawn[0] + 1 - drawn[1]) / 2)
+    constant = np.std(first) == 0 and np.std(second) == 0
+    p = np.nan if constant else float(stats.ttest_ind(first, second, equal_var=False).pvalue)
+    left = float((np.mean(first) + 1 - np.mean(second)) / 2)
+    return {**record, "left": left, "left_low": low, "left_high": high, "p": p,
+            "reason": "p: nobody differs within the groups" if constant else ""}  # fmt: skip
+
+
+# --- practice and people ------------------------------------------------------------------------
+
+
+def learning(test: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
+    """Do people get better over the test trials, without feedback? One row a scenario, then all.
+
+    Logistic regression of being right on the place in the order, in units of 100 trials, with
+    standard errors clustered by participant (`clustered_logit`); for all scenarios together with an
+    intercept each. Columns: ``scenario``, ``b`` (log odds per 100 trials), ``se``, ``z``, ``p``,
+    ``low``, ``high``, ``rows``, ``clusters``, ``reason``, ``first_half`` and ``second_half``
+    (accuracy in either half of the trials). Orders are random, so stimuli need no adjustment.
+    """
+    table = test.assign(hundred=test["trial"].to_numpy(dtype=np.float64) / 100)
+    parts = [(name, table[table["scenario"] == name]) for name in in_order(table["scenario"])]
+    if len(parts) > 1:
+        parts.append(("all", table))
+    fits = []
+    for name, rows in parts:
+        fixed = "scenario" if name == "all" else None
+        fit = clustered_logit(rows, "correct", ["hundred"], fixed=fixed, level=level)
+        fit = fit[fit["term"] == "hundred"].drop(columns="term")
+        late = rows["trial"] >= (rows["trial"].max() + 1) / 2
+        fit.insert(0, "scenario", name)
+        fits.append(
+            fit.assign(
+                first_half=float(rows.loc[~late, "correct"].mean()),
+                second_half=float(rows.loc[late, "correct"].mean()),
+            )
+        )
+    return pd.concat(fits, ignore_index=True)
+
+
+def background(sessions: pd.DataFrame) -> pd.DataFrame:
+    """Who took part: one row a question and answer, with ``sessions`` and ``share``.
+
+    Answers of numeric questions are given as they are; not answered is ``(none)``.
+    """
+    parts = []
+    for column in BACKGROUND:
+        if column not in sessions:
+            continue
+        values = sessions[column].astype(object)
+        named = values.where(values.notna() & (values != ""), "(none)")
+        counts = named.value_counts(sort=False)
+        counts = counts.sort_index(key=lambda index: index.map(str))
+        parts.append(
+            pd.DataFrame(
+                {
+                    "question": column,
+                    "answer": [str(value) for value in counts.index],
+                    "sessions": counts.to_numpy(),
+                    "share": counts.to_numpy() / max(len(sessions), 1),
+                }
+            )
+        )
+    columns = ["question", "answer", "sessions", "share"]
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=columns)
+
+
+def accuracy_by_background(test: pd.DataFrame, sessions: pd.DataFrame) -> pd.DataFrame:
+    """Does accuracy go with age, gender, education or the difficulty that people report?
+
+    Accuracies are taken relative to the mean of their scenario, since scenarios differ. One row a
+    question: ``question``, ``sessions``, ``test`` (``spearman`` for numbers, ``kruskal-wallis`` for
+    groups of at least two sessions), ``statistic``, ``df``, ``p``, ``reason``. Exploratory: as many
+    tests as questions, p not corrected.
+    """
+    require_columns(sessions, ["session"], "the table of sessions")
+    own = accuracy_by_participant(test)
+    own["relative"] = own["accuracy"] - own.groupby("scenario")["accuracy"].transform("mean")
+    joined = own.merge(sessions.drop(columns=["participant", "scenario"], errors="ignore"),
+                       on="session", how="left")  # fmt: skip
+    asked = [column for column in BACKGROUND if column in joined]
+    return pd.DataFrame([_association(joined, column) for column in asked])
+
+
+def _association(joined: pd.DataFrame, column: str) -> dict[str, Any]:
+    values = joined[column].astype(object)
+    rows = joined[values.notna() & (values != "")]
+    record: dict[str, Any] = {"question": column, "sessions": len(rows), "test": "", "df": np.nan}
+    record |= {"statistic": np.nan, "p": np.nan, "reason": ""}
+    if column in ("age", "difficulty"):
+        record["test"] = "spearman"
+        numbers = rows[column].astype(np.float64)
+        if len(rows) < 3 or numbers.nunique() < 2 or rows["relative"].nunique() < 2:
+            return {**record, "reason": "too few answers, or all alike"}
+        found = stats.spearmanr(numbers, rows["relative"])
+        return {**record, "statistic": float(found.statistic), "p": float(found.pvalue)}
+    record["test"] = "kruskal-wallis"
+    groups = [part["relative"] for _, part in rows.groupby(column) if len(part) >= 2]
+    if len(groups) < 2 or rows["relative"].nunique() < 2:
+        return {**record, "reason": "fewer than two groups of two, or all accuracies alike"}
+    found = stats.kruskal(*groups)
+    return {**record, "df": len(groups) - 1, "statistic": float(found.statistic),
+            "p": float(found.pvalue)}  # fmt: skip

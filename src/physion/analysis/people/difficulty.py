@@ -1,0 +1,98 @@
+"""Stimuli that fool people, and hard, chance and easy ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+from scipy import stats
+
+from physion.analysis.people.answers import share
+from physion.analysis.people.people import split_halves
+from physion.analysis.statistics.correlation import correlate_rows
+from physion.analysis.statistics.paired import benjamini_hochberg
+from physion.errors import BadInputError
+
+Array = npt.NDArray[np.float64]
+
+THIRDS = ("hard", "chance", "easy")
+EDGES = (1 / 3, 2 / 3)
+"""Accuracies that part the three; the paper says 33 and 67 %."""
+
+
+def below_chance_released(accuracy: npt.ArrayLike, count: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    """The study's rule: accuracy + 1.96 standard errors lie below 0.5.
+
+    The standard error is that of the normal approximation at the observed share, so that a share
+    of 0 has none; there is no correction for looking at 150 stimuli.
+    """
+    p, n = _shares(accuracy, count)
+    return np.asarray(p + 1.96 * np.sqrt(p * (1 - p) / n) < 0.5)
+
+
+def below_chance_p(accuracy: npt.ArrayLike, count: npt.ArrayLike) -> Array:
+    """Exact binomial p of so few or fewer right answers of ``count``, were people guessing."""
+    p, n = _shares(accuracy, count)
+    return np.asarray(stats.binom.cdf(np.rint(p * n), n, 0.5), dtype=np.float64)
+
+
+def below_chance(by_stimulus: pd.DataFrame, level: float = 0.05) -> pd.DataFrame:
+    """Which stimuli people get wrong more often than by guessing, by two rules.
+
+    ``by_stimulus`` has ``stimulus``, ``scenario``, ``accuracy`` and ``count``, from
+    `people.accuracy_by_stimulus` or `responses.read_humans`. Columns that come: ``released``
+    (`below_chance_released`), ``p`` (`below_chance_p`), ``p_adjusted`` (Benjamini and Hochberg over
+    all rows given), ``exact`` (p_adjusted < ``level``).
+    """
+    p = below_chance_p(by_stimulus["accuracy"], by_stimulus["count"])
+    adjusted = benjamini_hochberg(p)
+    return by_stimulus[["scenario", "stimulus", "accuracy", "count"]].assign(
+        released=below_chance_released(by_stimulus["accuracy"], by_stimulus["count"]),
+        p=p,
+        p_adjusted=adjusted,
+        exact=adjusted < level,
+    )
+
+
+def difficulty_third(accuracy: npt.ArrayLike, edges: tuple[float, float] = EDGES) -> pd.Series:
+    """``hard`` up to the first edge, ``easy`` from the second on, ``chance`` between; NaN stays."""
+    values = np.asarray(accuracy, dtype=np.float64)
+    names = np.select([values <= edges[0], values >= edges[1]], ["hard", "easy"], "chance")
+    return pd.Series(names, dtype=object).where(np.isfinite(values), np.nan)
+
+
+def r_by_third(
+    p_contact: npt.ArrayLike, yes: npt.ArrayLike, label: npt.ArrayLike, halves: int = 200,
+    seed: int = 0,
+) -> pd.DataFrame:  # fmt: skip
+    """r of models with the average person within hard, chance and easy stimuli of one scenario.
+
+    ``p_contact`` (m, s) with NaN for gaps, ``yes`` (n, s) the answers of people, ``label`` (s,).
+    Columns: ``third``, ``stimuli``, ``model`` (row number; -1: the two halves of the people, whose
+    ``low`` and ``high`` are the 2.5th and 97.5th percentile of r), ``r`` (halves: mean), ``low``,
+    ``high``. Thirds are made by the very answers that r is about: within a third accuracy hardly
+    varies, so r there is mostly whether P(contact) follows the outcome (easy) or its opposite
+    (hard). NaN where r is undefined.
+    """
+    answers, truth = np.asarray(yes, np.float64), np.asarray(label, np.float64)
+    models = np.atleast_2d(np.asarray(p_contact, np.float64))
+    shares = share(answers)
+    third = difficulty_third(np.where(truth == 1, shares, 1 - shares)).to_numpy()
+    rows: list[tuple[str, int, int, float, float, float]] = []
+    for name in THIRDS:
+        own = np.flatnonzero(third == name)
+        r = correlate_rows(models[:, own], np.broadcast_to(shares[own], (len(models), len(own))))
+        rows += [(name, len(own), k, float(value), np.nan, np.nan) for k, value in enumerate(r)]
+        among = split_halves(answers[:, own], halves, seed) if len(own) else np.empty(0)
+        among = among[np.isfinite(among)]
+        low, high = np.percentile(among, [2.5, 97.5]) if len(among) else (np.nan, np.nan)
+        mean = float(np.mean(among)) if len(among) else np.nan
+        rows.append((name, len(own), -1, mean, float(low), float(high)))
+    return pd.DataFrame(rows, columns=["third", "stimuli", "model", "r", "low", "high"])
+
+
+def _shares(accuracy: npt.ArrayLike, count: npt.ArrayLike) -> tuple[Array, Array]:
+    p, n = np.asarray(accuracy, dtype=np.float64), np.asarray(count, dtype=np.float64)
+    if not ((p >= 0) & (p <= 1)).all() or not (n >= 1).all():
+        raise BadInputError("accuracies must lie in 0..1, with at least one person a stimulus")
+    return p, n

@@ -1,0 +1,285 @@
+"""Which sessions are flagged, by which rule, and whether it matters.
+
+Rules flag, they do not drop: `flag_sessions` gives one row a session and one column a rule, so that
+analyses can be done with and without the flagged ones, as preregistered. Rule sets are values:
+`PREREGISTERED` is the preregistration's text, `OFFICIAL_CODE` what the released code did instead
+(reference/experiment-and-analysis.md, section 2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import pandas as pd
+
+from physion.analysis.people.participants import Responses
+from physion.analysis.people.session_measures import longest_streak, session_measures
+from physion.analysis.statistics.clustered_logit import clustered_logit
+from physion.analysis.tables.score_tables import in_order
+from physion.errors import BadInputError
+from physion.seeds import generator
+
+RULES = (
+    "streak",
+    "alternation",
+    "familiarization",
+    "low_accuracy",
+    "slow",
+    "incomplete",
+    "repeated",
+)
+"""The rules, each a column of the table of flags. ``incomplete`` sessions lack answers;
+``repeated`` ones are a participant's second and later sessions in a scenario."""
+
+
+BY_CONSTRUCTION = "by construction: sessions are flagged for their low accuracy"
+
+
+@dataclass(frozen=True)
+class ExclusionRules:
+    """Thresholds of the rules; None turns a rule off.
+
+    - ``streak_over``: longest run of one answer above which a session is flagged.
+    - ``streak_percentile``: take that limit from simulated coin tosses instead (`streak_limit`).
+    - ``alternation``: answers in a row that alternate, from which on a session is flagged.
+    - ``alternation_phase``: count only alternations that begin with ``first``, the first answer of
+      the scenario's table, as the released code did; None: either.
+    - ``familiarization_share``: share of right practice trials up to which it is flagged.
+    - ``accuracy_sd``: standard deviations below the ``accuracy_centre`` of the scenario.
+    - ``rt_sd``: standard deviations above the median of the participants' ``rt_summary`` of log
+      response times.
+    - ``ddof``: 1 divides the sum of squares by n - 1, 0 by n.
+    """
+
+    name: str
+    streak_over: float | None = 12
+    streak_percentile: float | None = None
+    alternation: int | None = 24
+    alternation_phase: Literal["first"] | None = None
+    familiarization_share: float | None = 0.3
+    accuracy_sd: float | None = 3.0
+    accuracy_centre: Literal["median", "mean"] = "median"
+    rt_sd: float | None = 3.0
+    rt_summary: Literal["mean", "median"] = "mean"
+    ddof: int = 1
+
+
+PREREGISTERED = ExclusionRules("preregistered")
+"""As preregistered; the text leaves open how a standard deviation is estimated: here with n - 1."""
+
+OFFICIAL_CODE = ExclusionRules(
+    "official-code",
+    streak_over=None,
+    streak_percentile=97.5,
+    alternation=20,
+    alternation_phase="first",
+    accuracy_centre="mean",
+    rt_summary="median",
+    ddof=0,
+)
+"""As the released code had it. Its limit of a streak came from an unseeded simulation."""
+
+RULE_SETS: Mapping[str, ExclusionRules] = {
+    rules.name: rules for rules in (PREREGISTERED, OFFICIAL_CODE)
+}
+
+
+def streak_limit(
+    trials: int = 150, percentile: float = 97.5, p_yes: float = 0.5,
+    simulations: int = 10_000, seed: int = 0,
+) -> float:  # fmt: skip
+    """The percentile of the longest streak of independent answers, by seeded simulation.
+
+    The exact 97.5th percentile for 150 fair answers is 12 (which 98.3 % of sequences do not exceed,
+    while 96.6 % do not exceed 11). The thousand simulations of the released code gave 11 or 13 now
+    and then; ten thousand do not.
+    """
+    rng = generator("streak", seed, trials, simulations)
+    answers = rng.random((simulations, trials)) < p_yes
+    return float(np.percentile([longest_streak(row) for row in answers], percentile))
+
+
+# --- rules: each takes the table of measures and gives a flag a session ------------------------
+
+
+def flag_streak(measures: pd.DataFrame, rules: ExclusionRules, seed: int = 0) -> pd.Series:
+    """A run of one answer that is longer than ``streak_over`` (or than the simulated limit)."""
+    if rules.streak_percentile is not None:
+        lengths = measures["expected"].astype(int)
+        limits = {n: streak_limit(n, rules.streak_percentile, seed=seed) for n in set(lengths)}
+        return measures["longest_streak"] > lengths.map(limits)
+    limit = np.inf if rules.streak_over is None else rules.streak_over
+    return measures["longest_streak"] > limit
+
+
+def flag_alternation(measures: pd.DataFrame, rules: ExclusionRules) -> pd.Series:
+    """At least ``alternation`` answers in a row that alternate."""
+    limit = np.inf if rules.alternation is None else rules.alternation
+    which = "longest_alternation" + ("_from_first" if rules.alternation_phase else "")
+    return measures[which] >= limit
+
+
+def flag_familiarization(measures: pd.DataFrame, rules: ExclusionRules) -> pd.Series:
+    """Too few practice trials right; not assessed, so not flagged, where none were recorded."""
+    limit = -np.inf if rules.familiarization_share is None else rules.familiarization_share
+    share = measures["familiarization_correct"] / measures["familiarization_trials"]
+    return share <= limit + 1e-9  # 3 of 10 is 0.3
+
+
+def flag_low_accuracy(measures: pd.DataFrame, rules: ExclusionRules) -> pd.Series:
+    """Accuracy far below that of the scenario's sessions."""
+    if rules.accuracy_sd is None:
+        return pd.Series(False, index=measures.index)
+    base = _reference(measures, "accuracy", rules.accuracy_centre, rules.ddof)
+    return measures["accuracy"] < base["centre"] - rules.accuracy_sd * base["sd"]
+
+
+def flag_slow(measures: pd.DataFrame, rules: ExclusionRules) -> pd.Series:
+    """Log response times far above those of the scenario's sessions."""
+    if rules.rt_sd is None:
+        return pd.Series(False, index=measures.index)
+    column = f"{rules.rt_summary}_log_rt"
+    base = _reference(measures, column, "median", rules.ddof)
+    return measures[column] > base["centre"] + rules.rt_sd * base["sd"]
+
+
+def flag_incomplete(measures: pd.DataFrame) -> pd.Series:
+    """Fewer test trials answered than the scenario has."""
+    return measures["trials"] < measures["expected"]
+
+
+def flag_repeated(measures: pd.DataFrame) -> pd.Series:
+    """Every session of a participant in a scenario but the first complete one.
+
+    Sessions count in the order in which they began. Where none is complete, the first counts.
+    """
+    incomplete = flag_incomplete(measures)
+    ordered = measures.assign(_incomplete=incomplete).sort_values("_incomplete", kind="stable")
+    return ordered.duplicated(["participant", "scenario"]).reindex(measures.index)
+
+
+def _reference(measures: pd.DataFrame, column: str, centre: str, ddof: int) -> pd.DataFrame:
+    """Centre and standard deviation of the complete sessions of each session's scenario."""
+    whole = measures[~flag_incomplete(measures)]
+    groups = whole.groupby("scenario")[column]
+    table = pd.DataFrame({"centre": groups.agg(centre), "sd": groups.std(ddof=ddof)})
+    found = table.reindex(measures["scenario"])
+    return found.set_axis(measures.index)
+
+
+# --- the table of flags ------------------------------------------------------------------------
+
+
+def flag_sessions(
+    responses: Responses,
+    rules: ExclusionRules = PREREGISTERED,
+    *,
+    expected: Mapping[str, int] | None = None,
+    seed: int = 0,
+) -> pd.DataFrame:
+    """One row a session: the measures, a bool for each of `RULES`, and ``flagged`` (any of them).
+
+    Flag before stimuli are dropped: rules about sequences need all answers. Centres and standard
+    deviations are those of the scenario's complete sessions, flagged by another rule or not.
+    """
+    measures = session_measures(responses, expected)
+    flags = {
+        "streak": flag_streak(measures, rules, seed),
+        "alternation": flag_alternation(measures, rules),
+        "familiarization": flag_familiarization(measures, rules),
+        "low_accuracy": flag_low_accuracy(measures, rules),
+        "slow": flag_slow(measures, rules),
+        "incomplete": flag_incomplete(measures),
+        "repeated": flag_repeated(measures),
+    }
+    table = measures.assign(**{name: flag.astype(bool) for name, flag in flags.items()})
+    return table.assign(flagged=table[list(RULES)].any(axis=1))
+
+
+def without_flagged(responses: Responses, flags: pd.DataFrame) -> Responses:
+    """The responses of the main analysis: only sessions that no rule flags.
+
+    Raises `BadInputError` where none remains.
+    """
+    unflagged = set(flags.loc[~flags["flagged"], "session"])
+    if not unflagged:
+        raise BadInputError(f"all {len(flags)} sessions are flagged: nothing is left to analyse")
+    return responses.keep_sessions(unflagged, "session is flagged")
+
+
+def count_flags(flags: pd.DataFrame) -> pd.DataFrame:
+    """Sessions that each rule flags, by scenario: ``scenario``, ``rule``, ``sessions``, ``only``.
+
+    ``only`` counts those that no other rule flags. The rows ``flagged`` (by any rule), ``kept`` and
+    ``all`` end each scenario; ``familiarization not assessed`` (no practice trial) and ``slow not
+    assessed`` (no response time) stand where they apply.
+    """
+    rows = []
+    for scenario in in_order(flags["scenario"]):
+        part = flags[flags["scenario"] == scenario]
+        alone = part[list(RULES)].sum(axis=1) == 1
+        rows += [
+            (scenario, rule, int(part[rule].sum()), int((part[rule] & alone).sum()))
+            for rule in RULES
+        ]
+        blind = {
+            "familiarization": part["familiarization_trials"] == 0,
+            "slow": part["mean_log_rt"].isna(),
+        }
+        for rule, unknown in blind.items():
+            if unknown.any():
+                rows.append((scenario, f"{rule} not assessed", int(unknown.sum()), 0))
+        flagged = int(part["flagged"].sum())
+        rows.append((scenario, "flagged", flagged, int(alone.sum())))
+        rows.append((scenario, "kept", len(part) - flagged, 0))
+        rows.append((scenario, "all", len(part), 0))
+    return pd.DataFrame(rows, columns=["scenario", "rule", "sessions", "only"])
+
+
+def with_and_without(
+    responses: Responses,
+    flags: pd.DataFrame,
+    analyse: Callable[[Responses], pd.DataFrame],
+) -> pd.DataFrame:
+    """A table of any analysis, once without and once with the flagged sessions.
+
+    ``analyse`` takes `Responses` and gives a table; the column ``sessions`` that is put before it
+    says ``unflagged`` (the main analysis) or ``complete`` (all complete first sessions).
+    """
+    whole = set(flags.loc[~flags["incomplete"] & ~flags["repeated"], "session"])
+    sets = {"unflagged": set(flags.loc[~flags["flagged"], "session"]), "complete": whole}
+    parts = []
+    for name, sessions in sets.items():
+        if not sessions:
+            raise BadInputError(f"no session is {name}: the analysis has nothing to work on")
+        table = analyse(responses.keep_sessions(sessions, f"not {name}"))
+        table.insert(0, "sessions", name)
+        parts.append(table)
+    return pd.concat(parts, ignore_index=True)
+
+
+def flag_effect(
+    responses: Responses, flags: pd.DataFrame, column: str = "flagged", level: float = 0.95
+) -> pd.DataFrame:
+    """The modelled effect of a session's flag on being right, over all sessions.
+
+    Logistic regression of every test answer on the flag and the scenario, with standard errors
+    that allow for the answers of one participant being alike (`clustered_logit`). Columns are
+    those of `clustered_logit`, for the term ``column`` alone; NaN with a ``reason`` where all or no
+    sessions are flagged. Low accuracy is itself a rule, so the effects of ``low_accuracy``, and of
+    ``flagged`` where it flags any session, are there by construction, which the ``reason`` says.
+    """
+    if column not in (*RULES, "flagged"):
+        raise BadInputError(f"{column!r} is no rule; choose one of {', '.join(RULES)} or flagged")
+    test = responses.test
+    value = test["session"].map(flags.set_index("session")[column]).astype(np.float64)
+    table = test.assign(**{column: value})
+    fit = clustered_logit(table, "correct", [column], fixed="scenario", level=level)
+    found = fit[fit["term"] == column].reset_index(drop=True)
+    if column in ("low_accuracy", "flagged") and flags["low_accuracy"].any():
+        known = found["reason"] != ""
+        found["reason"] = (found["reason"] + "; ").where(known, "") + BY_CONSTRUCTION
+    return found

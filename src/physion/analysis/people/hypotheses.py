@@ -1,0 +1,173 @@
+"""The four preregistered hypotheses: what makes a stimulus hard, and do people take longer then?
+
+By stimulus, which needs only the table of `people.accuracy_by_stimulus` or of the official files:
+regression of a stimulus' accuracy (or log response time) on the attribute, with an intercept for
+each scenario. The same hypotheses at the level of single answers are `HYPOTHESES[...].formula` on
+`answer_rows`, for the mixed models.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+from scipy import stats
+
+from physion.analysis.tables.attributes import ATTRIBUTES
+from physion.analysis.tables.csv_table import require_columns
+from physion.analysis.tables.score_tables import in_order
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """``predictor`` moves ``outcome`` in the direction of ``sign``.
+
+    ``formula`` says the same of single answers, with scenario fixed and participants and stimuli
+    random; ``family``: whether that model is ``logistic`` or ``linear``.
+    """
+
+    name: str
+    about: str
+    predictor: str
+    outcome: str
+    sign: int
+    formula: str
+    family: str
+
+
+def _harder(name: str, predictor: str, about: str) -> Hypothesis:
+    formula = f"correct ~ {predictor} + scenario + (1|participant) + (1|stimulus)"
+    return Hypothesis(name, about, predictor, "accuracy", -1, formula, "logistic")
+
+
+HYPOTHESES: Mapping[str, Hypothesis] = {
+    hypothesis.name: hypothesis
+    for hypothesis in (
+        _harder("H1", "elements", "Stimuli with more elements are harder"),
+        _harder("H2", "distractors", "Stimuli with distractors are harder"),
+        _harder("H3", "occluders", "Stimuli with occluders are harder"),
+        Hypothesis(
+            "H4",
+            "People take longer to answer stimuli that they get wrong more often",
+            "accuracy",
+            "mean_log_rt",
+            -1,
+            "log_rt ~ accuracy + scenario + (1|participant) + (1|stimulus)",
+            "linear",
+        ),
+    )
+}
+"""The preregistered hypotheses by name."""
+
+COLUMNS = (
+    "hypothesis", "scenario", "predictor", "outcome", "stimuli", "left_out", "b", "se", "t", "df",
+    "p", "low", "high", "r", "spearman", "as_predicted", "reason",
+)  # fmt: skip
+
+
+def with_attributes(by_stimulus: pd.DataFrame, attributes: pd.DataFrame) -> pd.DataFrame:
+    """``by_stimulus`` with the columns of `attributes.ATTRIBUTES`, NaN where they are not known."""
+    require_columns(by_stimulus, ["stimulus", "scenario", "accuracy"], "the table by stimulus")
+    columns = ["stimulus", *ATTRIBUTES]
+    return by_stimulus.merge(attributes[columns], on="stimulus", how="left", validate="one_to_one")
+
+
+def answer_rows(test: pd.DataFrame, stimuli: pd.DataFrame) -> pd.DataFrame:
+    """Single answers with the attributes of their stimuli: what a mixed model is fitted to.
+
+    ``stimuli``: from `with_attributes`. Columns: ``participant``, ``scenario``, ``stimulus``,
+    ``correct``, ``log_rt``, ``accuracy`` (of the stimulus, over all people), `ATTRIBUTES`.
+    """
+    columns = ["participant", "scenario", "stimulus", "correct", "log_rt"]
+    own = stimuli[["stimulus", "accuracy", *ATTRIBUTES]]
+    return test[columns].merge(own, on="stimulus", how="left", validate="many_to_one")
+
+
+def regress_hypotheses(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
+    """Each hypothesis in each scenario and, in row ``all``, over all with an intercept for each.
+
+    ``stimuli``: from `with_attributes`, with ``mean_log_rt`` for H4. Columns: ``b`` (change of the
+    outcome for one more of the predictor; H4: per unit of accuracy), ``se`` (HC3, which holds for
+    unequal variances), ``t``, ``df``, ``p`` (two-sided), ``low``, ``high``, ``r`` (Pearson's,
+    within scenarios) and ``spearman`` (in ``all`` of values less their scenario's mean),
+    ``as_predicted`` (sign of b), ``left_out`` (stimuli without predictor or outcome), ``reason``.
+    A reason also tells where distractors and occluders always come together: then neither has an
+    effect of its own that these stimuli could show.
+    """
+    records = []
+    for hypothesis in HYPOTHESES.values():
+        parts = [(name, stimuli[stimuli["scenario"] == name]) for name in
+                 in_order(stimuli["scenario"])]  # fmt: skip
+        if len(parts) > 1:
+            parts.append(("all", stimuli))
+        records += [_record(hypothesis, name, rows, level) for name, rows in parts]
+    return pd.DataFrame(records, columns=list(COLUMNS))
+
+
+def _record(hypothesis: Hypothesis, name: str, rows: pd.DataFrame, level: float) -> dict[str, Any]:
+    record: dict[str, Any] = dict.fromkeys(COLUMNS, np.nan)
+    record |= {"hypothesis": hypothesis.name, "scenario": name, "reason": "",
+               "predictor": hypothesis.predictor, "outcome": hypothesis.outcome}  # fmt: skip
+    missing = [c for c in (hypothesis.predictor, hypothesis.outcome) if c not in rows]
+    if missing:
+        return {**record, "stimuli": 0, "left_out": len(rows),
+                "reason": f"no column {missing[0]}"}  # fmt: skip
+    known = rows[[hypothesis.predictor, hypothesis.outcome]].notna().all(axis=1)
+    used = rows[known]
+    # A scenario of one stimulus, or of one value, says nothing about a slope within scenarios.
+    varied = used.groupby("scenario")[hypothesis.predictor].transform("nunique") > 1
+    used = used[varied]
+    record |= {"stimuli": len(used), "left_out": len(rows) - len(used), "as_predicted": ""}
+    if len(used) < 5:
+        why = "the predictor is not known" if not known.any() else "the predictor does not vary"
+        return {**record, "reason": f"{why}, or fewer than 5 stimuli"}
+    x, y = (_within(used, c) for c in (hypothesis.predictor, hypothesis.outcome))
+    if np.allclose(y, 0):
+        return {**record, "reason": "the outcome does not vary"}
+    of_scenario = used.groupby("scenario")["scenario"].transform("size").to_numpy(dtype=np.float64)
+    record |= _slope(x, y, of_scenario, level)
+    record["r"] = float(np.corrcoef(x, y)[0, 1])
+    record["spearman"] = float(stats.spearmanr(x, y).statistic)
+    record["as_predicted"] = "yes" if np.sign(record["b"]) == hypothesis.sign else "no"
+    record["reason"] = _confounded(hypothesis, used)
+    return record
+
+
+def _within(rows: pd.DataFrame, column: str) -> Array:
+    """A column less the mean of its scenario: the same as an intercept for each scenario."""
+    values = rows[column].astype(np.float64)
+    return np.asarray(values - values.groupby(rows["scenario"]).transform("mean"))
+
+
+def _slope(x: Array, y: Array, of_scenario: Array, level: float) -> dict[str, float]:
+    """Least squares through the origin of centred values, with HC3 standard error.
+
+    ``of_scenario``: stimuli of each stimulus' scenario, whose mean was taken off and adds
+    1 / of_scenario to its leverage.
+    """
+    squares = float(np.sum(x * x))
+    b = float(np.sum(x * y)) / squares
+    residuals = y - b * x
+    leverage = x * x / squares + 1 / of_scenario
+    meat = float(np.sum((x * residuals / (1 - leverage)) ** 2))
+    se, df = np.sqrt(meat) / squares, len(x) - round(float(np.sum(1 / of_scenario))) - 1
+    t = b / se if se > 0 else np.nan
+    half = float(stats.t.ppf(0.5 + level / 2, df)) * se
+    return {"b": b, "se": float(se), "t": float(t), "df": df, "low": b - half, "high": b + half,
+            "p": float(2 * stats.t.sf(abs(t), df))}  # fmt: skip
+
+
+def _confounded(hypothesis: Hypothesis, rows: pd.DataFrame) -> str:
+    pair = ("distractors", "occluders")
+    if hypothesis.predictor not in pair or not set(pair) <= set(rows.columns):
+        return ""
+    both = rows[list(pair)].dropna()
+    if len(both) and (both["distractors"] == both["occluders"]).all():
+        return "as many occluders as distractors in every stimulus: not to be told apart"
+    return ""

@@ -1,0 +1,275 @@
+"""Answers of single participants: read, checked, cleaned, with every drop counted.
+
+`read_responses` reads what our experiment exports (`response_schema`); `official_responses` reads
+the raw columns of the original study. Both give `Responses`, on which exclusions, the analyses of
+people and the comparison with models build.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from physion.analysis.people.response_schema import SESSION_COLUMNS, TRIAL_COLUMNS, check_table
+from physion.analysis.tables.csv_table import read_table, refuse_duplicates
+from physion.analysis.tables.stimuli import OFFICIAL_SCENARIOS, canonical_name, is_ledge
+from physion.errors import BadInputError
+
+Refuse = Literal["refuse", "drop"]
+
+NO_ANSWER = "no answer was given"
+COPY = "exact copy of another row"
+CONFLICT = "another row of the same session is about the same stimulus"
+UNKNOWN = "stimulus is not known"
+SIMULATED = "session of a simulated participant"
+EXCLUDED = "on the list of stimuli to leave out"
+LEDGE = "Roll stimulus with a ledge"
+NO_TIME = "no response time above 0: the answer counts, its time does not"
+
+DROPPED_COLUMNS = ("step", "scenario", "reason", "sessions", "rows")
+
+
+@dataclass(frozen=True)
+class Responses:
+    """Participant-level data of a study.
+
+    - ``trials``: one row a participant and trial, sorted by scenario, session, phase and trial.
+      Columns: ``participant``, ``session``, ``scenario`` (ours), ``stimulus`` (canonical name),
+      ``phase`` (familiarization or test), ``trial`` (int), ``yes``, ``label`` and ``correct``
+      (bool), ``rt_ms`` (from the moment of the buttons; NaN where not known), ``log_rt`` (natural
+      logarithm of it; NaN where not above 0), and whatever else of `TRIAL_COLUMNS` was given.
+    - ``sessions``: one row a session (`SESSION_COLUMNS`, as far as given), in the order in which
+      they began, or else in which they stand in the file.
+    - ``dropped``: what was left out: ``step``, ``scenario``, ``reason``, ``sessions`` (with at
+      least one such row) and ``rows``.
+    """
+
+    trials: pd.DataFrame
+    sessions: pd.DataFrame
+    dropped: pd.DataFrame
+
+    @property
+    def test(self) -> pd.DataFrame:
+        """The rows of the test phase."""
+        return self.trials[self.trials["phase"] == "test"]
+
+    def keep_sessions(self, sessions: Collection[str], reason: str) -> Responses:
+        """Only these sessions; the others are counted as dropped for ``reason``."""
+        gone = ~self.trials["session"].isin(sessions)
+        kept = self.sessions[self.sessions["session"].isin(sessions)].reset_index(drop=True)
+        return replace(_without(self, gone, "sessions", reason), sessions=kept)
+
+    def drop_stimuli(self, exclude: Iterable[str] = (), ledge: bool = True) -> Responses:
+        """Without the stimuli of a list and, as in the study, without Roll's ledges.
+
+        Flag sessions first: rules about the sequence of answers need all of it.
+        """
+        unwanted = {canonical_name(name) for name in exclude}
+        stimuli = self.trials["stimulus"]
+        is_gone = stimuli.map(is_ledge).astype(bool) if ledge else stimuli.isna()
+        found = _without(self, is_gone, "stimuli", LEDGE)
+        return _without(found, found.trials["stimulus"].isin(unwanted), "stimuli", EXCLUDED)
+
+
+def read_responses(
+    trials: Path,
+    sessions: Path | None = None,
+    *,
+    known: Collection[str] | None = None,
+    unknown: Refuse = "refuse",
+    conflicts: Refuse = "refuse",
+    simulated: bool = False,
+) -> Responses:
+    """Responses from our experiment's export: CSV or parquet, see `response_schema`.
+
+    ``known``: names of the stimuli that may occur. ``unknown``: what to do with others.
+    ``conflicts``: what to do with a second answer of one session to one stimulus (``drop`` keeps
+    the first). ``simulated``: keep the sessions that no person made. Raises `BadInputError`.
+    """
+    table = check_table(read_table(trials, ()), TRIAL_COLUMNS, str(trials))
+    people = None
+    if sessions is not None:
+        people = check_table(read_table(sessions, ()), SESSION_COLUMNS, str(sessions))
+    found = clean(
+        table, people, where=str(trials), known=known, unknown=unknown, conflicts=conflicts
+    )
+    made = set(found.trials.loc[found.trials["simulated"], "session"])
+    if "simulated" in found.sessions:
+        made |= set(found.sessions.loc[found.sessions["simulated"], "session"])
+    if simulated or not made:
+        return found
+    return found.keep_sessions(set(found.sessions["session"]) - made, SIMULATED)
+
+
+def clean(
+    trials: pd.DataFrame,
+    sessions: pd.DataFrame | None = None,
+    *,
+    where: str = "responses",
+    known: Collection[str] | None = None,
+    unknown: Refuse = "refuse",
+    conflicts: Refuse = "refuse",
+) -> Responses:
+    """Responses from a table that `check_table` has typed; see `read_responses`.
+
+    Raises `BadInputError` for a session of two participants or scenarios, a stimulus with two
+    labels, a ``correct`` that contradicts, a trial that names no session of ``sessions``.
+    """
+    if trials.empty:
+        raise BadInputError(f"{where} has no row")
+    table = trials.assign(
+        scenario=_scenarios(trials["scenario"]), stimulus=trials["stimulus"].map(canonical_name)
+    )
+    people = _sessions(table, sessions, where)
+    nothing = pd.DataFrame(columns=list(DROPPED_COLUMNS))
+    found = Responses(table.reset_index(drop=True), people, nothing)
+    found = _without(found, found.trials["response"] == "", "reading", NO_ANSWER)
+    if found.trials.empty:
+        raise BadInputError(f"{where} holds no answer")
+    found = _without(found, found.trials.duplicated(), "reading", COPY)
+    found = _known(found, known, unknown, where)
+    found = _one_answer_each(found, conflicts, where)
+    return replace(found, trials=_derived(found.trials, where))
+
+
+def _scenarios(names: pd.Series) -> pd.Series:
+    """Our spelling of the eight; a scenario of somebody else's keeps its name."""
+    return names.map({name: _ours(name) for name in names.unique()})
+
+
+def _ours(name: str) -> str:
+    return OFFICIAL_SCENARIOS.get(name.strip().lower(), name.strip().lower())
+
+
+def _sessions(trials: pd.DataFrame, given: pd.DataFrame | None, where: str) -> pd.DataFrame:
+    """The table of sessions, checked against the trials."""
+    keys = ["session", "participant", "scenario"]
+    found = trials[keys].drop_duplicates().reset_index(drop=True)
+    twice = found[found["session"].duplicated()]
+    if len(twice):
+        raise BadInputError(
+            f"{where}: session {twice['session'].iloc[0]!r} belongs to two participants or to "
+            "two scenarios"
+        )
+    if given is None:
+        return found
+    refuse_duplicates(given["session"], "table of sessions")
+    given = given.assign(scenario=_scenarios(given["scenario"]))
+    joined = found.merge(given[keys], on="session", how="left", suffixes=("", "_given"))
+    wrong = (joined["participant"] != joined["participant_given"]) | (
+        joined["scenario"] != joined["scenario_given"]
+    )
+    if wrong.any():
+        raise BadInputError(
+            f"{where}: session {joined.loc[wrong, 'session'].iloc[0]!r} is not, or is another one, "
+            "in the table of sessions"
+        )
+    if "started_at" in given:
+        began = pd.to_datetime(given["started_at"], errors="coerce", utc=True, format="ISO8601")
+        given = given.loc[began.sort_values(kind="stable", na_position="last").index]
+    return given.reset_index(drop=True)
+
+
+def _known(
+    found: Responses, known: Collection[str] | None, unknown: Refuse, where: str
+) -> Responses:
+    if known is None:
+        return found
+    names = {canonical_name(name) for name in known}
+    strange = ~found.trials["stimulus"].isin(names)
+    if strange.any() and unknown == "refuse":
+        raise BadInputError(
+            f"{where}: stimulus {found.trials.loc[strange, 'stimulus'].iloc[0]!r} is not known "
+            f"({int(strange.sum())} such rows); give all stimuli, or ask to drop unknown ones"
+        )
+    return _without(found, strange, "reading", UNKNOWN)
+
+
+def _one_answer_each(found: Responses, conflicts: Refuse, where: str) -> Responses:
+    rows = found.trials.sort_values("trial", kind="stable")
+    second = rows.duplicated(["session", "phase", "stimulus"])
+    second |= rows.duplicated(["session", "phase", "trial"])
+    second = second.reindex(found.trials.index)
+    if second.any() and conflicts == "refuse":
+        row = found.trials[second].iloc[0]
+        raise BadInputError(
+            f"{where}: session {row['session']!r} has two answers to trial {row['trial']} "
+            f"({row['stimulus']!r}, {row['phase']}); clean the file, or ask to keep the first"
+        )
+    return _without(found, second, "reading", CONFLICT)
+
+
+def _derived(trials: pd.DataFrame, where: str) -> pd.DataFrame:
+    """Booleans, log response times, order; contradictions are refused."""
+    yes, label = trials["response"] == "yes", trials["label"].astype(bool)
+    correct = yes == label
+    if "correct" in trials:
+        wrong = (trials["correct"].astype("boolean") != correct).fillna(False).astype(bool)
+        if wrong.any():
+            row = trials[wrong].iloc[0]
+            raise BadInputError(
+                f"{where}: session {row['session']!r}, stimulus {row['stimulus']!r}: correct is "
+                f"{row['correct']}, but the response {row['response']} and the label disagree"
+            )
+    labels = trials.groupby("stimulus")["label"].nunique()
+    if (labels > 1).any():
+        raise BadInputError(f"{where}: stimulus {labels[labels > 1].index[0]!r} has two labels")
+    rt = trials["rt_ms"].to_numpy(dtype=np.float64)
+    derived = trials.drop(columns="response").assign(
+        trial=trials["trial"].astype(np.int64),
+        yes=yes, label=label, correct=correct, log_rt=log_ms(rt),
+    )  # fmt: skip
+    order = ["scenario", "session", "phase", "trial"]
+    return derived.sort_values(order, kind="stable").reset_index(drop=True)
+
+
+def log_ms(rt_ms: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Natural logarithm of response times in ms; NaN where not above 0 or not known."""
+    values = np.asarray(rt_ms, dtype=np.float64)
+    return np.log(values, out=np.full_like(values, np.nan), where=values > 0)
+
+
+def _without(found: Responses, gone: pd.Series, step: str, reason: str) -> Responses:
+    """``found`` without the rows that are ``gone``, which are counted."""
+    if not gone.any():
+        return found
+    counts = _counted(found.trials[gone], step, reason)
+    parts = [part for part in (found.dropped, counts) if len(part)]
+    return replace(
+        found,
+        trials=found.trials[~gone].reset_index(drop=True),
+        dropped=pd.concat(parts, ignore_index=True),
+    )
+
+
+def _counted(rows: pd.DataFrame, step: str, reason: str) -> pd.DataFrame:
+    """``rows`` by scenario, with `DROPPED_COLUMNS`."""
+    counts = rows.groupby("scenario", sort=False)["session"].agg(sessions="nunique", rows="size")
+    return counts.reset_index().assign(step=step, reason=reason)[list(DROPPED_COLUMNS)]
+
+
+def missing_times(responses: Responses) -> pd.DataFrame:
+    """Test answers that no analysis of response times can use, as rows of ``dropped``.
+
+    They are not among `Responses.dropped`, since the answers themselves are kept.
+    """
+    test = responses.test
+    return _counted(test[test["log_rt"].isna()], "response times", NO_TIME)
+
+
+def check_labels(responses: Responses, labels: Mapping[str, bool]) -> None:
+    """Refuse responses whose labels contradict the official ones, naming the first stimulus."""
+    own = responses.trials.drop_duplicates("stimulus").set_index("stimulus")["label"]
+    official = own.index.map({canonical_name(name): value for name, value in labels.items()})
+    wrong = pd.Series(official, index=own.index).notna() & (official != own.to_numpy())
+    if wrong.any():
+        raise BadInputError(
+            f"the responses say that {own.index[wrong.to_numpy()][0]!r} ends otherwise than the "
+            f"labels say ({int(wrong.sum())} such stimuli)"
+        )

@@ -1,0 +1,228 @@
+"""How well and how alike people answer: by stimulus, by participant, by scenario.
+
+All functions take the test rows of `participants.Responses` (``responses.test``) with what is to be
+left out already left out. Intervals come from drawing participants with replacement (`Bootstrap`,
+1000 draws, seeded), as preregistered; a *zone* is the middle 95 % of single participants or pairs.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+from scipy import stats
+
+from physion.analysis.people.answers import Answers, answers_of, share
+from physion.analysis.statistics.bootstrap import Bootstrap
+from physion.analysis.statistics.correlation import correlate_rows
+from physion.analysis.statistics.kappa import (
+    pair_values,
+    pairwise_correlation,
+    pairwise_kappa,
+    resampled_mean_of_pairs,
+)
+from physion.analysis.tables.score_tables import MEAN, in_order
+from physion.errors import BadInputError
+from physion.seeds import generator
+
+Array = npt.NDArray[np.float64]
+
+HALVES = 1000
+
+
+def all_answers(test: pd.DataFrame) -> list[Answers]:
+    """The answers to every scenario that occurs, in the order of the paper."""
+    if test.empty:
+        raise BadInputError("there is no test answer of people; was every session left out?")
+    return [answers_of(test, name) for name in in_order(test["scenario"])]
+
+
+def draws_of_people(answers: Answers, bootstrap: Bootstrap) -> Array:
+    """How often each person is drawn, (resamples, n): the same draws for every statistic."""
+    return bootstrap.weights(f"people of {answers.scenario}", len(answers.sessions))
+
+
+def accuracy_by_stimulus(test: pd.DataFrame, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
+    """One row a stimulus: ``scenario``, ``stimulus``, ``label``, ``count`` (people), ``accuracy``
+    with ``_low``, ``_high``, ``p_yes``, ``consistency``, ``mean_log_rt``.
+
+    ``consistency`` is the share of people who gave the more frequent answer, be it right or wrong:
+    0.5 to 1. ``mean_log_rt`` is the mean over people of the natural logarithm of the ms. The table
+    has the columns that `responses.with_labels` gives, so that it can take its place.
+    """
+    draws = bootstrap or Bootstrap()
+    parts = []
+    for answers in all_answers(test):
+        p_yes, accuracy = answers.shares(), share(answers.correct)
+        drawn = share(answers.correct, draws_of_people(answers, draws))
+        bounds = [draws.interval(column) for column in drawn.T]
+        table = pd.DataFrame({"scenario": answers.scenario, "stimulus": answers.stimuli})
+        parts.append(
+            table.assign(
+                label=answers.label.astype(bool),
+                count=np.sum(~np.isnan(answers.yes), axis=0),
+                accuracy=accuracy,
+                accuracy_low=[low for low, _ in bounds],
+                accuracy_high=[high for _, high in bounds],
+                p_yes=p_yes,
+                consistency=np.maximum(p_yes, 1 - p_yes),
+                mean_log_rt=share(answers.log_rt),
+            )
+        )
+    return pd.concat(parts, ignore_index=True)
+
+
+def accuracy_by_participant(test: pd.DataFrame) -> pd.DataFrame:
+    """One row a session: ``scenario``, ``session``, ``participant``, ``trials``, ``accuracy``,
+    ``yes`` (share of yes), ``mean_log_rt``, ``median_rt_ms``."""
+    groups = test.groupby(["scenario", "session", "participant"], sort=True)
+    table = groups.agg(
+        trials=("correct", "size"),
+        accuracy=("correct", "mean"),
+        yes=("yes", "mean"),
+        mean_log_rt=("log_rt", "mean"),
+        median_rt_ms=("rt_ms", "median"),
+    ).reset_index()
+    return table.sort_values(
+        "scenario", key=lambda names: names.map(in_order(test["scenario"]).index), kind="stable"
+    ).reset_index(drop=True)
+
+
+def accuracy_by_scenario(test: pd.DataFrame, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
+    """One row a scenario and, in row `MEAN`, their mean, each scenario counting the same.
+
+    Columns: ``scenario``, ``people``, ``stimuli``, ``accuracy`` (mean over people of their share of
+    right answers) with ``_low``, ``_high`` (interval of that mean), ``sd`` over people, ``t``,
+    ``df``, ``p`` (two-sided, of people's accuracies against 0.5), ``zone_low``, ``zone_high``
+    (2.5th and 97.5th percentile of single people), ``consistency`` (mean over stimuli), ``reason``.
+    In row `MEAN` the scenarios' people are drawn independently.
+    """
+    draws = bootstrap or Bootstrap()
+    records, resampled = [], []
+    for answers in all_answers(test):
+        own = np.nanmean(answers.correct, axis=1)
+        resampled.append(draws_of_people(answers, draws) @ own / len(own))
+        records.append(_scenario_record(answers, own, resampled[-1], draws))
+    table = pd.DataFrame(records)
+    low, high = draws.interval(np.mean(resampled, axis=0))
+    mean: dict[str, Any] = {
+        "scenario": MEAN, "people": int(table["people"].sum()),
+        "stimuli": int(table["stimuli"].sum()), "accuracy": table["accuracy"].mean(),
+        "accuracy_low": low, "accuracy_high": high,
+        "consistency": table["consistency"].mean(),
+        "reason": "zone, sd and t: people of different scenarios are not one sample",
+    }  # fmt: skip
+    return pd.concat([table, pd.DataFrame([mean])], ignore_index=True)
+
+
+def _scenario_record(
+    answers: Answers, own: Array, resampled: Array, draws: Bootstrap
+) -> dict[str, Any]:
+    n = len(own)
+    low, high = draws.interval(resampled) if n > 1 else (np.nan, np.nan)
+    spread = float(np.std(own, ddof=1)) if n > 1 else np.nan
+    reasons = ["one person alone: no interval, no zone"] if n == 1 else []
+    if spread == 0:
+        reasons.append("all people have the same accuracy: t is undefined")
+    t = (float(np.mean(own)) - 0.5) / (spread / np.sqrt(n)) if spread > 0 else np.nan
+    zone = np.percentile(own, [2.5, 97.5]) if n > 1 else (np.nan, np.nan)
+    p_yes = answers.shares()
+    return {
+        "scenario": answers.scenario,
+        "people": n,
+        "stimuli": len(answers.stimuli),
+        "accuracy": float(np.mean(own)),
+        "accuracy_low": low,
+        "accuracy_high": high,
+        "sd": spread,
+        "t": t,
+        "df": n - 1,
+        "p": float(2 * stats.t.sf(abs(t), n - 1)) if n > 1 else np.nan,
+        "zone_low": float(zone[0]),
+        "zone_high": float(zone[1]),
+        "consistency": float(np.mean(np.maximum(p_yes, 1 - p_yes))),
+        "reason": "; ".join(reasons),
+    }
+
+
+# --- how alike people are -----------------------------------------------------------------------
+
+
+def agreement_by_scenario(
+    test: pd.DataFrame, bootstrap: Bootstrap | None = None, halves: int = HALVES
+) -> pd.DataFrame:
+    """How alike people of one scenario answer, one row a scenario and measure.
+
+    ``measure``: ``kappa`` and ``correlation`` of all pairs of participants, ``split_half`` (r of
+    the shares of yes of two random halves) and ``spearman_brown`` (the same, each r corrected to
+    the full number of people). Columns: ``values`` (pairs or halves), ``undefined`` (those of them
+    that are NaN), ``mean``, ``mean_low``, ``mean_high`` (drawing participants; pairs of one person
+    with himself left out; NaN for halves), ``low``, ``median``, ``high`` (2.5th, 50th and 97.5th
+    percentile of the values), ``reason``.
+    """
+    draws = bootstrap or Bootstrap()
+    records = []
+    for answers in all_answers(test):
+        people = draws_of_people(answers, draws)
+        for name, matrix in (
+            ("kappa", pairwise_kappa(answers.yes)),
+            ("correlation", pairwise_correlation(answers.yes)),
+        ):
+            record = _spread(answers.scenario, name, pair_values(matrix))
+            low, high = draws.interval(resampled_mean_of_pairs(matrix, people))
+            records.append({**record, "mean_low": low, "mean_high": high})
+        r = split_halves(answers.yes, halves, draws.seed)
+        for name, values in (("split_half", r), ("spearman_brown", spearman_brown(r))):
+            record = _spread(answers.scenario, name, values)
+            records.append({**record, "mean_low": np.nan, "mean_high": np.nan})
+    columns = ["scenario", "measure", "values", "undefined", "mean", "mean_low", "mean_high"]
+    return pd.DataFrame(records)[[*columns, "low", "median", "high", "reason"]]
+
+
+def _spread(scenario: str, measure: str, values: Array) -> dict[str, Any]:
+    known = values[np.isfinite(values)]
+    low, median, high = np.percentile(known, [2.5, 50, 97.5]) if len(known) else [np.nan] * 3
+    reasons = []
+    if len(known) < len(values):
+        reasons.append(f"{len(values) - len(known)} undefined (constant answers) and left out")
+    if not len(values):
+        reasons.append("one person alone makes no pair")
+    return {
+        "scenario": scenario,
+        "measure": measure,
+        "values": len(values),
+        "undefined": len(values) - len(known),
+        "mean": float(np.mean(known)) if len(known) else np.nan,
+        "low": float(low),
+        "median": float(median),
+        "high": float(high),
+        "reason": "; ".join(reasons),
+    }
+
+
+def split_halves(yes: Array, halves: int = HALVES, seed: int = 0) -> Array:
+    """r of the shares of yes of two random halves of the people, (halves,).
+
+    Of an odd number of people the second half has one more. NaN where r is undefined; empty with
+    fewer than two people.
+    """
+    n = len(yes)
+    if n < 2:
+        return np.empty(0)
+    rng = generator("halves", seed, n)
+    order = rng.permuted(np.tile(np.arange(n), (halves, 1)), axis=1)
+    first = (order < n // 2).astype(np.float64)
+    return correlate_rows(share(yes, first), share(yes, 1 - first))
+
+
+def spearman_brown(r: npt.ArrayLike, factor: float = 2.0) -> Array:
+    """The r to expect of groups ``factor`` times as large; NaN for r of -1 / (factor - 1) or less.
+
+    A negative r has no such reading for two halves, but is not clipped.
+    """
+    values = np.asarray(r, dtype=np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        below = 1 + (factor - 1) * values
+        return np.where(below > 0, factor * values / below, np.nan)

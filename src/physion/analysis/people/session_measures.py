@@ -1,0 +1,103 @@
+"""What exclusion rules look at: runs, alternations, accuracy and response times of a session."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from physion.analysis.people.participants import Responses
+from physion.errors import BadInputError
+
+
+def longest_streak(yes: npt.ArrayLike) -> int:
+    """Length of the longest run of one answer; 0 without answers."""
+    answers = np.asarray(yes, dtype=bool)
+    return _longest_run(answers[1:] == answers[:-1]) + 1 if len(answers) else 0
+
+
+def longest_alternation(yes: npt.ArrayLike, begins_with: bool | None = None) -> int:
+    """Answers in the longest stretch in which every one differs from the one before.
+
+    ``begins_with``: only count stretches from their first such answer on.
+    """
+    answers = np.asarray(yes, dtype=bool)
+    if not len(answers):
+        return 0
+    if begins_with is None:
+        return _longest_run(answers[1:] != answers[:-1]) + 1
+    breaks = np.flatnonzero(answers[1:] == answers[:-1]) + 1
+    stretches = np.split(answers, breaks)
+    return max(len(part) - int(part[0] != begins_with) for part in stretches)
+
+
+def _longest_run(same: npt.NDArray[np.bool_]) -> int:
+    """How many True stand in a row at most."""
+    ends = np.flatnonzero(np.concatenate(([True], ~same, [True])))
+    return int(np.max(np.diff(ends))) - 1
+
+
+def session_measures(
+    responses: Responses, expected: Mapping[str, int] | None = None
+) -> pd.DataFrame:
+    """What the rules look at, one row a session, in the order of ``responses.sessions``.
+
+    ``expected``: test trials by scenario, or by session where people see subsets; where absent,
+    the stimuli of the scenario that any session answered. Columns: ``session``,
+    ``participant``, ``scenario``, ``expected``, ``trials``, ``accuracy``, ``yes``,
+    ``mean_log_rt``, ``median_log_rt``, ``no_log_rt`` (trials without a response time above 0),
+    ``longest_streak``, ``longest_alternation``, ``longest_alternation_from_first``,
+    ``familiarization_trials``, ``familiarization_correct``.
+    Raises `BadInputError` where no session has a test answer.
+    """
+    test = responses.test
+    if test.empty:
+        raise BadInputError(
+            f"{len(responses.sessions)} session(s) hold practice alone and no test answer: "
+            "give responses with test trials"
+        )
+    found = test.groupby("scenario")["stimulus"].nunique().to_dict()
+    found |= dict(expected or {})
+    by_session = {
+        str(session): rows.sort_values("trial", kind="stable")
+        for session, rows in test.groupby("session", sort=False)
+    }
+    begins: dict[str, bool] = {}
+    for session, scenario in responses.sessions[["session", "scenario"]].to_numpy():
+        if session in by_session:
+            begins.setdefault(scenario, bool(by_session[session]["yes"].iloc[0]))
+    records = {
+        session: _session_record(rows, begins[str(rows["scenario"].iloc[0])])
+        for session, rows in by_session.items()
+    }
+    nothing = {"trials": 0, "longest_streak": 0, "longest_alternation": 0,
+               "longest_alternation_from_first": 0, "no_log_rt": 0}  # fmt: skip
+    keys = responses.sessions[["session", "participant", "scenario"]]
+    measures = pd.DataFrame([records.get(session, nothing) for session in keys["session"]])
+    measures = pd.concat([keys.reset_index(drop=True), measures], axis=1)
+    own = measures["session"].map(dict(expected or {}))
+    measures["expected"] = own.fillna(measures["scenario"].map(found)).fillna(1).astype(int)
+    practice = responses.trials[responses.trials["phase"] == "familiarization"]
+    counts = practice.groupby("session")["correct"].agg(["size", "sum"])
+    counts = counts.reindex(measures["session"])
+    measures["familiarization_trials"] = counts["size"].fillna(0).to_numpy(dtype=int)
+    measures["familiarization_correct"] = counts["sum"].to_numpy(dtype=np.float64)
+    return measures
+
+
+def _session_record(rows: pd.DataFrame, begins: bool) -> dict[str, float]:
+    yes, log_rt = rows["yes"].to_numpy(dtype=bool), rows["log_rt"].to_numpy(dtype=np.float64)
+    known = log_rt[np.isfinite(log_rt)]
+    return {
+        "trials": len(rows),
+        "accuracy": float(rows["correct"].mean()),
+        "yes": float(yes.mean()),
+        "mean_log_rt": float(np.mean(known)) if len(known) else np.nan,
+        "median_log_rt": float(np.median(known)) if len(known) else np.nan,
+        "no_log_rt": len(log_rt) - len(known),
+        "longest_streak": longest_streak(yes),
+        "longest_alternation": longest_alternation(yes),
+        "longest_alternation_from_first": longest_alternation(yes, begins),
+    }

@@ -1,0 +1,158 @@
+"""The published table of model accuracies by scenario, and the one that a reader takes it for.
+
+The table of the paper's supplement (S1) bears no protocol. Each of its 88 values is the mean over
+all rows that the released results have for a model and a scenario: every readout, every training
+protocol, every run. It thus mixes *detection* (readout *full*, which sees the outcome) into
+accuracies of *prediction*. A reader expects the paper's main setting: trained on *all* scenarios,
+readout *observed+simulated*.
+"""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from math import lcm
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+from physion.analysis.published.tables import (
+    OBSERVED_AGAIN,
+    PublishedTables,
+    in_paper_order,
+)
+from physion.analysis.statistics.bootstrap import Bootstrap
+from physion.analysis.tables.stimuli import SCENARIOS
+
+EXPECTED = {"training": "all", "readout": "observed+simulated"}
+"""The cell that the paper's main figure shows."""
+
+MOST_STIMULI = 400
+"""No scenario of the study was tested on more."""
+
+
+def accuracy_table(tables: PublishedTables, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
+    """The published mean of each model and scenario beside the cell that a reader expects.
+
+    Columns: ``model``, ``scenario``; ``published`` with ``published_low``, ``published_high``
+    (bootstrap over the rows that it averages: how it would move with other protocols and seeds,
+    not with other stimuli), ``rows`` (how many), ``without_copies`` (the mean with
+    *observed* once);
+    ``expected`` with ``expected_low``, ``expected_high`` (Wilson's 95 % interval: other stimuli of
+    the kind) and ``runs`` (seeds averaged in it), ``stimuli`` (tested; see `count_tested`),
+    ``difference`` (expected - published).
+    """
+    draws = bootstrap or Bootstrap()
+    level = draws.level
+    counts = count_tested(tables.runs)
+    once = tables.distinct
+    records = []
+    for (model, scenario), rows in tables.runs.groupby(["model", "scenario"], sort=False):
+        values = rows["accuracy"].to_numpy(dtype=np.float64)
+        weights = draws.weights(f"{model} {scenario}", len(values))
+        low, high = draws.interval(weights @ values / len(values))
+        own = once.loc[once.index.intersection(rows.index)]
+        cell = own[(own[list(EXPECTED)] == pd.Series(EXPECTED)).all(axis=1)]["accuracy"]
+        expected = float(cell.mean()) if len(cell) else float("nan")
+        stimuli = counts[(model, scenario)]
+        expected_low, expected_high = wilson(expected, stimuli, level)
+        records.append(
+            {
+                "model": model,
+                "scenario": scenario,
+                "published": float(values.mean()),
+                "published_low": low,
+                "published_high": high,
+                "rows": len(rows),
+                "without_copies": float(own["accuracy"].mean()),
+                "expected": expected,
+                "expected_low": expected_low,
+                "expected_high": expected_high,
+                "runs": len(cell),
+                "stimuli": stimuli,
+                "difference": expected - float(values.mean()),
+            }
+        )
+    return in_paper_order(pd.DataFrame(records), ["model", "scenario"])
+
+
+def grid(table: pd.DataFrame, column: str) -> pd.DataFrame:
+    """One column of `accuracy_table` as models by scenarios, with their mean last."""
+    wide = table.pivot(index="model", columns="scenario", values=column)
+    wide = wide.reindex(index=list(dict.fromkeys(table["model"])))
+    wide = wide[[name for name in SCENARIOS if name in wide]]
+    return wide.assign(mean=wide.mean(axis=1, skipna=False)).reset_index().rename_axis(columns=None)
+
+
+def count_tested(runs: pd.DataFrame) -> dict[tuple[str, str], int]:
+    """How many stimuli each model was tested on in each scenario, by (model, scenario).
+
+    The released tables do not say; the accuracies are fractions, so the number is recovered from
+    their denominators. Models see all test trials of a scenario, also those that no person saw.
+    """
+    largest: dict[tuple[str, str], int] = {}
+    common = dict.fromkeys(runs["scenario"], 1)
+    for (model, scenario), rows in runs.groupby(["model", "scenario"], sort=False):
+        found = [_denominator(value) for value in rows["accuracy"]]
+        largest[(model, scenario)] = max(found)
+        together = lcm(*found)
+        if together <= MOST_STIMULI:
+            common[scenario] = max(common[scenario], together)
+    return {
+        (model, scenario): common[scenario] if common[scenario] % n == 0 else n
+        for (model, scenario), n in largest.items()
+    }
+
+
+def _denominator(share: float) -> int:
+    return Fraction(share).limit_denominator(MOST_STIMULI).denominator
+
+
+def wilson(share: float, n: float, level: float = 0.95) -> tuple[float, float]:
+    """Wilson's interval of a share of ``n`` independent trials; NaN, NaN where undefined."""
+    if not (np.isfinite(share) and n > 0):
+        return float("nan"), float("nan")
+    z = float(stats.norm.ppf(0.5 + level / 2))
+    centre = share + z * z / (2 * n)
+    half = z * float(np.sqrt(share * (1 - share) / n + (z / (2 * n)) ** 2))
+    return (centre - half) / (1 + z * z / n), (centre + half) / (1 + z * z / n)
+
+
+def copies_of_observed(tables: PublishedTables) -> tuple[int, int]:
+    """Of the rows with the second copy of *observed*: how many equal the first one, and all."""
+    cell = ["model", "scenario", "training", "seed", "file"]
+    runs = tables.runs
+    again = runs[runs["readout"] == OBSERVED_AGAIN].set_index(cell)["accuracy"]
+    first = runs[runs["readout"] == "observed"].set_index(cell)["accuracy"]
+    return int((again == first.reindex(again.index)).sum()), len(again)
+
+
+def averaged_in_words(tables: PublishedTables) -> str:
+    """What a published value averages, counted in the tables at hand."""
+    equal, copies = copies_of_observed(tables)
+    counts = tables.runs.groupby("model")["accuracy"].size() / tables.runs["scenario"].nunique()
+    per_model = ", ".join(f"{model} {n:g}" for model, n in counts[counts > 3].items())
+    few = ", ".join(str(model) for model in counts[counts <= 3].index)
+    words = (
+        "Each published value is the plain mean of all released rows of a model and a scenario: "
+        "every readout (full, observed+simulated, observed), every training protocol (all, "
+        "all-but, only) and every run. Readout full sees the whole movie, so the published values "
+        f"mix detection into prediction. Rows averaged by model: {per_model}; {few} have the three "
+        "training protocols alone. "
+    )
+    if copies:
+        twice = " and ".join(
+            tables.runs[tables.runs["readout"] == OBSERVED_AGAIN]["model"].unique()
+        )
+        words += (
+            f"For {twice} observed counts twice: their readout D repeats C in {equal} of {copies} "
+            "rows. "
+        )
+    files = tables.runs.groupby(["model", "seed", "scenario"])["file"].nunique()
+    for (model, seed), number in files.groupby(["model", "seed"]).max().items():
+        if number > 1:
+            words += f"Seed {seed} of {model} stands in {number} result files, with other numbers. "
+    return words + (
+        "Beside it stands the cell that a reader expects: trained on all scenarios, readout "
+        "observed+simulated, the mean of the seeds."
+    )

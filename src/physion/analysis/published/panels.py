@@ -1,0 +1,121 @@
+"""The panels of the paper's main comparison as tables: accuracy, kappa, readouts, trainings.
+
+Panels A to C show training *all* and readout *observed+simulated*, of SVG and RPIN the first seed
+alone (as the released code selects); panels D and E vary the readout and the training. The
+intervals of the panels are bootstraps over the eight scenario values. Panel B (r with the average
+person) needs the predictions for single stimuli, which the released tables do not hold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+
+from physion.analysis.models.zones import released_zone
+from physion.analysis.published.cells import EXPECTED
+from physion.analysis.published.tables import (
+    PARTICLES,
+    TRAININGS,
+    PublishedTables,
+    in_paper_order,
+)
+from physion.analysis.statistics.bootstrap import Bootstrap
+from physion.analysis.tables.score_tables import MEAN
+
+FIRST_SEED = ("SVG", "RPIN")
+"""Models of which panels A to C show seed 0 alone."""
+
+READOUT_ORDER = ("observed", "observed+simulated", "full")
+
+SELECTION = (
+    "Panels A and C: training all, readout observed+simulated, of SVG and RPIN seed 0 alone, as "
+    "the released code selects. Panel D: training all, mean of the runs; particle models have one "
+    "readout. Panel E: readout observed+simulated, mean of the runs. Intervals of a mean are a "
+    "bootstrap over the scenario values, seeded (the released code drew without a seed). “Zone” "
+    "in a scenario's row is the middle 95 % of participants (accuracy) or of pairs of them "
+    "(kappa); in the row of the mean it is the paper's grey band, a bootstrap over the scenario "
+    "means, which does not say how participants differ. Kappa of a model is the median over "
+    "participants, though the paper speaks of a mean. Panel B is missing: r with the average "
+    "person cannot be had from the released tables, which hold no prediction for a single stimulus."
+)
+
+
+def panel_a(tables: PublishedTables, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
+    """Accuracy of each model by scenario beside people; see `_measure`."""
+    return _measure(tables, "accuracy", bootstrap or Bootstrap())
+
+
+def panel_c(tables: PublishedTables, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
+    """Cohen's kappa of each model with participants, median over them; see `_measure`."""
+    return _measure(tables, "kappa", bootstrap or Bootstrap())
+
+
+def panel_d(tables: PublishedTables, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
+    """Accuracy by readout, trained on all scenarios, averaged over runs, then over scenarios.
+
+    Columns: ``model``, ``readout``, ``scenarios`` (averaged), ``runs`` (of one scenario),
+    ``accuracy`` with ``low`` and ``high``.
+    """
+    cell = tables.mean_runs()
+    rows = cell[(cell["training"] == EXPECTED["training"]) & ~cell["model"].isin(PARTICLES)]
+    return _by(rows, "readout", READOUT_ORDER, bootstrap or Bootstrap())
+
+
+def panel_e(tables: PublishedTables, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
+    """Accuracy by training protocol, readout observed+simulated; columns as `panel_d`, with
+    ``training`` in place of ``readout``."""
+    cell = tables.mean_runs()
+    rows = cell[cell["readout"] == EXPECTED["readout"]]
+    return _by(rows, "training", tuple(TRAININGS.values()), bootstrap or Bootstrap())
+
+
+def _measure(tables: PublishedTables, measure: str, draws: Bootstrap) -> pd.DataFrame:
+    """One row a model and scenario, then its mean over scenarios.
+
+    Columns: ``model``, ``scenario``, the measure with ``low`` and ``high`` (of the mean: bootstrap
+    over scenarios; of a kappa: percentiles over participants; else NaN), ``people`` (what people
+    have) with ``zone_low``, ``zone_high``, and ``in_zone`` (is the model within? None without one).
+    """
+    runs = tables.distinct
+    chosen = runs[(runs[list(EXPECTED)] == pd.Series(EXPECTED)).all(axis=1)]
+    chosen = chosen[~chosen["model"].isin(FIRST_SEED) | (chosen["seed"] == 0)]
+    own = chosen[["model", "scenario", measure]].copy()
+    if measure == "kappa":
+        own[["low", "high"]] = chosen[["kappa_low", "kappa_high"]]
+    else:
+        own[["low", "high"]] = np.nan
+    zone = ["zone_low", "zone_high"] if measure == "accuracy" else ["kappa_low", "kappa_high"]
+    people = tables.people[["scenario", measure, *zone]]
+    people.columns = pd.Index(["scenario", "people", "zone_low", "zone_high"])
+    mean, low, high = released_zone(people["people"].to_numpy(dtype=np.float64), draws)
+    means = [
+        {"model": model, "scenario": MEAN, **_mean(rows[measure], measure, draws),
+         "people": mean, "zone_low": low, "zone_high": high}
+        for model, rows in own.groupby("model", sort=False)
+    ]  # fmt: skip
+    table = in_paper_order(
+        pd.concat([own.merge(people, on="scenario"), pd.DataFrame(means)], ignore_index=True),
+        ["model", "scenario"],
+    )
+    inside = table[measure].between(table["zone_low"], table["zone_high"])
+    return table.assign(in_zone=inside)
+
+
+def _by(rows: pd.DataFrame, what: str, order: Sequence[str], draws: Bootstrap) -> pd.DataFrame:
+    records = []
+    for (model, value), cells in rows.groupby(["model", what], sort=False):
+        record = {"model": model, what: value, "scenarios": len(cells)}
+        record |= {"runs": int(cells["runs"].max()), **_mean(cells["accuracy"], "accuracy", draws)}
+        records.append(record)
+    table = pd.DataFrame(records)
+    table = table.assign(place=table[what].map({name: at for at, name in enumerate(order)}))
+    return in_paper_order(table, ["model", "place"]).drop(columns="place")
+
+
+def _mean(values: pd.Series, measure: str, draws: Bootstrap) -> dict[str, float]:
+    array = values.to_numpy(dtype=np.float64)
+    weights = draws.weights("scenarios", len(array))
+    low, high = draws.interval(weights @ array / len(array))
+    return {measure: float(array.mean()), "low": low, "high": high}

@@ -1,0 +1,82 @@
+"""The published results of the original study, recomputed from its released tables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import pandas as pd
+
+from physion.analysis.published.cells import accuracy_table, averaged_in_words
+from physion.analysis.published.panels import SELECTION, panel_a, panel_c, panel_d, panel_e
+from physion.analysis.published.people import people_by_scenario, people_claims
+from physion.analysis.published.regressions import published_regressions
+from physion.analysis.published.tables import PublishedTables, read_published
+from physion.analysis.statistics.bootstrap import Bootstrap
+
+TITLES = {
+    "accuracies": "Accuracy of models by scenario: as published, and trained on all scenarios with "
+    "readout observed+simulated",
+    "panel_a": "Panel A: accuracy",
+    "panel_c": "Panel C: Cohen's kappa with participants",
+    "panel_d": "Panel D: accuracy by readout",
+    "panel_e": "Panel E: accuracy by training",
+    "regressions": "Regressions of the Results section",
+    "people": "People by scenario",
+    "people_claims": "What the paper says of people",
+    "left_out": "Rows left out",
+}
+"""The tables in the order in which a report shows them."""
+
+REGRESSIONS = (
+    "Linear mixed models of accuracy, REML, degrees of freedom by Satterthwaite, as the released "
+    "notebook has them. “run” is what the printed number was computed from; “once” the same with "
+    "each released row once; “asked” what the sentence says, each row once. Rows of one model and "
+    "scenario that differ in readout or seed share their test stimuli and are not independent, "
+    "which none of these models knows: their p are too small."
+)
+
+
+@dataclass(frozen=True)
+class PublishedResults:
+    """``tables`` by the names of `TITLES`, and ``words``: what each of them is made of."""
+
+    tables: Mapping[str, pd.DataFrame]
+    words: Mapping[str, str]
+
+
+def published_results(folder: Path, bootstrap: Bootstrap | None = None) -> PublishedResults:
+    """Everything from the official data in ``folder`` (``results/`` and ``humans/``).
+
+    Raises `BadInputError` for what is missing or wrong in it.
+    """
+    return results_of(read_published(folder), bootstrap)
+
+
+def results_of(released: PublishedTables, bootstrap: Bootstrap | None = None) -> PublishedResults:
+    """`published_results` of tables that are read already."""
+    draws = bootstrap or Bootstrap()
+    tables = {
+        "accuracies": accuracy_table(released, draws),
+        "panel_a": panel_a(released, draws),
+        "panel_c": panel_c(released, draws),
+        "panel_d": panel_d(released, draws),
+        "panel_e": panel_e(released, draws),
+        "regressions": published_regressions(released),
+        "people": people_by_scenario(released, draws),
+        "people_claims": people_claims(released),
+        "left_out": released.dropped,
+    }
+    words = {
+        "accuracies": averaged_in_words(released)
+        + f" Intervals: {draws.level:.0%}, of a published value a bootstrap over the rows that it "
+        "averages, of the expected cell Wilson's for the stimuli tested.",
+        "panels": SELECTION,
+        "regressions": REGRESSIONS,
+        "people": "Accuracy, kappa and split-half r from the released tables by scenario; kappa is "
+        "the median over pairs; split-half r is of halves (half_r_full: stepped up to all people). "
+        "Counts and accuracy_by_stimulus are from the tables by stimulus, whose exclusion is laxer "
+        "by up to eight people.",
+    }
+    return PublishedResults(tables, words)

@@ -1,0 +1,217 @@
+"""Do two models differ? Tests for answers to the same stimuli, and corrections for many of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import combinations
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+from scipy import stats
+
+from physion.analysis.statistics.agreement import pearson
+from physion.analysis.statistics.bootstrap import Bootstrap
+from physion.analysis.statistics.correlation import correlate_resampled, from_sums
+from physion.errors import BadInputError
+from physion.seeds import generator
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class McNemar:
+    """``only_first``: stimuli that the first alone has right; ``only_second``; ``p``: two-sided."""
+
+    only_first: int
+    only_second: int
+    p: float
+
+
+def mcnemar_exact(first: npt.ArrayLike, second: npt.ArrayLike) -> McNemar:
+    """Are two models right equally often? The exact test of McNemar on paired right answers.
+
+    ``first``, ``second``: 1 right, 0 wrong, NaN not answered; stimuli that one of them lacks are
+    left out. Without a stimulus on which they differ p is 1: nothing speaks against equality.
+    """
+    a, b = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
+    only_a, only_b = int(np.sum((a == 1) & (b == 0))), int(np.sum((a == 0) & (b == 1)))
+    if not only_a + only_b:
+        return McNemar(0, 0, 1.0)
+    p = float(stats.binomtest(only_a, only_a + only_b, 0.5).pvalue)
+    return McNemar(only_a, only_b, p)
+
+
+def r_difference_draws(
+    first: npt.ArrayLike, second: npt.ArrayLike, people: npt.ArrayLike, weights: npt.ArrayLike
+) -> Array:
+    """r(first, people) - r(second, people) in each resample of the stimuli, (resamples,)."""
+    pair = np.stack([np.asarray(first, np.float64), np.asarray(second, np.float64)])
+    drawn = np.asarray(weights, dtype=np.float64)
+    shares = np.broadcast_to(np.asarray(people, dtype=np.float64), drawn.shape)
+    r = correlate_resampled(pair, shares, drawn)
+    return np.asarray(r[:, 0] - r[:, 1])
+
+
+def r_permutation_p(
+    first: npt.ArrayLike,
+    second: npt.ArrayLike,
+    people: npt.ArrayLike,
+    permutations: int = 2000,
+    seed: int = 0,
+) -> float:
+    """Two-sided p of the difference of two models' r with people, by swapping the two.
+
+    Under the null hypothesis the models are exchangeable once each is standardised, since r knows
+    neither shift nor scale; for every stimulus a fair coin decides whether the two change places.
+    p = (1 + count of |difference| as large) / (1 + permutations). NaN where an r is undefined.
+    """
+    a, b = np.asarray(first, np.float64), np.asarray(second, np.float64)
+    y = np.asarray(people, np.float64)
+    known = np.isfinite(a) & np.isfinite(b) & np.isfinite(y)
+    a, b, y = a[known], b[known], y[known]
+    observed = pearson(a, y) - pearson(b, y)
+    if not np.isfinite(observed):
+        return float("nan")
+    a, b = (a - a.mean()) / a.std(), (b - b.mean()) / b.std()
+    swap = _coins(permutations, len(a), seed)
+    r = _swapped_r(a, b, y - y.mean(), swap) - _swapped_r(b, a, y - y.mean(), swap)
+    as_large = np.sum(np.abs(r) >= abs(observed) - 1e-12)
+    return float((1 + as_large) / (1 + permutations))
+
+
+@lru_cache(maxsize=2)
+def _coins(permutations: int, n: int, seed: int) -> Array:
+    """0 or 1 for each permutation and stimulus; kept, since all pairs of models toss the same."""
+    rng = generator("swap", seed, n)
+    coins = (rng.random((permutations, n)) < 0.5).astype(np.float64)
+    coins.flags.writeable = False
+    return coins
+
+
+def _swapped_r(a: Array, b: Array, y: Array, swap: Array) -> Array:
+    """r with ``y`` of ``a``, in which the stimuli of ``swap`` have the value of ``b``."""
+    change = swap @ np.stack([b - a, b * b - a * a, (b - a) * y], axis=1)
+    n, ones = float(len(a)), np.ones(len(swap))
+    return from_sums(
+        n * ones, a.sum() + change[:, 0], y.sum() * ones,
+        (a * a).sum() + change[:, 1], (y * y).sum() * ones, (a * y).sum() + change[:, 2],
+    )  # fmt: skip
+
+
+# --- corrections for many comparisons -----------------------------------------------------------
+
+
+def holm(p: npt.ArrayLike) -> Array:
+    """p values by Holm's step-down method, which bounds the chance of any false alarm.
+
+    NaN stays NaN and is not counted as a test.
+    """
+    return _adjust(
+        p, lambda ordered: np.maximum.accumulate(ordered * np.arange(len(ordered), 0, -1))
+    )
+
+
+def benjamini_hochberg(p: npt.ArrayLike) -> Array:
+    """p values by Benjamini and Hochberg, which bounds the share of false alarms among alarms."""
+
+    def step_up(ordered: Array) -> Array:
+        scaled = ordered * len(ordered) / np.arange(1, len(ordered) + 1)
+        return np.minimum.accumulate(scaled[::-1])[::-1]
+
+    return _adjust(p, step_up)
+
+
+def _adjust(p: npt.ArrayLike, method: Callable[[Array], Array]) -> Array:
+    values = np.asarray(p, dtype=np.float64)
+    known = np.flatnonzero(np.isfinite(values))
+    if ((values[known] < 0) | (values[known] > 1)).any():
+        raise BadInputError("p values must lie in 0..1")
+    order = known[np.argsort(values[known], kind="stable")]
+    adjusted = np.full(values.shape, np.nan)
+    adjusted[order] = np.minimum(method(values[order]), 1.0)
+    return adjusted
+
+
+# --- the table of all pairs ---------------------------------------------------------------------
+
+
+def compare_models(
+    names: list[str],
+    correct: Array,
+    p_contact: Array,
+    people: Array,
+    bootstrap: Bootstrap | None = None,
+    *,
+    strata: Sequence[str] | None = None,
+    permutations: int = 2000,
+) -> pd.DataFrame:
+    """Every two models on the same stimuli, one row a pair.
+
+    ``correct`` and ``p_contact`` (m, s) with NaN for stimuli that a model lacks, ``people`` (s,)
+    the share of people who say yes. ``strata`` (s,) names the scenario of each stimulus: every one
+    keeps its number of stimuli when they are drawn. A pair is compared on the stimuli that both
+    answered. Columns:
+    ``first``, ``second``, ``stimuli``, ``accuracy_difference`` (first - second), ``only_first``,
+    ``only_second``, ``p_accuracy`` (McNemar, exact), ``r_difference`` with ``_low``, ``_high``
+    (bootstrap over stimuli), ``p_r`` (permutations), and of both p the corrected ``_holm`` and
+    ``_bh`` over all pairs of this table, ``reason``.
+    """
+    draws = bootstrap or Bootstrap()
+    weights = _stratified(draws, ["pooled"] * len(people) if strata is None else list(strata))
+    together = correlate_resampled(p_contact, np.broadcast_to(people, weights.shape), weights)
+    records = []
+    for i, j in combinations(range(len(names)), 2):
+        shared = np.isfinite(correct[i]) & np.isfinite(correct[j])
+        counts = mcnemar_exact(correct[i], correct[j])
+        both = shared & np.isfinite(people)
+        x, z = np.where(both, p_contact[i], np.nan), np.where(both, p_contact[j], np.nan)
+        difference = pearson(x[both], people[both]) - pearson(z[both], people[both])
+        if (np.isfinite(p_contact[i]) == np.isfinite(p_contact[j])).all():
+            drawn = together[:, i] - together[:, j]
+        else:
+            drawn = r_difference_draws(x, z, people, weights)
+        low, high = draws.interval(drawn)
+        records.append(
+            {
+                "first": names[i],
+                "second": names[j],
+                "stimuli": int(shared.sum()),
+                "accuracy_difference": float(np.mean(correct[i, shared] - correct[j, shared]))
+                if shared.any()
+                else np.nan,
+                "only_first": counts.only_first,
+                "only_second": counts.only_second,
+                "p_accuracy": counts.p if shared.any() else np.nan,
+                "r_difference": difference,
+                "r_difference_low": low if np.isfinite(difference) else np.nan,
+                "r_difference_high": high if np.isfinite(difference) else np.nan,
+                "p_r": r_permutation_p(x, z, people, permutations, draws.seed),
+                "reason": _why(shared, difference),
+            }
+        )
+    columns = ["first", "second", "stimuli", "accuracy_difference", "only_first", "only_second"]
+    columns += ["p_accuracy", "r_difference", "r_difference_low", "r_difference_high", "p_r"]
+    table = pd.DataFrame(records, columns=[*columns, "reason"])
+    for p in ("p_accuracy", "p_r"):
+        table[f"{p}_holm"] = holm(table[p])
+        table[f"{p}_bh"] = benjamini_hochberg(table[p])
+    return table
+
+
+def _stratified(bootstrap: Bootstrap, strata: list[str]) -> Array:
+    """How often each stimulus is drawn, (resamples, s), each stratum by itself."""
+    names = np.array(strata, dtype=object)
+    weights = np.zeros((bootstrap.resamples, len(names)))
+    for name in dict.fromkeys(strata):
+        own = np.flatnonzero(names == name)
+        weights[:, own] = bootstrap.weights(name, len(own))
+    return weights
+
+
+def _why(shared: npt.NDArray[np.bool_], difference: float) -> str:
+    if not shared.any():
+        return "no stimulus that both predict"
+    return "" if np.isfinite(difference) else "r: undefined for one of the two"

@@ -1,0 +1,242 @@
+"""One table of many prediction files: how accurate, how like people, made by which versions.
+
+Each file is compared by itself, on the stimuli that people saw and it predicts, so that files made
+on different sets of trials can stand in one table; the column ``stimuli`` says on how many. A file
+that cannot be compared is not dropped silently: it stands in `Leaderboard.refused` with the reason.
+A model that lacks stimuli ranks after those that lack none, whatever its scores.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from physion.analysis.models.comparison import NOT_PREDICTED, compare
+from physion.analysis.people.exclusions import (
+    PREREGISTERED,
+    ExclusionRules,
+    flag_sessions,
+    without_flagged,
+)
+from physion.analysis.people.participants import Responses, check_labels
+from physion.analysis.people.people import all_answers
+from physion.analysis.statistics.bootstrap import Bootstrap
+from physion.analysis.tables.leaderboard_rows import SCORED, read_submission, score_models
+from physion.analysis.tables.score_tables import MEAN, POOLED
+from physion.analysis.tables.stimuli import SCENARIOS
+from physion.errors import BadInputError, UnknownNameError
+
+LOWER_IS_BETTER = ("rmsd",)
+
+COLUMNS = (
+    "rank",
+    "model",
+    "readout",
+    "training",
+    "file",
+    "scenarios",
+    "of_scenarios",
+    "stimuli",
+    "of_stimuli",
+    *(f"{score}{end}" for score in (*SCORED, "kappa") for end in ("", "_low", "_high")),
+    "versions",
+    "agent",
+    "reason",
+)
+"""Columns of the table. ``scenarios`` and ``stimuli`` count what the scores rest on, out of
+``of_scenarios`` and ``of_stimuli``: what people saw or, without people, what all files name.
+``agent`` is the name by which the file's own rows are told apart; ``reason`` says what a score
+rests on where that is not everything, and why a score is NaN."""
+
+
+@dataclass(frozen=True)
+class Leaderboard:
+    """The ranked table (`COLUMNS`), what was left out of each file (``file``, ``agent``,
+    ``scenario``, ``reason``, ``stimuli``), the files that could not be compared (``file``,
+    ``reason``), the answers of people that were left out (`Responses.dropped`; None: there were no
+    single answers), and the choices in words."""
+
+    table: pd.DataFrame
+    dropped: pd.DataFrame
+    refused: pd.DataFrame
+    dropped_answers: pd.DataFrame | None
+    settings: Mapping[str, str]
+
+
+def leaderboard(
+    files: Sequence[Path],
+    humans: pd.DataFrame | None = None,
+    labels: Mapping[str, bool] | None = None,
+    responses: Responses | None = None,
+    *,
+    rules: ExclusionRules = PREREGISTERED,
+    expected: Mapping[str, int] | None = None,
+    scenario: str = MEAN,
+    exclude: Iterable[str] = (),
+    exclude_ledge: bool = True,
+    bootstrap: Bootstrap | None = None,
+) -> Leaderboard:
+    """Score every model of every file, best accuracy first; see `sort_leaderboard`.
+
+    ``humans``, ``labels``, ``exclude``, ``exclude_ledge``: as `comparison.compare`. ``responses``:
+    answers of single participants, of which the sessions that ``rules`` flag are left out; they
+    give kappa and, where ``humans`` is None, stand in for it. ``expected``: see
+    `exclusions.flag_sessions`. ``scenario``: one of the eight, *mean* (each counting the same) or
+    *pooled*.
+
+    Raises `BadInputError` where there is no file, or not one that can be compared; where no session
+    is left; where the outcomes of the responses contradict ``labels``.
+    """
+    if not files:
+        raise BadInputError("no file of predictions was given")
+    if scenario not in (*SCENARIOS, MEAN, POOLED):
+        raise UnknownNameError("scenario", scenario, (*SCENARIOS, MEAN, POOLED))
+    draws = bootstrap or Bootstrap()
+    unwanted = tuple(exclude)
+    kept, flagging = _unflagged(responses, rules, expected, labels)
+    test = None if kept is None else kept.test
+    people, outcomes = _people(humans, labels, test)
+    answers = {} if test is None else {each.scenario: each for each in all_answers(test)}
+    tables, dropped, refused, rested = [], [], [], []
+    settings: Mapping[str, str] = {}
+    for path in files:
+        try:
+            rows, versions = read_submission(path)
+            found = compare(
+                rows,
+                people,
+                outcomes,
+                exclude=unwanted,
+                exclude_ledge=exclude_ledge,
+                bootstrap=draws,
+            )
+            own = score_models(found, rows, answers, scenario, draws)
+        except BadInputError as error:
+            refused.append({"file": str(path), "reason": str(error)})
+            continue
+        tables.append(own.assign(file=str(path), versions=own["agent"].map(versions)))
+        dropped.append(found.dropped.assign(file=str(path)))
+        rested.append(found.stimuli[["agent", "scenario", "stimulus"]].assign(file=str(path)))
+        settings = found.settings
+    if not tables:
+        raise BadInputError(f"no file can be compared: {refused[0]['reason']}")
+    left_out = pd.concat(dropped, ignore_index=True)
+    asked = _asked(pd.concat(rested, ignore_index=True), left_out)
+    table = _with_asked(pd.concat(tables, ignore_index=True), asked, scenario)
+    order = ["file", "agent", "scenario", "reason", "stimuli"]
+    return Leaderboard(
+        sort_leaderboard(table.reindex(columns=list(COLUMNS))),
+        left_out[order],
+        pd.DataFrame(refused, columns=["file", "reason"]),
+        None if kept is None else kept.dropped,
+        {**settings, **_words(scenario, test is not None), **flagging},
+    )
+
+
+def _unflagged(
+    responses: Responses | None,
+    rules: ExclusionRules,
+    expected: Mapping[str, int] | None,
+    labels: Mapping[str, bool] | None,
+) -> tuple[Responses | None, dict[str, str]]:
+    """The responses without flagged sessions, and how they were flagged in words."""
+    if responses is None:
+        return None, {}
+    if labels is not None:
+        check_labels(responses, labels)
+    flags = flag_sessions(responses, rules, expected=expected)
+    words = (
+        f"{int(flags['flagged'].sum())} of {len(flags)} sessions flagged by the rules "
+        f"“{rules.name}” and left out"
+    )
+    return without_flagged(responses, flags), {"Exclusions": words}
+
+
+def _asked(rested: pd.DataFrame, dropped: pd.DataFrame) -> pd.Series:
+    """How many stimuli a whole submission would have, by scenario.
+
+    What people saw: what a model answered of it and what it lacks. Without people: what all files
+    name together.
+    """
+    keys = ["file", "agent", "scenario"]
+    lacking = dropped[dropped["reason"] == NOT_PREDICTED].groupby(keys)["stimuli"].sum()
+    seen = rested.groupby(keys)["stimulus"].nunique().add(lacking, fill_value=0)
+    named = rested.groupby("scenario")["stimulus"].nunique()
+    most = pd.concat([seen.groupby("scenario").max(), named], axis=1).max(axis=1)
+    return most.astype(int)
+
+
+def _with_asked(table: pd.DataFrame, asked: pd.Series, scenario: str) -> pd.DataFrame:
+    """``of_scenarios`` and ``of_stimuli``, and a reason where a model lacks some of them."""
+    whole = asked if scenario in (MEAN, POOLED) else asked[[scenario]]
+    table = table.assign(of_scenarios=len(whole), of_stimuli=int(whole.sum()))
+    for place, row in table.iterrows():
+        if not _is_partial(row):
+            continue
+        over = "mean over" if scenario == MEAN else "over"
+        why = f"{over} {row['scenarios']} of {len(whole)} scenarios"
+        if row["scenarios"] == len(whole):
+            why = f"over {row['stimuli']} of {row['of_stimuli']} stimuli"
+        table.loc[place, "reason"] = "; ".join(filter(None, [why, row["reason"]]))
+    return table
+
+
+def _is_partial(rows: Any) -> Any:
+    """Does a row, or do the rows of a table, rest on fewer stimuli than there are?"""
+    return rows["stimuli"] < rows["of_stimuli"]
+
+
+def sort_leaderboard(
+    table: pd.DataFrame, by: str = "accuracy", ascending: bool | None = None
+) -> pd.DataFrame:
+    """The table sorted by any column, ``rank`` by that order, NaN last, ties by model and file.
+
+    By a score, models that lack stimuli come after those that lack none: means over other
+    scenarios do not compare. ``ascending`` None puts the best first: large scores, small RMSD,
+    words by the alphabet. Raises `UnknownNameError` with the closest columns.
+    """
+    if by not in table.columns or by == "rank":
+        raise UnknownNameError("column", by, [name for name in table.columns if name != "rank"])
+    if ascending is None:
+        numeric = pd.api.types.is_numeric_dtype(table[by])
+        ascending = not numeric or by.removesuffix("_low").removesuffix("_high") in LOWER_IS_BETTER
+    ties = [name for name in ("model", "readout", "training", "file", "agent") if name != by]
+    order = table.sort_values(ties, kind="stable").sort_values(
+        by, ascending=ascending, kind="stable", na_position="last"
+    )
+    if by.removesuffix("_low").removesuffix("_high") in (*SCORED, "kappa"):
+        after = _is_partial(order).astype(int).mask(order[by].isna(), 2)
+        order = order.loc[after.sort_values(kind="stable").index]
+    return order.assign(rank=np.arange(1, len(order) + 1)).reset_index(drop=True)
+
+
+def _people(
+    humans: pd.DataFrame | None, labels: Mapping[str, bool] | None, test: pd.DataFrame | None
+) -> tuple[pd.DataFrame | None, Mapping[str, bool] | None]:
+    """People by stimulus and outcomes: those given, else those of the single answers."""
+    if test is None:
+        return humans, labels
+    known = test.drop_duplicates("stimulus").set_index("stimulus")["label"]
+    outcomes = {str(name): bool(value) for name, value in known.items()} | dict(labels or {})
+    if humans is None:
+        by = test.groupby(["stimulus", "scenario"], as_index=False, sort=False)
+        humans = by.agg(accuracy=("correct", "mean"), count=("correct", "size"))
+    return humans, outcomes
+
+
+def _words(scenario: str, single: bool) -> dict[str, str]:
+    words = {
+        "Leaderboard": "each file by itself, on the stimuli that it shares with people; scores of "
+        + (scenario if scenario in SCENARIOS else f"the row “{scenario}” over scenarios")
+    }
+    if single:
+        words["Kappa"] = (
+            "mean over participants of Cohen's kappa with the model, averaged over scenarios; its "
+            "interval draws participants, those of the other scores draw stimuli"
+        )
+    return words

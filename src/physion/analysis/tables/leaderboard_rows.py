@@ -1,0 +1,132 @@
+"""What one file gives to the leaderboard: its models, the versions that made them, their scores."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from physion.analysis.models.comparison import Comparison
+from physion.analysis.models.model_people import models_of
+from physion.analysis.people.answers import Answers, share
+from physion.analysis.people.people import draws_of_people
+from physion.analysis.statistics.bootstrap import Bootstrap
+from physion.analysis.statistics.kappa import cross_kappa
+from physion.analysis.tables.csv_table import read_csv
+from physion.analysis.tables.predictions import REQUIRED, check_predictions, name_models
+from physion.analysis.tables.score_tables import MEAN, POOLED
+from physion.errors import BadInputError
+
+Array = npt.NDArray[np.float64]
+
+SCORED = ("accuracy", "difference", "r", "rmsd")
+"""Scores by `scores.scores` that the table shows, each with ``_low`` and ``_high``."""
+
+KAPPA_NEEDS = "kappa: needs the answers of single participants"
+
+
+def read_submission(path: Path) -> tuple[pd.DataFrame, dict[str, str]]:
+    """The checked rows of a file, and for each of its models the versions that made it."""
+    raw = read_csv(path, REQUIRED)
+    rows = name_models(check_predictions(raw, str(path)))
+    beside = sidecar_versions(path)
+    if "Versions" not in raw.columns:
+        return rows, dict.fromkeys(rows["agent"].unique(), beside)
+    # The rows are still in the order of the file.
+    words = raw["Versions"].fillna("").str.strip().reset_index(drop=True)
+    found = words.groupby(rows["agent"].to_numpy()).agg(lambda each: "; ".join(sorted({*each})))
+    return rows, {str(agent): text or beside for agent, text in found.items()}
+
+
+def sidecar_versions(path: Path) -> str:
+    """The entry ``versions`` of the JSON file beside a table of predictions; empty without one.
+
+    The file is called as the table, with ``.json`` for or after its ending; ``versions`` is text,
+    or an object of names and versions. Raises `BadInputError` where it is something else.
+    """
+    for beside in (path.with_suffix(".json"), path.with_name(path.name + ".json")):
+        if not beside.is_file():
+            continue
+        try:
+            content = json.loads(beside.read_text(encoding="utf-8"))
+        except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+            raise BadInputError(f"{beside} is not a JSON file: {error}") from error
+        versions = content.get("versions", "") if isinstance(content, dict) else None
+        if isinstance(versions, dict):
+            return ", ".join(f"{name} {version}" for name, version in versions.items())
+        if not isinstance(versions, str):
+            raise BadInputError(f"{beside}: 'versions' must be text or an object of versions")
+        return versions
+    return ""
+
+
+def score_models(
+    found: Comparison,
+    rows: pd.DataFrame,
+    answers: Mapping[str, Answers],
+    scenario: str,
+    draws: Bootstrap,
+) -> pd.DataFrame:
+    """One row a model of one file."""
+    chosen = found.scores[found.scores["scenario"] == scenario]
+    if chosen.empty:
+        raise BadInputError(f"nothing of scenario {scenario!r} can be compared")
+    scored = [f"{score}{end}" for score in SCORED for end in ("", "_low", "_high")]
+    table = chosen[["agent", "model", "readout", "stimuli", "reason", *scored]].copy()
+    counts = found.stimuli.groupby("agent")["scenario"].nunique()
+    table["scenarios"] = table["agent"].map(counts) if scenario in (MEAN, POOLED) else 1
+    training = rows.drop_duplicates("agent").set_index("agent")["Dynamics Training Dataset"]
+    table["training"] = table["agent"].map(training)
+    if not found.has_people:
+        return table
+    table[["kappa", "kappa_low", "kappa_high"]] = np.nan
+    if answers:
+        _add_kappa(table, found, answers, scenario, draws)
+    else:
+        table["reason"] = _also(table["reason"], KAPPA_NEEDS)
+    return table
+
+
+def _add_kappa(
+    table: pd.DataFrame,
+    found: Comparison,
+    answers: Mapping[str, Answers],
+    scenario: str,
+    draws: Bootstrap,
+) -> None:
+    """Mean kappa with the participants, averaged over scenarios, drawn over participants."""
+    for place, agent in table["agent"].items():
+        own = found.stimuli[found.stimuli["agent"] == agent]
+        names = own["scenario"].unique() if scenario in (MEAN, POOLED) else [scenario]
+        if scenario == POOLED or any(name not in answers for name in names):
+            why = "kappa: pooled over scenarios nobody answered all stimuli"
+            if scenario != POOLED:
+                why = "kappa: no answers of single participants for every scenario"
+            table.loc[place, "reason"] = "; ".join(filter(None, [table["reason"][place], why]))
+            continue
+        values, resampled = [], []
+        for name in names:
+            value, drawn = _kappa(own[own["scenario"] == name], answers[name], draws)
+            values.append(value)
+            resampled.append(drawn)
+        low, high = draws.interval(np.mean(resampled, axis=0))
+        table.loc[place, ["kappa", "kappa_low", "kappa_high"]] = [np.mean(values), low, high]
+        if not np.isfinite(np.mean(values)):
+            why = "kappa: undefined, model and people always give the same one answer"
+            table.loc[place, "reason"] = "; ".join(filter(None, [table["reason"][place], why]))
+
+
+def _kappa(rows: pd.DataFrame, answers: Answers, draws: Bootstrap) -> tuple[float, Array]:
+    """Mean over participants of kappa in one scenario, and that in each resample of them."""
+    models, _ = models_of(rows, answers)
+    pairs = cross_kappa(answers.yes, models.predicted)
+    drawn = share(pairs, draws_of_people(answers, draws))
+    return float(share(pairs)[0]), drawn[:, 0]
+
+
+def _also(reasons: pd.Series, why: str) -> pd.Series:
+    return reasons.where(reasons == "", reasons + "; ") + why

@@ -1,0 +1,171 @@
+"""What models answered: tables with the column names of the official result files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from physion.analysis.tables.csv_table import as_booleans, as_numbers, read_csv, require_columns
+from physion.analysis.tables.stimuli import (
+    OFFICIAL_SCENARIOS,
+    SCENARIOS,
+    canonical_name,
+    scenario_name,
+    scenario_of,
+)
+from physion.errors import BadInputError
+
+REQUIRED = (
+    "Model",
+    "Readout Type",
+    "Predicted Prob_true",
+    "Predicted Outcome",
+    "Actual Outcome",
+    "Stimulus Name",
+)
+"""Columns without which a table of predictions cannot be compared."""
+
+READOUTS = {"A": "full", "B": "observed+simulated", "C": "observed"}
+"""The letters of the official files and the protocols that they stand for."""
+
+DATASETS = (
+    "Encoder Pre-training Dataset",
+    "Encoder Training Dataset",
+    "Dynamics Training Dataset",
+    "Readout Train Data",
+)
+"""Columns that say on which scenario(s) a part was trained: by itself this tells two models of one
+name apart only after it is put in relation to the scenario that is tested."""
+
+DISTINGUISHING = (
+    "Init",
+    "Encoder Type",
+    "Dynamics Type",
+    "Encoder Pre-training Task",
+    "Encoder Pre-training Seed",
+    "Encoder Training Task",
+    "Encoder Training Seed",
+    "Dynamics Training Task",
+    "Dynamics Training Seed",
+    *DATASETS,
+)
+"""Further columns that tell two models of one name apart; all of them may be absent."""
+
+
+def read_predictions(paths: list[Path]) -> pd.DataFrame:
+    """The rows of several CSV files of predictions, checked; see `check_predictions`."""
+    if not paths:
+        raise BadInputError("no file of predictions was given")
+    tables = []
+    for path in paths:
+        raw = read_csv(path, REQUIRED)
+        tables.append(check_predictions(raw, str(path)))
+    return name_models(pd.concat(tables, ignore_index=True))
+
+
+def check_predictions(table: pd.DataFrame, where: str = "predictions") -> pd.DataFrame:
+    """One row a model and stimulus, with our column names; the order of rows is kept.
+
+    Columns: ``model`` (the name), ``readout`` (*observed*, *observed+simulated*, *full*, or what
+    stands there), ``stimulus`` (canonical), ``scenario`` (None where nothing tells it),
+    ``p_contact`` (0 to 1), ``predicted`` and ``actual`` (bool), and those of `DISTINGUISHING`
+    that are there, as text. ``actual`` is the outcome of the trial that the model was shown, so
+    for our own simulations the simulated outcome; ``recorded`` is the official one where a column
+    *Recorded Outcome* gives it (bool), else None. Raises `BadInputError`.
+    """
+    require_columns(table, REQUIRED, where)
+    table = table.reset_index(drop=True)
+    stimulus = table["Stimulus Name"].astype(str).map(canonical_name)
+    checked = pd.DataFrame(
+        {
+            "model": _text(table["Model"]),
+            "readout": _text(table["Readout Type"]).replace(READOUTS),
+            "stimulus": stimulus,
+            "scenario": _scenarios(table, stimulus),
+            "p_contact": as_numbers(table["Predicted Prob_true"], 0, 1, where),
+            "predicted": as_booleans(table["Predicted Outcome"], where),
+            "actual": as_booleans(table["Actual Outcome"], where),
+            "recorded": _recorded(table, where),
+        }
+    )
+    blank = (checked["model"] == "") | (checked["stimulus"] == "")
+    if blank.any():
+        row = int(np.flatnonzero(blank.to_numpy())[0]) + 1
+        raise BadInputError(f"{where}: row {row} names no model or no stimulus")
+    for column in DISTINGUISHING:
+        checked[column] = _text(table[column]) if column in table.columns else ""
+    for column in DATASETS:
+        checked[column] = _relative(checked[column], checked["scenario"])
+    return checked
+
+
+def name_models(predictions: pd.DataFrame) -> pd.DataFrame:
+    """``predictions`` with ``agent``, a name for each model that no other one bears.
+
+    It is model and readout, and where these two are shared by several models also what tells them
+    apart (training set, seed, ...). Raises `BadInputError` where one model predicts a stimulus
+    twice, or where two models were shown trials of one name but of different outcome.
+    """
+    agent = predictions["model"] + " · " + predictions["readout"]
+    for column in DISTINGUISHING:
+        if column not in predictions:
+            continue
+        values = predictions[column].astype(str)
+        several = values.groupby([predictions["model"], predictions["readout"]]).transform(
+            "nunique"
+        )
+        agent = agent.where(several < 2, agent + f" · {column.lower()} " + values)
+    named = predictions.assign(agent=agent)
+    twice = named[named.duplicated(["agent", "stimulus"])]
+    if len(twice):
+        row = twice.iloc[0]
+        raise BadInputError(f"{row['agent']!r} predicts {row['stimulus']!r} twice; keep one row")
+    outcomes = named.groupby("stimulus")["actual"].nunique()
+    if (outcomes > 1).any():
+        name = outcomes[outcomes > 1].index[0]
+        raise BadInputError(
+            f"two models were shown {name!r} with different outcomes; compare models on one set "
+            "of trials"
+        )
+    return named
+
+
+def _text(values: pd.Series) -> pd.Series:
+    """Values as text, nothing for an absent one, seeds without the decimals pandas gives them."""
+    words = values.astype(object).where(values.notna(), "").map(str).str.strip()
+    return words.str.replace(r"^(\d+)\.0$", r"\1", regex=True).replace({"nan": "", "None": ""})
+
+
+def _scenarios(table: pd.DataFrame, stimulus: pd.Series) -> pd.Series:
+    """By the stimulus, else by the scenario that the readout was tested on, else None."""
+    known = {*SCENARIOS, *OFFICIAL_SCENARIOS}
+    tested = table.get("Readout Test Data", pd.Series("", index=table.index)).astype(str)
+    found = [
+        scenario_of(name) or (scenario_name(test) if test.lower() in known else None)
+        for name, test in zip(stimulus, tested, strict=True)
+    ]
+    return pd.Series(found, index=table.index, dtype=object)
+
+
+def _recorded(table: pd.DataFrame, where: str) -> pd.Series:
+    found = pd.Series(None, index=table.index, dtype=object)
+    if "Recorded Outcome" not in table.columns:
+        return found
+    words = _text(table["Recorded Outcome"])
+    given = words != ""
+    found[given] = as_booleans(words[given], where).tolist()
+    return found
+
+
+def _relative(trained: pd.Series, scenario: pd.Series) -> pd.Series:
+    """``same`` where the training scenario is the tested one; all else stays as it is.
+
+    Without this a model trained on each scenario in turn would count as eight models. An absent
+    training scenario stays absent, also beside a stimulus whose scenario nothing tells.
+    """
+    ours = trained.map(lambda name: OFFICIAL_SCENARIOS.get(name.lower(), name.lower()))
+    left_out = trained.str.lower().str.startswith(("all_but", "no_"))
+    relative = trained.where((trained == "") | (ours != scenario.fillna("")), "same")
+    return relative.where(~left_out, "all but this")

@@ -1,0 +1,169 @@
+"""Tables of scores: one row a model and scenario, then their mean and the pool."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from physion.analysis.models.scores import SCORES, scores, summands, why_no_r
+from physion.analysis.statistics import agreement
+from physion.analysis.statistics.bootstrap import Bootstrap
+from physion.analysis.tables.stimuli import SCENARIOS
+
+MEAN = "mean"
+"""Name of the row that averages the scores of the scenarios, each counting the same."""
+
+POOLED = "pooled"
+"""Name of the row over all stimuli together, so that larger scenarios count more."""
+
+Array = npt.NDArray[np.float64]
+
+
+def in_order(scenarios: pd.Series) -> list[str]:
+    """The scenarios that occur: the eight in the order of the paper, then any other by name."""
+    found = {str(name) for name in scenarios}
+    return [name for name in SCENARIOS if name in found] + sorted(found - set(SCENARIOS))
+
+
+def score_table(stimuli: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
+    """The scores of every model, from a table of one row a model and stimulus.
+
+    Rows: for each ``agent`` its scenarios, then `MEAN` and `POOLED`. Columns: ``agent``, ``model``,
+    ``readout``, ``scenario``, ``stimuli`` and ``changed`` (counts; those whose simulated outcome is
+    not the official one), every score of `scores.SCORES` with ``_low`` and ``_high``, ``ceiling``
+    of r and ``floor`` of the RMSD, ``reason`` (why a score or an interval is NaN, or says less than
+    it seems to, as where all labels are of one class; else empty).
+    """
+    # Sorted, so that a draw means the same stimulus whatever the order of the files.
+    ordered = stimuli.sort_values("stimulus", kind="stable")
+    parts = [_agent_rows(rows, bootstrap) for _, rows in ordered.groupby("agent", sort=False)]
+    table = pd.concat(parts, ignore_index=True)
+    rank = {agent: place for place, agent in enumerate(stimuli["agent"].unique())}
+    return table.sort_values("agent", key=lambda a: a.map(rank), kind="stable").reset_index(
+        drop=True
+    )
+
+
+def _agent_rows(rows: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
+    names = in_order(rows["scenario"])
+    parts = [rows[rows["scenario"] == name] for name in names]
+    # Row 0 of the sums is the sample itself, the rest are its resamples.
+    sums = [_all_sums(part, name, bootstrap) for part, name in zip(parts, names, strict=True)]
+    by_scenario = [scores(total) for total in sums]
+    mean = {key: np.mean([found[key] for found in by_scenario], axis=0) for key in SCORES}
+    records = [
+        _record(name, part, found, bootstrap, why_no_r(part["p_contact"], part["p_yes"]))
+        for name, part, found in zip(names, parts, by_scenario, strict=True)
+    ]
+    undefined = [
+        name for name, found in zip(names, by_scenario, strict=True) if np.isnan(found["r"][0])
+    ]
+    one_class = [name for name, part in zip(names, parts, strict=True) if _one_class(part)]
+    whys = [f"r: undefined in {', '.join(undefined)}"] if undefined else []
+    whys += [f"labels: of one class in {', '.join(one_class)}"] if one_class else []
+    records.append(_record(MEAN, rows, mean, bootstrap, "; ".join(whys)))
+    for key in ("ceiling", "floor"):
+        records[-1][key] = float(np.mean([record[key] for record in records[:-1]]))
+    pooled = scores(np.sum(sums, axis=0))
+    why = why_no_r(rows["p_contact"], rows["p_yes"])
+    records.append(_record(POOLED, rows, pooled, bootstrap, why))
+    table = pd.DataFrame(records)
+    for place, column in enumerate(("agent", "model", "readout")):
+        table.insert(place, column, rows[column].iloc[0])
+    return table
+
+
+def _all_sums(part: pd.DataFrame, stratum: str, bootstrap: Bootstrap) -> Array:
+    weights = bootstrap.weights(stratum, len(part))
+    values = summands(part)
+    return np.vstack([values.sum(axis=0), weights @ values])
+
+
+def _one_class(rows: pd.DataFrame) -> bool:
+    """Do all of several stimuli end alike?"""
+    return len(rows) > 1 and rows["label"].nunique() == 1
+
+
+def _record(
+    name: str, rows: pd.DataFrame, found: dict[str, Array], bootstrap: Bootstrap, why: str
+) -> dict[str, Any]:
+    reasons = [why] if why else []
+    if name != MEAN and _one_class(rows):
+        word = "contact" if bool(rows["label"].iloc[0]) else "no contact"
+        reasons.append(f"labels: all {word}, so accuracy cannot tell knowing from always saying it")
+    record: dict[str, Any] = {
+        "scenario": name,
+        "stimuli": len(rows),
+        "changed": int((rows["label"] != rows["simulated"]).sum()),
+    }
+    for key in SCORES:
+        value = float(found[key][0])
+        # One stimulus, drawn again and again, would seem to be known without error.
+        known = np.isfinite(value) and len(rows) > 1
+        low, high = bootstrap.interval(found[key][1:]) if known else (np.nan, np.nan)
+        if known and np.isnan(low):
+            reasons.append(f"{key}: undefined in most resamples, no interval")
+        record |= {key: value, f"{key}_low": low, f"{key}_high": high}
+    if len(rows) > 1 and record["accuracy_low"] == record["accuracy_high"]:
+        reasons.append("accuracy: all answers alike, so the bootstrap interval has no width")
+    if len(rows) == 1:
+        reasons.append("intervals: one stimulus")
+    if np.isfinite(found["r"][0]) and np.isnan(found["r_same"][0]):
+        reasons.append("r_same: too few or constant where the outcomes agree")
+    record["ceiling"] = agreement.ceiling(rows["p_yes"], rows["count"])
+    record["floor"] = agreement.rmsd_floor(rows["p_yes"], rows["count"])
+    if np.isfinite(found["r"][0]) and np.isnan(record["ceiling"]):
+        reasons.append("ceiling: people too few or too alike to estimate it")
+    record["reason"] = "; ".join(reasons)
+    return record
+
+
+def people_table(
+    people: pd.DataFrame, zone: pd.DataFrame | None, bootstrap: Bootstrap
+) -> pd.DataFrame:
+    """The people by scenario and, in row `MEAN`, averaged over scenarios.
+
+    ``people`` has a row a stimulus, from `responses.with_labels`.
+
+    Columns: ``scenario``, ``stimuli``, ``people`` (median number a stimulus), ``base_rate`` (share
+    of stimuli with contact), ``yes`` (mean share who say yes), ``accuracy`` with ``_low`` and
+    ``_high`` (bootstrap over stimuli), ``reliability`` and ``ceiling`` (see `agreement`), and
+    ``zone_low``, ``zone_high``: the middle 95 % of participants where ``zone`` gives it, else NaN;
+    always NaN in the mean, since nobody took part in more than one scenario.
+    """
+    zones = {} if zone is None else zone.set_index("scenario")[["low", "high"]].T.to_dict()
+    records, draws = [], []
+    for name in in_order(people["scenario"]):
+        rows = people[people["scenario"] == name].sort_values("stimulus", kind="stable")
+        right = rows["accuracy"].to_numpy(dtype=np.float64)
+        draws.append(bootstrap.weights(name, len(rows)) @ right / len(rows))
+        records.append(_people_record(name, rows, draws[-1], zones.get(name, {}), bootstrap))
+    table = pd.DataFrame(records)
+    low, high = bootstrap.interval(np.mean(draws, axis=0))
+    averaged = ["people", "base_rate", "yes", "accuracy", "reliability", "ceiling"]
+    mean = {"scenario": MEAN, "stimuli": len(people), "accuracy_low": low, "accuracy_high": high}
+    mean |= {column: float(table[column].mean(skipna=False)) for column in averaged}
+    return pd.concat([table, pd.DataFrame([mean])], ignore_index=True)
+
+
+def _people_record(
+    name: str, rows: pd.DataFrame, drawn: Array, zone: dict[str, float], bootstrap: Bootstrap
+) -> dict[str, Any]:
+    low, high = bootstrap.interval(drawn) if len(rows) > 1 else (np.nan, np.nan)
+    return {
+        "scenario": name,
+        "stimuli": len(rows),
+        "people": float(np.median(rows["count"])),
+        "base_rate": float(np.mean(rows["label"].to_numpy(dtype=bool))),
+        "yes": float(rows["p_yes"].mean()),
+        "accuracy": float(rows["accuracy"].mean()),
+        "accuracy_low": low,
+        "accuracy_high": high,
+        "reliability": agreement.reliability(rows["p_yes"], rows["count"]),
+        "ceiling": agreement.ceiling(rows["p_yes"], rows["count"]),
+        "zone_low": zone.get("low", np.nan),
+        "zone_high": zone.get("high", np.nan),
+    }

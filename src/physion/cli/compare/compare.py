@@ -1,0 +1,111 @@
+"""Compare predictions with people and write the report: tables, figures, one page.
+
+`physion compare FILES... --humans DIR`: the comparison and its report (the options below).
+
+`physion compare official DIR`: the published numbers beside those that can be recomputed.
+
+`physion compare validate FILE...`: checks files of predictions and names each bad row.
+
+`physion compare leaderboard FILES...`: one table of many files, sorted by any column.
+
+A file that is called like one of these words is meant by ./official and so on.
+"""
+
+from __future__ import annotations
+
+import json as json_module
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+SUBVERBS = {
+    "official": "physion.cli.compare.official",
+    "validate": "physion.cli.compare.validate",
+    "leaderboard": "physion.cli.compare.leaderboard",
+}
+"""First words that stand for a verb of their own, and its module."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Whom to compare. What is None is as `physion.report.compare_files` has it."""
+
+    predictions: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Prediction files with the official column names."""
+    humans: Path | None = None
+    """Folder with human_accuracy-*.csv."""
+    labels: Path | None = None
+    """Official outcomes (stim_ID, label); looked for beside the people when not given."""
+    responses: tuple[Path, ...] = ()
+    """Answers of single participants, in place of --humans: our export or the study's raw files."""
+    sessions: Path | None = None
+    """Table of sessions of our export: demographics, order of sessions."""
+    rules: str | None = None
+    """By which sessions are flagged: preregistered (if not given) or official-code."""
+    expected: Path | None = None
+    """Table of the stimuli (stimulus) that each session, or each scenario, must have; if not given,
+    those that anyone answered."""
+    attributes: Path | None = None
+    """Elements, distractors, occluders of the stimuli: a table (CSV, parquet) or a dataset; if not
+    given, by official names."""
+    movies: Path | None = None
+    """Dataset whose testing trials' movies the page shows."""
+    zone: Path | None = None
+    """Official percentiles of participants; looked for beside the people when not given."""
+    dominoes: Literal["plain", "redyellow", "pooled"] | None = None
+    """Who counts for Dominoes in --humans; plain if not given: free colours, as in the paper."""
+    exclude: Path | None = None
+    """File of stimuli to leave out, one a line."""
+    ledge: bool = False
+    """Keep the Roll stimuli with a ledge, which the study left out."""
+    resamples: int | None = None
+    """Draws of the bootstrap; 1000 if not given."""
+    seed: int | None = None
+    """Seed of the bootstrap; 0 if not given."""
+    out: Path = Path("runs/report")
+    """Folder for the report."""
+    json: bool = False
+    """Print every table of the report as one JSON object."""
+
+
+def main(options: Options) -> int:
+    """Write the report and print where it is."""
+    from physion.cli.output import console
+    from physion.report.build import compare_files
+
+    page = compare_files(
+        list(options.predictions),
+        options.humans,
+        options.labels,
+        options.out,
+        exclude_ledge=not options.ledge,
+        **_given(options),
+    )
+    if options.json:
+        numbers = json_module.loads((page.parent / "report.json").read_text(encoding="utf-8"))
+        print(json_module.dumps({"report": str(page), **numbers}))
+    else:
+        console.print(f"report: {page}", markup=False, soft_wrap=True)
+    return 0
+
+
+def _given(options: Options) -> dict[str, Any]:
+    """The options that were given, by the names that `compare_files` has for them."""
+    from physion.analysis.statistics.bootstrap import Bootstrap
+    from physion.errors import BadInputError
+    from physion.report.page.movies import movies_of
+
+    same = ("responses", "sessions", "rules", "expected", "attributes", "zone", "dominoes",
+            "exclude")  # fmt: skip
+    found = {name: getattr(options, name) for name in same if getattr(options, name)}
+    draws = {"resamples": options.resamples, "seed": options.seed}
+    try:
+        chosen = {name: value for name, value in draws.items() if value is not None}
+        found["bootstrap"] = Bootstrap(**chosen)
+    except ValueError as error:
+        raise BadInputError(f"--resamples {options.resamples}: {error}") from error
+    if options.movies is not None:
+        found["movies"] = movies_of(options.movies)
+    return found

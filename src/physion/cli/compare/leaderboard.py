@@ -1,0 +1,177 @@
+"""One table of many prediction files: accuracy, r, kappa, RMSD, and the versions that made them.
+
+Exit code 1 where a file could not be compared; the others are in the table.
+"""
+
+from __future__ import annotations
+
+import json as json_module
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from physion.analysis.tables.leaderboard import Leaderboard
+
+SHOWN = ("rank", "model", "readout", "training", "scenarios", "stimuli")
+SCORES = ("accuracy", "r", "kappa", "rmsd")
+"""Columns on the console, then the versions and the file; those without a value are left out."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Which files, and what they are compared with."""
+
+    predictions: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Prediction files with the official column names."""
+    humans: Path | None = None
+    """Folder with human_accuracy-*.csv."""
+    labels: Path | None = None
+    """Official outcomes (stim_ID, label); looked for beside the people when not given."""
+    responses: tuple[Path, ...] = ()
+    """Answers of single participants, which give kappa: our export or the study's raw files."""
+    sessions: Path | None = None
+    """Table of sessions of our export."""
+    rules: str | None = None
+    """By which sessions are flagged and left out: preregistered (without this) or official-code."""
+    expected: Path | None = None
+    """Table of the stimuli (stimulus) that each session, or each scenario, must have."""
+    exclude: Path | None = None
+    """File of stimuli to leave out, one a line."""
+    ledge: bool = False
+    """Keep the Roll stimuli with a ledge, which the study left out."""
+    scenario: str = "mean"
+    """One scenario, or mean (each counts the same), or pooled."""
+    sort: str = "accuracy"
+    """Column to sort by."""
+    ascending: bool = False
+    """Smallest first; without it the best is first."""
+    out: Path | None = None
+    """Folder for leaderboard.csv and leaderboard.json."""
+    json: bool = False
+    """Print one JSON object."""
+
+
+def main(options: Options) -> int:
+    """Print the table; 1 if a file could not be compared."""
+    board = _board(options)
+    record = _record(board)
+    if options.out is not None:
+        _write(board, record, options.out)
+    if options.json:
+        print(json_module.dumps(record))
+    else:
+        _print(board.table)
+        _print_notes(board)
+    return 1 if len(board.refused) else 0
+
+
+def _board(options: Options) -> Leaderboard:
+    from dataclasses import replace
+
+    from physion.analysis.tables.leaderboard import leaderboard, sort_leaderboard
+    from physion.analysis.tables.responses import LABELS_FILE, find_beside, read_humans, read_labels
+    from physion.analysis.tables.stimuli import read_stimulus_list
+
+    humans, labels = options.humans, options.labels
+    if labels is None and humans is not None:
+        labels = find_beside(humans, "stimuli", LABELS_FILE)
+    board = leaderboard(
+        options.predictions,
+        None if humans is None else read_humans(humans),
+        None if labels is None else read_labels(labels),
+        scenario=options.scenario,
+        exclude=() if options.exclude is None else read_stimulus_list(options.exclude),
+        exclude_ledge=not options.ledge,
+        **_people(options),
+    )
+    ascending = True if options.ascending else None
+    return replace(board, table=sort_leaderboard(board.table, options.sort, ascending))
+
+
+def _people(options: Options) -> dict[str, Any]:
+    """Responses, and the choices that were made about them."""
+    from physion.errors import BadInputError
+    from physion.report.people_results import read_any_responses, read_expected, rules_called
+
+    if not options.responses:
+        if options.sessions or options.rules or options.expected:
+            raise BadInputError("--sessions, --rules and --expected are about --responses")
+        return {}
+    found: dict[str, Any] = {"responses": read_any_responses(options.responses, options.sessions)}
+    if options.rules is not None:
+        found["rules"] = rules_called(options.rules)
+    if options.expected is not None:
+        found["expected"] = read_expected(options.expected)
+    return found
+
+
+def _record(board: Leaderboard) -> dict[str, Any]:
+    """The board as JSON values; NaN is null."""
+    tables = {"rows": board.table, "dropped": board.dropped, "refused": board.refused}
+    if board.dropped_answers is not None:
+        tables["dropped_answers"] = board.dropped_answers
+    record: dict[str, Any] = {
+        name: json_module.loads(table.to_json(orient="records", double_precision=15))
+        for name, table in tables.items()
+    }
+    return {**record, "settings": dict(board.settings)}
+
+
+def _write(board: Leaderboard, record: dict[str, Any], folder: Path) -> None:
+    from physion.cli.output import write_text
+
+    table = board.table.to_csv(index=False, lineterminator="\n")
+    write_text(folder / "leaderboard.csv", table)
+    write_text(folder / "leaderboard.json", json_module.dumps(record, indent=1) + "\n")
+
+
+def _print(table: pd.DataFrame) -> None:
+    from physion.cli.output import console
+    from physion.cli.text_table import text_table
+
+    shown = table[[*SHOWN, *SCORES, "versions", "file"]].copy()
+    for name in ("scenarios", "stimuli"):
+        shown[name] = [
+            f"{row[name]}"
+            if row[name] == row[f"of_{name}"]
+            else f"{row[name]} of {row[f'of_{name}']}"
+            for row in table.to_dict("records")
+        ]
+    for name in SCORES:
+        shown[name] = [_interval(row, name) for row in table.to_dict("records")]
+    empty = [name for name in shown.columns if shown[name].isin(["", None]).all()]
+    text = text_table(shown.drop(columns=empty))
+    console.print(text, markup=False, soft_wrap=True)
+
+
+def _print_notes(board: Leaderboard) -> None:
+    """What was ranked last, refused and left out, and by which rules people were."""
+    partial = board.table[board.table["stimuli"] < board.table["of_stimuli"]]
+    notes = [f"not whole, so after those that are: {row.model}: {row.reason}" for row in
+             partial.itertuples()]  # fmt: skip
+    for row in board.refused.itertuples():
+        path, reason = str(row.file), str(row.reason)
+        notes.append(f"not compared: {reason if path in reason else f'{path}: {reason}'}")
+    left_out = int(board.dropped["stimuli"].sum())
+    if left_out:
+        notes.append(f"{left_out} stimuli left out over all files; reasons with --json or --out")
+    if "Exclusions" in board.settings:
+        notes.append(board.settings["Exclusions"])
+    if board.dropped_answers is not None and len(board.dropped_answers):
+        notes.append(f"{int(board.dropped_answers['rows'].sum())} answers of people left out")
+    from physion.cli.output import console
+
+    for note in notes:
+        console.print(note, markup=False, soft_wrap=True)
+
+
+def _interval(row: dict[str, Any], name: str) -> str:
+    value, low, high = row[name], row[f"{name}_low"], row[f"{name}_high"]
+    if value != value:
+        return ""
+    return f"{value:.3f}" + ("" if low != low else f" [{low:.3f}, {high:.3f}]")

@@ -1,0 +1,81 @@
+"""Check files of predictions: columns, stimuli, probabilities, duplicates, leakage of splits.
+
+Rows are counted from 1 below the header. Exit code 1 where a file has an error, else 0.
+"""
+
+from __future__ import annotations
+
+import json as json_module
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+if TYPE_CHECKING:
+    from physion.analysis.tables.submission import Checked, Reference
+
+
+@dataclass(frozen=True)
+class Options:
+    """Which files, and what they are held against."""
+
+    predictions: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Prediction files with the official column names."""
+    humans: Path | None = None
+    """Folder with human_accuracy-*.csv: the official outcomes are looked for beside it."""
+    labels: Path | None = None
+    """Official outcomes (stim_ID, label): the stimuli that should be predicted."""
+    index: Path | None = None
+    """Dataset, or its index (parquet or CSV): which trials there are, and of which split."""
+    fitted: Path | None = None
+    """List of the stimuli on which the readout was fitted, one a line."""
+    json: bool = False
+    """Print one JSON list, an object a file."""
+
+
+def main(options: Options) -> int:
+    """Print the faults; 1 if one of them is an error."""
+    from physion.analysis.tables.submission import validate
+    from physion.errors import BadInputError
+
+    if not options.predictions:
+        raise BadInputError("no file of predictions was given")
+    reference = _reference(options)
+    found = [validate(path, reference) for path in options.predictions]
+    if options.json:
+        print(json_module.dumps([{**asdict(each), "errors": each.errors} for each in found]))
+    else:
+        for each in found:
+            _print(each)
+    return 1 if any(each.errors for each in found) else 0
+
+
+def _reference(options: Options) -> Reference:
+    from physion.analysis.tables.responses import LABELS_FILE, find_beside, read_labels
+    from physion.analysis.tables.stimuli import read_stimulus_list
+    from physion.analysis.tables.submission import Reference, read_index
+    from physion.errors import BadInputError
+
+    labels = options.labels
+    if labels is None and options.humans is not None:
+        labels = find_beside(options.humans, "stimuli", LABELS_FILE)
+        if labels is None:
+            raise BadInputError(f"no {LABELS_FILE} lies near {options.humans}; give --labels")
+    return Reference(
+        labels=None if labels is None else read_labels(labels),
+        index=None if options.index is None else read_index(options.index),
+        fitted=None if options.fitted is None else read_stimulus_list(options.fitted),
+    )
+
+
+def _print(checked: Checked) -> None:
+    from physion.cli.output import console
+
+    for fault in checked.faults:
+        console.print(f"{checked.file}: {fault}", markup=False, soft_wrap=True)
+    for words in checked.not_checked:
+        console.print(f"{checked.file}: not checked: {words}", markup=False, soft_wrap=True)
+    warnings = len(checked.faults) - checked.errors
+    summary = f"{checked.rows} rows, {len(checked.models)} models, {checked.errors} errors, "
+    console.print(f"{checked.file}: {summary}{warnings} warnings", markup=False, soft_wrap=True)

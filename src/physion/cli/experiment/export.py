@@ -1,0 +1,64 @@
+"""Write a study's data into a folder: CSV and parquet for the analysis, Psych-DS and BIDS.
+
+A server may run meanwhile; the export is the data of one moment.
+"""
+
+from __future__ import annotations
+
+import json as json_module
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to export, and where to."""
+
+    study: Annotated[Path, tyro.conf.Positional]
+    """Folder of the study."""
+    out: Path | None = None
+    """Folder to write; an export that is there is replaced. STUDY/export if not given."""
+    database: str | None = None
+    """URL of a PostgreSQL database; responses.sqlite in the folder if not given."""
+    scenario: str | None = None
+    """Only this scenario."""
+    simulated: bool = True
+    """With simulated participants, who are marked as such."""
+    layout: Literal["both", "psych-ds", "bids"] = "both"
+    """Which conventions to follow besides the tables."""
+    json: bool = False
+    """Print the counts as one JSON object."""
+
+
+def main(options: Options) -> int:
+    """Export, and say how many sessions there are and what was left out."""
+    from physion.cli.experiment.experiment import require_extra
+
+    require_extra()
+    from physion.experiment.export.descriptions import count_lines
+    from physion.experiment.export.export_study import export_study
+    from physion.experiment.store.database import check_version, open_database, sqlite_url
+    from physion.experiment.study.study import load_study
+
+    study = load_study(options.study)
+    engine = open_database(options.database or sqlite_url(options.study), must_exist=True)
+    try:
+        check_version(engine)
+        report = export_study(
+            engine,
+            study,
+            options.out or options.study / "export",
+            simulated=options.simulated,
+            scenario=options.scenario,
+            layout=options.layout,
+        )
+    finally:
+        engine.dispose()
+    if options.json:
+        print(json_module.dumps({"out": str(report.out), **report.facts()}))
+        return 0
+    print("\n".join([*count_lines(report.facts()), f"export: {report.out}"]))
+    return 0

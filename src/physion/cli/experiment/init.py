@@ -1,0 +1,194 @@
+"""Make a study folder: from trials of ours, or from official lists of stimuli and their movies.
+
+Movies are cut to their observed frames; words, settings and stimuli are files to read and edit.
+A command that was stopped goes on where it stopped. The experimenter's password is shown once.
+"""
+
+from __future__ import annotations
+
+import json as json_module
+import secrets
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from physion.errors import BadInputError
+from physion.experiment.study.study_checks import NO_CONTACT
+
+if TYPE_CHECKING:
+    from physion.experiment.study.init_trials import Choice
+    from physion.experiment.study.study import Study
+
+
+@dataclass(frozen=True)
+class Options:
+    """Which stimuli, and what the study is called. All else is in study.toml."""
+
+    folder: Annotated[Path, tyro.conf.Positional]
+    """Folder of the study; new or empty."""
+    trials: Path | None = None
+    """Dataset whose testing and familiarization trials people see."""
+    stimuli: tuple[Path, ...] = ()
+    """In place of --trials: official lists of stimuli (JSON or CSV), one a scenario."""
+    familiarization: tuple[Path, ...] = ()
+    """Lists of the same form with the stimuli to practise on, in their order, one a scenario."""
+    familiarization_trials: Path | None = None
+    """In place of --familiarization: dataset whose familiarization trials are taken."""
+    movies: Path | None = None
+    """Folder with the movies of the lists, STIM_ID.mp4, all frames; they are cut."""
+    maps: Path | None = None
+    """Folder with the maps of the lists, looked for beside the movies if not given."""
+    scenario: tuple[str, ...] = ()
+    """Scenarios of --trials; all that have testing trials if not given."""
+    test: int | None = None
+    """Test trials of a session, half with contact; 150, or whole lists, if not given."""
+    practice: int = 10
+    """Familiarization trials that are taken from a dataset, half with contact."""
+    look: Literal["free", "redyellow"] = "free"
+    """Colours of trials from a dataset; people saw free ones."""
+    name: str | None = None
+    """Short name of the study; that of the folder if not given."""
+    title: str = "Predict what happens"
+    """What participants see above everything."""
+    contact: str = NO_CONTACT
+    """Whom participants can ask."""
+    participants: int = 100
+    """Complete sessions wanted for each scenario."""
+    languages: tuple[str, ...] = ("en", "de")
+    """Languages whose texts are copied into the study."""
+    seed: int = 0
+    """Decides which trials are drawn, and all orders."""
+    password_file: Path | None = None
+    """File with the experimenter's password; one is made and shown if not given."""
+    json: bool = False
+    """Print one JSON object."""
+
+
+def main(options: Options) -> int:
+    """Make the study; print its password once, and what to do next."""
+    from physion.cli.experiment.experiment import require_extra
+
+    require_extra()
+    from physion.cli.output import track
+    from physion.experiment.study.study_folder import make_study
+
+    password, chosen = _password(options.password_file), _choose(options)
+    study = make_study(_study(options, chosen.scenarios), chosen.sources, password, track=track)
+    _print(options, study, chosen, password if options.password_file is None else None)
+    return 0
+
+
+def _choose(options: Options) -> Choice:
+    from physion.experiment.study.init_trials import TEST, choose_trials
+
+    if (options.trials is None) == (not options.stimuli):
+        raise BadInputError("give either --trials DATASET or --stimuli LISTS with --movies DIR")
+    if options.trials is None:
+        return _choose_listed(options)
+    given = ("familiarization", "familiarization_trials", "movies", "maps")
+    for name in given:
+        if getattr(options, name):
+            raise BadInputError(f"--{name.replace('_', '-')} goes with --stimuli, not --trials")
+    return choose_trials(
+        options.trials,
+        scenarios=options.scenario,
+        test=TEST if options.test is None else options.test,
+        practice=options.practice,
+        look=options.look,
+        seed=options.seed,
+    )
+
+
+def _choose_listed(options: Options) -> Choice:
+    from physion.experiment.study.init_official import choose_listed
+    from physion.experiment.study.init_trials import choose_familiarization
+
+    if options.movies is None:
+        raise BadInputError("--stimuli needs --movies DIR, the folder with STIM_ID.mp4")
+    if options.scenario:
+        raise BadInputError("--scenario goes with --trials; a list is of one scenario")
+    if bool(options.familiarization) == (options.familiarization_trials is not None):
+        raise BadInputError(
+            "give the stimuli to practise on: --familiarization LISTS of the same form, or "
+            "--familiarization-trials DATASET (physion generate DATASET --split familiarization)"
+        )
+    listed = choose_listed(
+        options.stimuli, options.familiarization, options.movies, options.maps,
+        test=options.test, seed=options.seed,
+    )  # fmt: skip
+    parts = [listed]
+    if options.familiarization_trials is not None:
+        parts += [
+            choose_familiarization(
+                options.familiarization_trials, scenario,
+                count=options.practice, look=options.look, seed=options.seed,
+            )
+            for scenario in listed.scenarios
+        ]  # fmt: skip
+    return type(listed)(
+        tuple(source for part in parts for source in part.sources),
+        tuple(note for part in parts for note in part.notes),
+    )
+
+
+def _study(options: Options, scenarios: tuple[str, ...]) -> Study:
+    from physion.experiment.study.study import Study
+
+    return Study(
+        folder=options.folder,
+        name=options.name or options.folder.resolve().name,
+        version="1",
+        title=options.title,
+        contact=options.contact,
+        scenarios=scenarios,
+        languages=options.languages,
+        participants=options.participants,
+        seed=options.seed,
+    )
+
+
+def _password(path: Path | None) -> str:
+    """The password in a file, its first line; else a new one of 96 random bits."""
+    from physion.experiment.study.identity import MAX_PASSWORD, MIN_PASSWORD
+    from physion.experiment.study.plain_files import read_plain
+
+    if path is None:
+        return secrets.token_urlsafe(12)
+    try:
+        password = read_plain(path, 10_000).decode().splitlines()[0].strip()
+    except (UnicodeDecodeError, IndexError) as error:
+        raise BadInputError(f"{path} has no password in its first line") from error
+    if not MIN_PASSWORD <= len(password) <= MAX_PASSWORD:
+        raise BadInputError(f"the password in {path} must have {MIN_PASSWORD} characters or more")
+    return password
+
+
+def _print(options: Options, study: Study, chosen: Choice, password: str | None) -> None:
+    from physion.cli.output import console
+
+    counts = {
+        scenario: {
+            phase: len(study.phase(scenario, phase)) for phase in ("familiarization", "test")
+        }
+        for scenario in study.scenarios
+    }
+    if options.json:
+        values = {"study": str(study.folder), "digest": study.digest, "stimuli": counts}
+        print(json_module.dumps(values | {"notes": chosen.notes, "password": password}))
+        return
+    for note in chosen.notes:
+        console.print(f"note: {note}", markup=False, soft_wrap=True)
+    for scenario, found in counts.items():
+        console.print(
+            f"{scenario}: {found['test']} test and {found['familiarization']} familiarization "
+            "trials", markup=False, soft_wrap=True,
+        )  # fmt: skip
+    lines = [f"study: {study.folder}"]
+    if password is not None:
+        lines.append(f"password of the experimenter's pages, shown only now: {password}")
+    lines.append("next: set title and contact in study.toml, read texts/ (the consent!), and then")
+    lines.append(f"  physion experiment serve {study.folder}")
+    for line in lines:
+        console.print(line, markup=False, soft_wrap=True)

@@ -1,0 +1,46 @@
+"""The addresses of a study to hand out, by recruiter and scenario; to look at it; to pilot it."""
+
+from __future__ import annotations
+
+import json as json_module
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+@dataclass(frozen=True)
+class Options:
+    """Whose links."""
+
+    study: Annotated[Path, tyro.conf.Positional]
+    """Folder of the study."""
+    base_url: str = "http://127.0.0.1:8000"
+    """Address by which people reach the server."""
+    json: bool = False
+    """Print one JSON object."""
+
+
+def main(options: Options) -> int:
+    """Print the links."""
+    from physion.cli.experiment.experiment import require_extra
+
+    require_extra()
+    from physion.experiment.study.identity import Secrets
+    from physion.experiment.study.recruitment import links
+    from physion.experiment.study.study import load_study
+
+    study = load_study(options.study)
+    found = links(study, Secrets.load(options.study), options.base_url)
+    if options.json:
+        print(json_module.dumps({"links": [asdict(link) for link in found]}, indent=1))
+        return 0
+    for scenario in study.scenarios:
+        print(scenario)
+        for link in found:
+            if link.scenario == scenario:
+                print(f"  {link.name}: {link.goes_to}\n    {link.address}")
+                if link.lacks:
+                    print(f"    study.toml lacks {link.lacks}")
+    return 0

@@ -1,0 +1,230 @@
+"""A study's answers in BIDS: behaviour without recordings, one file a participant and scenario.
+
+::
+
+    dataset_description.json   README.md   participants.tsv   participants.json
+    task-<scenario>_beh.json                          what the columns mean, for all files of a task
+    sub-<participant>/beh/sub-<participant>_task-<scenario>_beh.tsv
+
+Where a study has several scenarios, each is a session of its own: ``ses-<scenario>`` in folders and
+names, and ``sub-<participant>_sessions.tsv`` (with ``sessions.json``) holds what is known of each.
+Empty cells are ``n/a``. See bids-specification.readthedocs.io, behavioral experiments.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from pyarrow import csv
+
+from physion.analysis.people.response_schema import SESSION_COLUMNS, TRIAL_COLUMNS, Column
+from physion.experiment.export.column_words import labels_of, levels_of
+from physion.experiment.export.spreadsheet import guard_cell
+from physion.experiment.export.trial_rows import Trials
+from physion.experiment.study.study import Study
+
+VERSION = "1.10.0"
+EMPTY = "n/a"
+TASK = (
+    "A movie of objects is stopped after its first part. Will the object that was shown in red "
+    "touch the one that was shown in yellow?"
+)
+TEXT_RULE = (
+    'Text is written as within quotes in JSON (line ends as \\n, tabs as \\t, quotes as \\")'
+)
+TRIAL_TYPE = Column(
+    "trial_type", "choice", "With feedback (familiarization) or without (test)",
+    choices=("familiarization", "test"),
+)  # fmt: skip
+RESPONSE_TIME = Column(
+    "response_time", "number", "From the moment the buttons are enabled to the answer", unit="s"
+)
+_IN_NAMES = ("participant", "session", "scenario", "simulated", "phase", "rt_ms")
+BEH_COLUMNS = (
+    TRIAL_TYPE,
+    RESPONSE_TIME,
+    *(column for column in TRIAL_COLUMNS if column.name not in _IN_NAMES),
+)
+PERSON_COLUMNS = tuple(
+    column
+    for column in SESSION_COLUMNS
+    if column.name in ("simulated", "age", "gender", "education")
+)
+_PARTICIPANT = {"Description": "sub- and the keyed hash of the participant's id"}
+_SESSION = {"Description": "ses- and the scenario"}
+
+
+class BidsFolder:
+    """Writes a dataset: `write` for some sessions after the other, then `close`."""
+
+    def __init__(self, folder: Path, study: Study, sessions: pa.Table) -> None:
+        folder.mkdir(parents=True)
+        self._folder, self._sessions = str(folder), sessions
+        self._several = len(study.scenarios) > 1
+        self._labels = labels_of(study.scenarios)
+        self._participants = sessions.column("participant").to_pylist()
+        self._scenarios = sessions.column("scenario").to_pylist()
+        self._made: set[str] = set()
+        self._answered: list[int] = []
+
+    def write(self, trials: Trials) -> None:
+        """The files of some sessions; one without answers has none."""
+        header = "\t".join(column.name for column in BEH_COLUMNS).encode() + b"\n"
+        rows = _tsv(_beh_table(trials.table))
+        ends = np.flatnonzero(np.frombuffer(rows, np.uint8) == ord("\n")) + 1
+        begin, row = 0, 0
+        for at, count in zip(trials.sessions, trials.counts, strict=True):
+            if not count:
+                continue
+            row += count
+            end = int(ends[row - 1])
+            with open(self._path(at), "wb") as file:  # noqa: PTH123 - 10,000 times
+                file.write(header)
+                file.write(rows[begin:end])
+            begin = end
+            self._answered.append(at)
+
+    def close(self, *, name: str, readme: str, version: str) -> int:
+        """Write what belongs to all files; how many sessions have no file for want of answers."""
+        folder = Path(self._folder)
+        answered = self._sessions.take(pa.array(self._answered, pa.int64()))
+        _write_json(folder / "dataset_description.json", {
+            "Name": name, "BIDSVersion": VERSION, "DatasetType": "raw",
+            "GeneratedBy": [{"Name": "physion", "Version": version}],
+        })  # fmt: skip
+        (folder / "README.md").write_text(readme, encoding="utf-8")
+        scenarios = set(answered.column("scenario").to_pylist())
+        for scenario, label in self._labels.items():
+            if scenario in scenarios:
+                described = describe(BEH_COLUMNS)
+                task = {"TaskName": label, "TaskDescription": TASK}
+                _write_json(folder / f"task-{label}_beh.json", task | described)
+        self._write_people(folder, answered)
+        return int(self._sessions.num_rows) - len(self._answered)
+
+    def _path(self, at: int) -> str:
+        """Where the answers of a session go, in folders that are made."""
+        subject = f"sub-{self._participants[at]}"
+        label = self._labels[self._scenarios[at]]
+        folders = [subject, *([f"ses-{label}"] if self._several else []), "beh"]
+        path = self._folder
+        for folder in folders:
+            path = f"{path}/{folder}"
+            if path not in self._made:
+                Path(path).mkdir()
+                self._made.add(path)
+        return f"{path}/{'_'.join(folders[:-1])}_task-{label}_beh.tsv"
+
+    def _write_people(self, folder: Path, sessions: pa.Table) -> None:
+        """``participants.tsv`` and, where there are several scenarios, the files of sessions."""
+        rows = sessions.to_pylist()
+        people: dict[str, list[dict[str, Any]]] = {}
+        for row in rows:
+            people.setdefault(row["participant"], []).append(row)
+        columns = PERSON_COLUMNS if self._several else SESSION_COLUMNS[1:]
+        lines = [_line(["participant_id", *(column.name for column in columns)])]
+        for participant, own in people.items():
+            # What was told once holds for a person's other sessions.
+            told = {c.name: next(filter(_is_told, (r[c.name] for r in own)), None) for c in columns}
+            lines.append(_line([f"sub-{participant}", *(_cell(v) for v in told.values())]))
+            if self._several:
+                self._write_sessions(folder, participant, own)
+        (folder / "participants.tsv").write_bytes("".join(lines).encode())
+        _write_json(
+            folder / "participants.json", {"participant_id": _PARTICIPANT} | describe(columns)
+        )
+        if self._several:
+            described = {"session_id": _SESSION} | describe(SESSION_COLUMNS[1:])
+            _write_json(folder / "sessions.json", described)
+
+    def _write_sessions(
+        self, folder: Path, participant: str, rows: Sequence[Mapping[str, Any]]
+    ) -> None:
+        names = [column.name for column in SESSION_COLUMNS[1:]]
+        lines = [_line(["session_id", *names])]
+        for row in rows:
+            label = self._labels[row["scenario"]]
+            lines.append(_line([f"ses-{label}", *(_cell(row[name]) for name in names)]))
+        subject = f"sub-{participant}"
+        path = folder / subject / f"{subject}_sessions.tsv"
+        path.write_bytes("".join(lines).encode())
+
+
+def describe(columns: Sequence[Column]) -> dict[str, dict[str, Any]]:
+    """The columns as BIDS describes them: Description, Units, Levels."""
+    found = {}
+    for column in columns:
+        about = column.about
+        if column.kind == "text" and column.name in _TEXTS:
+            about = f"{about}. {TEXT_RULE}"
+        entry: dict[str, Any] = {"Description": about}
+        if column.unit:
+            entry["Units"] = column.unit
+        if levels_of(column):
+            entry["Levels"] = {level: level for level in levels_of(column)}
+        found[column.name] = entry
+    return found
+
+
+_TEXTS = frozenset(
+    column.name
+    for column in SESSION_COLUMNS
+    if column.kind == "text" and column.name not in ("participant", "session", "scenario")
+)
+
+
+def _beh_table(trials: pa.Table) -> pa.Table:
+    """Answers with BIDS's names, and ``n/a`` for what is not known."""
+    columns = []
+    for column in BEH_COLUMNS:
+        if column is TRIAL_TYPE:
+            values = trials.column("phase")
+        elif column is RESPONSE_TIME:
+            values = pc.divide(trials.column("rt_ms"), 1000.0)
+        else:
+            values = trials.column(column.name)
+        if values.null_count:
+            values = pc.fill_null(pc.cast(values, pa.string()), EMPTY)
+        columns.append(values)
+    return pa.table(columns, names=[column.name for column in BEH_COLUMNS])
+
+
+def _tsv(table: pa.Table) -> bytes:
+    """Rows without a header. Names of stimuli hold no tabs: ArrowInvalid if one did."""
+    buffer = io.BytesIO()
+    options = csv.WriteOptions(include_header=False, delimiter="\t", quoting_style="none")
+    csv.write_csv(table, buffer, options)
+    return buffer.getvalue()
+
+
+def _is_told(value: Any) -> bool:
+    return value is not None
+
+
+def _cell(value: Any) -> str:
+    """One cell of a small table, safe in a spreadsheet."""
+    if value is None or value == "":
+        return EMPTY
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if not isinstance(value, str):
+        return str(value)
+    text = json.dumps(value, ensure_ascii=False)[1:-1]
+    # A text that reads "n/a" is no empty cell; JSON allows the stroke to be escaped.
+    return guard_cell("n\\/a" if text == EMPTY else text)
+
+
+def _line(cells: Sequence[str]) -> str:
+    return "\t".join(cells) + "\n"
+
+
+def _write_json(path: Path, values: Mapping[str, Any]) -> None:
+    text = json.dumps(values, indent=2, ensure_ascii=False)
+    path.write_text(text + "\n", encoding="utf-8")

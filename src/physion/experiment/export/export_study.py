@@ -1,0 +1,186 @@
+"""The data of a study as a folder of files: what the analysis reads, and what conventions ask for.
+
+::
+
+    OUT/
+      README.md              what is what
+      trials.csv, .parquet   one row a session and trial: physion compare --responses
+      sessions.csv, .parquet one row a session: physion compare --sessions
+      events.csv, .parquet   what else happened
+      trial_details.parquet  moments within each trial
+      stimuli.csv, expected.csv   what was shown; what the test of each scenario consists of
+      data_dictionary.json   every column of every table
+      study.json             what the study decided, without codes and keys
+      psych-ds/, bids/       the same in two conventions
+      export.json            counts, and what was left out; written last
+
+The same data and version of this package give the same bytes.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pyarrow.compute as pc
+from sqlalchemy import Connection, Engine, select
+
+import physion
+from physion.analysis.people.response_schema import data_dictionary
+from physion.experiment.export.answer_tables import snapshot
+from physion.experiment.export.bids import BidsFolder
+from physion.experiment.export.descriptions import STIMULI_COLUMNS, readme
+from physion.experiment.export.folder import whole_folder, write_manifest
+from physion.experiment.export.iso_times import iso_times
+from physion.experiment.export.large_tables import TABLES, Written, write_tables
+from physion.experiment.export.psych_ds import write_psych_ds
+from physion.experiment.export.session_rows import EXPORTED_KINDS, Sessions, Wanted, read_sessions
+from physion.experiment.export.spreadsheet import RULE
+from physion.experiment.store.tables import STUDIES
+from physion.experiment.study.study import Study
+
+Layout = Literal["both", "psych-ds", "bids"]
+GONE = "answer to a stimulus that the study folder has no more"
+NO_FILE = "no answer yet, and so no file in bids/"
+_SECRET_SETTINGS = ("recruitment", "folder", "stimuli")
+
+
+@dataclass(frozen=True)
+class Report:
+    """What was exported to ``out``.
+
+    ``sessions``: by kind and ``finished`` or ``unfinished``. ``rows``: by table. ``left_out``: what
+    (session or answer), kind, reason and count. ``until``: the last moment in the data.
+    """
+
+    out: Path
+    sessions: dict[str, dict[str, int]]
+    rows: dict[str, int]
+    left_out: tuple[dict[str, Any], ...]
+    until: str | None
+
+    def facts(self) -> dict[str, Any]:
+        """The counts, as plain values; no path."""
+        return {
+            "sessions": self.sessions,
+            "rows": self.rows,
+            "left_out": list(self.left_out),
+            "data_until": self.until,
+        }
+
+
+def export_study(
+    engine: Engine,
+    study: Study,
+    out: Path,
+    *,
+    simulated: bool = True,
+    scenario: str | None = None,
+    layout: Layout = "both",
+) -> Report:
+    """Export all data at one moment into the folder ``out``, whole or not at all.
+
+    A server may run meanwhile. An ``out`` that is there is replaced where it is an export that
+    nobody added anything to; `BadInputError` otherwise. Without ``simulated``, people alone.
+    """
+    kinds = EXPORTED_KINDS if simulated else ("person",)
+    with whole_folder(out) as folder:
+        with snapshot(engine) as connection:
+            sessions = read_sessions(connection, study, Wanted(kinds, scenario))
+            bids = None
+            if layout != "psych-ds":
+                bids = BidsFolder(folder / "bids", study, sessions.table)
+            written = write_tables(folder, connection, study, sessions, bids)
+            states = _states(connection, sessions)
+        report = _report(out, sessions, written)
+        _write_stimuli(folder, study)
+        _write_json(folder / "study.json", {"states": states})
+        dictionary: dict[str, Any] = {
+            name: data_dictionary(columns) for name, columns in TABLES.items()
+        }
+        _write_json(folder / "data_dictionary.json", dictionary | {"spreadsheet_safety": RULE})
+        if bids is not None:
+            without = bids.close(
+                name=study.title, readme=readme(study, "bids"), version=physion.__version__
+            )
+            report = _with_left_out(report, "session", "any", NO_FILE, without)
+        if layout != "bids":
+            _write_psych_ds(folder, study, sessions, report.until)
+        (folder / "README.md").write_text(readme(study, "export", report.facts()), "utf-8")
+        known = {"package": f"physion {physion.__version__}", "name": study.name}
+        write_manifest(folder, known | {"version": study.version} | report.facts())
+    return report
+
+
+def _report(out: Path, sessions: Sessions, written: Written) -> Report:
+    kinds: dict[str, dict[str, int]] = {}
+    for kind in EXPORTED_KINDS:
+        states = {state: sessions.states[kind, state] for state in ("finished", "unfinished")}
+        if any(states.values()):
+            kinds[kind] = states
+    report = Report(out, kinds, written.rows, (), written.until)
+    for (kind, reason), count in sorted(sessions.left_out.items()):
+        report = _with_left_out(report, "session", kind, reason, count)
+    return _with_left_out(report, "answer", "any", GONE, written.gone)
+
+
+def _with_left_out(report: Report, what: str, kind: str, reason: str, count: int) -> Report:
+    if not count:
+        return report
+    entry = {"what": what, "kind": kind, "reason": reason, "count": count}
+    left_out = (*report.left_out, entry)
+    return Report(report.out, report.sessions, report.rows, left_out, report.until)
+
+
+def _states(connection: Connection, sessions: Sessions) -> list[dict[str, Any]]:
+    """The states of the study under which the sessions ran, without codes and links."""
+    rows = connection.execute(select(STUDIES)).fetchall()
+    found = []
+    for row in sorted(rows, key=lambda row: (row.first_served, row.digest)):
+        if row.digest in sessions.studies:
+            kept = {k: v for k, v in row.settings.items() if k not in _SECRET_SETTINGS}
+            found.append({
+                "digest": row.digest, "name": row.name, "version": row.version,
+                "stimuli_digest": row.stimuli_digest,
+                "first_served": iso_times(np.array([row.first_served]))[0].as_py(),
+                "settings": kept,
+            })  # fmt: skip
+    return found
+
+
+def _write_stimuli(folder: Path, study: Study) -> None:
+    names = [column.name for column in STIMULI_COLUMNS]
+    shown = [[getattr(stimulus, name) for name in names] for stimulus in study.stimuli]
+    _write_csv(folder / "stimuli.csv", names, shown)
+    test = [[s.stimulus, s.scenario] for s in study.stimuli if s.phase == "test"]
+    _write_csv(folder / "expected.csv", ["stimulus", "scenario"], test)
+
+
+def _write_csv(path: Path, header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    lines = io.StringIO(newline="")
+    writer = csv.writer(lines, lineterminator="\n")
+    writer.writerows([header, *rows])
+    path.write_bytes(lines.getvalue().encode())
+
+
+def _write_psych_ds(folder: Path, study: Study, sessions: Sessions, until: str | None) -> None:
+    began = pc.min(sessions.table.column("started_at")).as_py()
+    write_psych_ds(
+        folder / "psych-ds",
+        {name: (folder / f"{name}.csv", TABLES[name]) for name in ("trials", "sessions", "events")},
+        name=study.name,
+        description=study.title,
+        readme=readme(study, "psych-ds"),
+        covers=(began, until) if began and until else None,
+    )
+
+
+def _write_json(path: Path, values: Any) -> None:
+    text = json.dumps(values, indent=2, ensure_ascii=False)
+    path.write_text(text + "\n", encoding="utf-8")

@@ -1,0 +1,70 @@
+"""How many test trials a person got right, and how that compares with others who finished."""
+
+from __future__ import annotations
+
+import threading
+from collections import defaultdict
+from collections.abc import Sequence
+from itertools import islice
+
+from sqlalchemy import Connection, bindparam, select
+
+from physion.experiment.store.tables import ANSWERS, SESSIONS, STUDIES
+from physion.experiment.study.study import Study
+
+_CHUNK = 500
+_FINISHED = (
+    select(SESSIONS.c.session)
+    .join(STUDIES, STUDIES.c.digest == SESSIONS.c.study)
+    .where(
+        SESSIONS.c.scenario == bindparam("of_scenario"),
+        SESSIONS.c.kind == bindparam("of_kind"),
+        SESSIONS.c.finished_at.is_not(None),
+        SESSIONS.c.withdrawn_at.is_(None),
+        # Previews may be of other stimuli, whose ends nobody knows any more.
+        STUDIES.c.stimuli_digest == bindparam("of_stimuli"),
+    )
+)
+_TEST = select(ANSWERS.c.session, ANSWERS.c.stimulus, ANSWERS.c.response).where(
+    ANSWERS.c.session.in_(bindparam("sessions", expanding=True)), ANSWERS.c.phase == "test"
+)
+
+
+class Scores:
+    """Correct test answers of finished sessions. They change no more, so each is counted once."""
+
+    def __init__(self, study: Study) -> None:
+        self._labels = {
+            (stimulus.scenario, stimulus.stimulus): stimulus.label
+            for stimulus in study.stimuli
+            if stimulus.phase == "test"
+        }
+        self._stimuli = study.stimuli_digest
+        self._correct: dict[str, int] = {}
+        self._lock = threading.Lock()
+
+    def of(self, connection: Connection, scenario: str, kind: str) -> dict[str, int]:
+        """Correct answers by session, of the finished sessions of one scenario and kind that were
+        made with the present stimuli.
+        """
+        values = {"of_scenario": scenario, "of_kind": kind, "of_stimuli": self._stimuli}
+        rows = connection.execute(_FINISHED, values)
+        finished = [session for (session,) in rows]
+        with self._lock:
+            new = iter([session for session in finished if session not in self._correct])
+            while chunk := list(islice(new, _CHUNK)):
+                self._count(connection, scenario, chunk)
+            return {session: self._correct[session] for session in finished}
+
+    def _count(self, connection: Connection, scenario: str, sessions: list[str]) -> None:
+        correct: dict[str, int] = defaultdict(int)
+        for session, stimulus, response in connection.execute(_TEST, {"sessions": sessions}):
+            correct[session] += (response == "yes") == self._labels[scenario, stimulus]
+        self._correct.update({session: correct[session] for session in sessions})
+
+
+def percentile(correct: int, others: Sequence[int]) -> float:
+    """The share (%) of the ``others`` with fewer correct, plus half of those with as many."""
+    fewer = sum(other < correct for other in others)
+    as_many = sum(other == correct for other in others)
+    return 100 * (fewer + as_many / 2) / len(others)

@@ -1,0 +1,159 @@
+"""Pages between the trials: what each may hold, and what it changes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from sqlalchemy import Connection, delete, select, update
+
+from physion.experiment.protocol.messages import PageDone, State
+from physion.experiment.protocol.refused import Refused
+from physion.experiment.store.sessions import (
+    ENTERED_AGAIN,
+    STAGES,
+    Session,
+    change_session,
+    plain,
+    stage_of,
+    state_of,
+)
+from physion.experiment.store.tables import EVENTS, RAW_IDS, SESSIONS
+from physion.experiment.study.study import Study
+
+MIN_AGE, MAX_AGE = 18, 130
+MAX_WORDS = 200
+
+
+def _yes_or_no(value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise ValueError("true or false")
+    return value
+
+
+def _age(value: Any) -> int | None:
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float) or value != int(value):
+        raise ValueError(f"a whole number from {MIN_AGE} to {MAX_AGE}, or null")
+    if not MIN_AGE <= value <= MAX_AGE:
+        raise ValueError(f"a whole number from {MIN_AGE} to {MAX_AGE}, or null")
+    return int(value)
+
+
+def _words(value: Any) -> str | None:
+    if value is None:
+        return None
+    if not isinstance(value, str) or len(value) > MAX_WORDS:
+        raise ValueError(f"text of at most {MAX_WORDS} characters, or null")
+    return plain(value).strip() or None
+
+
+def _difficulty(value: Any) -> int:
+    if isinstance(value, bool) or value not in (1, 2, 3, 4, 5):
+        raise ValueError("a whole number from 1 (very easy) to 5 (very hard)")
+    return int(value)
+
+
+def _free_text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise ValueError("text, which may be empty")
+    return plain(value).strip()
+
+
+FIELDS: Mapping[str, Mapping[str, Callable[[Any], Any]]] = {
+    "consent": {"agreed": _yes_or_no},
+    "instructions": {},
+    "ready": {},
+    "demographics": {"age": _age, "gender": _words, "education": _words},
+    "feedback": {
+        "difficulty": _difficulty,
+        "technical_problems": _yes_or_no,
+        "text": _free_text,
+    },
+    "withdraw": {},
+}
+"""Fields of each page, all of them needed; null where a person prefers not to say."""
+OPTIONAL: Mapping[str, Mapping[str, Callable[[Any], Any]]] = {"consent": {"language": _words}}
+"""Fields that a page may have besides."""
+
+
+def check_page(done: PageDone) -> dict[str, Any]:
+    """The values of a page; `Refused` names the first field that is missing, wrong or unknown."""
+    optional = OPTIONAL.get(done.page, {})
+    expected = {**FIELDS[done.page], **{k: v for k, v in optional.items() if k in done.data}}
+    unknown = sorted(set(done.data) - set(expected))
+    if unknown:
+        name = ascii(unknown[0][:40])
+        raise Refused("bad_request", f"data: the page {done.page} has no field {name}")
+    values = {}
+    for name, check in expected.items():
+        if name not in done.data:
+            raise Refused("bad_request", f"data.{name} is missing")
+        try:
+            values[name] = check(done.data[name])
+        except (ValueError, OverflowError) as error:
+            raise Refused("bad_request", f"data.{name}: {error}") from None
+    return values
+
+
+def turn_page(
+    connection: Connection,
+    study: Study,
+    trials: Mapping[str, int],
+    session: Session,
+    page: str,
+    values: Mapping[str, Any],
+    now: float,
+) -> State:
+    """Take a page that was sent. One that is over already changes nothing."""
+    stage = stage_of(session, trials)
+    if page == "withdraw" or values.get("agreed") is False:
+        if stage == "done":
+            raise Refused("wrong_stage", "This session is finished.", state_of(session, trials))
+        if stage != "withdrawn":
+            change_session(connection, session, withdrawn_at=now, last_seen=now)
+            if session.consented_at is None:
+                _forget(connection, session)
+        return state_of(session, trials)
+    if stage == "withdrawn" or STAGES.index(stage) < STAGES.index(page):  # type: ignore[arg-type]
+        raise Refused("wrong_stage", "This page does not come now.", state_of(session, trials))
+    if stage == page:
+        change_session(connection, session, last_seen=now, **_columns(study, page, values, now))
+    return state_of(session, trials)
+
+
+def _forget(connection: Connection, session: Session) -> None:
+    """Delete what came with who did not agree: browser and screen, and the recruiter's id where it
+    belongs to no other session.
+    """
+    change_session(connection, session, device={})
+    again = (EVENTS.c.session == session.session) & (EVENTS.c.kind == ENTERED_AGAIN)
+    connection.execute(update(EVENTS).where(again).values(data={}))
+    other = select(SESSIONS.c.session).where(
+        SESSIONS.c.participant == session.participant, SESSIONS.c.session != session.session
+    )
+    own = RAW_IDS.c.participant == session.participant
+    connection.execute(delete(RAW_IDS).where(own, ~other.exists()))
+
+
+def _columns(study: Study, page: str, values: Mapping[str, Any], now: float) -> dict[str, Any]:
+    match page:
+        case "consent":
+            # The consent is given in the language in which it was read.
+            known = values.get("language") in study.languages
+            language = {"language": values["language"]} if known else {}
+            return {"consented_at": now, "consent_version": study.consent_version, **language}
+        case "instructions":
+            return {"instructed_at": now}
+        case "ready":
+            return {"ready_at": now}
+        case "demographics":
+            return {"demographics_at": now, **values}
+        case _:
+            return {
+                "finished_at": now,
+                "difficulty": values["difficulty"],
+                "technical_problems": values["technical_problems"],
+                "feedback": values["text"],
+            }

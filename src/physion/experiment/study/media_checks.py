@@ -1,0 +1,74 @@
+"""Do the media of a study hold what its stimuli.csv says? Asked before a study is served.
+
+A lab may edit stimuli.csv or put movies of its own there; one frame too many would show people what
+they are to predict.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import av
+from PIL import Image
+
+from physion.errors import BadInputError
+from physion.experiment.study.plain_files import check_plain
+from physion.experiment.study.stimuli import Stimulus
+from physion.experiment.study.study import Study
+
+
+def check_media(study: Study) -> None:
+    """`BadInputError` names the first movie of other frames, size, rate or form, or other map.
+
+    Movies are H.264, as every browser plays it, without sound. Frames are counted from the packets
+    of the file, without decoding them.
+    """
+    seen: set[tuple[str, int]] = set()
+    for s in study.stimuli:
+        for name, frames in ((s.movie, s.frames), (s.full, s.full_frames)):
+            if name and (name, frames) not in seen:
+                seen.add((name, frames))
+                _check_movie(study.folder / name, frames, s)
+        if (s.map, 0) not in seen:
+            seen.add((s.map, 0))
+            _check_map(study.folder / s.map, s)
+
+
+def _check_movie(path: Path, frames: int, s: Stimulus) -> None:
+    check_plain(path)
+    try:
+        with av.open(str(path), metadata_errors="replace") as container:
+            if len(container.streams) != 1 or not container.streams.video:
+                raise BadInputError(f"movie {path} must hold pictures and nothing else")
+            stream = container.streams.video[0]
+            context = stream.codec_context
+            found = (context.width, context.height)
+            rate, codec = float(stream.average_rate or 0), context.name
+            counted = sum(1 for packet in container.demux(stream) if packet.size)
+    except (av.FFmpegError, ValueError, AttributeError) as error:
+        raise BadInputError(f"movie {path} cannot be read: {error}") from error
+    if counted != frames:
+        raise BadInputError(
+            f"movie {path} has {counted} frames; stimuli.csv says {frames} of {s.stimulus}"
+        )
+    if found != (s.width, s.height) or abs(rate - s.rate) > 0.01:
+        raise BadInputError(
+            f"movie {path} is {found[0]} x {found[1]} at {rate:g} frames/s; stimuli.csv says "
+            f"{s.width} x {s.height} at {s.rate:g} of {s.stimulus}"
+        )
+    if codec != "h264":
+        raise BadInputError(f"movie {path} is {codec}, not H.264, which every browser plays")
+
+
+def _check_map(path: Path, s: Stimulus) -> None:
+    check_plain(path)
+    try:
+        with Image.open(path, formats=["PNG"]) as picture:
+            found = picture.size
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise BadInputError(f"map {path} is no readable PNG picture: {error}") from error
+    if found != (s.width, s.height):
+        raise BadInputError(
+            f"map {path} is {found[0]} x {found[1]} pixels large; stimuli.csv says "
+            f"{s.width} x {s.height} of {s.stimulus}"
+        )

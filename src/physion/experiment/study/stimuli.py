@@ -1,0 +1,236 @@
+"""The stimuli of a study: what is shown, in which phase and place, and how it ends.
+
+They stand in ``stimuli.csv`` of the study folder, one row a stimulus. The file is never served.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+from physion.atomic import write_atomic
+from physion.errors import BadInputError, UnknownNameError
+from physion.experiment.study.csv_rows import csv_rows
+from physion.experiment.study.plain_files import read_plain
+
+STIMULI_FILE = "stimuli.csv"
+MEDIA_FOLDER = "media"
+PHASES = ("familiarization", "test")
+LOOKS = ("free", "redyellow")
+NAME = r"[A-Za-z0-9][A-Za-z0-9._+-]{0,199}"
+"""Names of stimuli and scenarios: letters, digits and ._+- alone, so that no file system, address
+or spreadsheet reads anything into them."""
+MAX_BYTES = 50_000_000
+MAX_FRAMES = 100_000
+MAX_SIDE = 10_000
+
+
+@dataclass(frozen=True, slots=True)
+class Stimulus:
+    """One row of ``stimuli.csv``.
+
+    ``place`` is the fixed place in familiarization, from 0; in the test it only makes the file
+    readable. ``label``: does the agent touch the patient? ``movie`` holds the observed frames
+    alone, ``full`` the whole movie (familiarization alone, else empty), ``map`` agent and patient
+    (PNG); all three are paths relative to the study folder. ``frames`` and ``full_frames`` count
+    the frames of both movies (0 where there is no full one), ``rate`` is frames a second,
+    ``width`` and ``height`` are pixels. ``look`` is ``free`` or ``redyellow``.
+    """
+
+    stimulus: str
+    scenario: str
+    phase: str
+    place: int
+    label: bool
+    movie: str
+    map: str
+    full: str
+    frames: int
+    full_frames: int
+    rate: float
+    width: int
+    height: int
+    look: str
+
+
+COLUMNS = tuple(field.name for field in fields(Stimulus))
+
+
+def is_name(name: str) -> bool:
+    """Can a stimulus or scenario be called so?"""
+    return re.fullmatch(NAME, name) is not None
+
+
+def read_stimuli(path: Path) -> tuple[Stimulus, ...]:
+    """The stimuli of a file, checked; `BadInputError` names the row and column of what is wrong.
+
+    Rows are counted as a spreadsheet shows them: the header is row 1.
+    """
+    return parse_stimuli(path, read_plain(path, MAX_BYTES))
+
+
+def parse_stimuli(path: Path, content: bytes) -> tuple[Stimulus, ...]:
+    """The same from the bytes of a file that was read from ``path``."""
+    found = []
+    for row, cells in csv_rows(path, content, COLUMNS):
+        if unknown := set(cells) - set(COLUMNS):
+            raise BadInputError(f"{path}: {UnknownNameError('column', min(unknown), COLUMNS)}")
+        found.append((row, _parse(path, row, cells)))
+    check_stimuli(found, path)
+    return tuple(stimulus for _, stimulus in found)
+
+
+def write_stimuli(path: Path, stimuli: Iterable[Stimulus]) -> None:
+    """Write ``stimuli.csv``, atomically; what `read_stimuli` would refuse is refused here."""
+    chosen = list(stimuli)
+    check_stimuli(list(enumerate(chosen, start=2)), path)
+    lines = io.StringIO(newline="")
+    writer = csv.writer(lines, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for stimulus in chosen:
+        writer.writerow([getattr(stimulus, name) for name in COLUMNS])
+    write_atomic(path, lines.getvalue().encode())
+
+
+def _flag(cell: str) -> bool:
+    # Spreadsheets write TRUE where Python writes True.
+    known = {"true": True, "false": False}
+    if cell.lower() not in known:
+        raise ValueError("True or False")
+    return known[cell.lower()]
+
+
+def _whole(cell: str) -> int:
+    if not re.fullmatch(r"[0-9]{1,9}", cell):
+        raise ValueError("a whole number from 0")
+    return int(cell)
+
+
+def _number(cell: str) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        raise ValueError("a number") from None
+
+
+_READ: Mapping[str, Callable[[str], str | int | float | bool]] = {
+    **dict.fromkeys(COLUMNS, str),
+    **dict.fromkeys(("place", "frames", "full_frames", "width", "height"), _whole),
+    "label": _flag,
+    "rate": _number,
+}
+
+
+def _parse(path: Path, row: int, cells: dict[str, str]) -> Stimulus:
+    values: dict[str, str | int | float | bool] = {}
+    for name, cell in cells.items():
+        try:
+            values[name] = _READ[name](cell)
+        except ValueError as error:
+            raise BadInputError(
+                f"{path}, row {row}: {name} must be {error}, not {cell[:60]!r}"
+            ) from error
+    return Stimulus(**values)  # type: ignore[arg-type]
+
+
+# --- checks --------------------------------------------------------------------------------------
+
+_MOVIE = re.compile(rf"{MEDIA_FOLDER}/[A-Za-z0-9][A-Za-z0-9_-]{{0,99}}\.mp4")
+_MAP = re.compile(rf"{MEDIA_FOLDER}/[A-Za-z0-9][A-Za-z0-9_-]{{0,99}}\.png")
+
+
+def check_stimuli(rows: list[tuple[int, Stimulus]], path: Path) -> None:
+    """Refuse what cannot be shown as it should be: each row by itself, then all together."""
+    if not rows:
+        raise BadInputError(f"{path} has no stimulus")
+    for row, stimulus in rows:
+        for column, allowed in _faults(stimulus):
+            value = getattr(stimulus, column)
+            raise BadInputError(f"{path}, row {row}: {column} must be {allowed}, not {value!r}")
+    names: dict[tuple[str, str], int] = {}
+    places: dict[tuple[str, str, int], int] = {}
+    for row, s in rows:
+        first = names.setdefault((s.scenario, s.stimulus), row)
+        if first != row:
+            # In both phases it would be answered with its outcome known.
+            raise BadInputError(
+                f"{path}, row {row}: {s.stimulus} is there already, in row {first}; a scenario "
+                "shows each stimulus once"
+            )
+        first = places.setdefault((s.scenario, s.phase, s.place), row)
+        if first != row:
+            raise BadInputError(
+                f"{path}, row {row}: place {s.place} of {s.phase} of {s.scenario} is taken by "
+                f"row {first}"
+            )
+    check_apart(((s.scenario, s.stimulus) for _, s in rows), path)
+    _check_futures(rows, path)
+
+
+def check_apart(names: Iterable[tuple[str, str]], where: Path) -> None:
+    """`BadInputError` where two (scenario, stimulus) are one and the same to the analysis."""
+    seen: dict[tuple[str, str], str] = {}
+    for scenario, name in names:
+        first = seen.setdefault((scenario, analysis_name(name)), name)
+        if first == name:
+            continue
+        raise BadInputError(
+            f"{where}: {first} and {name} of {scenario} are one stimulus to the analysis, which "
+            "takes off -redyellow, _img, .mp4 and .hdf5; leave one of them out, or rename it"
+        )
+
+
+def analysis_name(stimulus: str) -> str:
+    """What `physion.analysis.tables.stimuli.canonical_name` gives, whose import takes seconds."""
+    for ending in (".mp4", ".hdf5", "_img"):
+        stimulus = stimulus.removesuffix(ending)
+    return stimulus.replace("-redyellow", "")
+
+
+def _faults(s: Stimulus) -> Iterable[tuple[str, str]]:
+    """Column and what would be allowed, for each fault of one row."""
+    practice = s.phase == "familiarization"
+    letters = "letters, digits and ._+- alone"
+    if not is_name(s.stimulus):
+        yield "stimulus", letters
+    if not is_name(s.scenario):
+        yield "scenario", letters
+    if s.phase not in PHASES:
+        yield "phase", " or ".join(PHASES)
+    if s.look not in LOOKS:
+        yield "look", " or ".join(LOOKS)
+    if not _MOVIE.fullmatch(s.movie):
+        yield "movie", f"the path of a movie, {MEDIA_FOLDER}/NAME.mp4"
+    if not _MAP.fullmatch(s.map):
+        yield "map", f"the path of a picture, {MEDIA_FOLDER}/NAME.png"
+    if practice and not _MOVIE.fullmatch(s.full):
+        yield "full", f"the path of the whole movie, {MEDIA_FOLDER}/NAME.mp4, in familiarization"
+    if not practice and s.full:
+        yield "full", "empty in the test: nobody sees how a test trial ends"
+    if not 1 <= s.frames <= MAX_FRAMES:
+        yield "frames", f"from 1 to {MAX_FRAMES}"
+    if practice and not s.frames < s.full_frames <= MAX_FRAMES:
+        yield "full_frames", f"more than the {s.frames} observed frames, at most {MAX_FRAMES}"
+    if not practice and s.full_frames:
+        yield "full_frames", "0 in the test"
+    if not (math.isfinite(s.rate) and 1 <= s.rate <= 240):
+        yield "rate", "from 1 to 240 frames a second"
+    for side in ("width", "height"):
+        if not 16 <= getattr(s, side) <= MAX_SIDE:
+            yield side, f"from 16 to {MAX_SIDE} pixels"
+
+
+def _check_futures(rows: list[tuple[int, Stimulus]], path: Path) -> None:
+    """No movie that is shown before an answer may be one that shows an outcome."""
+    whole = {s.full: row for row, s in rows if s.full}
+    for row, s in rows:
+        if s.movie in whole:
+            raise BadInputError(
+                f"{path}, row {row}: movie is the whole movie of row {whole[s.movie]}; it must "
+                "hold the observed frames alone"
+            )

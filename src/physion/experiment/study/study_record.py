@@ -1,0 +1,76 @@
+"""The study folder as it is served, noted in the database beside the sessions made under it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from typing import Any
+
+from sqlalchemy import ColumnElement, Connection, func, select, update
+
+from physion.errors import BadInputError
+from physion.experiment.store.sessions import insert_new
+from physion.experiment.store.tables import SESSIONS, STUDIES
+from physion.experiment.study.study import STUDY_FILE, Study
+
+
+def register(connection: Connection, study: Study, now: float) -> None:
+    """Note the state of the study folder; refuse one under which sessions could not go on.
+
+    Raises:
+        BadInputError: there are sessions of people or programs with other stimuli, or of a
+            scenario that the study has no more.
+    """
+    other = SESSIONS.c.session.in_(
+        select(SESSIONS.c.session)
+        .join(STUDIES, STUDIES.c.digest == SESSIONS.c.study)
+        .where(STUDIES.c.stimuli_digest != study.stimuli_digest)
+    )
+    gone = SESSIONS.c.scenario.not_in(study.scenarios)
+    count = sum(_by_scenario(connection, other).values())
+    if count:
+        raise BadInputError(
+            f"{count} sessions were made with another stimuli.csv or other media; their orders of "
+            "trials would change. Bring the old stimuli back, or make a new study folder (or give "
+            "another database) for the new ones"
+        )
+    for scenario, of_scenario in _by_scenario(connection, gone).items():
+        raise BadInputError(
+            f"{of_scenario} sessions are of the scenario {scenario}, which {STUDY_FILE} has no "
+            f"more: put {scenario} back into scenarios (so that nobody new begins it, hand out "
+            "links of the others alone), or make a new study folder (or give another database) "
+            "without it"
+        )
+    # Previews are nobody's data: those that cannot go on simply end.
+    ended = (other | gone) & SESSIONS.c.finished_at.is_(None) & SESSIONS.c.withdrawn_at.is_(None)
+    connection.execute(update(SESSIONS).where(ended).values(withdrawn_at=now))
+    connection.execute(
+        insert_new(connection, STUDIES),
+        {
+            "digest": study.digest,
+            "name": study.name,
+            "version": study.version,
+            "stimuli_digest": study.stimuli_digest,
+            "settings": _settings(study),
+            "first_served": now,
+        },
+    )
+
+
+def _by_scenario(connection: Connection, which: ColumnElement[bool]) -> dict[str, int]:
+    """Sessions that are somebody's data, counted by scenario in the order of names."""
+    columns = SESSIONS.c
+    counts = select(columns.scenario, func.count()).where(which, columns.kind != "preview")
+    rows = connection.execute(counts.group_by(columns.scenario).order_by(columns.scenario))
+    return dict(rows.all())
+
+
+def _settings(study: Study) -> dict[str, Any]:
+    """All that the study decides and says, without stimuli: labels stay in the folder."""
+    left_out = {"folder", "stimuli"}
+    shallow = {name: value for name, value in vars(study).items() if name not in left_out}
+    return json.loads(json.dumps(shallow, default=_plain))  # type: ignore[no-any-return]
+
+
+def _plain(value: Any) -> Any:
+    return dict(value) if hasattr(value, "items") else asdict(value)

@@ -1,0 +1,149 @@
+"""The endpoints: a request body in, one call of the store, a response message out."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Literal
+
+from fastapi import APIRouter
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import Response
+
+from physion.experiment.protocol.messages import (
+    Answer,
+    Enter,
+    Events,
+    Health,
+    PageDone,
+    PublicStudy,
+    TrialMedia,
+)
+from physion.experiment.study.recruitment import RECRUITERS, begins_nothing
+from physion.experiment.study.stimuli import PHASES
+from physion.experiment.web.bearer import read_token
+from physion.experiment.web.bodies import read_message
+from physion.experiment.web.guards import GIVEN_TOKEN
+from physion.experiment.web.media_links import sign_media
+from physion.experiment.web.refusals import Reply, refuse
+
+if TYPE_CHECKING:
+    from physion.experiment.store.store import Store
+    from physion.experiment.study.identity import Secrets
+    from physion.experiment.study.study import Study
+
+SHOWN: tuple[Literal["movie"], Literal["map"]] = ("movie", "map")
+
+
+def public_study(study: Study, secrets: Secrets) -> PublicStudy:
+    """What anyone may know."""
+    return PublicStudy(
+        title=study.title,
+        contact=study.contact,
+        languages=list(study.languages),
+        consent_version=study.consent_version,
+        scenarios=list(study.scenarios),
+        id_needed=study.recruitment.id_needed,
+        min_width=study.screen.min_width,
+        min_height=study.screen.min_height,
+        cue_ms=study.timing.cue_ms,
+        flash_hz=study.timing.flash_hz,
+        preload=study.preload,
+        example={name: _example(study, secrets, name) for name in study.scenarios},
+        recruiters=list(RECRUITERS),
+    )
+
+
+def _example(study: Study, secrets: Secrets, scenario: str) -> TrialMedia:
+    """The last trial of familiarization, observed part alone: the one whose memory fades longest
+    until it comes, and no trial of the test.
+    """
+    trial = len(study.phase(scenario, "familiarization")) - 1
+    shown = study.phase(scenario, "familiarization")[trial]
+    movie, picture = (
+        sign_media(study, secrets, scenario, 0, "familiarization", trial, kind) for kind in SHOWN
+    )
+    return TrialMedia(
+        trial=0,
+        movie=movie,
+        map=picture,
+        frames=shown.frames,
+        rate=shown.rate,
+        width=shown.width,
+        height=shown.height,
+        fixation_ms=1000,
+    )
+
+
+def token_of(request: Request) -> str:
+    """The token that a request carries; empty where there is none."""
+    return read_token(request.scope["headers"])
+
+
+def build_api(study: Study, secrets: Secrets, store: Store) -> APIRouter:
+    """The router of ``/api``."""
+    router = APIRouter(prefix="/api")
+    about = public_study(study, secrets).model_dump_json().encode()
+    texts = {
+        language: json.dumps(dict(words), ensure_ascii=False).encode()
+        for language, words in study.texts.items()
+    }
+
+    # First, since routes are tried in order, and this one is asked for most.
+    @router.post("/answers")
+    async def post_answer(request: Request) -> Response:
+        answer = await read_message(request, Answer)
+        return Reply(await store.answer(token_of(request), answer))
+
+    @router.get("/study")
+    async def get_study(request: Request) -> Response:
+        return Response(about, media_type="application/json")
+
+    @router.get("/texts/{language}")
+    async def get_texts(request: Request) -> Response:
+        words = texts.get(request.path_params["language"])
+        return (
+            refuse("not_found") if words is None else Response(words, media_type="application/json")
+        )
+
+    @router.post("/enter")
+    async def post_enter(request: Request) -> Response:
+        enter = await read_message(request, Enter)
+        if begins_nothing(enter):
+            return refuse("not_yet", "Accept the task first.")
+        entered = await store.enter(enter)
+        request.scope["state"][GIVEN_TOKEN] = entered.token
+        return Reply(entered)
+
+    @router.get("/session")
+    async def get_session(request: Request) -> Response:
+        load = request.query_params.get("load") == "true"
+        return Reply(await store.state(token_of(request), load))
+
+    @router.get("/trials/{phase}")
+    async def get_trials(request: Request) -> Response:
+        phase = request.path_params["phase"]
+        if phase not in PHASES:
+            return refuse("not_found")
+        return Reply(await run_in_threadpool(store.trials, token_of(request), phase))
+
+    @router.post("/page")
+    async def post_page(request: Request) -> Response:
+        page = await read_message(request, PageDone)
+        return Reply(await store.page(token_of(request), page))
+
+    @router.post("/events")
+    async def post_events(request: Request) -> Response:
+        events = await read_message(request, Events)
+        return Reply(await store.events(token_of(request), events))
+
+    @router.get("/result")
+    async def get_result(request: Request) -> Response:
+        return Reply(await run_in_threadpool(store.result, token_of(request)))
+
+    @router.api_route("/health", methods=["GET", "HEAD"])
+    async def get_health(request: Request) -> Response:
+        answers = await run_in_threadpool(store.healthy)
+        return Reply(Health(ok=True)) if answers else refuse("unavailable")
+
+    return router

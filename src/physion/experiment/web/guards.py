@@ -1,0 +1,201 @@
+"""What stands before the application: limits of size and rate, headers, errors that say nothing.
+
+Pure ASGI: a request passes through two small wrappers and no extra task.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+import time
+from typing import TYPE_CHECKING
+from urllib.parse import quote
+
+from starlette.requests import ClientDisconnect
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from physion.experiment.protocol.messages import MAX_BODY
+from physion.experiment.web.bearer import read_token
+from physion.experiment.web.rate_limits import RateLimits
+from physion.experiment.web.refusals import Reply, refuse
+from physion.experiment.web.security_headers import HTTPS_ONLY, security_headers
+
+if TYPE_CHECKING:
+    from physion.experiment.study.study import Study
+
+log = logging.getLogger("physion.experiment")
+
+MAX_TARGET = 4096
+"""Bytes of path and query together."""
+MAX_HEADERS, MAX_HEADER_BYTES = 64, 16 * 1024
+GIVEN_TOKEN = "given_token"
+"""State of a request under which the application says which new token its answer holds."""
+BODY_SECONDS = 20.0
+"""A body that takes longer is given up."""
+LINGER_BYTES, LINGER_SECONDS = 256 * 1024, 1.0
+"""So much of a refused body is still taken, else the client would not read why it was refused."""
+
+
+class _BodyRefused(Exception):
+    """Ends an application whose request's body is too large or too slow."""
+
+
+class Guards:
+    """ASGI middleware around everything that is served."""
+
+    def __init__(self, app: ASGIApp, study: Study) -> None:
+        self._app = app
+        self._headers = security_headers(study)
+        self._limits = RateLimits(study.limits)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "lifespan":
+            await self._app(scope, receive, send)
+        elif scope["type"] == "http":
+            await _Exchange(self._app, self._headers, self._limits, scope, receive, send).run()
+        else:
+            await send({"type": "websocket.close", "code": 1000})
+
+
+class _Exchange:
+    """One request and its response."""
+
+    def __init__(self, app: ASGIApp, headers: list[tuple[bytes, bytes]], limits: RateLimits,
+                 scope: Scope, receive: Receive, send: Send) -> None:  # fmt: skip
+        self._app, self._extra, self._limits = app, headers, limits
+        self._scope, self._receive, self._send = scope, receive, send
+        scope.setdefault("state", {})
+        self._address = scope["client"][0] if scope.get("client") else ""
+        self._path: str = scope["path"]
+        self._token = read_token(scope["headers"])
+        self._declared = 0
+        self._deadline = 0.0
+        self._taken = 0
+        self._body_ended = True
+        self._refusal: Reply | None = None
+        self._started = False
+
+    async def run(self) -> None:
+        refusal = self._read_headers() or self._check_rate()
+        if refusal is not None:
+            await self._refuse(refusal)
+            return
+        try:
+            await self._app(self._scope, self.receive, self.send)
+        except _BodyRefused:
+            pass
+        except ClientDisconnect:
+            return
+        except Exception:
+            # Path and trace alone: query, headers and body may tell who takes part.
+            log.exception("%s %s failed", self._scope["method"], quote(self._path))
+            if self._started:
+                raise
+            self._refusal = refuse("server_error")
+        if self._refusal is not None and not self._started:
+            await self._refuse(self._refusal)
+
+    def _read_headers(self) -> Reply | None:
+        """Take what is needed of the headers; refuse what is out of measure."""
+        scope = self._scope
+        headers = scope["headers"]
+        target = len(scope.get("raw_path") or b"") + len(scope["query_string"])
+        if target > MAX_TARGET or len(headers) > MAX_HEADERS:
+            return refuse("too_large", "The address or the headers are too long.")
+        size = 0
+        for name, value in headers:
+            size += len(name) + len(value)
+            if name == b"content-length":
+                self._declared = int(value) if value.isdigit() and len(value) < 19 else MAX_BODY + 1
+                self._body_ended = self._declared == 0
+            elif name == b"transfer-encoding":
+                self._body_ended = False
+        if size > MAX_HEADER_BYTES:
+            return refuse("too_large", "The address or the headers are too long.")
+        return refuse("too_large") if self._declared > MAX_BODY else None
+
+    def _check_rate(self) -> Reply | None:
+        wait = self._limits.before(
+            self._scope["method"], self._path, self._token, self._address, time.monotonic()
+        )
+        if wait <= 0:
+            return None
+        return refuse("too_many", headers={"retry-after": str(math.ceil(wait))})
+
+    async def receive(self) -> Message:
+        """The next part of the body, as long as body and time allow."""
+        if self._body_ended:
+            return await self._receive()
+        now = asyncio.get_running_loop().time()
+        self._deadline = self._deadline or now + BODY_SECONDS
+        try:
+            async with asyncio.timeout_at(self._deadline):
+                message = await self._receive()
+        except TimeoutError as error:
+            self._refusal = refuse("bad_request", "The body took too long.", status=408)
+            raise _BodyRefused from error
+        self._taken += len(message.get("body", b""))
+        self._body_ended = not message.get("more_body", False)
+        if self._taken > MAX_BODY:
+            self._refusal = refuse("too_large")
+            raise _BodyRefused
+        return message
+
+    async def send(self, message: Message) -> None:
+        """Pass a response on with our headers; drop it where the body was refused meanwhile."""
+        if self._refusal is not None and not self._started:
+            return
+        if message["type"] == "http.response.start":
+            self._started = True
+            self._learn(message["status"])
+            message = self._with_headers(message)
+        await self._send(message)
+
+    def _learn(self, status: int) -> None:
+        now = time.monotonic()
+        self._limits.after(status, self._path, self._token, self._address, now)
+        given = self._scope["state"].get(GIVEN_TOKEN)
+        if given is not None:
+            self._limits.gave_out(given, now)
+
+    def _with_headers(self, message: Message) -> Message:
+        if log.isEnabledFor(logging.INFO):
+            # Without the query, which may tell who comes; quoted: nobody writes lines of their own.
+            path = quote(self._path[:200])
+            log.info("%s %s %d", self._scope["method"], path, message["status"])
+        headers = list(message.get("headers", ()))
+        given = {name for name, _ in headers}
+        headers += [pair for pair in self._extra if pair[0] not in given]
+        if b"cache-control" not in given:
+            headers.append((b"cache-control", b"no-store"))
+        if self._scope["scheme"] == "https":
+            headers.append(HTTPS_ONLY)
+        if not self._body_ended:
+            headers.append((b"connection", b"close"))
+        return {**message, "headers": headers}
+
+    async def _refuse(self, reply: Reply) -> None:
+        """Answer at once, then take a bounded rest of the body so that the answer arrives."""
+        if not self._body_ended and self._declared <= MAX_BODY and self._taken <= MAX_BODY:
+            await self._linger()
+        start = {"type": "http.response.start", "status": reply.status_code,
+                 "headers": reply.raw_headers}  # fmt: skip
+        self._started = True
+        await self._send(self._with_headers(start))
+        body = b"" if self._scope["method"] == "HEAD" else reply.body
+        await self._send({"type": "http.response.body", "body": body, "more_body": True})
+        if not self._body_ended:
+            await self._linger()
+        await self._send({"type": "http.response.body", "body": b""})
+
+    async def _linger(self) -> None:
+        taken = 0
+        try:
+            async with asyncio.timeout(LINGER_SECONDS):
+                while not self._body_ended and taken < LINGER_BYTES:
+                    message = await self._receive()
+                    taken += len(message.get("body", b""))
+                    self._body_ended = not message.get("more_body", False)
+        except TimeoutError:
+            return

@@ -1,0 +1,92 @@
+"""Rigid bodies as cubic lattices of particles, as NVIDIA Flex fills its solids."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+
+from physion.numerics.linear_algebra import dot, multiply, norm
+from physion.physics.cloth.solver import Solids
+from physion.scenes.scene import Body, Vec3
+from physion.scenes.shapes.primitives import Piece, shape
+
+Points = NDArray[np.float64]
+Filled = NDArray[np.bool_]
+
+
+@lru_cache(maxsize=256)
+def fill_shape(name: str, scale: Vec3, spacing: float) -> tuple[Points, Filled]:
+    """Fill a shape at ``scale`` with a lattice of particles ``spacing`` metres apart.
+
+    Returns the lattice's first corner (3,) in the body's frame and its occupancy (I, J, K). The
+    lattice is centred in the bounds and holds as many whole spacings as fit, at least one point
+    a side. A shape too thin for every lattice point gets the one closest to its middle, so that
+    no body is without particles.
+    """
+    found = shape(name)
+    low, high = found.bounds * np.asarray(scale)
+    # A side of exactly n spacings holds n points however its length was rounded.
+    sizes = np.maximum(((high - low) / spacing * (1 + 1e-4)).astype(int), 1)
+    origin = (low + high) / 2 - (sizes - 1) / 2 * spacing
+    axes = [origin[k] + spacing * np.arange(sizes[k]) for k in range(3)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    filled = np.zeros(len(grid), np.bool_)
+    for piece in found.pieces:
+        filled |= _inside(piece, grid / np.asarray(scale))
+    if not filled.any():
+        filled[np.argmin(norm(grid - (low + high) / 2))] = True
+    return origin, filled.reshape(tuple(int(n) for n in sizes))
+
+
+def _inside(piece: Piece, points: Points) -> Filled:
+    """Which ``points`` (P, 3) of the shape's frame at unit scale lie in a convex piece."""
+    if piece.kind == "convex":
+        planes = ConvexHull(piece.vertices).equations
+        return np.asarray((multiply(points, planes[:, :3].T) + planes[:, 3] <= 1e-9).all(axis=1))
+    local = multiply(points - np.asarray(piece.center), piece.turn) / np.asarray(piece.half)
+    if piece.kind == "box":
+        return np.asarray((np.abs(local) <= 1 + 1e-9).all(axis=1))
+    if piece.kind == "sphere":
+        return np.asarray(dot(local, local) <= 1 + 1e-9)
+    round_ = dot(local[:, :2], local[:, :2]) <= 1 + 1e-9
+    return np.asarray(round_ & (np.abs(local[:, 2]) <= 1 + 1e-9))
+
+
+def particles_of(body: Body, spacing: float) -> Points:
+    """Particles (P, 3) of a body in its own frame, metres, scaled; pose not applied."""
+    origin, filled = fill_shape(body.shape, body.scale, spacing)
+    return np.asarray(origin + spacing * np.argwhere(filled))
+
+
+def surface_particles(body: Body, spacing: float) -> Points:
+    """Those particles of a body that lack one of their six neighbours: enough for distances."""
+    origin, filled = fill_shape(body.shape, body.scale, spacing)
+    padded = np.pad(filled, 1)
+    buried = filled.copy()
+    for axis in range(3):
+        for shift in (-1, 1):
+            buried &= np.roll(padded, shift, axis)[1:-1, 1:-1, 1:-1]
+    return np.asarray(origin + spacing * np.argwhere(filled & ~buried))
+
+
+def fill_bodies(bodies: tuple[Body, ...], spacing: float) -> Solids:
+    """All bodies as lattices, in their order; scenery is drawn only and stays empty."""
+    lattices = [
+        (np.zeros(3), np.zeros((0, 0, 0), np.bool_))
+        if body.scenery
+        else fill_shape(body.shape, body.scale, spacing)
+        for body in bodies
+    ]
+    counts = np.array([filled.size for _, filled in lattices], np.int64)
+    return Solids(
+        np.array([origin for origin, _ in lattices], np.float64).reshape(-1, 3),
+        np.array([filled.shape for _, filled in lattices], np.int64).reshape(-1, 3),
+        np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)[:-1]])
+        if len(counts)
+        else np.zeros(0, np.int64),
+        np.concatenate([filled.ravel() for _, filled in lattices] or [np.zeros(0, np.bool_)]),
+        spacing,
+    )

@@ -1,0 +1,228 @@
+"""Figures over stimuli: models against people, accuracies, response times, calibration.
+
+Every function draws its table and nothing else; `figure_tables` makes the tables.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import matplotlib
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from physion.analysis.statistics.agreement import pearson
+from physion.analysis.tables.score_tables import in_order
+from physion.report.figures.by_scenario import label
+from physion.report.figures.theme import HATCHES, LIGHT, Theme, legend, panels, style, title
+from physion.report.page.blocks import number
+
+BINS = np.linspace(0, 1, 21)
+"""Edges of the bars in the distribution of accuracy."""
+
+TAIL = (
+    ("not below chance", 0),
+    ("below chance by the study's rule alone", 4),
+    ("below chance also when corrected", 5),
+)
+"""What the bars of that distribution are made of, and their places in the palette."""
+
+
+SQUARE = 1.16
+"""Width of a scenario's square and the gap beside it, in units of its scale from 0 to 1."""
+
+
+def scatter_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
+    """Points: P(contact) of each model against the share of people who say yes, by stimulus.
+
+    ``table``: see `figure_tables.scatter_table`. A panel a model, in it a square a scenario, so
+    that no colour is needed; hollow points are stimuli whose simulated outcome is not the official
+    one.
+    """
+    agents = list(table["agent"].unique())
+    scenarios = in_order(table["scenario"])
+    columns = max(1, min(4, 8 // len(scenarios)))
+    width = 11 / columns
+    height = (width - 0.4) / (SQUARE * len(scenarios))
+    with matplotlib.rc_context(style(theme)):
+        figure, axes = panels(
+            len(agents), columns, (width, height + 0.52), above=0.4, sharex=True, sharey=True
+        )
+        for axis, agent in zip(axes, agents, strict=True):
+            _squares(axis, table[table["agent"] == agent], scenarios, theme)
+        figure.supxlabel("share of people who say yes", fontsize=10)
+        figure.supylabel("P(contact) of the model", fontsize=10)
+        if (table["label"] != table["simulated"]).any():
+            legend(figure, _scatter_handles(theme), 2)
+    return figure
+
+
+def _squares(axis: Axes, rows: pd.DataFrame, scenarios: Sequence[str], theme: Theme) -> None:
+    """The squares of one model, beside each other on one axis, which is quick to draw."""
+    left = SQUARE * np.arange(len(scenarios))
+    frame = np.array([(0, 0), (1, 1), (np.nan, np.nan), (0, 1), (0, 0), (1, 0), (np.nan, np.nan)])
+    lines = np.concatenate([frame + np.array([x, 0]) for x in left])
+    axis.plot(*lines.T, color=theme.faint, linewidth=0.8, zorder=0)
+    x = rows["p_yes"] + rows["scenario"].map(dict(zip(scenarios, left, strict=True)))
+    changed = rows["label"] != rows["simulated"]
+    for hollow in (False, True):
+        if (changed == hollow).any():
+            # Markers of a line are one drawing each in SVG and quick to make.
+            axis.plot(x[changed == hollow], rows["p_contact"][changed == hollow],
+                      **_point(hollow, theme))  # fmt: skip
+    for place, scenario in zip(left, scenarios, strict=True):
+        own = rows[rows["scenario"] == scenario]
+        words = f"{scenario}, {_r_words(own['p_contact'], own['p_yes'])}"
+        axis.text(place, 1.05, words, fontsize=7.5, va="bottom")
+    pooled = f"{_r_words(rows['p_contact'], rows['p_yes'])} pooled, {len(rows)} stimuli"
+    join = ", " if len(scenarios) > 3 else "\n"
+    axis.set_title(f"{label(rows['agent'].iloc[0], 90)}{join}{pooled}", fontsize=8.5, loc="left",
+                   pad=15)  # fmt: skip
+    axis.set_xlim(-0.04, left[-1] + 1.04)
+    axis.set_ylim(-0.04, 1.04)
+    axis.set_aspect("equal")
+    axis.set_xticks(np.ravel(np.column_stack([left, left + 1])), ["0", "1"] * len(left), fontsize=8)
+    axis.set_yticks([0, 0.5, 1])
+    axis.spines[["left", "bottom"]].set_visible(False)
+
+
+def _r_words(x: pd.Series, y: pd.Series) -> str:
+    return f"r = {number(pearson(x, y))}"
+
+
+def _point(hollow: bool, theme: Theme) -> dict[str, Any]:
+    colour = theme.palette[0]
+    look = {"linestyle": "", "marker": "o", "markersize": 3.2, "color": colour}
+    if hollow:
+        return look | {"markerfacecolor": "none", "markeredgewidth": 0.9}
+    return look | {"alpha": 0.55, "markeredgewidth": 0}
+
+
+def _scatter_handles(theme: Theme) -> list[Line2D]:
+    names = ("stimulus", "stimulus whose simulated outcome differs")
+    return [
+        Line2D([], [], label=name, **_point(hollow, theme))
+        for name, hollow in zip(names, (False, True), strict=True)
+    ]
+
+
+def difficulty_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
+    """How many stimuli people get right how often, by scenario, with the tail below chance.
+
+    ``table``: from `difficulty.below_chance`.
+    """
+    scenarios = in_order(table["scenario"])
+    with matplotlib.rc_context(style(theme)):
+        size = (11 / 4, 2.1)
+        figure, axes = panels(len(scenarios), 4, size, above=0.7, sharex=True, sharey=True)
+        for axis, scenario in zip(axes, scenarios, strict=True):
+            rows = table[table["scenario"] == scenario]
+            _tail_bars(axis, rows, theme)
+            axis.axvline(0.5, color=theme.ink, linestyle=":", linewidth=1)
+            axis.axvline(rows["accuracy"].mean(), color=theme.ink, linestyle="--", linewidth=1.2)
+            title(axis, scenario)
+            axis.set_xlim(0, 1)
+            tail = int((rows["released"] | rows["exact"]).sum())
+            axis.text(0.03, 0.95, f"{tail} of {len(rows)}\nbelow chance", fontsize=8, va="top",
+                      transform=axis.transAxes)  # fmt: skip
+        figure.supxlabel("accuracy of people on a stimulus", fontsize=10)
+        figure.supylabel("stimuli", fontsize=10)
+        handles: list[Patch | Line2D] = [
+            Patch(facecolor=_tail_colour(place, theme), hatch=_tail_hatch(place),
+                  edgecolor=theme.paper, label=words)
+            for words, place in TAIL
+        ]  # fmt: skip
+        handles.append(Line2D([], [], color=theme.ink, linestyle="--", label="mean"))
+        handles.append(Line2D([], [], color=theme.ink, linestyle=":", label="chance"))
+        legend(figure, handles, 5)
+    return figure
+
+
+def _tail_bars(axis: Axes, rows: pd.DataFrame, theme: Theme) -> None:
+    """Stacked bars; those without height are not drawn."""
+    corrected = rows["exact"].to_numpy(dtype=bool)
+    alone = rows["released"].to_numpy(dtype=bool) & ~corrected
+    below = np.zeros(len(BINS) - 1)
+    for (_, place), own in zip(TAIL, (~(alone | corrected), alone, corrected), strict=True):
+        count, _ = np.histogram(rows["accuracy"][own], BINS)
+        there = count > 0
+        axis.bar(BINS[:-1][there], count[there], np.diff(BINS)[there], below[there], align="edge",
+                 facecolor=_tail_colour(place, theme), edgecolor=theme.paper,
+                 hatch=_tail_hatch(place), linewidth=0.6)  # fmt: skip
+        below += count
+
+
+def _tail_colour(place: int, theme: Theme) -> str:
+    return theme.palette[place]
+
+
+def _tail_hatch(place: int) -> str:
+    return {0: "", 4: HATCHES[1], 5: HATCHES[3]}[place]
+
+
+def response_time_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
+    """Mean log response time of a stimulus against its accuracy, by scenario, with a line.
+
+    ``table``: see `figure_tables.response_time_table`.
+    """
+    scenarios = in_order(table["scenario"])
+    with matplotlib.rc_context(style(theme)):
+        size = (11 / 4, 2.5)
+        figure, axes = panels(len(scenarios), 4, size, above=0.3, sharex=True, sharey=True)
+        for place, (axis, scenario) in enumerate(zip(axes, scenarios, strict=True)):
+            rows = table[(table["scenario"] == scenario) & table["mean_log_rt"].notna()]
+            x = rows["accuracy"].to_numpy(dtype=np.float64)
+            y = rows["mean_log_rt"].to_numpy(dtype=np.float64)
+            colour, marker = theme.mark(place)
+            axis.plot(x, y, linestyle="", marker=marker, color=colour, markersize=3.6, alpha=0.7,
+                      markeredgewidth=0)  # fmt: skip
+            r = pearson(x, y)
+            if np.isfinite(r):
+                slope, level = np.polyfit(x, y, 1)
+                ends = np.array([x.min(), x.max()])
+                axis.plot(ends, level + slope * ends, color=theme.ink, linewidth=1.3)
+            title(axis, scenario)
+            axis.set_title(f"r = {number(r)}", fontsize=8.5, loc="right")
+            axis.set_xlim(-0.03, 1.03)
+            axis.set_xticks([0, 0.5, 1])
+        figure.supxlabel("accuracy of people on a stimulus", fontsize=10)
+        figure.supylabel("mean log response time (log ms)", fontsize=10)
+    return figure
+
+
+def calibration_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
+    """Reliability curves: how often contact follows where a model says so much; one panel a model.
+
+    ``table``: see `figure_tables.calibration_table`. The area of a point goes with its stimuli.
+    """
+    agents = list(table["agent"].unique())
+    columns = 3 if len(agents) <= 6 else 5
+    with matplotlib.rc_context(style(theme)):
+        width = 11 / columns
+        figure, axes = panels(len(agents), columns, (width, width + 0.2), above=0.5,
+                              sharex=True, sharey=True)  # fmt: skip
+        for axis, agent in zip(axes, agents, strict=True):
+            rows = table[(table["agent"] == agent) & (table["stimuli"] > 0)]
+            axis.plot([0, 1], [0, 1], color=theme.faint, linewidth=1, linestyle=":")
+            axis.vlines(rows["mean_p"], rows["low"], rows["high"], color=theme.palette[0],
+                        linewidth=1.1)  # fmt: skip
+            axis.plot(rows["mean_p"], rows["share"], color=theme.palette[0], linewidth=0.8)
+            share = rows["stimuli"] / rows["stimuli"].sum()
+            axis.scatter(rows["mean_p"], rows["share"], s=8 + 160 * share, zorder=3,
+                         color=theme.palette[0], edgecolors=theme.ink, linewidths=0.6)  # fmt: skip
+            words = label(agent, 30 if columns == 5 else 44)
+            brier = table.loc[table["agent"] == agent, "brier"].iloc[0]
+            axis.set_title(f"{words}\nBrier {brier:.3f}", fontsize=8, loc="left")
+            axis.set_xlim(-0.03, 1.03)
+            axis.set_ylim(-0.03, 1.03)
+            axis.set_aspect("equal")
+            axis.set_xticks([0, 0.5, 1])
+            axis.set_yticks([0, 0.5, 1])
+        figure.supxlabel("P(contact) of the model", fontsize=10)
+        figure.supylabel("share of stimuli with contact", fontsize=10)
+    return figure

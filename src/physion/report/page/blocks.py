@@ -1,0 +1,345 @@
+"""The pieces of the report page: tables, lists and cards, every text escaped."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Literal
+
+import numpy as np
+import pandas as pd
+
+from physion.analysis.models.comparison import Comparison
+from physion.analysis.tables.predictions import DATASETS
+from physion.analysis.tables.score_tables import MEAN, POOLED, in_order
+
+MOST_BARS = 8
+"""Models of which a card shows each; of more it shows the one it is about and the others' mean."""
+
+
+def details(title: str, content: str) -> str:
+    """A part that opens on a click; ``content`` is HTML."""
+    return f"<details><summary>{escape(title)}</summary>\n{content}</details>"
+
+
+def plural(count: int, noun: str) -> str:
+    """``1 model``, ``2 models``, ``2 stimuli``."""
+    many = noun.removesuffix("us") + "i" if noun.endswith("us") else noun + "s"
+    return f"{count} {noun if count == 1 else many}"
+
+
+def protocol_names(text: str) -> str:
+    """``text`` with trainings called by their protocols: *all*, *all-but*, *only*.
+
+    Tables of the analysis name the column of the predictions, *dynamics training dataset same*; the
+    page and the figures write *only*. Of parts other than the dynamics the column stays in sight.
+    """
+    short = _RELATIVE.sub(lambda found: found[1] + PROTOCOLS[found[2]], text)
+    return short.replace(" · dynamics training dataset ", " · ")
+
+
+PROTOCOLS = {"same": "only", "all but this": "all-but"}
+"""What a training in relation to the tested scenario is called, by its name in predictions."""
+
+_RELATIVE = re.compile(rf"( · (?:{'|'.join(DATASETS)}) )(same|all but this)\b", re.IGNORECASE)
+
+
+def number(value: float, digits: int = 2) -> str:
+    """A number with so many decimals, a minus that is one, no minus zero; ``NaN`` if undefined."""
+    if pd.isna(value):
+        return "NaN"
+    # Adding zero turns -0.0 into 0.0.
+    return f"{round(float(value), digits) + 0.0:.{digits}f}".replace("-", "−")
+
+
+def p_value(value: float) -> str:
+    """A p value to three decimals, or ``< .001``."""
+    if pd.isna(value):
+        return "NaN"
+    return "&lt; 0.001" if value < 0.001 else number(value, 3)
+
+
+def undefined(reason: str) -> str:
+    """``NaN`` with its reason on hovering, as HTML."""
+    return f'<span class="none" title="{escape(reason)}">NaN</span>'
+
+
+def interval(row: pd.Series, key: str, low: str = "", high: str = "", digits: int = 2) -> str:
+    """A value with its interval in small print, as HTML; NaN with its reason where undefined.
+
+    ``low`` and ``high``: columns of the bounds, if they are not ``key`` with _low and _high.
+    """
+    if pd.isna(row[key]):
+        return undefined(str(row.get("reason", "")))
+    bounds = row.get(low or f"{key}_low", np.nan), row.get(high or f"{key}_high", np.nan)
+    if pd.isna(bounds[0]):
+        return f"{number(row[key], digits)} <small>no interval</small>"
+    spread = " to ".join(number(bound, digits) for bound in bounds)
+    return f"{number(row[key], digits)} <small>{spread}</small>"
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table of the page: its heading, and how the value of ``key`` is written."""
+
+    heading: str
+    key: str
+    kind: Literal["text", "count", "number", "interval", "p", "percent"] = "number"
+    digits: int = 2
+    low: str = ""
+    high: str = ""
+
+    def cell(self, row: pd.Series) -> str:
+        """The cell as HTML."""
+        value = row.get(self.key)
+        if self.kind == "interval":
+            return interval(row, self.key, self.low, self.high, self.digits)
+        if self.kind == "text":
+            return "" if value is None or value != value else escape(str(value))
+        if pd.isna(value):
+            return undefined(str(row.get("reason", "")))
+        if self.kind == "count":
+            return str(round(float(value)))
+        if self.kind == "p":
+            return p_value(float(value))
+        return percent(float(value)) if self.kind == "percent" else number(value, self.digits)
+
+
+def rows_table(rows: pd.DataFrame, columns: Sequence[Column], caption: str = "") -> str:
+    """A table of some columns of ``rows``; reasons of undefined numbers are listed below it."""
+    cells = [[column.cell(row) for column in columns] for _, row in rows.iterrows()]
+    return table([column.heading for column in columns], cells, caption) + notes(rows, columns)
+
+
+def notes(rows: pd.DataFrame, columns: Sequence[Column]) -> str:
+    """The column ``reason`` of rows, once each, with how many rows it is about."""
+    if "reason" not in rows:
+        return ""
+    given = rows[rows["reason"].astype(str).str.len() > 0]
+    items = []
+    for reason, own in given.groupby("reason", sort=False):
+        named = [str(row[columns[0].key]) for _, row in own.iterrows()]
+        who = ", ".join(dict.fromkeys(named)) if len(set(named)) <= 8 else f"{len(named)} rows"
+        items.append(f"<li>{escape(who)}: {escape(str(reason))}</li>")
+    return f'<ul class="notes">{"".join(items)}</ul>' if items else ""
+
+
+def words_list(values: Mapping[str, str]) -> str:
+    """Names and what they mean or say."""
+    rows = "".join(f"<dt>{escape(k)}</dt><dd>{escape(v)}</dd>" for k, v in values.items())
+    return f"<dl>{rows}</dl>"
+
+
+def paragraph(words: str) -> str:
+    """Words as a paragraph."""
+    return f"<p>{escape(words)}</p>"
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]], caption: str = "") -> str:
+    """A table; the header and the caption are text, the cells are HTML."""
+    head = "".join(f'<th scope="col">{escape(name)}</th>' for name in header)
+    lines = []
+    for first, *rest in rows:
+        cells = "".join(f"<td>{cell}</td>" for cell in rest)
+        lines.append(f'<tr><th scope="row">{first}</th>{cells}</tr>')
+    above = f"<caption>{escape(caption)}</caption>" if caption else ""
+    body = "\n".join(lines)
+    return (
+        f'<div class="wide"><table>{above}<thead><tr>{head}</tr></thead>\n'
+        f"<tbody>\n{body}\n</tbody></table></div>\n"
+    )
+
+
+def overall_table(comparison: Comparison, which: str, caption: str = "") -> str:
+    """A row a model: accuracy against both outcomes, beside people; r with its ceiling; RMSD.
+
+    What is about simulated outcomes is absent where they all are the official ones.
+    """
+    rows = comparison.scores[comparison.scores["scenario"] == which]
+    shown = {"accuracy": "accuracy", "accuracy_simulated": "against simulated outcome"}
+    if comparison.has_people:
+        shown |= {"human_accuracy": "people", "difference": "difference", "r": "Pearson r",
+                  "r_same": "r, same outcome"}  # fmt: skip
+    if comparison.changed.empty:
+        shown = {k: v for k, v in shown.items() if k not in ("accuracy_simulated", "r_same")}
+    header = ["model", "readout", "stimuli", *shown.values()]
+    header += ["ceiling of r", "RMSD"] if comparison.has_people else []
+    cells = []
+    for _, row in rows.iterrows():
+        line = [escape(_model_words(row)), escape(row["readout"]), str(row["stimuli"])]
+        line += [interval(row, key) for key in shown]
+        if comparison.has_people:
+            line += [number(row["ceiling"]), interval(row, "rmsd")]
+        cells.append(line)
+    reasons = [
+        f"<li>{escape(row['agent'])}: {escape(row['reason'])}</li>"
+        for _, row in rows.iterrows()
+        if row["reason"]
+    ]
+    notes = f'<ul class="notes">{"".join(reasons)}</ul>' if reasons else ""
+    return table(header, cells, caption) + notes
+
+
+def _model_words(row: pd.Series) -> str:
+    """The model's name with what tells it from others of that name, but without the readout."""
+    head = f"{row['model']} · {row['readout']}"
+    return str(row["model"]) + str(row["agent"]).removeprefix(head)
+
+
+def matrix(comparison: Comparison, key: str) -> str:
+    """A score by model (rows) and scenario (columns), people on top."""
+    scores = comparison.scores
+    columns = [*in_order(comparison.stimuli["scenario"]), MEAN, POOLED]
+    rows = []
+    if comparison.has_people:
+        rows.append([f"<em>{_people_title(key)}</em>", *_people_cells(comparison, key, columns)])
+    for agent in comparison.agents:
+        own = scores[scores["agent"] == agent].set_index("scenario")
+        cells = [
+            interval(own.loc[name], key) if name in own.index else undefined("no predictions")
+            for name in columns
+        ]
+        rows.append([escape(agent), *cells])
+    return table(["", *columns], rows)
+
+
+def _people_title(key: str) -> str:
+    return "people" if key == "accuracy" else "ceiling"
+
+
+def _people_cells(comparison: Comparison, key: str, columns: Sequence[str]) -> list[str]:
+    people = comparison.people.set_index("scenario").assign(reason="")
+    if key == "accuracy":
+        return [interval(people.loc[name], key) if name in people.index else "" for name in columns]
+    return [number(people.loc[name, "ceiling"]) if name in people.index else "" for name in columns]
+
+
+_NO_ZONE = "known only of scenarios of which all stimuli that single participants saw are predicted"
+
+
+def people(comparison: Comparison) -> str:
+    """The people by scenario."""
+    header = ["scenario", "stimuli", "people", "base rate", "say yes", "accuracy", "zone"]
+    rows = []
+    for _, row in comparison.people.assign(reason="").iterrows():
+        zone = f"{number(row['zone_low'])} to {number(row['zone_high'])}"
+        rows.append(
+            [
+                escape(row["scenario"]),
+                str(row["stimuli"]),
+                number(row["people"], 0),
+                number(row["base_rate"]),
+                number(row["yes"]),
+                interval(row, "accuracy"),
+                zone if np.isfinite(row["zone_low"]) else undefined(_NO_ZONE),
+                number(row["reliability"], 3),
+                number(row["ceiling"], 3),
+            ]
+        )
+    return table([*header, "reliability", "ceiling of r"], rows, "People")
+
+
+def definitions(comparison: Comparison) -> str:
+    """What the columns mean; those that are hidden, see `overall_table`, are not explained."""
+    meaning = {
+        "accuracy": "share of the model's answers that equal the official outcome; people: mean "
+        "over stimuli of the share who are right, on the same stimuli",
+        "against simulated outcome": "the same answers against the outcome of the trial as it was "
+        "simulated for the model",
+        "Pearson r": "correlation over stimuli of P(contact) with the share of people who say yes, "
+        "that is, with the average person; “same outcome”: without the stimuli whose simulated "
+        "outcome is not the official one, as there people and model saw different events",
+        "RMSD": "root of the mean squared difference of these two",
+        "NaN": "undefined; the reason stands below the table or shows on hovering",
+        "all, all-but, only": "a model's training: on all scenarios, on all but the tested one, on "
+        "the tested one alone; in the files the last two are “all but this” and “same”",
+    }
+    if comparison.changed.empty:
+        del meaning["against simulated outcome"]
+        meaning["Pearson r"] = meaning["Pearson r"].partition(";")[0]
+    return f"<h3>What the numbers mean</h3>{words_list(meaning)}"
+
+
+def changed(comparison: Comparison, links: Mapping[str, str] | None = None) -> str:
+    """The trials whose simulated outcome is not the official one; ``links``: to their movies."""
+    rows = comparison.changed
+    if rows.empty:
+        return "<p>None.</p>"
+    counts = rows["scenario"].value_counts()
+    totals = comparison.stimuli.groupby("scenario")["stimulus"].nunique()
+    words = ", ".join(
+        f"{name} {counts.get(name, 0)} of {totals[name]}" for name in in_order(totals.index)
+    )
+    header = ["stimulus", "scenario", "official", "simulated"]
+    header += ["people say yes"] if comparison.has_people else []
+    cells = []
+    for _, row in rows.iterrows():
+        line = [stimulus_link(row["stimulus"], links or {}), escape(row["scenario"])]
+        line += [_outcome(row["label"]), _outcome(row["simulated"])]
+        line += [percent(row["p_yes"])] if comparison.has_people else []
+        cells.append(line)
+    listing = details(f"{plural(len(rows), 'trial')}, one by one", table(header, cells))
+    return (
+        f"<p>{len(rows)} of {comparison.stimuli['stimulus'].nunique()} stimuli: {escape(words)}. "
+        "There the models were shown another event than people saw, so accuracy is given against "
+        "both outcomes and r also without them.</p>" + listing
+    )
+
+
+def stimulus_link(stimulus: str, links: Mapping[str, str]) -> str:
+    """The name of a stimulus, a link where ``links`` has its movie."""
+    name = f"<code>{escape(stimulus)}</code>"
+    return f'<a href="{escape(links[stimulus])}">{name}</a>' if stimulus in links else name
+
+
+def dropped(comparison: Comparison) -> str:
+    """Counts of what was left out, and why."""
+    rows = comparison.dropped
+    if rows.empty:
+        return "<p>Nothing.</p>"
+    keys = ["agent", "reason"]
+    totals = rows.groupby(keys, sort=False)["stimuli"].sum().reset_index()
+    cells = [
+        [escape(row["agent"] or "people"), escape(row["reason"]), str(row["stimuli"])]
+        for _, row in totals.iterrows()
+    ]
+    return table(["whose", "reason", "stimuli"], cells)
+
+
+def card(comparison: Comparison, row: pd.Series, movie: str) -> str:
+    """One stimulus: its movie (HTML), outcome, what people and what every model said."""
+    own = comparison.stimuli[comparison.stimuli["stimulus"] == row["stimulus"]]
+    bars = [_bar("people say yes", row["p_yes"], "human")]
+    named = own["agent"] == row["agent"]
+    if len(own) <= MOST_BARS:
+        for _, answer in own.iterrows():
+            kind = "model named" if answer["agent"] == row["agent"] else "model"
+            bars.append(_bar(str(answer["agent"]), answer["p_contact"], kind))
+    else:
+        bars.append(_bar(str(row["agent"]), row["p_contact"], "model named"))
+        others = own.loc[~named, "p_contact"]
+        bars.append(_bar(f"mean of {len(others)} other models", others.mean(), "model"))
+    return (
+        f"<article>{movie}<h3>{escape(row['scenario'])}: {_outcome(row['label'])}</h3>"
+        f"<p><code>{escape(row['stimulus'])}</code></p>{''.join(bars)}</article>"
+    )
+
+
+def _bar(name: str, value: float, kind: str) -> str:
+    """A labelled bar; a ``meter`` would be coloured by the browser as good or bad."""
+    width = number(100 * value, 0)
+    return (
+        f'<div class="bar {kind}"><span>{escape(name)}</span><b>{percent(value)}</b>'
+        f'<i style="width:{width}%"></i></div>'
+    )
+
+
+def _outcome(value: bool) -> str:
+    return "contact" if value else "no contact"
+
+
+def percent(value: float) -> str:
+    """A share in percent, or ``NaN``."""
+    return f"{100 * value:.0f} %" if np.isfinite(value) else "NaN"

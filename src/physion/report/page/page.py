@@ -1,0 +1,176 @@
+"""The page of a comparison: models beside people, with all choices, tests and counts."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from html import escape
+from pathlib import Path
+
+from physion.analysis.tables.score_tables import MEAN, POOLED, in_order
+from physion.report.inputs import EXPECTED_METHODS, ReportInputs
+from physion.report.page import blocks, people_blocks, session_blocks, tests_of_models
+from physion.report.page.document import Picture, Section, figure, render_document
+from physion.report.page.movies import gaps
+
+
+def render_page(
+    inputs: ReportInputs, pictures: Sequence[Picture], folder: Path | None = None
+) -> str:
+    """The page as text; the same inputs give the same text. Raises `BadInputError` for a movie.
+
+    ``folder``: where the page will lie, so that it can link to the movies of other stimuli than
+    those that it holds itself.
+    """
+    shown = {picture.name: figure(picture) for picture in pictures}
+    links = _links(inputs, folder)
+    sections = [
+        Section("Scores", _scores(inputs)),
+        Section("By scenario", _by_scenario(inputs, shown)),
+        Section("Readout and training", _training(inputs, shown)),
+        Section("Stimulus by stimulus", _stimuli(inputs, shown, links)),
+        Section("Where model and people differ most", _gaps(inputs)),
+        Section("People", people_blocks.people(inputs, shown)),
+        Section("Sessions left out", session_blocks.sessions(inputs)),
+        Section("Tests", tests_of_models.tests(inputs)),
+        Section("Trials whose simulated outcome differs", blocks.changed(inputs.comparison, links)),
+        Section("How this was made", _methods(inputs)),
+        Section("What was left out", _left_out(inputs)),
+    ]
+    page = render_document(inputs.title, _summary(inputs), [s for s in sections if s.content])
+    return blocks.protocol_names(page)  # here, so that no table or caption has names of its own
+
+
+def _links(inputs: ReportInputs, folder: Path | None) -> Mapping[str, str]:
+    """Addresses of the movies by stimulus, relative to the page."""
+    if folder is None:
+        return {}
+    base = folder.resolve()
+    return {
+        stimulus: Path(os.path.relpath(path.resolve(), base)).as_posix()
+        for stimulus, path in inputs.movies.items()
+    }
+
+
+def _summary(inputs: ReportInputs) -> str:
+    comparison = inputs.comparison
+    stimuli = comparison.stimuli["stimulus"].nunique()
+    scenarios = in_order(comparison.stimuli["scenario"])
+    words = [
+        f"{blocks.plural(len(comparison.agents), 'model')} on {blocks.plural(stimuli, 'stimulus')} "
+        f"of {blocks.plural(len(scenarios), 'scenario')} ({', '.join(scenarios)})."
+    ]
+    if comparison.has_people:
+        mean = comparison.people.set_index("scenario").loc[MEAN]
+        words.append(
+            f"People: mean accuracy {mean['accuracy']:.3f} over scenarios, about "
+            f"{mean['people']:.0f} participants a stimulus."
+        )
+    else:
+        words.append("No answers of people were given: the models stand alone here.")
+    if inputs.people is not None:
+        flags = inputs.people.tables["flags"]
+        words.append(
+            f"Flagged and left out: {int(flags['flagged'].sum())} of "
+            f"{blocks.plural(len(flags), 'session')}; the main results are given with them too."
+        )
+    if len(comparison.changed):
+        words.append(
+            f"In {len(comparison.changed)} of these stimuli the simulated outcome is not the "
+            "official one; accuracy is given against both."
+        )
+    return f'<p class="lead">{escape(" ".join(words))}</p>'
+
+
+def _scores(inputs: ReportInputs) -> str:
+    comparison = inputs.comparison
+    return blocks.overall_table(comparison, MEAN, "Mean over scenarios") + blocks.details(
+        "All stimuli pooled", blocks.overall_table(comparison, POOLED)
+    )
+
+
+def _by_scenario(inputs: ReportInputs, shown: Mapping[str, str]) -> str:
+    comparison = inputs.comparison
+    parts = ["<h3>Accuracy</h3>", shown["accuracy"]]
+    parts.append(blocks.details("Accuracy as a table", blocks.matrix(comparison, "accuracy")))
+    if "r" in shown:
+        parts += ["<h3>Correlation with the average person</h3>", shown["r"]]
+        parts.append(
+            blocks.details("Pearson r by scenario, as a table", blocks.matrix(comparison, "r"))
+        )
+    if "kappa" in shown:
+        parts += ["<h3>Agreement with single participants</h3>", shown["kappa"]]
+        parts.append(people_blocks.measures(inputs))
+    return "\n".join(parts)
+
+
+def _training(inputs: ReportInputs, shown: Mapping[str, str]) -> str:
+    parts = [shown[name] for name in ("effects", "generalization") if name in shown]
+    return "\n".join(parts)
+
+
+def _stimuli(inputs: ReportInputs, shown: Mapping[str, str], links: Mapping[str, str]) -> str:
+    parts = []
+    for name, heading in (
+        ("scatter", "Models against people"),
+        ("thirds", "Hard, chance and easy stimuli"),
+        ("calibration", "Calibration of P(contact)"),
+    ):
+        if name in shown:
+            parts += [f"<h3>{heading}</h3>", shown[name]]
+    parts.append(tests_of_models.calibration(inputs))
+    if "difficulty" in shown:
+        parts += ["<h3>Stimuli that fool people</h3>", shown["difficulty"]]
+        parts.append(people_blocks.fooled(inputs, links))
+    if "response_time" in shown:
+        parts += ["<h3>Response times</h3>", shown["response_time"]]
+    return "\n".join(parts)
+
+
+def _gaps(inputs: ReportInputs) -> str:
+    return gaps(inputs) if inputs.comparison.has_people else ""
+
+
+def _methods(inputs: ReportInputs) -> str:
+    stated = dict.fromkeys(EXPECTED_METHODS, "not stated") | dict(inputs.methods)
+    choices = {**stated, **inputs.comparison.settings, **session_blocks.methods(inputs)}
+    return blocks.words_list(choices) + blocks.definitions(inputs.comparison)
+
+
+def _left_out(inputs: ReportInputs) -> str:
+    parts = ["<h3>Stimuli</h3>", blocks.dropped(inputs.comparison)]
+    if inputs.people is not None:
+        parts += ["<h3>Answers of people</h3>", session_blocks.dropped(inputs.people)]
+    missing = _cannot_be_said(inputs)
+    if missing:
+        items = "".join(f"<li>{escape(words)}</li>" for words in missing)
+        parts += [
+            "<h3>What cannot be said from these files</h3>",
+            f'<ul class="notes">{items}</ul>',
+        ]
+    return "\n".join(parts)
+
+
+def _cannot_be_said(inputs: ReportInputs) -> list[str]:
+    """What a full report would hold and this one lacks, and why."""
+    words = []
+    if not inputs.comparison.has_people:
+        words.append(
+            "Everything that compares with people: no answers of people were given (--humans for "
+            "their averages, --responses for single participants)."
+        )
+    if inputs.people is None:
+        words.append(
+            "Cohen's kappa with participants, their zones of r and kappa, split halves, response "
+            "times, biases, learning, exclusions and their effect, intervals that draw people, "
+            "mixed models of answers: they need the answers of single participants (--responses)."
+        )
+    elif inputs.people.tables["by_stimulus"]["mean_log_rt"].isna().all():
+        words.append("Response times: no answer has one above 0.")
+    counts = inputs.comparison.stimuli[["agent", "stimulus"]].groupby("agent").size()
+    if counts.nunique() > 1:
+        words.append(
+            f"Models answered between {counts.min()} and {counts.max()} stimuli: their scores are "
+            "of different stimuli; the paired tests use those that both answered."
+        )
+    return words

@@ -1,0 +1,226 @@
+"""The page of the published results: what was printed beside what a reader expects."""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from physion.analysis.published.cells import grid
+from physion.analysis.published.summary import TITLES, PublishedResults
+from physion.analysis.tables.score_tables import MEAN
+from physion.atomic import write_atomic
+from physion.report.figures.by_scenario import (
+    PARTICIPANTS,
+    SCENARIO_ZONE,
+    grouped_figure,
+    measure_figure,
+)
+from physion.report.figures.figure_tables import GROUPED_COLUMNS, MEASURE_COLUMNS
+from physion.report.figures.theme import Plot, Theme
+from physion.report.page.blocks import (
+    Column,
+    details,
+    number,
+    p_value,
+    paragraph,
+    rows_table,
+    table,
+)
+from physion.report.page.document import Section, figure, render_document
+from physion.report.write import prepare_folder, write_csv, write_plot
+
+TITLE = "The published results of the original study, recomputed from its released tables"
+
+
+def build_published_report(results: PublishedResults, folder: Path) -> Path:
+    """Write ``report.html``, ``published.json``, ``tables/*.csv``, ``figures/*``; the page's path.
+
+    The same inputs give the same bytes. Raises `BadInputError` where ``folder`` is a file.
+    """
+    pictures = prepare_folder(folder)
+    for name, rows in results.tables.items():
+        write_csv(folder / "tables" / f"{name}.csv", rows)
+    shown = {plot.name: figure(write_plot(plot, pictures)) for plot in published_plots(results)}
+    text = json.dumps(published_numbers(results), indent=1, allow_nan=False)
+    write_atomic(folder / "published.json", f"{text}\n".encode())
+    page = folder / "report.html"
+    write_atomic(page, _page(results, shown).encode())
+    return page
+
+
+def published_numbers(results: PublishedResults) -> dict[str, Any]:
+    """Every table, as a list of rows, and what is said of them, for JSON; NaN becomes null."""
+    tables = {
+        name: json.loads(rows.to_json(orient="records", double_precision=15))
+        for name, rows in results.tables.items()
+    }
+    return {"tables": tables, "words": dict(results.words)}
+
+
+# --- figures ------------------------------------------------------------------------------------
+
+
+def published_plots(results: PublishedResults) -> list[Plot]:
+    """Panels A, C, D and E of the paper's main figure."""
+    tables, words = results.tables, results.words["panels"]
+    rows = tables["panel_a"]
+    people = float(rows.loc[rows["scenario"] == MEAN, "people"].iloc[0])
+    return [
+        Plot("panel_a", f"{TITLES['panel_a']}. {_ACCURACY}",
+             _measure(tables["panel_a"], "accuracy", PARTICIPANTS), partial(_draw, "accuracy")),
+        Plot("panel_c", f"{TITLES['panel_c']}. {_KAPPA}",
+             _measure(tables["panel_c"], "kappa", "95 % of pairs of participants"),
+             partial(_draw, "kappa")),
+        Plot("panel_d", f"{TITLES['panel_d']}. {words}",
+             _grouped(tables["panel_d"], "readout", "by readout (trained on all)", people),
+             _draw_grouped),
+        Plot("panel_e", f"{TITLES['panel_e']}. Readout observed+simulated.",
+             _grouped(tables["panel_e"], "training", "by training (readout observed+simulated)",
+                      people), _draw_grouped),
+    ]  # fmt: skip
+
+
+_SHOWN = (
+    "Trained on all scenarios, readout observed+simulated. Dashed: people. Grey: the middle 95 % "
+    "of {of}. Hatched, in the mean: the band of the paper, a bootstrap over the scenario means. "
+    "Intervals of the mean draw scenarios{more}."
+)
+_ACCURACY = _SHOWN.format(of="participants", more="; single runs have none")
+_KAPPA = _SHOWN.format(
+    of="pairs of participants", more="; others are percentiles over participants"
+)
+
+
+def _measure(panel: pd.DataFrame, measure: str, zone: str) -> pd.DataFrame:
+    rows = panel.rename(columns={"model": "agent", "scenario": "panel", measure: "value"})
+    is_mean = rows["panel"] == MEAN
+    rows = rows.assign(kind="", people_is="people", reason="", zone=zone)
+    rows["zone"] = rows["zone"].mask(is_mean, SCENARIO_ZONE)
+    order = list(dict.fromkeys(rows.loc[~is_mean, "panel"]))
+    place = rows["panel"].map({name: at for at, name in enumerate(order)}).fillna(len(order))
+    return rows.assign(place=place).sort_values("place", kind="stable")[list(MEASURE_COLUMNS)]
+
+
+def _grouped(panel: pd.DataFrame, column: str, name: str, people: float) -> pd.DataFrame:
+    rows = panel.rename(columns={"model": "agent", column: "group", "accuracy": "value"})
+    rows = rows.assign(panel=name, people=people, stimuli=float("nan"), reason="")
+    return rows[list(GROUPED_COLUMNS)].reset_index(drop=True)
+
+
+def _draw(measure: str, rows: pd.DataFrame, theme: Theme) -> Any:
+    return measure_figure(rows, measure, theme)
+
+
+def _draw_grouped(rows: pd.DataFrame, theme: Theme) -> Any:
+    return grouped_figure(rows, "accuracy", 0.5, theme)
+
+
+# --- page ---------------------------------------------------------------------------------------
+
+
+def _page(results: PublishedResults, shown: dict[str, str]) -> str:
+    tables, words = results.tables, results.words
+    models = tables["accuracies"]["model"].nunique()
+    lead = (
+        f'<p class="lead">{models} models and people on '
+        f"{tables['accuracies']['scenario'].nunique()} scenarios: what was printed, "
+        "what it averages or compares, and beside it what a reader expects.</p>"
+    )
+    panels = [shown["panel_a"], _panel(tables["panel_a"], "accuracy"), shown["panel_c"],
+              _panel(tables["panel_c"], "kappa")]  # fmt: skip
+    sections = [
+        Section("Accuracies by scenario", _accuracies(results)),
+        Section("Panels A and C", "\n".join(panels)),
+        Section("Panels D and E", shown["panel_d"] + shown["panel_e"]),
+        Section("Regressions of the Results section", _regressions(results)),
+        Section("People", _people(tables["people"], tables["people_claims"], words["people"])),
+        Section("Rows left out", _left_out(tables["left_out"])),
+    ]
+    return render_document(TITLE, lead, sections)
+
+
+def _accuracies(results: PublishedResults) -> str:
+    rows = results.tables["accuracies"]
+    parts = [paragraph(results.words["accuracies"])]
+    for column, caption in (
+        ("published", "As published: means of all released rows"),
+        ("expected", "As a reader expects: trained on all, readout observed+simulated"),
+        ("difference", "Expected less published"),
+    ):
+        wide = grid(rows, column)
+        names = [name for name in wide.columns if name != "model"]
+        cells = [
+            [escape(str(row["model"])), *(number(row[name], 3) for name in names)]
+            for _, row in wide.iterrows()
+        ]
+        parts.append(table(["model", *names], cells, caption))
+    columns = [
+        Column("model", "model", "text"), Column("scenario", "scenario", "text"),
+        Column("published", "published", "interval", 3), Column("rows", "rows", "count"),
+        Column("observed once", "without_copies", digits=3),
+        Column("expected", "expected", "interval", 3), Column("runs", "runs", "count"),
+        Column("stimuli", "stimuli", "count"), Column("difference", "difference", digits=3),
+    ]  # fmt: skip
+    parts.append(details("Every value with its interval", rows_table(rows, columns)))
+    return "\n".join(parts)
+
+
+def _panel(rows: pd.DataFrame, measure: str) -> str:
+    columns = [
+        Column("model", "model", "text"), Column("scenario", "scenario", "text"),
+        Column(measure, measure, "interval", 3, "low", "high"),
+        Column("people", "people", "interval", 3, "zone_low", "zone_high"),
+        Column("in zone", "in_zone", "text"),
+    ]  # fmt: skip
+    words = rows.assign(in_zone=rows["in_zone"].map({True: "yes", False: "no"}))
+    return details(f"{measure} as a table", rows_table(words, columns))
+
+
+def _regressions(results: PublishedResults) -> str:
+    cells = []
+    for _, row in results.tables["regressions"].iterrows():
+        printed = ", ".join(f"{k} {row[f'printed_{k}']}" for k in "btp" if row[f"printed_{k}"])
+        fits = [
+            f"b {number(row[f'{fit}_b'], 3)}, t({number(row[f'{fit}_df'], 0)}) = "
+            f"{number(row[f'{fit}_t'], 1)}, p {p_value(row[f'{fit}_p'])}"
+            for fit in ("run", "once", "asked")
+        ]
+        about = f"{escape(row['claim'])}<small>{escape(row['sentence'])}</small>"
+        differs = escape(f"Compares {row['compared']} ({row['state']}): {row['differs']}")
+        cells.append([about, escape(printed), *fits, escape(row["met"]), differs])
+    header = ["claim", "printed", "as run", "each row once", "as the sentence asks", "figures met",
+              "what differs"]  # fmt: skip
+    return paragraph(results.words["regressions"]) + table(header, cells)
+
+
+def _people(rows: pd.DataFrame, claims: pd.DataFrame, words: str) -> str:
+    columns = [
+        Column("scenario", "scenario", "text"),
+        Column("accuracy", "accuracy", "interval", 3, "zone_low", "zone_high"),
+        Column("kappa", "kappa", "interval", 3, "kappa_low", "kappa_high"),
+        Column("r of halves", "half_r", "interval", 3),
+        Column("stepped up", "half_r_full", digits=3),
+        Column("participants", "participants", "count"), Column("stimuli", "stimuli", "count"),
+        Column("below chance", "below_chance", "count"),
+    ]  # fmt: skip
+    said = [Column("claim", "claim", "text"), Column("printed", "printed", "text"),
+            Column("here", "ours", "text"), Column("note", "note", "text")]  # fmt: skip
+    return (
+        paragraph(words)
+        + rows_table(
+            rows, columns, "Small print: the zones (2.5 to 97.5 %); in the mean the paper's"
+        )
+        + rows_table(claims, said, "What the paper says of people")
+    )
+
+
+def _left_out(rows: pd.DataFrame) -> str:
+    if rows.empty:
+        return paragraph("None.")
+    columns = [Column(name, name, "text") for name in rows.columns]
+    return rows_table(rows, columns)

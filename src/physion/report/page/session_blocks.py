@@ -1,0 +1,133 @@
+"""The parts of the page about sessions: who was flagged, and what changes with them."""
+
+from __future__ import annotations
+
+from html import escape
+
+import pandas as pd
+
+from physion.analysis.people.exclusions import RULES, ExclusionRules
+from physion.analysis.tables.score_tables import MEAN, in_order
+from physion.report.inputs import ReportInputs
+from physion.report.page.blocks import Column, paragraph, rows_table, table, undefined
+from physion.report.people_results import PeopleResults
+
+
+def sessions(inputs: ReportInputs) -> str:
+    """Who was flagged, by which rule, and what changes with flagged sessions."""
+    if inputs.people is None:
+        return ""
+    found = inputs.people.tables
+    parts = [paragraph(rules_in_words(inputs.people.rules)), _flag_counts(found["flag_counts"])]
+    parts.append(_with_and_without(inputs))
+    if len(found["flag_effects"]):
+        columns = [
+            Column("rule", "term", "text"),
+            Column("log odds of being right", "b", "interval", 3, "low", "high"),
+            Column("z", "z"), Column("p", "p", "p"), Column("answers", "rows", "count"),
+            Column("participants", "clusters", "count"),
+        ]  # fmt: skip
+        words = (
+            "Effect of a flag on being right, over all sessions: logistic regression with an "
+            "intercept for each scenario, standard errors clustered by participant. Low accuracy "
+            "is itself a reason to be flagged, so its effect, and that of “flagged”, is there by "
+            "construction"
+        )
+        parts.append(rows_table(found["flag_effects"], columns, words))
+    return "\n".join(parts)
+
+
+def _flag_counts(counts: pd.DataFrame) -> str:
+    rules = list(dict.fromkeys(counts["rule"]))
+    rules = [name for name in rules if name not in ("flagged", "kept", "all")]
+    rules += ["flagged", "kept", "all"]
+    wide = counts.pivot(index="scenario", columns="rule", values="sessions").fillna(0)
+    names = in_order(counts["scenario"])
+    rows = [[escape(name), *(str(int(wide.loc[name, rule])) for rule in rules)] for name in names]
+    rows.append(["all", *(str(int(wide[rule].sum())) for rule in rules)])
+    heads = [name.replace("_", " ") for name in rules]
+    words = "Sessions that each rule flags; one session can be flagged by several rules"
+    return table(["scenario", *heads], rows, words)
+
+
+def _with_and_without(inputs: ReportInputs) -> str:
+    """People's accuracy, and the models' scores, without and with the flagged sessions."""
+    assert inputs.people is not None
+    rows = inputs.people.tables["with_and_without"]
+    columns = [Column("people", "people", "count"), Column("accuracy", "accuracy", "interval", 3)]
+    cells = []
+    for name in dict.fromkeys(rows["scenario"]):
+        line = [escape(str(name))]
+        for which in ("unflagged", "complete"):
+            own = rows[(rows["scenario"] == name) & (rows["sessions"] == which)]
+            line += [c.cell(own.iloc[0]) for c in columns] if len(own) else [undefined("none"), ""]
+        cells.append(line)
+    header = ["scenario", "people, unflagged", "accuracy", "people, all complete", "accuracy"]
+    found = table(header, cells, "Accuracy of people without flagged sessions and with them")
+    if inputs.comparison_all is None:
+        return found
+    with_all = inputs.comparison_all.scores
+    cells = []
+    for _, row in inputs.comparison.scores.iterrows():
+        if row["scenario"] != MEAN:
+            continue
+        other = with_all[(with_all["agent"] == row["agent"]) & (with_all["scenario"] == MEAN)]
+        line = [escape(str(row["agent"]))]
+        for key in ("difference", "r"):
+            for own in (row, other.iloc[0]):
+                line.append(Column("", key, "interval").cell(own))
+        cells.append(line)
+    header = ["model", "less people, unflagged", "with all complete", "r, unflagged",
+              "with all complete"]  # fmt: skip
+    return found + table(
+        header, cells, "Models, mean over scenarios: accuracy less people's, and r"
+    )
+
+
+def rules_in_words(rules: ExclusionRules) -> str:
+    """The rules of a set with their thresholds."""
+    words = []
+    if rules.streak_percentile is not None:
+        words.append(
+            f"a streak longer than {rules.streak_percentile:g} % of simulated coin tosses have"
+        )
+    elif rules.streak_over is not None:
+        words.append(f"a streak of one answer over {rules.streak_over:g}")
+    if rules.alternation is not None:
+        words.append(f"{rules.alternation} or more alternating answers in a row")
+    if rules.familiarization_share is not None:
+        words.append(f"{rules.familiarization_share:.0%} or fewer of the practice trials right")
+    if rules.accuracy_sd is not None:
+        words.append(f"accuracy {rules.accuracy_sd:g} sd below the {rules.accuracy_centre}")
+    if rules.rt_sd is not None:
+        words.append(f"{rules.rt_summary} log response time {rules.rt_sd:g} sd above the median")
+    return (
+        f"Rules “{rules.name}”: {'; '.join(words)}; not all trials answered; not the participant's "
+        "first session. Rules flag; the main analysis leaves flagged sessions out, and the tables "
+        "below say what changes with them. Centres and standard deviations are those of the "
+        f"scenario's complete sessions (sd with {'n − 1' if rules.ddof else 'n'})."
+    )
+
+
+def dropped(found: PeopleResults) -> str:
+    """Answers left out, by step and reason."""
+    rows = found.tables["left_out"]
+    if rows.empty:
+        return paragraph("Nothing.")
+    keys = ["step", "reason"]
+    totals = rows.groupby(keys, sort=False)[["sessions", "rows"]].sum().reset_index()
+    columns = [Column("step", "step", "text"), Column("reason", "reason", "text"),
+               Column("sessions", "sessions", "count"),
+               Column("answers", "rows", "count")]  # fmt: skip
+    cells = [[column.cell(row) for column in columns] for _, row in totals.iterrows()]
+    return table([column.heading for column in columns], cells)
+
+
+def methods(inputs: ReportInputs) -> dict[str, str]:
+    """The choices that participant-level answers bring, in words."""
+    if inputs.people is None:
+        return {}
+    return {
+        "Exclusions": rules_in_words(inputs.people.rules),
+        "Rules applied": ", ".join(name.replace("_", " ") for name in RULES),
+    }

@@ -1,0 +1,126 @@
+"""The parts of the page that test: models against each other, mixed models, calibration."""
+
+from __future__ import annotations
+
+from html import escape
+
+import numpy as np
+import pandas as pd
+
+from physion.report.inputs import ReportInputs, permutations_of
+from physion.report.mixed_fits import MixedTable
+from physion.report.page.blocks import Column, details, number, paragraph, rows_table
+
+
+def tests(inputs: ReportInputs) -> str:
+    """Paired tests of models, then mixed models."""
+    parts = []
+    if inputs.paired is not None:
+        parts += ["<h3>Models against each other</h3>", _paired(inputs.paired)]
+    if inputs.mixed:
+        parts.append("<h3>Mixed models</h3>")
+        parts.append(paragraph(_MIXED))
+        parts += [_mixed(model) for model in inputs.mixed]
+    return "\n".join(parts)
+
+
+_MIXED = (
+    "Random intercepts as the formula says. Logistic models: maximum likelihood by Laplace "
+    "approximation, Wald z. Linear models: restricted maximum likelihood, t with degrees of "
+    "freedom by Satterthwaite. b of a logistic model is in log odds. Rows of one model and "
+    "scenario that differ in readout or training share their stimuli, which the models of "
+    "accuracies do not know: their p are too small; the paired tests above do without that."
+)
+
+
+def _paired(rows: pd.DataFrame) -> str:
+    """A summary in words, and the table of all pairs."""
+    counts = {
+        key: (int((rows[f"{key}_holm"] < 0.05).sum()), int((rows[f"{key}_bh"] < 0.05).sum()),
+              int(rows[key].notna().sum()))
+        for key in ("p_accuracy", "p_r")
+    }  # fmt: skip
+    words = (
+        "Every two models on the stimuli that both answered, all scenarios together. Accuracy: "
+        "exact test of McNemar. r with the average person: permutation test that swaps the two "
+        f"models stimulus by stimulus ({permutations_of(len(rows))} permutations), interval by "
+        "drawing stimuli. Correction over all pairs: by "
+        "Holm (chance of any false alarm) and by Benjamini and Hochberg (share of false alarms). "
+        f"Of {counts['p_accuracy'][2]} pairs, {counts['p_accuracy'][0]} differ in accuracy by "
+        f"Holm and {counts['p_accuracy'][1]} by Benjamini and Hochberg (5 %); of "
+        f"{counts['p_r'][2]}, {counts['p_r'][0]} and {counts['p_r'][1]} in r."
+    )
+    columns = [
+        Column("first", "first", "text"), Column("second", "second", "text"),
+        Column("stimuli", "stimuli", "count"),
+        Column("accuracy, first less second", "accuracy_difference", digits=3),
+        Column("only first right", "only_first", "count"),
+        Column("only second right", "only_second", "count"),
+        Column("p", "p_accuracy", "p"), Column("Holm", "p_accuracy_holm", "p"),
+        Column("B-H", "p_accuracy_bh", "p"),
+        Column("r, first less second", "r_difference", "interval"),
+        Column("p", "p_r", "p"), Column("Holm", "p_r_holm", "p"), Column("B-H", "p_r_bh", "p"),
+    ]  # fmt: skip
+    if rows["r_difference"].isna().all():
+        columns = columns[:9]
+    listing = rows_table(rows, columns)
+    if len(rows) > 10:
+        listing = details(f"All {len(rows)} pairs", listing)
+    return paragraph(words) + listing
+
+
+def _mixed(model: MixedTable) -> str:
+    formula = f"<p><code>{escape(model.formula)}</code></p>"
+    if model.fit is None:
+        return details(f"{model.about}: not fitted", formula + paragraph(model.reason))
+    fit = model.fit
+    rows = fit.table.assign(
+        term=fit.table["term"].str.replace(r"(\w+)\[T\.(.*)\]", r"\1: \2", regex=True)
+    )
+    columns = [
+        Column("term", "term", "text"), Column("b", "b", "interval", 3, "low", "high"),
+        Column("SE", "se", digits=3), Column("z", "z"), Column("t", "t"),
+        Column("df", "df", digits=1), Column("p", "p", "p"),
+    ]  # fmt: skip
+    logistic = "z" in rows
+    known = [c for c in columns if c.key in rows and not (logistic and c.key == "df")]
+    spreads = ", ".join(
+        f"{row['group']} {number(row['sd'], 3)} ({int(row['levels'])})"
+        for _, row in fit.random.iterrows()
+    )
+    note = f"{fit.rows} rows, {fit.left_out} left out; standard deviations (levels): {spreads}. "
+    note += " ".join(fit.warnings)
+    listing = rows_table(rows, known) + f'<p class="note">{escape(note)}</p>'
+    return details(f"{model.about}{_together(model)}", formula + listing)
+
+
+def _together(model: MixedTable) -> str:
+    """The test that all coefficients of the model's term are zero, in words."""
+    if model.fit is None or not model.term:
+        return ""
+    test = model.fit.joint_test(model.term)
+    p = "p < 0.001" if test.p < 0.001 else f"p = {number(test.p, 3)}"
+    if np.isinf(test.df2):
+        return f". All together: χ²({test.df1}) = {number(test.statistic * test.df1, 1)}, {p}"
+    return f". All together: F({test.df1}, {number(test.df2, 1)}) = {number(test.statistic)}, {p}"
+
+
+def calibration(inputs: ReportInputs) -> str:
+    """Brier score and its parts, a row a model."""
+    rows = inputs.calibration
+    if rows is None:
+        return ""
+    columns = [
+        Column("model", "model", "text"), Column("stimuli", "stimuli", "count"),
+        Column("Brier", "brier", digits=3), Column("reliability", "reliability", digits=3),
+        Column("resolution", "resolution", digits=3),
+        Column("uncertainty", "uncertainty", digits=3),
+        Column("within bins", "within", digits=3), Column("skill", "skill", digits=3),
+        Column("calibration error", "calibration_error", digits=3),
+    ]  # fmt: skip
+    words = (
+        "Brier score = reliability − resolution + uncertainty + within bins (ten of equal width); "
+        "skill is 1 − Brier / uncertainty, above 0 where a model beats the base rate"
+    )
+    known = rows.replace([np.inf, -np.inf], np.nan)
+    return details("Brier score and its parts", rows_table(known, columns, words))

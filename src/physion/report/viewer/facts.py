@@ -1,0 +1,206 @@
+"""What a trial is, in words and numbers: the card, the marks of the time line, the tables."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from physion.physics.labels import contact_frames
+from physion.report.viewer.motion import role_of
+from physion.report.viewer.passes import thing_colors
+from physion.scenes.scene import Scene
+from physion.trials.trial_file import Trial
+
+Table = dict[str, Any]
+"""``title``; ``header`` or none; ``rows`` of text; ``outcome`` lists rows that give the answer
+away, by number."""
+
+_NAMES = {
+    "physics_seconds": "seconds of physics",
+    "playback_seconds": "seconds of playback",
+    "first_frame": "first frame of contact",
+    "observed": "contact while observed",
+    "min_distance": "smallest gap to the cloth (m)",
+    "robust": "share of jittered runs that agree",
+    "frame_time": "seconds of physics a frame",
+    "playback_rate": "frames of movie a second",
+    "completed": "everything came to rest",
+    "digest": "digest of the motion",
+    "scene_digest": "digest of the scene",
+}
+"""What fields are called where their own names would not do."""
+_OUTCOME = ("contact", "first_frame", "observed", "min_distance", "robust", "recorded_contact")
+
+
+def card(trial: Trial) -> dict[str, Any]:
+    """What the grid shows and filters by."""
+    meta, labels = trial.metadata, trial.labels
+    robust = labels.robust
+    return {
+        "trial": meta.trial,
+        "scenario": meta.scenario,
+        "split": meta.split,
+        "preset": meta.preset or "",
+        "contact": labels.contact,
+        "first": labels.first_frame,
+        "observed": labels.observed,
+        "robust": robust if robust is not None and math.isfinite(robust) else None,
+        "frames": meta.frames,
+        "observedFrames": meta.observed_frames,
+        "rate": meta.playback_rate,
+        "frameTime": meta.frame_time,
+        "words": _words(trial),
+    }
+
+
+def _words(trial: Trial) -> str:
+    """All that the search looks through, in small letters."""
+    meta, scene = trial.metadata, trial.scene
+    parts = [meta.trial, meta.dataset, meta.scenario, meta.split, meta.preset, meta.seed]
+    parts += [meta.digest, meta.scene_digest, meta.look, scene.room]
+    parts += [text for body in scene.bodies for text in (body.name, body.shape, body.look.texture)]
+    parts += [cloth.name for cloth in scene.cloths]
+    kept = dict.fromkeys(str(part) for part in parts if not _absent(part))
+    return " ".join(kept).lower()
+
+
+def contact_runs(trial: Trial) -> list[list[int]]:
+    """Frames in which agent and patient touch, as runs: first and last frame of each."""
+    runs: list[list[int]] = []
+    for frame in contact_frames(trial.scene, trial.trajectory).tolist():
+        if runs and runs[-1][1] == frame - 1:
+            runs[-1][1] = frame
+        else:
+            runs.append([frame, frame])
+    return runs
+
+
+def legend(scene: Scene) -> list[dict[str, Any]]:
+    """Name, role and colour (0..255) in the picture of ids of everything in the scene."""
+    colors = thing_colors(scene)
+    return [
+        {"name": name, "role": role_of(scene, name), "color": list(color)}
+        for name, color in zip(scene.names(), colors, strict=True)
+    ]
+
+
+def tables(trial: Trial) -> list[Table]:
+    """Everything that decides a trial, and what came of it."""
+    scene = trial.scene
+    found = [
+        _bodies_table(scene),
+        _cloths_table(scene),
+        _pushes_table(scene),
+        _table("Joints", ("parent", "child"), [(j.parent, j.child) for j in scene.joints]),
+        _trial_table(trial),
+        _table("Parameters of the scenario", None, _flat("", scene.parameters)),
+        _stage_table(scene),
+    ]
+    return [table for table in found if table["rows"]]
+
+
+def _table(title: str, header: Sequence[str] | None, rows: Iterable[Sequence[object]]) -> Table:
+    texts = [[text(value) for value in row] for row in rows]
+    return {"title": title, "header": list(header) if header else None, "rows": texts}
+
+
+def _trial_table(trial: Trial) -> Table:
+    """Times and labels first, then the rest of the metadata as it stands in the file."""
+    meta, labels = trial.metadata, trial.labels
+    facts: dict[str, object] = {
+        "physics_seconds": meta.physics_seconds,
+        "playback_seconds": meta.playback_seconds,
+    }
+    facts |= {f.name: getattr(labels, f.name) for f in dataclasses.fields(labels)}
+    facts |= {f.name: getattr(meta, f.name) for f in dataclasses.fields(meta)}
+    rows = [(_NAMES.get(name, name.replace("_", " ")), value) for name, value in facts.items()]
+    table = _table("Trial", None, rows)
+    return table | {"outcome": [i for i, name in enumerate(facts) if name in _OUTCOME]}
+
+
+def _bodies_table(scene: Scene) -> Table:
+    header = ["body", "role", "shape", "mass (kg)", "static friction", "dynamic friction"]
+    header += ["restitution", "scale", "position (m)", "kind", "colour", "texture"]
+    rows = []
+    for body in scene.bodies:
+        kind = "scenery" if body.scenery else "fixed" if body.kinematic else "free"
+        touch = body.contact
+        rows.append(
+            [
+                *(body.name, role_of(scene, body.name), body.shape, body.mass),
+                *(touch.static_friction, touch.dynamic_friction, touch.restitution),
+                *(body.scale, body.position, kind, _hex(body.look.color), body.look.texture),
+            ]
+        )
+    return _table("Bodies", header, rows)
+
+
+def _cloths_table(scene: Scene) -> Table:
+    header = ["cloth", "role", "mass (kg)", "size (m)", "position (m)", "resolution"]
+    header += ["stretch", "bend", "tether", "colour", "texture"]
+    rows = [
+        [
+            *(c.name, role_of(scene, c.name), c.mass, c.size, c.position, c.resolution),
+            *(c.stretch, c.bend, c.tether, _hex(c.look.color), c.look.texture),
+        ]
+        for c in scene.cloths
+    ]
+    return _table("Cloths", header, rows)
+
+
+def _pushes_table(scene: Scene) -> Table:
+    header = ["body", "impulse (N s)", "strength (N s)", "point (m)", "before the step after frame"]
+    rows = [
+        [p.body, p.impulse, math.hypot(*p.impulse), p.point or "centre of mass", p.frame]
+        for p in scene.pushes
+    ]
+    return _table("Pushes", header, rows)
+
+
+def _stage_table(scene: Scene) -> Table:
+    camera = scene.camera
+    rows: list[tuple[str, object]] = [
+        ("camera at (m)", camera.position),
+        ("looks at (m)", camera.target),
+        ("vertical field of view", f"{math.degrees(camera.fov):.4g} degrees"),
+        ("room", scene.room),
+        ("floor (m)", scene.floor),
+        ("settling before frame 0", f"{scene.settle_frames} frames"),
+        ("ends at rest after", f"{scene.ending.min_frames} frames"),
+        ("ends at the latest after", f"{scene.ending.max_frames} frames"),
+    ]
+    return _table("Camera, room, ending", None, rows)
+
+
+def _flat(path: str, value: Any) -> list[tuple[str, object]]:
+    """Nested parameters as rows of path and value; lists of plain values stay in one row."""
+    if isinstance(value, Mapping):
+        rows = [_flat(f"{path}.{key}" if path else str(key), v) for key, v in value.items()]
+        return [row for part in rows for row in part]
+    if isinstance(value, list) and any(isinstance(v, Mapping | list) for v in value):
+        rows = [_flat(f"{path}[{i}]", v) for i, v in enumerate(value)]
+        return [row for part in rows for row in part]
+    return [(path, value)]
+
+
+def text(value: object) -> str:
+    """A value of any kind as people read it: numbers in four digits, a dash for what is absent."""
+    if isinstance(value, list | tuple):
+        return ", ".join(text(v) for v in value) if value else "none"
+    if _absent(value):
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return str(value)
+
+
+def _absent(value: object) -> bool:
+    return value is None or (isinstance(value, float) and math.isnan(value))
+
+
+def _hex(color: Sequence[float]) -> str:
+    return "#" + "".join(f"{round(min(max(c, 0.0), 1.0) * 255):02x}" for c in color)

@@ -1,0 +1,149 @@
+"""One HTML page that shows a dataset: movies by scenario, and each trial from all sides."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from physion.atomic import write_atomic
+from physion.errors import BadInputError, UnknownNameError
+from physion.report.viewer import facts as viewer_facts
+from physion.report.viewer import motion as viewer_motion
+from physion.report.viewer import viewer_movies
+from physion.report.viewer.text import TrialData, render_viewer
+from physion.trials.dataset import Dataset
+
+Track = Callable[[Iterable[Any], str, int], Iterator[Any]]
+"""Passes items on and shows how far it is, as `physion.cli.output.track` does."""
+
+
+@dataclass(frozen=True)
+class ViewerOptions:
+    """How much of a dataset goes into the page, and how large.
+
+    - ``trials``: of each scenario at most so many; ``details``: so many of them with all passes
+      and the scene in 3D.
+    - ``scenario``, ``split``: only these, or all.
+    - ``card_size``, ``pass_size``: pixels of the longer side of the movies.
+    - ``stride``: passes are shown of every so manieth frame.
+    """
+
+    trials: int = 6
+    details: int = 3
+    scenario: str | None = None
+    split: str | None = None
+    card_size: int = 128
+    pass_size: int = 160
+    stride: int = 2
+
+    def __post_init__(self) -> None:
+        for name, least in (("trials", 1), ("details", 0), ("stride", 1)):
+            if getattr(self, name) < least:
+                raise BadInputError(f"{name} must be {least} or more, not {getattr(self, name)}")
+        for name in ("card_size", "pass_size"):
+            if not 16 <= getattr(self, name) <= 1024:
+                raise BadInputError(f"{name} must be 16 to 1024 pixels, not {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class ViewerReport:
+    """What `build_viewer` wrote: where, how many bytes, how many trials, and how many left out."""
+
+    page: Path
+    size: int
+    shown: int
+    left_out: int
+
+
+def build_viewer(
+    folder: Path, out: Path, options: ViewerOptions | None = None, *, track: Track | None = None
+) -> ViewerReport:
+    """Write the page of the dataset in ``folder`` to the file ``out``, whole or not at all.
+
+    The page needs no other file and no network. The same trials and options give the same bytes.
+    Raises `BadInputError` where there is no dataset, a trial is damaged, or ``out`` is a folder or
+    cannot be written, and `UnknownNameError` for a scenario or split that the dataset does not
+    hold.
+    """
+    options = options or ViewerOptions()
+    dataset = Dataset(folder)
+    if out.is_dir():
+        raise BadInputError(f"{out} is a folder; give a file for the page")
+    if not out.parent.is_dir():
+        raise BadInputError(f"folder {out.parent} does not exist; make it, or choose another")
+    # Rendering takes minutes: better said before.
+    if not os.access(out.parent, os.W_OK):
+        raise _unwritable(out, "the folder is read-only")
+    chosen, totals = choose_trials(dataset.index, options)
+    rows = [row for _, row in chosen.iterrows()]
+    shapes: set[str] = set()
+    found = []
+    for row in track(rows, "viewing", len(rows)) if track else rows:
+        data, names = _trial_data(dataset, row, options)
+        found.append(data)
+        shapes |= names
+    title = ", ".join(sorted(set(dataset.index["dataset"].astype(str)))) or "no trials"
+    page = render_viewer(title, found, totals, viewer_motion.pack_shapes(shapes)).encode()
+    try:
+        write_atomic(out, page)
+    except OSError as error:
+        raise _unwritable(out, error.strerror or str(error)) from error
+    return ViewerReport(out, len(page), len(found), sum(totals.values()) - len(found))
+
+
+def _unwritable(out: Path, reason: str) -> BadInputError:
+    return BadInputError(f"cannot write {out}: {reason}; give another place for the page (--out)")
+
+
+def choose_trials(
+    index: pd.DataFrame, options: ViewerOptions
+) -> tuple[pd.DataFrame, dict[str, int]]:
+    """Rows of the index for the page, and how many trials each scenario has to choose from.
+
+    Of each scenario the first trials, splits taking turns. The column ``detailed`` says which
+    of them are shown with all passes.
+    """
+    table = index
+    for column, wanted in (("scenario", options.scenario), ("split", options.split)):
+        if wanted is not None:
+            known = [str(name) for name in index[column].unique()]
+            if wanted not in known:
+                raise UnknownNameError(f"{column} of the dataset", wanted, known)
+            table = table[table[column] == wanted]
+    turn = table.groupby(["scenario", "split"]).cumcount()
+    table = table.assign(turn=turn).sort_values(["scenario", "turn", "split"], kind="stable")
+    place = table.groupby("scenario").cumcount()
+    table = table.assign(detailed=place < options.details)[place < options.trials]
+    totals = turn.groupby(index.loc[turn.index, "scenario"].astype(str)).size()
+    ordered = table.sort_values(["scenario", "split", "trial"], ignore_index=True)
+    return ordered, {str(name): int(count) for name, count in totals.items()}
+
+
+def _trial_data(
+    dataset: Dataset, row: pd.Series, options: ViewerOptions
+) -> tuple[TrialData, set[str]]:
+    """What the page holds of one trial, and the shapes that its 3D view needs."""
+    paths = dataset.paths(row["trial"])
+    trial = dataset.trial(row["trial"])
+    if trial.metadata.playback_rate < 1:
+        raise BadInputError(f"{paths.trial_file}: a movie of {trial.metadata.playback_rate} Hz")
+    detail: dict[str, Any] = {
+        "tables": viewer_facts.tables(trial),
+        "runs": viewer_facts.contact_runs(trial),
+        "legend": viewer_facts.legend(trial.scene),
+    }
+    shapes: set[str] = set()
+    if row["detailed"]:
+        strip, ranges = viewer_movies.passes_movie(trial, options.pass_size, options.stride)
+        detail["passes"] = strip.as_record()
+        detail["ranges"] = {"near": ranges.near, "far": ranges.far, "flow": ranges.flow}
+        detail["motion"] = viewer_motion.pack_motion(trial.shown("redyellow"), trial.trajectory)
+        shapes = {body.shape for body in trial.scene.bodies}
+    movie = viewer_movies.small_movie(paths.movie, trial, options.card_size)
+    size = {"width": movie.width, "height": movie.height}
+    return TrialData(viewer_facts.card(trial) | size, movie.as_record(), detail), shapes

@@ -1,0 +1,286 @@
+"""Where the camera stands, and what stands behind and before the scene.
+
+Rules of the official generator (reference/official-system.md, sections 2.4 and 2.5), with one
+addition: a camera that does not see agent and patient is drawn again.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from physion.errors import BadSceneError
+from physion.numerics.elementary import arctan2, cos, sin, tan
+from physion.numerics.linear_algebra import dot, norm, ordered_mean, unit
+from physion.numerics.rotations import rotate_vectors
+from physion.scenes.looks import prop_look
+from physion.scenes.sampling.parameters import (
+    Angle,
+    Angles,
+    Distances,
+    Lengths,
+    Props,
+    Quantity,
+    Range,
+    Share,
+    Shares,
+    Sides,
+    pick,
+    uniform,
+    yaw,
+)
+from physion.scenes.scene import Body, Camera, Look
+from physion.scenes.shapes.primitives import shape
+from physion.scenes.shapes.prop_names import expand_props
+from physion.scenes.shapes.props import NATURAL_SIZES
+
+CLEARANCE = 0.25
+"""Metres kept free between the scene and scenery."""
+CAMERA_TRIES = 200
+NEAREST_OCCLUDER = 0.85
+"""Largest share of the way to the camera at which scenery may stand."""
+
+STEPS_ASIDE = (0, 1, -1, 2, -2, 3, -3, 4, -4, 5, -5, 6, -6)
+"""Places at which a prop is tried, one after the other, in angles between neighbours."""
+FARTHER = (1.0, 1.5)
+"""Rows in which places are tried, in times the distance that was drawn."""
+FARTHEST_ASIDE = math.radians(80.0)
+"""Places more than a few steps aside are at most this far from straight behind or before."""
+
+PropCount = Annotated[int, Quantity("", 0, 12)]
+
+
+@dataclass(frozen=True, slots=True)
+class CameraRule:
+    """How the camera is drawn.
+
+    - ``radius``: metres; the official rule moves the camera by (radius, radius), so that its
+      horizontal distance from the middle is radius times the square root of 2.
+    - ``angle_deg``: degrees; the azimuth is this plus 45.
+    - ``height``: metres above the floor. Officially it may be 2 cm, where nobody can see a zone.
+    - ``mirror``: chance that left and right (the signs of x) are swapped.
+    """
+
+    radius: Distances = (1.75, 1.75)
+    angle_deg: Angles = (45.0, 225.0)
+    height: Lengths = (0.75, 2.0)
+    mirror: Share = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class SceneryRule:
+    """How many props stand behind (``distractors``) and before (``occluders``) the scene.
+
+    Distances are shares of the camera's radius, angles are degrees between neighbours, sizes are
+    metres of the largest side. ``occlusion`` is the share of the line of sight at which an
+    occluder's top ends.
+    """
+
+    distractors: PropCount = 0
+    occluders: PropCount = 0
+    distractor_props: Props = ("full",)
+    occluder_props: Props = ("vase", "plant", "lamp", "globe")
+    distractor_distance: Shares = (0.4, 1.0)
+    occluder_distance: Shares = (0.6, 0.8)
+    distractor_spacing_deg: Angle = 15.0
+    occluder_spacing_deg: Angle = 10.0
+    yaw_deg: Angle = 30.0
+    distractor_size: Sides = (0.5, 1.5)
+    occluder_size: Sides = (0.25, 1.5)
+    occlusion: Share = 0.75
+
+
+def world_corners(body: Body) -> NDArray[np.float64]:
+    """(V, 3): the corners of a body's drawn mesh in the world, metres."""
+    corners = shape(body.shape).mesh.vertices * body.scale
+    return np.asarray(rotate_vectors(body.rotation, corners) + np.array(body.position))
+
+
+def world_bounds(body: Body) -> NDArray[np.float64]:
+    """(2, 3): smallest and largest coordinates of a body in the world, metres."""
+    corners = world_corners(body)
+    return np.stack([corners.min(axis=0), corners.max(axis=0)])
+
+
+def on_screen(camera: Camera, point: ArrayLike) -> tuple[float, float]:
+    """Where a square picture shows ``point``: right and up, from -1 to 1; infinite if behind."""
+    forward = unit(np.subtract(camera.target, camera.position))
+    right = unit(np.cross(forward, [0.0, 0.0, 1.0]))
+    ray = np.subtract(point, camera.position)
+    depth = float(dot(ray, forward))
+    if not camera.near < depth < camera.far:
+        return (math.inf, math.inf)
+    size = depth * tan(camera.fov / 2)
+    return (float(dot(ray, right)) / size, float(dot(ray, np.cross(right, forward))) / size)
+
+
+def place_camera(
+    rng: np.random.Generator, rule: CameraRule, aim_height: float, seen: Sequence[Body]
+) -> Camera:
+    """A camera that looks at the middle of the scene and shows the centres of all of ``seen``.
+
+    Raises `BadSceneError` if `CAMERA_TRIES` draws show none such.
+    """
+    centers = [ordered_mean(world_bounds(body), axis=0) for body in seen]
+    for _ in range(CAMERA_TRIES):
+        distance = uniform(rng, rule.radius) * math.sqrt(2)
+        azimuth = math.radians(uniform(rng, rule.angle_deg) + 45.0)
+        x, y = distance * cos(azimuth), distance * sin(azimuth)
+        if rule.mirror and rng.random() < rule.mirror:
+            x = -x
+        camera = Camera((x, y, uniform(rng, rule.height)), (0.0, 0.0, aim_height))
+        if all(max(map(abs, on_screen(camera, center))) < 0.98 for center in centers):
+            return camera
+    names = " and ".join(body.name for body in seen)
+    raise BadSceneError(f"no camera shows {names}: widen the camera's ranges or move it away")
+
+
+def place_scenery(
+    rule: SceneryRule,
+    camera: Camera,
+    bodies: Sequence[Body],
+    distractors: np.random.Generator,
+    occluders: np.random.Generator,
+) -> tuple[Body, ...]:
+    """Props behind and before ``bodies``, drawn only, each kind on its own random stream."""
+    bounds = np.array([world_bounds(body) for body in bodies])
+    keep_out = np.stack([bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)])
+    placed: list[Body] = []
+    for i in range(rule.distractors):
+        props = rule.distractor_props, rule.distractor_size, rule.distractor_distance
+        drawn = _draw_prop(distractors, f"distractor_{i}", *props, rule.yaw_deg)
+        spacing = math.radians(rule.distractor_spacing_deg)
+        turn = math.pi + (i - (rule.distractors - 1) / 2) * spacing
+        placed.append(_first_free(drawn, camera, keep_out, turn, spacing, placed))
+    for i in range(rule.occluders):
+        props = rule.occluder_props, rule.occluder_size, rule.occluder_distance
+        drawn = _draw_prop(occluders, f"occluder_{i}", *props, rule.yaw_deg)
+        spacing = math.radians(rule.occluder_spacing_deg)
+        turn = (i - (rule.occluders - 1) / 2) * spacing
+        size = _occluding_size(drawn, camera, keep_out, turn, rule)
+        drawn = replace(drawn, size=size)
+        placed.append(_first_free(drawn, camera, keep_out, turn, spacing, placed))
+    return tuple(placed)
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """What chance decided about a prop; where it stands follows from the rest of the scene."""
+
+    name: str
+    shape: str
+    size: NDArray[np.float64]
+    yaw: float
+    share: float
+    look: Look
+
+
+def _draw_prop(
+    rng: np.random.Generator,
+    name: str,
+    props: Sequence[str],
+    limits: Range,
+    distance: Range,
+    yaw_deg: float,
+) -> _Drawn:
+    prop = pick(rng, expand_props(props))
+    size = np.array(NATURAL_SIZES[prop])
+    largest = float(size.max())
+    size = size * float(np.clip(largest, *limits)) / largest
+    turn = math.radians(uniform(rng, (-yaw_deg, yaw_deg)))
+    return _Drawn(
+        name, f"prop:{prop}", size, turn, uniform(rng, distance), prop_look(rng, f"prop:{prop}")
+    )
+
+
+def _first_free(
+    drawn: _Drawn,
+    camera: Camera,
+    keep_out: NDArray[np.float64],
+    turn: float,
+    spacing: float,
+    placed: Sequence[Body],
+) -> Body:
+    """The prop at its angle or, where another prop is, steps of ``spacing`` beside it or behind."""
+    for times, step in itertools.product(FARTHER, STEPS_ASIDE):
+        at = turn + step * spacing
+        if abs(step) > 3 and abs(cos(at)) < cos(FARTHEST_ASIDE):
+            continue
+        body = _standing(replace(drawn, share=drawn.share * times), camera, keep_out, at)
+        if not any(_footprints_meet(body, other) for other in placed):
+            return body
+    raise BadSceneError(
+        f"no room for {drawn.name} beside {placed[-1].name}: make scenery fewer or smaller, or "
+        "its spacing wider"
+    )
+
+
+def _standing(drawn: _Drawn, camera: Camera, keep_out: NDArray[np.float64], turn: float) -> Body:
+    place = _place(drawn, camera, keep_out, turn)
+    azimuth = arctan2(camera.position[1], camera.position[0])
+    return Body(
+        name=drawn.name,
+        shape=drawn.shape,
+        position=(float(place[0]), float(place[1]), 0.0),
+        scale=(float(drawn.size[0]), float(drawn.size[1]), float(drawn.size[2])),
+        rotation=yaw(azimuth + turn + drawn.yaw),
+        kinematic=True,
+        scenery=True,
+        look=drawn.look,
+    )
+
+
+def _place(
+    drawn: _Drawn, camera: Camera, keep_out: NDArray[np.float64], turn: float
+) -> NDArray[np.float64]:
+    """Where (2,) a prop stands: clear of the scene, and not in the camera's face."""
+    x, y, _ = camera.position
+    azimuth, whole = arctan2(y, x) + turn, math.sqrt(x * x + y * y)
+    way = np.array([cos(azimuth), sin(azimuth)])
+    place = _clear(way, drawn.share * whole / math.sqrt(2), drawn.size, keep_out)
+    if cos(turn) > 0:
+        place *= min(1.0, NEAREST_OCCLUDER * whole / float(norm(place)))
+    return place
+
+
+def _occluding_size(
+    drawn: _Drawn,
+    camera: Camera,
+    keep_out: NDArray[np.float64],
+    turn: float,
+    rule: SceneryRule,
+) -> NDArray[np.float64]:
+    """A size whose top ends at its share of the line of sight; width grows along within limits."""
+    place = _place(drawn, camera, keep_out, turn)
+    along = float(norm(place) / norm(camera.position[:2]))
+    sight = camera.target[2] + (camera.position[2] - camera.target[2]) * along
+    top = max(rule.occlusion * sight, 0.05)
+    factor = min(top / drawn.size[2], rule.occluder_size[1] / max(drawn.size))
+    return np.array([drawn.size[0] * factor, drawn.size[1] * factor, top])
+
+
+def _footprints_meet(body: Body, other: Body) -> bool:
+    """Whether the circles round two props' floor plans meet."""
+    reach = (norm(body.scale[:2]) + norm(other.scale[:2])) / 2
+    return bool(norm(np.subtract(body.position[:2], other.position[:2])) < reach)
+
+
+def _clear(
+    way: NDArray[np.float64],
+    distance: float,
+    size: NDArray[np.float64],
+    keep_out: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """The first place along ``way`` from ``distance`` on that is clear of the scene's rectangle."""
+    room = CLEARANCE + float(norm(size[:2])) / 2
+    low, high = keep_out[0, :2] - room, keep_out[1, :2] + room
+    with np.errstate(divide="ignore"):
+        exits = np.where(way > 0, high / way, low / way)
+    inside = bool(((way * distance > low) & (way * distance < high)).all())
+    return np.asarray(way * (float(exits.min()) if inside else distance))

@@ -1,0 +1,149 @@
+"""A ball that hits a stand on which other bodies stand: what contain and link have in common."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from physion.scenes.sampling.build import Palette, Staged, build_scene
+from physion.scenes.sampling.clearance import beside, cleared
+from physion.scenes.sampling.parameters import place
+from physion.scenes.sampling.rules import (
+    BodyRule,
+    PushRule,
+    ZoneRule,
+    draw_body,
+    draw_push,
+    draw_zone,
+)
+from physion.scenes.sampling.stacks import (
+    FilledStackRule,
+    Stand,
+    StandRule,
+    choose,
+    draw_looks,
+    draw_stack,
+    draw_stand,
+    lowered,
+    top_of,
+)
+from physion.scenes.scene import Body, Look, Roles, Scene, Vec3
+from physion.seeds import child_generator
+
+TRIES = 100
+MAX_FRAMES = 452
+STACK_MASS = 0.25
+"""Bodies of the stack have this share of their mass by volume (official-system.md, 3.4)."""
+
+
+class Standing(Staged, Protocol):
+    """Parameters of a scenario with a stand."""
+
+    @property
+    def length(self) -> float:
+        """The probe starts at minus half of this, metres."""
+        ...
+
+    @property
+    def stand(self) -> StandRule:
+        """What stands in the middle."""
+        ...
+
+    @property
+    def stack(self) -> FilledStackRule:
+        """What stands on or in it."""
+        ...
+
+    @property
+    def choice(self) -> tuple[int, int]:
+        """First and last position in the stack at which the agent may be."""
+        ...
+
+    @property
+    def zone(self) -> ZoneRule:
+        """The patient."""
+        ...
+
+    @property
+    def probe(self) -> BodyRule:
+        """What is pushed."""
+        ...
+
+    @property
+    def push(self) -> PushRule:
+        """How it is pushed."""
+        ...
+
+    @property
+    def monochrome(self) -> bool:
+        """Whether the bodies of the stack share one colour."""
+        ...
+
+
+@dataclass
+class _Drawn:
+    stand: Stand
+    stack: list[Body]
+    probe: Body
+
+
+def sample_standing(
+    scenario: str,
+    params: Standing,
+    seed: np.random.SeedSequence,
+    base_color: Vec3 | None,
+    attachment_color: Vec3,
+) -> Scene:
+    """Draw a stand in the middle, a stack in or on it, and a ball at -x pushed at its foot.
+
+    Colours of the stand are fixed ones of the official configurations; None draws one.
+    """
+    rng, palette = child_generator(seed, "placement"), Palette.of(seed)
+    member = params.stack.member
+    agent_look = palette.agent_look(member.textures)
+    base_look = _painted(palette.look(params.stand.base.textures), base_color)
+    attachment_look = _painted(palette.look(params.stand.attachment.textures), attachment_color)
+    probe_look = palette.look(params.probe.textures)
+    zone = draw_zone(rng, params.zone, palette.look(params.zone.textures))
+    looks = draw_looks(rng, params.stack, palette, params.monochrome)
+    at = choose(rng, len(looks), params.choice)
+    looks[at] = agent_look
+    chance = child_generator(seed, "push")
+    drawn: list[_Drawn] = []
+
+    def attempt() -> str | None:
+        stand = draw_stand(rng, params.stand, zone, base_look, attachment_look)
+        around = (zone, *stand.holders)
+        stack = draw_stack(rng, params.stack, stand.start, around, looks, "member", STACK_MASS)
+        fitting = lowered(stack, stand)
+        start = (-params.length / 2, 0.0, 0.0)
+        probe = draw_body(chance, params.probe, "probe", start, probe_look, angular_drag=0.0)
+        probe = cleared(probe, (zone,))
+        if fitting is None:
+            return "the stack does not fit under the cap"
+        if not beside(probe, (*stand.bodies, *fitting)):
+            return "the probe would start inside the stand"
+        drawn.append(_Drawn(stand, fitting, probe))
+        return None
+
+    place(TRIES, scenario, attempt)
+    found = drawn[0]
+    target = replace(found.stack[at], name="target")
+    others = [body for i, body in enumerate(found.stack) if i != at]
+    return build_scene(
+        scenario,
+        seed,
+        params,
+        bodies=(zone, target, found.probe, *found.stand.bodies, *others),
+        roles=Roles("target", "zone", "probe"),
+        max_frames=MAX_FRAMES,
+        aim_height=top_of(found.stack[-1]) / 2,
+        pushes=(draw_push(chance, params.push, found.probe),),
+        joints=found.stand.joints,
+    )
+
+
+def _painted(look: Look, color: Vec3 | None) -> Look:
+    return look if color is None else replace(look, color=color)

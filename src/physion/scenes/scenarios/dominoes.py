@@ -1,0 +1,150 @@
+"""Dominoes: a pushed domino topples a row of others, or not; does the last one reach the zone?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from physion.numerics.elementary import arctan2
+from physion.numerics.rotations import rotate_vectors
+from physion.scenes.sampling.build import Palette, build_scene
+from physion.scenes.sampling.parameters import Count, Length, Room, Share, place, uniform
+from physion.scenes.sampling.placement import CameraRule, SceneryRule, world_bounds
+from physion.scenes.sampling.registry import scenario
+from physion.scenes.sampling.rules import (
+    BodyRule,
+    PushRule,
+    ZoneRule,
+    above_floor,
+    draw_body,
+    draw_push,
+    draw_zone,
+    require_apart,
+)
+from physion.scenes.scene import Body, Look, Roles, Scene
+from physion.seeds import child_generator
+
+MAX_FRAMES = 302
+ZONE_GAP = 0.1
+"""Metres added between zone and target (official-system.md, section 3.1)."""
+BODY_GAP = 0.01
+"""Metres kept free between neighbours, which officially may start inside each other."""
+ROW_TRIES = 100
+
+DOMINO = ((0.1, 0.1), (0.25, 0.25), (0.5, 0.5))
+"""Width along the row, width across, height: metres."""
+TARGET = BodyRule(scale=DOMINO)
+MIDDLE = BodyRule(scale=DOMINO, turn_deg=(-30.0, 30.0))
+PROBE = BodyRule(scale=DOMINO, static_friction=(0.01, 0.01), dynamic_friction=(0.01, 0.01))
+ZONE = ZoneRule()
+PUSH = PushRule(speed=(0.75, 0.75), frame=(0.0, 15.0))
+CAMERA, SCENERY = CameraRule(), SceneryRule()
+
+
+@dataclass(frozen=True)
+class Params:
+    """What is drawn for a trial of dominoes (reference/official-system.md, 2.1, 3.0 and 3.1).
+
+    Defaults are the official configuration `pilot_dominoes_2mid_J025R30`, in which every second
+    trial ends in contact; those of the official class are the preset `default_boxroom`.
+
+    - ``length``: metres from probe to target. ``middles``: how many stand between them.
+    - ``spacing_jitter``: share by which each step along the row is longer or shorter; it adds up.
+      ``lateral_jitter``: share of its width by which a middle one stands aside.
+    - ``remove_middle``: one of the middle ones is left out, so that there is a gap.
+    - ``turned_push``: the push turns with the probe, as officially.
+    - ``monochrome``: the middle ones share a colour.
+    """
+
+    length: Length = 1.5
+    middles: Count = 2
+    target: BodyRule = TARGET
+    middle: BodyRule = MIDDLE
+    probe: BodyRule = PROBE
+    zone: ZoneRule = ZONE
+    spacing_jitter: Share = 0.25
+    lateral_jitter: Share = 0.25
+    remove_middle: bool = False
+    push: PushRule = PUSH
+    turned_push: bool = True
+    monochrome: bool = True
+    room: Room = "box"
+    camera: CameraRule = CAMERA
+    scenery: SceneryRule = SCENERY
+
+
+@scenario("dominoes", Params)
+def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
+    """Draw a row of dominoes along x, the probe at its negative end, the zone beyond the target."""
+    rng, palette = child_generator(seed, "placement"), Palette.of(seed)
+    half = params.length / 2
+    zone = draw_zone(rng, params.zone, palette.look(params.zone.textures), (half + ZONE_GAP, 0.0))
+    x, y, _ = zone.position
+    zone = replace(zone, position=(x + zone.scale[0], y, 0.0))
+    look = palette.agent_look(params.target.textures)
+    target = above_floor(draw_body(rng, params.target, "target", (half, 0.0, 0.0), look))
+    chance = child_generator(seed, "push")
+    look = palette.look(params.probe.textures)
+    probe = above_floor(
+        draw_body(chance, params.probe, "probe", (-half, 0.0, 0.0), look, angular_drag=0.0)
+    )
+    require_apart(probe, target)
+    require_apart(target, zone)
+    row = _row(params, rng, palette, probe, target)
+    push = draw_push(chance, params.push, probe, heading(probe) if params.turned_push else 0.0)
+    return build_scene(
+        "dominoes",
+        seed,
+        params,
+        bodies=(zone, target, probe, *row),
+        roles=Roles("target", "zone", "probe"),
+        max_frames=MAX_FRAMES,
+        pushes=(push,),
+    )
+
+
+def heading(body: Body) -> float:
+    """Radians from +x, towards +y, of where the body's own x axis points."""
+    x, y, _ = rotate_vectors(body.rotation, (1.0, 0.0, 0.0))
+    return arctan2(float(y), float(x))
+
+
+def _row(
+    params: Params, rng: np.random.Generator, palette: Palette, probe: Body, target: Body
+) -> list[Body]:
+    """The dominoes between probe and target, drawn anew as a whole where they do not fit."""
+    removed = int(rng.integers(max(params.middles, 1))) if params.remove_middle else -1
+    looks = [palette.look(params.middle.textures, params.monochrome) for _ in range(params.middles)]
+    free = float(world_bounds(probe)[1, 0]), float(world_bounds(target)[0, 0])
+    row: list[Body] = []
+
+    def attempt() -> str | None:
+        row[:] = _draw_row(params, rng, looks, *free)
+        if len(row) < params.middles:
+            return f"no room left for all {params.middles} in the middle"
+        return None
+
+    place(ROW_TRIES, f"a row of dominoes {params.length:g} m long", attempt)
+    return [body for i, body in enumerate(row) if i != removed]
+
+
+def _draw_row(
+    params: Params, rng: np.random.Generator, looks: list[Look], start: float, end: float
+) -> list[Body]:
+    """As many as fit between ``start`` and ``end`` (metres along x); their jitter adds up."""
+    spacing = params.length / (params.middles + 1)
+    x, taken, row = -params.length / 2, start, []
+    for i, look in enumerate(looks):
+        share = params.spacing_jitter
+        x += spacing * uniform(rng, (1 - share, 1 + share))
+        aside = uniform(rng, (-params.lateral_jitter, params.lateral_jitter))
+        body = above_floor(draw_body(rng, params.middle, f"middle_{i}", (0.0, 0.0, 0.0), look))
+        low, high = (float(bound) for bound in world_bounds(body)[:, 0])
+        first, last = taken + BODY_GAP - low, end - BODY_GAP - high
+        if first > last:
+            break
+        at = max(min(x, last), first)
+        taken = at + high
+        row.append(replace(body, position=(at, aside * body.scale[1], body.position[2])))
+    return row

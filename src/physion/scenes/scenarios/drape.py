@@ -1,0 +1,298 @@
+"""Drape: a cloth falls over some objects; does it touch the one in question?"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Annotated, NamedTuple
+
+import numpy as np
+
+from physion.scenes.sampling.build import Palette, build_scene
+from physion.scenes.sampling.parameters import (
+    SMALLEST_SIDE,
+    Length,
+    Lengths,
+    Masses,
+    Materials,
+    Offsets,
+    Place,
+    Props,
+    Quantity,
+    Range,
+    Room,
+    Shapes,
+    Share,
+    Shares,
+    Sides,
+    SizeFactors,
+    pick,
+    place,
+    uniform,
+    yaw,
+)
+from physion.scenes.sampling.placement import CameraRule, SceneryRule, world_bounds
+from physion.scenes.sampling.registry import scenario
+from physion.scenes.sampling.rules import ZoneRule, draw_zone
+from physion.scenes.scene import Body, Cloth, Roles, Scene, Vec3
+from physion.scenes.shapes.prop_names import PREFIX
+from physion.scenes.shapes.props import NATURAL_SIZES
+from physion.seeds import child_generator
+
+MAX_FRAMES = 151
+TRIES = 100
+VERTEX_SPACING = 0.04
+"""Metres between the vertices of a cloth: 51 along the official two metres (`Cloth`)."""
+
+
+class Setting(NamedTuple):
+    """Size of a prop in the world, its place on the floor, metres, and how it is turned."""
+
+    size: Vec3
+    place: tuple[float, float]
+    turn_deg: float = 0.0
+
+
+SETTINGS = {
+    "floor_lamp": Setting((0.613, 0.503, 1.286), (0.058, -1.098)),
+    "sculpture": Setting((1.387, 1.414, 1.121), (0.029, -1.086)),
+    "desk_lamp": Setting((0.979, 0.231, 1.177), (0.187, -1.086), turn_deg=-90.0),
+    "armchair": Setting((0.915, 0.914, 0.833), (0.0, -1.4)),
+}
+"""The four models that stand behind the official scenes, as measured."""
+OTHER_PLACE = (0.0, -1.1)
+
+Frames = Annotated[int, Quantity("frames", 0, 10000)]
+
+FAMILIES = ("wood", "metal", "plastic")
+ZONE = ZoneRule(("cone",), ((0.2, 0.2), (0.2, 0.2), (0.3, 0.3)))
+CAMERA = CameraRule((1.5, 2.5), (0.0, 90.0), (1.5, 2.0), mirror=0.5)
+SCENERY = SceneryRule(distractor_size=(0.8, 1.2), occluder_size=(0.8, 1.2))
+
+
+@dataclass(frozen=True)
+class ClothRule:
+    """The cloth, a square sheet that is let go flat and level.
+
+    - ``size``: metres a side. ``stretch``, ``bend``, ``tether``: stiffnesses (`Cloth`).
+    - ``x``, ``y``, ``height``: metres, of its centre. ``mass``: kg. ``textures``: materials.
+    """
+
+    size: Sides = (2.0, 2.0)
+    stretch: Shares = (0.0, 1.0)
+    bend: Shares = (0.0, 1.0)
+    tether: Shares = (0.0, 1.0)
+    x: Offsets = (-0.2, 0.2)
+    y: Offsets = (-0.6, -0.4)
+    height: Lengths = (1.3, 1.5)
+    mass: Masses = (0.5, 0.5)
+    textures: Materials = ("cloth",)
+
+
+@dataclass(frozen=True)
+class AnchorRule:
+    """The objects on both sides that hold the cloth up.
+
+    - ``shapes``; ``width`` along x and ``depth`` along y, metres; ``mass``: kg; ``textures``.
+    - ``height``: metres, more or less by up to ``height_jitter``; the right one is ``taller``.
+    - ``between``: x of the left and of the right one; both are further out by up to ``jitter``.
+    - ``extra``: chance of a third one, ``extra_height`` tall, jittered alike. It stands
+      ``extra_distance`` outside of the left one's place with a chance of ``extra_left``, or of the
+      right one's, by up to ``jitter`` to the left of that. (Height, side and the direction of this
+      jitter are measured on 69 of them.)
+    """
+
+    shapes: Shapes = ("cone", "cube", "cylinder", "pyramid", "triangular_prism")
+    width: Sides = (0.1, 0.3)
+    depth: Sides = (0.2, 0.5)
+    height: Length = 0.6
+    height_jitter: Length = 0.2
+    taller: Length = 0.1
+    between: Offsets = (-0.4, 0.4)
+    jitter: Length = 0.1
+    extra: Share = 0.7
+    extra_left: Share = 0.65
+    extra_distance: Length = 0.5
+    extra_height: Length = 0.5
+    mass: Masses = (25.0, 25.0)
+    textures: Materials = FAMILIES
+
+    def check_values(self) -> str | None:
+        """What is wrong with values that are good one by one, or None."""
+        for key, height in (("height", self.height), ("extra_height", self.extra_height)):
+            if height - self.height_jitter < SMALLEST_SIDE:
+                return (
+                    f"height_jitter is {self.height_jitter:g} m and {key} {height:g} m; "
+                    f"at least {SMALLEST_SIDE:g} m must be left"
+                )
+        return None
+
+
+@dataclass(frozen=True)
+class PropRule:
+    """The large object behind the others.
+
+    ``size`` is times the official size (`SETTINGS`) or, of props that the study does not have,
+    times the natural one; ``shift`` is metres from its official place.
+    """
+
+    props: Props = tuple(SETTINGS)
+    size: SizeFactors = (1.0, 1.0)
+    shift: Place = (0.0, 0.0)
+    mass: Masses = (100.0, 100.0)
+    textures: Materials = FAMILIES
+
+
+@dataclass(frozen=True)
+class Params:
+    """What is drawn for a trial of drape (reference/official-system.md, 2.1, 3.0 and 3.8).
+
+    Defaults are the official rules, with middling values of what the configurations differ in.
+
+    - ``zone_share``: where the zone stands, as a share of the way from the right anchor's place to
+      the left one's. ``zone_y``: metres.
+    - ``settle_frames``: see `Scene`. Bodies never move: cloth does not push them.
+    """
+
+    cloth: ClothRule = ClothRule()
+    anchors: AnchorRule = AnchorRule()
+    zone: ZoneRule = ZONE
+    zone_share: Shares = (0.2, 0.8)
+    zone_y: Offsets = (-0.2, 0.4)
+    prop: PropRule = PropRule()
+    settle_frames: Frames = 100
+    room: Room = "box"
+    camera: CameraRule = CAMERA
+    scenery: SceneryRule = SCENERY
+
+
+@scenario("drape", Params)
+def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
+    """Draw a cloth above anchors along x, with the zone between them and a prop behind."""
+    palette = Palette.of(seed)
+    cloth = _draw_cloth(params.cloth, child_generator(seed, "cloth"), palette)
+    prop = _draw_prop(params.prop, child_generator(seed, "prop"), palette)
+    anchors = _draw_anchors(params.anchors, child_generator(seed, "anchors"), palette, prop)
+    zone = _draw_zone(params, child_generator(seed, "placement"), palette, (prop, *anchors))
+    sheet = Body(cloth.name, "cube", cloth.position, (cloth.size[0], cloth.size[1], 0.01))
+    bodies = (zone, *anchors, prop)
+    return build_scene(
+        "drape",
+        seed,
+        params,
+        bodies=bodies,
+        cloths=(cloth,),
+        roles=Roles("cloth", "zone"),
+        max_frames=MAX_FRAMES,
+        seen=(zone, sheet),
+        around=(*bodies, sheet),
+        settle_frames=params.settle_frames,
+    )
+
+
+def _draw_cloth(rule: ClothRule, rng: np.random.Generator, palette: Palette) -> Cloth:
+    size = uniform(rng, rule.size)
+    return Cloth(
+        "cloth",
+        (uniform(rng, rule.x), uniform(rng, rule.y), uniform(rng, rule.height)),
+        (size, size, 0.0),
+        mass=uniform(rng, rule.mass),
+        resolution=max(2, round(size / VERTEX_SPACING) + 1),
+        stretch=uniform(rng, rule.stretch),
+        bend=uniform(rng, rule.bend),
+        tether=uniform(rng, rule.tether),
+        look=palette.agent_look(rule.textures),
+    )
+
+
+def _draw_prop(rule: PropRule, rng: np.random.Generator, palette: Palette) -> Body:
+    name = pick(rng, rule.props)
+    found = SETTINGS.get(name, Setting(NATURAL_SIZES[name], OTHER_PLACE))
+    factor = uniform(rng, rule.size)
+    width, depth, height = (side * factor for side in found.size)
+    across = found.turn_deg % 180 != 0
+    return Body(
+        "prop",
+        PREFIX + name,
+        (found.place[0] + rule.shift[0], found.place[1] + rule.shift[1], 0.0),
+        (depth, width, height) if across else (width, depth, height),
+        yaw(math.radians(found.turn_deg)),
+        mass=uniform(rng, rule.mass),
+        kinematic=True,
+        look=palette.look(rule.textures),
+    )
+
+
+def _draw_anchors(
+    rule: AnchorRule, rng: np.random.Generator, palette: Palette, prop: Body
+) -> list[Body]:
+    """The anchors left and right, and perhaps the extra one."""
+    left, right = rule.between
+    rightwards, leftwards = (0.0, rule.jitter), (-rule.jitter, 0.0)
+    wanted = [
+        ("anchor_left", left, leftwards, rule.height),
+        ("anchor_right", right, rightwards, rule.height + rule.taller),
+    ]
+    if rng.random() < rule.extra:
+        aside = rng.random() < rule.extra_left
+        x = left - rule.extra_distance if aside else right + rule.extra_distance
+        wanted.append(("anchor_extra", x, leftwards, rule.extra_height))
+    placed: list[Body] = []
+    for name, x, jitter, height in wanted:
+        draw = partial(_anchor, rule, rng, name, x, jitter, height)
+        placed.append(_draw_apart(name, (prop, *placed), draw))
+    return [replace(anchor, look=palette.look(rule.textures)) for anchor in placed]
+
+
+def _anchor(
+    rule: AnchorRule,
+    rng: np.random.Generator,
+    name: str,
+    x: float,
+    jitter: Range,
+    height: float,
+) -> Body:
+    height += uniform(rng, (-rule.height_jitter, rule.height_jitter))
+    return Body(
+        name,
+        pick(rng, rule.shapes),
+        (x + uniform(rng, jitter), 0.0, 0.0),
+        (uniform(rng, rule.width), uniform(rng, rule.depth), height),
+        mass=uniform(rng, rule.mass),
+        kinematic=True,
+    )
+
+
+def _draw_zone(
+    params: Params, rng: np.random.Generator, palette: Palette, others: Sequence[Body]
+) -> Body:
+    left, right = params.anchors.between
+    look = palette.look(params.zone.textures)
+
+    def draw() -> Body:
+        x = right - uniform(rng, params.zone_share) * (right - left)
+        return draw_zone(rng, params.zone, look, (x, uniform(rng, params.zone_y)))
+
+    return _draw_apart("zone", others, draw)
+
+
+def _draw_apart(name: str, others: Sequence[Body], draw: Callable[[], Body]) -> Body:
+    """The first body drawn whose floor plan is apart from those of ``others``.
+
+    Official ones may start inside each other, and are pushed apart while they settle.
+    """
+    drawn: list[Body] = []
+
+    def attempt() -> str | None:
+        drawn.append(draw())
+        low, high = world_bounds(drawn[-1])[:, :2]
+        for other in others:
+            other_low, other_high = world_bounds(other)[:, :2]
+            if (low < other_high).all() and (other_low < high).all():
+                return f"it meets {other.name}"
+        return None
+
+    place(TRIES, name, attempt)
+    return drawn[-1]

@@ -1,0 +1,104 @@
+"""Support: a ball hits a tower; does the object on its top fall onto the plate around it?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from physion.scenes.sampling.build import Palette, build_scene
+from physion.scenes.sampling.clearance import beside, cleared
+from physion.scenes.sampling.parameters import Length, Room, place
+from physion.scenes.sampling.placement import CameraRule, SceneryRule
+from physion.scenes.sampling.registry import scenario
+from physion.scenes.sampling.rules import (
+    BodyRule,
+    PushRule,
+    ZoneRule,
+    draw_body,
+    draw_push,
+    draw_zone,
+)
+from physion.scenes.sampling.stacks import StackRule, draw_looks, draw_stack, top_of, weighed
+from physion.scenes.scene import Body, Roles, Scene
+from physion.seeds import child_generator
+
+MAX_FRAMES = 602
+TRIES = 100
+
+BLOCKS = StackRule(
+    BodyRule(
+        ("cube",),
+        (0.4, 0.5),
+        (-45.0, 45.0),
+        static_friction=(0.0, 0.9),
+        dynamic_friction=(0.0, 0.9),
+        restitution=(0.0, 1.0),
+    ),
+    jitter=0.3,
+)
+CAP = BodyRule(("sphere",), (0.4, 0.4))
+ZONE = ZoneRule(scale=((5.0, 5.0), (5.0, 5.0), (0.01, 0.01)), friction=(0.15, 0.15))
+PROBE = BodyRule(
+    ("sphere",), (0.3, 0.3), static_friction=(0.01, 0.01), dynamic_friction=(0.01, 0.01)
+)
+PUSH = PushRule(speed=(1.0, 8.0), height=0.5, frame=(15.0, 15.0))
+CAMERA = CameraRule((2.75, 2.75), (0.0, 90.0), (0.75, 2.0))
+SCENERY = SceneryRule()
+
+
+@dataclass(frozen=True)
+class Params:
+    """What is drawn for a trial of support (reference/official-system.md, 2.1, 3.0 and 3.2).
+
+    - ``length``: the probe starts at minus half of this, metres; the tower stands in the middle.
+    - ``stack``: the blocks of the tower, from below. ``cap``: what is on its top, the agent.
+
+    Masses of blocks and cap are those of a cube of 0.5 m a side (`StackRule`).
+    """
+
+    length: Length = 2.0
+    stack: StackRule = BLOCKS
+    cap: BodyRule = CAP
+    zone: ZoneRule = ZONE
+    probe: BodyRule = PROBE
+    push: PushRule = PUSH
+    monochrome: bool = True
+    room: Room = "box"
+    camera: CameraRule = CAMERA
+    scenery: SceneryRule = SCENERY
+
+
+@scenario("support", Params)
+def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
+    """Draw a tower in the middle of a plate, and a ball at -x that is pushed at its foot."""
+    placement, palette = child_generator(seed, "placement"), Palette.of(seed)
+    target_look = palette.agent_look(params.cap.textures)
+    probe_look = palette.look(params.probe.textures)
+    zone = draw_zone(placement, params.zone, palette.look(params.zone.textures))
+    looks = draw_looks(placement, params.stack, palette, params.monochrome)
+    chance = child_generator(seed, "push")
+    drawn: list[Body] = []
+
+    def attempt() -> str | None:
+        floor = zone.scale[2]
+        blocks = draw_stack(placement, params.stack, floor, (zone,), looks, "block")
+        top = top_of(blocks[-1]) if blocks else floor
+        cap = weighed(draw_body(placement, params.cap, "target", (0.0, 0.0, top), target_look))
+        start = (-params.length / 2, 0.0, 0.0)
+        probe = draw_body(chance, params.probe, "probe", start, probe_look, angular_drag=0.0)
+        drawn[:] = [cleared(cap, (zone, *blocks)), cleared(probe, (zone,)), *blocks]
+        return None if beside(drawn[1], blocks) else "the probe would start inside the tower"
+
+    place(TRIES, "support", attempt)
+    target, probe = drawn[:2]
+    return build_scene(
+        "support",
+        seed,
+        params,
+        bodies=(zone, *drawn),
+        roles=Roles("target", "zone", "probe"),
+        max_frames=MAX_FRAMES,
+        aim_height=top_of(target) / 2,
+        pushes=(draw_push(chance, params.push, probe),),
+    )

@@ -1,0 +1,384 @@
+"""The primitives of every scene by name: how they look, collide, and how heavy they are.
+
+Sizes are those of the official model records (reference/official-system.md, section 1.2), with
+their (x, y up, z) written as our (x, z, y up): the pivot is the centre of the bottom face, so that
+a shape stands on z = 0. The records give bounds alone; their "volume" is not that of the solid but,
+as far as it can be checked, the summed volume of boxes round the convex colliders: for shapes that
+are their own hull it is exactly that of the bounding box, and for a torus of 16 colliders it yields
+the same hole that a published picture shows (radius 0.429 against 0.430). What bounds and that sum
+leave open is a named constant here, with its reason.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from physion.numerics.elementary import arctan2, cos, sin
+from physion.numerics.linear_algebra import ordered_sum, outer
+from physion.registry import Registry
+from physion.scenes.scene import Vec3
+from physion.scenes.shapes.meshes import (
+    Mesh,
+    Points,
+    box,
+    extrude,
+    hull,
+    inertia_from_second_moment,
+    revolve,
+    solid_properties,
+)
+from physion.scenes.shapes.prop_names import PREFIX, PROPS
+
+CURVED = math.radians(40.0)
+"""Crease angle of turned shapes: walls are shaded round, rims stay sharp."""
+ROUND_SEGMENTS = 32
+CONE_SEGMENTS = 22
+"""From the record: 0.9898 wide and 1 deep, which is a 22-sided cone with corners on one axis."""
+RING_SEGMENTS = 16
+"""Sides of the torus, counted in a published picture."""
+TORUS_INNER = 0.429
+"""Inner radius of the torus: 0.688 (sd 0.004) of the outer 0.625, measured on 8 corners of a
+torus-shaped zone in a published picture; 0.429 from the boxes of 16 colliders (0.2618)."""
+TORUS_BEVEL = 0.06
+"""The torus' section is a rectangle with corners cut off by this much, judged from pictures."""
+PIPE_INNER = 0.389
+"""Inner radius of the pipe: the boxes of 16 to 32 colliders add up to the record's 0.5146 for
+0.386 to 0.391."""
+BOWL_RADIUS, BOWL_HEIGHT = 0.4904, 0.3789
+BOWL_FLAT = 0.2
+"""Radius of the bowl's flat bottom, fitted: of 0.12, 0.2 and 0.28 it misses the official final
+positions of contained objects least (reference: a wholly round bottom suits bowls, not vases)."""
+BOWL_WALL = 0.045
+"""Thickness of the bowl's wall: 0.03 to 0.055 fit the record's 0.1715, by the number of colliders;
+the rim in pictures looks no thicker."""
+BOWL_PIECE_WALL = 0.035
+"""Thickness at the corners of the bowl's pieces: the hull of a sector also fills the hollow behind
+its chords, and with this corner thickness the pieces have the volume of the drawn wall."""
+DUMBBELL_HEAD, DUMBBELL_BAR = 0.375, 0.1206
+"""Half sizes of a dumbbell's two cubes and of the square bar between them, each a third of its
+length. Official ones come to rest on four sides and stand on narrow ones, so the heads are flat;
+boxes of these sizes add up to the record's 0.8873."""
+RAMP_FOOT, RAMP_DEPTH = 1.629, 2.0
+"""Distance of the pivot from the foot of a ramp, and its width. The lengths in the records are
+those of slopes of 30 and 60 per cent and one platform of 1.61. The records put the foot at +x, but
+what comes to rest in front of the official ramps shows that it lies at -x."""
+BOWL_SEGMENTS = 24
+PIPE_SECTORS, BOWL_SECTORS, BOWL_BANDS = 16, 12, 3
+"""Convex sectors that stand for a hollow shape in contacts, and bands of the bowl's wall."""
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """A convex part of a shape for contacts.
+
+    ``center`` and ``half`` (half sizes; a sphere's radius three times; a cylinder's rx, ry and
+    half height, its axis along z) describe all kinds, as the bounding box for ``convex``, whose
+    corners are ``vertices`` (K, 3) in the shape's frame. The others have no vertices.
+    ``turn`` is the rotation (3, 3) from the piece's own axes to the shape's.
+    """
+
+    kind: Literal["box", "sphere", "cylinder", "convex"]
+    center: Vec3
+    half: Vec3
+    vertices: Points
+    turn: Points
+
+    @property
+    def mesh(self) -> Mesh:
+        """The piece as a closed mesh; round ones have 32 sides."""
+        if self.kind == "convex":
+            return hull(self.vertices)
+        if self.kind == "box":
+            solid = box((0, 0, 0), self.half)
+        elif self.kind == "sphere":
+            solid = ball_mesh(self.half[0])
+        else:
+            ends = [(0.0, -1.0), (1.0, -1.0), (1.0, 1.0), (0.0, 1.0)]
+            solid = revolve(ends, ROUND_SEGMENTS).moved(self.half)
+        return solid.turned(self.turn).moved(offset=self.center)
+
+
+@dataclass(frozen=True, eq=False)
+class MassProperties:
+    """How an evenly filled body resists motion.
+
+    ``volume`` in cubic metres; ``center`` of mass (3,) in the shape's frame, metres; ``inertia``
+    (3, 3) about that centre for a mass of 1 kg: multiply it by the body's mass.
+    """
+
+    volume: float
+    center: Points
+    inertia: Points
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """A shape at unit scale: its mesh to draw (closed) and its convex pieces to collide.
+
+    ``volume`` (cubic metres) is that of the mesh. ``hollow`` shapes have a hole or a cavity.
+    """
+
+    name: str
+    mesh: Mesh
+    pieces: tuple[Piece, ...]
+    hollow: bool = False
+
+    @property
+    def volume(self) -> float:
+        """Volume of the drawn solid, cubic metres at unit scale."""
+        return solid_properties(self.mesh)[0]
+
+    @property
+    def bounds(self) -> Points:
+        """(2, 3): smallest and largest coordinates of the mesh."""
+        return self.mesh.bounds
+
+    def mass_properties(
+        self, scale: Vec3 = (1.0, 1.0, 1.0), of: Literal["solid", "pieces"] = "solid"
+    ) -> MassProperties:
+        """Volume, centre and inertia at ``scale``, of the drawn solid or of its pieces.
+
+        Unity takes a body's centre and inertia from its colliders: ``of="pieces"``.
+        """
+        parts = [self.mesh] if of == "solid" else [piece.mesh for piece in self.pieces]
+        found = [solid_properties(part.moved(scale)) for part in parts]
+        volumes = np.array([volume for volume, _, _ in found])
+        volume = float(ordered_sum(volumes))
+        shares = volumes / volume
+        centers = np.stack([center for _, center, _ in found])
+        center = ordered_sum(shares[:, None] * centers, axis=0)
+        inertia = np.zeros((3, 3))
+        for share, part_center, (_, _, own) in zip(shares, centers, found, strict=True):
+            arm = part_center - center
+            inertia += share * (own + inertia_from_second_moment(outer(arm, arm)))
+        return MassProperties(volume, center, inertia)
+
+
+Outline = list[tuple[float, float]]
+Maker = Callable[[], Shape]
+shapes: Registry[Maker] = Registry(
+    "shape", {PREFIX + name: "physion.scenes.shapes.props:shapes" for name in PROPS}
+)
+"""Makers of shapes; call `shape` for the shape itself."""
+
+
+@cache
+def shape(name: str) -> Shape:
+    """The shape called ``name``; `UnknownNameError` with the closest names if there is none."""
+    return shapes.get(name)()
+
+
+def primitive(kind: Literal["box", "sphere", "cylinder"], center: Vec3, half: Vec3) -> Piece:
+    """A piece that engines know by itself, its axes along the shape's."""
+    return Piece(kind, center, half, np.zeros((0, 3)), np.eye(3))
+
+
+def convex(points: NDArray[np.float64]) -> Piece:
+    """A piece that is the hull of ``points`` (K, 3)."""
+    corners = hull(points).vertices
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    center, half = (low + high) / 2, (high - low) / 2
+    return Piece("convex", _vec3(center), _vec3(half), corners, np.eye(3))
+
+
+def ball_mesh(radius: float, segments: int = ROUND_SEGMENTS) -> Mesh:
+    """A sphere about the origin, in ``segments`` meridians and half as many bands."""
+    bands = segments // 2
+    turns = [-math.pi / 2 + math.pi * i / bands for i in range(bands + 1)]
+    rings = [(radius * cos(t), radius * sin(t)) for t in turns[1:-1]]
+    return revolve([(0.0, -radius), *rings, (0.0, radius)], segments, smooth=CURVED)
+
+
+def ring_pieces(sections: list[NDArray[np.float64]], sectors: int, steps: int) -> tuple[Piece, ...]:
+    """Convex sectors of a ring: each section (K, 2) of (radius, height), swept over its share.
+
+    ``steps`` is how many corners of the drawn circle a sector spans.
+    """
+    pieces = []
+    for section in sections:
+        for sector in range(sectors):
+            turns = 2 * math.pi * (sector + np.arange(steps + 1) / steps) / sectors
+            circle = np.stack([cos(turns), sin(turns)], axis=1)
+            points = [
+                np.column_stack([circle * r, np.full(len(circle), z)]) for r, z in section if r > 0
+            ]
+            pieces.append(convex(np.concatenate(points)))
+    return tuple(pieces)
+
+
+@shapes.register("cube")
+def _cube() -> Shape:
+    center, half = (0.0, 0.0, 0.5), (0.5, 0.5, 0.5)
+    return Shape("cube", box(center, half), (primitive("box", center, half),))
+
+
+@shapes.register("sphere")
+def _sphere() -> Shape:
+    center = (0.0, 0.0, 0.5)
+    mesh = ball_mesh(0.5).moved(offset=center)
+    return Shape("sphere", mesh, (primitive("sphere", center, (0.5, 0.5, 0.5)),))
+
+
+@shapes.register("cylinder")
+def _cylinder() -> Shape:
+    profile = [(0.0, 0.0), (0.5, 0.0), (0.5, 1.0), (0.0, 1.0)]
+    mesh = revolve(profile, ROUND_SEGMENTS, smooth=CURVED)
+    return Shape("cylinder", mesh, (primitive("cylinder", (0.0, 0.0, 0.5), (0.5, 0.5, 0.5)),))
+
+
+@shapes.register("half:cylinder")
+def _half_cylinder() -> Shape:
+    # Not an official shape: the official ledge is a stretched ball, sunk by half into the floor.
+    turns = np.linspace(0, math.pi, 9)
+    points = [(cos(t) / 2, y, sin(t) / 2) for t in turns for y in (-0.5, 0.5)]
+    return _solid("half:cylinder", hull(points, CURVED))
+
+
+@shapes.register("cone")
+def _cone() -> Shape:
+    profile = [(0.0, 0.0), (0.5, 0.0), (0.0, 1.0)]
+    return _solid("cone", revolve(profile, CONE_SEGMENTS, phase=math.pi / 2, smooth=CURVED))
+
+
+@shapes.register("pyramid")
+def _pyramid() -> Shape:
+    side = 0.75 / math.sqrt(2)
+    return _solid("pyramid", hull([*_square(side, 0.0), (0.0, 0.0, 1.0)]))
+
+
+@shapes.register("octahedron")
+def _octahedron() -> Shape:
+    # Both a square with sides of 1 and one with diagonals of 1 fit the bounds; with sides of 1 the
+    # eight faces are nearly regular, as the name promises.
+    return _solid("octahedron", hull([*_square(0.5, 0.75), (0.0, 0.0, 0.0), (0.0, 0.0, 1.5)]))
+
+
+@shapes.register("platonic")
+def _platonic() -> Shape:
+    turns = 2 * np.pi * np.arange(5) / 5
+    radius, rise = 1 / math.sqrt(5), 0.5 / math.sqrt(5)
+    upper = np.column_stack([radius * cos(turns), radius * sin(turns), np.full(5, rise)])
+    poles = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, -0.5]])
+    corners = np.concatenate([upper, -upper, poles])
+    return _solid("platonic", hull(corners).moved(offset=(0, 0, 0.5)))
+
+
+@shapes.register("pentagon")
+def _pentagon() -> Shape:
+    turns = -np.pi / 2 + 2 * np.pi * np.arange(5) / 5
+    corners = 0.5 * np.stack([cos(turns), sin(turns)], axis=1)
+    return _solid("pentagon", extrude(corners, 0.0, 1.0))
+
+
+@shapes.register("triangular_prism")
+def _triangular_prism() -> Shape:
+    # The ridge runs along x: with it along y the official falls of prisms are missed by 0.33 m
+    # (median of 20 trials), with it along x by 0.07 m.
+    ends = [(x, y, 0.0) for x in (-0.5, 0.5) for y in (-0.5, 0.5)]
+    ridge = [(x, 0.0, 0.5 + math.sqrt(3) / 4) for x in (-0.5, 0.5)]
+    return _solid("triangular_prism", hull([*ends, *ridge]))
+
+
+@shapes.register("dumbbell")
+def _dumbbell() -> Shape:
+    head, bar = DUMBBELL_HEAD, DUMBBELL_BAR
+    # Four segments of a lathe make a square solid; it is then laid along y.
+    corner, neck, end = head * math.sqrt(2), bar * math.sqrt(2), 3 * head
+    half = [(0.0, -end), (corner, -end), (corner, -head), (neck, -head)]
+    profile = [*half, *((r, -z) for r, z in reversed(half))]
+    lay = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    mesh = revolve(profile, 4, phase=math.pi / 4).turned(lay).moved(offset=(0, 0, head))
+    heads = (primitive("box", (0.0, y, head), (head, head, head)) for y in (-2 * head, 2 * head))
+    rod = primitive("box", (0.0, 0.0, head), (bar, head, bar))
+    return Shape("dumbbell", mesh, (*heads, rod))
+
+
+@shapes.register("torus")
+def _torus() -> Shape:
+    inner, outer, cut = TORUS_INNER, 0.625, TORUS_BEVEL
+    section = [(inner + cut, 0.0), (outer - cut, 0.0), (outer, cut), (outer, 0.25 - cut)]
+    section += [(outer - cut, 0.25), (inner + cut, 0.25), (inner, 0.25 - cut), (inner, cut)]
+    mesh = revolve(section, RING_SEGMENTS, closed=True, smooth=CURVED)
+    return Shape("torus", mesh, ring_pieces([np.array(section)], RING_SEGMENTS, 1), hollow=True)
+
+
+@shapes.register("pipe")
+def _pipe() -> Shape:
+    section = [(PIPE_INNER, 0.0), (0.5, 0.0), (0.5, 1.0), (PIPE_INNER, 1.0)]
+    mesh = revolve(section, ROUND_SEGMENTS, closed=True, smooth=CURVED)
+    steps = ROUND_SEGMENTS // PIPE_SECTORS
+    pieces = ring_pieces([np.array(section)], PIPE_SECTORS, steps)
+    return Shape("pipe", mesh, pieces, hollow=True)
+
+
+def bowl_outline(radius: float, height: float, flat: float, points: int) -> Outline:
+    """A circular arc of ``points`` corners from (``flat``, 0) up to (``radius``, ``height``).
+
+    Of all circles through both ends, that which a round bottom at z = 0 would have.
+    """
+    middle = (radius * radius + height * height - flat * flat) / (2 * height)
+    size = math.sqrt(flat * flat + middle * middle)
+    first, last = arctan2(-middle, flat), arctan2(height - middle, radius)
+    turns = np.linspace(first, last, points)
+    return [(size * cos(t), middle + size * sin(t)) for t in turns]
+
+
+@shapes.register("bowl")
+def _bowl() -> Shape:
+    outside = bowl_outline(BOWL_RADIUS, BOWL_HEIGHT, BOWL_FLAT, 4 * BOWL_BANDS + 1)
+    inside = _inside_bowl(BOWL_WALL, len(outside))
+    profile = [(0.0, 0.0), *outside, *reversed(inside), (0.0, BOWL_WALL)]
+    mesh = revolve(profile, BOWL_SEGMENTS, smooth=CURVED)
+    corners = _inside_bowl(BOWL_PIECE_WALL, len(outside))
+    sections = []
+    for first in range(0, 4 * BOWL_BANDS, 4):
+        outer = outside[first : first + 5]
+        sections.append(np.array([*outer, corners[first], corners[first + 4]]))
+    walls = ring_pieces(sections, BOWL_SECTORS, BOWL_SEGMENTS // BOWL_SECTORS)
+    floor = revolve([(0, 0), outside[0], inside[0], (0, BOWL_WALL)], BOWL_SEGMENTS)
+    return Shape("bowl", mesh, (*walls, convex(floor.vertices)), hollow=True)
+
+
+def _inside_bowl(wall: float, points: int) -> Outline:
+    """The inner side of a bowl's wall, from the bottom up to the rim."""
+    flat = max(BOWL_FLAT - wall / 2, 0.01)
+    arc = bowl_outline(BOWL_RADIUS - wall, BOWL_HEIGHT - wall, flat, points)
+    return [(r, z + wall) for r, z in arc]
+
+
+@shapes.register("ramp_with_platform_30")
+def _ramp_30() -> Shape:
+    return _ramp("ramp_with_platform_30", 0.3, 4.9529, 1.0007)
+
+
+@shapes.register("ramp_with_platform_60")
+def _ramp_60() -> Shape:
+    return _ramp("ramp_with_platform_60", 0.6, 3.2789, 1.0003)
+
+
+def _ramp(name: str, grade: float, length: float, height: float) -> Shape:
+    """A slope that rises from its foot towards +x by ``grade``, then a level platform."""
+    foot, top, end = -RAMP_FOOT, height / grade - RAMP_FOOT, length - RAMP_FOOT
+    side = [(foot, 0.0), (top, height), (end, height), (end, 0.0)]
+    corners = [(x, y, z) for x, z in side for y in (-RAMP_DEPTH / 2, RAMP_DEPTH / 2)]
+    return _solid(name, hull(corners))
+
+
+def _solid(name: str, mesh: Mesh) -> Shape:
+    """A convex shape, which is its own single piece."""
+    return Shape(name, mesh, (convex(mesh.vertices),))
+
+
+def _square(half: float, height: float) -> list[Vec3]:
+    return [(x, y, height) for x in (-half, half) for y in (-half, half)]
+
+
+def _vec3(values: NDArray[np.float64]) -> Vec3:
+    return (float(values[0]), float(values[1]), float(values[2]))

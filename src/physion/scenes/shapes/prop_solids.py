@@ -1,0 +1,225 @@
+"""Solids that props are made of: boxes, cushions, limbs, turned, bent and lofted ones."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from physion.numerics.elementary import cos, sin
+from physion.numerics.linear_algebra import dot, multiply, norm, ordered_mean, unit
+from physion.scenes.scene import Look, Vec3
+from physion.scenes.shapes.meshes import Mesh, Points, box, hull, revolve, solid_properties
+from physion.scenes.shapes.primitives import CURVED, ball_mesh
+from physion.scenes.shapes.prop_parts import Part
+
+SIDES = 24
+"""Sides of what is turned."""
+
+
+def solid(mesh: Mesh, look: Look | None = None) -> Part:
+    """A convex mesh, which is its own piece."""
+    return Part(mesh, (mesh.vertices,), look)
+
+
+def board(center: ArrayLike, half: ArrayLike, look: Look | None = None) -> Part:
+    """A box by its centre and half sizes."""
+    return solid(box(center, half), look)
+
+
+def block(
+    low: Sequence[float],
+    high: Sequence[float],
+    bottom: float,
+    top: float,
+    look: Look | None = None,
+) -> Part:
+    """A box that tapers: half sizes ``low`` at height ``bottom``, ``high`` at ``top``."""
+    signs = [(x, y) for x in (-1, 1) for y in (-1, 1)]
+    points = [(x * low[0], y * low[1], bottom) for x, y in signs]
+    return solid(hull(points + [(x * high[0], y * high[1], top) for x, y in signs]), look)
+
+
+def cushion(center: ArrayLike, half: ArrayLike, radius: float, look: Look | None = None) -> Part:
+    """A box with edges rounded by ``radius``."""
+    ball = ball_mesh(radius, 12).vertices
+    inner = np.asarray(half, np.float64) - radius
+    signs = itertools.product((-1, 1), repeat=3)
+    points = np.concatenate([ball + inner * np.array(sign) for sign in signs])
+    return solid(hull(points + np.asarray(center), CURVED), look)
+
+
+def limb(
+    start: ArrayLike,
+    end: ArrayLike,
+    thick: float,
+    thin: float | None = None,
+    look: Look | None = None,
+) -> Part:
+    """A rounded limb from ``start`` to ``end``; radii ``thick`` and ``thin`` at the ends."""
+    first = ball_mesh(thick, 10).moved(offset=start).vertices
+    last = ball_mesh(thick if thin is None else thin, 10).moved(offset=end).vertices
+    return solid(hull(np.concatenate([first, last]), CURVED), look)
+
+
+def ball(center: ArrayLike, half: ArrayLike, look: Look | None = None, sides: int = 16) -> Part:
+    """An ellipsoid by its centre and half sizes."""
+    return solid(ball_mesh(1.0, sides).moved(half, center), look)
+
+
+def turned(
+    outline: Sequence[tuple[float, float]],
+    wall: float | None = None,
+    look: Look | None = None,
+    sides: int = SIDES,
+) -> Part:
+    """An ``outline`` of (radius, height) from the bottom up, turned; hollow if it has a ``wall``.
+
+    Its pieces are the full slices between neighbouring points.
+    """
+    (_, bottom), (_, top) = outline[0], outline[-1]
+    profile = [(0.0, bottom), *outline]
+    if wall is None:
+        profile.append((0.0, top))
+    else:
+        inside = [(max(r - wall, 0.3 * r), z) for r, z in outline if z > bottom + wall]
+        profile += [*reversed(inside), (0.0, inside[0][1])]
+    slices = [
+        revolve([(0.0, a[1]), a, b, (0.0, b[1])], 12).vertices
+        for a, b in itertools.pairwise(outline)
+        if b[1] > a[1]
+    ]
+    return Part(revolve(profile, sides, smooth=CURVED), tuple(slices), look)
+
+
+def sleeve(outline: Sequence[tuple[float, float]], wall: float, look: Look | None = None) -> Part:
+    """A turned wall, open above and below, as a lamp shade; its pieces are full slices."""
+    inside = [(r - wall, z) for r, z in reversed(outline)]
+    mesh = revolve([*outline, *inside], SIDES, closed=True, smooth=CURVED)
+    return replace(turned(outline, look=look), mesh=mesh)
+
+
+def curve(points: Sequence[Sequence[float]] | Sequence[Points], steps: int = 5) -> Points:
+    """A smooth line (K, D) through ``points`` (Catmull-Rom), ``steps`` to each span."""
+    p = np.asarray(points, np.float64)
+    p = np.concatenate([p[:1], p, p[-1:]])
+    t = np.linspace(0, 1, steps, endpoint=False)[:, None]
+    spans = []
+    for a, b, c, d in zip(p, p[1:], p[2:], p[3:], strict=False):
+        bend = (2 * a - 5 * b + 4 * c - d) * t**2 + (3 * b - a - 3 * c + d) * (t * t * t)
+        spans.append(0.5 * (2 * b + (c - a) * t + bend))
+    return np.concatenate([*spans, p[-1:]])
+
+
+def outline(points: Sequence[tuple[float, float]], steps: int = 3) -> list[tuple[float, float]]:
+    """A smooth outline of (radius, height) through ``points``, for `turned`."""
+    return [(float(r), float(z)) for r, z in curve(points, steps)]
+
+
+def tube(
+    path: ArrayLike,
+    radii: ArrayLike,
+    look: Look | None = None,
+    *,
+    sides: int = 8,
+    rounded: bool = False,
+    closed: bool = False,
+) -> Part:
+    """A tube along ``path`` (K, 3) with elliptic sections: one radius, one a point, or two.
+
+    Of two radii the first lies level, across the path, where the path is not upright; ``rounded``
+    adds domes at both ends; a ``closed`` path comes back to its start.
+    """
+    points = np.asarray(path, np.float64)
+    given = np.asarray(radii, np.float64)
+    if given.ndim < 2:
+        given = given.reshape(-1, 1)
+    sizes = np.broadcast_to(given, (len(points), 2))
+    across, up, ways = _frames(points, closed)
+    if rounded:
+        points, sizes, across, up = _domed(points, sizes, across, up, ways)
+    turns = 2 * math.pi * np.arange(sides) / sides
+    section = np.stack([cos(turns), sin(turns)], axis=1)
+    spokes = np.stack([across * sizes[:, :1], up * sizes[:, 1:]], axis=1)
+    rings = points[:, None] + multiply(section, spokes)
+    part = loft(rings, look, closed=closed)
+    if not rounded:
+        return part
+    # A dome belongs to the piece that it ends.
+    cuts = [0, *range(4, len(rings) - 4), len(rings) - 1]
+    pieces = [rings[a : b + 1].reshape(-1, 3) for a, b in itertools.pairwise(cuts)]
+    return replace(part, pieces=tuple(pieces))
+
+
+def loft(rings: Points, look: Look | None = None, *, closed: bool = False) -> Part:
+    """The skin over rings (K, S, 3) of corners, closed by fans; its pieces lie between rings."""
+    count, sides = rings.shape[:2]
+    at = np.arange(count * sides).reshape(count, sides)
+    if closed:
+        at = np.concatenate([at, at[:1]])
+    low, high = at[:-1], at[1:]
+    ahead, above = np.roll(low, -1, axis=1), np.roll(high, -1, axis=1)
+    faces = [np.stack(x, axis=-1).reshape(-1, 3) for x in ((low, ahead, above), (low, above, high))]
+    vertices = rings.reshape(-1, 3)
+    if not closed:
+        vertices = np.concatenate([vertices, ordered_mean(rings[[0, -1]], axis=1)])
+        first, last = count * sides, count * sides + 1
+        faces.append(np.stack([np.full(sides, first), np.roll(at[0], -1), at[0]], axis=1))
+        faces.append(np.stack([np.full(sides, last), at[-1], np.roll(at[-1], -1)], axis=1))
+    mesh = Mesh(vertices, np.concatenate(faces).astype(np.int32), CURVED)
+    if solid_properties(mesh)[0] < 0:
+        mesh = replace(mesh, faces=np.ascontiguousarray(mesh.faces[:, ::-1]))
+    around = [*rings, rings[0]] if closed else list(rings)
+    pieces = tuple(np.concatenate(pair) for pair in itertools.pairwise(around))
+    return Part(mesh, pieces, look)
+
+
+def arc(
+    center: ArrayLike, right: ArrayLike, up: ArrayLike, first: float, last: float, count: int
+) -> Points:
+    """``count`` points (K, 3) of an ellipse with these half axes, between two angles in radians."""
+    turns = np.linspace(first, last, count)[:, None]
+    middle, x, y = (np.asarray(v, np.float64) for v in (center, right, up))
+    return np.asarray(middle + cos(turns) * x + sin(turns) * y)
+
+
+def ring(x: float, y: float, z: float, sides: int = 12) -> list[Vec3]:
+    """Corners of a level ellipse at height ``z``."""
+    turns = 2 * math.pi * np.arange(sides) / sides
+    return [(x * cos(t), y * sin(t), z) for t in turns]
+
+
+def _frames(points: Points, closed: bool) -> tuple[Points, Points, Points]:
+    """Axes (K, 3) across and up, and the way ahead, that turn as little as the path bends."""
+    ahead = np.roll(points, -1, axis=0) - points
+    behind = points - np.roll(points, 1, axis=0)
+    if not closed:
+        ahead[-1], behind[0] = behind[-1], ahead[0]
+    ways = unit(unit(ahead) + unit(behind))
+    level = np.cross(ways[0], (0.0, 0.0, 1.0))
+    across = level if norm(level) > 0.2 else np.array([1.0, 0.0, 0.0])
+    found = []
+    for way in ways:
+        across = unit(across - way * dot(across, way))
+        found.append(across)
+    sideways = np.array(found)
+    return sideways, np.cross(sideways, ways), ways
+
+
+def _domed(
+    points: Points, sizes: Points, across: Points, up: Points, ways: Points
+) -> tuple[Points, Points, Points, Points]:
+    """The path with three more rings at each end, which close it like half a ball."""
+    turns = np.radians([84.0, 60.0, 30.0])[:, None]
+    first = points[0] - ways[0] * sin(turns) * sizes[0].min()
+    last = points[-1] + ways[-1] * sin(turns[::-1]) * sizes[-1].min()
+    return (
+        np.concatenate([first, points, last]),
+        np.concatenate([sizes[0] * cos(turns), sizes, sizes[-1] * cos(turns[::-1])]),
+        np.concatenate([across[:1].repeat(3, 0), across, across[-1:].repeat(3, 0)]),
+        np.concatenate([up[:1].repeat(3, 0), up, up[-1:].repeat(3, 0)]),
+    )

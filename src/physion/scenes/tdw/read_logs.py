@@ -1,0 +1,321 @@
+"""Official command logs become scenes: the one door through which left-handed, y-up data comes in.
+
+A configuration is a folder with ``tdw_commands.json`` (or ``.json.gz``) and ``metadata.json``.
+The log holds one JSON list of commands a line, followed by ``trial N``; the lists of one trial are
+its frames, ``trial None`` prepares the room (reference/engines-and-rendering.md, "Format facts").
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from physion.errors import BadInputError, PhysionError, UnknownNameError
+from physion.numerics.rotations import rotate_vectors
+from physion.scenes.looks import prop_look
+from physion.scenes.scene import (
+    Body,
+    Camera,
+    Cloth,
+    Ending,
+    Joint,
+    Look,
+    Push,
+    Roles,
+    Scene,
+    Vec3,
+)
+from physion.scenes.shapes.primitives import shapes
+from physion.scenes.shapes.prop_names import ModelBounds, prop_for, read_model_bounds
+from physion.scenes.tdw.commands import CommandReader, LoggedObject, vector
+from physion.scenes.tdw.log_lines import (
+    ImportFailure,
+    find_logs,
+    read_command_log,
+    read_metadata,
+)
+from physion.seeds import generator
+
+SCENARIOS = {
+    "MultiDominoes": "dominoes",
+    "Tower": "support",
+    "Collision": "collide",
+    "Containment": "contain",
+    "Drop": "drop",
+    "Linking": "link",
+    "RollingSliding": "roll",
+    "ClothSagging": "drape",
+}
+"""Controller names of the official metadata. Some Roll trials were made by the Collide controller:
+a folder whose name says ``rolling`` is Roll."""
+
+MAX_FRAMES = {"collide": 152, "contain": 452, "link": 452, "support": 602, "drape": 151}
+"""Longest trial by scenario, frame 0 counted; 302 for the others (reference section 2.6)."""
+
+FLOORS = {"bright": 0.0043}
+"""Height in metres of a room's floor where it is not 0. In ``tdw_room`` everything that was put
+at 0 ends .004 or .005 higher than in ``box_room_2018`` (recorded displacements of the targets)."""
+
+FLEX_SETTLE_FRAMES = 100
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What the official simulator recorded for a trial (its ``metadata.json``).
+
+    Frames are counted from 0. ``displacement`` is the agent's final position minus its reference
+    position, in our axes; ``min_distance`` belongs to cloth trials.
+    """
+
+    contact: bool
+    first_frame: int | None
+    frames: int
+    displacement: Vec3 | None = None
+    min_distance: float | None = None
+
+
+@dataclass(frozen=True)
+class ImportedTrial:
+    """A scene with what really happened in it. ``notes`` say what was left out."""
+
+    scene: Scene
+    outcome: Outcome
+    notes: tuple[str, ...] = ()
+
+
+@dataclass
+class TrialSet:
+    """Everything found under a folder.
+
+    ``unknown`` counts commands that the importer does not know, ``unrecorded`` the trials of logs
+    for which ``metadata.json`` holds no outcome.
+    """
+
+    trials: list[ImportedTrial] = field(default_factory=list)
+    failures: list[ImportFailure] = field(default_factory=list)
+    unknown: Counter[str] = field(default_factory=Counter)
+    unrecorded: int = 0
+
+    def require_trials(self) -> None:
+        """Raise `BadInputError` with the first failure where nothing could be imported."""
+        if not self.trials:
+            why = str(self.failures[0]) if self.failures else "no trial fits the choice"
+            raise BadInputError(f"no trial could be imported: {why}")
+
+    def unique(self) -> tuple[list[ImportedTrial], int]:
+        """Trials with different physics, and how many were left out as copies of another."""
+        first: dict[str, ImportedTrial] = {}
+        for trial in self.trials:
+            first.setdefault(trial.scene.physics_digest(), trial)
+        return list(first.values()), len(self.trials) - len(first)
+
+
+def read_scenes(root: Path, scenario: str | None = None, limit: int | None = None) -> TrialSet:
+    """Import every log under ``root``; ``limit`` keeps the first trials of each scenario.
+
+    A broken log or trial becomes a failure of the result and the others go on;
+    `BadInputError` only where there is no log at all, `UnknownNameError` for a scenario that no
+    log can have.
+    """
+    if scenario is not None and scenario not in SCENARIOS.values():
+        raise UnknownNameError("scenario", scenario, SCENARIOS.values())
+    if limit is not None and limit < 1:
+        raise BadInputError(f"the limit of trials must be 1 or more, not {limit}")
+    found = TrialSet()
+    bounds = _bounds_beside(root)
+    taken: Counter[str] = Counter()
+    for log in find_logs(root):
+        for trial in read_log(log, found, bounds):
+            name = trial.scene.scenario
+            if scenario not in (None, name) or (limit is not None and taken[name] >= limit):
+                continue
+            taken[name] += 1
+            found.trials.append(trial)
+    return found
+
+
+def read_log(
+    path: Path, found: TrialSet, bounds: Mapping[str, ModelBounds] | None = None
+) -> Iterator[ImportedTrial]:
+    """Yield the trials of one log; failures and unknown commands are added to ``found``."""
+    try:
+        records = read_metadata(path.parent / "metadata.json")
+        log = read_command_log(path)
+    except PhysionError as error:
+        found.failures.append(ImportFailure(str(path), None, str(error)))
+        return
+    found.failures += log.failures
+    for tag, frames in log.trials.items():
+        try:
+            if tag not in records:
+                # Familiarization trials were chosen by hand out of the log.
+                found.unrecorded += 1
+                continue
+            commands = CommandReader(found.unknown)
+            commands.read(log.setup, frames)
+            builder = _SceneBuilder(commands, records[tag], path.parent, bounds or {})
+            yield ImportedTrial(builder.scene(), builder.outcome(), tuple(builder.notes))
+        except PhysionError as error:
+            found.failures.append(ImportFailure(str(path), tag, str(error)))
+
+
+def _bounds_beside(root: Path) -> Mapping[str, ModelBounds]:
+    for folder in (root, *root.resolve().parents[:3]):
+        if (folder / "model_bounds.json").is_file():
+            return read_model_bounds(folder / "model_bounds.json")
+    return {}
+
+
+class _SceneBuilder:
+    """Makes the scene and the outcome of one trial out of its carried-out commands."""
+
+    def __init__(
+        self,
+        read: CommandReader,
+        record: Mapping[str, Any],
+        folder: Path,
+        bounds: Mapping[str, ModelBounds],
+    ) -> None:
+        self.commands, self.record, self.folder, self.bounds = read, record, folder, bounds
+        self.notes = read.notes
+
+    def scene(self) -> Scene:
+        kept: list[LoggedObject] = []
+        for thing in self.commands.objects.values():
+            if thing.gone:
+                continue
+            if thing.vanishing:
+                self.notes.append(f"{thing.name} has no size or no mass and is left out")
+                continue
+            kept.append(thing)
+        ids = {thing.id for thing in kept}
+        scenario = self._scenario()
+        pushes = tuple(push for id_, push in self.commands.pushes if id_ in ids)
+        names = {thing.id: thing.name for thing in kept}
+        index = self.record.get("trial_num", self.record.get("stimulus_name"))
+        return Scene(
+            name=str(self.record.get("stimulus_name") or f"{self.folder.name}_{index}"),
+            scenario=scenario,
+            bodies=tuple(self._body(thing) for thing in kept if thing.cloth is None),
+            cloths=tuple(self._cloth(thing) for thing in kept if thing.cloth is not None),
+            pushes=pushes,
+            joints=tuple(
+                Joint(names[a], names[b]) for a, b in self.commands.joints if a in ids and b in ids
+            ),
+            roles=self._roles(kept, pushes),
+            camera=Camera(self.commands.eye, self.commands.target, self.commands.fov),
+            room=self.commands.room,
+            floor=FLOORS.get(self.commands.room, 0.0),
+            ending=Ending(151, self._max_frames(scenario)),
+            settle_frames=FLEX_SETTLE_FRAMES if self.commands.settles else 0,
+            parameters={
+                "source": "official command log",
+                "configuration": self.folder.name,
+                "trial_seed": self.record.get("trial_seed"),
+            },
+        )
+
+    def _scenario(self) -> str:
+        controller = str(self.record.get("controller_name"))
+        if "rolling" in self.folder.name.lower():
+            return "roll"
+        if controller not in SCENARIOS:
+            raise BadInputError(
+                f"metadata.json names the controller {controller!r}; known: {sorted(SCENARIOS)}"
+            )
+        return SCENARIOS[controller]
+
+    def _max_frames(self, scenario: str) -> int:
+        by_collision = self.record.get("controller_name") == "Collision"
+        return MAX_FRAMES["collide"] if by_collision else MAX_FRAMES.get(scenario, 302)
+
+    def _roles(self, kept: list[LoggedObject], pushes: tuple[Push, ...]) -> Roles:
+        """Lowest id: the zone. Id 2: the target, or, where it is gone, the last of its colour."""
+        by_id = {thing.id: thing for thing in kept}
+        if not kept:
+            raise BadInputError("no object is left in the trial")
+        zone = by_id[min(by_id)]
+        first = self.commands.objects.get(2)
+        if first is None or zone.id == 2:
+            raise BadInputError("there is no object 2, the target")
+        agent: LoggedObject | None = first
+        if first.gone:
+            alike = [t for t in kept if t.id > 2 and t.color == first.color]
+            agent = max(alike, key=lambda t: t.id) if alike else None
+        if agent is None or agent.id not in by_id:
+            raise BadInputError("the target was removed and no other object has its colour")
+        probe = pushes[0].body if pushes else None
+        return Roles(agent=agent.name, patient=zone.name, probe=probe)
+
+    def _look(self, thing: LoggedObject) -> Look:
+        if thing.color is None and thing.model not in shapes:
+            # Library models bring their own pictures: a model looks the same in every trial.
+            chance = generator("library model", thing.model)
+            return prop_look(chance, prop_for(thing.category, thing.model))
+        return Look(thing.color or (0.8, 0.8, 0.8), thing.texture)
+
+    def _body(self, thing: LoggedObject) -> Body:
+        primitive = thing.model in shapes
+        shape, scale, position = thing.model, thing.scale, thing.position
+        if not primitive:
+            shape, scale, position = self._prop(thing)
+        return Body(
+            name=thing.name,
+            shape=shape,
+            position=position,
+            scale=scale,
+            rotation=thing.rotation,
+            mass=1.0 if thing.mass is None else thing.mass,
+            contact=thing.contact,
+            # Flex solids carry their weight on the floor and do not move once settled.
+            kinematic=thing.kinematic or thing.mass is None or thing.flex,
+            scenery=thing.mass is None,
+            drag=thing.drag,
+            angular_drag=thing.angular_drag,
+            look=self._look(thing),
+        )
+
+    def _prop(self, thing: LoggedObject) -> tuple[str, Vec3, Vec3]:
+        """A stand-in that fills the bounds of a library model: shape, scale, pivot."""
+        bounds = self.bounds.get(thing.model)
+        if bounds is None:
+            self.notes.append(f"no bounds are known for {thing.model!r}; it is drawn half a metre")
+            bounds = ModelBounds((0.0, 0.0, 0.0), (0.5, 0.5, 0.5))
+        size = tuple(a * b for a, b in zip(bounds.size, thing.scale, strict=True))
+        shift = tuple(a * b for a, b in zip(bounds.bottom, thing.scale, strict=True))
+        x, y, z = rotate_vectors(thing.rotation, shift).tolist()
+        px, py, pz = thing.position
+        return prop_for(thing.category, thing.model), size, (px + x, py + y, pz + z)  # type: ignore[return-value]
+
+    def _cloth(self, thing: LoggedObject) -> Cloth:
+        assert thing.cloth is not None
+        stretch, bend, tether = thing.cloth
+        return Cloth(
+            name=thing.name,
+            position=thing.position,
+            size=(2.0 * thing.scale[0], 2.0 * thing.scale[1], 0.0),
+            rotation=thing.rotation,
+            mass=0.5 if thing.mass is None else thing.mass,
+            stretch=stretch,
+            bend=bend,
+            tether=tether,
+            look=replace(self._look(thing), texture="cloth"),
+        )
+
+    def outcome(self) -> Outcome:
+        record = self.record
+        contact = record.get("does_target_contact_zone")
+        if not isinstance(contact, bool):
+            raise BadInputError("metadata.json does not say does_target_contact_zone for it")
+        first = record.get("first_target_contact_zone_frame")
+        moved = record.get("final_target_displacement")
+        return Outcome(
+            contact=contact,
+            first_frame=int(first) if isinstance(first, int) else None,
+            frames=int(record.get("num_frames") or 0),
+            displacement=vector(moved) if isinstance(moved, dict) else None,
+            min_distance=record.get("minimum_distance_target_to_zone"),
+        )

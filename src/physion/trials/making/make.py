@@ -1,0 +1,156 @@
+"""One trial: from its task to its files."""
+
+from __future__ import annotations
+
+import dataclasses
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import physion
+from physion.errors import BadInputError, PhysionError
+from physion.golden import version_digest
+from physion.physics.engine import simulate
+from physion.physics.labels import Labels, label_contact
+from physion.physics.trajectory import Trajectory
+from physion.rendering.renderer import PASSES, Frame, Renderer, role_map
+from physion.rendering.renderer import VERSION as RENDERER_VERSION
+from physion.scenes.sampling.preset import get_preset
+from physion.scenes.sampling.registry import sample_scene
+from physion.scenes.scene import FRAME_TIME, OBSERVED_FRAMES, Scene
+from physion.trials.files import encode_png, write_files
+from physion.trials.making.plan import Job, Task
+from physion.trials.trial_file import Metadata, TrialWriter, in_look
+from physion.trials.video import MovieEncoder
+
+RENDERER = (
+    f"physion-{RENDERER_VERSION}.{version_digest(*PASSES)}, "
+    f"av {version('av')}, pillow {version('pillow')}"
+)
+"""Versions of the renderer, with the digest of the golden pictures, and of what writes movies and
+maps; stored with every trial."""
+
+
+def make_trial(job: Job) -> str:
+    """Make one trial and write its files; its name. A pure function of the job.
+
+    The trial file comes last, so that a trial with a trial file is complete.
+    """
+    task = job.task
+    scene = scene_of(task)
+    trajectory = simulate(scene)
+    if len(trajectory) <= OBSERVED_FRAMES:
+        raise BadInputError(
+            f"trial {task.trial!r} has {len(trajectory)} frames; nothing is left to predict after "
+            f"the {OBSERVED_FRAMES} observed ones"
+        )
+    labels = label_contact(scene, trajectory)
+    labels = dataclasses.replace(labels, robust=task.robust)
+    write_files(job.paths, _files(job, scene, trajectory, labels))
+    return task.trial
+
+
+def scene_of(task: Task) -> Scene:
+    """The scene of a task in its free colours: the imported one, or one drawn by its seed."""
+    if task.scene is not None:
+        return task.scene
+    params = None if task.preset is None else get_preset(task.scenario, task.preset).params
+    scene = sample_scene(task.scenario, task.seed(), params)
+    if task.scene_digest not in (None, scene.physics_digest()):
+        raise PhysionError(
+            f"trial {task.trial!r}: the draw that was chosen for it comes out differently now; "
+            "package or preset have changed since: choose another folder, or delete choices/ and "
+            "the trials made from it"
+        )
+    return dataclasses.replace(scene, name=task.trial)
+
+
+def _files(job: Job, scene: Scene, trajectory: Trajectory, labels: Labels) -> dict[str, bytes]:
+    """The bytes of the trial's files, each frame of each look being rendered once."""
+    settings = job.settings
+    size = settings.width, settings.height
+    renderer = Renderer(in_look(scene, job.looks[0]), trajectory, *size)
+    ids = _image(renderer.render(0, ("ids",)), "ids")
+    writer = TrialWriter(
+        _metadata(job, scene, trajectory),
+        scene,
+        trajectory,
+        labels,
+        ids,
+        passes=settings.passes,
+        compatible=settings.compatible,
+    )
+    files = {}
+    if settings.movies:
+        rate = settings.playback_rate
+        files["map"] = encode_png(role_map(ids, scene))
+        files["movie"], files["observed_movie"] = make_movies(
+            renderer, rate, writer if settings.passes else None
+        )
+        for look in job.looks[1:]:
+            other = Renderer(in_look(scene, look), trajectory, *size)
+            files[f"{look}_movie"], files[f"{look}_observed_movie"] = make_movies(other, rate)
+    return {**files, "trial_file": writer.finish()}
+
+
+def make_movies(
+    renderer: Renderer, rate: int, writer: TrialWriter | None = None
+) -> tuple[bytes, bytes]:
+    """The full and the observed movie at ``rate`` frames a second.
+
+    ``writer`` gets the passes that it stores, frame by frame. The same trial, the same bytes.
+    """
+    frames = len(renderer.trajectory)
+    movie, observed = (
+        MovieEncoder(renderer.width, renderer.height, count, rate=rate)
+        for count in (frames, OBSERVED_FRAMES)
+    )
+    kept = writer.passes if writer else ()
+    for index in range(frames):
+        frame = renderer.render(index, tuple(dict.fromkeys(("color", *kept))))
+        color = _image(frame, "color")
+        movie.add(color)
+        if index < OBSERVED_FRAMES:
+            observed.add(color)
+        if writer:
+            writer.add_frame({name: _image(frame, name) for name in kept})
+    return movie.finish(), observed.finish()
+
+
+def _image(frame: Frame, name: str) -> NDArray[Any]:
+    image = getattr(frame, name)
+    assert isinstance(image, np.ndarray), f"the renderer left out {name}"
+    return image
+
+
+def _metadata(job: Job, scene: Scene, trajectory: Trajectory) -> Metadata:
+    task, settings = job.task, job.settings
+    sampled = task.scene is None
+    return Metadata(
+        trial=task.trial,
+        dataset=task.dataset,
+        scenario=task.scenario,
+        split=task.split,
+        index=task.index,
+        preset=get_preset(task.scenario, task.preset).name if task.preset else None,
+        seed=f"{task.seed().entropy:x}" if sampled else None,
+        attempt=task.attempt if sampled else None,
+        scene_digest=scene.physics_digest(),
+        look=job.looks[0],
+        movies=settings.movies,
+        free_movies=settings.movies and len(job.looks) > 1,
+        width=settings.width,
+        height=settings.height,
+        frames=len(trajectory),
+        observed_frames=OBSERVED_FRAMES,
+        frame_time=FRAME_TIME,
+        playback_rate=settings.playback_rate,
+        completed=bool(trajectory.completed),
+        engine=trajectory.engine,
+        renderer=RENDERER,
+        package=f"physion {physion.__version__}",
+        digest=trajectory.digest(),
+        recorded_contact=task.recorded_contact,
+    )

@@ -1,0 +1,83 @@
+"""Does this machine make the same bytes? One known trial of each scenario, part by part."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import physion
+from physion.golden import FILE, golden_digests
+from physion.physics.engine import simulate
+from physion.physics.labels import label_contact
+from physion.physics.particles import particles_over_time
+from physion.rendering.renderer import PASSES, Renderer
+from physion.scenes.sampling.registry import sample_scene, scenarios
+from physion.seeds import trial_seed
+from physion.trials.making.choose import robustness
+
+DATASET = "golden"
+RUNS = 2
+"""Jittered simulations of the robustness."""
+SIZE = 96
+"""Pixels along the side of the rendered frame."""
+MOTION_PARTS = ("scene", "motion", "label", "robust", "particles")
+
+
+def trial_digests(scenario: str) -> dict[str, str]:
+    """Sample, simulate and render the golden trial of a scenario; return a digest of each part.
+
+    ``scene``; ``motion`` (poses, velocities, cloth, contacts); ``label``; ``robust``, the outcomes
+    of jittered simulations; ``particles``; and each pass of the frame half way through the trial.
+    """
+    seed = trial_seed(DATASET, scenario, "testing", 0)
+    scene = sample_scene(scenario, seed)
+    trajectory = simulate(scene)
+    labels = label_contact(scene, trajectory)
+    middle = len(trajectory) // 2
+    particles = particles_over_time(scene, trajectory, frames=[0, middle])
+    frame = Renderer(scene, trajectory, SIZE, SIZE).render(middle, PASSES)
+    return {
+        "scene": hashlib.sha256(scene.to_json().encode()).hexdigest(),
+        "motion": trajectory.digest(),
+        "label": f"{labels.contact} {labels.first_frame} {labels.observed} {labels.min_distance}",
+        "robust": f"{robustness(scene, labels.contact, seed, RUNS)}",
+        "particles": _digest(particles.positions),
+        **{name: _digest(getattr(frame, name)) for name in PASSES},
+    }
+
+
+def _digest(array: Any) -> str:
+    data = np.ascontiguousarray(array)
+    return hashlib.sha256(repr((data.shape, data.dtype.str)).encode() + data.tobytes()).hexdigest()
+
+
+def differences(scenario: str) -> list[str]:
+    """Return the parts of a scenario's golden trial that come out differently on this machine."""
+    golden = golden_digests().get(scenario, {})
+    found = trial_digests(scenario)
+    return [name for name, digest in found.items() if golden.get(name) != digest]
+
+
+def main() -> None:
+    """Print all digests as JSON; with ``--write`` make them those of this version.
+
+    They are written after a change that is meant to move a scene or to look different. Raise
+    `physion.physics.engine.VERSION` or `physion.rendering.renderer.VERSION` with them.
+    """
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("--write", action="store_true")
+    options = parser.parse_args()
+    text = json.dumps({name: trial_digests(name) for name in sorted(scenarios.names())}, indent=1)
+    if options.write:
+        (Path(physion.__file__).parent / FILE).write_text(text + "\n")
+    else:
+        print(text)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,286 @@
+"""Is a dataset still what its index says?"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from physion.errors import BadInputError
+from physion.physics.labels import label_contact
+from physion.scenes.sampling.preset import load_presets
+from physion.seeds import stable_hash
+from physion.trials.index import COLUMNS, FILES, as_table, index_bytes, index_row, read_index
+from physion.trials.layout import CHOICES, INDEX, SETTINGS, TrialPaths, find_trials
+from physion.trials.making.choose import BALANCED, robustness, split_of, wanted_contact
+from physion.trials.making.plan import Task
+from physion.trials.sealed import read_sealed
+from physion.trials.trial_file import Trial
+from physion.trials.video import count_frames
+
+SAMPLE = 4
+"""Trials that are made again by default."""
+
+Track = Callable[[Iterable[Any], str, int], Iterator[Any]]
+
+
+@dataclass
+class Verification:
+    """What was found in a dataset, one line each.
+
+    ``faults`` is empty where all is right. ``other_versions`` names what comes out differently
+    because another version of engine, renderer or encoder made it, which is no fault.
+    """
+
+    faults: list[str] = field(default_factory=list)
+    other_versions: list[str] = field(default_factory=list)
+
+    def add(self, found: list[str], stored: str = "", here: str = "") -> None:
+        """Add what was found in something that the version ``stored`` made; ours is ``here``."""
+        if stored == here:
+            self.faults += found
+        else:
+            note = f"made by another version, {stored}; this is {here}"
+            self.other_versions += [f"{line}: {note}" for line in found]
+
+
+def verify_dataset(
+    folder: Path, *, again: int = SAMPLE, track: Track | None = None
+) -> Verification:
+    """Compare a dataset with its index and with itself, and make a part of it again.
+
+    Every file is compared with the index byte for byte (by SHA-256), the index with the trial
+    files, the labels with the contacts, the movies' lengths with the trials', the trajectories
+    with their digests, and all physics with one another. ``again`` trials, chosen by the index
+    itself, are also simulated and rendered anew from their scenes: motion, map and movies must
+    come out the same to the bit under the same version of engine and renderer; -1 takes all.
+    `BadInputError` where there is no index.
+    """
+    table = read_index(folder)
+    listed = set(table["trial"])
+    result = Verification(
+        [
+            f"{paths.trial_file} is not in the index"
+            for paths in find_trials(folder)
+            if paths.trial not in listed
+        ]
+    )
+    result.faults += _check_folder(folder, table)
+    result.faults += _copies(table)
+    settings = _settings(folder)
+    remade = _sample(table, again)
+    rows = [row for _, row in table.iterrows()]
+    for row in track(rows, "verifying", len(rows)) if track else rows:
+        paths = TrialPaths(folder, row["split"], row["scenario"], row["trial"])
+        try:
+            result.faults += _compare(row, paths)
+            result.faults += _check_trial(paths)
+            result.faults += _check_split(row, settings)
+            if row["trial"] in remade:
+                _make_again(paths, settings, result)
+        except BadInputError as error:
+            result.faults.append(str(error))
+    return result
+
+
+def _settings(folder: Path) -> Mapping[str, Any]:
+    """The settings of `generate`, or none: imported datasets have no such file."""
+    try:
+        return dict(read_sealed(folder / SETTINGS)["settings"])
+    except (BadInputError, KeyError, TypeError, ValueError):
+        return {}
+
+
+def _check_folder(folder: Path, table: pd.DataFrame) -> list[str]:
+    """What is wrong with the files beside the trials, and which files belong to no trial."""
+    faults = []
+    records = [path for path in (folder / SETTINGS,) if path.is_file()]
+    for path in (*records, *sorted((folder / CHOICES).glob("*.json"))):
+        try:
+            read_sealed(path)
+        except BadInputError as error:
+            faults.append(str(error))
+    path = folder / INDEX
+    # Another version of the library that writes the file may write other bytes.
+    mine = index_bytes(table)
+    if path.read_bytes() != mine and _writer(path.read_bytes()) == _writer(mine):
+        faults.append(f"{path}: its bytes are not those of the table that it holds")
+    listed = {folder / str(name) for file in FILES for name in table[file].dropna()}
+    strangers = {path for path in folder.glob("*/*/*") if path.is_file()} - listed
+    faults += [
+        f"{path} belongs to no trial of the index"
+        for path in sorted(strangers)
+        if path.suffix != ".h5"  # said already
+    ]
+    return faults
+
+
+def _writer(content: bytes) -> str:
+    try:
+        return str(pq.read_metadata(io.BytesIO(content)).created_by)
+    except (pa.ArrowException, OSError, ValueError):
+        return ""
+
+
+def _check_split(row: pd.Series[Any], settings: Mapping[str, Any]) -> list[str]:
+    """What a sampled trial has that its split does not take."""
+    if pd.isna(row["seed"]) or not settings:
+        return []
+    faults = []
+    if (belongs := split_of(row["scene_digest"])) != row["split"]:
+        faults.append(f"{row['trial']}: field 'scene_digest': its physics belongs to {belongs}")
+    task = Task(row["dataset"], row["scenario"], row["split"], int(row["index"]))
+    if wanted_contact(task) not in (None, row["contact"]):
+        faults.append(f"{row['trial']}: field 'contact': the balance of its split wants the other")
+    if task.split in BALANCED and row["observed_contact"] and not settings["observed_contact"]:
+        faults.append(f"{row['trial']}: field 'observed_contact': nothing is left to predict")
+    return faults
+
+
+def _sample(table: pd.DataFrame, count: int) -> set[str]:
+    """Names of ``count`` trials, or all for a negative count; the same index, the same names."""
+    names = sorted(table["trial"], key=lambda name: stable_hash("verify", str(name)))
+    return set(names if count < 0 else names[:count])
+
+
+def _copies(table: pd.DataFrame) -> list[str]:
+    """Sampled trials with the physics of another trial. Imported sets may hold such pairs."""
+    sampled = table[table["seed"].notna()]
+    groups = sampled.groupby("scene_digest")["trial"].apply(list)
+    return [
+        f"{names[0]}: field 'scene_digest': the same physics as {', '.join(names[1:])}"
+        for names in groups
+        if len(names) > 1
+    ]
+
+
+def _compare(stored: pd.Series[Any], paths: TrialPaths) -> list[str]:
+    """Columns of the index that the files contradict."""
+    found = as_table([index_row(paths)]).iloc[0]
+    return [
+        f"{paths.trial}: {name} is {found[name]!s}, the index says {stored[name]!s}"
+        for name in COLUMNS
+        if not _same(found[name], stored[name])
+    ]
+
+
+def _same(one: Any, other: Any) -> bool:
+    if pd.isna(one) or pd.isna(other):
+        return bool(pd.isna(one) and pd.isna(other))
+    return bool(one == other)
+
+
+def _check_trial(paths: TrialPaths) -> list[str]:
+    """What a trial says of itself that is not so."""
+    trial = Trial.open(paths.trial_file)
+    meta, faults = trial.metadata, []
+    lengths = {"movie": meta.frames, "observed_movie": meta.observed_frames}
+    lengths |= {f"free_{name}": frames for name, frames in lengths.items()}
+    for name, path in paths.all(meta.movies, meta.free_movies).items():
+        if name in lengths and (found := count_frames(path)) != lengths[name]:
+            faults.append(f"{path} has {found} frames, not {lengths[name]}")
+    if trial.trajectory.digest() != meta.digest:
+        faults.append(f"{paths.trial_file}: field 'trajectory' does not fit its digest")
+    if trial.scene.physics_digest() != meta.scene_digest:
+        faults.append(f"{paths.trial_file}: field 'scene' does not fit its digest")
+    if meta.engine.startswith("imported"):
+        return faults  # labels and movies of other simulators are theirs
+    labels = label_contact(trial.scene, trial.trajectory)
+    for name in ("contact", "first_frame", "observed", "min_distance"):
+        is_now, stored = getattr(labels, name), getattr(trial.labels, name)
+        if is_now != stored:
+            faults.append(
+                f"{paths.trial_file}: labels/{name} is {stored}, the contacts say {is_now}"
+            )
+    return faults
+
+
+def _make_again(paths: TrialPaths, settings: Mapping[str, Any], result: Verification) -> None:
+    """Draw, simulate and render the trial again, and add to ``result`` what comes out otherwise."""
+    from physion.physics.engine import simulate
+    from physion.trials.making.make import RENDERER
+
+    trial = Trial.open(paths.trial_file)
+    meta = trial.metadata
+    if meta.engine.startswith("imported"):
+        return
+    motion = simulate(trial.scene)
+    found = _draw_again(paths, trial, settings)
+    if motion.digest() != meta.digest:
+        found.append(f"{paths.trial_file}: field 'trajectory': the scene moves differently")
+    result.add(found, meta.engine, motion.engine)
+    result.add(_render_again(paths, trial), meta.renderer, RENDERER)
+
+
+def _render_again(paths: TrialPaths, trial: Trial) -> list[str]:
+    """What comes out differently when the trial is rendered again."""
+    from physion.rendering.renderer import role_map
+    from physion.trials.files import encode_png
+    from physion.trials.making.make import make_movies
+
+    meta, faults = trial.metadata, []
+    ids = trial.render(0, ("ids",)).ids
+    assert ids is not None, "ids were asked for"
+    if not np.array_equal(ids, trial.ids):
+        faults.append(f"{paths.trial_file}: field 'first_frame/ids' is rendered differently")
+    counts = np.bincount(ids.ravel(), minlength=len(trial.scene.names()) + 1)[1:]
+    if not np.array_equal((counts / ids.size).astype(np.float32), trial.shares):
+        faults.append(f"{paths.trial_file}: field 'first_frame/shares' does not fit the ids")
+    for name in trial.pass_names:
+        for frame in (0, meta.frames // 2, meta.frames - 1):
+            stored = trial.passes(frame)[name]
+            again = np.asarray(getattr(trial.render(frame, (name,)), name))
+            if not np.array_equal(again.astype(stored.dtype), stored, equal_nan=stored.ndim != 2):
+                faults.append(f"{paths.trial_file}: field 'passes/{name}': frame {frame} differs")
+    if not meta.movies:
+        return faults
+    made = {"map": encode_png(role_map(ids, trial.scene))}
+    for look, prefix in ((meta.look, ""), *((("free", "free_"),) if meta.free_movies else ())):
+        both = make_movies(trial.renderer(look=look), meta.playback_rate)
+        made |= zip((f"{prefix}movie", f"{prefix}observed_movie"), both, strict=True)
+    files = paths.all(meta.movies, meta.free_movies)
+    faults += [
+        f"{files[name]}: other bytes are rendered than the stored ones"
+        for name, content in made.items()
+        if files[name].read_bytes() != content
+    ]
+    return faults
+
+
+def _draw_again(paths: TrialPaths, trial: Trial, settings: Mapping[str, Any]) -> list[str]:
+    """What comes out differently when a sampled scene is drawn from its preset and seed.
+
+    Presets of files of one's own are not known here, and their scenes taken as they are.
+    """
+    from physion.trials.making.make import scene_of
+
+    meta = trial.metadata
+    if meta.seed is None or meta.preset is None or meta.preset not in load_presets(meta.scenario):
+        return []
+    if meta.attempt is None:
+        return [f"{paths.trial_file}: field 'metadata' has a seed but no attempt"]
+    task = Task(
+        meta.dataset,
+        meta.scenario,
+        meta.split,
+        meta.index,
+        preset=meta.preset,
+        attempt=meta.attempt,
+    )
+    faults = []
+    if scene_of(task) != trial.scene:
+        faults.append(f"{paths.trial_file}: field 'scene' is not what preset and seed draw")
+    if trial.labels.robust is not None and settings:
+        found = robustness(trial.scene, trial.labels.contact, task.seed(), settings["jitters"])
+        if found != trial.labels.robust:
+            faults.append(
+                f"{paths.trial_file}: labels/robust is {trial.labels.robust}, again it is {found}"
+            )
+    return faults

@@ -1,0 +1,262 @@
+"""A dataset in the layouts of the original study, so that code written for those reads ours.
+
+::
+
+    OUT/labels.csv                          as in PhysionTest-Core: <stimulus>_img, True or False
+    OUT/stimulus_names_and_labels.csv       as published; addresses are paths below OUT, and what
+                                            people answered ("correct") is empty
+    OUT/Dominoes/maps/<stimulus>_map.png            PhysionTest-Core: the testing split
+    OUT/Dominoes/mp4s/<stimulus>_img.mp4            free colours
+    OUT/Dominoes/mp4s-redyellow/<config>-redyellow_0000_img.mp4
+    OUT/Dominoes/<config>/0000.hdf5         as the generator leaves a configuration, every split;
+                         /0000_img.mp4      in the trial's own look
+                         /metadata.json
+                         /trial_stats.json
+
+A trial called ``dominoes_testing_0007`` is number 0007 of the configuration ``dominoes_testing``.
+Scenario folders are capitalised, as in the published archives.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from physion.atomic import folder_lock, remove_leftovers, write_atomic
+from physion.compute.executor import Executor
+from physion.errors import BadInputError
+from physion.trials.dataset import Dataset
+from physion.trials.files import encode_png
+from physion.trials.layout import TrialPaths
+from physion.trials.making.generate import Track
+from physion.trials.official.names import FOLDERS, TRIAL_FILE, redyellow_name, split_name
+from physion.trials.official.read_hdf5 import OfficialFile
+from physion.trials.official.run import OfficialReport, run_all
+from physion.trials.official.write_metadata import trial_stats
+from physion.trials.trial_file import Metadata, Trial
+from physion.trials.video import MovieEncoder, count_frames
+
+CORE_SPLIT = "testing"
+"""The split that PhysionTest-Core is."""
+_SAME = ("digest", "look", "width", "height", "playback_rate", "package")
+"""Metadata that a file must share with its trial to be kept."""
+
+
+@dataclass(frozen=True)
+class ExportJob:
+    """One trial to export: its files, and the folder to write into."""
+
+    paths: TrialPaths
+    out: Path
+
+    @property
+    def stimulus(self) -> str:
+        """The official name: configuration and number."""
+        return "_".join(split_name(self.paths.trial))
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the scenario."""
+        return self.out / FOLDERS.get(self.paths.scenario, self.paths.scenario)
+
+    @property
+    def hdf5(self) -> Path:
+        """The HDF5 file; its folder is that of the configuration."""
+        config, number = split_name(self.paths.trial)
+        return self.folder / config / f"{number}.hdf5"
+
+    def movies(self) -> dict[Path, str | None]:
+        """Movies to write, with their look; None is the trial's own."""
+        found: dict[Path, str | None] = {self.hdf5.with_name(f"{self.hdf5.stem}_img.mp4"): None}
+        if self.paths.split == CORE_SPLIT:
+            found[self.folder / "mp4s" / f"{self.stimulus}_img.mp4"] = "free"
+            redyellow = f"{redyellow_name(self.stimulus)}_img.mp4"
+            found[self.folder / "mp4s-redyellow" / redyellow] = "redyellow"
+        return found
+
+    def map(self) -> Path | None:
+        """The map, where the trial belongs to PhysionTest-Core."""
+        if self.paths.split != CORE_SPLIT:
+            return None
+        return self.folder / "maps" / f"{self.stimulus}_map.png"
+
+
+def export_official(
+    dataset: Path,
+    out: Path,
+    *,
+    split: str | None = None,
+    scenario: str | None = None,
+    executor: Executor | None = None,
+    track: Track | None = None,
+) -> OfficialReport:
+    """Write the trials of a split and a scenario, or all, into ``out``; see the module.
+
+    Trials that are there already, from the same motion in the same look, are kept; the lists and
+    statistics are then written over all that ``out`` holds. Raises `BadInputError` where
+    ``dataset`` is none, no trial fits the choice, two trials would share a name, or ``out``
+    cannot be written; a trial that fails leaves no file of its own and the others go on.
+    """
+    source = Dataset(dataset)
+    names = source.trials(split, scenario)
+    if not names:
+        raise BadInputError(
+            f"{dataset} has no trial of split {split or 'any'!r} and scenario {scenario or 'any'!r}"
+        )
+    jobs = {name: ExportJob(source.paths(name), out) for name in names}
+    _check(jobs, dataset, out)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with folder_lock(out):
+            remove_leftovers(out)
+            kept = {name for name, job in jobs.items() if _is_done(job)}
+            missing = {name: job for name, job in jobs.items() if name not in kept}
+            made, failed = run_all(export_trial, missing, executor, track, "exporting", out)
+            index, broken = _write_lists(out)
+    except OSError as error:
+        raise BadInputError(f"cannot write into {out}: {error.strerror or error}") from error
+    return OfficialReport(
+        tuple(made), tuple(name for name in jobs if name in kept), {**failed, **broken}, {}, index
+    )
+
+
+def export_trial(job: ExportJob) -> str:
+    """Write all files of one trial, the HDF5 file last; the name of its stimulus."""
+    # Engine and renderer are loaded by whoever exports, not by whoever lists.
+    from physion.rendering.renderer import role_map
+    from physion.trials.official.write_hdf5 import official_file
+
+    trial = Trial.open(job.paths.trial_file)
+    if not np.isfinite(trial.trajectory.positions).all():
+        raise BadInputError(
+            f"the motion of trial {job.paths.trial!r} is unknown (it was imported from a movie "
+            "alone): official files are full of it"
+        )
+    data, _ = official_file(trial)
+    map_path = job.map()
+    for path in (*job.movies(), job.hdf5, *([map_path] if map_path else [])):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    for path, look in job.movies().items():
+        write_atomic(path, _movie(job.paths, trial, look or trial.metadata.look))
+    if map_path is not None:
+        write_atomic(map_path, encode_png(role_map(trial.ids, trial.scene)))
+    write_atomic(job.hdf5, data)
+    return job.stimulus
+
+
+def _movie(paths: TrialPaths, trial: Trial, look: str) -> bytes:
+    """The movie of the trial in a look: its own, copied, or rendered where it has none."""
+    meta = trial.metadata
+    own = paths.movie if look == meta.look else paths.free_movie
+    if (meta.movies if look == meta.look else look == "free" and meta.free_movies) and (
+        count_frames(own) == meta.frames
+    ):
+        return own.read_bytes()
+    encoder = MovieEncoder(meta.width, meta.height, meta.frames, rate=meta.playback_rate)
+    for frame in range(meta.frames):
+        color = trial.render(frame, look=look).color
+        assert color is not None
+        encoder.add(color)
+    return encoder.finish()
+
+
+def _check(jobs: Mapping[str, ExportJob], dataset: Path, out: Path) -> None:
+    """Refuse to write into the dataset itself, or two trials to one place."""
+    if out.resolve().is_relative_to(dataset.resolve()):
+        raise BadInputError(f"{out} lies in the dataset {dataset}; choose a folder outside it")
+    seen: dict[str, str] = {}
+    for name, job in jobs.items():
+        # Some file systems take names that differ only in case for one.
+        other = seen.setdefault(str(job.hdf5).lower(), name)
+        if other != name:
+            raise BadInputError(
+                f"trials {other!r} and {name!r} would both be {job.hdf5}; export them by --split "
+                "or --scenario into different folders"
+            )
+
+
+def _is_done(job: ExportJob) -> bool:
+    """All files of the trial are there, and its HDF5 file shows this very motion and look."""
+    map_path = job.map()
+    files = [job.hdf5, *job.movies(), *([map_path] if map_path else [])]
+    if not all(path.is_file() for path in files):
+        return False
+    try:
+        wanted: Metadata = Trial.open(job.paths.trial_file).metadata
+        with OfficialFile.open(job.hdf5) as file:
+            found = json.loads(file.text("physion/metadata")) if file.has(TRIAL_FILE) else None
+    except (BadInputError, ValueError):
+        return False
+    return isinstance(found, dict) and all(
+        found.get(name) == getattr(wanted, name) for name in _SAME
+    )
+
+
+def _write_lists(out: Path) -> tuple[Path, dict[str, str]]:
+    """Write metadata.json, trial_stats.json and the lists of all that ``out`` holds.
+
+    Returns the path of ``labels.csv``, and what is wrong with files that cannot be read.
+    """
+    by_folder: dict[Path, list[dict[str, Any]]] = defaultdict(list)
+    failed = {}
+    for path in _files(out):
+        try:
+            with OfficialFile.open(path) as file:
+                by_folder[path.parent].append(json.loads(file.text("physion/record")))
+        except (BadInputError, ValueError) as error:
+            failed[str(path.relative_to(out))] = f"{error}; delete it to have it made again"
+    rows = []
+    for folder, records in by_folder.items():
+        write_atomic(folder / "metadata.json", _json(records))
+        write_atomic(folder / "trial_stats.json", _json(trial_stats(records)))
+        rows += [row for record in records if (row := _list_row(out, folder, record))]
+    labels = [("", "ground truth outcome")]
+    labels += [(f"{row['stim_ID']}_img", row["label"]) for row in rows]
+    write_atomic(out / "labels.csv", _csv(labels))
+    columns = ("stim_ID", "scenario", "stim_url", "map_url", "hdf5_url", "correct", "label")
+    table = [columns, *(tuple(row[column] for column in columns) for row in rows)]
+    write_atomic(out / "stimulus_names_and_labels.csv", _csv(table))
+    return out / "labels.csv", failed
+
+
+def _files(out: Path) -> list[Path]:
+    return sorted(out.glob("*/*/[0-9][0-9][0-9][0-9].hdf5"))
+
+
+def _list_row(out: Path, folder: Path, record: Mapping[str, Any]) -> dict[str, str] | None:
+    """The row of a trial of PhysionTest-Core in the lists; None for other trials."""
+    stimulus = str(record["stimulus_name"])
+    movie = folder.parent / "mp4s" / f"{stimulus}_img.mp4"
+    if not movie.is_file():
+        return None
+    files = {
+        "stim_url": movie,
+        "map_url": folder.parent / "maps" / f"{stimulus}_map.png",
+        "hdf5_url": folder / f"{split_name(stimulus)[1]}.hdf5",
+    }
+    titles = {title: name for name, title in FOLDERS.items()}
+    return {
+        "stim_ID": stimulus,
+        "scenario": titles.get(folder.parent.name, folder.parent.name),
+        **{column: path.relative_to(out).as_posix() for column, path in files.items()},
+        "correct": "",
+        "label": str(bool(record["does_target_contact_zone"])),
+    }
+
+
+def _json(value: Any) -> bytes:
+    return (json.dumps(value, indent=4) + "\n").encode()
+
+
+def _csv(rows: list[Any]) -> bytes:
+    buffer = io.StringIO()
+    csv.writer(buffer, lineterminator="\n").writerows(rows)
+    return buffer.getvalue().encode()

@@ -1,0 +1,182 @@
+"""One official HDF5 file becomes a trial: scene, motion, contacts, labels, movies."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+import physion
+from physion.errors import BadInputError
+from physion.physics.labels import Labels, label_contact
+from physion.physics.trajectory import Trajectory
+from physion.rendering.renderer import Renderer, role_map
+from physion.scenes.scene import FRAME_TIME, OBSERVED_FRAMES, PLAYBACK_RATE, Scene
+from physion.trials.files import encode_png, write_files
+from physion.trials.official.import_folder import IMPORTED, ImportJob
+from physion.trials.official.movies import (
+    PICTURES,
+    Movies,
+    make_movies,
+    read_movie,
+    stored_frames,
+)
+from physion.trials.official.read_hdf5 import OfficialFile
+from physion.trials.official.read_motion import MotionReader
+from physion.trials.official.read_scene import SceneReader
+from physion.trials.official.round_trip import restored_files, stored_trial
+from physion.trials.trial_file import Metadata, TrialWriter
+
+UNSEEN_SIZE = (256, 256)
+"""Width and height in pixels of the id map of a trial without any picture."""
+_CODE = np.array([1, 256, 65536])
+"""Makes one number of a colour."""
+
+
+def import_state(job: ImportJob) -> tuple[str, ...]:
+    """Write the files of the trial in an official HDF5 file; what was guessed or left out."""
+    with OfficialFile.open(job.source) as file:
+        reader = SceneReader(file, job.paths.trial, job.paths.scenario)
+        motion = MotionReader(reader)
+        scene, trajectory = motion.scene, motion.trajectory()
+        frames = len(trajectory)
+        if frames <= OBSERVED_FRAMES:
+            raise file.bad(
+                "frames", f"holds {frames}; nothing is left to predict after {OBSERVED_FRAMES}"
+            )
+        stored = stored_trial(motion, trajectory)
+        if stored is not None:
+            write_files(job.paths, restored_files(job, file, reader.frames, stored))
+            return ()
+        movies = _movies(job, file, reader, frames)
+        ids = _ids(file, reader, scene, trajectory, movies.size if movies else UNSEEN_SIZE)
+        said = motion.said
+        labels = _labels(job, scene, trajectory, said)
+        recorded = job.contact if said is None else bool(said.any())
+        if recorded is not None and recorded != label_contact(scene, trajectory).contact:
+            reader.notes.append(f"the file says contact {recorded}, its contacts the opposite")
+        metadata = imported_metadata(
+            job,
+            scene,
+            trajectory,
+            ids,
+            look="redyellow" if reader.redyellow() else "free",
+            movies=movies is not None,
+            rate=movies.rate if movies else PLAYBACK_RATE,
+            recorded=recorded,
+        )
+    files: dict[str, bytes] = {}
+    if movies:
+        files = {"movie": movies.full, "observed_movie": movies.observed}
+        files["map"] = encode_png(role_map(ids, scene))
+    files["trial_file"] = TrialWriter(metadata, scene, trajectory, labels, ids).finish()
+    write_files(job.paths, files)
+    return tuple(dict.fromkeys(reader.notes))
+
+
+def _labels(
+    job: ImportJob, scene: Scene, trajectory: Trajectory, said: NDArray[np.bool_] | None
+) -> Labels:
+    """The file's own labels; where it has none, metadata.json's, else those of its contacts."""
+    labels = label_contact(scene, trajectory)
+    if said is None and job.contact is None:
+        return labels
+    touches = np.flatnonzero(said) if said is not None else np.zeros(0)
+    first = int(touches[0]) if len(touches) else None
+    contact = first is not None
+    if said is None:
+        contact, first = bool(job.contact), job.first_frame
+    observed = first is not None and first < OBSERVED_FRAMES
+    return replace(labels, contact=contact, first_frame=first, observed=observed)
+
+
+def _movies(job: ImportJob, file: OfficialFile, reader: SceneReader, frames: int) -> Movies | None:
+    """The movie beside the file, or, if it lacks frames, made of the pictures inside the file."""
+    beside = job.source.with_name(f"{job.source.stem}_img.mp4")
+    try:
+        return read_movie(beside, frames) if beside.is_file() else _stored(file, reader, frames)
+    except BadInputError as error:
+        if not file.has(f"{reader.frames[0]}/{PICTURES}"):
+            raise
+        reader.notes.append(f"the pictures inside the file replace its movie: {error}")
+        return _stored(file, reader, frames)
+
+
+def _stored(file: OfficialFile, reader: SceneReader, frames: int) -> Movies | None:
+    if not file.has(f"{reader.frames[0]}/{PICTURES}"):
+        reader.notes.append("it has no pictures and gets no movies")
+        return None
+    pictures = stored_frames(file, reader.frames)
+    return make_movies(pictures, frames, PLAYBACK_RATE)
+
+
+def _ids(
+    file: OfficialFile,
+    reader: SceneReader,
+    scene: Scene,
+    trajectory: Trajectory,
+    size: tuple[int, int],
+) -> NDArray[np.int16]:
+    """What each pixel of frame 0 shows, by the file's own picture of ids; drawn if it has none.
+
+    ``size`` is (width, height) in pixels.
+    """
+    path, colors = f"{reader.frames[0]}/images/_id", "static/object_segmentation_colors"
+    if file.has(path) and file.has(colors):
+        codes = file.picture(path).astype(np.int64) @ _CODE
+        rows = file.table(colors, 3)
+        if len(rows) == len(reader.ids) and np.isfinite(rows).all():
+            ids = np.zeros(codes.shape, np.int16)
+            for place in reader.kept:
+                color = rows[place].astype(np.int64) @ _CODE
+                ids[codes == color] = scene.index(reader.label(place)) + 1
+            down, across = (
+                (np.arange(wanted) * have) // wanted
+                for wanted, have in zip(size[::-1], ids.shape, strict=True)
+            )
+            return np.asarray(ids[down][:, across])
+    reader.notes.append("it has no picture of ids; they are drawn from its state")
+    drawn = Renderer(scene, trajectory, *size).render(0, ("ids",)).ids
+    assert drawn is not None, "the renderer left out ids"
+    return drawn
+
+
+def imported_metadata(
+    job: ImportJob,
+    scene: Scene,
+    trajectory: Trajectory,
+    ids: NDArray[np.int16],
+    *,
+    look: str,
+    movies: bool,
+    rate: int,
+    recorded: bool | None,
+    free_movies: bool = False,
+) -> Metadata:
+    """Where an imported trial comes from; ``rate`` is its movies' frames a second."""
+    return Metadata(
+        trial=job.paths.trial,
+        dataset=job.dataset or IMPORTED,
+        scenario=job.paths.scenario,
+        split=job.paths.split,
+        index=job.index,
+        preset=None,
+        seed=None,
+        look=look,
+        width=ids.shape[1],
+        height=ids.shape[0],
+        frames=len(trajectory),
+        observed_frames=OBSERVED_FRAMES,
+        frame_time=FRAME_TIME,
+        playback_rate=rate,
+        completed=bool(trajectory.completed),
+        engine=trajectory.engine,
+        renderer="imported",
+        package=f"physion {physion.__version__}",
+        digest=trajectory.digest(),
+        scene_digest=scene.physics_digest(),
+        movies=movies,
+        free_movies=free_movies,
+        recorded_contact=recorded,
+    )

@@ -1,0 +1,256 @@
+"""One trial as an official HDF5 file: what never changes, every frame, and our own extras.
+
+Names, shapes and encodings are those of reference/official-system.md, section 4, with gzip alone.
+Static arrays all have one entry for each object (the originals leave scenery out of masses and
+frictions, so that they do not line up). Ids and counts are int64, measures float32. What the
+official layout has no place for stands apart, under ``physion/``: the scene, labels and metadata as
+JSON, the record for ``metadata.json``, the flow in pixels (``flow``: frames, rows, columns, (right,
+down), half precision), and the bytes of the trial file without passes (``trial_file``), of which an
+import makes the same trial again.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from typing import Any
+
+import h5py
+import numpy as np
+
+import physion
+from physion.scenes.scene import Cloth
+from physion.scenes.shapes.primitives import shape
+from physion.trials.official.axes import rotation_matrices, swap_axes, to_official_euler
+from physion.trials.official.names import RAMPS, ROOMS, TRIAL_FILE, segmentation_colors, split_name
+from physion.trials.official.write_flex import flex_groups
+from physion.trials.official.write_frames import PASSES, FrameWriter, put
+from physion.trials.official.write_metadata import trial_record
+from physion.trials.official.write_objects import OfficialObjects, model_name
+from physion.trials.trial_file import Trial, TrialWriter
+
+NONE = -1
+"""Id of an object that a trial does not have."""
+_UNSET_CONTACT = (0.5, 0.5, 0.0)
+_SEED_BITS = 2**63
+
+
+def official_file(trial: Trial) -> tuple[bytes, dict[str, Any]]:
+    """The bytes of the trial's official file in its own look, and its record for metadata.json.
+
+    Pictures are rendered again from the state, frame by frame; the file is built in memory, some
+    0.3 MB a frame at 256 x 256 pixels.
+    """
+    meta, scene = trial.metadata, trial.shown()
+    objects = OfficialObjects(scene, trial.trajectory)
+    # In memory, as a full disk would crash the HDF5 library.
+    file = h5py.File("official", "w", driver="core", backing_store=False, block_size=2**22)
+    with file:
+        static = _static(trial, objects)
+        _write_static(file.create_group("static"), static, objects)
+        frames = file.create_group("frames")
+        writer = FrameWriter(objects, meta.width, meta.height)
+        extra = file.create_group("physion")
+        flow = extra.create_dataset(
+            "flow",
+            (meta.frames, meta.height, meta.width, 2),
+            np.float16,
+            chunks=(1, meta.height, meta.width, 2),
+            compression="gzip",
+            compression_opts=4,
+            shuffle=True,
+        )
+        for frame in range(meta.frames):
+            images = trial.render(frame, PASSES)
+            writer.add(frames, frame, images)
+            assert images.flow is not None
+            with np.errstate(over="ignore"):
+                flow[frame] = images.flow.astype(np.float16)
+        record = {**trial_record(writer, static), "split": meta.split}
+        texts = {"scene": scene.to_json(), "record": json.dumps(record)}
+        texts |= {"labels": json.dumps(dataclasses.asdict(trial.labels))}
+        texts |= {"metadata": json.dumps(dataclasses.asdict(meta))}
+        for name, text in texts.items():
+            put(extra, name, np.array(text.encode()))
+        whole = TrialWriter(meta, trial.scene, trial.trajectory, trial.labels, trial.ids).finish()
+        # It is packed already.
+        file.create_dataset(TRIAL_FILE, data=np.frombuffer(whole, np.uint8))
+        file.flush()
+        return bytes(file.id.get_file_image()), record
+
+
+def _static(trial: Trial, objects: OfficialObjects) -> dict[str, Any]:
+    """Scalars and small lists of the static group, common ones first, by name."""
+    scene, meta = objects.scene, trial.metadata
+    ids, roles = objects.ids, scene.roles
+    config, number = split_name(meta.trial)
+    ramps = [body for body in scene.bodies if body.shape in RAMPS]
+    things = dict(zip(ids, objects.things, strict=True))
+    found: dict[str, Any] = {
+        "git_commit": f"physion {physion.__version__}",
+        "stimulus_name": f"{config}_{number}",
+        "room": ROOMS.get(scene.room, scene.room),
+        "seed": 0,
+        "randomize": 0,
+        "trial_seed": _trial_seed(trial),
+        "trial_num": meta.index,
+        "zone_id": ids[roles.patient],
+        "target_id": ids[roles.agent],
+        "probe_id": ids[roles.probe] if roles.probe else NONE,
+        "ramp_id": ids[ramps[0].name] if ramps else NONE,
+        "ramp_base_id": NONE,
+        "ramp_base_height": np.float32(ramps[0].position[2] - scene.floor if ramps else 0.0),
+        "target_type": model_name(things[roles.agent]),
+        "target_rotation": to_official_euler(things[roles.agent].rotation).astype(np.float32),
+        "probe_type": model_name(things[roles.probe]) if roles.probe else "",
+        "probe_mass": np.float32(things[roles.probe].mass if roles.probe else 0.0),
+        **_push(objects),
+        **{
+            kind: [model_name(things[name]) for name in names]
+            for kind, names in objects.scenery.items()
+        },
+    }
+    return found | _of_scenario(objects)
+
+
+def _trial_seed(trial: Trial) -> int:
+    """The low 63 bits of the trial's seed; an imported trial keeps the seed it came with."""
+    if trial.metadata.seed is not None:
+        return int(trial.metadata.seed, 16) % _SEED_BITS
+    seed = trial.scene.parameters.get("trial_seed")
+    return seed if isinstance(seed, int) and 0 <= seed < _SEED_BITS else NONE
+
+
+def _push(objects: OfficialObjects) -> dict[str, Any]:
+    """The first push: impulse, point, frame; zeros where nothing is pushed."""
+    scene = objects.scene
+    if not scene.pushes:
+        return {
+            **dict.fromkeys(("push_force", "push_position"), np.zeros(3, np.float32)),
+            "push_time": 0,
+        }
+    push = scene.pushes[0]
+    point = push.point
+    if point is None:
+        body = scene.bodies[scene.index(push.body)]
+        center = np.asarray(shape(body.shape).mass_properties().center) * np.asarray(body.scale)
+        turned = rotation_matrices(body.rotation) @ center + np.asarray(body.position)
+        point = (float(turned[0]), float(turned[1]), float(turned[2]))
+    return {
+        "push_force": swap_axes(push.impulse).astype(np.float32),
+        "push_position": swap_axes(point).astype(np.float32),
+        "push_time": push.frame,
+    }
+
+
+def _of_scenario(objects: OfficialObjects) -> dict[str, Any]:
+    """What the files of one scenario have and those of others have not."""
+    scene, ids = objects.scene, objects.ids
+    agent = objects.things[ids[scene.roles.agent] - 1]
+    middle = [body.shape for body in objects.middle]
+    if scene.scenario == "dominoes":
+        return {
+            "remove_middle": bool(scene.parameters.get("remove_middle", False)),
+            "middle_objects": middle,
+            "middle_type": middle[0] if middle else "",
+        }
+    if scene.scenario == "support":
+        cap = {"cap_type": model_name(agent), "use_cap": True}
+        return cap | {"num_blocks": len(middle)}
+    if scene.scenario == "drop":
+        return {
+            "drop_type": model_name(agent),
+            "drop_position": swap_axes(agent.position).astype(np.float32),
+            "drop_rotation": to_official_euler(agent.rotation).astype(np.float32),
+        }
+    if scene.scenario in ("contain", "link"):
+        return _of_stack(objects)
+    return {}
+
+
+def _of_stack(objects: OfficialObjects) -> dict[str, Any]:
+    """Base, attachment and links of Contain and Link; ``attachent_type`` is spelt as there."""
+    scene, ids = objects.scene, objects.ids
+    parts = {}
+    for part in ("base", "attachment"):
+        found = [body for body in scene.bodies if body.name.split("_")[0] == part]
+        parts[part] = found[0] if found else None
+    base, attachment = parts["base"], parts["attachment"]
+    taken = {part.name for part in (base, attachment) if part is not None}
+    taken |= {scene.roles.patient, scene.roles.probe or ""}
+    # From the lowest to the highest, as they are stacked.
+    links = sorted(
+        (body for body in scene.bodies if body.name not in taken and not body.scenery),
+        key=lambda body: body.position[2],
+    )
+    caps = [body for body in links if body.name.split("_")[0] == "cap"]
+    links = [body for body in links if body not in caps]
+    names = [body.name for body in links]
+    agent = scene.roles.agent
+    fixed = {name for joint in scene.joints for name in (joint.parent, joint.child)}
+    return {
+        "base_id": ids[base.name] if base else NONE,
+        "use_base": base is not None,
+        "base_type": base.shape if base else "",
+        "attachment_id": ids[attachment.name] if attachment else NONE,
+        "use_attachment": attachment is not None,
+        "attachent_type": attachment.shape if attachment else "",
+        "attachment_fixed": attachment is not None and attachment.name in fixed,
+        "link_type": links[0].shape if links else "",
+        "num_links": len(links),
+        "target_link_idx": names.index(agent) if agent in names else NONE,
+        "use_cap": bool(caps),
+    }
+
+
+def _write_static(group: h5py.Group, static: dict[str, Any], objects: OfficialObjects) -> None:
+    for name, value in static.items():
+        put(group, name, _plain(value))
+    things, count = objects.things, len(objects)
+    contacts = np.array(
+        [
+            _UNSET_CONTACT
+            if isinstance(thing, Cloth)
+            else (
+                thing.contact.static_friction,
+                thing.contact.dynamic_friction,
+                thing.contact.restitution,
+            )
+            for thing in things
+        ]
+    )
+    scale = swap_axes(objects.scales).astype(np.float32)
+    arrays: dict[str, Any] = {
+        "object_ids": np.arange(1, count + 1, dtype=np.int64),
+        "model_names": np.array([name.encode() for name in objects.models]),
+        "object_segmentation_colors": segmentation_colors(count),
+        "initial_position": swap_axes([t.position for t in things]).astype(np.float32),
+        "initial_rotation": to_official_euler([t.rotation for t in things]).astype(np.float32),
+        "scale": scale,
+        **{f"scale_{axis}": scale[:, place] for place, axis in enumerate("xyz")},
+        "color": np.array([thing.look.color for thing in things], np.float32),
+        "mass": np.array([thing.mass for thing in things], np.float32),
+        "static_friction": contacts[:, 0].astype(np.float32),
+        "dynamic_friction": contacts[:, 1].astype(np.float32),
+        "bounciness": contacts[:, 2].astype(np.float32),
+    }
+    for name, values in arrays.items():
+        put(group, name, values)
+    for name, values in flex_groups(objects).items():
+        actors = group.create_group(name)
+        for key, value in values.items():
+            put(actors, key, value)
+    mesh = group.create_group("mesh")
+    for place in range(count):
+        vertices, faces = objects.mesh(place)
+        put(mesh, f"vertices_{place}", vertices.astype(np.float32))
+        put(mesh, f"faces_{place}", faces.astype(np.int32))
+
+
+def _plain(value: Any) -> Any:
+    """A value as HDF5 has it: texts as bytes, lists of texts as arrays of bytes."""
+    if isinstance(value, str):
+        return np.array(value.encode() or b"\0")
+    if isinstance(value, list):
+        return np.array([text.encode() for text in value], dtype="S64" if not value else None)
+    return value

@@ -1,0 +1,188 @@
+"""The things of a scene as the official files list them: order, ids, names, sizes, meshes.
+
+Object ids count from 1. The zone comes first, then a ramp, the target and the probe, because
+official readers find target and zone by their places; then everything else as in the scene, and
+cloths last among their like.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from physion.physics.cloth.sheet import sheet_triangles, sheet_vertices
+from physion.physics.trajectory import Trajectory
+from physion.scenes.scene import Body, Cloth, Scene
+from physion.scenes.shapes.primitives import shape
+from physion.trials.official.axes import rotation_matrices, swap_axes
+from physion.trials.official.names import CLOTH_MODEL, RAMPS
+
+Floats = NDArray[np.float64]
+
+_SIDES = {
+    "front": (0.0, 1.0, 0.0),
+    "back": (0.0, -1.0, 0.0),
+    "left": (-1.0, 0.0, 0.0),
+    "right": (1.0, 0.0, 0.0),
+    "top": (0.0, 0.0, 1.0),
+    "bottom": (0.0, 0.0, -1.0),
+    "center": (0.0, 0.0, 0.0),
+}
+"""Face centres of a box about its centre in half sizes, along our axes of the object."""
+
+
+@dataclass(frozen=True)
+class OfficialObjects:
+    """The objects of a trial in the official order; ``order`` holds indices of `Scene.names`."""
+
+    scene: Scene
+    trajectory: Trajectory
+
+    @cached_property
+    def order(self) -> list[int]:
+        """Indices of `Scene.names`, object by object."""
+        scene = self.scene
+        roles = scene.roles
+        first = [roles.patient]
+        first += [body.name for body in scene.bodies if body.shape in RAMPS][:1]
+        first += [roles.agent, *([roles.probe] if roles.probe else [])]
+        names = [*first, *scene.names()]
+        return [scene.index(name) for name in dict.fromkeys(names)]
+
+    @cached_property
+    def ids(self) -> dict[str, int]:
+        """Object ids by name, from 1."""
+        names = self.scene.names()
+        return {names[index]: place for place, index in enumerate(self.order, start=1)}
+
+    def __len__(self) -> int:
+        return len(self.order)
+
+    @cached_property
+    def things(self) -> list[Body | Cloth]:
+        """Bodies and cloths, object by object."""
+        everything: list[Body | Cloth] = [*self.scene.bodies, *self.scene.cloths]
+        return [everything[index] for index in self.order]
+
+    @property
+    def models(self) -> list[str]:
+        """Model names, object by object."""
+        return [model_name(thing) for thing in self.things]
+
+    @cached_property
+    def scales(self) -> Floats:
+        """Scale factors (N, 3) along our axes of each object."""
+        return np.array([_scale(thing) for thing in self.things])
+
+    @cached_property
+    def poses(self) -> tuple[Floats, Floats]:
+        """Positions (F, N, 3) and rotations (F, N, 4), ours. A cloth is where its middle is."""
+        t = self.trajectory
+        frames, bodies = t.positions.shape[:2]
+        count = bodies + len(self.scene.cloths)
+        positions, rotations = np.zeros((frames, count, 3)), np.zeros((frames, count, 4))
+        positions[:, :bodies], rotations[:, :bodies] = t.positions, t.rotations
+        for place, cloth in enumerate(self.scene.cloths, start=bodies):
+            positions[:, place] = self.cloth_vertices(place).mean(axis=1)
+            rotations[:, place] = cloth.rotation
+        return positions[:, self.order], rotations[:, self.order]
+
+    @cached_property
+    def motions(self) -> tuple[Floats, Floats]:
+        """Velocities and spins (F, N, 3), ours; those of a cloth are 0, as nobody gave any."""
+        t = self.trajectory
+        pad = ((0, 0), (0, len(self.scene.cloths)), (0, 0))
+        return (
+            np.pad(t.velocities.astype(np.float64), pad)[:, self.order],
+            np.pad(t.angular_velocities.astype(np.float64), pad)[:, self.order],
+        )
+
+    def cloth_vertices(self, index: int) -> Floats:
+        """Vertices (F, V, 3) of the cloth that is ``index`` in `Scene.names`."""
+        sizes = [cloth.resolution**2 for cloth in self.scene.cloths]
+        place = index - len(self.scene.bodies)
+        start = sum(sizes[:place])
+        vertices = self.trajectory.cloth_vertices[:, start : start + sizes[place]]
+        return np.asarray(vertices, np.float64)
+
+    def mesh(self, place: int) -> tuple[Floats, NDArray[np.int32]]:
+        """Vertices (V, 3) and triangles (T, 3) of an object as the official files have them.
+
+        In its own frame and their axes, to be multiplied by its scale; clockwise from outside, as
+        Unity's, so that a cross product of the numbers points outwards.
+        """
+        thing = self.things[place]
+        if isinstance(thing, Cloth):
+            flat = Cloth(thing.name, (0.0, 0.0, 0.0), resolution=thing.resolution)
+            vertices, faces = sheet_vertices(flat), sheet_triangles(thing.resolution)
+        else:
+            mesh = shape(thing.shape).mesh
+            vertices, faces = mesh.vertices, mesh.faces
+        return swap_axes(vertices), faces[:, ::-1]
+
+    def boxes(self, frame: int) -> dict[str, Floats]:
+        """Face centres and centre (N, 3), ours, of the boxes round all objects, by side."""
+        positions, rotations = self.poses
+        turns = rotation_matrices(rotations[frame])
+        low, high = np.moveaxis(self._bounds, 1, 0) * self.scales
+        found = {}
+        for side, away in _SIDES.items():
+            local = (low + high) / 2 + np.array(away) * (high - low) / 2
+            found[side] = positions[frame] + np.einsum("nij,nj->ni", turns, local)
+        for place, thing in enumerate(self.things):
+            if isinstance(thing, Cloth):
+                points = self.cloth_vertices(self.order[place])[frame]
+                low_, high_ = points.min(axis=0), points.max(axis=0)
+                for side, away in _SIDES.items():
+                    middle = (low_ + high_) / 2
+                    found[side][place] = middle + np.array(away) * (high_ - low_) / 2
+        return found
+
+    @cached_property
+    def _bounds(self) -> Floats:
+        return np.stack(
+            [
+                np.zeros((2, 3)) if isinstance(thing, Cloth) else shape(thing.shape).bounds
+                for thing in self.things
+            ]
+        )
+
+    @cached_property
+    def scenery(self) -> dict[str, list[str]]:
+        """Names of the scenery: ``occluders`` before the scene and ``distractors`` behind it."""
+        eye, middle = np.array(self.scene.camera.position), np.array(self.scene.camera.target)
+        found: dict[str, list[str]] = {"distractors": [], "occluders": []}
+        for body in self.scene.bodies:
+            if not body.scenery:
+                continue
+            before = float((np.array(body.position) - middle) @ (eye - middle)) > 0
+            if body.name.startswith(("occluder", "distractor")):
+                before = body.name.startswith("occluder")
+            found["occluders" if before else "distractors"].append(body.name)
+        return found
+
+    @cached_property
+    def middle(self) -> list[Body]:
+        """Bodies that move and have no role: dominoes, blocks, links."""
+        roles = self.scene.roles
+        taken = {roles.agent, roles.patient, roles.probe}
+        return [
+            body
+            for body in self.scene.bodies
+            if body.name not in taken and not body.scenery and not body.kinematic
+        ]
+
+
+def model_name(thing: Body | Cloth) -> str:
+    """Official name of a model; props, which no official library holds, keep ours."""
+    return CLOTH_MODEL if isinstance(thing, Cloth) else thing.shape
+
+
+def _scale(thing: Body | Cloth) -> tuple[float, float, float]:
+    if isinstance(thing, Body):
+        return thing.scale
+    # The official square of cloth is 2 m a side.
+    return (thing.size[0] / 2, thing.size[1] / 2, 1.0)

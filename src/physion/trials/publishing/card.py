@@ -1,0 +1,225 @@
+"""The card of a dataset: a README for people and `croissant.json` for machines, side by side."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from physion.atomic import write_atomic
+from physion.errors import BadInputError
+from physion.trials.layout import INDEX
+from physion.trials.publishing.croissant import Terms, croissant
+from physion.trials.publishing.facts import MEANINGS, SCENARIOS, SPLITS, Facts, meaning, read_facts
+
+CARD = "README.md"
+METADATA = "croissant.json"
+TITLE = "Physion: "
+"""How the name of every dataset begins in a card of ours."""
+MADE_BY = "Made with the package physion after the study of Bear et al. (2021)."
+"""Sentence in every description of ours, by which a file is known to be one."""
+CITATION = """@inproceedings{bear2021physion,
+  title = {Physion: Evaluating Physical Prediction from Vision in Humans and Machines},
+  author = {Bear, Daniel M. and Wang, Elias and Mrowca, Damian and Binder, Felix J. and
+    Tung, Hsiao-Yu Fish and Pramod, R. T. and Holdaway, Cameron and Tao, Sirui and Smith, Kevin and
+    Sun, Fan-Yun and Fei-Fei, Li and Kanwisher, Nancy and Tenenbaum, Joshua B. and
+    Yamins, Daniel L. K. and Fan, Judith E.},
+  booktitle = {Advances in Neural Information Processing Systems, Datasets and Benchmarks},
+  year = {2021}
+}"""
+"""The study whose system is built here (BibTeX)."""
+
+
+@dataclass(frozen=True)
+class Card:
+    """Paths of the two files, and the ``facts`` that they tell."""
+
+    readme: Path
+    metadata: Path
+    facts: Facts
+
+
+def write_card(
+    folder: Path,
+    out: Path | None = None,
+    *,
+    license: str = "MIT",
+    version: str = "1.0.0",
+    creator: str | None = None,
+    url: str | None = None,
+    published: str | None = None,
+) -> Card:
+    """Describe the dataset in ``folder`` by `README.md` and `croissant.json`, beside its index.
+
+    With ``out`` they are written there, to be put beside the index later. Arguments are as in
+    `Terms`; the day is by default today's. All counts come from the index as it is now: write the
+    card anew when the dataset changes; it takes the place of an older card and of nothing else.
+    `BadInputError` where there is no index or no trial, another file has one of the two names, or
+    an argument is not what it should be.
+    """
+    day = published or datetime.date.today().isoformat()
+    terms = _checked(Terms(day, license, version, creator, url))
+    facts = read_facts(folder)
+    target = folder if out is None else out
+    _refuse_strangers(target)
+    metadata = croissant(facts, terms, description(facts), CITATION)
+    text = json.dumps(metadata, indent=1, ensure_ascii=False) + "\n"
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+        write_atomic(target / METADATA, text.encode())
+        write_atomic(target / CARD, card_text(facts, terms).encode())
+    except OSError as error:
+        raise BadInputError(f"cannot write into {target}: {error.strerror or error}") from error
+    return Card(target / CARD, target / METADATA, facts)
+
+
+def _refuse_strangers(target: Path) -> None:
+    """Raise `BadInputError` where somebody else's file would be written over."""
+    for name, is_ours in ((CARD, _is_readme), (METADATA, _is_metadata)):
+        path = target / name
+        if not path.exists() and not path.is_symlink():
+            continue
+        if not (path.is_file() and is_ours(path)):
+            raise BadInputError(
+                f"{path} is not a card of ours and would be lost; move it away, or write the card "
+                "into another folder (`physion export DATASET FOLDER --layout card`)"
+            )
+
+
+def _is_readme(path: Path) -> bool:
+    """Whether the front matter is that of a card."""
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    if not lines or lines[0] != "---" or "---" not in lines[1:]:
+        return False
+    return any(x.startswith(f'pretty_name: "{TITLE}') for x in lines[1 : lines.index("---", 1)])
+
+
+def _is_metadata(path: Path) -> bool:
+    try:
+        data = json.loads(path.read_bytes())
+    except (ValueError, RecursionError):
+        return False
+    return isinstance(data, dict) and str(data.get("description")).endswith(MADE_BY)
+
+
+def description(facts: Facts) -> str:
+    """What the dataset is, in a few sentences."""
+    return (
+        f"{len(facts.index)} simulated physical scenes, {facts.movies or 'none'} of them with "
+        "movies. Who predicts sees the first part of a trial; the question is whether one thing, "
+        f"the agent, touches another, the patient, at any time of it. {MADE_BY}"
+    )
+
+
+def card_text(facts: Facts, terms: Terms) -> str:
+    """The README: YAML front matter as on the Hugging Face hub, then Markdown."""
+    name = terms.creator or "not named"
+    sections = [
+        _front_matter(facts, terms),
+        f"# {facts.name}\n{description(facts)}",
+        f"## How it was made\n{facts.collection()}\n\n"
+        f"Creator: {name}. Version {terms.version}, {terms.published}. "
+        f"Licence: {terms.license}.",
+        f"## Splits\n{_table(_counts(facts.index))}\n\n{_meanings('split', SPLITS, facts)}",
+        f"## Scenarios\n{_meanings('scenario', SCENARIOS, facts)}",
+        f"## Files\nOne folder for each split, in it one for each scenario. `{INDEX}` has one row "
+        "for each trial, with the path, size and SHA-256 of its files; together they have "
+        f"{facts.total_bytes() / 1e6:.1f} MB. `{METADATA}` says the same for machines. Who "
+        "predicts may have the observed movies and the maps, and nothing else: the index, the "
+        "trial files and the full movies hold the answers.",
+        f"## Columns of the index\n{_table(_columns(facts))}",
+        "## Biases\n" + _list(facts.biases()),
+        "## Known limits\n" + _list(facts.limitations()),
+        f"## Citation\n```bibtex\n{CITATION}\n```",
+    ]
+    return "\n\n".join(sections) + "\n"
+
+
+def _front_matter(facts: Facts, terms: Terms) -> str:
+    """Metadata of the hub. Values are JSON, which YAML reads as it is."""
+    values: dict[str, Any] = {
+        "license": terms.license.lower(),
+        "pretty_name": f"{TITLE}{facts.name}",
+        "task_categories": ["video-classification"],
+        "annotations_creators": ["machine-generated"],
+        "size_categories": [_size_category(len(facts.index))],
+        "tags": ["physics", "intuitive-physics", "video", "simulation", "croissant"],
+        "configs": [{"config_name": "index", "data_files": INDEX}],
+    }
+    lines = [f"{name}: {json.dumps(value, ensure_ascii=False)}" for name, value in values.items()]
+    return "\n".join(["---", *lines, "---"])
+
+
+def _size_category(count: int) -> str:
+    """The hub's name for a number of records."""
+    bounds = (1_000, 10_000, 100_000, 1_000_000)
+    names = ("n<1K", "1K<n<10K", "10K<n<100K", "100K<n<1M", "1M<n<10M")
+    return names[sum(count >= bound for bound in bounds)]
+
+
+def _counts(index: pd.DataFrame) -> pd.DataFrame:
+    """One row for each split and scenario: trials, contact rate, length, robustness."""
+    rows = []
+    for (split, scenario), part in index.groupby(["split", "scenario"], observed=True):
+        robust = part["robust"].dropna()
+        rows.append(
+            {
+                "split": split,
+                "scenario": scenario,
+                "trials": len(part),
+                "contact rate": f"{part['contact'].mean():.3f}",
+                "contact while observed": int(part["observed_contact"].sum()),
+                "frames, median": f"{part['frames'].median():.0f}",
+                "agreement under jitter": f"{robust.mean():.3f}" if len(robust) else "-",
+                "looks": ", ".join(sorted(set(part["look"]))),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def _columns(facts: Facts) -> pd.DataFrame:
+    rows = [{"column": f"`{name}`", "meaning": meaning(name)} for name in MEANINGS]
+    rows = [row for row in rows if row["column"].strip("`") in facts.index.columns]
+    rows.append(
+        {"column": "`*_bytes`, `*_sha256`", "meaning": "size and hash of the file named in `*`"}
+    )
+    return pd.DataFrame(rows)
+
+
+def _meanings(column: str, meanings: dict[str, str], facts: Facts) -> str:
+    found = sorted(set(facts.index[column]))
+    return _table(
+        pd.DataFrame([{column: f"`{name}`", "meaning": meanings.get(name, "-")} for name in found])
+    )
+
+
+def _table(table: pd.DataFrame) -> str:
+    """A Markdown table."""
+    rows = [list(table.columns), ["---"] * len(table.columns), *table.astype(str).values.tolist()]
+    return "\n".join("| " + " | ".join(c.replace("|", "\\|") for c in row) + " |" for row in rows)
+
+
+def _list(items: list[str]) -> str:
+    return "\n".join(f"- {item}" for item in items)
+
+
+def _checked(terms: Terms) -> Terms:
+    """The terms, or `BadInputError` for what the formats would not take."""
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9.+-]*", terms.license):
+        raise BadInputError(
+            f"licence {terms.license!r} is not an identifier of spdx.org, like MIT or CC-BY-4.0"
+        )
+    if not re.fullmatch(r"\d+\.\d+\.\d+", terms.version):
+        raise BadInputError(f"version {terms.version!r} is not three numbers, like 1.0.0")
+    if terms.url is not None and not re.fullmatch(r"https?://\S+|urn:\S+", terms.url):
+        raise BadInputError(f"{terms.url!r} is not an address that begins with http:// or https://")
+    try:
+        datetime.date.fromisoformat(terms.published)
+    except ValueError:
+        raise BadInputError(f"day {terms.published!r} is not like 2026-01-31") from None
+    return terms

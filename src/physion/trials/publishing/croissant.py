@@ -1,0 +1,211 @@
+"""A dataset described for machines: Croissant 1.0 with the responsible-AI vocabulary 1.0 (JSON-LD).
+
+Words of both vocabularies are those of their specifications (docs.mlcommons.org/croissant); the
+context stands in the file, so that nothing has to be fetched to read it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from physion.trials.index import COLUMNS
+from physion.trials.layout import INDEX
+from physion.trials.publishing.facts import MEANINGS, SCENARIOS, SPLITS, Facts, meaning
+
+CROISSANT = "http://mlcommons.org/croissant/1.0"
+RAI = "http://mlcommons.org/croissant/RAI/1.0"
+
+_TYPES = {"string": "sc:Text", "int64": "sc:Integer", "bool": "sc:Boolean", "float64": "sc:Float"}
+_FILES = {
+    "trial-files": ("*/*/*.h5", "application/x-hdf5", "trial_file"),
+    "movies": ("*/*/*_img.mp4", "video/mp4", "movie"),
+    "observed-movies": ("*/*/*_observed.mp4", "video/mp4", "observed_movie"),
+    "maps": ("*/*/*_map.png", "image/png", "map"),
+}
+_MINE = """citeAs column extract field fileProperty fileObject fileSet format includes isLiveDataset
+jsonPath key md5 parentField path recordSet references regex repeated replace separator source
+subField transform"""
+CONTEXT: dict[str, Any] = {
+    "@language": "en",
+    "@vocab": "https://schema.org/",
+    "sc": "https://schema.org/",
+    "cr": "http://mlcommons.org/croissant/",
+    "rai": "http://mlcommons.org/croissant/RAI/",
+    "dct": "http://purl.org/dc/terms/",
+    "conformsTo": "dct:conformsTo",
+    "data": {"@id": "cr:data", "@type": "@json"},
+    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
+    "equivalentProperty": "cr:equivalentProperty",
+    "examples": {"@id": "cr:examples", "@type": "@json"},
+    "samplingRate": "cr:samplingRate",
+    **{word: f"cr:{word}" for word in _MINE.split()},
+}
+
+
+@dataclass(frozen=True)
+class Terms:
+    """What a dataset cannot say of itself, for who publishes it.
+
+    - ``license``: an identifier of spdx.org. By default that of this package, and of the official
+      command logs. ``version``: of the dataset, three numbers with dots.
+    - ``creator``: who made it. ``url``: its page; by default a name made of its index's hash.
+    - ``published``: the day, ``YYYY-MM-DD``.
+    """
+
+    published: str
+    license: str = "MIT"
+    version: str = "1.0.0"
+    creator: str | None = None
+    url: str | None = None
+
+
+def croissant(facts: Facts, terms: Terms, description: str, citation: str) -> dict[str, Any]:
+    """The metadata as JSON-LD; ``citation`` is BibTeX."""
+    package = facts.versions("package")
+    creator = terms.creator or f"An unnamed user of {package}"
+    return {
+        "@context": CONTEXT,
+        "@type": "sc:Dataset",
+        "conformsTo": [CROISSANT, RAI],
+        "name": facts.name,
+        "description": description,
+        "url": terms.url or f"urn:sha256:{facts.index_sha256}",
+        "license": f"https://spdx.org/licenses/{terms.license}.html",
+        "version": terms.version,
+        "datePublished": terms.published,
+        "creator": {"@type": "sc:Organization", "name": creator},
+        "citeAs": citation,
+        "keywords": ["physics", "video", "prediction", "cognitive science", "benchmark"],
+        "distribution": _distribution(facts),
+        "recordSet": [*_enumerations(facts), _trials()],
+        **responsible(facts),
+    }
+
+
+def responsible(facts: Facts) -> dict[str, Any]:
+    """Properties of the responsible-AI vocabulary."""
+    n = len(facts.index)
+    return {
+        "rai:dataCollection": facts.collection(),
+        "rai:dataCollectionType": ["Software Collection"]
+        + (["Secondary Data analysis"] if facts.imported else []),
+        "rai:dataCollectionRawData": "Scenes (bodies, poses, pushes, camera) and their simulated "
+        "motion are kept in every trial file; pictures can be rendered from them again.",
+        "rai:dataCollectionMissingData": facts.missing(),
+        "rai:dataAnnotationProtocol": "Labels are computed, not judged: whether the simulation "
+        "made agent and patient touch, at any time of the trial, the unseen part included.",
+        "rai:machineAnnotationTools": [facts.versions("engine"), facts.versions("package")],
+        "rai:annotationsPerItem": "0 by people; one label is computed",
+        "rai:dataBiases": facts.biases(),
+        "rai:dataLimitations": facts.limitations(),
+        "rai:dataUseCases": [
+            "Training models that predict what happens next from video or from physical state.",
+            "Testing whether such models foresee contacts, and comparing them with people who "
+            "judge the same movies.",
+            "Not meant for decisions about real objects: nothing here was measured on any.",
+        ],
+        "rai:dataSocialImpact": "None is known beyond that of research on physical prediction.",
+        "rai:personalSensitiveInformation": [
+            "None. All pictures are rendered from made scenes; no person was filmed, and nobody's "
+            "answers are part of the dataset."
+        ],
+        "rai:dataReleaseMaintenancePlan": f"The {n - facts.imported} trials with a seed can be "
+        f"made again by {facts.versions('package')}; every file's SHA-256 is in the index, and "
+        "`physion verify` compares them. A version of other pictures or labels gets a new number.",
+        "rai:dataPreprocessingProtocol": preprocessing(facts),
+    }
+
+
+def preprocessing(facts: Facts) -> list[str]:
+    """What became of the simulation before it was stored."""
+    sizes = facts.index[["width", "height"]].drop_duplicates().sort_values(["width", "height"])
+    text = ", ".join(f"{row.width} x {row.height}" for row in sizes.itertuples())
+    said = ["States are stored as the engine computed them, in single precision."]
+    if facts.movies:
+        said.append(f"Movies are H.264 ({text} pixels); the observed part is a file of its own.")
+    return said
+
+
+def _distribution(facts: Facts) -> list[dict[str, Any]]:
+    index_file = {
+        "@type": "cr:FileObject",
+        "@id": INDEX,
+        "name": INDEX,
+        "description": "One row a trial, with label, hashes and paths. Holds the answers.",
+        "contentUrl": INDEX,
+        "contentSize": f"{facts.index_bytes} B",
+        "encodingFormat": "application/x-parquet",
+        "sha256": facts.index_sha256,
+    }
+    sets = [
+        {
+            "@type": "cr:FileSet",
+            "@id": name,
+            "name": name,
+            "description": f"{MEANINGS[column][0].upper()}{MEANINGS[column][1:]}. The SHA-256 of "
+            "each file is in the index.",
+            "encodingFormat": kind,
+            "includes": pattern,
+        }
+        for name, (pattern, kind, column) in _FILES.items()
+        if facts.index[column].notna().any()
+    ]
+    return [index_file, *sets]
+
+
+def _enumerations(facts: Facts) -> list[dict[str, Any]]:
+    """Splits and scenarios that occur, with what they mean."""
+    sets = []
+    for column, meanings, kind in (
+        ("split", SPLITS, "cr:Split"),
+        ("scenario", SCENARIOS, "sc:Enumeration"),
+    ):
+        name = f"{column}s"
+        rows = [
+            {f"{name}/name": value, f"{name}/meaning": meanings.get(value, "of the user's own")}
+            for value in sorted(set(facts.index[column]))
+        ]
+        fields = [
+            {"@type": "cr:Field", "@id": f"{name}/{part}", "name": part, "dataType": "sc:Text"}
+            for part in ("name", "meaning")
+        ]
+        sets.append(
+            {
+                "@type": "cr:RecordSet",
+                "@id": name,
+                "name": name,
+                "dataType": kind,
+                "key": {"@id": f"{name}/name"},
+                "field": fields,
+                "data": rows,
+            }
+        )
+    return sets
+
+
+def _trials() -> dict[str, Any]:
+    """The index, column by column."""
+    return {
+        "@type": "cr:RecordSet",
+        "@id": "trials",
+        "name": "trials",
+        "description": "One record a trial.",
+        "key": {"@id": "trials/trial"},
+        "field": [_field(name, kind) for name, kind in COLUMNS.items()],
+    }
+
+
+def _field(name: str, kind: str) -> dict[str, Any]:
+    plain = {"Int64": "int64", "Float64": "float64", "boolean": "bool"}.get(kind, kind)
+    field: dict[str, Any] = {
+        "@type": "cr:Field",
+        "@id": f"trials/{name}",
+        "name": name,
+        "description": meaning(name),
+        "dataType": _TYPES[plain],
+        "source": {"fileObject": {"@id": INDEX}, "extract": {"column": name}},
+    }
+    if name in ("split", "scenario"):
+        field["references"] = {"field": {"@id": f"{name}s/name"}}
+    return field
