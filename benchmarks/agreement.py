@@ -2,10 +2,10 @@
 
 Side by side in one run: Cohen's kappa of every pair of 100 people who answered 150 stimuli, by
 scikit-learn pair by pair and by `physion.analysis.statistics.kappa` at once, with the largest
-difference of the two; then 1000 bootstraps of the mean pairwise kappa, drawing people, stimuli or both; then 20
-models beside the 100 people with every interval; then the same in eight scenarios, from tables,
-with the tests of all pairs of models, zones and calibration. Times are the best of several runs,
-but for the loop and the eight scenarios, which run once. ``--write`` puts them into
+difference of the two; then 1000 bootstraps of the mean pairwise kappa, drawing people, stimuli or
+both; then 20 models beside the 100 people with every interval; then the same in eight scenarios,
+from tables, with the tests of all pairs of models, zones and calibration. Times are the best of
+several runs, but for the loop and the eight scenarios, which run once. ``--write`` puts them into
 benchmarks/results/agreement.json.
 """
 

@@ -283,9 +283,8 @@ def check(study: Study, database: str | None, tally: Tally) -> int:
 
 def measure(name: str, options: argparse.Namespace, folder: Path) -> Row:
     """Make a study, serve it, load it, stop, and look everything up."""
-    from tiny_study import make_tiny_study
-
     from physion.experiment.study.study import Limits
+    from support.experiment.tiny_study import make_tiny_study
 
     fast = Limits(
         requests_per_second=10_000,

@@ -34,7 +34,7 @@ TEST_TRIALS = 150
 
 def make_study(folder: Path) -> Study:
     """The tiny study with 150 test trials; nobody asks for the movies of the further ones."""
-    from tiny_study import make_tiny_study
+    from support.experiment.tiny_study import make_tiny_study
 
     tiny = make_tiny_study(folder, test=1, timing=Timing(cue_ms=100))
     test = tiny.phase("collide", "test")[0]

@@ -21,9 +21,8 @@ import pandas as pd
 ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "analysis")]
 
-from mixed_cases import CASES, STORED, Case, as_csv, digest, published  # noqa: E402
-
-from conftest import official_folder  # noqa: E402
+from support.mixed_cases import CASES, STORED, Case, as_csv, digest, published  # noqa: E402
+from support.official import official_folder  # noqa: E402
 
 PACKAGES = ("r-base-core", "r-cran-lme4", "r-cran-lmertest", "r-cran-glmmtmb")
 COLUMNS = ["case", "fitter", "quantity", "term", "value"]

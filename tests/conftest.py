@@ -1,18 +1,12 @@
-"""Shared fixtures: where the official data is, if it is here."""
+"""Fixtures of all tests."""
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import pytest
 
-
-def official_folder() -> Path | None:
-    """The folder of the original study's data, from $PHYSION_OFFICIAL or beside the checkout."""
-    named = os.environ.get("PHYSION_OFFICIAL")
-    folder = Path(named) if named else Path(__file__).parents[2] / "shared" / "official"
-    return folder if (folder / "scenes").is_dir() else None
+from support.official import official_folder
 
 
 @pytest.fixture(scope="session")

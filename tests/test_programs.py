@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from programs import find_chromium, find_program
+from support.programs import find_chromium, find_program
 
 ROOT = Path(__file__).parents[1]
 

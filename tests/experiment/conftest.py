@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from postgres import database_url, fresh_postgres, postgres_cluster, postgres_url
-from store_walk import small_secrets, small_study, sqlite_store, store
+from support.experiment.postgres import database_url, fresh_postgres, postgres_cluster, postgres_url
+from support.experiment.store_walk import small_secrets, small_study, sqlite_store, store
 
 __all__ = [
     "database_url",

@@ -9,7 +9,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from moving_dots import make_dots
 from physion.analysis.tables.predictions import check_predictions
 from physion.errors import BadInputError, UnknownNameError
 from physion.models import build_model, models
@@ -17,6 +16,7 @@ from physion.readout import Evaluation, EvaluationConfig, evaluate, evaluate_mod
 from physion.readout.logistic import ReadoutConfig
 from physion.readout.table import OFFICIAL_COLUMNS, OWN_COLUMNS, read_table, write_table
 from physion.trials.dataset import Dataset
+from support.moving_dots import make_dots
 
 TINY: dict[str, Any] = {
     "encoder": "test_vit", "image_size": 64, "weights": "random", "hidden": 16,

@@ -14,8 +14,15 @@ from physion.rendering.rasterizer import NOTHING, SAMPLES, rasterize
 from physion.rendering.renderer import Frame, Renderer
 from physion.scenes.scene import Camera, Cloth, Scene
 from physion.scenes.shapes.primitives import shape, shapes
-
-from .scenes import CAMERA, body, flat_sheet, resting, scene_of, trajectory_of, tumbling
+from support.rendered_scenes import (
+    CAMERA,
+    body,
+    flat_sheet,
+    resting,
+    scene_of,
+    trajectory_of,
+    tumbling,
+)
 
 EXACT = ("depth", "normals", "ids", "flow")
 Array = NDArray[np.float64]

@@ -6,7 +6,6 @@ import dataclasses
 import hashlib
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,8 +23,8 @@ from physion.rendering.renderer import (
 from physion.rendering.rooms import rooms
 from physion.rendering.textures.atlas import FINISHES, SIZE, build_atlas, finish
 from physion.scenes.scene import Camera, Look
-
-from .scenes import ALL, body, resting, scene_of, tumbling
+from support.paths import FIND_TESTS
+from support.rendered_scenes import ALL, body, resting, scene_of, tumbling
 
 
 def digest(frame: Frame) -> str:
@@ -91,14 +90,13 @@ def test_drawing_still_things_once_changes_no_byte() -> None:
 def test_a_fresh_process_gives_the_same_bytes() -> None:
     scene, trajectory = tumbling()
     code = (
-        "from tests.rendering.scenes import tumbling, ALL\n"
+        "from support.rendered_scenes import tumbling, ALL\n"
         "from tests.rendering.test_rendering_frames import digest\n"
         "from physion.rendering.renderer import Renderer\n"
         "print(digest(Renderer(*tumbling()).render(1, ALL)))"
     )
-    root = Path(__file__).parents[2]
     run = subprocess.run(
-        [sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True
+        [sys.executable, "-c", code], env=FIND_TESTS, capture_output=True, text=True, check=True
     )
     assert run.stdout.strip() == digest(Renderer(scene, trajectory).render(1, ALL))
 

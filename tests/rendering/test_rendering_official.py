@@ -8,8 +8,7 @@ import numpy as np
 
 from physion.rendering.renderer import Renderer
 from physion.scenes.tdw.read_logs import read_scenes
-
-from .scenes import resting
+from support.rendered_scenes import resting
 
 
 def test_first_trial_of_every_scenario_shows_agent_and_patient(official: Path) -> None:

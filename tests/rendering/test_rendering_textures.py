@@ -19,8 +19,7 @@ from physion.scenes.scene import Camera, Look, Scene
 from physion.scenes.shapes.primitives import shape
 from physion.scenes.shapes.prop_names import PREFIX, PROPS
 from physion.scenes.shapes.prop_parts import Prop
-
-from .scenes import body, resting, scene_of
+from support.rendered_scenes import body, resting, scene_of
 
 NEAR = Camera((1.3, 1.0, 0.9), (0.0, 0.0, 0.35))
 

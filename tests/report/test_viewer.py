@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from viewer_dataset import EVIL, FRAMES, PLANS, Plan, make_dataset, make_scene, make_trajectory
 
 from physion.cli import view
 from physion.cli.main import main as cli
@@ -29,6 +28,15 @@ from physion.scenes.shapes.meshes import Mesh, solid_properties
 from physion.scenes.shapes.primitives import shape
 from physion.trials.dataset import Dataset
 from physion.trials.video import read_frames
+from support.viewer_dataset import (
+    EVIL,
+    FRAMES,
+    PLANS,
+    Plan,
+    make_dataset,
+    make_scene,
+    make_trajectory,
+)
 
 SMALL = ViewerOptions(card_size=32, pass_size=32, stride=6)
 

@@ -19,11 +19,11 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from viewer_dataset import EVIL, Plan, make_dataset
 
 from physion.report.viewer.write_viewer import ViewerOptions, build_viewer
 from physion.trials.video import read_frames
-from programs import find_chromium
+from support.programs import find_chromium
+from support.viewer_dataset import EVIL, Plan, make_dataset
 
 pytestmark = pytest.mark.slow
 

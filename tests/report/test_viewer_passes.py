@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from viewer_dataset import PLANS, make_scene
 
 from physion.rendering.renderer import PASSES, Frame
 from physion.report.viewer.passes import (
@@ -21,6 +20,7 @@ from physion.report.viewer.passes import (
     ranges_of,
 )
 from physion.scenes.looks import RED, YELLOW, mistakable
+from support.viewer_dataset import PLANS, make_scene
 
 
 def test_near_is_bright_and_nothing_is_dark() -> None:

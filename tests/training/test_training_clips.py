@@ -12,12 +12,12 @@ import torch
 from lightning_fabric import Fabric
 from numpy.typing import NDArray
 
-from moving_dots import OBSERVED, make_dots
 from physion.errors import BadInputError, UnknownNameError
 from physion.models import Provenance, Spec, build_model
 from physion.training.clips import FeatureStore, FullClips, FutureFrameError, observed_clips
 from physion.trials.dataset import Dataset
 from physion.trials.video import read_frames
+from support.moving_dots import OBSERVED, make_dots
 
 SPEC = Spec(image_size=32)
 TINY: dict[str, Any] = {

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from hand_made import Parts, make_parts
+
+from support.hand_made import Parts, make_parts
 
 
 @pytest.fixture(scope="session")

@@ -8,7 +8,6 @@ import math
 import numpy as np
 import pandas as pd
 import pytest
-from hand_made import make_parts
 from numpy.typing import NDArray
 
 from physion.errors import BadInputError, BadSceneError
@@ -28,6 +27,7 @@ from physion.scenes.scene import (
 )
 from physion.trials import state
 from physion.trials.trial_file import Trial, TrialWriter
+from support.hand_made import make_parts
 
 WIDTH, HEIGHT = 96, 64
 

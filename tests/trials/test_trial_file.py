@@ -13,12 +13,13 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from hand_made import FRAMES, Parts, images, make_parts
 
 from physion.errors import BadInputError
 from physion.physics.trajectory import Trajectory
 from physion.trials.schema import FIELDS, SEAL_BYTES, seal
 from physion.trials.trial_file import Trial, TrialWriter, write_trial
+from support.hand_made import FRAMES, Parts, images, make_parts
+from support.paths import FIND_TESTS
 
 
 def sealed_with(change: Callable[[h5py.File], None], data: bytes) -> bytes:
@@ -285,7 +286,7 @@ import sys
 import numpy as np
 from physion.errors import BadInputError
 from physion.trials.schema import seal, SEAL_BYTES
-from test_trial_file import read_all
+from tests.trials.test_trial_file import read_all
 data = open(sys.argv[1], "rb").read()
 rng = np.random.default_rng(int(sys.argv[2]))
 refused = read = 0
@@ -344,7 +345,7 @@ def test_mutations_with_a_right_seal_never_crash(
         [sys.executable, "-c", FUZZ, str(tmp_path / "t.h5"), "1", str(count)],
         capture_output=True,
         text=True,
-        cwd=Path(__file__).parent,
+        env=FIND_TESTS,
         timeout=240,
     )
     assert done.returncode == 0, f"{done.returncode}: {done.stderr[-2000:]}"

@@ -1,0 +1,1 @@
+"""Frames of a trial: colour, depth, normals, ids, optical flow."""

@@ -1,0 +1,1 @@
+"""The collected data as tables and in the layouts of other conventions."""

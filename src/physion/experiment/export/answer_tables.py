@@ -1,9 +1,9 @@
 """The data of a study as two tables: one row a session, one row a session and trial.
 
 Columns, types and order are those of `physion.analysis.people.response_schema`. Sessions
-stand in the order in which they began; trials by session, familiarization first, in the order in which they were
-shown. Labels come from the study folder. Which sessions are never in any table, and why, is counted
-(`session_rows.Sessions.left_out`).
+stand in the order in which they began; trials by session, familiarization first, in the order in
+which they were shown. Labels come from the study folder. Which sessions are never in any table, and
+why, is counted (`session_rows.Sessions.left_out`).
 """
 
 from __future__ import annotations

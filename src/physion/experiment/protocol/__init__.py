@@ -1,0 +1,1 @@
+"""Messages between browser and server, and the reasons for a refusal."""

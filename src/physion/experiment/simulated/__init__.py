@@ -1,0 +1,1 @@
+"""Simulated participants, who test a study before people do."""

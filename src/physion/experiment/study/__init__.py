@@ -1,0 +1,1 @@
+"""The study folder: settings, texts, stimuli, media, recruitment."""

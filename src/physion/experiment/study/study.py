@@ -91,8 +91,8 @@ class Study:
     study is full. ``orders``: 0 gives each participant an order of their own; else so many prepared
     orders, least used first (the official study had 125). ``exclusions``: the rules by which
     sessions are flagged, a name of `physion.analysis.people.exclusions.RULE_SETS`.
-    ``percentile_from``: other finished people that it takes before anyone is told a percentile. ``embed_from``: sites
-    that may show the pages in a frame (MTurk), none by default.
+    ``percentile_from``: other finished people that it takes before anyone is told a percentile.
+    ``embed_from``: sites that may show the pages in a frame (MTurk), none by default.
     """
 
     folder: Path

@@ -1,0 +1,1 @@
+"""The web server: endpoints, limits, headers, files."""

@@ -1,0 +1,1 @@
+"""Cloth: sheets of particles that fall on rigid bodies."""

@@ -1,0 +1,1 @@
+"""Drawing scenes at random: parameters, presets, placement of objects, camera and scenery."""

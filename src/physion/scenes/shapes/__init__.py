@@ -1,0 +1,1 @@
+"""Shapes: primitives and props, with the convex pieces that they collide by."""

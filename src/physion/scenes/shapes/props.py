@@ -8,9 +8,9 @@ other (``prop:vase``): mostly scenery, but their parts are also pieces for conta
 
 from __future__ import annotations
 
-from physion.scenes import (  # noqa: F401  # importing them registers their props
+from physion.scenes.shapes import (  # noqa: F401  # importing them registers their props
     prop_furniture,
-    prop_life,
+    prop_plants_and_animals,
     prop_things,
     prop_vessels,
 )

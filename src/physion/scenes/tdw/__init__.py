@@ -1,0 +1,1 @@
+"""The official simulator's command logs become scenes."""

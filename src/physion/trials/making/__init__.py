@@ -1,0 +1,1 @@
+"""From scenes to trials on disk: plan, choose, make, verify."""

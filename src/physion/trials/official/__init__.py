@@ -1,0 +1,1 @@
+"""The original study's files: export to them and import from them."""

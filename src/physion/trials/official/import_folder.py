@@ -79,8 +79,8 @@ def import_official(
     files of our own come from, else `IMPORTED` and ``testing``. ``scenario`` is that of trials
     whose names do not say it. Files of our own become the trials that they were made of (see
     `physion.trials.official.round_trip`). Trials that are there already are kept, and a bad
-    file fails alone. Raises `BadInputError` where there is no official file at all, or ``out`` holds something
-    else or cannot be written.
+    file fails alone. Raises `BadInputError` where there is no official file at all, or ``out``
+    holds something else or cannot be written.
     """
     if split is not None and split not in SPLITS:
         raise UnknownNameError("split", split, SPLITS)

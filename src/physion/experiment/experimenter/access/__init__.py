@@ -1,0 +1,1 @@
+"""Login to the experimenter's pages."""

@@ -1,0 +1,1 @@
+"""Statistics of the experimenter's pages, computed in a process of their own."""

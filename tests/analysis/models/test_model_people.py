@@ -1,0 +1,504 @@
+"""Models beside single people: against plain loops, scikit-learn, scipy and statsmodels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from sklearn.metrics import brier_score_loss, cohen_kappa_score
+from statsmodels.stats.contingency_tables import mcnemar
+from statsmodels.stats.multitest import multipletests
+
+from physion.analysis.models.model_people import (
+    MEASURES,
+    Models,
+    compare_with_people,
+    model_pairs,
+    models_of,
+)
+from physion.analysis.models.people_comparison import PeopleComparison, compare_everywhere
+from physion.analysis.models.zones import RELEASED_R, human_zones, released_r_zone, released_zone
+from physion.analysis.people.answers import Answers, answers_of
+from physion.analysis.people.difficulty import difficulty_third, r_by_third
+from physion.analysis.people.people import draws_of_people, split_halves
+from physion.analysis.statistics import agreement
+from physion.analysis.statistics.bootstrap import Bootstrap
+from physion.analysis.statistics.calibration import (
+    brier,
+    calibration_table,
+    decompose,
+    reliability_curve,
+)
+from physion.analysis.statistics.kappa import correctness
+from physion.analysis.statistics.paired import (
+    _coins,
+    benjamini_hochberg,
+    compare_models,
+    holm,
+    mcnemar_exact,
+    r_permutation_p,
+)
+from physion.errors import BadInputError
+from support.simulated_people import study
+
+Array = npt.NDArray[np.float64]
+FEW = Bootstrap(resamples=50)
+
+
+@pytest.fixture(scope="module")
+def answers() -> Answers:
+    test = study(people=12, stimuli=25, scenarios=("collide",), seed=1).test
+    return answers_of(test.drop(index=test.index[[5, 60, 61]]), "collide")
+
+
+@pytest.fixture(scope="module")
+def models(answers: Answers) -> Models:
+    generator = np.random.default_rng(0)
+    p = np.vstack([answers.shares(), generator.random(25), np.full(25, 0.8), generator.random(25)])
+    p[3, [0, 7]] = np.nan
+    predicted = np.where(np.isnan(p), np.nan, p > 0.5)
+    return Models(("people", "chance", "always", "gaps"), p, predicted)
+
+
+def plain(
+    k: int, models: Models, answers: Answers, people: npt.ArrayLike, stimuli: npt.ArrayLike
+) -> dict[str, float]:
+    """Every measure of model ``k`` by definition, on people and stimuli drawn by their numbers."""
+    who, what = np.asarray(people), np.asarray(stimuli)
+    yes, correct = answers.yes[np.ix_(who, what)], answers.correct[np.ix_(who, what)]
+    p, said, label = models.p_contact[k, what], models.predicted[k, what], answers.label[what]
+    with np.errstate(invalid="ignore"):
+        share, right = np.nanmean(yes, axis=0), np.nanmean(correct, axis=0)
+    known = np.isfinite(p)
+    p, said, label = p[known], said[known], label[known]
+    yes, correct, share, right = yes[:, known], correct[:, known], share[known], right[known]
+
+    def kappa(a: Array, b: Array) -> float:
+        both = np.isfinite(a) & np.isfinite(b)
+        if len({*a[both], *b[both]}) < 2:
+            return float("nan")
+        return float(cohen_kappa_score(a[both], b[both]))
+
+    mean = float(np.nanmean([kappa(row, said) for row in yes]))
+    among = [kappa(yes[i], yes[j]) for i in range(len(who)) for j in range(i)
+             if who[i] != who[j]]  # fmt: skip
+    rmsd = agreement.rmsd(p, share)
+    return {
+        "accuracy": agreement.accuracy(said == 1, label == 1),
+        "difference": float(np.mean(said == label) - np.mean(right)),
+        "r": agreement.pearson(p, share),
+        "rmsd": rmsd,
+        "euclid_over_n": float(np.sqrt(np.sum((p - share) ** 2)) / len(p)),
+        "kappa": mean,
+        "kappa_gap": mean - float(np.nanmean(among)),
+        "error_consistency": float(
+            np.nanmean([kappa(row, (said == label).astype(float)) for row in correct])
+        ),
+    }
+
+
+@pytest.mark.filterwarnings("ignore:Mean of empty slice")
+def test_every_measure_is_what_it_says(models: Models, answers: Answers) -> None:
+    table = compare_with_people(models, answers, FEW)
+    assert len(table) == 4 * len(MEASURES)
+    for k, name in enumerate(models.names):
+        expected = plain(k, models, answers, range(12), range(25))
+        if name == "gaps":  # the yardstick takes all stimuli that people answered
+            del expected["kappa_gap"]
+        found = table[table["model"] == name].set_index("measure")
+        for measure, value in expected.items():
+            assert found.loc[measure, "value"] == pytest.approx(value, abs=1e-9, nan_ok=True)
+        assert (found["stimuli"] == (23 if name == "gaps" else 25)).all()
+    undefined = table[table["value"].isna()]
+    assert set(undefined["model"]) == {"always"} and set(undefined["measure"]) == {"r"}
+    assert undefined["reason"].str.contains("P\\(contact\\) constant").all()
+
+
+def test_intervals_are_those_of_drawing_people_stimuli_or_both(
+    models: Models, answers: Answers
+) -> None:
+    draws = Bootstrap(resamples=12, seed=3)
+    table = compare_with_people(models, answers, draws).set_index(["model", "measure"])
+    people = draws_of_people(answers, draws).astype(int)
+    stimuli = draws.weights(answers.scenario, 25).astype(int)
+    for what in ("people", "stimuli", "both"):
+        values = []
+        for k in range(12):
+            who = np.arange(12) if what == "stimuli" else np.repeat(np.arange(12), people[k])
+            of = np.arange(25) if what == "people" else np.repeat(np.arange(25), stimuli[k])
+            values.append(plain(1, models, answers, who, of))
+        for measure in MEASURES:
+            row = table.loc[("chance", measure)]
+            found = (row[f"low_{what}"], row[f"high_{what}"])
+            if measure == "accuracy" and what == "people":
+                assert np.isnan(found).all() and "do not enter" in row["reason"]
+                continue
+            drawn = np.array([value[measure] for value in values])
+            assert found == pytest.approx(draws.interval(drawn), abs=1e-9), (what, measure)
+
+
+def test_a_model_that_knows_people_is_best_and_noise_adds_up(answers: Answers) -> None:
+    p = np.vstack([answers.shares(), np.random.default_rng(1).random(25)])
+    models = Models(("people", "chance"), p, (p > 0.5).astype(float))
+    table = compare_with_people(models, answers, Bootstrap(resamples=300))
+    table = table.set_index(["model", "measure"])
+    assert table.loc[("people", "r"), "value"] == pytest.approx(1)
+    assert table.loc[("people", "rmsd"), "value"] == pytest.approx(0, abs=1e-9)
+    assert table.loc[("people", "kappa"), "value"] > table.loc[("chance", "kappa"), "value"]
+    row = table.loc[("chance", "kappa")]
+    width = {what: row[f"high_{what}"] - row[f"low_{what}"]
+             for what in ("people", "stimuli", "both")}  # fmt: skip
+    assert width["both"] >= 0.95 * max(width["people"], width["stimuli"])
+
+
+def test_a_person_as_a_model_stands_in_the_zone_of_people(answers: Answers) -> None:
+    zones = human_zones(answers, split_halves(answers.yes, 50)).set_index(["measure", "of"])
+    others = np.arange(12) != 4
+    rest = Answers(answers.scenario, answers.sessions[:11], answers.participants[:11],
+                   answers.stimuli, answers.yes[others], answers.label,
+                   answers.log_rt[others])  # fmt: skip
+    as_model = Models(("person",), answers.yes[4:5], answers.yes[4:5])
+    table = compare_with_people(as_model, rest, FEW).set_index("measure")["value"]
+    every = {}
+    for k in range(12):
+        chosen = np.arange(12) != k
+        known = np.isfinite(answers.yes[k])
+        share = np.nanmean(answers.yes[chosen], axis=0)
+        every[k] = agreement.pearson(answers.yes[k, known], share[known])
+    assert table["r"] == pytest.approx(every[4])
+    expected = np.percentile(list(every.values()), [2.5, 50, 97.5])
+    found = zones.loc[("r", "participants"), ["low", "median", "high"]]
+    np.testing.assert_allclose(found.to_numpy(dtype=float), expected)
+    assert zones.loc[("accuracy", "participants"), "mean"] == pytest.approx(
+        np.mean(np.nanmean(answers.correct, axis=1))
+    )
+    assert zones.loc[("kappa", "pairs"), "values"] == 66
+    assert zones.loc[("kappa", "pairs"), "mean"] == pytest.approx(
+        zones.loc[("kappa", "participants"), "mean"]
+    )
+    # Halves are averages of several people, so they agree better than one person with the rest.
+    assert zones.loc[("r", "halves"), "low"] > zones.loc[("r", "participants"), "median"]
+
+
+def test_the_released_zone_is_another_thing(official: Path) -> None:
+    """The grey band over eight scenario means is far narrower than that of participants."""
+    table = pd.read_csv(official / "results" / "human_accuracy_by_scenario.csv")
+    mean, low, high = released_zone(table["obs_mean"])
+    assert mean == pytest.approx(table["obs_mean"].mean()) and low < mean < high
+    assert high - low < 0.6 * float(np.mean(table["pct_97.5"] - table["pct_2.5"]))
+    with pytest.raises(BadInputError, match="defined"):
+        released_zone([0.7, np.nan])
+
+
+def test_the_band_of_r_is_undefined_where_a_scenario_has_none(answers: Answers) -> None:
+    one = human_zones(answers, split_halves(answers.yes, 50))
+    other = human_zones(answers, np.full(50, np.nan))
+    assert released_r_zone(pd.concat([one, one]))["low"].notna().all()
+    band = released_r_zone(pd.concat([one, other])).iloc[0]
+    assert np.isnan([band["low"], band["high"]]).all() and band["undefined"] == 1
+
+
+# --- tables in, models out ----------------------------------------------------------------------
+
+
+def test_tables_become_models_and_what_has_no_counterpart_is_counted(answers: Answers) -> None:
+    rows = pd.DataFrame(
+        [(agent, stimulus, 0.7, True) for agent in ("b", "a") for stimulus in answers.stimuli],
+        columns=["agent", "stimulus", "p_contact", "predicted"],
+    )
+    rows.loc[0, "stimulus"] = "somewhere else"
+    models, dropped = models_of(rows, answers)
+    assert models.names == ("b", "a") and np.isnan(models.p_contact).sum() == 1
+    assert dropped.to_numpy().tolist() == [
+        ["b", "people did not see it", 1],
+        ["b", "the model does not predict it", 1],
+    ]
+    with pytest.raises(BadInputError, match="twice"):
+        models_of(pd.concat([rows, rows.iloc[[3]]]), answers)
+    nothing, dropped = models_of(rows.assign(stimulus=rows.index.astype(str)), answers)
+    table = compare_with_people(nothing, answers, FEW)
+    assert table["value"].isna().all() and table["reason"].str.contains("predicts none").all()
+    assert dropped["stimuli"].sum() == 100
+
+
+@pytest.mark.parametrize(
+    ("p", "predicted", "names", "words"),
+    [
+        ([[1.2, 0.1]], [[1, 0]], ("a",), "does not lie in"),
+        ([[0.2, 0.1]], [[0.5, 0]], ("a",), "0, 1 or NaN"),
+        ([[0.2, np.nan]], [[0, 0]], ("a",), "both"),
+        ([[0.2, 0.1]], [[0, 0]], ("a", "b"), "one name"),
+        ([[0.2, 0.1]] * 2, [[0, 0]] * 2, ("a", "a"), "one name"),
+        ([[0.2, 0.1]], [[0]], ("a",), "shape"),
+    ],
+)
+def test_models_that_are_none_are_refused(
+    p: list[list[float]], predicted: list[list[float]], names: tuple[str, ...], words: str
+) -> None:
+    with pytest.raises(BadInputError, match=words):
+        Models(names, np.array(p), np.array(predicted, dtype=float))
+
+
+def test_models_among_themselves(models: Models, answers: Answers) -> None:
+    found = model_pairs(models, answers).set_index(["first", "second"])
+    assert len(found) == 6
+    row = found.loc[("people", "chance")]
+    assert row["kappa"] == pytest.approx(cohen_kappa_score(*models.predicted[:2]))
+    right = correctness(models.predicted, answers.label)
+    assert row["error_consistency"] == pytest.approx(cohen_kappa_score(*right[:2]))
+    assert found.loc[("chance", "gaps"), "stimuli"] == 23
+
+
+# --- every scenario -----------------------------------------------------------------------------
+
+
+def everywhere(**changes: object) -> tuple[PeopleComparison, pd.DataFrame, pd.DataFrame]:
+    test = study(people=10, stimuli=20, scenarios=("collide", "roll"), seed=8).test
+    shares = test.groupby(["scenario", "stimulus"])["yes"].mean().reset_index()
+    generator = np.random.default_rng(0)
+    parts = [
+        pd.DataFrame({"agent": agent, "stimulus": shares["stimulus"], "p_contact": p,
+                      "predicted": p > 0.5})
+        for agent, p in (("people", shares["yes"]), ("chance", generator.random(len(shares))))
+    ]  # fmt: skip
+    predictions = pd.concat(parts, ignore_index=True).assign(**changes)
+    return compare_everywhere(predictions, test, FEW, halves=20, permutations=50), predictions, test
+
+
+def test_all_scenarios_and_their_mean() -> None:
+    found, predictions, test = everywhere()
+    scores = found.scores.set_index(["model", "scenario", "measure"])
+    for model in ("people", "chance"):
+        for measure in MEASURES:
+            values = scores.loc[(model, ["collide", "roll"], measure), "value"]
+            assert scores.loc[(model, "mean", measure), "value"] == pytest.approx(values.mean())
+    answers = answers_of(test, "roll")
+    models, _ = models_of(predictions, answers)
+    alone = compare_with_people(models, answers, FEW).set_index(["model", "measure"])
+    here = scores.xs("roll", level="scenario").loc[alone.index]
+    pd.testing.assert_frame_equal(here[alone.columns.drop("scenario")],
+                                  alone.drop(columns="scenario"))  # fmt: skip
+    chance = scores.loc[("chance", "mean", "r")]
+    wide = scores.loc[("chance", "roll", "r")]
+    assert chance["low_both"] < chance["value"] < chance["high_both"]
+    assert (
+        chance["high_stimuli"] - chance["low_stimuli"] < wide["high_stimuli"] - wide["low_stimuli"]
+    )
+    row = scores.loc[("people", "collide", "accuracy")]
+    assert row["in_zone"] == (
+        "yes" if row["zone_low"] <= row["value"] <= row["zone_high"] else "no"
+    )
+    assert scores.loc[("people", "mean", "accuracy"), "in_zone"] == ""
+    assert found.dropped.empty and len(found.tests) == 1 and len(found.pairs) == 2
+    assert found.tests["stimuli"].iloc[0] == 40 and found.calibration["stimuli"].tolist() == [
+        40,
+        40,
+    ]
+    halves = found.zones[found.zones["of"] == "halves"]
+    (band,) = found.zones[found.zones["of"] == RELEASED_R].to_dict("records")
+    assert (band["scenario"], band["measure"], band["values"]) == ("mean", "r", 2)
+    for edge in ("low", "high"):
+        assert band[edge] == pytest.approx(np.mean(halves[edge]))
+    again, _, _ = everywhere()
+    pd.testing.assert_frame_equal(found.scores, again.scores)
+
+
+def test_what_is_missing_somewhere_is_counted_and_undefined_there() -> None:
+    _, predictions, test = everywhere()
+    constant = predictions["stimulus"].str.startswith("roll")
+    odd = predictions.assign(p_contact=predictions["p_contact"].where(~constant, 0.5))
+    odd.loc[0, "stimulus"] = "elsewhere"
+    found = compare_everywhere(odd, test, FEW, halves=20, permutations=50)
+    scores = found.scores.set_index(["model", "scenario", "measure"])
+    row = scores.loc[("chance", "mean", "r")]
+    assert np.isnan(row["value"]) and row["reason"].startswith("undefined in roll")
+    assert found.dropped.to_numpy().tolist() == [
+        ["people", "unknown", "people did not see it", 1],
+        ["people", "collide", "the model does not predict it", 1],
+    ]
+    no_roll = compare_everywhere(predictions[~constant], test, FEW, halves=20, permutations=50)
+    gone = no_roll.dropped.set_index(["agent", "scenario"])["stimuli"]
+    assert gone.to_dict() == {("people", "roll"): 20, ("chance", "roll"): 20}
+
+
+def test_thirds_are_parted_at_their_edges() -> None:
+    found = difficulty_third([0.0, 1 / 3, 0.34, 0.66, 2 / 3, 1.0, np.nan]).tolist()
+    assert found[:6] == ["hard", "hard", "chance", "chance", "easy", "easy"]
+    assert np.isnan(found[6])
+
+
+def test_r_within_thirds_is_that_of_their_stimuli(answers: Answers, models: Models) -> None:
+    table = r_by_third(models.p_contact, answers.yes, answers.label, halves=30)
+    shares = answers.shares()
+    third = difficulty_third(np.where(answers.label == 1, shares, 1 - shares)).to_numpy()
+    for row in table[table["model"] >= 0].itertuples():
+        own = (third == row.third) & np.isfinite(models.p_contact[row.model])
+        expected = agreement.pearson(models.p_contact[row.model, own], shares[own])
+        assert row.r == pytest.approx(expected, abs=1e-9, nan_ok=True)
+        assert row.stimuli == (third == row.third).sum()
+    assert table["stimuli"].sum() == 25 * 5 and (table["model"] == -1).sum() == 3
+
+
+# --- paired tests and corrections ---------------------------------------------------------------
+
+bits = st.integers(1, 40).flatmap(
+    lambda n: hnp.arrays(np.float64, (2, n), elements=st.sampled_from([0.0, 1.0]))
+)
+
+
+@settings(deadline=None)
+@given(bits)
+def test_mcnemar_is_that_of_statsmodels(pair: Array) -> None:
+    a, b = pair
+    found = mcnemar_exact(a, b)
+    table = [[np.sum((a == 1) & (b == 1)), found.only_first],
+             [found.only_second, np.sum((a == 0) & (b == 0))]]  # fmt: skip
+    assert found.only_first - found.only_second == np.sum(a) - np.sum(b)
+    if found.only_first + found.only_second:
+        assert found.p == pytest.approx(mcnemar(table, exact=True).pvalue)
+    else:
+        assert found.p == 1
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.lists(st.floats(0, 1), min_size=1, max_size=30))
+def test_corrections_are_those_of_statsmodels(p: list[float]) -> None:
+    np.testing.assert_allclose(holm(p), multipletests(p, method="holm")[1], atol=1e-12)
+    np.testing.assert_allclose(
+        benjamini_hochberg(p), multipletests(p, method="fdr_bh")[1], atol=1e-12
+    )
+    with_gap = holm([*p, np.nan])
+    assert np.isnan(with_gap[-1])
+    np.testing.assert_array_equal(with_gap[:-1], holm(p))
+
+
+def test_p_values_that_are_none_are_refused() -> None:
+    with pytest.raises(BadInputError, match="p values"):
+        holm([0.2, 1.5])
+    assert benjamini_hochberg([]).shape == (0,)
+
+
+def test_permutations_keep_their_level_and_find_a_difference() -> None:
+    generator = np.random.default_rng(0)
+    p = []
+    for seed in range(60):
+        y = generator.random(60)
+        a, b = (y + generator.normal(0, 0.5, 60) for _ in range(2))
+        p.append(r_permutation_p(a, b, y, permutations=200, seed=seed))
+    assert np.mean(np.array(p) < 0.05) < 0.15 and 0.3 < np.mean(p) < 0.7
+    y = generator.random(100)
+    near, far = y + generator.normal(0, 0.1, 100), generator.random(100)
+    assert r_permutation_p(near, far, y, permutations=500) == pytest.approx(1 / 501)
+    assert r_permutation_p(5 * near + 3, near, y, permutations=100) == 1.0
+    assert np.isnan(r_permutation_p(np.full(100, 0.5), far, y))
+
+
+def test_permutations_are_those_of_swapping_by_hand() -> None:
+    generator = np.random.default_rng(4)
+    y, a, b = generator.random((3, 15))
+    found = r_permutation_p(a, b, y, permutations=50, seed=2)
+    coins = _coins(50, 15, 2) == 1
+    one, two = ((x - x.mean()) / x.std() for x in (a, b))
+    differences = [
+        agreement.pearson(np.where(coin, two, one), y)
+        - agreement.pearson(np.where(coin, one, two), y)
+        for coin in coins
+    ]
+    observed = abs(agreement.pearson(a, y) - agreement.pearson(b, y))
+    assert found == (1 + np.sum(np.abs(differences) >= observed - 1e-12)) / 51
+
+
+def test_pairs_of_models_are_compared_on_what_both_answered() -> None:
+    generator = np.random.default_rng(1)
+    people, label = generator.random(80), generator.integers(0, 2, 80).astype(float)
+    p = np.vstack(
+        [people * 0.9 + 0.05, generator.random(80), np.full(80, 0.5), generator.random(80)]
+    )
+    predicted = (p > 0.5).astype(float)
+    correct = (predicted == label).astype(float)
+    correct[3], p[3] = np.nan, np.nan
+    table = compare_models(list("abcd"), correct, p, people, FEW, permutations=200)
+    table = table.set_index(["first", "second"])
+    row = table.loc[("a", "b")]
+    assert row["accuracy_difference"] == pytest.approx(np.mean(correct[0]) - np.mean(correct[1]))
+    assert row["r_difference"] == pytest.approx(
+        agreement.pearson(p[0], people) - agreement.pearson(p[1], people)
+    )
+    assert row["r_difference_low"] > 0 and row["p_r"] < 0.01
+    known = table["p_accuracy"].dropna()
+    np.testing.assert_allclose(
+        table.loc[known.index, "p_accuracy_holm"], multipletests(known, method="holm")[1]
+    )
+    gaps = p.copy()
+    gaps[0, :7] = np.nan
+    part = compare_models(list("ab"), np.where(np.isnan(gaps[:2]), np.nan, correct[:2]), gaps[:2],
+                          people, FEW, permutations=20).iloc[0]  # fmt: skip
+    assert part["stimuli"] == 73
+    assert part["r_difference"] == pytest.approx(
+        agreement.pearson(p[0, 7:], people[7:]) - agreement.pearson(p[1, 7:], people[7:])
+    )
+    assert part["r_difference_low"] < part["r_difference"] < part["r_difference_high"]
+    assert table.loc[("a", "c"), "reason"].startswith("r: undefined")
+    assert table.loc[("a", "d"), "reason"] == "no stimulus that both predict"
+    assert table.loc[("a", "d"), ["p_accuracy", "accuracy_difference", "p_r"]].isna().all()
+
+
+# --- calibration --------------------------------------------------------------------------------
+
+forecasts = st.integers(1, 50).flatmap(
+    lambda n: st.tuples(
+        hnp.arrays(np.float64, n, elements=st.floats(0, 1)),
+        hnp.arrays(np.float64, n, elements=st.sampled_from([0.0, 1.0])),
+    )
+)
+
+
+@settings(deadline=None)
+@given(forecasts, st.integers(1, 15))
+def test_the_parts_of_the_brier_score_add_up(pair: tuple[Array, Array], bins: int) -> None:
+    p, label = pair
+    found = decompose(p, label, bins)
+    assert found.brier == pytest.approx(float(np.mean((p - label) ** 2)))
+    total = found.reliability - found.resolution + found.uncertainty + found.within
+    assert total == pytest.approx(found.brier, abs=1e-12)
+    curve = reliability_curve(p, label, bins)
+    assert curve["stimuli"].sum() == len(p) and len(curve) == bins
+    full = curve[curve["stimuli"] > 0]
+    assert full["share"].between(full["low"] - 1e-12, full["high"] + 1e-12).all()
+    assert full["mean_p"].between(full["from"] - 1e-9, full["to"] + 1e-9).all()
+    gap = np.sum(full["stimuli"] / len(p) * (full["mean_p"] - full["share"]).abs())
+    assert found.calibration_error == pytest.approx(gap, abs=1e-12)
+
+
+def test_brier_is_that_of_scikit_learn_and_knows_calibrated_forecasts() -> None:
+    generator = np.random.default_rng(0)
+    p = generator.random(20_000)
+    label = (generator.random(20_000) < p).astype(float)
+    assert brier(p, label) == pytest.approx(brier_score_loss(label, p))
+    good, bold = decompose(p, label), decompose((p > 0.5).astype(float), label)
+    assert good.calibration_error < 0.02 < 0.2 < bold.calibration_error
+    assert good.skill > bold.skill and abs(good.within) < 0.01
+    table = calibration_table(["good", "part"], np.stack([p, np.where(p < 0.5, p, np.nan)]), label)
+    assert table["stimuli"].tolist() == [20_000, int(np.sum(p < 0.5))]
+
+
+def test_forecasts_that_are_none_are_refused_and_one_outcome_has_no_skill() -> None:
+    one = decompose([0.2, 0.9], [1, 1])
+    assert np.isnan(one.skill) and "one outcome" in one.reason
+    assert decompose([], []).reason == "no stimulus" and np.isnan(brier([], []))
+    for p, label, words in (
+        ([1.1], [1], "does not lie"),
+        ([np.nan], [1], "does not lie"),
+        ([0.1], [0.5], "0 or 1"),
+        ([0.1, 0.2], [1], "do not pair"),
+    ):
+        with pytest.raises(BadInputError, match=words):
+            brier(p, label)
+    with pytest.raises(BadInputError, match="bins"):
+        reliability_curve([0.1], [1], bins=0)

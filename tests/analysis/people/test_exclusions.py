@@ -1,0 +1,321 @@
+"""Each rule on sessions that were made to break it; limits by simulation; flags and accuracy."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from itertools import groupby
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from physion.analysis.people.exclusions import (
+    BY_CONSTRUCTION,
+    OFFICIAL_CODE,
+    PREREGISTERED,
+    RULE_SETS,
+    RULES,
+    ExclusionRules,
+    count_flags,
+    flag_effect,
+    flag_sessions,
+    streak_limit,
+    with_and_without,
+)
+from physion.analysis.people.participants import DROPPED_COLUMNS, Responses, missing_times
+from physion.analysis.people.people import accuracy_by_scenario
+from physion.analysis.people.session_measures import longest_alternation, longest_streak
+from physion.analysis.statistics.clustered_logit import clustered_logit
+from physion.errors import BadInputError
+from support.simulated_people import as_responses, simulate_study, study
+
+answers = st.lists(st.booleans(), max_size=60)
+
+
+def flagged_by(flags: pd.DataFrame, rule: str) -> list[str]:
+    return flags.loc[flags[rule], "session"].tolist()
+
+
+# --- measures -----------------------------------------------------------------------------------
+
+
+@settings(deadline=None)
+@given(answers)
+def test_streaks_are_the_longest_groups(yes: list[bool]) -> None:
+    expected = max((len(list(group)) for _, group in groupby(yes)), default=0)
+    assert longest_streak(yes) == expected
+
+
+@settings(deadline=None)
+@given(answers)
+def test_alternation_is_the_streak_of_every_second_answer_turned(yes: list[bool]) -> None:
+    turned = [answer ^ bool(place % 2) for place, answer in enumerate(yes)]
+    assert longest_alternation(yes) == longest_streak(turned)
+    text = "".join("YN"[not answer] for answer in yes)
+    for begins in (True, False):
+        pattern = ("YN" if begins else "NY") * 30
+        expected = max(n for n in range(61) if pattern[:n] in text)
+        assert longest_alternation(yes, begins) == expected
+
+
+def exact_share_up_to(longest: int, tosses: int) -> float:
+    """The chance that no run of ``tosses`` fair answers is longer, by recursion."""
+
+    @cache
+    def sequences(n: int) -> int:
+        """Sequences of n answers that begin anew, with no run over the limit."""
+        return 1 if n == 0 else sum(sequences(n - k) for k in range(1, min(longest, n) + 1))
+
+    return 2 * sequences(tosses) / 2**tosses
+
+
+def test_the_simulated_limit_is_that_of_the_exact_distribution() -> None:
+    assert exact_share_up_to(12, 150) > 0.975 > exact_share_up_to(11, 150)
+    # The limit that was preregistered, whatever the seed.
+    assert [streak_limit(150, 97.5, seed=seed) for seed in range(3)] == [12, 12, 12]
+    short = streak_limit(20, 90, seed=1)
+    assert (
+        exact_share_up_to(int(short), 20) >= 0.89 and exact_share_up_to(int(short) - 1, 20) < 0.91
+    )
+    assert short == streak_limit(20, 90, seed=1)
+
+
+# --- rules --------------------------------------------------------------------------------------
+
+
+def with_answers(responses_of: dict[str, list[bool]], label: list[bool]) -> Responses:
+    """One scenario; the answers of each session in their order."""
+    rows = [
+        {"participant": name.split("/")[0], "session": name, "scenario": "drop", "phase": "test",
+         "stimulus": f"s{k}", "trial": k, "response": "yes" if yes else "no", "label": label[k],
+         "rt_ms": 1000.0, "simulated": False}
+        for name, given in responses_of.items()
+        for k, yes in enumerate(given)
+    ]  # fmt: skip
+    return as_responses(pd.DataFrame(rows))
+
+
+def some_answers(seed: int, n: int = 40) -> list[bool]:
+    """Neither long streaks nor long alternations."""
+    generator = np.random.default_rng(seed)
+    while True:
+        found = [bool(x) for x in generator.random(n) < 0.5]
+        if longest_streak(found) < 9 and longest_alternation(found) < 9:
+            return found
+
+
+def test_streaks_from_13_and_alternations_from_24_on_are_flagged() -> None:
+    base, pause = [True, True, False], [False, False, True, True, False, False, True]
+    sessions = {
+        "streak12": [*pause, *[False], *[True] * 12, *[False], *pause, *pause, *base, *[False] * 2],
+        "streak13": [*pause, *[False], *[True] * 13, *[False], *pause, *pause, *base, *[False]],
+        "turns23": [True, *[True, False] * 11, True, True, *pause, *pause, *[False]],
+        "turns24": [True, *[True, False] * 12, False, *pause, *pause],
+    }
+    n = min(map(len, sessions.values()))
+    found = with_answers({name: given[:n] for name, given in sessions.items()}, [True] * n)
+    flags = flag_sessions(found).set_index("session", drop=False)
+    measures = flags[["longest_streak", "longest_alternation"]]
+    assert measures.loc["streak12", "longest_streak"] == 12
+    assert measures.loc["streak13", "longest_streak"] == 13
+    assert measures.loc["turns23", "longest_alternation"] == 23
+    assert measures.loc["turns24", "longest_alternation"] == 24
+    assert flagged_by(flags, "streak") == ["streak13"]
+    assert flagged_by(flags, "alternation") == ["turns24"]
+    official = flag_sessions(found, OFFICIAL_CODE)
+    assert set(flagged_by(official, "alternation")) == {"turns23", "turns24"}
+
+
+def test_the_released_alternation_counts_one_phase_only() -> None:
+    first = [False, True, *[True, False] * 10, False, False, True]
+    other = [True, False, *[False, True] * 10, True, True, False]
+    label = [True] * 25
+    # The scenario's first answer sets the phase: no. Twenty answers from yes on hold 19 from no on.
+    found = with_answers({"a": first, "b": other}, label)
+    assert flagged_by(flag_sessions(found, OFFICIAL_CODE), "alternation") == ["b"]
+    either = replace(OFFICIAL_CODE, alternation_phase=None)
+    assert flagged_by(flag_sessions(found, either), "alternation") == ["a", "b"]
+
+
+def test_practice_accuracy_and_response_time_rules() -> None:
+    trials, sessions = simulate_study(people=40, stimuli=60, scenarios=("roll",), ability_sd=0.1)
+    wrong = trials["session"] == "roll-s000"
+    practice = trials["phase"] == "familiarization"
+    trials = trials.drop(columns="correct")
+    flip = wrong & practice & (trials["trial"] >= 3)
+    trials.loc[flip, "response"] = np.where(trials.loc[flip, "label"], "no", "yes")
+    flip = (trials["session"] == "roll-s001") & practice & (trials["trial"] >= 4)
+    trials.loc[flip, "response"] = np.where(trials.loc[flip, "label"], "no", "yes")
+    poor = (trials["session"] == "roll-s002") & ~practice
+    trials.loc[poor, "response"] = np.where(trials.loc[poor, "label"], "no", "yes")
+    slow = (trials["session"] == "roll-s003") & ~practice
+    trials.loc[slow, "rt_ms"] *= 3
+    rules = replace(PREREGISTERED, streak_over=None)
+    flags = flag_sessions(as_responses(trials, sessions), rules)
+    assert flagged_by(flags, "familiarization") == ["roll-s000"]  # 3 of 10; 4 of 10 is enough
+    assert flagged_by(flags, "low_accuracy") == ["roll-s002"]
+    assert flagged_by(flags, "slow") == ["roll-s003"]
+    assert not flags[["streak", "alternation", "incomplete", "repeated"]].any(axis=None)
+    whole = flags["accuracy"]
+    limit = whole.median() - 3 * whole.std(ddof=1)
+    assert flags.set_index("session")["accuracy"]["roll-s002"] < limit
+    table = count_flags(flags).set_index("rule")["sessions"]
+    assert table["flagged"] == 3 and table["kept"] == 37 and table["all"] == 40
+
+
+def test_the_sets_differ_where_the_released_code_did() -> None:
+    assert RULE_SETS == {"preregistered": PREREGISTERED, "official-code": OFFICIAL_CODE}
+    generator = np.random.default_rng(2)
+    label = [bool(x) for x in generator.random(40) < 0.5]
+
+    def answer(rights: int, seed: int) -> list[bool]:
+        wrong = set(np.random.default_rng(seed).permutation(40)[rights:])
+        return [truth ^ (k in wrong) for k, truth in enumerate(label)]
+
+    # Skewed accuracies: the mean lies below the median, so its limit is the laxer one.
+    rights = [36] * 20 + [33, 30, 28, 24, 24]
+    found = with_answers({f"s{k:02d}": answer(n, k) for k, n in enumerate(rights)}, label)
+    accuracy = np.array(rights) / 40
+    by_median = accuracy < np.median(accuracy) - 3 * np.std(accuracy, ddof=1)
+    by_mean = accuracy < np.mean(accuracy) - 3 * np.std(accuracy)
+    assert by_median.sum() != by_mean.sum()
+    loose = ExclusionRules("x", streak_over=None, alternation=None)
+    assert flag_sessions(found, loose)["low_accuracy"].tolist() == by_median.tolist()
+    code = replace(OFFICIAL_CODE, streak_percentile=None, alternation=None)
+    assert flag_sessions(found, code)["low_accuracy"].tolist() == by_mean.tolist()
+
+
+def test_incomplete_and_repeated_sessions_are_flagged() -> None:
+    label = [True] * 40
+    found = with_answers(
+        {
+            "ann/1": some_answers(1)[:30],
+            "ann/2": some_answers(2),
+            "ann/3": some_answers(3),
+            "bob/1": some_answers(4),
+            "cid/1": some_answers(5)[:39],
+        },
+        label,
+    )
+    flags = flag_sessions(found)
+    assert flagged_by(flags, "incomplete") == ["ann/1", "cid/1"]
+    assert flagged_by(flags, "repeated") == ["ann/1", "ann/3"]  # the first complete one counts
+    assert (flags["familiarization_trials"] == 0).all() and not flags["familiarization"].any()
+    assert "familiarization not assessed" in set(count_flags(flags)["rule"])
+    longer = flag_sessions(found, expected={"drop": 41})
+    assert longer["incomplete"].all()
+
+
+def test_rules_can_be_turned_off_and_missing_times_do_not_flag() -> None:
+    nothing = ExclusionRules("nothing", None, None, None, None, None, None, "median", None)
+    found = with_answers({"a": [True] * 40, "b": [True, False] * 20}, [True] * 40)
+    assert not flag_sessions(found, nothing)["flagged"].any()
+    assert flag_sessions(found)["flagged"].all()
+    blind = replace(found, trials=found.trials.assign(log_rt=np.nan))
+    flags = flag_sessions(blind)
+    assert not flags["slow"].any() and (flags["no_log_rt"] == 40).all()
+    assert count_flags(flags).set_index("rule")["sessions"]["slow not assessed"] == 2
+    assert "slow not assessed" not in set(count_flags(flag_sessions(found))["rule"])
+
+
+def test_missing_response_times_are_counted() -> None:
+    found = with_answers({"a": [True, False] * 3, "b": [True, False] * 3}, [True] * 6)
+    assert missing_times(found).empty
+    late = found.trials["session"].eq("a") & (found.trials["trial"] < 2)
+    some = replace(found, trials=found.trials.assign(log_rt=found.trials["log_rt"].mask(late)))
+    table = missing_times(some)
+    assert tuple(table.columns) == DROPPED_COLUMNS
+    assert table[["scenario", "sessions", "rows"]].to_numpy().tolist() == [["drop", 1, 2]]
+    assert table["rows"].sum() == flag_sessions(some)["no_log_rt"].sum()
+
+
+def test_practice_alone_is_refused() -> None:
+    trials, sessions = simulate_study(people=3, stimuli=4, scenarios=("roll",))
+    practice = trials[trials["phase"] == "familiarization"]
+    with pytest.raises(BadInputError, match="no test answer"):
+        flag_sessions(as_responses(practice, sessions))
+
+
+# --- with and without, and the effect -----------------------------------------------------------
+
+
+def test_analyses_are_done_with_and_without_the_flagged() -> None:
+    responses = study(people=30, stimuli=40, scenarios=("drop",), seed=4)
+    flags = flag_sessions(responses)
+    flags["streak"] = flags["flagged"] = flags.index < 5
+    both = with_and_without(responses, flags, lambda kept: accuracy_by_scenario(kept.test))
+    people = both[both["scenario"] == "drop"].set_index("sessions")["people"]
+    assert people["unflagged"] == 25 and people["complete"] == 30
+    with pytest.raises(BadInputError, match="no session is unflagged"):
+        with_and_without(responses, flags.assign(flagged=True), lambda kept: kept.test)
+
+
+def test_the_effect_of_a_flag_is_found_and_its_interval_allows_for_people() -> None:
+    responses = study(people=60, stimuli=50, scenarios=("drop", "roll"), seed=6, ability_sd=0.0)
+    flags = flag_sessions(responses)
+    worse = flags["session"].isin(flags["session"].iloc[::3])
+    generator = np.random.default_rng(0)
+    trials = responses.trials.copy()
+    rows = trials["session"].isin(flags.loc[worse, "session"]) & (
+        generator.random(len(trials)) < 0.3
+    )
+    trials.loc[rows, "yes"] = ~trials.loc[rows, "yes"]
+    trials["correct"] = trials["yes"] == trials["label"]
+    found = flag_effect(replace(responses, trials=trials), flags.assign(slow=worse), "slow")
+    assert found["term"].tolist() == ["slow"]
+    assert found["high"].iloc[0] < 0 and found["p"].iloc[0] < 1e-4
+    test = replace(responses, trials=trials).test
+    right = test["correct"].groupby(test["session"].isin(flags.loc[worse, "session"])).mean()
+    odds = np.log(right / (1 - right))
+    assert found["b"].iloc[0] == pytest.approx(odds[True] - odds[False], abs=0.03)
+    nobody = flag_effect(responses, flags.assign(slow=False), "slow")
+    assert np.isnan(nobody["b"].iloc[0]) and "same in all rows" in nobody["reason"].iloc[0]
+    poor = flags.assign(low_accuracy=worse, flagged=worse)
+    for column in ("low_accuracy", "flagged"):
+        assert flag_effect(responses, poor, column)["reason"].tolist() == [BY_CONSTRUCTION]
+    assert flag_effect(responses, poor.assign(slow=worse), "slow")["reason"].tolist() == [""]
+    other = flag_effect(responses, flags.assign(low_accuracy=False, flagged=worse), "flagged")
+    assert other["reason"].tolist() == [""]
+    with pytest.raises(BadInputError, match="no rule"):
+        flag_effect(responses, flags, "tired")
+
+
+def test_clustered_errors_are_wider_where_people_differ_and_cover_the_truth() -> None:
+    """100 studies without an effect: about 95 intervals hold 0, though people differ much."""
+    held = 0
+    for seed in range(100):
+        generator = np.random.default_rng(seed)
+        person = np.repeat(np.arange(40), 20)
+        ability = generator.normal(0, 1.0, 40)[person]
+        rows = pd.DataFrame(
+            {
+                "participant": person,
+                "group": (person % 2).astype(float),
+                "right": generator.random(800) < 1 / (1 + np.exp(-ability)),
+            }
+        )
+        found = clustered_logit(rows, "right", ["group"]).set_index("term").loc["group"]
+        held += bool(found["low"] <= 0 <= found["high"])
+    assert 88 <= held <= 100
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        ({"x": [0.0, 1, 0, 1], "y": [True] * 4}, "alike"),
+        ({"x": [0.0, np.nan, 0, 1], "y": [True, False] * 2}, "missing"),
+        ({"x": [0.0, 1, 0, 1], "y": [True, False] * 2}, "separates"),
+    ],
+)
+def test_regressions_that_cannot_be_say_why(rows: dict[str, list[float]], words: str) -> None:
+    table = pd.DataFrame(rows).assign(participant=["a", "a", "b", "b"])
+    found = clustered_logit(table, "y", ["x"])
+    assert found["b"].isna().all() and words in found["reason"].iloc[0]
+
+
+def test_every_rule_has_its_column() -> None:
+    flags = flag_sessions(study(people=5, stimuli=10, scenarios=("drop",)))
+    assert all(flags[rule].dtype == bool for rule in (*RULES, "flagged"))

@@ -1,0 +1,297 @@
+"""Participant-level responses: what is read, what is refused, what is dropped and counted."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from physion.analysis.people.answers import answers_of, share
+from physion.analysis.people.official_responses import read_official_responses
+from physion.analysis.people.participants import (
+    CONFLICT,
+    COPY,
+    EXCLUDED,
+    LEDGE,
+    NO_ANSWER,
+    SIMULATED,
+    UNKNOWN,
+    check_labels,
+    read_responses,
+)
+from physion.analysis.people.response_schema import (
+    SESSION_COLUMNS,
+    TRIAL_COLUMNS,
+    check_table,
+    data_dictionary,
+)
+from physion.errors import BadInputError
+from support.simulated_people import as_responses, simulate_study, study
+
+SMALL = {"people": 3, "stimuli": 6, "scenarios": ("collide",)}
+
+
+@pytest.fixture
+def tables() -> tuple[pd.DataFrame, pd.DataFrame]:
+    return simulate_study(**SMALL)  # type: ignore[arg-type]
+
+
+def counts(dropped: pd.DataFrame) -> dict[str, tuple[int, int]]:
+    return {row.reason: (row.sessions, row.rows) for row in dropped.itertuples()}
+
+
+# --- reading ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ending", ["csv", "parquet"])
+def test_what_was_exported_comes_back(
+    tables: tuple[pd.DataFrame, pd.DataFrame], tmp_path: Path, ending: str
+) -> None:
+    files = []
+    for name, table in zip(("trials", "sessions"), tables, strict=True):
+        files.append(tmp_path / f"{name}.{ending}")
+        if ending == "csv":
+            table.to_csv(files[-1], index=False)
+        else:
+            table.to_parquet(files[-1])
+    found = read_responses(*files)
+    trials = tables[0]
+    assert len(found.trials) == len(trials) == 3 * (6 + 10)
+    assert found.dropped.empty and len(found.sessions) == 3
+    joined = found.trials.merge(trials, on=["session", "stimulus"], suffixes=("", "_raw"))
+    assert (joined["yes"] == (joined["response"] == "yes")).all()
+    assert (joined["correct"] == joined["correct_raw"]).all()
+    np.testing.assert_allclose(joined["log_rt"], np.log(joined["rt_ms_raw"]))
+    assert found.sessions["age"].dtype == "Int64" and len(found.test) == 18
+
+
+def test_broken_files_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "trials.parquet"
+    path.write_bytes(b"PAR1 not really")
+    with pytest.raises(BadInputError, match="parquet"):
+        read_responses(path)
+    with pytest.raises(BadInputError, match="is not a file"):
+        read_responses(tmp_path / "absent.csv")
+    empty = pd.DataFrame({column.name: [] for column in TRIAL_COLUMNS})
+    with pytest.raises(BadInputError, match="no row"):
+        as_responses(empty)
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "words"),
+    [
+        ("response", "maybe", "row 2 of column 'response' holds 'maybe'; expected yes or no"),
+        ("phase", "rest", "familiarization or test"),
+        ("trial", "1.5", "whole number"),
+        ("trial", "-1", "from 0"),
+        ("label", "", "expected a value"),
+        ("label", "often", "True or False"),
+        ("rt_ms", "fast", "expected a number"),
+        ("rt_ms", "inf", "expected a number"),
+        ("participant", "", "expected a value"),
+    ],
+)
+def test_a_cell_that_breaks_its_column_is_named(
+    tables: tuple[pd.DataFrame, pd.DataFrame], column: str, value: str, words: str
+) -> None:
+    trials = tables[0].astype(object)
+    trials.loc[1, column] = value
+    with pytest.raises(BadInputError, match=words):
+        as_responses(trials)
+
+
+def test_times_numbers_and_choices_of_sessions_are_checked(
+    tables: tuple[pd.DataFrame, pd.DataFrame],
+) -> None:
+    for column, value in (("started_at", "yesterday"), ("difficulty", 6), ("age", 200)):
+        sessions = tables[1].astype(object)
+        sessions.loc[0, column] = value
+        with pytest.raises(BadInputError, match=column):
+            check_table(sessions, SESSION_COLUMNS, "sessions")
+    with pytest.raises(BadInputError, match="lacks the column"):
+        check_table(tables[1].drop(columns="simulated"), SESSION_COLUMNS, "sessions")
+
+
+def test_the_data_dictionary_says_all_of_the_schema() -> None:
+    for columns in (TRIAL_COLUMNS, SESSION_COLUMNS):
+        entries = json.loads(json.dumps(data_dictionary(columns)))
+        assert [entry["name"] for entry in entries] == [column.name for column in columns]
+        assert len({entry["name"] for entry in entries}) == len(entries)
+        assert all(entry["about"] and entry["kind"] for entry in entries)
+        assert all(entry["choices"] for entry in entries if entry["kind"] == "choice")
+
+
+# --- cleaning: nothing goes without being counted -----------------------------------------------
+
+
+def test_copies_and_missing_answers_are_dropped_and_counted(
+    tables: tuple[pd.DataFrame, pd.DataFrame],
+) -> None:
+    trials = tables[0].astype(object)
+    trials.loc[[10, 11], ["response", "correct"]] = ""
+    trials = pd.concat([trials, trials.iloc[[20, 30, 31]]])
+    found = as_responses(trials)
+    assert counts(found.dropped) == {NO_ANSWER: (1, 2), COPY: (1, 3)}
+    assert len(found.trials) == 3 * 16 - 2
+
+
+def test_two_different_answers_to_one_stimulus_are_refused_or_counted(
+    tables: tuple[pd.DataFrame, pd.DataFrame], tmp_path: Path
+) -> None:
+    trials = tables[0]
+    again = trials.iloc[[12]].assign(trial=99, rt_ms=5000.0)
+    path = tmp_path / "trials.csv"
+    pd.concat([again, trials]).to_csv(path, index=False)
+    with pytest.raises(BadInputError, match="two answers"):
+        read_responses(path)
+    found = read_responses(path, conflicts="drop")
+    assert counts(found.dropped) == {CONFLICT: (1, 1)}
+    assert 99 not in set(found.trials["trial"])  # the first by order of answering stays
+
+
+def test_unknown_stimuli_are_refused_or_counted(
+    tables: tuple[pd.DataFrame, pd.DataFrame], tmp_path: Path
+) -> None:
+    path = tmp_path / "trials.csv"
+    tables[0].to_csv(path, index=False)
+    known = set(tables[0]["stimulus"]) - {"collide_003"}
+    with pytest.raises(BadInputError, match="'collide_003' is not known"):
+        read_responses(path, known=known)
+    found = read_responses(path, known=known, unknown="drop")
+    assert counts(found.dropped) == {UNKNOWN: (3, 3)}
+
+
+def test_simulated_participants_are_left_out_and_counted(
+    tables: tuple[pd.DataFrame, pd.DataFrame], tmp_path: Path
+) -> None:
+    trials, sessions = tables
+    sessions.loc[1, "simulated"] = True
+    trials.to_csv(tmp_path / "t.csv", index=False)
+    sessions.to_csv(tmp_path / "s.csv", index=False)
+    found = read_responses(tmp_path / "t.csv", tmp_path / "s.csv")
+    assert counts(found.dropped) == {SIMULATED: (1, 16)} and len(found.sessions) == 2
+    trials.assign(simulated=trials["session"] == "collide-s002").to_csv(tmp_path / "t.csv")
+    marked = read_responses(tmp_path / "t.csv")  # the mark travels with every row
+    assert counts(marked.dropped) == {SIMULATED: (1, 16)}
+    kept = read_responses(tmp_path / "t.csv", tmp_path / "s.csv", simulated=True)
+    assert kept.dropped.empty and len(kept.sessions) == 3
+
+
+def test_contradictions_are_refused(tables: tuple[pd.DataFrame, pd.DataFrame]) -> None:
+    trials, sessions = tables
+    wrong = trials.assign(correct=~trials["correct"].astype(bool))
+    with pytest.raises(BadInputError, match="disagree"):
+        as_responses(wrong)
+    labels = trials.drop(columns="correct")
+    at = labels.index[labels["stimulus"] == "collide_001"][0]
+    labels.loc[at, "label"] = not labels.loc[at, "label"]
+    with pytest.raises(BadInputError, match="two labels"):
+        as_responses(labels)
+    with pytest.raises(BadInputError, match="two participants"):
+        as_responses(trials.assign(participant=["a"] * 5 + ["b"] * (len(trials) - 5)))
+    with pytest.raises(BadInputError, match="table of sessions"):
+        as_responses(trials, sessions.iloc[1:])
+    with pytest.raises(BadInputError, match="stands in two rows"):
+        as_responses(trials, pd.concat([sessions, sessions]))
+    found = as_responses(trials)
+    truth = dict(zip(trials["stimulus"], trials["label"], strict=True))
+    check_labels(found, truth)
+    with pytest.raises(BadInputError, match="ends otherwise"):
+        check_labels(found, truth | {"collide_001_img": not truth["collide_001"]})
+
+
+def test_stimuli_are_left_out_by_list_and_as_ledges(
+    tables: tuple[pd.DataFrame, pd.DataFrame],
+) -> None:
+    ledge = "pilot_it2_rollingSliding_simple_ledge_box_0001"
+    trials = tables[0].replace("collide_002", f"{ledge}_img")
+    found = as_responses(trials).drop_stimuli(["collide_001"])
+    assert counts(found.dropped) == {LEDGE: (3, 3), EXCLUDED: (3, 3)}
+    assert len(found.test) == 3 * 4
+    kept = as_responses(trials).drop_stimuli(ledge=False)
+    assert ledge in set(kept.trials["stimulus"]) and kept.dropped.empty
+
+
+# --- the official columns -----------------------------------------------------------------------
+
+NAMES = ("pilot_it2_collision_simple_box_1_dis_1_occ_0001", "pilot_it2_collision_yeet_box_0004")
+
+
+def official_file(folder: Path, name: str, **columns: object) -> Path:
+    rows = {
+        "gameID": ["g1", "g1", "g2", "g2"],
+        "trialNum": [1, 0, 0, 1],
+        "prolificIDAnon": ["p", "p", "q", "q"],
+        "stim_ID": [f"{NAMES[0]}_img", f"{NAMES[1]}_img"] * 2,
+        "response": ["YES", "NO", "NO", "NO"],
+        "target_hit_zone_label": [True, True, True, True],
+        "correct": [True, False, False, False],
+        "choices": ["['YES' 'NO']"] * 2 + ['["NO","YES"]'] * 2,
+        "rt": [3500.0, 4500.0, 2400.0, np.nan],
+    }
+    path = folder / name
+    pd.DataFrame(rows | columns).to_csv(path)
+    return path
+
+
+def test_official_columns_are_read_with_the_official_offset(tmp_path: Path) -> None:
+    test = official_file(tmp_path, "human_responses-collision_pilot-production_2_testing.csv")
+    practice = official_file(
+        tmp_path,
+        "familiarization_human_responses-collision_pilot-production_2_testing.csv",
+        stim_ID=["familiarization_0001", "familiarization_0002"] * 2,
+    )
+    found = read_official_responses([test, practice])
+    assert len(found.trials) == 8 and set(found.trials["scenario"]) == {"collide"}
+    assert (found.trials["phase"] == "familiarization").sum() == 4
+    rows = found.test
+    assert rows["rt_ms"].tolist() == pytest.approx([2000, 1000, -100, np.nan], nan_ok=True)
+    assert np.isnan(rows["log_rt"].to_numpy()).tolist() == [False, False, True, True]
+    assert rows["stimulus"].tolist() == [NAMES[1], NAMES[0], NAMES[0], NAMES[1]]
+    assert rows["buttons"].tolist() == ["yes-no"] * 2 + ["no-yes"] * 2
+    assert rows["participant"].tolist() == ["p", "p", "q", "q"]
+    later = read_official_responses([test], rt_offset_ms=3500)
+    assert later.test["rt_ms"].iloc[1] == 0 and np.isnan(later.test["log_rt"].iloc[1])
+
+
+def test_official_files_of_any_name_know_their_scenario_by_their_stimuli(tmp_path: Path) -> None:
+    path = official_file(tmp_path, "a.csv", condition=["prediction", "prediction"] * 2)
+    assert set(read_official_responses([path]).trials["scenario"]) == {"collide"}
+    strange = official_file(tmp_path, "b.csv", stim_ID=["x_0001", "x_0002"] * 2)
+    with pytest.raises(BadInputError, match="name the scenario"):
+        read_official_responses([strange])
+    named = read_official_responses([strange], scenario="towers")
+    assert set(named.trials["scenario"]) == {"support"}
+    with pytest.raises(BadInputError, match="'rt' holds"):
+        read_official_responses([official_file(tmp_path, "c.csv", rt=["soon"] * 4)],
+                                scenario="drop")  # fmt: skip
+    with pytest.raises(BadInputError, match="no file"):
+        read_official_responses([])
+
+
+# --- arrays -------------------------------------------------------------------------------------
+
+
+def test_answers_as_arrays_hold_what_the_rows_say() -> None:
+    responses = study(people=4, stimuli=7, scenarios=("collide", "roll"), seed=3)
+    gone = responses.test.index[[3, 20]]
+    test = responses.test.drop(index=gone)
+    answers = answers_of(test, "collide")
+    assert answers.yes.shape == (4, 7) and np.isnan(answers.yes).sum() == len(
+        set(gone) & set(responses.test.index[responses.test["scenario"] == "collide"])
+    )
+    rows = test[test["scenario"] == "collide"]
+    for row in rows.itertuples():
+        cell = answers.sessions.index(row.session), answers.stimuli.index(row.stimulus)
+        assert answers.yes[cell] == row.yes and answers.correct[cell] == row.correct
+        assert answers.log_rt[cell] == row.log_rt
+    by_hand = rows.groupby("stimulus")["yes"].mean()
+    np.testing.assert_allclose(answers.shares(), by_hand.loc[list(answers.stimuli)])
+    weights = np.array([[2.0, 0, 1, 1]])
+    drawn = np.repeat(answers.yes, weights[0].astype(int), axis=0)
+    np.testing.assert_allclose(share(answers.yes, weights)[0], np.nanmean(drawn, axis=0))
+    with pytest.raises(BadInputError, match="no answer"):
+        answers_of(test, "drape")

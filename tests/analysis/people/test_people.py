@@ -1,0 +1,449 @@
+"""Analyses of people: against scipy and plain loops, known truths, and the official tables."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+import pytest
+import statsmodels.api as sm
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from scipy import stats
+
+from physion.analysis.people.answers import answers_of
+from physion.analysis.people.biases import (
+    accuracy_by_background,
+    background,
+    learning,
+    side_bias,
+    yes_bias,
+)
+from physion.analysis.people.difficulty import below_chance, below_chance_p, difficulty_third
+from physion.analysis.people.hypotheses import (
+    HYPOTHESES,
+    answer_rows,
+    regress_hypotheses,
+    with_attributes,
+)
+from physion.analysis.people.participants import Responses
+from physion.analysis.people.people import (
+    accuracy_by_participant,
+    accuracy_by_scenario,
+    accuracy_by_stimulus,
+    agreement_by_scenario,
+    spearman_brown,
+    split_halves,
+)
+from physion.analysis.statistics import agreement
+from physion.analysis.statistics.bootstrap import Bootstrap
+from physion.analysis.statistics.correlation import correlate_resampled, correlate_rows
+from physion.analysis.statistics.kappa import pair_values, pairwise_kappa
+from physion.analysis.tables.attributes import (
+    ATTRIBUTES,
+    MISLABELLED,
+    attributes_from_metadata,
+    attributes_from_names,
+    attributes_from_table,
+    better_attributes,
+)
+from physion.analysis.tables.responses import read_humans, read_labels, with_labels
+from physion.errors import BadInputError
+from support.simulated_people import study
+
+Array = npt.NDArray[np.float64]
+FEW = Bootstrap(resamples=200)
+
+
+@pytest.fixture(scope="module")
+def made() -> Responses:
+    return study(people=24, stimuli=30, scenarios=("collide", "roll"), seed=1)
+
+
+@pytest.fixture(scope="module")
+def official_people(official: Path) -> pd.DataFrame:
+    labels = read_labels(official / "stimuli" / "stimulus_names_and_labels.csv")
+    return with_labels(read_humans(official / "humans"), labels)
+
+
+# --- accuracy -----------------------------------------------------------------------------------
+
+
+def test_accuracies_are_those_of_plain_grouping(made: Responses) -> None:
+    test = made.test
+    by_stimulus = accuracy_by_stimulus(test, FEW).set_index("stimulus")
+    plain = test.groupby("stimulus")["correct"].mean()
+    np.testing.assert_allclose(by_stimulus["accuracy"].loc[plain.index], plain)
+    yes = test.groupby("stimulus")["yes"].mean()
+    np.testing.assert_allclose(by_stimulus["consistency"].loc[yes.index], np.maximum(yes, 1 - yes))
+    rt = test.groupby("stimulus")["log_rt"].mean()
+    np.testing.assert_allclose(by_stimulus["mean_log_rt"].loc[rt.index], rt)
+    assert (by_stimulus["count"] == 24).all()
+    inside = by_stimulus["accuracy"].between(
+        by_stimulus["accuracy_low"], by_stimulus["accuracy_high"]
+    )
+    assert inside.all()
+    people = accuracy_by_participant(test).set_index("session")["accuracy"]
+    plain = test.groupby("session")["correct"].mean()
+    np.testing.assert_allclose(people.loc[plain.index], plain)
+    table = accuracy_by_scenario(test, FEW).set_index("scenario")
+    own = plain[plain.index.str.startswith("roll")]
+    expected = stats.ttest_1samp(own, 0.5)
+    row = table.loc["roll"]
+    assert row["accuracy"] == pytest.approx(own.mean())
+    assert (row["t"], row["p"]) == pytest.approx((expected.statistic, expected.pvalue))
+    assert (row["zone_low"], row["zone_high"]) == pytest.approx(np.percentile(own, [2.5, 97.5]))
+    assert table.loc["mean", "accuracy"] == pytest.approx(table["accuracy"].iloc[:2].mean())
+    assert "not one sample" in table.loc["mean", "reason"]
+
+
+def test_the_interval_of_people_has_the_width_of_the_standard_error() -> None:
+    test = study(people=100, stimuli=60, scenarios=("drop",), seed=2).test
+    row = accuracy_by_scenario(test).iloc[0]
+    error = row["sd"] / np.sqrt(100)
+    assert (row["accuracy_high"] - row["accuracy_low"]) / (2 * 1.96 * error) == pytest.approx(
+        1, abs=0.1
+    )
+
+
+def test_people_who_are_too_few_or_too_alike_get_reasons(made: Responses) -> None:
+    one = made.test[made.test["session"] == "roll-s001"]
+    row = accuracy_by_scenario(one, FEW).iloc[0]
+    assert np.isnan(row["accuracy_low"]) and "one person alone" in row["reason"]
+    alike = agreement_by_scenario(one, FEW, halves=10)
+    assert alike["mean"].isna().all() and alike["reason"].str.contains("no pair").all()
+    same = made.test.assign(yes=True)
+    same["correct"] = same["label"]
+    table = agreement_by_scenario(same, FEW, halves=10).set_index(["scenario", "measure"])
+    row = table.loc[("roll", "kappa")]
+    assert row["undefined"] == row["values"] == 24 * 23 / 2 and np.isnan(row["median"])
+    assert "constant answers" in row["reason"]
+    scenario = accuracy_by_scenario(same, FEW).iloc[0]
+    assert np.isnan(scenario["t"]) and "same accuracy" in scenario["reason"]
+    with pytest.raises(BadInputError, match="no test answer"):
+        accuracy_by_scenario(made.test.iloc[:0])
+
+
+# --- agreement ----------------------------------------------------------------------------------
+
+
+def test_pairs_are_summarised_as_they_are(made: Responses) -> None:
+    table = agreement_by_scenario(made.test, FEW, halves=50).set_index(["scenario", "measure"])
+    values = pair_values(pairwise_kappa(answers_of(made.test, "collide").yes))
+    row = table.loc[("collide", "kappa")]
+    assert row["mean"] == pytest.approx(values.mean())
+    expected = np.percentile(values, [2.5, 50, 97.5])
+    assert (row["low"], row["median"], row["high"]) == pytest.approx(expected)
+    assert row["mean_low"] < row["mean"] < row["mean_high"]
+    halves, whole = table.loc[("collide", "split_half")], table.loc[("collide", "spearman_brown")]
+    assert halves["mean"] < whole["mean"] and halves["values"] == 50
+
+
+@settings(deadline=None)
+@given(st.floats(-0.99, 1), st.floats(1, 5))
+def test_spearman_brown_lengthens_and_shortens(r: float, factor: float) -> None:
+    longer = float(spearman_brown(r, factor))
+    if np.isnan(longer):
+        assert 1 + (factor - 1) * r <= 1e-12
+        return
+    assert longer == pytest.approx(factor * r / (1 + (factor - 1) * r))
+    if r > 0:
+        assert r - 1e-12 <= longer <= 1 + 1e-12
+        assert float(spearman_brown(longer, 1 / factor)) == pytest.approx(r)
+
+
+def test_halves_of_people_give_what_their_number_makes_likely() -> None:
+    """Independent answers: the mean r of halves is the reliability of half the people."""
+    generator = np.random.default_rng(0)
+    p = generator.beta(2, 2, 400)
+    yes = (generator.random((40, 400)) < p).astype(float)
+    r = split_halves(yes, 200)
+    expected = agreement.reliability(yes.mean(axis=0), np.full(400, 40), people=20)
+    assert np.mean(r) == pytest.approx(expected, abs=0.02)
+    whole = agreement.reliability(yes.mean(axis=0), np.full(400, 40))
+    assert np.mean(spearman_brown(r)) == pytest.approx(whole, abs=0.02)
+    np.testing.assert_array_equal(r, split_halves(yes, 200))
+    assert not np.array_equal(r, split_halves(yes, 200, seed=1))
+
+
+def test_official_split_halves_come_back_from_the_official_shares(
+    official_people: pd.DataFrame, official: Path
+) -> None:
+    """People drawn from the published shares have the published r of split halves within 0.01."""
+    published = pd.read_csv(official / "results" / "human_pairwiseCorrs_by_scenario.csv")
+    names = {"clothiness": "drape", "collision": "collide", "containment": "contain",
+             "linking": "link", "rollingsliding": "roll", "towers": "support"}  # fmt: skip
+    published["scenario"] = published["scenario"].replace(names)
+    generator = np.random.default_rng(0)
+    for scenario, r_mean in published[["scenario", "r_mean"]].to_numpy():
+        rows = official_people[official_people["scenario"] == scenario]
+        count = int(rows["count"].median())
+        yes = generator.random((count, len(rows))) < rows["p_yes"].to_numpy(dtype=float)
+        found = float(np.mean(split_halves(yes.astype(float), 100)))
+        assert found == pytest.approx(r_mean, abs=0.01), scenario
+
+
+arrays = st.tuples(st.integers(1, 4), st.integers(3, 20)).flatmap(
+    lambda shape: hnp.arrays(
+        np.float64, shape, elements=st.sampled_from([0.0, 0.2, 0.5, 0.9, 1.0, np.nan])
+    )
+)
+
+
+@settings(deadline=None, max_examples=50)
+@given(arrays, st.integers(0, 50))
+def test_correlations_of_many_are_those_of_each(x: Array, seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    y = np.where(generator.random(x.shape) < 0.2, np.nan, generator.random(x.shape))
+    weights = generator.integers(0, 3, x.shape).astype(float)
+    rows, many = correlate_rows(x, y), correlate_resampled(x, y, weights)
+    for k in range(len(x)):
+        known = np.isfinite(x[k]) & np.isfinite(y[k])
+        plain = agreement.pearson(x[k, known], y[k, known])
+        assert rows[k] == pytest.approx(plain, abs=1e-7, nan_ok=True)
+        for m in range(len(x)):
+            known = np.isfinite(x[m]) & np.isfinite(y[k])
+            times = weights[k, known].astype(int)
+            a, b = np.repeat(x[m, known], times), np.repeat(y[k, known], times)
+            assert many[k, m] == pytest.approx(agreement.pearson(a, b), abs=1e-7, nan_ok=True)
+
+
+# --- stimuli that fool people -------------------------------------------------------------------
+
+
+def test_hard_chance_and_easy_have_the_published_shares(official_people: pd.DataFrame) -> None:
+    """The paper: 10, 22 and 68 % of the stimuli of all eight scenarios."""
+    found = difficulty_third(official_people["accuracy"]).value_counts(normalize=True)
+    assert found["hard"] == pytest.approx(0.10, abs=0.01)
+    assert found["chance"] == pytest.approx(0.22, abs=0.01)
+    assert found["easy"] == pytest.approx(0.68, abs=0.005)
+
+
+def test_every_scenario_has_stimuli_below_chance_as_the_paper_says(
+    official_people: pd.DataFrame,
+) -> None:
+    found = below_chance(official_people)
+    by_scenario = found.groupby("scenario")[["released", "exact"]].sum()
+    assert len(by_scenario) == 8 and (by_scenario > 0).all(axis=None)
+    # A correction for 1144 looks makes the rule stricter: nothing new is found.
+    assert not (found["exact"] & ~found["released"]).any()
+
+
+def test_below_chance_is_scipys_binomial_test_and_guards_against_many_looks() -> None:
+    accuracy, count = np.array([0.3, 0.5, 0.0]), np.array([60, 40, 5])
+    expected = [stats.binomtest(round(a * n), n, 0.5, "less").pvalue
+                for a, n in zip(accuracy, count, strict=True)]  # fmt: skip
+    np.testing.assert_allclose(below_chance_p(accuracy, count), expected)
+    generator = np.random.default_rng(0)
+    guessed = pd.DataFrame({"stimulus": np.arange(3000).astype(str), "scenario": "x", "count": 80,
+                            "accuracy": generator.binomial(80, 0.5, 3000) / 80})  # fmt: skip
+    found = below_chance(guessed)
+    assert 30 < found["released"].sum() < 150 and found["exact"].sum() <= 1
+    with pytest.raises(BadInputError, match="must lie in"):
+        below_chance_p([1.2], [3])
+    assert difficulty_third([np.nan, 0.2, 0.5, 0.9]).tolist()[1:] == ["hard", "chance", "easy"]
+    assert pd.isna(difficulty_third([np.nan]).iloc[0])
+
+
+# --- biases, practice, background ---------------------------------------------------------------
+
+
+def test_a_liking_for_yes_and_for_the_left_are_told_apart(made: Responses) -> None:
+    balanced = yes_bias(made.test, FEW).set_index("scenario")
+    assert balanced["bias_low"].lt(0.1).all() and (balanced["d_prime"] > 0.3).all()
+    generator = np.random.default_rng(0)
+    always = made.test.assign(yes=made.test["yes"] | (generator.random(len(made.test)) < 0.4))
+    liked = yes_bias(always, FEW).set_index("scenario")
+    assert (liked["bias_low"] > 0.1).all() and (liked["criterion_high"] < 0).all()
+    sides = side_bias(always, FEW).set_index("scenario")
+    assert sides["left"].between(0.4, 0.6).all() and (sides["yes_left"] == 12).all()
+    to_left = made.test["buttons"].eq("yes-no")
+    pushed = generator.random(len(made.test)) < 0.4
+    lefty = made.test.assign(yes=np.where(pushed, to_left, made.test["yes"]))
+    found = side_bias(lefty, FEW).set_index("scenario")
+    assert (found["left_low"] > 0.55).all() and (found["p"] < 1e-3).all()
+    assert found["left"].to_numpy() == pytest.approx([0.7, 0.7], abs=0.05)
+
+
+def test_biases_that_cannot_be_known_say_why(made: Responses) -> None:
+    one_outcome = made.test[made.test["label"]]
+    found = yes_bias(one_outcome, FEW)
+    assert found["d_prime"].isna().all() and found["reason"].str.contains("one outcome").all()
+    blind = side_bias(made.test.drop(columns="buttons"), FEW)
+    assert blind["left"].isna().all() and (blind["unknown"] == 24).all()
+    assert blind["reason"].str.contains("fewer than two").all()
+
+
+def test_learning_is_found_where_there_is_some() -> None:
+    flat = learning(study(people=60, stimuli=100, scenarios=("drop",), seed=3).test)
+    assert flat["low"].iloc[0] < 0 < flat["high"].iloc[0]
+    steep = study(people=60, stimuli=100, scenarios=("drop", "roll"), seed=3, learning=1.0).test
+    found = learning(steep).set_index("scenario")
+    assert (found["low"] > 0).all() and (found["second_half"] > found["first_half"]).all()
+    # Stimuli differ, so that the slope over all is flatter than the one within stimuli: 1.
+    assert 0.6 < found.loc["all", "b"] < 1.0
+
+
+def test_background_is_counted_and_related_to_accuracy(made: Responses) -> None:
+    sessions = made.sessions
+    table = background(sessions)
+    assert table.groupby("question")["sessions"].sum().eq(48).all()
+    assert set(table["question"]) == {"age", "gender", "difficulty"}
+    blank = background(sessions.assign(gender="", age=pd.array([pd.NA] * 48, dtype="Int64")))
+    assert set(blank.loc[blank["question"].isin(["age", "gender"]), "answer"]) == {"(none)"}
+    accuracy = accuracy_by_participant(made.test).set_index("session")["accuracy"]
+    rank = accuracy.rank()
+    by_skill = sessions.assign(difficulty=6 - np.ceil(sessions["session"].map(rank) / 48 * 5))
+    found = accuracy_by_background(made.test, by_skill).set_index("question")
+    assert found.loc["difficulty", "statistic"] < -0.5 and found.loc["difficulty", "p"] < 1e-3
+    assert found.loc["gender", "test"] == "kruskal-wallis" and found.loc["gender", "p"] > 1e-3
+    alike = accuracy_by_background(made.test, sessions.assign(age=30, gender="a"))
+    assert alike.set_index("question").loc[["age", "gender"], "reason"].ne("").all()
+
+
+# --- attributes and hypotheses ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "elements", "distractors", "occluders", "room"),
+    [
+        ("pilot_dominoes_2mid_J020R15_d3chairs_o1plants_tdwroom_2_0004_img", 2, 3, 1, "tdw"),
+        ("pilot_dominoes_4midRM1_boxroom_0001", 3, 0, 0, "box"),
+        ("pilot_dominoes_4mid_boxroom_0001", 4, 0, 0, "box"),
+        ("pilot_dominoes_4mid_tdwroom_0001", 8, 0, 0, "tdw"),
+        ("pilot_dominoes_SJ020_d3chairs_o1plants_tdwroom_0001", np.nan, 3, 1, "tdw"),
+        ("pilot_dominoes_1mid_J025R45_o1full_tdwroom_0001", 1, 0, 1, "tdw"),
+        ("pilot_towers_nb4_fr015_SJ000_gr-01_mono1_dis1_occ1_boxroom_0003", 4, 1, 1, "box"),
+        ("pilot_it2_collision_yeet_tdw_2_dis_2_occ_0001", np.nan, 2, 2, "tdw"),
+        ("pilot_it2_drop_simple_box_0001", np.nan, 0, 0, "box"),
+        ("pilot-containment-cone-plate_0006", np.nan, 1, 1, "box"),
+        ("pilot_linking_nl1-8_ms03_aCylcap_bCyl_occ1_dis1_tdwroom_0001", np.nan, 1, 1, "tdw"),
+        ("test13_0011", np.nan, 0, 0, "box"),
+    ],
+)
+def test_official_names_are_read(
+    name: str, elements: float, distractors: int, occluders: int, room: str
+) -> None:
+    row = attributes_from_names([name]).iloc[0]
+    assert row[list(ATTRIBUTES)].tolist() == pytest.approx(
+        [elements, distractors, occluders], nan_ok=True
+    )
+    assert row["room"] == room
+
+
+def test_names_with_their_correction_say_what_the_metadata_say(
+    official_people: pd.DataFrame, official: Path
+) -> None:
+    names = attributes_from_names(official_people["stimulus"])
+    metadata = attributes_from_metadata(official / "scenes")
+    joined = metadata.merge(names, on="stimulus", suffixes=("", "_name"))
+    assert len(joined) > 500
+    assert joined["room"].eq(joined["room_name"]).all()
+    for name in ATTRIBUTES:
+        both = joined[[name, f"{name}_name"]]
+        differ = joined[(both[name] != both[f"{name}_name"]) & both.notna().any(axis=1)]
+        assert differ.empty
+    corrected = joined[joined["configuration"].isin(MISLABELLED)]
+    assert len(corrected) == 3 and (corrected["elements_name"] == 8).all()
+    best = better_attributes(metadata, names).set_index("stimulus")
+    assert best.index.is_unique and set(official_people["stimulus"]) <= set(best.index)
+    assert (best[best["configuration"] == "pilot_dominoes_4mid_tdwroom"]["elements"] == 8).all()
+
+
+def test_attributes_from_tables_and_broken_sources(tmp_path: Path) -> None:
+    table = pd.DataFrame({"stimulus": ["a_img", "b"], "scenario": "drop", "occluders": ["1", "x"]})
+    found = attributes_from_table(table)
+    assert found["stimulus"].tolist() == ["a", "b"] and found["occluders"].iloc[0] == 1
+    assert np.isnan(found["occluders"].iloc[1]) and found["elements"].isna().all()
+    with pytest.raises(BadInputError, match="none of the columns"):
+        attributes_from_table(table[["stimulus", "scenario"]])
+    with pytest.raises(BadInputError, match="no official name"):
+        attributes_from_names(["collide_0001"])
+    with pytest.raises(BadInputError, match="stands in two rows"):
+        attributes_from_names(["test13_0011", "test13_0011_img"])
+    with pytest.raises(BadInputError, match="holds no"):
+        attributes_from_metadata(tmp_path)
+    (tmp_path / "drop" / "x").mkdir(parents=True)
+    path = tmp_path / "drop" / "x" / "metadata.json"
+    for text, words in (("{", "not JSON"), ("{}", "list of trials"), ("[{}]", "stimulus_name")):
+        path.write_text(text)
+        with pytest.raises(BadInputError, match=words):
+            attributes_from_metadata(tmp_path)
+
+
+def stimuli_table(seed: int, effect: float) -> pd.DataFrame:
+    generator = np.random.default_rng(seed)
+    scenario = np.repeat(["drop", "roll", "link"], [60, 40, 20])
+    occluders = generator.integers(0, 3, 120).astype(float)
+    accuracy = 0.7 + 0.1 * (scenario == "roll") + effect * occluders
+    accuracy += generator.normal(0, 0.05 * (1 + occluders))
+    return pd.DataFrame(
+        {"stimulus": [f"s{k}" for k in range(120)], "scenario": scenario, "accuracy": accuracy,
+         "occluders": occluders, "distractors": generator.integers(0, 2, 120).astype(float),
+         "elements": np.nan, "mean_log_rt": 7 - accuracy + generator.normal(0, 0.1, 120)}
+    )  # fmt: skip
+
+
+def test_slopes_and_robust_errors_are_those_of_statsmodels() -> None:
+    stimuli = stimuli_table(0, -0.05)
+    found = regress_hypotheses(stimuli).set_index(["hypothesis", "scenario"])
+    dummies = pd.get_dummies(stimuli["scenario"], dtype=float)
+    for rows, name in ((stimuli, "all"), (stimuli[stimuli["scenario"] == "drop"], "drop")):
+        for key in ("H2", "H3", "H4"):
+            hypothesis = HYPOTHESES[key]
+            design = pd.concat([rows[hypothesis.predictor], dummies.loc[rows.index]], axis=1)
+            design = design.loc[:, (design != 0).any()]
+            fit = sm.OLS(rows[hypothesis.outcome], design).fit(cov_type="HC3", use_t=True)
+            row = found.loc[(key, name)]
+            assert (row["b"], row["se"], row["p"]) == pytest.approx(
+                (fit.params.iloc[0], fit.bse.iloc[0], fit.pvalues.iloc[0]), rel=1e-6
+            )
+            assert row["df"] == fit.df_resid
+            assert (row["low"], row["high"]) == pytest.approx(fit.conf_int().iloc[0].tolist())
+    assert found.loc[("H3", "all"), "as_predicted"] == "yes"
+    assert found.loc[("H4", "all"), "p"] < 1e-6
+    left_out = {"drop": 60, "roll": 40, "link": 20, "all": 120}
+    assert found.loc["H1", "left_out"].to_dict() == left_out
+    assert found.loc["H1", "reason"].str.contains("not known").all()
+
+
+def test_confounded_and_constant_attributes_say_so() -> None:
+    stimuli = stimuli_table(1, 0.0)
+    together = regress_hypotheses(stimuli.assign(distractors=stimuli["occluders"]))
+    chosen = together["hypothesis"].isin(["H2", "H3"])
+    assert together.loc[chosen, "reason"].str.contains("not to be told apart").all()
+    constant = regress_hypotheses(stimuli.assign(occluders=1.0)).set_index("hypothesis")
+    assert constant.loc["H3", "reason"].str.contains("does not vary").all()
+    silent = regress_hypotheses(stimuli.drop(columns="mean_log_rt")).set_index("hypothesis")
+    assert silent.loc["H4", "reason"].eq("no column mean_log_rt").all()
+
+
+def test_single_answers_are_laid_out_for_the_mixed_models(made: Responses) -> None:
+    by_stimulus = accuracy_by_stimulus(made.test, FEW)
+    generator = np.random.default_rng(0)
+    attributes = by_stimulus[["stimulus", "scenario"]].assign(
+        elements=generator.integers(1, 5, len(by_stimulus)), distractors=0, occluders=1
+    )
+    rows = answer_rows(made.test, with_attributes(by_stimulus, attributes_from_table(attributes)))
+    assert len(rows) == len(made.test) and rows.notna().all(axis=None)
+    for hypothesis in HYPOTHESES.values():
+        named = set(hypothesis.formula.replace("(1|", "").replace(")", "").split())
+        assert named - {"~", "+"} <= set(rows.columns)
+
+
+def test_slow_answers_go_with_errors_where_they_were_made_to() -> None:
+    test = study(people=40, stimuli=60, scenarios=("drop", "roll"), seed=5).test
+    stimuli = accuracy_by_stimulus(test, FEW).assign(elements=1, distractors=1, occluders=1)
+    row = regress_hypotheses(stimuli).set_index(["hypothesis", "scenario"]).loc[("H4", "all")]
+    assert row["b"] == pytest.approx(-0.5, abs=0.15) and row["p"] < 1e-6
+
+
+def test_dropping_rows_leaves_other_stimuli_as_they_were(made: Responses) -> None:
+    whole = accuracy_by_stimulus(made.test, FEW).set_index("stimulus")
+    part = replace(made, trials=made.trials[made.trials["stimulus"] != "roll_003"])
+    fewer = accuracy_by_stimulus(part.test, FEW).set_index("stimulus")
+    pd.testing.assert_frame_equal(fewer, whole.drop("roll_003"))

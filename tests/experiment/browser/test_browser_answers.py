@@ -1,0 +1,148 @@
+"""No answer is lost on its way, in a real browser: proxies, firewalls, tokens that are gone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
+
+import sqlalchemy as sa
+
+from physion.experiment.store.database import open_database, sqlite_url
+from physion.experiment.store.tables import TOKENS
+from physion.experiment.study.study import Study
+from support.experiment.browser import Visit, chromium, rows_of, served
+
+__all__ = ["chromium"]
+pytestmark = pytest.mark.slow
+TEST = 3
+KEPT = "JSON.parse(localStorage.getItem('physion:answers') ?? '[]').map(one => one.answer.trial)"
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Study, str]]:
+    with served(tmp_path_factory.mktemp("study"), test=TEST, familiarization=1) as (study, server):
+        yield study, server.url
+
+
+def to_the_test(visit: Visit, query: str) -> None:
+    visit.begin(query)
+    visit.practise(1)
+    visit.begin_test()
+    visit.page.locator(".answer").first.wait_for()
+
+
+def forget_tokens(study: Study, session: str) -> None:
+    """As after an older copy of the database was put back."""
+    engine = open_database(sqlite_url(study.folder), must_exist=True)
+    try:
+        with engine.begin() as connection:
+            connection.execute(sa.delete(TOKENS).where(TOKENS.c.session == session))
+    finally:
+        engine.dispose()
+
+
+def of_test(study: Study, name: str) -> list[tuple[int, str, bool]]:
+    _, answers, _ = rows_of(study, name)
+    return [(row.trial, row.response, row.resumed) for row in answers if row.phase == "test"]
+
+
+FOREIGN: dict[str, dict[str, Any]] = {
+    "proxy": {"status": 404, "content_type": "text/plain", "body": "404 page not found"},
+    "firewall": {"status": 403, "content_type": "text/html", "body": "<h1>Blocked</h1>"},
+    "gateway": {"status": 401, "content_type": "application/json", "body": '{"error": "login"}'},
+    "timeout": {
+        "status": 408,
+        "content_type": "application/json",
+        "body": '{"error": "bad_request", "message": "The body took too long."}',
+    },
+    "login-page": {"status": 200, "content_type": "text/html", "body": "<p>Welcome to our wifi"},
+    "other-json": {"status": 200, "content_type": "application/json", "body": '{"ok": true}'},
+}
+
+
+@pytest.mark.parametrize("who", sorted(FOREIGN))
+def test_what_others_answer_is_no_refusal(chromium: Any, site: tuple[Study, str], who: str) -> None:
+    study, url = site
+    with Visit(chromium, url) as visit:
+        to_the_test(visit, f"?participant={who}")
+        sent: list[tuple[int, str]] = []
+
+        def stand_between(route: Any) -> None:
+            answer = route.request.post_data_json
+            sent.append((answer["trial"], answer["key"]))
+            if len(sent) <= 2:
+                route.fulfill(**FOREIGN[who])
+            else:
+                route.continue_()
+
+        visit.context.route("**/api/answers", stand_between)
+        visit.answer("yes")
+        visit.page.get_by_text("No connection.").wait_for()
+        visit.answer("no")
+        visit.answer("yes")
+        visit.heading("About you")
+    assert [trial for trial, _ in sent] == [0, 0, 0, 1, 2]
+    assert len({key for _, key in sent}) == TEST
+    assert of_test(study, who) == [(0, "yes", False), (1, "no", False), (2, "yes", False)]
+    assert "answer_refused" not in {event.kind for event in rows_of(study, who)[2]}
+
+
+def test_a_token_that_is_gone(chromium: Any, site: tuple[Study, str]) -> None:
+    """The answer waits in the browser, and goes with the token of the next entering."""
+    study, url = site
+    with Visit(chromium, url, "token") as visit:
+        to_the_test(visit, "?participant=Gone")
+        visit.answer("no")
+        visit.page.get_by_text("Trial 2 of 3").wait_for()
+        visit.wait_for_answer()
+        while len(of_test(study, "Gone")) < 1:
+            visit.page.wait_for_timeout(50)
+        forget_tokens(study, rows_of(study, "Gone")[0].session)
+        visit.page.click(".answer[data-response=yes]")
+        visit.page.get_by_text("open the link of your invitation once more").wait_for()
+        visit.picture("told")
+        assert visit.page.evaluate(KEPT) == [1]
+        # Who else takes part here neither sends it nor loses it.
+        visit.go("?participant=Other")
+        visit.heading("Taking part in this study")
+        assert visit.page.evaluate(KEPT) == [1]
+        visit.go("?participant=Gone")
+        visit.page.get_by_text("Trial 3 of 3").wait_for()
+        assert visit.page.evaluate(KEPT) == []
+        visit.answer("yes")
+        visit.heading("About you")
+    # The first answer of the new load is the third, not the one that waited.
+    assert [row[:2] for row in of_test(study, "Gone")] == [(0, "no"), (1, "yes"), (2, "yes")]
+
+
+def test_a_refused_answer_is_noted_before_it_is_forgotten(
+    chromium: Any, site: tuple[Study, str]
+) -> None:
+    """What is noted of it outlives a browser that is closed in this very moment."""
+    study, url = site
+    with Visit(chromium, url) as visit, Visit(chromium, url) as there:
+        to_the_test(visit, "?participant=Noted")
+        there.go("?participant=Noted")
+        there.answer("yes")
+        there.page.get_by_text("Trial 2 of 3").wait_for()
+        there.page.close()
+        visit.context.route("**/api/events", lambda route: route.abort())
+        visit.answer("no")
+        visit.page.wait_for_timeout(1500)
+        assert visit.page.evaluate(KEPT) == [0]
+        visit.page.close()
+        visit.context.unroute("**/api/events")
+        visit.page = visit.open_tab()
+        visit.go()
+        visit.page.get_by_text("Trial 2 of 3").wait_for()
+        assert visit.page.evaluate(KEPT) == []
+    assert of_test(study, "Noted")[0][:2] == (0, "yes")
+    (event,) = [one for one in rows_of(study, "Noted")[2] if one.kind == "answer_refused"]
+    assert event.data.pop("rt_ms") >= 0
+    assert event.data == {
+        "code": "already_answered", "phase": "test", "trial": 0, "response": "no",
+    }  # fmt: skip

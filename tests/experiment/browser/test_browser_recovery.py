@@ -1,0 +1,262 @@
+"""What breaks on the way, in a real browser: reload, no connection, two tabs, a killed server."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
+
+from physion.experiment.study.orders import order_of
+from physion.experiment.study.study import Recruitment, Study
+from support.experiment.browser import Visit, chromium, rows_of, served
+
+__all__ = ["chromium"]
+pytestmark = pytest.mark.slow
+TEST = 4
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Study, str]]:
+    folder = tmp_path_factory.mktemp("study")
+    code = Recruitment(link_code="TINY-CODE")
+    with served(folder, test=TEST, familiarization=1, recruitment=code) as (study, server):
+        yield study, server.url
+
+
+def to_the_test(visit: Visit, name: str) -> None:
+    """Up to the first trial of the test."""
+    visit.begin(f"?participant={name}")
+    visit.practise(1)
+    visit.begin_test()
+    visit.page.locator(".answer").first.wait_for()
+
+
+def check_complete(study: Study, name: str, responses: list[str]) -> list[Any]:
+    """Every trial of the test has one answer, in the session's own order."""
+    session, answers, _ = rows_of(study, name)
+    assert session.finished_at is not None
+    test = [row for row in answers if row.phase == "test"]
+    order = order_of(study, session.scenario, session.order_seed)["test"]
+    assert [row.stimulus for row in test] == [stimulus.stimulus for stimulus in order]
+    assert [row.response for row in test] == responses
+    return test
+
+
+def test_a_reload_goes_on_at_the_same_trial(chromium: Any, site: tuple[Study, str]) -> None:
+    study, url = site
+    with Visit(chromium, url) as visit:
+        to_the_test(visit, "Reload")
+        sides = visit.left()
+        visit.answer("yes")
+        visit.page.get_by_text("Trial 2 of 4").wait_for()
+        before = [path for path in visit.requests if "/t-1-movie-" in path]
+        visit.requests.clear()
+        visit.page.reload()
+        visit.page.get_by_text("Trial 2 of 4").wait_for()
+        assert [path for path in visit.requests if "/t-1-movie-" in path] == before
+        assert not any("/t-0-" in path for path in visit.requests)
+        assert visit.left() == sides
+        visit.answer("no")
+        visit.page.get_by_text("Trial 3 of 4").wait_for()
+    # The next day, in another browser, by the address that the recruiter gave.
+    with Visit(chromium, url) as visit:
+        visit.go("?participant=Reload")
+        visit.page.get_by_text("Trial 3 of 4").wait_for()
+        assert visit.left() == sides
+        visit.answer("yes")
+        visit.answer("no")
+        visit.finish()
+        assert visit.unexpected() == []
+        # Who has finished finds the result again, in this browser ...
+        for query in ("", "?participant=Reload"):
+            visit.go(query)
+            visit.heading("Thank you!")
+            assert visit.page.inner_text("#code") == "TINY-CODE"
+    test = check_complete(study, "Reload", ["yes", "no", "yes", "no"])
+    assert [row.resumed for row in test] == [False, True, True, False]
+    # ... and elsewhere is told that once is all.
+    with Visit(chromium, url, "twice") as visit:
+        visit.go("?participant=Reload")
+        visit.page.get_by_text("You have already taken part").wait_for()
+        visit.picture("told")
+        assert visit.page.locator("#code").count() == 0
+
+
+def test_a_reload_where_the_browser_keeps_nothing(chromium: Any, site: tuple[Study, str]) -> None:
+    """The address still says who takes part, so that no second participation begins."""
+    study, url = site
+    with Visit(chromium, url) as visit:
+        visit.context.add_init_script(
+            "Object.defineProperty(window, 'localStorage',"
+            " { get() { throw new DOMException('forbidden', 'SecurityError'); } });"
+        )
+        to_the_test(visit, "Forbidden")
+        assert visit.page.url.endswith("?participant=Forbidden")
+        visit.answer("no")
+        visit.page.get_by_text("Trial 2 of 4").wait_for()
+        while len(rows_of(study, "Forbidden")[1]) < 2:
+            visit.page.wait_for_timeout(50)
+        visit.page.reload()
+        visit.page.get_by_text("Trial 2 of 4").wait_for()
+        assert visit.unexpected() == []
+
+
+def test_twenty_seconds_offline(chromium: Any, site: tuple[Study, str]) -> None:
+    study, url = site
+    with Visit(chromium, url, "offline") as visit:
+        to_the_test(visit, "Offline")
+        visit.wait_for_answer()
+        visit.context.set_offline(True)
+        visit.answer("no")
+        visit.page.get_by_text("Trial 2 of 4").wait_for()
+        visit.answer("no")
+        visit.page.get_by_text("No connection.").wait_for()
+        visit.picture("lost")
+        visit.page.get_by_text("Trial 3 of 4").wait_for()
+        visit.page.wait_for_timeout(15_000)
+        assert len([row for row in rows_of(study, "Offline")[1] if row.phase == "test"]) == 0
+        kept = visit.page.evaluate("JSON.parse(localStorage.getItem('physion:answers')).length")
+        assert kept == 2
+        visit.context.set_offline(False)
+        visit.page.get_by_text("The connection is back.").wait_for()
+        visit.answer("yes")
+        visit.answer("yes")
+        visit.heading("About you")
+        assert visit.page.evaluate("localStorage.getItem('physion:answers')") is None
+        visit.finish()
+        assert visit.unexpected() == []
+    check_complete(study, "Offline", ["no", "no", "yes", "yes"])
+    kinds = {event.kind for event in rows_of(study, "Offline")[2]}
+    assert {"offline", "online"} <= kinds
+
+
+def test_a_form_stays_until_it_is_stored(chromium: Any, site: tuple[Study, str]) -> None:
+    study, url = site
+    with Visit(chromium, url, "form") as visit:
+        to_the_test(visit, "Form")
+        for _ in range(TEST):
+            visit.answer("yes")
+        visit.heading("About you")
+        visit.page.fill("#age", "47")
+        times: list[int] = []
+
+        def busy(route: Any) -> None:
+            times.append(1)
+            if len(times) == 1:
+                route.fulfill(status=503, body="busy")
+            elif len(times) == 2:
+                route.abort()
+            else:
+                route.continue_()
+
+        visit.context.route("**/api/page", busy)
+        visit.main_button().click()
+        visit.page.get_by_text("The server is busy.").wait_for()
+        visit.page.get_by_text("Your answers are being sent").wait_for()
+        visit.picture("busy")
+        assert visit.page.input_value("#age") == "47"
+        assert visit.main_button().count() == 0
+        visit.heading("How was it?")
+        assert len(times) == 3
+    assert rows_of(study, "Form")[0].age == 47
+
+
+def test_a_browser_that_is_closed_offline(chromium: Any, site: tuple[Study, str]) -> None:
+    """The answers are sent when the page is opened again, before it asks where to go on."""
+    study, url = site
+    with Visit(chromium, url) as visit:
+        to_the_test(visit, "Closed")
+        visit.wait_for_answer()
+        visit.context.set_offline(True)
+        visit.answer("no")
+        visit.page.get_by_text("Trial 2 of 4").wait_for()
+        visit.answer("yes")
+        visit.page.get_by_text("Trial 3 of 4").wait_for()
+        visit.page.close()
+        visit.context.set_offline(False)
+        visit.page = visit.open_tab()
+        visit.go()
+        visit.page.get_by_text("Trial 3 of 4").wait_for()
+        visit.answer("yes")
+        visit.answer("yes")
+        visit.heading("About you")
+        visit.finish()
+        assert visit.unexpected() == []
+    test = check_complete(study, "Closed", ["no", "yes", "yes", "yes"])
+    assert [row.resumed for row in test] == [False, False, True, False]
+
+
+def test_the_second_tab_takes_over(chromium: Any, site: tuple[Study, str]) -> None:
+    study, url = site
+    with Visit(chromium, url, "tabs") as visit:
+        to_the_test(visit, "Tabs")
+        visit.answer("yes")
+        visit.page.get_by_text("Trial 2 of 4").wait_for()
+        first, visit.page = visit.page, visit.open_tab()
+        visit.go()
+        visit.page.get_by_text("Trial 2 of 4").wait_for()
+        first.get_by_text("The study goes on in another tab").wait_for()
+        assert first.locator(".answer").count() == 0
+        visit.answer("no")
+        visit.page.get_by_text("Trial 3 of 4").wait_for()
+        second, visit.page = visit.page, first
+        visit.page.bring_to_front()
+        visit.picture("first")
+        visit.main_button().click()  # go on here
+        second.get_by_text("The study goes on in another tab").wait_for()
+        visit.page.get_by_text("Trial 3 of 4").wait_for()
+        visit.answer("no")
+        visit.answer("yes")
+        visit.heading("About you")
+        visit.finish()
+        assert visit.unexpected() == []
+    check_complete(study, "Tabs", ["yes", "no", "no", "yes"])
+
+
+def test_another_device_answers_meanwhile(chromium: Any, site: tuple[Study, str]) -> None:
+    """Nobody tells this page of the other: it learns from the server's refusal, and goes on."""
+    study, url = site
+    with Visit(chromium, url) as here, Visit(chromium, url) as there:
+        to_the_test(here, "Devices")
+        there.go("?participant=Devices")
+        there.answer("yes")
+        there.page.get_by_text("Trial 2 of 4").wait_for()
+        there.answer("yes")
+        there.page.get_by_text("Trial 3 of 4").wait_for()
+        there.page.close()
+        here.answer("no")
+        here.page.get_by_text("Trial 3 of 4").wait_for()
+        here.answer("no")
+        here.page.get_by_text("Trial 4 of 4").wait_for()
+        here.answer("no")
+        here.heading("About you")
+        here.finish()
+        assert here.unexpected() == []
+    check_complete(study, "Devices", ["yes", "yes", "no", "no"])
+    refused = [event for event in rows_of(study, "Devices")[2] if event.kind == "answer_refused"]
+    assert [event.data["code"] for event in refused] == ["already_answered"]
+
+
+def test_the_server_is_killed(chromium: Any, tmp_path: Path) -> None:
+    code = Recruitment(link_code="TINY-CODE")
+    with (
+        served(tmp_path, test=TEST, familiarization=1, recruitment=code) as (study, server),
+        Visit(chromium, server.url) as visit,
+    ):
+        to_the_test(visit, "Killed")
+        visit.answer("yes")
+        visit.page.get_by_text("Trial 2 of 4").wait_for()
+        server.kill()
+        visit.answer("yes")
+        visit.page.get_by_text("No connection.").wait_for()
+        visit.answer("no")
+        server.start()
+        visit.answer("no")
+        visit.heading("About you")
+        visit.finish()
+        assert visit.unexpected() == []
+        check_complete(study, "Killed", ["yes", "yes", "no", "no"])

@@ -1,0 +1,350 @@
+"""Who is turned away, and what goes wrong with movies and windows, in a real browser."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
+
+import sqlalchemy as sa
+
+from physion.experiment.store.database import open_database, sqlite_url
+from physion.experiment.store.tables import RAW_IDS, SESSIONS
+from physion.experiment.study.identity import Secrets
+from physion.experiment.study.recruitment import pass_word
+from physion.experiment.study.study import Recruitment, Study
+from support.experiment.browser import Visit, chromium, rows_of, served
+
+__all__ = ["chromium"]
+pytestmark = pytest.mark.slow
+SMALL = {"width": 900, "height": 560}
+LARGE = {"width": 1280, "height": 800}
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Study, str]]:
+    folder = tmp_path_factory.mktemp("study")
+    decided = Recruitment(id_needed=True, prolific_code="PROLIFIC7", link_code="TINY-CODE")
+    with served(folder, test=2, familiarization=1, recruitment=decided) as (study, server):
+        yield study, server.url
+
+
+def stored(study: Study, table: sa.Table) -> list[Any]:
+    engine = open_database(sqlite_url(study.folder), must_exist=True)
+    try:
+        with engine.connect() as connection:
+            return list(connection.execute(sa.select(table)).all())
+    finally:
+        engine.dispose()
+
+
+PHONE = {
+    "viewport": {"width": 1100, "height": 700},
+    "screen": {"width": 1100, "height": 700},
+    "has_touch": True,
+    "is_mobile": True,
+}
+
+
+TABLET = {"viewport": SMALL, "screen": SMALL, "has_touch": True}
+
+
+@pytest.mark.parametrize(
+    ("query", "context", "script", "told"),
+    [
+        ("?participant=Phone", PHONE, "", "does not work on phones and tablets"),
+        ("?participant=Screen", TABLET, "matchMedia = () => ({matches: true})", "screen of this"),
+        (
+            "?participant=Old",
+            {},
+            "delete HTMLVideoElement.prototype.requestVideoFrameCallback",
+            "browser is too old",
+        ),
+        (
+            "?participant=Codec",
+            {},
+            "HTMLVideoElement.prototype.canPlayType = () => ''",
+            "cannot play our movies",
+        ),
+        ("", {}, "", "your number is missing"),
+        ("?participant=Word&pass=preview-0000", {}, "", "no longer valid"),
+        ("?participant=Part&scenario=nothing", {}, "", "no longer valid"),
+        ("?workerId=W&assignmentId=ASSIGNMENT_ID_NOT_AVAILABLE", {}, "", "Accept it to begin"),
+        ("?language=de", {}, "", "Ihre Nummer fehlt"),
+    ],
+)
+def test_turned_away(
+    chromium: Any, site: tuple[Study, str], query: str, context: Any, script: str, told: str
+) -> None:
+    study, url = site
+    before = len(stored(study, SESSIONS))
+    with Visit(chromium, url, "refused", **context) as visit:
+        if script:
+            visit.context.add_init_script(script)
+        visit.go(query)
+        visit.page.get_by_text(told).wait_for()
+        visit.picture(query[1:8].replace("=", "-") or "nobody")
+        assert visit.page.locator(".button:not(.quiet)").count() == 0
+        complaints = [line for line in visit.unexpected() if "status of 403" not in line]
+        assert complaints == []
+    assert len(stored(study, SESSIONS)) == before
+
+
+def test_without_script_the_page_says_so(chromium: Any, site: tuple[Study, str]) -> None:
+    study, url = site
+    with Visit(chromium, url, java_script_enabled=False) as visit:
+        visit.go()
+        said = visit.page.inner_text("main")
+        for language in study.languages:
+            assert study.texts[language]["refusal.no_script"] in said
+
+
+def test_old_browsers_are_told_without_modules(chromium: Any, site: tuple[Study, str]) -> None:
+    """What a browser does that knows no modules: it runs the script marked nomodule alone."""
+    study, url = site
+    with Visit(chromium, url) as visit:
+        visit.context.route("**/static/main.js", lambda route: route.abort())
+        visit.go()
+        assert not visit.page.locator("#too-old").is_visible()
+        visit.page.evaluate(
+            "const old = document.createElement('script');"
+            "old.src = document.querySelector('script[nomodule]').src; document.body.append(old);"
+        )
+        for language in study.languages:
+            visit.page.get_by_text(study.texts[language]["refusal.browser"]).wait_for()
+
+
+def test_small_windows_wait_and_go_on(chromium: Any, site: tuple[Study, str]) -> None:
+    study, url = site
+    # As on a laptop with scaling or zoom: all but the trials can be done.
+    with Visit(chromium, url, "window", viewport=SMALL, screen=SMALL) as visit:
+        visit.begin("?participant=Window")
+        visit.heading("Please make the window larger")
+        visit.picture("small")
+        visit.page.set_viewport_size(LARGE)
+        visit.wait_for_answer()
+        # In the middle of a session, before the next trial.
+        visit.page.set_viewport_size(SMALL)
+        visit.answer("yes")
+        visit.see_feedback()
+        visit.begin_test()
+        visit.heading("Please make the window larger")
+        visit.page.set_viewport_size(LARGE)
+        visit.answer("yes")
+        visit.answer("yes")
+        visit.heading("About you")
+        visit.finish()
+        assert visit.unexpected() == []
+    _, answers, events = rows_of(study, "Window")
+    assert {(row.window_width, row.window_height) for row in answers[1:]} == {(1280, 800)}
+    assert "too_small" in {event.kind for event in events}
+
+
+def test_movies_that_fail_are_shown_again(chromium: Any, site: tuple[Study, str]) -> None:
+    study, url = site
+    with Visit(chromium, url, "movie") as visit:
+        asked: list[str] = []
+
+        def spoil(route: Any) -> None:
+            asked.append(route.request.url)
+            times = asked.count(route.request.url)
+            if "/t-0-movie-" in route.request.url and times == 1:
+                route.fulfill(body=b"no movie", content_type="video/mp4")
+            elif "/t-1-map-" in route.request.url and times <= 2:
+                refusal = {"error": "not_found", "message": "no such movie or picture"}
+                route.fulfill(status=404, json=refusal)
+            else:
+                route.continue_()
+
+        visit.context.route("**/media/*", spoil)
+        visit.begin("?participant=Movie")
+        visit.practise(1)
+        visit.begin_test()
+        visit.page.get_by_text("The movies could not be loaded.").wait_for()
+        visit.picture("not-loaded")
+        visit.main_button().click()
+        visit.page.get_by_text("The movie could not be played.").wait_for()
+        visit.picture("not-played")
+        visit.answer("yes")
+        visit.answer("no")
+        visit.heading("About you")
+        visit.finish()
+    _, answers, events = rows_of(study, "Movie")
+    assert [json.loads(row.details)["attempts"] for row in answers] == [1, 2, 1]
+    assert [row.response for row in answers[1:]] == ["yes", "no"]
+    assert "movie_failed" in {event.kind for event in events}
+
+
+HIDE = (
+    "hidden => {"
+    "const set = (name, value) =>"
+    " Object.defineProperty(document, name, {value, configurable: true});"
+    "set('hidden', hidden); set('visibilityState', hidden ? 'hidden' : 'visible');"
+    "document.dispatchEvent(new Event('visibilitychange')); }"
+)
+
+
+def test_a_page_that_is_hidden_is_noted(chromium: Any, site: tuple[Study, str]) -> None:
+    study, url = site
+    with Visit(chromium, url) as visit:
+        visit.begin("?participant=Hidden")
+        visit.page.locator(".trial").wait_for()
+        visit.page.evaluate(HIDE, True)
+        visit.page.wait_for_timeout(200)
+        visit.page.evaluate(HIDE, False)
+        visit.practise(1)
+        visit.begin_test()
+        visit.answer("yes")
+        visit.answer("yes")
+        visit.heading("About you")
+    _, answers, events = rows_of(study, "Hidden")
+    assert [row.visibility_changes for row in answers] == [2, 0, 0]
+    changes = json.loads(answers[0].details)["visibility"]
+    assert [state for _, state in changes] == ["hidden", "visible"]
+    assert {"hidden", "visible"} <= {event.kind for event in events}
+
+
+def test_a_trial_that_was_hidden_is_shown_again(chromium: Any, site: tuple[Study, str]) -> None:
+    """From the cross with its whole cue; hidden once the movie is over, it is not."""
+    study, url = site
+    with Visit(chromium, url) as visit:
+        visit.begin("?participant=Again")
+        visit.practise(1)
+        visit.begin_test()
+        for where in (".fixation", ".screen-cover[hidden]"):  # the cross; the cue
+            visit.page.locator(where).wait_for(state="attached")
+            visit.page.evaluate(HIDE, True)
+            visit.page.wait_for_timeout(700)
+            visit.page.evaluate(HIDE, False)
+        visit.wait_for_answer()
+        visit.page.evaluate(HIDE, True)
+        visit.page.evaluate(HIDE, False)
+        visit.answer("yes")
+        for time in range(6):  # the last time it goes on
+            visit.page.locator(".fixation").wait_for(state="attached")
+            visit.page.evaluate(HIDE, True)
+            visit.page.wait_for_timeout(100)
+            visit.page.evaluate(HIDE, False)
+            if time < 5:
+                visit.page.locator(".fixation").wait_for(state="attached")
+        visit.answer("no")
+        visit.heading("About you")
+        assert visit.unexpected() == []
+    answers = [row for row in rows_of(study, "Again")[1] if row.phase == "test"]
+    details = [json.loads(row.details) for row in answers]
+    assert [(one["attempts"], one["hidden"]) for one in details] == [(3, 2), (6, 6)]
+    assert [row.visibility_changes for row in answers] == [6, 12]
+    for row, one in zip(answers, details, strict=True):
+        assert abs(row.cue_ms - 500) < 60
+        assert [on for _, on in one["flashes"]] == [True, False]
+        assert row.frames_shown > 30
+
+
+def test_a_press_that_began_before_is_no_answer(chromium: Any, site: tuple[Study, str]) -> None:
+    study, url = site
+    with Visit(chromium, url) as visit:
+        visit.begin("?participant=Press")
+        visit.practise(1)
+        visit.begin_test()
+        box = visit.page.locator(".answer").first.bounding_box()
+        visit.page.mouse.move(box["x"] + 20, box["y"] + 20)
+        visit.page.mouse.down()
+        visit.wait_for_answer()
+        visit.page.mouse.up()
+        visit.page.wait_for_timeout(300)
+        assert visit.page.locator(".answer:enabled").count() == 2
+        # The press counts, not the release.
+        visit.page.mouse.down()
+        visit.page.wait_for_timeout(1500)
+        visit.page.mouse.up()
+        visit.page.get_by_text("Trial 2 of 2").wait_for()
+        visit.answer("no")
+        visit.heading("About you")
+        assert visit.unexpected() == []
+    first = next(row for row in rows_of(study, "Press")[1] if row.phase == "test")
+    assert first.input == "mouse" and 300 <= first.rt_ms < 1500
+
+
+def test_stopping_for_good(chromium: Any, site: tuple[Study, str]) -> None:
+    study, url = site
+    with Visit(chromium, url, "stop") as visit:
+        visit.begin("?participant=Stop")
+        visit.page.locator(".answer").first.wait_for()
+        visit.page.get_by_text("Stop taking part").click()
+        visit.heading("Do you want to stop?")
+        visit.picture("asked")
+        visit.page.get_by_text("Go on with the study").click()
+        visit.practise(1)
+        visit.begin_test()
+        visit.page.get_by_text("Stop taking part").click()
+        visit.page.get_by_text("Stop for good").click()
+        visit.heading("You have stopped")
+        visit.picture("stopped")
+        assert rows_of(study, "Stop")[0].reference in visit.page.inner_text("main")
+        visit.page.reload()
+        visit.heading("You have stopped")
+        assert visit.unexpected() == []
+    session, answers, _ = rows_of(study, "Stop")
+    assert session.withdrawn_at is not None and session.finished_at is None
+    assert len(answers) == 1
+
+
+def test_declining_the_consent(chromium: Any, site: tuple[Study, str]) -> None:
+    study, url = site
+    with Visit(chromium, url) as visit:
+        visit.go("?participant=Decline")
+        visit.page.select_option("#language", "de")
+        visit.heading("Teilnahme an dieser Studie")
+        visit.page.get_by_text("Ich möchte nicht teilnehmen").click()
+        visit.heading("Sie nehmen nicht teil")
+        assert visit.unexpected() == []
+    session, answers, _ = rows_of(study, "Decline")
+    assert session.withdrawn_at is not None and session.consented_at is None
+    assert answers == []
+
+
+def test_recruiters(chromium: Any, site: tuple[Study, str]) -> None:
+    """Prolific's ids are kept apart, the address forgets them, and the code leads back."""
+    study, url = site
+    with Visit(chromium, url, "prolific") as visit:
+        visit.go("?PROLIFIC_PID=5f00&STUDY_ID=s1&SESSION_ID=v1&language=de")
+        visit.page.select_option("#language", "en")
+        visit.heading("Taking part in this study")
+        visit.main_button().click()
+        visit.heading("What you will do")
+        assert visit.page.url == f"{url}/"
+        assert "5f00" not in visit.page.evaluate("JSON.stringify(localStorage)")
+        for _ in range(3):
+            visit.heading()
+            visit.main_button().click()
+        visit.practise(1)
+        visit.begin_test()
+        visit.answer("yes")
+        visit.answer("no")
+        visit.heading("About you")
+        visit.finish()
+        visit.picture("result")
+        address = "https://app.prolific.com/submissions/complete?cc=PROLIFIC7"
+        assert visit.page.get_attribute("#go", "href") == address
+        assert visit.unexpected() == []
+    (raw,) = [row for row in stored(study, RAW_IDS) if row.source == "prolific"]
+    assert (raw.raw_id, raw.recruiter) == ("5f00", {"STUDY_ID": "s1", "SESSION_ID": "v1"})
+    (session,) = [row for row in stored(study, SESSIONS) if row.source == "prolific"]
+    assert session.language == "en"
+
+
+def test_previews_need_no_id(chromium: Any, site: tuple[Study, str]) -> None:
+    study, url = site
+    word = pass_word(Secrets.load(study.folder), "preview")
+    with Visit(chromium, url) as visit:
+        visit.go(f"?pass={word}")
+        visit.heading("Taking part in this study")
+        visit.main_button().click()
+        visit.heading("What you will do")
+        visit.page.reload()
+        visit.heading("What you will do")
+    assert [row.kind for row in stored(study, SESSIONS)].count("preview") == 1

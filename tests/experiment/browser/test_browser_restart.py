@@ -1,0 +1,114 @@
+"""A server that has too much to do, or was started again with other things, in a real browser."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
+
+from physion.experiment.study.identity import SECRET_FILE
+from physion.experiment.study.study import Limits
+from support.experiment.browser import Visit, chromium, rows_of, served
+
+__all__ = ["chromium"]
+pytestmark = pytest.mark.slow
+
+
+def test_who_comes_in_a_crowd_waits(chromium: Any, tmp_path: Path) -> None:
+    limits = replace(Limits(), sessions_per_minute=8.0, sessions_at_once=1)
+    with served(tmp_path, test=1, familiarization=1, limits=limits) as (study, server):
+        with Visit(chromium, server.url) as first, Visit(chromium, server.url, "crowd") as visit:
+            first.go("?participant=One")
+            first.heading("Taking part in this study")
+            visit.go("?participant=Two")
+            visit.heading("One moment, please")
+            visit.picture("waiting")
+            told = visit.page.locator("[role=timer]").inner_text()
+            assert re.fullmatch(r"It tries again in [1-9] s\.", told)
+            assert visit.page.locator("#status").inner_text() == ""
+            visit.heading("Taking part in this study")
+        assert rows_of(study, "Two")[0].finished_at is None
+
+
+def test_movies_whose_addresses_changed(chromium: Any, tmp_path: Path) -> None:
+    """The addresses that the page has are worth nothing any more: it asks for new ones."""
+    with (
+        served(tmp_path, test=3, familiarization=1, preload=1) as (study, server),
+        Visit(chromium, server.url) as visit,
+    ):
+        visit.begin("?participant=Restart")
+        visit.wait_for_answer()
+        change_addresses(study.folder, server)
+        # The whole movie of practice comes with its own address, which changes on its way.
+        spoilt: list[str] = []
+
+        def spoil(route: Any) -> None:
+            answer = route.fetch().json()
+            if answer["feedback"] and not spoilt:
+                answer["feedback"]["movie"] = re.sub(
+                    r"-\w+$", "-" + "0" * 32, answer["feedback"]["movie"]
+                )
+                spoilt.append(answer["feedback"]["movie"])
+            route.fulfill(json=answer)
+
+        visit.context.route("**/api/answers", spoil)
+        visit.practise(1)
+        assert len(spoilt) == 1
+        visit.begin_test()
+        visit.wait_for_answer()
+        change_addresses(study.folder, server)
+        lists = len([url for url in visit.requests if url.endswith("/api/trials/test")])
+        visit.answer("no")
+        visit.answer("yes")
+        visit.answer("no")
+        visit.heading("About you")
+        asked = [url for url in visit.requests if url.endswith("/api/trials/test")]
+        assert (lists, len(asked)) == (1, 2)
+    answers = [row for row in rows_of(study, "Restart")[1] if row.phase == "test"]
+    assert [row.response for row in answers] == ["no", "yes", "no"]
+    assert [json.loads(row.details)["attempts"] for row in answers] == [1, 1, 1]
+
+
+def change_addresses(folder: Path, server: Any) -> None:
+    """Start the server again with another key for the addresses of movies."""
+    server.kill()
+    path = folder / SECRET_FILE
+    content = json.loads(path.read_text())
+    content["link_key"] = content["link_key"][::-1]
+    path.write_text(json.dumps(content))
+    server.start()
+
+
+def test_the_language_of_the_session_decides(chromium: Any, tmp_path: Path) -> None:
+    with (
+        served(tmp_path, test=1, familiarization=1) as (_, server),
+        Visit(chromium, server.url) as visit,
+    ):
+        visit.go("?participant=Words&language=de")
+        visit.heading("Teilnahme an dieser Studie")
+        # The browser remembers a language that the study has no more.
+        visit.page.evaluate("localStorage.setItem('physion:language', '\"fr\"')")
+        visit.go("?participant=Words")
+        visit.heading("Teilnahme an dieser Studie")
+
+        def other_language(language: str) -> Any:
+            def change(route: Any) -> None:
+                route.fulfill(json={**route.fetch().json(), "language": language})
+
+            return change
+
+        # Meanwhile the study lost the language in which the session began ...
+        visit.context.route("**/api/page", other_language("en"))
+        visit.main_button().click()
+        visit.heading("What you will do")
+        visit.context.unroute("**/api/page")
+        # ... and words that cannot be had stop nobody.
+        visit.context.route("**/api/session**", other_language("fr"))
+        visit.page.reload()
+        visit.heading("What you will do")

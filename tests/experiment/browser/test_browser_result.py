@@ -1,0 +1,129 @@
+"""What people are told in the end, and how they get their credit, in a real browser."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+from urllib.parse import parse_qs
+
+import pytest
+
+pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
+
+from physion.experiment.study.study import Recruitment, Study
+from support.experiment.browser import Visit, chromium, rows_of, served
+
+__all__ = ["chromium"]
+pytestmark = pytest.mark.slow
+MTURK = "https://workersandbox.mturk.com"
+SCREEN = """
+Object.defineProperty(screen, "width", {value: 1280});
+Object.defineProperty(screen, "height", {value: 800});
+"""
+"""What Playwright tells pages of the screen does not reach frames of other sites."""
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Study, str]]:
+    settings: dict[str, Any] = {
+        "recruitment": Recruitment(link_code="TINY-CODE", mturk_code="TURK-CODE"),
+        "embed_from": (MTURK,),
+        "percentile_from": 1,
+    }
+    folder = tmp_path_factory.mktemp("study")
+    with served(folder, test=2, familiarization=1, **settings) as (study, server):
+        yield study, server.url
+
+
+def take_part(visit: Visit, query: str) -> str:
+    """The words of the last page."""
+    visit.begin(query)
+    visit.practise(1)
+    visit.begin_test()
+    visit.answer("yes")
+    visit.answer("yes")
+    visit.finish()
+    return str(visit.page.inner_text("main"))
+
+
+def correct(study: Study, name: str) -> int:
+    labels = {stimulus.stimulus: stimulus.label for stimulus in study.stimuli}
+    answers = [row for row in rows_of(study, name)[1] if row.phase == "test"]
+    return sum((row.response == "yes") == labels[row.stimulus] for row in answers)
+
+
+def test_the_percentile_is_what_its_words_say(chromium: Any, site: tuple[Study, str]) -> None:
+    """Of two people who were equally right, the second stands in the middle of the others."""
+    study, url = site
+    with Visit(chromium, url) as visit:
+        assert "percentile" not in take_part(visit, "?participant=First")
+    with Visit(chromium, url) as visit:
+        told = take_part(visit, "?participant=Second")
+    assert correct(study, "First") == correct(study, "Second") == 1
+    assert "Compared with the other people who finished, you are at percentile 50" in told
+
+
+def test_the_form_of_mturk_stays_in_its_frame(chromium: Any, site: tuple[Study, str]) -> None:
+    """From the first page to the last in a frame of MTurk's page, and handed in there."""
+    _, url = site
+    task = f"{MTURK}/projects/task"
+    submit = f"{MTURK}/mturk/externalSubmit"
+    handed_in: list[tuple[dict[str, list[str]], bool]] = []
+
+    def amazon(route: Any) -> None:
+        request = route.request
+        if request.url == task:
+            page = '<title>Tasks</title><iframe id="task" width="1240" height="760"></iframe>'
+            route.fulfill(content_type="text/html", body=page)
+        elif request.url == submit:
+            handed_in.append((parse_qs(request.post_data), request.frame != top.main_frame))
+            route.fulfill(content_type="text/html", body="<p>Thank you, worker</p>")
+        else:
+            route.abort()
+
+    with Visit(chromium, url) as visit:
+        visit.context.route(f"{MTURK}/**", amazon)
+        visit.context.add_init_script(SCREEN)
+        top = visit.page
+        top.goto(task)
+        # All steps are taken in the frame.
+        visit.page = top.main_frame.child_frames[0]
+        take_part(visit, f"?workerId=W1&assignmentId=A1&hitId=H1&turkSubmitTo={MTURK}")
+        form = visit.page.locator("form")
+        assert (form.get_attribute("action"), form.get_attribute("target")) == (submit, None)
+        visit.page.locator("#go").click()
+        visit.page.get_by_text("Thank you, worker").wait_for()
+        assert top.url == task and top.title() == "Tasks"
+    assert handed_in == [({"assignmentId": ["A1"], "code": ["TURK-CODE"]}, True)]
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        "https://www.mturk.com.example.org/mturk/externalSubmit",
+        "http://www.mturk.com/mturk/externalSubmit",
+        "https://www.mturk.com@example.org/mturk/externalSubmit",
+        "https://www.mturk.com/other",
+    ],
+)
+def test_no_form_goes_to_anybody_else(chromium: Any, site: tuple[Study, str], address: str) -> None:
+    """Even if the server should say so."""
+    _, url = site
+    with Visit(chromium, url) as visit:
+        visit.go("?participant=Form")
+        visit.heading("Taking part in this study")
+
+        def finished(route: Any) -> None:
+            state = route.fetch().json()
+            route.fulfill(json={**state, "stage": "done", "trial": None})
+
+        completion = {"code": "C", "url": address, "post": {"assignmentId": "A"}}
+        result = {"correct": 1, "trials": 2, "accuracy": 0.5, "percentile": None}
+        visit.context.route("**/api/session**", finished)
+        visit.context.route(
+            "**/api/result", lambda route: route.fulfill(json={**result, "completion": completion})
+        )
+        visit.go()
+        visit.page.locator("#code").wait_for()
+        assert visit.page.locator("form").count() == 0
+        visit.page.get_by_text("You can close this window now.").wait_for()

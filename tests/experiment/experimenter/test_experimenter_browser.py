@@ -1,0 +1,145 @@
+"""The experimenter's pages in a real browser: nothing is blocked, cut off or left standing."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
+
+from physion.experiment.simulated.server_process import OwnServer
+from physion.experiment.store.database import open_database, sqlite_url
+from physion.experiment.study.identity import Secrets
+from physion.experiment.study.study import Study
+from support.experiment.browser import chromium
+from support.experiment.experimenter_client import BASE, TWO
+from support.experiment.experimenter_rows import insert_sessions
+from support.experiment.tiny_study import PASSWORD, make_tiny_study
+
+__all__ = ["chromium"]
+pytestmark = pytest.mark.slow
+PAGES = ("", "?kind=simulated", "/sessions", "/sessions?flag=any", "/export", "/payments")
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Study, str]]:
+    study = make_tiny_study(tmp_path_factory.mktemp("study"), test=20, scenarios=TWO, size=64)
+    with OwnServer(study.folder) as server:
+        add(study, 120)
+        yield study, server.url + BASE
+
+
+def add(study: Study, count: int, **settings: Any) -> list[str]:
+    engine = open_database(sqlite_url(study.folder), must_exist=True)
+    try:
+        return insert_sessions(engine, study, Secrets.load(study.folder), count, **settings)
+    finally:
+        engine.dispose()
+
+
+def log_in(page: Any, url: str, password: str = PASSWORD) -> None:
+    page.goto(url)
+    page.fill("#password", password)
+    page.keyboard.press("Enter")
+
+
+def picture(page: Any, name: str) -> None:
+    """Writes the page to $PHYSION_SCREENSHOTS, if that is given."""
+    folder = os.environ.get("PHYSION_SCREENSHOTS")
+    if folder:
+        page.screenshot(path=Path(folder) / f"experimenter-{name}.png", full_page=True)
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_all_pages_are_whole(chromium: Any, site: tuple[Study, str], scheme: str) -> None:
+    study, url = site
+    (name, *_) = add(study, 1, seed=len(scheme), ends=("finished",))
+    context = chromium.new_context(color_scheme=scheme, viewport={"width": 1024, "height": 600})
+    page = context.new_page()
+    complaints: list[str] = []
+    page.on("console", lambda message: complaints.append(message.text))
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.on("requestfailed", lambda request: complaints.append(f"{request.url} {request.failure}"))
+    log_in(page, url)
+    page.wait_for_selector("text=Log out")
+    for place in (*PAGES, f"/sessions/{name}"):
+        page.goto(url + place)
+        assert page.evaluate("document.documentElement.scrollWidth") <= 1024, place
+        cut = page.evaluate(
+            "[...document.querySelectorAll('.scroll')].filter(e => e.scrollWidth > e.clientWidth)"
+            ".map(e => e.innerText.slice(0, 80))"
+        )
+        assert cut == [], f"{place}: a table is wider than the window"
+        picture(page, f"{scheme}-{place.strip('/?').replace('/', '-')[:20] or 'overview'}")
+    # The icon of a page that is left at once is given up.
+    assert [words for words in complaints if "ERR_ABORTED" not in words] == []
+    paper = page.evaluate("getComputedStyle(document.body).backgroundColor")
+    assert paper == {"light": "rgb(255, 255, 255)", "dark": "rgb(21, 24, 29)"}[scheme]
+    context.close()
+
+
+def test_the_overview_refreshes_in_place(chromium: Any, site: tuple[Study, str]) -> None:
+    study, url = site
+    context = chromium.new_context()
+    page = context.new_page()
+    page.clock.install()
+    log_in(page, url)
+    page.wait_for_selector("text=Log out")
+    page.goto(f"{url}?kind=preview")
+    count = page.locator(".tabs [aria-current] .count")
+    assert count.inner_text() == "0"
+    page.evaluate("window.same = true")
+    add(study, 3, seed=99, kind="preview")
+    for _ in range(20):
+        page.clock.run_for(30_000)
+        page.wait_for_timeout(500)
+        if count.inner_text() != "0":
+            break
+    assert count.inner_text() == "3"
+    assert page.evaluate("window.same"), "the page was not loaded anew"
+    context.clear_cookies()
+    page.clock.run_for(31_000)
+    page.wait_for_selector("#password")
+    context.close()
+
+
+def test_the_overview_refreshes_without_scripts(chromium: Any, site: tuple[Study, str]) -> None:
+    _, url = site
+    context = chromium.new_context(java_script_enabled=False)
+    page = context.new_page()
+    log_in(page, url)
+    page.wait_for_selector("text=Log out")
+    seconds, _, address = (
+        page.get_attribute("meta[http-equiv=refresh]", "content") or ""
+    ).partition(";url=")
+    assert seconds == "30"
+    page.goto(f"{url.removesuffix(BASE)}{address}")
+    assert page.locator("h1").inner_text() == "Overview"
+    context.close()
+
+
+def test_from_login_to_logout_by_keyboard(chromium: Any, site: tuple[Study, str]) -> None:
+    _, url = site
+    context = chromium.new_context()
+    page = context.new_page()
+    log_in(page, url, "wrong")
+    assert "not the password" in page.locator("[role=alert]").inner_text()
+    page.keyboard.type(PASSWORD)
+    page.keyboard.press("Enter")
+    page.wait_for_selector("text=Log out")
+    (cookie,) = context.cookies()
+    assert cookie["httpOnly"] and cookie["sameSite"] == "Strict" and cookie["path"] == BASE
+    assert page.evaluate("document.cookie") == ""
+    page.goto(f"{url}/export")
+    with page.expect_download(timeout=60_000) as download:
+        page.get_by_role("button", name="Download").press("Enter")
+    assert download.value.suggested_filename.endswith(".zip")
+    page.get_by_role("button", name="Log out").press("Enter")
+    page.wait_for_selector("#password")
+    page.goto(f"{url}/sessions")
+    assert page.url == f"{url}/login"
+    context.close()

@@ -1,0 +1,237 @@
+"""The tables of a study: what the analysis reads, from SQLite and PostgreSQL alike."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import sqlalchemy as sa
+from pandas.testing import assert_frame_equal
+
+from physion.analysis.people.response_schema import SESSION_COLUMNS, TRIAL_COLUMNS, check_table
+from physion.errors import PhysionError, UnknownNameError
+from physion.experiment.experimenter.statistics.summaries import Summaries
+from physion.experiment.export import trial_rows
+from physion.experiment.export.answer_tables import read_tables, snapshot
+from physion.experiment.export.session_rows import (
+    GONE_SCENARIO,
+    NO_CONSENT,
+    PREVIEW,
+    WITHDRAWN,
+    Wanted,
+    read_sessions,
+)
+from physion.experiment.export.trial_rows import read_trials
+from physion.experiment.store.database import open_database, upgrade
+from physion.experiment.store.tables import ANSWERS, SESSIONS
+from physion.experiment.study.identity import Secrets
+from physion.experiment.study.study import Study
+from support.experiment.experimenter_rows import insert_sessions
+from support.experiment.tiny_study import make_tiny_study
+
+NOW = 1_790_000_000.0
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Study:
+    folder = tmp_path_factory.mktemp("study")
+    return make_tiny_study(folder, scenarios=("collide", "drop"), size=64)
+
+
+@pytest.fixture
+def engine(study: Study, database_url: str) -> sa.Engine:
+    """A database of people, simulated participants and previews, in every state."""
+    engine = open_database(database_url)
+    upgrade(engine)
+    secrets = Secrets.load(study.folder)
+    insert_sessions(engine, study, secrets, 40, now=NOW)
+    insert_sessions(engine, study, secrets, 8, kind="simulated", seed=1, now=NOW)
+    insert_sessions(engine, study, secrets, 3, kind="preview", seed=2, now=NOW)
+    return engine
+
+
+def test_the_tables_are_as_the_schema_types_them(engine: sa.Engine, study: Study) -> None:
+    trials, sessions = read_tables(engine, study)
+    assert list(trials.columns) == [column.name for column in TRIAL_COLUMNS]
+    assert list(sessions.columns) == [column.name for column in SESSION_COLUMNS]
+    assert len(trials) > 400 and len(sessions) > 30
+    assert_frame_equal(check_table(trials, TRIAL_COLUMNS, "trials"), trials)
+    assert_frame_equal(check_table(sessions, SESSION_COLUMNS, "sessions"), sessions)
+
+
+def test_every_answer_is_there_once_with_all_that_was_stored(
+    engine: sa.Engine, study: Study
+) -> None:
+    trials, sessions = read_tables(engine, study)
+    labels = {(s.scenario, s.stimulus): s.label for s in study.stimuli}
+    with engine.connect() as connection:
+        query = sa.select(ANSWERS).where(ANSWERS.c.session.in_(list(sessions["session"])))
+        stored = {(r.session, r.phase, r.trial): r for r in connection.execute(query)}
+    assert len(trials) == len(stored)
+    for row in trials.itertuples():
+        answer = stored.pop((row.session, row.phase, row.trial))
+        for name in ("stimulus", "response", "rt_ms", "input", "fixation_ms", "cue_ms", "movie_ms",
+                     "frames_expected", "frames_shown", "frames_dropped", "visibility_changes",
+                     "window_width", "window_height", "resumed"):  # fmt: skip
+            assert getattr(row, name) == getattr(answer, name), name
+        assert row.label == labels[row.scenario, row.stimulus]
+        assert row.correct == ((row.response == "yes") == row.label)
+        at = pd.Timestamp(row.answered_at).timestamp()
+        assert answer.answered_at - 0.001 < at <= answer.answered_at
+    assert not stored
+
+
+def test_order_is_that_of_time(engine: sa.Engine, study: Study) -> None:
+    trials, sessions = read_tables(engine, study)
+    assert list(sessions["started_at"]) == sorted(sessions["started_at"])
+    assert list(trials["session"].unique()) == [
+        session for session in sessions["session"] if session in set(trials["session"])
+    ]
+    for _, rows in trials.groupby("session", sort=False):
+        assert list(rows["phase"]) == sorted(rows["phase"])  # f before t
+        for _, phase in rows.groupby("phase"):
+            assert list(phase["trial"]) == list(range(len(phase)))
+
+
+def test_what_is_left_out_is_counted(engine: sa.Engine, study: Study) -> None:
+    with engine.connect() as connection:
+        stored = pd.DataFrame(connection.execute(sa.select(SESSIONS)).mappings().all())
+    agreed = stored["consented_at"].notna()
+    withdrew = agreed & stored["withdrawn_at"].notna()
+    own = stored["kind"] != "preview"
+    with snapshot(engine) as connection:
+        found = read_sessions(connection, study)
+    assert found.left_out["preview", PREVIEW] == 3
+    for kind in ("person", "simulated"):
+        of_kind = stored["kind"] == kind
+        assert found.left_out[kind, NO_CONSENT] == (of_kind & ~agreed).sum()
+        assert found.left_out[kind, WITHDRAWN] == (of_kind & withdrew).sum()
+    assert found.left_out["person", NO_CONSENT] > 0 < found.left_out["person", WITHDRAWN]
+    kept = stored[own & agreed & ~withdrew]
+    assert set(found.table.column("session").to_pylist()) == set(kept["session"])
+    assert sum(found.states.values()) == len(kept)
+    assert (
+        found.states["person", "finished"]
+        == ((kept["kind"] == "person") & kept["finished_at"].notna()).sum()
+    )
+
+
+def test_kinds_scenario_and_finished_can_be_chosen(engine: sa.Engine, study: Study) -> None:
+    trials, sessions = read_tables(engine, study, kinds=("person",), finished_only=True)
+    assert not trials["simulated"].any() and not sessions["simulated"].any()
+    assert (sessions["finished_at"] != "").all()
+    trials, sessions = read_tables(engine, study, kinds=("simulated",), scenario="drop")
+    assert trials["simulated"].all() and set(trials["scenario"]) == {"drop"}
+    assert set(sessions["scenario"]) == {"drop"}
+    with pytest.raises(UnknownNameError, match="kind"):
+        read_tables(engine, study, kinds=("preview",))
+    with pytest.raises(UnknownNameError, match="collide"):
+        read_tables(engine, study, scenario="colide")
+
+
+def test_an_empty_study_has_empty_tables(study: Study, database_url: str) -> None:
+    engine = open_database(database_url)
+    upgrade(engine)
+    trials, sessions = read_tables(engine, study)
+    assert trials.empty and sessions.empty
+    assert list(trials.columns) == [column.name for column in TRIAL_COLUMNS]
+    assert_frame_equal(check_table(trials, TRIAL_COLUMNS, "trials"), trials)
+
+
+def test_cells_that_are_not_known_are_empty(study: Study, database_url: str) -> None:
+    engine = open_database(database_url)
+    upgrade(engine)
+    nothing = dict.fromkeys(("age", "gender", "education", "technical_problems", "feedback"))
+    insert_sessions(engine, study, Secrets.load(study.folder), 1, ends=("finished",), now=NOW,
+                    **nothing, device={})  # fmt: skip
+    absent = ("fixation_ms", "cue_ms", "frames_shown", "frames_dropped", "movie_ms",
+              "visibility_changes", "window_width", "window_height")  # fmt: skip
+    with engine.connect() as connection, connection.begin():
+        connection.execute(
+            sa.update(ANSWERS).where(ANSWERS.c.trial == 2).values(**dict.fromkeys(absent))
+        )
+        connection.execute(sa.update(ANSWERS).where(ANSWERS.c.trial == 3).values(cue_ms=0.0))
+    trials, sessions = read_tables(engine, study)
+    row = sessions.iloc[0]
+    assert row["feedback"] == "" and row["gender"] == "" and row["user_agent"] == ""
+    assert pd.isna(row["age"]) and pd.isna(row["technical_problems"]) and pd.isna(row["refresh_hz"])
+    assert (trials["trial"] == 2).sum() == 2
+    assert trials.loc[trials["trial"] == 2, list(absent)].isna().all(axis=None)
+    assert (trials.loc[trials["trial"] == 3, "cue_ms"] == 0).all()
+    assert trials.loc[trials["trial"] != 2, list(absent)].notna().all(axis=None)
+    assert_frame_equal(check_table(trials, TRIAL_COLUMNS, "trials"), trials)
+    assert_frame_equal(check_table(sessions, SESSION_COLUMNS, "sessions"), sessions)
+
+
+def test_sessions_of_a_scenario_that_is_gone_are_left_out_by_name(
+    engine: sa.Engine, study: Study
+) -> None:
+    stimuli = tuple(s for s in study.stimuli if s.scenario == "collide")
+    fewer = replace(study, scenarios=("collide",), stimuli=stimuli)
+    _, before = read_tables(engine, study)
+    trials, sessions = read_tables(engine, fewer)
+    assert set(trials["scenario"]) == set(sessions["scenario"]) == {"collide"}
+    assert set(sessions["session"]) == set(before["session"][before["scenario"] == "collide"])
+    with snapshot(engine) as connection:
+        found = read_sessions(connection, fewer)
+    said = GONE_SCENARIO.format(scenario="drop")
+    for kind in ("person", "simulated"):
+        of_kind = before["simulated"] == (kind == "simulated")
+        count = (of_kind & (before["scenario"] == "drop")).sum()
+        assert found.left_out[kind, said] == count > 0
+    # The experimenter's pages go on.
+    summaries = Summaries(fewer, engine).refresh(NOW)
+    stages = {s.stage for s in summaries if s.facts["scenario"] == "drop"}
+    assert stages == {"done", "familiarization"}
+
+
+def test_what_is_written_meanwhile_is_not_seen(
+    engine: sa.Engine, study: Study, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trial_rows, "AT_ONCE", 5)
+    before, _ = read_tables(engine, study)
+    seen = 0
+    with snapshot(engine) as connection:
+        sessions = read_sessions(connection, study, Wanted())
+        for number, part in enumerate(read_trials(connection, study, sessions.table)):
+            seen += part.table.num_rows
+            if number == 0:
+                with engine.connect() as other, other.begin():
+                    other.execute(sa.update(ANSWERS).values(rt_ms=7.0))
+                    other.execute(sa.delete(ANSWERS).where(ANSWERS.c.trial > 2))
+            else:
+                assert 7.0 not in part.table.column("rt_ms").to_pylist()
+    assert seen == len(before)
+    after, _ = read_tables(engine, study)
+    assert len(after) < len(before) and (after["rt_ms"] == 7.0).all()
+
+
+def test_answers_to_stimuli_that_are_gone_are_named(engine: sa.Engine, study: Study) -> None:
+    with engine.connect() as connection, connection.begin():
+        gone = sa.update(ANSWERS).where(ANSWERS.c.trial == 1, ANSWERS.c.phase == "test")
+        connection.execute(gone.values(stimulus="gone"))
+    with pytest.raises(PhysionError, match="the first to gone"):
+        read_tables(engine, study)
+    with snapshot(engine) as connection:
+        sessions = read_sessions(connection, study, Wanted())
+        parts = list(read_trials(connection, study, sessions.table))
+    assert {name for part in parts for name in part.unknown} == {"gone"}
+    assert sum(len(part.unknown) for part in parts) > 20
+    assert all(part.counts.sum() == part.table.num_rows for part in parts)
+
+
+def test_both_databases_give_the_same(
+    study: Study, tmp_path: Path, fresh_postgres: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tables = []
+    for url in (f"sqlite:///{tmp_path / 'one.sqlite'}", fresh_postgres):
+        engine = open_database(url)
+        upgrade(engine)
+        names = iter(f"{number:032x}" for number in range(100))
+        monkeypatch.setattr("support.experiment.experimenter_rows.new_session", lambda names=names: next(names))
+        insert_sessions(engine, study, Secrets.load(study.folder), 12, now=NOW + 1 / 3)
+        tables.append(read_tables(engine, study))
+    for one, other in zip(*tables, strict=True):
+        assert_frame_equal(one, other)

@@ -1,0 +1,433 @@
+"""The exported folder: what the analysis reads, whole or not at all, and nothing that is secret."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import sqlalchemy as sa
+from pandas.testing import assert_frame_equal
+
+from physion.analysis.people.exclusions import flag_sessions
+from physion.analysis.people.participants import read_responses
+from physion.analysis.people.response_schema import check_table
+from physion.analysis.tables.csv_table import read_table
+from physion.cli.experiment import export as experiment_export
+from physion.cli.main import main
+from physion.errors import BadInputError, PhysionError
+from physion.experiment.export import export_study as export
+from physion.experiment.export import large_tables as export_tables
+from physion.experiment.export.answer_tables import read_tables
+from physion.experiment.export.export_study import GONE, NO_FILE, TABLES, export_study
+from physion.experiment.export.spreadsheet import restore_cell
+from physion.experiment.store.database import open_database, sqlite_url, upgrade
+from physion.experiment.store.tables import ANSWERS, RAW_IDS, SESSIONS, STUDIES
+from physion.experiment.study.identity import Secrets
+from physion.experiment.study.study import Recruitment, Study
+from physion.report.people_results import read_expected
+from support.experiment import experimenter_rows
+from support.experiment.experimenter_rows import insert_sessions
+from support.experiment.tiny_study import make_tiny_study
+
+NOW = 1_790_000_000.0
+NASTY = '=HYPERLINK("http://evil","x")\n-2;@SUM(1)\t+3, "quoted"\rend'
+CODE = "COMPLETION-CODE-17"
+SONA = f"https://lab.sona-systems.com/webstudy_credit.aspx?experiment_id=1&credit_token={CODE}"
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Study:
+    folder = tmp_path_factory.mktemp("study")
+    return make_tiny_study(
+        folder,
+        scenarios=("collide", "drop"),
+        size=64,
+        recruitment=Recruitment(prolific_code=CODE, sona_address=SONA),
+    )
+
+
+Fill = Callable[[str], sa.Engine]
+
+
+@pytest.fixture
+def fill(study: Study, monkeypatch: pytest.MonkeyPatch) -> Fill:
+    """Fills a database with people, simulated participants and previews; always the same rows."""
+
+    def filled(url: str) -> sa.Engine:
+        numbers = iter(range(1000))
+        monkeypatch.setattr(experimenter_rows, "new_session", lambda: f"{next(numbers):032x}")
+        engine = open_database(url)
+        upgrade(engine)
+        secrets = Secrets.load(study.folder)
+        insert_sessions(engine, study, secrets, 30, now=NOW)
+        insert_sessions(engine, study, secrets, 4, ends=("finished",), seed=3, now=NOW,
+                        feedback=NASTY, gender="=woman", age=None)  # fmt: skip
+        insert_sessions(engine, study, secrets, 8, kind="simulated", seed=1, now=NOW)
+        insert_sessions(engine, study, secrets, 3, kind="preview", seed=2, now=NOW)
+        settings = vars(study) | {"folder": str(study.folder), "stimuli": [], "texts": {}}
+        settings = json.loads(json.dumps(settings, default=vars))
+        with engine.begin() as connection:
+            connection.execute(sa.update(STUDIES).values(settings=settings))
+        return engine
+
+    return filled
+
+
+@pytest.fixture
+def engine(fill: Fill, database_url: str) -> sa.Engine:
+    return fill(database_url)
+
+
+@pytest.fixture
+def small(fill: Fill, tmp_path: Path) -> sa.Engine:
+    """The same on SQLite alone, for what does not depend on the database."""
+    return fill(f"sqlite:///{tmp_path / 'small.sqlite'}")
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+# --- what is in it ------------------------------------------------------------------------------
+
+
+def test_the_analysis_reads_what_is_exported(
+    engine: sa.Engine, study: Study, tmp_path: Path
+) -> None:
+    report = export_study(engine, study, tmp_path / "out")
+    trials, sessions = read_tables(engine, study)
+    assert report.rows["trials"] == len(trials) and report.rows["sessions"] == len(sessions)
+    out = tmp_path / "out"
+    found = read_responses(out / "trials.csv", out / "sessions.csv", simulated=True)
+    assert len(found.trials) == len(trials) and found.dropped.empty
+    assert found.sessions["session"].tolist() == sessions["session"].tolist()
+    joined = found.trials.merge(trials, on=["session", "phase", "trial"], suffixes=("", "_stored"))
+    for name in ("stimulus", "participant", "label", "correct", "rt_ms", "answered_at", "resumed"):
+        assert (joined[name] == joined[f"{name}_stored"]).all(), name
+    people = read_responses(out / "trials.csv", out / "sessions.csv")
+    assert people.dropped["sessions"].sum() > 0 and not people.sessions["simulated"].any()
+    flags = flag_sessions(people, expected=read_expected(out / "expected.csv"))
+    assert set(flags["expected"]) == {6}
+    unfinished = sessions.loc[~sessions["simulated"] & (sessions["finished_at"] == ""), "session"]
+    assert set(flags.loc[flags["incomplete"], "session"]) == set(unfinished)
+
+
+def test_csv_and_parquet_hold_the_same(engine: sa.Engine, study: Study, tmp_path: Path) -> None:
+    out = export_study(engine, study, tmp_path / "out").out
+    tables = dict(zip(("trials", "sessions"), read_tables(engine, study), strict=True))
+    for name in ("trials", "sessions", "events"):
+        typed = check_table(read_table(out / f"{name}.parquet", ()), TABLES[name], name)
+        text = check_table(read_table(out / f"{name}.csv", ()), TABLES[name], name)
+        for column in TABLES[name]:
+            if column.kind == "text":
+                text[column.name] = text[column.name].map(restore_cell).str.strip()
+        assert list(text.columns) == [column.name for column in TABLES[name]]
+        assert_frame_equal(text, typed)
+        if name in tables:
+            assert_frame_equal(typed, check_table(tables[name], TABLES[name], name))
+    nasty = pd.read_parquet(out / "sessions.parquet")["feedback"]
+    assert (nasty == NASTY).sum() == 4
+    assert b"=HYPERLINK" not in (out / "sessions.csv").read_bytes().replace(b"'=HYPERLINK", b"")
+
+
+def test_details_and_events_are_there(small: sa.Engine, study: Study, tmp_path: Path) -> None:
+    with small.begin() as connection:
+        connection.execute(
+            sa.update(ANSWERS).where(ANSWERS.c.trial == 2).values(details='{"flashes":[1.5]}')
+        )
+    out = export_study(small, study, tmp_path / "out").out
+    details = pd.read_parquet(out / "trial_details.parquet")
+    trials = pd.read_parquet(out / "trials.parquet")
+    keys = ["session", "phase", "trial"]
+    assert_frame_equal(details[keys], trials[keys])
+    third = details["trial"] == 2
+    assert (details.loc[third, "details"] == '{"flashes":[1.5]}').all() and third.sum() > 40
+    assert (details.loc[~third, "details"] == "{}").all()
+    events = pd.read_parquet(out / "events.parquet")
+    sessions = pd.read_parquet(out / "sessions.parquet")
+    assert events["session"].tolist() == sessions["session"].tolist()
+    assert json.loads(events["data"][0]) == {"trial": 3} and (events["number"] == 0).all()
+    words = json.loads((out / "data_dictionary.json").read_bytes())
+    for name in ("trials", "sessions", "events"):
+        header = (out / f"{name}.csv").read_text().partition("\n")[0].split(",")
+        assert [entry["name"] for entry in words[name]] == header
+    assert [entry["name"] for entry in words["trial_details"]] == list(details.columns)
+    assert "apostrophe" in words["spreadsheet_safety"]
+
+
+def test_the_same_data_give_the_same_bytes(
+    fill: Fill, study: Study, tmp_path: Path, fresh_postgres: str
+) -> None:
+    urls = [f"sqlite:///{tmp_path / name}.sqlite" for name in ("one", "two")] + [fresh_postgres]
+    exports = []
+    for number, url in enumerate(urls):
+        export_study(fill(url), study, tmp_path / str(number))
+        exports.append(contents(tmp_path / str(number)))
+    assert len(exports[0]) > 60
+    for other in exports[1:]:
+        assert other == exports[0]
+
+
+def test_what_was_left_out_is_said(small: sa.Engine, study: Study, tmp_path: Path) -> None:
+    with small.begin() as connection:
+        first = sa.select(ANSWERS.c.session).join(SESSIONS).where(
+            SESSIONS.c.kind == "person", SESSIONS.c.finished_at.is_not(None)
+        )  # fmt: skip
+        session = connection.execute(first).scalars().first()
+        query = sa.update(ANSWERS).where(ANSWERS.c.session == session, ANSWERS.c.trial == 1)
+        connection.execute(query.values(stimulus="gone"))
+        unanswered = dict.fromkeys(("answered_test", "answered_familiarization"), 0)
+        only = sa.select(sa.func.max(SESSIONS.c.session)).where(
+            SESSIONS.c.kind == "person", SESSIONS.c.finished_at.is_not(None)
+        )
+        name = connection.scalar(only)
+        assert name != session
+        connection.execute(sa.delete(ANSWERS).where(ANSWERS.c.session == name))
+        connection.execute(
+            sa.update(SESSIONS).where(SESSIONS.c.session == name).values(**unanswered)
+        )
+    report = export_study(small, study, tmp_path / "out")
+    counts = {(e["what"], e["kind"], e["reason"]): e["count"] for e in report.left_out}
+    assert counts["answer", "any", GONE] == 2
+    assert counts["session", "any", NO_FILE] >= 1
+    with small.connect() as connection:
+        rows = connection.execute(sa.select(SESSIONS)).fetchall()
+    agreed = [r for r in rows if r.kind == "person" and r.consented_at is not None]
+    withdrew = sum(r.withdrawn_at is not None for r in agreed)
+    assert counts["session", "person", "the participant withdrew"] == withdrew > 0
+    assert sum(report.sessions["person"].values()) == len(agreed) - withdrew
+    trials, sessions = (
+        pd.read_parquet(tmp_path / "out" / f"{name}.parquet") for name in ("trials", "sessions")
+    )
+    latest = [trials["answered_at"].max(), sessions["finished_at"].dropna().max()]
+    assert report.until == max(latest)
+    manifest = json.loads((tmp_path / "out" / "export.json").read_bytes())
+    assert manifest["left_out"] == list(report.left_out)
+    assert (
+        f"left out: {withdrew} sessions (person): the participant withdrew"
+        in (tmp_path / "out" / "README.md").read_text()
+    )
+
+
+def test_nothing_secret_is_exported(small: sa.Engine, study: Study, tmp_path: Path) -> None:
+    out = export_study(small, study, tmp_path / "out").out
+    with small.connect() as connection:
+        raw = list(connection.execute(sa.select(RAW_IDS.c.raw_id)).scalars())
+        absent = connection.execute(
+            sa.select(SESSIONS.c.session, SESSIONS.c.participant).where(
+                (SESSIONS.c.kind == "preview")
+                | SESSIONS.c.withdrawn_at.is_not(None)
+                | SESSIONS.c.consented_at.is_(None)
+            )
+        ).fetchall()
+    assert len(raw) == 45 and len(absent) > 8
+    secret = [
+        line for line in (study.folder / "secret.json").read_text().split('"') if len(line) > 15
+    ]
+    assert secret
+    words = [*raw, CODE, *secret, str(study.folder), *(word for row in absent for word in row)]
+    for path in sorted(out.rglob("*")):
+        content = path.name.encode()
+        if path.suffix == ".parquet":
+            content += pd.read_parquet(path).to_csv().encode()
+        elif path.is_file():
+            content += path.read_bytes()
+        found = [word for word in words if word.encode() in content]
+        assert not found, (path, found)
+    settings = json.loads((out / "study.json").read_bytes())["states"]
+    assert settings[0]["settings"]["title"] == study.title
+
+
+def test_people_alone_and_one_scenario(small: sa.Engine, study: Study, tmp_path: Path) -> None:
+    report = export_study(
+        small, study, tmp_path / "out", simulated=False, scenario="drop", layout="psych-ds"
+    )
+    assert set(report.sessions) == {"person"}
+    trials = pd.read_csv(tmp_path / "out" / "trials.csv")
+    assert set(trials["scenario"]) == {"drop"} and not trials["simulated"].any()
+    reasons = {entry["reason"] for entry in report.left_out}
+    assert "simulated, which was not asked for" in reasons
+    assert not (tmp_path / "out" / "bids").exists() and (tmp_path / "out" / "psych-ds").is_dir()
+
+
+def test_a_study_without_data_is_exported_all_the_same(study: Study, tmp_path: Path) -> None:
+    engine = open_database(f"sqlite:///{tmp_path / 'empty.sqlite'}")
+    upgrade(engine)
+    report = export_study(engine, study, tmp_path / "out")
+    assert report.rows == {"trials": 0, "sessions": 0, "events": 0, "trial_details": 0}
+    assert report.until is None and report.sessions == {}
+    assert len((tmp_path / "out" / "trials.csv").read_text().splitlines()) == 1
+
+
+# --- whole or not at all ------------------------------------------------------------------------
+
+
+def test_a_failure_leaves_nothing_and_the_old_export(
+    small: sa.Engine, study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+
+    def fails(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(export, "write_psych_ds", fails)
+        with pytest.raises(OSError, match="No space"):
+            export_study(small, study, out)
+    assert not list(tmp_path.glob("*out*"))
+    export_study(small, study, out)
+    before = contents(out)
+    for module, name in ((export, "write_manifest"), (export_tables, "read_trials")):
+        with monkeypatch.context() as broken:
+            broken.setattr(module, name, fails)
+            with pytest.raises(OSError, match="No space"):
+                export_study(small, study, out)
+        assert contents(out) == before
+        assert [path.name for path in tmp_path.glob("*out*")] == ["out"]
+
+
+def test_a_failure_while_writing_behind_is_not_lost(
+    small: sa.Engine, study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(export.BidsFolder, "write", fails)
+    with pytest.raises(OSError, match="No space"):
+        export_study(small, study, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_export_is_replaced_and_nothing_else(
+    small: sa.Engine, study: Study, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    export_study(small, study, out, simulated=False)
+    export_study(small, study, out)
+    both = contents(out)
+    (out / "bids" / "notes.txt").write_text("mine")
+    with pytest.raises(BadInputError, match="files were added"):
+        export_study(small, study, out)
+    (out / "bids" / "notes.txt").unlink()
+    export_study(small, study, out)
+    assert contents(out) == both
+    (out / "export.json").write_text("{}")
+    with pytest.raises(BadInputError, match="something else"):
+        export_study(small, study, out)
+    own = tmp_path / "own"
+    own.mkdir()
+    export_study(small, study, own)  # an empty folder is nobody's
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "thesis.tex").write_text("mine")
+    (tmp_path / "link").symlink_to(other)
+    (tmp_path / "file").write_text("mine")
+    for path in (other, tmp_path / "link", tmp_path / "file"):
+        with pytest.raises(BadInputError, match="choose another"):
+            export_study(small, study, path)
+    assert (other / "thesis.tex").read_text() == "mine"
+
+
+def test_what_a_killed_export_left_is_cleared_away(
+    small: sa.Engine, study: Study, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    export_study(small, study, out)
+    whole = contents(out)
+    out.rename(tmp_path / ".out.old")  # killed between the two renamings
+    (tmp_path / ".out.part" / "bids").mkdir(parents=True)
+    (tmp_path / ".out.part" / "trials.csv").write_text("half a")
+    export_study(small, study, out)
+    assert contents(out) == whole
+    assert [path.name for path in tmp_path.glob("*out*")] == ["out"]
+
+
+def test_two_exports_do_not_meet(
+    small: sa.Engine, study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inner: list[Exception] = []
+    original = export.read_sessions
+
+    def once_more(*words: object) -> object:
+        monkeypatch.setattr(export, "read_sessions", original)
+        with pytest.raises(PhysionError, match="another process") as refused:
+            export_study(small, study, tmp_path / "out")
+        inner.append(refused.value)
+        return original(*words)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(export, "read_sessions", once_more)
+    export_study(small, study, tmp_path / "out")
+    assert inner and (tmp_path / "out" / "export.json").exists()
+
+
+def test_others_on_the_machine_cannot_read_it(
+    small: sa.Engine, study: Study, tmp_path: Path
+) -> None:
+    out = export_study(small, study, tmp_path / "out").out
+    assert out.stat().st_mode & 0o077 == 0
+
+
+@pytest.mark.slow
+def test_physion_compare_takes_the_export(
+    study: Study, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    engine = open_database(f"sqlite:///{tmp_path / 'people.sqlite'}")
+    upgrade(engine)
+    insert_sessions(engine, study, Secrets.load(study.folder), 24, ends=("finished",), now=NOW,
+                    feedback=NASTY)  # fmt: skip
+    insert_sessions(engine, study, Secrets.load(study.folder), 4, kind="simulated", seed=1)
+    out = export_study(engine, study, tmp_path / "out").out
+    rows = [
+        {
+            "Model": "guesser", "Readout Type": "C", "Readout Test Data": stimulus.scenario,
+            "Predicted Prob_true": 0.3 + 0.05 * (place % 10), "Predicted Outcome": place % 10 > 4,
+            "Actual Outcome": stimulus.label, "Stimulus Name": stimulus.stimulus,
+            "Dynamics Training Dataset": "all",
+        }
+        for place, stimulus in enumerate(study.stimuli)
+        if stimulus.phase == "test"
+    ]  # fmt: skip
+    pd.DataFrame(rows).to_csv(tmp_path / "predictions.csv", index=False)
+    words = ["compare", str(tmp_path / "predictions.csv"), "--responses", str(out / "trials.csv"),
+             "--sessions", str(out / "sessions.csv"), "--expected", str(out / "expected.csv"),
+             "--resamples", "50", "--out", str(tmp_path / "report"), "--json"]  # fmt: skip
+    assert main(words) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert Path(said["report"]).is_file()
+    people = {row["scenario"]: (row["people"], row["stimuli"]) for row in said["people"]}
+    assert people["collide"] == people["drop"] == (12, 6)
+    left_out = {row["reason"]: row["sessions"] for row in said["people_left_out"]}
+    assert left_out == {"session of a simulated participant": 2}  # of either scenario
+    incomplete = [r for r in said["people_flag_counts"] if r["rule"] == "incomplete"]
+    assert [row["sessions"] for row in incomplete] == [0, 0]
+
+
+# --- the verb -----------------------------------------------------------------------------------
+
+
+def test_the_verb_exports_and_says_what(
+    study: Study, fill: Fill, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    engine = fill(sqlite_url(study.folder))
+    try:
+        options = experiment_export.Options(study.folder, out=tmp_path / "out", json=True)
+        assert experiment_export.main(options) == 0
+        said = json.loads(capsys.readouterr().out)
+        assert said["out"] == str(tmp_path / "out") and said["rows"]["trials"] > 300
+        assert experiment_export.main(experiment_export.Options(study.folder)) == 0
+        text = capsys.readouterr().out
+        assert f"rows: {said['rows']['trials']} trials, " in text
+        assert contents(study.folder / "export") == contents(tmp_path / "out")
+    finally:
+        engine.dispose()
+        for path in study.folder.glob("responses.sqlite*"):
+            path.unlink()
+    with pytest.raises(BadInputError, match="was the study served"):
+        experiment_export.main(experiment_export.Options(study.folder))

@@ -1,0 +1,166 @@
+"""Simulated participants: how they answer, and what a simulation leaves in the database."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
+
+from physion.cli.main import main
+from physion.errors import UnknownNameError
+from physion.experiment.simulated.participants import Plan, Visit, simulate
+from physion.experiment.simulated.person import SimulatedPerson
+from physion.experiment.simulated.server_process import OwnServer
+from physion.experiment.study.identity import Secrets
+from physion.experiment.study.stimuli import Stimulus
+from physion.experiment.study.study import Study
+from support.experiment.serving import stored_answers, stored_sessions
+from support.experiment.tiny_study import make_tiny_study
+
+
+def _stimulus(number: int, label: bool) -> Stimulus:
+    return Stimulus(
+        stimulus=f"stimulus-{number}", scenario="collide", phase="test", place=number, label=label,
+        movie="", map="", full="", frames=45, full_frames=0, rate=30.0, width=8, height=8,
+        look="free",
+    )  # fmt: skip
+
+
+def test_a_person_answers_the_same_again_and_others_differ() -> None:
+    stimuli = [_stimulus(number, number % 2 == 0) for number in range(40)]
+    first = [SimulatedPerson(0, 1).predict(stimulus) for stimulus in stimuli]
+    assert first == [SimulatedPerson(0, 1).predict(stimulus) for stimulus in stimuli]
+    assert first != [SimulatedPerson(0, 2).predict(stimulus) for stimulus in stimuli]
+    assert first != [SimulatedPerson(1, 1).predict(stimulus) for stimulus in stimuli]
+    assert {one.response for one in first} == {"yes", "no"}
+
+
+def test_people_are_right_as_often_as_they_should_be_and_slower_where_it_is_hard() -> None:
+    people = [SimulatedPerson(0, number) for number in range(100)]
+    stimuli = [_stimulus(number, number % 2 == 0) for number in range(60)]
+    chance = np.array([[p.chance(s) for s in stimuli] for p in people])
+    answers = [[p.predict(s) for s in stimuli] for p in people]
+    right = np.array([[(a.response == "yes") == s.label for a, s in zip(row, stimuli, strict=True)]
+                      for row in answers])  # fmt: skip
+    rt = np.array([[a.rt_ms for a in row] for row in answers])
+    # 6000 tosses: the mean is within 0.02 of its expectation (3 standard errors), leaning apart.
+    assert abs(right.mean() - chance.mean()) < 0.02
+    assert 0.65 < right.mean() < 0.8
+    easy = chance.mean(axis=0) > np.median(chance.mean(axis=0))
+    assert right[:, easy].mean() > right[:, ~easy].mean() + 0.15
+    assert np.log(rt[:, easy]).mean() < np.log(rt[:, ~easy]).mean()
+    assert rt.min() > 0
+
+
+def test_a_share_of_the_people_leaves() -> None:
+    leaving = [SimulatedPerson(0, n).leaves_before(150, 0.1) for n in range(1000)]
+    places = [place for place in leaving if place is not None]
+    assert 70 < len(places) < 130
+    assert min(places) >= 0 and max(places) < 150 and len(set(places)) > 30
+    assert all(SimulatedPerson(0, n).leaves_before(150, 0.0) is None for n in range(100))
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Study:
+    folder = tmp_path_factory.mktemp("simulated") / "study"
+    return make_tiny_study(folder, test=4, familiarization=2, scenarios=("collide", "drop"))
+
+
+@pytest.fixture(scope="module")
+def served(study: Study) -> tuple[OwnServer, list[Visit], list[Visit]]:
+    """Two simulations on one server: some people leave, then they come back."""
+    plan = Plan(url="", participants=8, dropouts=0.5, seed=5)
+    secrets = Secrets.load(study.folder)
+    with OwnServer(study.folder) as server:
+        plan = replace(plan, url=server.url)
+        first = asyncio.run(simulate(study, secrets, plan))
+        second = asyncio.run(simulate(study, secrets, replace(plan, dropouts=0.0)))
+    return server, first, second
+
+
+def test_people_finish_or_leave_and_come_back(
+    served: tuple[OwnServer, list[Visit], list[Visit]],
+) -> None:
+    _, first, second = served
+    assert {visit.outcome for visit in first} == {"done", "left"}
+    assert {visit.scenario for visit in first} == {"collide", "drop"}
+    for before, after in zip(first, second, strict=True):
+        assert after.outcome == ("done before" if before.outcome == "done" else "done"), after
+        assert len(before.answers) + len(after.answers) == 6
+        if before.result is not None:
+            right = sum(a.phase == "test" for a in before.answers)
+            assert right == 4 and 0 <= before.result.accuracy <= 1
+
+
+def test_simulated_is_written_in_the_data_for_good(
+    study: Study, served: tuple[OwnServer, list[Visit], list[Visit]]
+) -> None:
+    _, first, second = served
+    sessions = stored_sessions(study)
+    assert len(sessions) == 8 and {session.kind for session in sessions.values()} == {"simulated"}
+    assert all(session.finished_at for session in sessions.values())
+    told = [(visit.reference, a) for visit in (*first, *second) for a in visit.answers]
+    stored = stored_answers(study)
+    assert len(stored) == 48
+    for reference, answer in told:
+        row = stored[reference, answer.phase, answer.trial]
+        assert (row.key, row.stimulus, row.response, row.rt_ms) == (
+            answer.key, answer.stimulus, answer.response, answer.rt_ms
+        )  # fmt: skip
+    labels = {s.stimulus: s.label for s in study.stimuli}
+    for visit in first:
+        if visit.result is not None:
+            right = [(a.response == "yes") == labels[a.stimulus]
+                     for a in visit.answers if a.phase == "test"]  # fmt: skip
+            assert visit.result.correct == sum(right)
+
+
+@pytest.mark.slow
+def test_the_verb_serves_by_itself_and_prints(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = make_tiny_study(tmp_path / "study", test=2, familiarization=1).folder
+    words = ["experiment", "simulate", str(folder), "--participants", "3", "--dropouts", "0"]
+    assert main([*words, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["done"], found["answers"], found["reasons"]) == (3, 9, {})
+    assert 0 <= found["mean_accuracy"] <= 1
+    assert main(words) == 0
+    assert "3 done before" in capsys.readouterr().out
+
+
+def test_another_study_s_server_refuses_the_pilot_link(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mine = make_tiny_study(tmp_path / "mine", test=2, familiarization=1)
+    other = make_tiny_study(tmp_path / "other", test=2, familiarization=1)
+    with OwnServer(other.folder) as server:
+        words = ["--participants", "2", "--url", server.url]
+        assert main(["experiment", "simulate", str(mine.folder), *words]) == 1
+    out = capsys.readouterr().out
+    assert "2 refused" in out and "bad_link" in out
+    assert not stored_sessions(other)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [(["--participants", "0"], "--participants"), (["--dropouts", "1.5"], "--dropouts"),
+     (["--pace", "-1"], "--pace"), (["--url", "x", "--database", "y"], "--database")],
+)  # fmt: skip
+def test_bad_options_are_refused(
+    study: Study, words: list[str], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["experiment", "simulate", str(study.folder), *words]) == 2
+    assert told in capsys.readouterr().err
+
+
+def test_an_unknown_scenario_is_refused_before_anything_is_sent(study: Study) -> None:
+    plan = Plan(url="http://127.0.0.1:1", scenario="colide")
+    with pytest.raises(UnknownNameError, match="collide"):
+        asyncio.run(simulate(study, Secrets.load(study.folder), plan))

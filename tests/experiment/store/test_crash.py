@@ -1,0 +1,188 @@
+"""The server is killed under load, again and again: no acknowledged answer is lost or doubled.
+
+Simulated participants go through the study while the server, or PostgreSQL under it, is ended as by
+``kill -9`` at random moments and started again. They ask again with the same key until they are
+answered, as the pages do. Afterwards every answer that was acknowledged must be in the database as
+it was sent, once, and every session must be complete.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
+
+import sqlalchemy as sa
+from sqlalchemy.engine import make_url
+
+from physion.experiment.simulated.participants import Plan, Visit, simulate
+from physion.experiment.store.database import open_database, sqlite_url
+from physion.experiment.study.identity import Secrets
+from physion.experiment.study.study import Limits, Study
+from support.experiment.postgres import Cluster
+from support.experiment.serving import QuickServer, stored_answers, stored_sessions
+from support.experiment.tiny_study import make_tiny_study
+
+KILLS, POSTGRES_KILLS, DATABASE_CRASHES = 50, 8, 3
+PHASES = {"familiarization": 3, "test": 12}
+FAST = Limits(
+    requests_per_second=10_000, burst=100_000, sessions_per_minute=100_000, sessions_at_once=100_000
+)
+"""Limits that do not slow the load down; they are tested elsewhere."""
+LONGEST_RUN_S = 0.4
+"""A kill comes at a random moment up to so long after the server is there."""
+
+
+class Load:
+    """Participants who keep coming until they are told to stop; then the last ones finish."""
+
+    def __init__(self, study: Study, url: str, people: int) -> None:
+        self._study, self._secrets = study, Secrets.load(study.folder)
+        self._url, self._people = url, people
+        self._stopping = threading.Event()
+        self.waves: list[list[Visit]] = []
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._run()), daemon=True)
+        self.error: BaseException | None = None
+
+    async def _run(self) -> None:
+        try:
+            await asyncio.gather(*(self._come(place) for place in range(3)))
+        except BaseException as error:
+            self.error = error
+
+    async def _come(self, place: int) -> None:
+        wave = 0
+        while not self._stopping.is_set():
+            # Asked again soon and often, but so that the server still gets the processor.
+            plan = Plan(
+                self._url, self._people, seed=1000 * place + wave, dropouts=0.0, pace=0.01,
+                waits_s=(0.05, 0.4), patience_s=90.0, media=False,
+            )  # fmt: skip
+            self.waves.append(await simulate(self._study, self._secrets, plan))
+            wave += 1
+
+    def __enter__(self) -> Load:
+        self._thread.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self._stopping.set()
+        if kind is not None:  # there may be no server any more
+            return
+        self._thread.join(120)
+        assert not self._thread.is_alive(), "the participants did not get to the end"
+        if self.error is not None:
+            raise self.error
+
+    @property
+    def visits(self) -> list[Visit]:
+        """Everybody who came."""
+        return [visit for wave in self.waves for visit in wave]
+
+
+def kill_again_and_again(server: QuickServer, kills: int, seed: int) -> None:
+    """Kill at random moments, most of them in work and some while the server starts."""
+    rng = np.random.default_rng(seed)
+    for number in range(kills):
+        time.sleep(rng.random() * LONGEST_RUN_S)
+        server.kill()
+        if number % 10 == 5:
+            server.launch()
+            time.sleep(rng.random() * LONGEST_RUN_S)
+            server.kill()
+        server.start()
+
+
+def check(study: Study, visits: list[Visit], url: str | None = None) -> None:
+    """All that was acknowledged is there once and unaltered, and all sessions are complete."""
+    assert {visit.outcome for visit in visits} == {"done"}, [
+        visit for visit in visits if visit.outcome != "done"
+    ][:3]
+    stored, sessions = stored_answers(study, url), stored_sessions(study, url)
+    told = {(visit.reference, a.phase, a.trial): a for visit in visits for a in visit.answers}
+    assert len(told) == sum(len(visit.answers) for visit in visits), "acknowledged twice"
+    for place, answer in told.items():
+        row = stored[place]
+        sent = (answer.key, answer.stimulus, answer.response, answer.rt_ms)
+        assert (row.key, row.stimulus, row.response, row.rt_ms) == sent
+    assert len(sessions) == len(visits)
+    assert len(stored) == len(visits) * sum(PHASES.values())
+    for session in sessions.values():
+        assert session.finished_at is not None and session.kind == "simulated"
+        assert session.answered_familiarization == PHASES["familiarization"]
+        assert session.answered_test == PHASES["test"]
+
+
+def make_study(folder: Path) -> Study:
+    return make_tiny_study(
+        folder, familiarization=PHASES["familiarization"], test=PHASES["test"], limits=FAST
+    )
+
+
+@pytest.mark.slow
+def test_sqlite_loses_nothing_when_the_server_is_killed_fifty_times(tmp_path: Path) -> None:
+    study = make_study(tmp_path / "study")
+    with QuickServer(study.folder) as server, Load(study, server.url, people=5) as load:
+        kill_again_and_again(server, KILLS, seed=1)
+    assert sum(visit.retries for visit in load.visits) > KILLS, "the kills met no load"
+    check(study, load.visits)
+    engine = open_database(sqlite_url(study.folder), must_exist=True)
+    with engine.connect() as connection:
+        assert connection.scalar(sa.text("PRAGMA integrity_check")) == "ok"
+    engine.dispose()
+
+
+@pytest.mark.slow
+def test_postgresql_loses_nothing_when_the_server_is_killed(
+    tmp_path: Path, fresh_postgres: str
+) -> None:
+    study = make_study(tmp_path / "study")
+    with (
+        QuickServer(study.folder, fresh_postgres) as server,
+        Load(study, server.url, people=5) as load,
+    ):
+        kill_again_and_again(server, POSTGRES_KILLS, seed=2)
+    assert sum(visit.retries for visit in load.visits) > POSTGRES_KILLS
+    check(study, load.visits, fresh_postgres)
+
+
+@pytest.fixture
+def own_postgres(postgres_cluster: Cluster) -> Iterator[str]:
+    """A database on our own cluster, which may be crashed."""
+    server = make_url(postgres_cluster.url).set(drivername="postgresql+psycopg")
+    engine = sa.create_engine(server, isolation_level="AUTOCOMMIT", poolclass=sa.NullPool)
+    with engine.connect() as connection:
+        connection.execute(sa.text("CREATE DATABASE crashed"))
+    yield server.set(database="crashed").render_as_string(hide_password=False)
+    with engine.connect() as connection:
+        connection.execute(sa.text("DROP DATABASE crashed WITH (FORCE)"))
+
+
+@pytest.mark.slow
+def test_the_server_outlives_a_crash_of_postgresql_and_loses_nothing(
+    tmp_path: Path, postgres_cluster: Cluster, own_postgres: str
+) -> None:
+    study = make_study(tmp_path / "study")
+    rng = np.random.default_rng(3)
+    with (
+        QuickServer(study.folder, own_postgres) as server,
+        Load(study, server.url, people=5) as load,
+    ):
+        process = server.pid
+        for _ in range(DATABASE_CRASHES):
+            time.sleep(0.5 + rng.random())
+            postgres_cluster.stop("immediate")
+            time.sleep(rng.random())
+            postgres_cluster.start()
+        time.sleep(1)
+        assert server.pid == process and server.is_running, server.last_words()
+        before = sum(len(visit.answers) for visit in load.visits)
+    assert sum(len(visit.answers) for visit in load.visits) > before, "nobody went on"
+    check(study, load.visits, own_postgres)

@@ -1,0 +1,238 @@
+"""Raw ids are deleted so that no byte of them stays; passwords are changed at the command line."""
+
+from __future__ import annotations
+
+import io
+import json
+import sqlite3
+from pathlib import Path
+
+import pytest
+
+from physion.cli.main import main
+from physion.errors import BadInputError, PhysionError
+from physion.experiment.protocol.messages import Device, Enter, Event, Events
+from physion.experiment.store.forget import forget, forget_raw_ids, forget_sessions
+from physion.experiment.store.store import Store
+from physion.experiment.store.tables import ANSWERS, EVENTS, RAW_IDS, SESSIONS, TOKENS
+from physion.experiment.study.identity import Secrets, check_password, participant_hash
+from physion.experiment.study.study import Study
+from support.experiment.store_walk import enter, give, page, refusal, rows, run, walk
+from support.experiment.tiny_study import PASSWORD
+
+
+def raw_id(number: int) -> str:
+    return f"5f1eada{number:04d}b0b" * 4
+
+
+def fill(store: Store, count: int = 60) -> None:
+    """People with ids and parameters, some of whom come again, and data around them."""
+    for number in range(count):
+        more = {"STUDY_ID": f"visit-first-{number:04d}"}
+        token = enter(store, raw_id(number), source="prolific", recruiter=more, scenario="drop")
+        if number % 5 == 0:
+            page(store, token, "consent")
+            page(store, token, "withdraw")
+    for number in range(1, count, 3):
+        if number % 5:
+            more = {"STUDY_ID": f"visit-again-{number:04d}" * 5}
+            enter(store, raw_id(number), source="prolific", recruiter=more)
+
+
+def bytes_of(folder: Path) -> bytes:
+    return b"".join(path.read_bytes() for path in sorted(folder.glob("*.sqlite*")))
+
+
+@pytest.fixture
+def database(tmp_path: Path, small_study: Study, small_secrets: Secrets) -> str:
+    from dataclasses import replace
+
+    url = f"sqlite:///{tmp_path / 'responses.sqlite'}"
+    store = Store.open(replace(small_study, participants=1000), small_secrets, url)
+    fill(store)
+    declined = enter(store, "did-not-agree-0001", source="sona", scenario="drop")
+    assert b"did-not-agree" in bytes_of(tmp_path)
+    page(store, declined, "consent", agreed=False)
+    store.close()
+    found = bytes_of(tmp_path)
+    assert b"did-not-agree" not in found
+    assert b"5f1eada" in found and b"visit-first" in found and b"visit-again" in found
+    return url
+
+
+def test_no_byte_of_the_ids_stays(
+    database: str, tmp_path: Path, small_study: Study, small_secrets: Secrets
+) -> None:
+    assert forget(database, None) == 60
+    found = bytes_of(tmp_path)
+    assert b"5f1eada" not in found and b"visit-" not in found
+    assert forget(database, None) == 0
+    store = Store.open(small_study, small_secrets, database)
+    try:
+        assert len(rows(store, SESSIONS)) == 61 and rows(store, RAW_IDS) == []
+        # People are still recognised by their hash.
+        entered = enter(store, raw_id(1), source="prolific", scenario="drop")
+        assert len(rows(store, SESSIONS)) == 61
+        assert run(store.state(entered)).stage == "consent"
+    finally:
+        store.close()
+
+
+def test_single_participants_are_forgotten(
+    database: str, tmp_path: Path, small_secrets: Secrets
+) -> None:
+    names = [participant_hash(small_secrets, "prolific", raw_id(number)) for number in (3, 4)]
+    for wrong in ("0" * 32, "x", raw_id(3), "'; --", names[0].upper()):
+        with pytest.raises(BadInputError, match="participant"):
+            forget(database, [names[0], wrong])
+    assert raw_id(3).encode() in bytes_of(tmp_path)
+    assert forget(database, [*names, names[0]]) == 2
+    found = bytes_of(tmp_path)
+    assert raw_id(3).encode() not in found and b"-0004" not in found
+    assert raw_id(5).encode() in found
+
+
+def test_ids_are_forgotten_while_the_study_is_served(
+    store: Store, small_secrets: Secrets, database_url: str
+) -> None:
+    tokens = [enter(store, raw_id(number), source="sona") for number in range(4)]
+    walk(store, tokens[0], "test")
+    first = participant_hash(small_secrets, "sona", raw_id(0))
+    assert run(forget_raw_ids(store, [first])) == 1
+    assert len(rows(store, RAW_IDS)) == 3
+    assert run(forget_raw_ids(store)) == 3
+    assert rows(store, RAW_IDS) == []
+    assert not give(store, tokens[0], 0).duplicate  # and the session goes on
+    if database_url.startswith("sqlite"):
+        folder = Path(database_url.removeprefix("sqlite:///")).parent
+        assert b"5f1eada" not in bytes_of(folder)
+
+
+def test_a_served_study_and_a_busy_reader_are_named(
+    database: str, tmp_path: Path, small_study: Study, small_secrets: Secrets,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    store = Store.open(small_study, small_secrets, database)
+    with pytest.raises(PhysionError, match="another"):
+        forget(database, None)
+    assert len(rows(store, RAW_IDS)) == 60
+    store.close()
+    monkeypatch.setattr("physion.experiment.store.database.BUSY_MS", 200)
+    reader = sqlite3.connect(tmp_path / "responses.sqlite", isolation_level=None)
+    reader.execute("BEGIN")
+    reader.execute("SELECT count(*) FROM raw_ids").fetchone()
+    with pytest.raises(PhysionError, match="close it, and say"):
+        forget(database, None)
+    reader.close()
+    forget(database, None)
+    assert b"5f1eada" not in bytes_of(tmp_path)
+
+
+def test_forget_on_postgresql(
+    fresh_postgres: str, small_study: Study, small_secrets: Secrets
+) -> None:
+    store = Store.open(small_study, small_secrets, fresh_postgres)
+    enter(store, raw_id(1), source="prolific")
+    store.close()
+    assert forget(fresh_postgres, None) == 1
+    store = Store.open(small_study, small_secrets, fresh_postgres)
+    assert rows(store, RAW_IDS) == [] and len(rows(store, SESSIONS)) == 1
+    store.close()
+
+
+def test_all_of_a_session_is_forgotten(
+    database_url: str, small_study: Study, small_secrets: Secrets
+) -> None:
+    store = Store.open(small_study, small_secrets, database_url)
+    seen = Device(user_agent="TellingBrowser")
+    tokens = {
+        scenario: enter(store, raw_id(1), source="sona", scenario=scenario, device=seen)
+        for scenario in ("drop", "collide")
+    }
+    other = walk(store, enter(store, raw_id(2), source="sona", scenario="drop"), "demographics")
+    for token in tokens.values():
+        walk(store, token, "feedback")
+        run(store.events(token, Events(events=[Event(kind="x", at_ms=1, data={"a": "TellingE"})])))
+        page(store, token, "feedback", difficulty=2, technical_problems=False, text="TellingText")
+    references = {one: run(store.state(token)).reference for one, token in tokens.items()}
+    store.close()
+
+    with pytest.raises(BadInputError, match="no sessions have the reference 'K7QF-29XM'"):
+        forget_sessions(database_url, [references["drop"], "k7qf-29xm"])
+    assert forget_sessions(database_url, [references["drop"].lower()]) == 1
+    store = Store.open(small_study, small_secrets, database_url)
+    gone, kept = (
+        next(row for row in rows(store, SESSIONS) if row.reference == references[scenario])
+        for scenario in ("drop", "collide")
+    )
+    assert gone.withdrawn_at is not None and gone.consented_at is not None
+    assert (gone.answered_test, gone.finished_at, gone.age, gone.gender) == (0, None, None, None)
+    assert (gone.feedback, gone.device) == (None, {})
+    assert kept.feedback == "TellingText" and kept.withdrawn_at is None and kept.answered_test == 4
+    for table in (ANSWERS, EVENTS, TOKENS):
+        sessions = {row.session for row in rows(store, table)}
+        assert gone.session not in sessions and (table is EVENTS or len(sessions) == 2)
+    assert len(rows(store, RAW_IDS)) == 2  # the id is that of the other session, too
+    again = Enter(source="sona", id=raw_id(1), scenario="drop")
+    assert refusal(store.enter(again)).code == "already_took_part"
+    assert run(store.state(other)).stage == "demographics"
+    store.close()
+
+    assert forget_sessions(database_url, [references["collide"], references["drop"]]) == 2
+    store = Store.open(small_study, small_secrets, database_url)
+    assert [row.raw_id for row in rows(store, RAW_IDS)] == [raw_id(2)]
+    store.close()
+    if database_url.startswith("sqlite"):
+        found = bytes_of(Path(database_url.removeprefix("sqlite:///")).parent)
+        assert b"Telling" not in found and raw_id(1).encode() not in found
+        assert raw_id(2).encode() in found
+
+
+def test_the_verb_forgets_a_session(
+    database: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with sqlite3.connect(tmp_path / "responses.sqlite") as connection:
+        (reference,) = connection.execute("SELECT reference FROM sessions LIMIT 1").fetchone()
+    study = str(tmp_path)
+    assert main(["experiment", "forget", study, "--session", reference]) == 0
+    assert capsys.readouterr().out == "forgotten: 1 session\n"
+    assert main(["experiment", "forget", study, "--session", "'; --"]) == 2
+    said = capsys.readouterr().err
+    assert "no sessions have the reference" in said and said.count("\n") == 1
+    assert main(["experiment", "forget", study, "--session", reference, "--all"]) == 2
+
+
+def test_the_verb_forget(database: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    study = str(tmp_path)
+    assert main(["experiment", "forget", study]) == 2
+    assert main(["experiment", "forget", study, "--all", "--participant", "0" * 32]) == 2
+    assert capsys.readouterr().err.count("say whose ids") == 2
+    assert main(["experiment", "forget", study, "--all", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"forgotten": 60}
+    assert main(["experiment", "forget", str(tmp_path / "none"), "--all"]) == 2
+    assert not (tmp_path / "none").exists()
+
+
+def test_the_verb_password(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = Secrets.create(tmp_path, PASSWORD)
+    study, file = str(tmp_path), tmp_path / "new"
+    file.write_text("another password \nnot this\n")
+    assert main(["experiment", "password", study, "--password-file", str(file)]) == 0
+    after = Secrets.load(tmp_path)
+    assert check_password(after, "another password") and not check_password(after, PASSWORD)
+    assert after.hash_key == before.hash_key
+    for content in (b"", b"short\n", b"\xff\xff\xff\xff\xff\xff\xff\xff\xff"):
+        file.write_bytes(content)
+        assert main(["experiment", "password", study, "--password-file", str(file)]) == 2
+    monkeypatch.setattr("sys.stdin", io.StringIO("typed password\n"))
+    assert main(["experiment", "password", study]) == 2
+    assert "no terminal" in capsys.readouterr().err
+    assert Secrets.load(tmp_path) == after
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    typed = iter(["one password", "other password", "same password", "same password"])
+    monkeypatch.setattr("getpass.getpass", lambda prompt: next(typed))
+    assert main(["experiment", "password", study]) == 2
+    assert main(["experiment", "password", study]) == 0
+    assert check_password(Secrets.load(tmp_path), "same password")

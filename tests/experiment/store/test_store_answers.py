@@ -1,0 +1,266 @@
+"""Answers: each once, in order, safe, whatever is sent in whatever order; on both databases."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import random
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sqlalchemy import delete
+
+from physion.experiment.protocol.messages import Answer, Enter, PageDone
+from physion.experiment.store.store import Refused, Store
+from physion.experiment.store.tables import ANSWERS, METADATA, SESSIONS, STUDIES
+from physion.experiment.study.identity import Secrets
+from physion.experiment.study.orders import order_of
+from physion.experiment.study.study import Study
+from physion.experiment.web.media_links import read_media_path
+from support.experiment.store_walk import answer, enter, give, page, refusal, rows, run, walk
+
+HOSTILE = "'; DROP TABLE answers; -- \"<script>alert(1)</script>\\ %s {0} \0 é ☃ 🎲"
+
+
+def test_an_answer_is_stored_as_it_was_sent(store: Store, small_study: Study) -> None:
+    token = walk(store, enter(store, "Ada", scenario="drop"), "test")
+    sent = answer(
+        0, response="no", rt_ms=1234.5678901, input="keyboard", fixation_ms=700.25, cue_ms=2000.5,
+        frames_shown=44, frames_dropped=1, movie_ms=1466.7, visibility_changes=2,
+        window_width=1024, window_height=600, details={"frames": [1, 2.5, None], HOSTILE: HOSTILE},
+    )  # fmt: skip
+    stored = run(store.answer(token, sent))
+    assert not stored.duplicate and stored.feedback is None and stored.state.trial == 1
+    (session,) = rows(store, SESSIONS)
+    row = next(row for row in rows(store) if row.phase == "test")
+    for name in ("key", "response", "rt_ms", "input", "fixation_ms", "cue_ms", "frames_shown",
+                 "frames_dropped", "movie_ms", "visibility_changes", "window_width"):  # fmt: skip
+        assert getattr(row, name) == getattr(sent, name)
+    assert json.loads(row.details) == sent.details
+    assert row.stimulus == order_of(small_study, "drop", session.order_seed)["test"][0].stimulus
+    assert row.frames_expected == 45 and not row.resumed
+    assert session.answered_test == 1 and session.last_seen == row.answered_at
+
+
+def test_familiarization_alone_gives_feedback(store: Store, small_study: Study) -> None:
+    token = walk(store, enter(store, "Ada", scenario="drop"), "familiarization")
+    for trial, stimulus in enumerate(small_study.phase("drop", "familiarization")):
+        response = "yes" if trial != 1 else "no"
+        stored = give(store, token, trial, "familiarization", response=response)
+        assert stored.feedback is not None
+        assert stored.feedback.contact == stimulus.label
+        assert stored.feedback.correct == ((response == "yes") == stimulus.label)
+        assert stored.feedback.frames == 60
+        found = read_media_path(store.study, store.secrets, stored.feedback.movie)
+        assert found == small_study.folder / stimulus.full
+        # The same answer again, with another response: what is stored counts.
+        again = give(store, token, trial, "familiarization", response="no")
+        assert again.duplicate and again.feedback == stored.feedback
+    page(store, token, "ready")
+    replies = [give(store, token, trial) for trial in range(4)]
+    assert all(each.feedback is None for each in replies)
+    for reply in replies:
+        words = reply.model_dump_json().lower()
+        assert not any(word in words for word in ("label", "correct", 'contact":', "tiny"))
+
+
+def test_the_same_answer_again_is_known_even_much_later(store: Store) -> None:
+    token = walk(store, enter(store, "Ada"), "done")
+    before = rows(store)
+    for phase, trial in (("familiarization", 0), ("familiarization", 2), ("test", 3)):
+        stored = give(store, token, trial, phase)
+        assert stored.duplicate and stored.state.stage == "done"
+        assert (stored.feedback is not None) == (phase == "familiarization")
+    assert rows(store) == before
+
+
+def test_answers_out_of_turn_are_refused_with_the_state(store: Store) -> None:
+    token = enter(store, "Ada")
+    cases = [
+        ("consent", answer(0, "familiarization"), "wrong_stage"),
+        ("familiarization", answer(1, "familiarization"), "out_of_order"),
+        ("familiarization", answer(0, "test"), "out_of_order"),
+        ("ready", answer(2, "familiarization", key="another-key"), "already_answered"),
+        ("ready", answer(0, "test"), "wrong_stage"),
+        ("test", answer(0, "test", key="familiarization-0000"), "already_answered"),
+        ("test", answer(1, "test"), "out_of_order"),
+        ("test", answer(3, "familiarization"), "out_of_order"),
+        ("demographics", answer(4, "test"), "wrong_stage"),
+        ("demographics", answer(100_000, "test"), "wrong_stage"),
+        ("done", answer(0, "test", key="another-key"), "already_answered"),
+    ]
+    for stage, sent, code in cases:
+        walk(store, token, stage)
+        before = rows(store), rows(store, SESSIONS)
+        refused = refusal(store.answer(token, sent))
+        assert refused.code == code, (stage, sent)
+        assert refused.state == run(store.state(token))
+        assert (rows(store), rows(store, SESSIONS)) == before
+    give(store, token, 0, "familiarization")  # and nothing got in the way of what is right
+
+
+def test_tokens_open_their_own_session_alone(store: Store) -> None:
+    ada, bob = (walk(store, enter(store, name, scenario="drop"), "test") for name in ("Ada", "Bob"))
+    give(store, ada, 0)
+    assert not give(store, bob, 0).duplicate  # the same key in another session is another answer
+    assert len({(row.session, row.trial) for row in rows(store) if row.phase == "test"}) == 2
+
+
+def test_details_are_bounded_plain_json(sqlite_store: Store) -> None:
+    token = walk(sqlite_store, enter(sqlite_store), "familiarization")
+    deep: Any = []
+    for _ in range(100_000):
+        deep = [deep]
+    bad = [{"a": "x" * 17_000}, {"a": float("nan")}, {"a": float("inf")}, {"a": 10**5000},
+           {"a": {1, 2}}, {"a": deep}]  # fmt: skip
+    for details in bad:
+        sent = Answer.model_construct(**{**dict(answer(0, "familiarization")), "details": details})
+        refused = refusal(sqlite_store.answer(token, sent))
+        assert refused.code == "bad_request" and refused.message.startswith("details")
+    assert rows(sqlite_store) == []
+    give(sqlite_store, token, 0, "familiarization", details={"a": "\ud800", "b": "x" * 16_000})
+
+
+def test_racing_tabs_make_one_row(store: Store) -> None:
+    one = walk(store, enter(store, "Ada"), "test")
+    two = enter(store, "Ada")
+
+    async def race() -> list[Any]:
+        sent = [(token, answer(0, key=f"key-of-tab-{tab}")) for tab, token in enumerate((one, two))]
+        posts = [store.answer(token, each) for token, each in sent * 20]
+        return await asyncio.gather(*posts, return_exceptions=True)
+
+    replies = run(race())
+    (row,) = [row for row in rows(store) if row.phase == "test"]
+    winner = int(row.key[-1])
+    accepted = [each for each in replies if not isinstance(each, BaseException)]
+    refused = [each for each in replies if isinstance(each, Refused)]
+    assert len(accepted) == len(refused) == 20
+    assert sum(not each.duplicate for each in accepted) == 1
+    assert all(each.code == "already_answered" for each in refused)
+    assert not isinstance(replies[winner], BaseException)
+    assert run(store.state(two)).trial == 1
+
+
+def test_many_people_at_once_lose_nothing(store: Store) -> None:
+    async def one(number: int) -> None:
+        asked = Enter(id=f"p{number}", scenario=("collide", "drop")[number % 2])
+        token = (await store.enter(asked)).token
+        luck = random.Random(number)
+        for name, phase, count in (("instructions", "familiarization", 3), ("ready", "test", 4)):
+            await store.page(token, PageDone(page="consent", data={"agreed": True}))
+            await store.page(token, PageDone(page=name))  # type: ignore[arg-type]
+            for trial in range(count):
+                sent, times = answer(trial, phase), luck.choice([1, 3])
+                posts = [store.answer(token, sent) for _ in range(times)]
+                stored = await asyncio.gather(*posts)
+                assert sum(not each.duplicate for each in stored) == 1
+
+    async def everybody() -> None:
+        await asyncio.gather(*(one(number) for number in range(6)))
+
+    run(everybody())
+    found = {(row.session, row.phase, row.trial) for row in rows(store)}
+    assert len(found) == len(rows(store)) == 6 * 7
+    assert {row.answered_test for row in rows(store, SESSIONS)} == {4}
+
+
+class Machine:
+    """One store for all examples: making a database for each would take minutes."""
+
+    def __init__(self, study: Study, secrets: Secrets, folder: Path) -> None:
+        self.store = Store.open(study, secrets, f"sqlite:///{folder / 'a.sqlite'}")
+
+    def session(self) -> str:
+        with self.store.engine.begin() as connection:
+            for table in reversed(METADATA.sorted_tables):
+                if table is not STUDIES:
+                    connection.execute(delete(table))
+        return walk(self.store, enter(self.store), "familiarization")
+
+
+@pytest.fixture(scope="module")
+def machine(small_study: Study, small_secrets: Secrets) -> Iterator[Machine]:
+    folder = Path(tempfile.mkdtemp())
+    found = Machine(small_study, small_secrets, folder)
+    yield found
+    found.store.close()
+    shutil.rmtree(folder)
+
+
+POSTS = st.lists(
+    st.one_of(
+        st.tuples(st.just("answer"), st.sampled_from(["familiarization", "test"]),
+                  st.integers(0, 5), st.integers(0, 2)),
+        st.tuples(st.just("next"), st.integers(0, 2), st.integers(1, 3)),
+        st.tuples(st.just("ready")),
+        st.tuples(st.just("load")),
+    ),
+    max_size=40,
+)  # fmt: skip
+
+
+@settings(max_examples=150, deadline=None)
+@given(POSTS)
+def test_whatever_is_sent_rows_are_the_first_trials_once(machine: Machine, posts: Any) -> None:
+    store, token = machine.store, machine.session()
+    model: dict[str, list[str]] = {"familiarization": [], "test": []}
+
+    async def send() -> None:
+        for kind, *rest in posts:
+            if kind == "ready":
+                if len(model["familiarization"]) < 3:
+                    with pytest.raises(Refused, match="does not come now"):
+                        await store.page(token, PageDone(page="ready"))
+                else:
+                    await store.page(token, PageDone(page="ready"))
+            elif kind == "load":
+                await store.state(token, True)
+            else:
+                await post(kind, rest)
+
+    async def post(kind: str, rest: Any) -> None:
+        state = await store.state(token)
+        if kind == "answer":
+            phase, trial, variant = rest
+            times = 1
+        elif state.trial is None:
+            return
+        else:
+            phase, trial, (variant, times) = state.stage, state.trial, rest
+        key = f"{phase}-{trial}-{variant}"
+        replies = await asyncio.gather(
+            *(store.answer(token, answer(trial, phase, key=key)) for _ in range(times)),
+            return_exceptions=True,
+        )
+        known = model[phase]
+        for reply in replies:
+            if isinstance(reply, Refused):
+                assert reply.code in ("wrong_stage", "out_of_order", "already_answered")
+                assert trial >= len(known) or known[trial] != key
+            else:
+                assert not isinstance(reply, BaseException)
+                assert reply.duplicate == (trial < len(known))
+                if not reply.duplicate:
+                    assert trial == len(known)
+                    known.append(key)
+                assert known[trial] == key
+
+    run(send())
+    stored: dict[str, list[str]] = {"familiarization": [], "test": []}
+    for row in sorted(rows(store), key=lambda row: (row.phase, row.trial)):
+        assert row.trial == len(stored[row.phase])
+        stored[row.phase].append(row.key)
+    assert stored == model
+    (session,) = rows(store, SESSIONS)
+    assert [session.answered_familiarization, session.answered_test] == [
+        len(model["familiarization"]),
+        len(model["test"]),
+    ]
+    assert len({row.stimulus for row in rows(store)}) == len(rows(store, ANSWERS))

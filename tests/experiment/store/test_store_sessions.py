@@ -1,0 +1,776 @@
+"""Entering, pages, states and results, on both databases."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+from sqlalchemy import update
+
+from physion.errors import BadInputError, PhysionError
+from physion.experiment.protocol.messages import REFUSALS, Device, Enter, Event, Events, PageDone
+from physion.experiment.store.scores import percentile
+from physion.experiment.store.sessions import ACTIVE_WITHIN
+from physion.experiment.store.store import Refused, Store
+from physion.experiment.store.tables import EVENTS, PARTICIPANTS, RAW_IDS, SESSIONS, STUDIES, TOKENS
+from physion.experiment.study.identity import Secrets, participant_hash
+from physion.experiment.study.recruitment import pass_word
+from physion.experiment.study.study import Recruitment, Study
+from support.experiment.store_walk import (
+    PAGES,
+    STAGES,
+    answer,
+    enter,
+    give,
+    page,
+    refusal,
+    rows,
+    run,
+    walk,
+)
+
+HOSTILE = "'; DROP TABLE sessions; -- \"<script>alert(1)</script>\\ %s {0} \0 é ☃ 🎲"
+
+
+def test_a_whole_session(store: Store, small_study: Study) -> None:
+    token = enter(store, "Ada", source="prolific", scenario="drop")
+    seen = []
+    for stage in STAGES:
+        walk(store, token, stage)
+        state = run(store.state(token))
+        seen.append((state.stage, state.trial))
+    in_phase = {"familiarization", "test"}
+    assert seen == [(stage, 0 if stage in in_phase else None) for stage in STAGES]
+    result = store.result(token)
+    # Half of the four test trials end with contact, and the walk says yes to all.
+    assert (result.correct, result.trials, result.accuracy, result.percentile) == (2, 4, 0.5, None)
+    (session,) = rows(store, SESSIONS)
+    assert (session.age, session.gender, session.education) == (31, "woman", "master")
+    assert (session.difficulty, session.technical_problems, session.feedback) == (2, False, "fine")
+    assert session.consent_version == small_study.consent_version
+    assert session.started_at < session.consented_at < session.instructed_at < session.ready_at
+    assert session.ready_at < session.demographics_at < session.finished_at == session.last_seen
+    assert session.kind == "person" and session.study == small_study.digest
+
+
+def test_ids_are_kept_apart_from_the_data(store: Store, small_secrets: Secrets) -> None:
+    recruiter = {"STUDY_ID": "s1", "SESSION_ID": HOSTILE}
+    enter(store, "Ada-5f1e", source="prolific", recruiter=recruiter)
+    enter(store, "Ada-5f1e", source="prolific", recruiter={"STUDY_ID": "s2"})
+    hashed = participant_hash(small_secrets, "prolific", "Ada-5f1e")
+    (raw,) = rows(store, RAW_IDS)
+    assert (raw.participant, raw.source, raw.raw_id) == (hashed, "prolific", "Ada-5f1e")
+    assert raw.recruiter == {"STUDY_ID": "s2"}
+    assert [row.participant for row in rows(store, PARTICIPANTS)] == [hashed]
+    for table in (SESSIONS, TOKENS, EVENTS, PARTICIPANTS, STUDIES):
+        assert "5f1e" not in repr(rows(store, table))
+
+
+def test_tokens_are_stored_as_hashes_and_both_open_the_session(store: Store) -> None:
+    one, two = enter(store, "Ada"), enter(store, "Ada")
+    assert one != two and len(rows(store, SESSIONS)) == 1
+    assert one not in repr(rows(store, TOKENS))
+    walk(store, one, "test")
+    assert run(store.state(two)).stage == "test"
+
+
+@pytest.mark.parametrize("token", ["", "x", "\0", "\ud800", HOSTILE, "a" * 5000])
+def test_unknown_tokens_open_nothing(sqlite_store: Store, token: str) -> None:
+    done = PageDone(page="ready")
+    for asked in (
+        sqlite_store.state(token),
+        sqlite_store.state(token, True),
+        sqlite_store.page(token, done),
+        sqlite_store.events(token, Events(events=[])),
+    ):
+        assert refusal(asked).code == "unknown_token"
+    for ask in (lambda: sqlite_store.trials(token, "test"), lambda: sqlite_store.result(token)):
+        with pytest.raises(Refused) as caught:
+            ask()
+        assert caught.value.code == "unknown_token"
+
+
+def test_who_finished_or_withdrew_may_not_begin_again(store: Store) -> None:
+    walk(store, enter(store, "Ada", scenario="drop"), "done")
+    page(store, enter(store, "Bob", scenario="drop"), "withdraw")
+    for person in ("Ada", "Bob"):
+        assert refusal(store.enter(Enter(id=person, scenario="drop"))).code == "already_took_part"
+        # The other scenario is open to them, asked for or not.
+        assert run(store.enter(Enter(id=person))).state.scenario == "collide"
+    walk(store, enter(store, "Ada"), "done")
+    assert refusal(store.enter(Enter(id="Ada"))).code == "already_took_part"
+    assert len(rows(store, SESSIONS)) == 4
+
+
+def test_the_unfinished_session_goes_on_before_another_begins(store: Store) -> None:
+    walk(store, enter(store, "Ada", scenario="drop"), "test")
+    state = run(store.enter(Enter(id="Ada"))).state
+    assert (state.scenario, state.stage) == ("drop", "test")
+    assert run(store.enter(Enter(id="Ada", scenario="collide"))).state.stage == "consent"
+
+
+def test_sources_keep_ids_apart(store: Store) -> None:
+    for source in ("link", "prolific", "sona", "mturk"):
+        enter(store, "17", source=source)
+    assert len({row.participant for row in rows(store, SESSIONS)}) == 4
+
+
+def test_least_filled_scenario_first_until_the_study_is_full(store: Store) -> None:
+    # participants=3: one of drop has finished, one of collide withdrew, one left a while ago.
+    walk(store, enter(store, "done", scenario="drop"), "done")
+    page(store, enter(store, "gone", scenario="collide"), "withdraw")
+    page(store, enter(store, "asleep", scenario="collide"), "consent")
+    _let_time_pass(store, "asleep")
+    tokens = [enter(store, f"p{i}") for i in range(5)]
+    given = [run(store.state(token)).scenario for token in tokens]
+    assert given == ["collide", "collide", "drop", "collide", "drop"]
+    # Who only opened the page takes no place.
+    early = enter(store, "early", scenario="drop")
+    for token in tokens:
+        page(store, token, "consent")
+    assert refusal(store.enter(Enter(id="late"))).code == "study_full"
+    assert refusal(store.enter(Enter(id="late", scenario="drop"))).code == "study_full"
+    # Whoever has begun may finish, even one more than there are places for.
+    assert run(store.enter(Enter(id="asleep"))).state.scenario == "collide"
+    assert run(store.enter(Enter(id="early"))).state.stage == "consent"
+    for token in (early, *tokens, enter(store, "asleep")):
+        walk(store, token, "done")
+    finished = Counter(row.scenario for row in rows(store, SESSIONS) if row.finished_at)
+    assert finished == {"drop": 4, "collide": 4}
+
+
+def test_who_leaves_gives_the_place_back_and_may_return(store: Store) -> None:
+    tokens = [enter(store, f"p{i}", scenario="drop") for i in range(3)]
+    for token in tokens:
+        walk(store, token, "test")
+    assert refusal(store.enter(Enter(id="late", scenario="drop"))).code == "study_full"
+    _let_time_pass(store, "p0", ACTIVE_WITHIN - 30)
+    assert refusal(store.enter(Enter(id="late", scenario="drop"))).code == "study_full"
+    _let_time_pass(store, "p0", 60)
+    walk(store, enter(store, "late", scenario="drop"), "test")
+    assert refusal(store.enter(Enter(id="later", scenario="drop"))).code == "study_full"
+    for token in (*tokens, enter(store, "p0")):
+        walk(store, token, "done")
+
+
+def _let_time_pass(store: Store, person: str, seconds: float = ACTIVE_WITHIN + 1) -> None:
+    """Nothing is heard of someone for a while."""
+    own = SESSIONS.c.participant == participant_hash(store.secrets, "link", person)
+    with store.engine.begin() as connection:
+        earlier = SESSIONS.c.last_seen - seconds
+        connection.execute(update(SESSIONS).where(own).values(last_seen=earlier))
+
+
+def test_previews_and_programs_take_nobodys_place(store: Store, small_secrets: Secrets) -> None:
+    for kind in ("preview", "simulated"):
+        word = pass_word(small_secrets, kind)
+        for number in range(4):
+            token = enter(store, f"p{number}", scenario="drop", **{"pass": word})
+            assert run(store.state(token)).kind == kind
+    assert [run(store.enter(Enter(id=f"p{i}", scenario="drop"))).state.kind for i in range(3)] == [
+        "person"
+    ] * 3
+    kinds = Counter(row.kind for row in rows(store, SESSIONS))
+    assert kinds == {"preview": 4, "simulated": 4, "person": 3}
+    assert len(rows(store, RAW_IDS)) == 3
+
+
+@pytest.mark.parametrize("word", ["", "preview", "preview-", "person-{0}", "preview-{0}", HOSTILE])
+def test_words_that_we_never_gave_are_refused(
+    sqlite_store: Store, small_secrets: Secrets, word: str
+) -> None:
+    signature = pass_word(small_secrets, "simulated").partition("-")[2]
+    asked = Enter.model_validate({"pass": word.replace("{0}", signature)})
+    assert refusal(sqlite_store.enter(asked)).code == "bad_link"
+    assert rows(sqlite_store, SESSIONS) == []
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        "{{%PROLIFIC_PID%}}", "%7B%7B%25PROLIFIC_PID%25%7D%7D", "{{%25PROLIFIC_PID%25}}",
+        "%SURVEY_CODE%", "%25SURVEY_CODE%25", "%2525SURVEY_CODE%2525", " {{id}} ", "${workerId}",
+    ],
+)  # fmt: skip
+def test_placeholders_that_the_recruiter_left_are_nobodys_id(
+    sqlite_store: Store, value: str
+) -> None:
+    for asked in (
+        Enter(source="prolific", id=value),
+        Enter(source="prolific", id="5f1e", recruiter={"SESSION_ID": value}),
+    ):
+        refused = refusal(sqlite_store.enter(asked))
+        assert refused.code == "bad_link" and "did not fill in your id" in refused.message
+    assert rows(sqlite_store, SESSIONS) == []
+
+
+def test_ids_that_only_resemble_placeholders_are_ids(sqlite_store: Store) -> None:
+    for name in ("100%", "%41da", "{0}", "a%20b"):
+        enter(sqlite_store, name, source="sona")
+    assert len(rows(sqlite_store, SESSIONS)) == 4
+
+
+def test_what_a_session_is_never_changes(store: Store, small_secrets: Secrets) -> None:
+    token = enter(store, "Ada", scenario="drop", **{"pass": pass_word(small_secrets, "simulated")})
+    walk(store, token, "done")
+    (session,) = rows(store, SESSIONS)
+    assert session.kind == "simulated"
+
+
+def test_ids_where_they_are_needed(
+    store: Store, small_study: Study, small_secrets: Secrets, tmp_path: Path
+) -> None:
+    assert enter(store) != enter(store)
+    assert len({row.participant for row in rows(store, SESSIONS)}) == 2
+    for blank in (None, "\0"):
+        assert refusal(store.enter(Enter(source="sona", id=blank))).code == "id_needed"
+    needed = replace(small_study, recruitment=Recruitment(id_needed=True))
+    strict = Store.open(needed, small_secrets, f"sqlite:///{tmp_path / 'strict.sqlite'}")
+    try:
+        assert refusal(strict.enter(Enter())).code == "id_needed"
+        preview = Enter.model_validate({"pass": pass_word(small_secrets, "preview")})
+        assert run(strict.enter(preview)).state.kind == "preview"
+    finally:
+        strict.close()
+
+
+WORD = "3f6c1d2e-0000-4000-8000-abcdefABCDEF"
+
+
+def test_a_visits_word_gives_the_same_session_again(
+    store: Store, small_study: Study, small_secrets: Secrets, tmp_path: Path
+) -> None:
+    tokens = [enter(store, visit=WORD) for _ in range(3)]
+    assert len(set(tokens)) == 3
+    assert len(rows(store, SESSIONS)) == 1
+    walk(store, tokens[0], "test")
+    assert {run(store.state(token)).stage for token in tokens} == {"test"}
+    # Another word, an id beside it, another way to come: somebody else each.
+    simulated = {"pass": pass_word(small_secrets, "simulated")}
+    preview = {"pass": pass_word(small_secrets, "preview")}
+    for _ in range(2):
+        enter(store, visit=WORD[:-1])
+        enter(store, "Ada", visit=WORD)
+        enter(store, visit=WORD, **simulated)
+        enter(store, visit=WORD, **preview)
+    enter(store, WORD)
+    found = rows(store, SESSIONS)
+    assert len(found) == 6 == len({row.participant for row in found})
+    assert enter(store, "Ada") and len(rows(store, SESSIONS)) == 6
+    # The word is not kept, and is no id.
+    assert {row.raw_id for row in rows(store, RAW_IDS)} == {"Ada", WORD}
+    for table in (SESSIONS, TOKENS, EVENTS, PARTICIPANTS):
+        assert WORD not in repr(rows(store, table))
+    assert refusal(store.enter(Enter(source="sona", visit=WORD))).code == "id_needed"
+    needed = replace(small_study, recruitment=Recruitment(id_needed=True))
+    strict = Store.open(needed, small_secrets, f"sqlite:///{tmp_path / 'strict.sqlite'}")
+    assert refusal(strict.enter(Enter(visit=WORD))).code == "id_needed"
+    strict.close()
+
+
+def test_without_id_and_word_everybody_is_new(store: Store) -> None:
+    for _ in range(3):
+        enter(store)
+    assert len({row.participant for row in rows(store, SESSIONS)}) == 3
+
+
+@pytest.mark.parametrize(
+    "word", ["", "a" * 15, "a" * 65, "a" * 16 + "_", "ä" * 20, "a" * 20 + "\n"]
+)
+def test_other_words_are_no_visit(word: str) -> None:
+    with pytest.raises(ValidationError):
+        Enter(visit=word)
+
+
+def test_a_language_that_is_gone_locks_nobody_out(
+    small_study: Study, small_secrets: Secrets, database_url: str
+) -> None:
+    store = Store.open(small_study, small_secrets, database_url)
+    token = walk(store, enter(store, "Ada", language="de", scenario="drop"), "test")
+    store.close()
+    store = Store.open(replace(small_study, languages=("en",)), small_secrets, database_url)
+    states = [
+        run(store.state(token)),
+        run(store.state(token, True)),
+        give(store, token, 0).state,
+        page(store, token, "ready"),
+        run(store.enter(Enter(id="Ada"))).state,
+        refusal(store.answer(token, answer(3))).state,
+    ]
+    assert [state.language for state in states if state is not None] == ["en"] * 6
+    (session,) = rows(store, SESSIONS)
+    assert session.language == "de"  # what it began in stays known
+    store.close()
+
+
+@pytest.mark.parametrize("scenario", ["none", "Drop", HOSTILE])
+def test_unknown_scenarios_are_refused(sqlite_store: Store, scenario: str) -> None:
+    assert refusal(sqlite_store.enter(Enter(scenario=scenario))).code == "bad_link"
+
+
+LANGUAGES = {"de": "de", "de-AT": "de", "DE": "de", "": "en", "fr": "en", "en_US": "en"}
+
+
+@pytest.mark.parametrize(("wanted", "given"), LANGUAGES.items())
+def test_languages(sqlite_store: Store, wanted: str, given: str) -> None:
+    assert run(sqlite_store.enter(Enter(language=wanted))).state.language == given
+
+
+def test_prepared_orders_are_used_evenly(
+    small_study: Study, small_secrets: Secrets, database_url: str
+) -> None:
+    study = replace(small_study, orders=3, participants=100)
+    store = Store.open(study, small_secrets, database_url)
+    try:
+        for number in range(6):
+            enter(store, f"p{number}", scenario="drop")
+        enter(store, "other", scenario="collide")
+        page(store, enter(store, "p1", scenario="drop"), "withdraw")
+        enter(store, "p6", scenario="drop")
+        found = {row.participant: row for row in rows(store, SESSIONS)}
+        numbers = [
+            found[participant_hash(small_secrets, "link", f"p{number}")].order_number
+            for number in range(7)
+        ]
+        # The order of who withdrew is free again.
+        assert numbers == [1, 2, 3, 1, 2, 3, 2]
+        seeds = {(row.scenario, row.order_number, row.order_seed) for row in found.values()}
+        assert len(seeds) == 4
+    finally:
+        store.close()
+
+
+def test_buttons_stay_with_the_participant(store: Store) -> None:
+    for person in ("a", "b", "c"):
+        buttons = {
+            run(store.enter(Enter(id=person, scenario=scenario))).state.buttons
+            for scenario in ("collide", "drop")
+        }
+        assert len(buttons) == 1
+
+
+def test_many_at_once_make_one_session_each(store: Store) -> None:
+    async def all_at_once() -> list[Any]:
+        visits = [Enter(id=f"p{number % 3}", scenario="drop") for number in range(30)]
+        return await asyncio.gather(*(store.enter(visit) for visit in visits))
+
+    entered = run(all_at_once())
+    assert len({each.token for each in entered}) == 30
+    assert len(rows(store, SESSIONS)) == 3 and len(rows(store, TOKENS)) == 30
+    assert len({each.state.reference for each in entered}) == 3
+
+
+def test_pages_come_in_their_order_and_twice_is_once(store: Store) -> None:
+    token = enter(store, "Ada")
+    for stage in STAGES[:-1]:
+        walk(store, token, stage)
+        late = [name for name in PAGES if STAGES.index(name) > STAGES.index(stage)]
+        for name in late:
+            refused = refusal(store.page(token, PageDone(page=name, data=PAGES[name])))
+            assert refused.code == "wrong_stage"
+            assert refused.state is not None and refused.state.stage == stage
+        before = rows(store, SESSIONS)
+        for name in PAGES:
+            if name not in late and name != stage:
+                assert page(store, token, name).stage == stage
+        assert rows(store, SESSIONS) == before
+    walk(store, token, "done")
+    page(store, token, "feedback", difficulty=5, technical_problems=True, text="other")
+    (session,) = rows(store, SESSIONS)
+    assert (session.difficulty, session.feedback) == (2, "fine")
+
+
+@pytest.mark.parametrize("how", ["withdraw", "consent"])
+def test_who_does_not_agree_leaves_nothing_behind(store: Store, how: str) -> None:
+    data = {} if how == "withdraw" else {"agreed": False}
+    device = Device(user_agent="Mozilla", screen_width=1920)
+    more: dict[str, Any] = {"source": "prolific", "device": device, "recruiter": {"STUDY_ID": "s"}}
+    enter(store, "Ada", **more)
+    for person in ("Ada", "Bob", "Cy"):
+        token = enter(store, person, scenario="drop", **more)
+        enter(store, person, scenario="drop", **more)
+        if person == "Bob":
+            page(store, token, "consent")
+        page(store, token, how, **data)
+    # Ada has another session, and Bob withdrew: they may have to be paid.
+    assert {row.raw_id for row in rows(store, RAW_IDS)} == {"Ada", "Bob"}
+    by_participant = {(row.participant, row.scenario): row.device for row in rows(store, SESSIONS)}
+    kept = device.model_dump()
+    ada, bob, cy = (
+        participant_hash(store.secrets, "prolific", name) for name in ("Ada", "Bob", "Cy")
+    )
+    assert by_participant == {
+        (ada, "collide"): kept, (ada, "drop"): {}, (bob, "drop"): kept, (cy, "drop"): {},
+    }  # fmt: skip
+    assert sorted(row.data.get("user_agent", "") for row in rows(store, EVENTS)) == [
+        "", "", "Mozilla",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("stage", STAGES[:-1])
+@pytest.mark.parametrize("how", ["withdraw", "consent"])
+def test_who_withdraws_is_left_alone(sqlite_store: Store, stage: str, how: str) -> None:
+    token = walk(sqlite_store, enter(sqlite_store, "Ada"), stage)
+    data = {} if how == "withdraw" else {"agreed": False}
+    for _ in range(2):
+        assert page(sqlite_store, token, how, **data).stage == "withdrawn"
+    before = (rows(sqlite_store, SESSIONS), rows(sqlite_store))
+    event = Events(events=[Event(kind="hidden", at_ms=1)])
+    for asked in (
+        *(sqlite_store.page(token, PageDone(page=name, data=PAGES[name])) for name in PAGES),
+        sqlite_store.answer(token, answer(9)),
+        sqlite_store.events(token, event),
+    ):
+        refused = refusal(asked)
+        assert refused.code == "wrong_stage"
+        assert refused.state is not None and refused.state.stage == "withdrawn"
+    for ask in (lambda: sqlite_store.trials(token, "test"), lambda: sqlite_store.result(token)):
+        with pytest.raises(Refused) as caught:
+            ask()
+        assert caught.value.code == "wrong_stage"
+    assert run(sqlite_store.state(token, True)).stage == "withdrawn"
+    assert (rows(sqlite_store, SESSIONS), rows(sqlite_store)) == before
+
+
+def test_a_finished_session_stays_finished(store: Store) -> None:
+    token = walk(store, enter(store, "Ada"), "done")
+    assert refusal(store.page(token, PageDone(page="withdraw"))).code == "wrong_stage"
+    assert store.result(token).trials == 4
+
+
+BAD_PAGES: list[tuple[str, dict[str, Any], str]] = [
+    ("consent", {}, "agreed is missing"),
+    ("consent", {"agreed": 1}, "agreed: true or false"),
+    ("instructions", {"a'b\n": 1}, "no field"),
+    *(("demographics", {"age": age, "gender": None, "education": None}, "age: a whole number")
+      for age in (17, 131, -1, 20.5, "30", True, 1e300)),
+    ("demographics", {"age": 30, "gender": "x" * 201, "education": None}, "gender: text"),
+    ("demographics", {"age": 30, "gender": None, "education": 5}, "education: text"),
+    ("demographics", {"age": 30, "gender": None}, "education is missing"),
+    ("demographics", {"age": 30, "gender": None, "education": None, "kind": "preview"}, "no field"),
+    *(("feedback", {"difficulty": value, "technical_problems": False, "text": ""}, "difficulty")
+      for value in (0, 6, None, 2.5, "2", True)),
+    ("feedback", {"difficulty": 2, "technical_problems": None, "text": ""}, "technical_problems"),
+    ("feedback", {"difficulty": 2, "technical_problems": False, "text": None}, "text: text"),
+    ("feedback", {"difficulty": 2, "technical_problems": False}, "text is missing"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "data", "said"), BAD_PAGES)
+def test_bad_pages_name_the_field(
+    sqlite_store: Store, name: Any, data: dict[str, Any], said: str
+) -> None:
+    token = walk(sqlite_store, enter(sqlite_store), name)
+    refused = refusal(sqlite_store.page(token, PageDone(page=name, data=data)))
+    assert refused.code == "bad_request" and said in refused.message
+    assert run(sqlite_store.state(token)).stage == name
+
+
+def test_nobody_has_to_say_anything(store: Store) -> None:
+    token = walk(store, enter(store), "demographics")
+    page(store, token, "demographics", age=None, gender=None, education=" ")
+    page(store, token, "feedback", difficulty=5.0, technical_problems=True, text="")
+    (session,) = rows(store, SESSIONS)
+    assert (session.age, session.gender, session.education) == (None, None, None)
+    assert (session.difficulty, session.technical_problems) == (5, True)
+
+
+def test_hostile_texts_are_stored_as_texts(store: Store) -> None:
+    device = Device(user_agent=HOSTILE)
+    token = enter(store, HOSTILE, recruiter={HOSTILE: HOSTILE}, language=HOSTILE[:20],
+                  device=device)  # fmt: skip
+    walk(store, token, "demographics")
+    page(store, token, "demographics", age=20, gender=HOSTILE, education=HOSTILE)
+    page(store, token, "feedback", difficulty=1, technical_problems=False, text=HOSTILE * 50)
+    event = Event(kind="error", at_ms=5, data={HOSTILE: HOSTILE})
+    assert run(store.events(token, Events(events=[event]))).stored == 1
+    clean = HOSTILE.replace("\0", "")
+    (session,), (raw,), (stored,) = rows(store, SESSIONS), rows(store, RAW_IDS), rows(store, EVENTS)
+    assert (session.gender, session.education, session.feedback) == (clean, clean, clean * 50)
+    assert session.device["user_agent"] == clean
+    assert raw.raw_id == clean and raw.recruiter == {clean: clean}
+    assert stored.data == {clean: clean}
+    assert run(store.enter(Enter(id="other"))).state.stage == "consent"
+
+
+def test_trials_come_after_the_consent_in_the_sessions_order(store: Store) -> None:
+    token = enter(store, "Ada", scenario="drop")
+    with pytest.raises(Refused) as caught:
+        store.trials(token, "familiarization")
+    assert caught.value.code == "not_yet"
+    walk(store, token, "instructions")
+    listed = store.trials(token, "test")
+    assert [each.trial for each in listed.trials] == [0, 1, 2, 3]
+    assert all(each.frames == 45 and 500 <= each.fixation_ms <= 1500 for each in listed.trials)
+    assert listed == store.trials(token, "test")
+    for word in ("tiny", "drop", "label", "true", "false", "full"):
+        assert word not in listed.model_dump_json().lower()
+    walk(store, token, "demographics")
+    given = [row.stimulus for row in rows(store) if row.phase == "test"]
+    from physion.experiment.web.media_links import read_media_path
+
+    files = {
+        str(read_media_path(store.study, store.secrets, each.movie)): trial
+        for trial, each in enumerate(listed.trials)
+    }
+    shown = {
+        stimulus.stimulus: files[str(store.study.folder / stimulus.movie)]
+        for stimulus in store.study.phase("drop", "test")
+    }
+    assert sorted(given, key=lambda name: shown[name]) == given
+
+
+def test_results_come_at_the_end_alone(store: Store) -> None:
+    token = enter(store, "Ada")
+    for stage in STAGES[:-1]:
+        walk(store, token, stage)
+        with pytest.raises(Refused) as caught:
+            store.result(token)
+        assert caught.value.code == "not_yet"
+
+
+def test_percentiles_are_among_finished_people_of_the_scenario(
+    small_study: Study, small_secrets: Secrets, database_url: str
+) -> None:
+    store = Store.open(replace(small_study, participants=9), small_secrets, database_url)
+
+    def finish(person: str, right: int, scenario: str = "drop", **more: Any) -> str:
+        token = walk(store, enter(store, person, scenario=scenario, **more), "test")
+        labels = [stimulus.label for stimulus in _order(store, person, scenario, more)]
+        for trial, label in enumerate(labels):
+            yes = label if trial < right else not label
+            give(store, token, trial, response="yes" if yes else "no")
+        return walk(store, token, "done")
+
+    first = finish("a", 1)
+    assert store.result(first).percentile is None  # percentile_from=2
+    simulated = {"pass": pass_word(small_secrets, "simulated")}
+    finish("s", 4, **simulated)
+    finish("other", 4, "collide")
+    walk(store, enter(store, "unfinished", scenario="drop"), "feedback")
+    assert store.result(first).percentile is None
+    second = finish("b", 3)
+    assert store.result(first).percentile is store.result(second).percentile is None  # one other
+    third = finish("c", 3)
+    best = finish("d", 4)
+    found = [store.result(token) for token in (first, second, third, best)]
+    assert [each.correct for each in found] == [1, 3, 3, 4]
+    # Among three others: none had fewer; one had, and one as many; all had.
+    assert [each.percentile for each in found] == pytest.approx([0, 50, 50, 100])
+    store.close()
+
+
+def _order(store: Store, person: str, scenario: str, more: dict[str, Any]) -> tuple[Any, ...]:
+    from physion.experiment.study.orders import order_of, own_order_seed
+
+    source = "simulated link" if more else "link"
+    seed = own_order_seed(store.study, scenario, participant_hash(store.secrets, source, person))
+    return order_of(store.study, scenario, seed)["test"]
+
+
+def test_percentile_is_among_the_others() -> None:
+    assert percentile(3, [3]) == 50
+    assert percentile(0, [1, 2, 3]) == 0
+    assert percentile(4, [1, 2, 3]) == 100
+    assert percentile(2, [2, 2, 2]) == 50
+    assert percentile(2, [1, 2, 3, 3]) == 37.5
+
+
+def test_previews_of_other_stimuli_are_in_no_result(
+    small_study: Study, small_secrets: Secrets, database_url: str
+) -> None:
+    word = {"pass": pass_word(small_secrets, "preview"), "scenario": "drop"}
+    store = Store.open(small_study, small_secrets, database_url)
+    old = [walk(store, enter(store, f"old{number}", **word), "done") for number in range(3)]
+    assert store.result(old[0]).percentile == 50
+    store.close()
+    gone = small_study.phase("drop", "test")[1]
+    stimuli = tuple(
+        replace(each, stimulus="drop_other_name") if each is gone else each
+        for each in small_study.stimuli
+    )
+    changed = replace(small_study, stimuli=stimuli, stimuli_digest="0" * 64, digest="1" * 64)
+    store = Store.open(changed, small_secrets, database_url)
+    try:
+        new = walk(store, enter(store, "new", **word), "done")
+        result = store.result(new)
+        assert (result.correct, result.trials, result.percentile) == (2, 4, None)
+        for token in old:
+            assert run(store.state(token)).stage == "done"
+            with pytest.raises(Refused, match="stimuli have changed") as caught:
+                store.result(token)
+            assert caught.value.code == "unknown_token"
+    finally:
+        store.close()
+
+
+def test_loads_are_counted_and_say_where(store: Store) -> None:
+    token = enter(store, "Ada")
+    run(store.state(token, True))
+    (session,) = rows(store, SESSIONS)
+    assert (session.loads, session.loaded_at_phase) == (1, None)
+    walk(store, token, "test")
+    give(store, token, 0)
+    run(store.state(token))
+    run(store.state(token, True))
+    (session,) = rows(store, SESSIONS)
+    assert (session.loads, session.loaded_at_phase, session.loaded_at_trial) == (2, "test", 1)
+    give(store, token, 1)
+    give(store, token, 2)
+    enter(store, "Ada")  # another browser
+    give(store, token, 3)
+    assert [row.resumed for row in rows(store) if row.phase == "test"] == [
+        False, True, False, True,
+    ]  # fmt: skip
+    (event,) = rows(store, EVENTS)
+    assert event.kind == "entered_again"
+
+
+def test_events_are_kept_up_to_a_limit(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("physion.experiment.store.store.MAX_EVENTS", 7)
+    token = enter(store)
+    some = Events(events=[Event(kind="hidden", at_ms=number) for number in range(5)])
+    assert [run(store.events(token, some)).stored for _ in range(3)] == [5, 2, 0]
+    assert [row.at_ms for row in rows(store, EVENTS)] == [0, 1, 2, 3, 4, 0, 1]
+
+
+def test_a_batch_of_events_is_stored_once(store: Store) -> None:
+    token, other = enter(store, "Ada"), enter(store, "Bob")
+    some = [Event(kind="hidden", at_ms=number) for number in range(3)]
+
+    def send(token: str, key: str | None) -> int:
+        return run(store.events(token, Events(key=key, events=some))).stored
+
+    assert [send(token, "batch-01") for _ in range(3)] == [3, 0, 0]
+    assert [send(token, "batch-02"), send(other, "batch-01")] == [3, 3]
+    assert [send(token, None) for _ in range(2)] == [3, 3]
+    assert len(rows(store, EVENTS)) == 15
+    assert {row.batch for row in rows(store, EVENTS)} == {"batch-01", "batch-02", None}
+
+
+@pytest.mark.parametrize(
+    ("value", "said"), [(10**5000, "plain JSON"), ("é" * 4000, "at most")], ids=["number", "text"]
+)
+def test_events_too_large_are_refused(sqlite_store: Store, value: Any, said: str) -> None:
+    token = enter(sqlite_store)
+    events = Events(events=[Event(kind="error", at_ms=0, data={"a": value})])
+    refused = refusal(sqlite_store.events(token, events))
+    assert refused.code == "bad_request" and said in refused.message
+    assert rows(sqlite_store, EVENTS) == []
+
+
+def test_everything_is_there_after_a_restart(
+    small_study: Study, small_secrets: Secrets, database_url: str
+) -> None:
+    store = Store.open(small_study, small_secrets, database_url)
+    token = walk(store, enter(store, "Ada"), "test")
+    give(store, token, 0)
+    listed = store.trials(token, "test")
+    store.close()
+    store = Store.open(small_study, small_secrets, database_url)
+    try:
+        state = run(store.state(token))
+        assert (state.stage, state.trial) == ("test", 1)
+        assert store.trials(token, "test") == listed
+        assert give(store, token, 0).duplicate
+        assert len(rows(store, STUDIES)) == 1
+    finally:
+        store.close()
+
+
+def test_one_store_at_a_time(
+    store: Store, small_study: Study, small_secrets: Secrets, database_url: str
+) -> None:
+    with pytest.raises(PhysionError, match="another"):
+        Store.open(small_study, small_secrets, database_url)
+    assert store.healthy()
+    store.close()
+    again = Store.open(small_study, small_secrets, database_url)
+    assert refusal(store.enter(Enter())).code == "unavailable"
+    again.close()
+
+
+def test_other_stimuli_are_refused_where_sessions_exist(
+    small_study: Study, small_secrets: Secrets, database_url: str
+) -> None:
+    def reopen(study: Study) -> Store:
+        return Store.open(study, small_secrets, database_url)
+
+    other = replace(small_study, stimuli_digest="0" * 64, digest="1" * 64)
+    store = reopen(small_study)
+    preview = enter(store, **{"pass": pass_word(small_secrets, "preview")})
+    store.close()
+    store = reopen(other)  # a preview is nobody's data
+    assert run(store.state(preview)).stage == "withdrawn"
+    enter(store, "Ada")
+    store.close()
+    with pytest.raises(BadInputError, match=r"1 sessions.*new study folder"):
+        reopen(small_study)
+    # Words and settings may change.
+    reworded = replace(other, digest="2" * 64, participants=50)
+    store = reopen(reworded)
+    assert [row.participants for row in map(_settings, rows(store, STUDIES))] == [3, 3, 50]
+    assert all("label" not in repr(row.settings) for row in rows(store, STUDIES))
+    store.close()
+
+
+def test_a_scenario_with_sessions_cannot_be_taken_out(
+    small_study: Study, small_secrets: Secrets, database_url: str
+) -> None:
+    def reopen(study: Study) -> Store:
+        return Store.open(study, small_secrets, database_url)
+
+    fewer = replace(
+        small_study,
+        scenarios=("collide",),
+        stimuli=tuple(s for s in small_study.stimuli if s.scenario == "collide"),
+        digest="3" * 64,
+    )
+    preview = {"pass": pass_word(small_secrets, "preview"), "scenario": "drop"}
+    store = reopen(small_study)
+    going = walk(store, enter(store, "P1", **preview), "test")
+    done = walk(store, enter(store, "P2", **preview), "done")
+    store.close()
+    store = reopen(fewer)  # previews are nobody's data, and end
+    for token in (going, done):
+        for asked in (store.state(token), store.state(token, True), store.answer(token, answer(0))):
+            assert refusal(asked).code == "unknown_token"
+        with pytest.raises(Refused, match="no more"):
+            store.result(token)
+    marks = {(row.finished_at is None, row.withdrawn_at is None) for row in rows(store, SESSIONS)}
+    assert marks == {(True, False), (False, True)}
+    assert run(store.enter(Enter.model_validate(preview | {"id": "P1", "scenario": None})))
+    store.close()
+    store = reopen(small_study)
+    token = walk(store, enter(store, "Ada", scenario="drop"), "test")
+    give(store, token, 0)
+    store.close()
+    with pytest.raises(BadInputError, match=r"1 sessions are of the scenario drop.*put drop back"):
+        reopen(fewer)
+    store = reopen(small_study)
+    assert run(store.state(token)).trial == 1
+    # A program's session is data, too; and the other one may go where it has none.
+    store.close()
+    with pytest.raises(BadInputError, match="scenario drop"):
+        reopen(replace(fewer, digest="4" * 64))
+    others = tuple(s for s in small_study.stimuli if s.scenario == "drop")
+    store = reopen(replace(small_study, scenarios=("drop",), stimuli=others, digest="5" * 64))
+    assert run(store.state(token)).trial == 1
+    store.close()
+
+
+def _settings(row: Any) -> Any:
+    from types import SimpleNamespace
+
+    return SimpleNamespace(**row.settings)
+
+
+def test_refusals_have_known_codes() -> None:
+    with pytest.raises(AssertionError):
+        Refused("no such code", "")
+    assert {"bad_link", "study_full", "unavailable"} <= set(REFUSALS)

@@ -1,0 +1,370 @@
+"""physion experiment init: balanced choices, cut movies, and a killed making that goes on."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from physion.cli.experiment.experiment import SUBVERBS
+from physion.cli.main import main
+from physion.errors import BadInputError, UnknownNameError
+from physion.experiment.study import study_folder
+from physion.experiment.study.identity import Secrets, check_password
+from physion.experiment.study.init_trials import choose_familiarization, choose_trials
+from physion.experiment.study.media import Source, take_stimulus
+from physion.experiment.study.study import Study, load_study
+from physion.experiment.study.study_folder import JOURNAL, make_study
+from physion.trials.index import write_index
+from physion.trials.video import read_frames
+from support.experiment.tiny_dataset import is_marked, make_tiny_dataset
+from support.experiment.tiny_study import OBSERVED, make_tiny_study, read_number
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six testing and four familiarization trials of two scenarios."""
+    folder = tmp_path_factory.mktemp("dataset")
+    make_tiny_dataset(folder, scenarios=("roll", "collide"))
+    return folder
+
+
+# --- which trials --------------------------------------------------------------------------------
+
+
+def test_the_choice_is_balanced_and_always_the_same(dataset: Path) -> None:
+    chosen = choose_trials(dataset, test=4, practice=4)
+    assert chosen == choose_trials(dataset, test=4, practice=4)
+    assert chosen.scenarios == ("collide", "roll") and not chosen.notes
+    for scenario in chosen.scenarios:
+        for phase in ("familiarization", "test"):
+            part = [s for s in chosen.sources if (s.scenario, s.phase) == (scenario, phase)]
+            assert [s.place for s in part] == [0, 1, 2, 3]
+            assert Counter(s.label for s in part) == {True: 2, False: 2}
+            assert all(("testing" in s.stimulus) == (phase == "test") for s in part)
+            assert all(s.label == (int(s.stimulus[-1]) % 2 == 0) for s in part)
+
+
+def test_another_seed_chooses_otherwise(dataset: Path) -> None:
+    choices = {
+        tuple(s.stimulus for s in choose_trials(dataset, test=2, seed=seed).sources)
+        for seed in range(10)
+    }
+    assert len(choices) == 10
+
+
+def test_where_fewer_are_there_it_says_so(dataset: Path) -> None:
+    chosen = choose_trials(dataset, scenarios=["roll"])
+    assert Counter(s.phase for s in chosen.sources) == {"test": 6, "familiarization": 4}
+    assert chosen.notes == (
+        "roll: 4 familiarization trials in place of 10: no more are balanced",
+        "roll: 6 testing trials in place of 150: no more are balanced",
+    )
+
+
+def test_fewer_of_one_kind_means_fewer_of_both(dataset: Path, tmp_path: Path) -> None:
+    _changed(dataset, tmp_path, lambda t: t["trial"] != "roll_testing_0002")
+    chosen = choose_trials(tmp_path, scenarios=["roll"])
+    test = [source for source in chosen.sources if source.phase == "test"]
+    assert Counter(s.label for s in test) == {True: 2, False: 2}
+
+
+def test_a_scenario_without_one_kind_is_refused(dataset: Path, tmp_path: Path) -> None:
+    _changed(dataset, tmp_path, lambda t: t["contact"] | (t["split"] != "familiarization"))
+    with pytest.raises(BadInputError, match="no familiarization trial of collide without") as e:
+        choose_trials(tmp_path)
+    assert "physion generate" in str(e.value) and "--split familiarization" in str(e.value)
+
+
+def test_datasets_without_testing_trials_are_refused(dataset: Path, tmp_path: Path) -> None:
+    _changed(dataset, tmp_path, lambda t: t["split"] == "familiarization")
+    with pytest.raises(BadInputError, match="no testing trials"):
+        choose_trials(tmp_path)
+    assert len(choose_familiarization(tmp_path, "roll").sources) == 4
+
+
+@pytest.mark.parametrize(("test", "practice"), [(3, 4), (0, 4), (4, 5), (-2, 4)])
+def test_counts_must_be_even(dataset: Path, test: int, practice: int) -> None:
+    with pytest.raises(BadInputError, match="must be even"):
+        choose_trials(dataset, test=test, practice=practice)
+
+
+def test_unknown_scenarios_get_the_closest(dataset: Path) -> None:
+    with pytest.raises(UnknownNameError, match="closest: collide"):
+        choose_trials(dataset, scenarios=["colide"])
+
+
+def test_looks_are_free_unless_asked_otherwise(dataset: Path, tmp_path: Path) -> None:
+    for look in ("free", "redyellow"):
+        chosen = choose_trials(dataset, test=2, practice=2, scenarios=["roll"], look=look)
+        study = make_study(_study(tmp_path / look, ("roll",)), chosen.sources, "a password")
+        for stimulus in study.stimuli:
+            assert stimulus.look == look
+            frame = read_frames(study.folder / stimulus.movie, count=1)[0]
+            assert is_marked(frame) == (look == "redyellow")
+
+
+def test_a_look_that_was_not_made_is_refused(tmp_path: Path) -> None:
+    make_tiny_dataset(tmp_path, free=False)
+    with pytest.raises(BadInputError, match="--look redyellow"):
+        choose_trials(tmp_path, test=2, practice=2)
+    assert choose_trials(tmp_path, test=2, practice=2, look="redyellow").sources
+
+
+def test_trials_without_movies_are_refused(dataset: Path, tmp_path: Path) -> None:
+    table = _changed(dataset, tmp_path, lambda t: t["split"] != "")
+    table.loc[:, ["map", "map_sha256"]] = None
+    write_index(tmp_path, table)
+    with pytest.raises(BadInputError, match="no map file"):
+        choose_trials(tmp_path)
+
+
+# --- the folder ----------------------------------------------------------------------------------
+
+
+def test_a_study_shows_what_the_trials_show(dataset: Path, tmp_path: Path) -> None:
+    chosen = choose_trials(dataset)
+    study = make_study(_study(tmp_path / "study"), chosen.sources, "a password")
+    assert study == load_study(tmp_path / "study")
+    assert {(s.stimulus, s.label, s.place) for s in study.stimuli} == {
+        (s.stimulus, s.label, s.place) for s in chosen.sources
+    }
+    by_name = {source.stimulus: source for source in chosen.sources}
+    for stimulus in study.stimuli:
+        frames = read_frames(study.folder / stimulus.movie)
+        assert [read_number(frame) for frame in frames] == list(range(OBSERVED))
+        whole = read_frames(by_name[stimulus.stimulus].movie)
+        assert np.abs(frames.astype(int) - whole[:OBSERVED]).mean() < 1
+        assert bool(stimulus.full) == (stimulus.phase == "familiarization")
+    assert check_password(Secrets.load(study.folder), "a password")
+    assert {path.name for path in study.folder.iterdir()} == {
+        "study.toml", "stimuli.csv", "texts", "media", "secret.json"}  # fmt: skip
+    # No file names a stimulus, and none is there that no stimulus has.
+    used = {Path(n).name for s in study.stimuli for n in (s.movie, s.map, s.full) if n}
+    assert {path.name for path in (study.folder / "media").iterdir()} == used
+
+
+def test_missing_files_are_named_all_at_once(dataset: Path, tmp_path: Path) -> None:
+    sources = list(choose_trials(dataset).sources)
+    for number in (0, 3):
+        sources[number] = dataclasses.replace(sources[number], observed=tmp_path / f"{number}.mp4")
+    with pytest.raises(BadInputError, match="2 of 48 files are missing") as raised:
+        make_study(_study(tmp_path / "study"), sources, "a password")
+    assert "0.mp4" in str(raised.value) and "3.mp4" in str(raised.value)
+    assert not (tmp_path / "study").exists()
+
+
+def test_a_failed_making_goes_on_where_it_stopped(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken: list[str] = []
+    broken_at = 5
+
+    def take(source: Source, folder: Path) -> Any:
+        if len(taken) == broken_at:
+            raise KeyboardInterrupt
+        taken.append(source.stimulus)
+        return take_stimulus(source, folder)
+
+    monkeypatch.setattr(study_folder, "take_stimulus", take)
+    sources = choose_trials(dataset).sources
+    with pytest.raises(KeyboardInterrupt):
+        make_study(_study(tmp_path / "study"), sources, "a password")
+    with pytest.raises(BadInputError):
+        load_study(tmp_path / "study")
+    # The last line of the journal may be half written.
+    with (tmp_path / "study" / JOURNAL).open("a") as file:
+        file.write('{"key": "half')
+    broken_at = -1
+    study = make_study(_study(tmp_path / "study"), sources, "another password")
+    assert Counter(taken) == Counter(source.stimulus for source in sources)
+    assert check_password(Secrets.load(study.folder), "another password")
+    fresh = make_study(_study(tmp_path / "fresh"), sources, "a password")
+    assert fresh.stimuli == study.stimuli and fresh.digest == study.digest
+
+
+def test_another_choice_leaves_nothing_of_the_first(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "study"
+    monkeypatch.setattr(study_folder, "load_study", _interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        make_study(_study(folder), choose_trials(dataset).sources, "a password")
+    assert (folder / "study.toml").exists() and (folder / JOURNAL).exists()
+    keys = (folder / "secret.json").read_text()
+    monkeypatch.undo()
+    chosen = choose_trials(dataset, scenarios=["roll"], test=2, practice=2)
+    study = make_study(_study(folder, ("roll",)), chosen.sources, "a password")
+    assert len(list((folder / "media").iterdir())) == 2 * 2 + 2 * 3
+    assert len(study.stimuli) == 4
+    # The keys stay those that the folder had.
+    assert json.loads(keys)["hash_key"] == Secrets.load(folder).hash_key.hex()
+
+
+@pytest.mark.parametrize("name", ["notes.txt", "responses.sqlite", "study.toml"])
+def test_folders_with_something_in_them_are_left_alone(
+    dataset: Path, tmp_path: Path, name: str
+) -> None:
+    folder = tmp_path / "study"
+    folder.mkdir()
+    (folder / name).write_text("mine")
+    with pytest.raises(BadInputError, match=r"already|not empty"):
+        make_study(_study(folder), choose_trials(dataset).sources, "a password")
+    assert [path.name for path in folder.iterdir()] == [name]
+
+
+def test_a_finished_study_is_left_alone(dataset: Path, tmp_path: Path) -> None:
+    study = make_tiny_study(tmp_path)
+    with pytest.raises(BadInputError, match=r"study in .* already"):
+        make_study(_study(tmp_path), choose_trials(dataset).sources, "a password")
+    assert load_study(tmp_path) == study
+
+
+def test_answers_in_an_unfinished_folder_are_left_alone(dataset: Path, tmp_path: Path) -> None:
+    make_tiny_study(tmp_path)
+    (tmp_path / JOURNAL).write_text("")
+    (tmp_path / "responses.sqlite").write_text("answers")
+    with pytest.raises(BadInputError, match=r"responses\.sqlite"):
+        make_study(_study(tmp_path), choose_trials(dataset).sources, "a password")
+    assert (tmp_path / "responses.sqlite").read_text() == "answers"
+
+
+# --- the command ---------------------------------------------------------------------------------
+
+
+def test_the_command_makes_a_study(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "pilot-1"
+    assert main(["experiment", "init", str(folder), "--trials", str(dataset)]) == 0
+    out = capsys.readouterr().out
+    study = load_study(folder)
+    assert study.name == "pilot-1" and study.scenarios == ("collide", "roll")
+    (password,) = (line.split()[-1] for line in out.splitlines() if "password" in line)
+    assert check_password(Secrets.load(folder), password)
+    assert f"physion experiment serve {folder}" in out
+    assert "roll: 6 testing trials in place of 150" in out
+    assert "collide: 6 test and 4 familiarization trials" in out
+
+
+def test_the_command_takes_a_password_and_prints_json(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    secret = tmp_path / "secret"
+    secret.write_text("correct horse battery\n")
+    words = ["--trials", str(dataset), "--password-file", str(secret), "--scenario", "roll"]
+    words += ["--test", "4", "--practice", "2", "--participants", "7", "--json"]
+    assert main(["experiment", "init", str(tmp_path / "study"), *words]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["password"] is None and "correct horse" not in json.dumps(printed)
+    assert printed["stimuli"] == {"roll": {"familiarization": 2, "test": 4}}
+    study = load_study(tmp_path / "study")
+    assert printed["digest"] == study.digest and study.participants == 7
+    assert check_password(Secrets.load(study.folder), "correct horse battery")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "give either --trials DATASET or --stimuli"),
+        (["--trials", "DATA", "--stimuli", "a.json"], "give either"),
+        (["--trials", "DATA", "--movies", "."], "--movies goes with --stimuli"),
+        (["--stimuli", "a.json"], "--stimuli needs --movies"),
+        (["--stimuli", "a.json", "--movies", "."], "--familiarization LISTS"),
+        (["--trials", "nowhere"], "does not exist"),
+        (["--trials", "DATA", "--test", "7"], "--test must be even"),
+        (["--trials", "DATA", "--name", "a/b"], "name must be letters"),
+        (["--trials", "DATA", "--languages", "en", "fr"], "unknown language 'fr'"),
+        (["--trials", "DATA", "--password-file", "SHORT"], "8 characters or more"),
+        (["--trials", "DATA", "--password-file", "nowhere"], "nowhere is missing"),
+    ],
+)
+def test_bad_commands_are_one_line_and_leave_nothing(
+    dataset: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    words: list[str],
+    message: str,
+) -> None:
+    short = tmp_path / "short"
+    short.write_text("short\n")
+    names = {"DATA": str(dataset), "SHORT": str(short)}
+    given = [names.get(word, word) for word in words]
+    assert main(["experiment", "init", str(tmp_path / "study"), *given]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+    assert not (tmp_path / "study").exists()
+
+
+def test_the_verb_alone_says_which_words_there_are(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["experiment"]) == 2
+    out = capsys.readouterr().out
+    assert all(f"physion experiment {word} DIR" in out for word in SUBVERBS)
+    assert main(["experiment", "srve"]) == 2
+    assert "closest: serve" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("word", list(SUBVERBS))
+def test_a_missing_extra_is_said_in_one_line(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    word: str,
+) -> None:
+    monkeypatch.setattr("physion.cli.experiment.experiment.NEEDED", ("no_such_module",))
+    more = ["--all"] if word == "forget" else []
+    assert main(["experiment", word, str(tmp_path / "s"), *more]) == 2
+    said = capsys.readouterr().err
+    assert ".[experiment]" in said and said.count("\n") == 1
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="kills a process group")
+def test_a_killed_command_is_taken_up_again(tmp_path: Path) -> None:
+    data, folder = tmp_path / "dataset", tmp_path / "study"
+    make_tiny_dataset(data, test=30, familiarization=10, size=128)
+    words = ["-m", "physion.cli.main", "experiment", "init", str(folder), "--trials", str(data)]
+    first = subprocess.Popen(
+        [sys.executable, *words], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    while first.poll() is None and len(list((folder / "media").glob("*.mp4"))) < 8:
+        pass
+    first.send_signal(signal.SIGKILL)
+    first.wait()
+    assert not (folder / "study.toml").exists(), "it was done before it could be killed"
+    done = subprocess.run([sys.executable, *words], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    study = load_study(folder)
+    assert len(study.stimuli) == 40
+    used = {Path(n).name for s in study.stimuli for n in (s.movie, s.map, s.full) if n}
+    assert {path.name for path in (folder / "media").iterdir()} == used
+    assert not list(folder.rglob("*.part")) and not (folder / JOURNAL).exists()
+
+
+def _changed(dataset: Path, folder: Path, keep: Any) -> Any:
+    """A copy of a dataset with only those rows of its index; the table."""
+    shutil.copytree(dataset, folder, dirs_exist_ok=True)
+    from physion.trials.index import read_index
+
+    table = read_index(folder)
+    kept = table[keep(table)].reset_index(drop=True)
+    write_index(folder, kept)
+    return kept
+
+
+def _interrupt(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
+def _study(folder: Path, scenarios: tuple[str, ...] = ("collide", "roll")) -> Study:
+    return Study(folder, "tiny", "1", "A title", "Ada, ada@example.org", scenarios)

@@ -1,0 +1,279 @@
+"""study.toml: what is written is read back, and whatever is wrong is named."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from physion.errors import BadInputError
+from physion.experiment.study.study import (
+    Limits,
+    Recruitment,
+    Screen,
+    Study,
+    Timing,
+    load_study,
+    study_of,
+    study_to_toml,
+    write_settings,
+)
+from physion.experiment.study.study_checks import KEYS, TABLES
+from support.experiment.tiny_study import make_tiny_study
+
+NAMES = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,40}", fullmatch=True)
+CODES = st.from_regex(r"[A-Za-z0-9_-]{0,30}", fullmatch=True)
+LINES = (
+    st.text(st.characters(exclude_categories=["Cc", "Cs", "Zl", "Zp"]), min_size=1, max_size=60)
+    .map(str.strip)
+    .filter(bool)
+)
+SPANS = st.tuples(st.integers(0, 60_000), st.integers(0, 60_000)).map(
+    lambda ends: (min(ends), max(ends))
+)
+ADDRESSES = st.sampled_from(
+    ["", "https://lab.example.org/credit?experiment_id=1&credit_token=a%20b&x=", ]
+)  # fmt: skip
+STUDIES = st.builds(
+    Study,
+    folder=st.just(Path("somewhere")),
+    name=NAMES,
+    version=LINES,
+    title=LINES,
+    contact=LINES,
+    scenarios=st.lists(NAMES, min_size=1, max_size=4, unique=True).map(tuple),
+    languages=st.lists(st.sampled_from(["en", "de", "pt-BR", "zh-Hant"]), min_size=1,
+                       unique=True).map(tuple),
+    consent_version=LINES,
+    participants=st.integers(1, 10**6),
+    seed=st.integers(0, 2**63 - 1),
+    orders=st.integers(0, 100_000),
+    exclusions=st.sampled_from(["preregistered", "official-code"]),
+    percentile_from=st.integers(1, 10**6),
+    preload=st.integers(1, 1000),
+    embed_from=st.lists(st.sampled_from(["https://www.mturk.com", "https://*.a-b.org:8443"]),
+                        unique=True).map(tuple),
+    timing=st.builds(
+        Timing,
+        fixation_ms=SPANS,
+        fixation_in_familiarization=st.booleans(),
+        cue_ms=st.integers(0, 60_000),
+        flash_hz=st.floats(0, 3),
+    ),
+    screen=st.builds(Screen, st.integers(320, 10_000), st.integers(320, 10_000)),
+    recruitment=st.builds(
+        Recruitment,
+        id_needed=st.booleans(),
+        prolific_code=CODES,
+        sona_address=ADDRESSES,
+        mturk_code=CODES.filter(bool),
+        link_code=CODES,
+        link_address=ADDRESSES,
+    ),
+    limits=st.builds(
+        Limits, st.floats(0.1, 10_000), st.integers(1, 100_000), st.floats(0.1, 100_000)
+    ),
+)  # fmt: skip
+
+
+@given(STUDIES)
+@settings(max_examples=200, deadline=None)
+def test_what_is_written_is_read_back(study: Study) -> None:
+    text = study_to_toml(study)
+    assert study_of(tomllib.loads(text), study.folder / "study.toml") == study
+
+
+def test_every_setting_is_written_with_its_comment(tmp_path: Path) -> None:
+    study = make_tiny_study(tmp_path)
+    text = (tmp_path / "study.toml").read_text()
+    tables = tomllib.loads(text)
+    for key in KEYS:
+        assert key.name in (tables[key.table] if key.table else tables)
+        assert all(f"# {line}" in text for line in key.about.splitlines())
+    # Each field of the types is a key, so that none can be forgotten.
+    others = {"folder", "stimuli", "texts", "digest", "stimuli_digest", *TABLES}
+    assert {key.name for key in KEYS if not key.table} == {
+        field.name for field in dataclasses.fields(Study)
+    } - others
+    for table in TABLES:
+        named = {key.name for key in KEYS if key.table == table}
+        assert named == {field.name for field in dataclasses.fields(getattr(study, table))}
+
+
+REFUSED: dict[str, tuple[str, Any, str]] = {
+    "a name with a slash": ("name", "a/b", "letters, digits"),
+    "an empty title": ("title", "  ", "1 to 200"),
+    "a title of two lines": ("title", "a\nb", "control characters"),
+    "a number for a text": ("contact", 3, "one line of text"),
+    "no scenario": ("scenarios", [], "1 to 100"),
+    "a scenario twice": ("scenarios", ["collide", "collide"], "nothing stands twice"),
+    "a word for a list": ("scenarios", "collide", "a list"),
+    "a language that is a path": ("languages", ["../en"], "a language such as en"),
+    "no participant": ("participants", 0, "from 1"),
+    "half a participant": ("participants", 1.5, "a whole number"),
+    "true for a number": ("participants", True, "a whole number"),
+    "a negative seed": ("seed", -1, "from 0"),
+    "unknown rules": ("exclusions", "none", "preregistered or official-code"),
+    "rules in a list": ("exclusions", ["preregistered"], "preregistered or official-code"),
+    "a site with a path": ("embed_from", ["https://a.org/x"], "without a path"),
+    "a site without safety": ("embed_from", ["http://a.org"], "https://"),
+    "a directive in a site": ("embed_from", ["https://a.org; script-src *"], "without a path"),
+    "fixation backwards": ("timing.fixation_ms", [1500, 500], "the smaller one first"),
+    "fixation of one end": ("timing.fixation_ms", [500], "two whole numbers"),
+    "a harmful flash": ("timing.flash_hz", 5, "from 0 to 3"),
+    "a flash that is no number": ("timing.flash_hz", float("nan"), "a number"),
+    "a huge number": ("timing.flash_hz", 10**400, "a number"),
+    "a text for a flag": ("recruitment.id_needed", "yes", "true or false"),
+    "a code with a quote": ("recruitment.prolific_code", 'C"1', "letters, digits"),
+    "credit without a token": (
+        "recruitment.sona_address", "https://s.org/?experiment_id=1", "credit_token"),
+    "an address that is a script": ("recruitment.link_address", "javascript:alert(1)", "https://"),
+    "an address that is no address": ("recruitment.link_address", "https://[", "https://"),
+    "no code for MTurk": ("recruitment.mturk_code", "", "session"),
+    "a tiny window": ("screen.min_width", 10, "from 320"),
+    "no requests": ("limits.requests_per_second", 0, "from 0.1"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_bad_value_is_named_with_what_is_allowed(case: str) -> None:
+    key, value, allowed = REFUSED[case]
+    tables = tomllib.loads(study_to_toml(_study()))
+    owner = tables
+    *above, name = key.split(".")
+    for table in above:
+        owner = owner[table]
+    owner[name] = value
+    with pytest.raises(BadInputError, match="must be") as raised:
+        study_of(tables, Path("x/study.toml"))
+    message = str(raised.value)
+    assert "x/study.toml" in message and key in message and allowed in message
+
+
+@pytest.mark.parametrize(
+    ("change", "closest"),
+    [
+        ({"participant": 3}, "participants"),
+        ({"timing": {"cue": 3}}, "cue_ms"),
+        ({"timings": {"cue_ms": 3}}, "timing"),
+    ],
+)
+def test_unknown_keys_are_refused_with_the_closest(change: dict[str, Any], closest: str) -> None:
+    tables = {**tomllib.loads(study_to_toml(_study())), **change}
+    with pytest.raises(BadInputError, match="unknown key") as raised:
+        study_of(tables, Path("study.toml"))
+    assert closest in str(raised.value)
+
+
+@pytest.mark.parametrize("name", ["name", "version", "title", "contact", "scenarios"])
+def test_what_a_lab_must_say_may_not_lack(name: str) -> None:
+    tables = tomllib.loads(study_to_toml(_study()))
+    del tables[name]
+    with pytest.raises(BadInputError, match=f"lacks {name}"):
+        study_of(tables, Path("study.toml"))
+
+
+def test_a_value_for_a_table_is_refused() -> None:
+    tables = {**tomllib.loads(study_to_toml(_study())), "timing": 3}
+    with pytest.raises(BadInputError, match=r"\[timing\]"):
+        study_of(tables, Path("study.toml"))
+
+
+def test_a_study_that_could_not_be_read_back_is_not_written(tmp_path: Path) -> None:
+    study = dataclasses.replace(_study(), folder=tmp_path, participants=0)
+    with pytest.raises(BadInputError, match="participants"):
+        write_settings(study)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("content", [b"name = ", b"\xff\xfe", b"x = " + b"9" * 5000, b"[" * 9000])
+def test_what_is_no_toml_is_refused(tmp_path: Path, content: bytes) -> None:
+    make_tiny_study(tmp_path)
+    (tmp_path / "study.toml").write_bytes(content)
+    with pytest.raises(BadInputError, match=r"study\.toml is not TOML"):
+        load_study(tmp_path)
+
+
+# --- the folder ----------------------------------------------------------------------------------
+
+
+def test_a_study_folder_is_loaded_whole(tmp_path: Path) -> None:
+    made = make_tiny_study(tmp_path, test=4, familiarization=2, scenarios=("collide", "roll"))
+    study = load_study(str(tmp_path))
+    assert study == made
+    assert [s.place for s in study.phase("roll", "test")] == [0, 1, 2, 3]
+    assert {s.scenario for s in study.stimuli} == {"collide", "roll"}
+    assert study.texts["de"].keys() == study.texts["en"].keys()
+
+
+def test_every_file_counts_for_the_digest(tmp_path: Path) -> None:
+    first = make_tiny_study(tmp_path)
+    digests = {first.digest}
+    for name in ("study.toml", "texts/en.toml", "texts/de.toml"):
+        with (tmp_path / name).open("a") as file:
+            file.write("\n# looked at\n")
+        found = load_study(tmp_path)
+        digests.add(found.digest)
+        assert found.stimuli_digest == first.stimuli_digest
+    rows = (tmp_path / "stimuli.csv").read_text()
+    (tmp_path / "stimuli.csv").write_text(rows.replace("_0001,", "_0099,"))
+    last = load_study(tmp_path)
+    assert last.stimuli_digest != first.stimuli_digest
+    assert len(digests | {last.digest}) == 5
+
+
+@pytest.mark.parametrize(
+    "name", ["study.toml", "stimuli.csv", "texts/de.toml", "media/00000.mp4", "media/00000.png"]
+)
+def test_missing_files_and_links_are_refused(tmp_path: Path, name: str) -> None:
+    folder = tmp_path / "study"
+    make_tiny_study(folder)
+    path, elsewhere = folder / name, tmp_path / "elsewhere"
+    path.rename(elsewhere)
+    with pytest.raises(BadInputError, match=r"is missing") as raised:
+        load_study(folder)
+    assert str(path) in str(raised.value)
+    path.symlink_to(elsewhere)
+    with pytest.raises(BadInputError, match="link"):
+        load_study(folder)
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(BadInputError, match="no plain file"):
+        load_study(folder)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
+def test_a_pipe_does_not_make_us_wait(tmp_path: Path) -> None:
+    make_tiny_study(tmp_path)
+    (tmp_path / "stimuli.csv").unlink()
+    os.mkfifo(tmp_path / "stimuli.csv")
+    with pytest.raises(BadInputError, match="no plain file"):
+        load_study(tmp_path)
+
+
+def test_a_scenario_without_stimuli_is_refused(tmp_path: Path) -> None:
+    study = make_tiny_study(tmp_path)
+    write_settings(dataclasses.replace(study, scenarios=("collide", "roll")))
+    with pytest.raises(BadInputError, match="no stimulus of roll for familiarization"):
+        load_study(tmp_path)
+
+
+def test_a_scenario_can_be_taken_out(tmp_path: Path) -> None:
+    study = make_tiny_study(tmp_path, scenarios=("collide", "roll"))
+    write_settings(dataclasses.replace(study, scenarios=("roll",)))
+    assert {s.scenario for s in load_study(tmp_path).stimuli} == {"roll"}
+
+
+def test_no_folder_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="no study folder"):
+        load_study(tmp_path / "none")
+
+
+def _study() -> Study:
+    return Study(Path("somewhere"), "tiny", "1", "A title", "Ada, ada@example.org", ("collide",))

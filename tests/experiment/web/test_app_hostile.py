@@ -1,0 +1,410 @@
+"""Requests that no page of ours sends: refused in one way, nothing stored, nothing given away."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import pytest
+
+pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
+
+import sqlalchemy as sa
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from physion.experiment.protocol import messages as wire
+from physion.experiment.store.tables import ANSWERS, EVENTS, RAW_IDS, SESSIONS
+from physion.experiment.study.identity import Secrets
+from physion.experiment.web.bodies import BadBodyError, parse_message
+from physion.experiment.web.media_links import sign_media
+from support.experiment.app_walk import Person, Served, answer_body, served
+from support.experiment.live_app import exchange, running
+from support.experiment.tiny_study import make_tiny_study
+
+NASTY = (
+    "<script>alert(1)</script>",
+    "'; DROP TABLE answers; --",
+    '" OR ""="',
+    "=cmd|' /C calc'!A0",
+    "../../secret.json",
+    "{7*7} {%7*7%} $(7*7) %s %(x)s",
+    "a\r\nSet-Cookie: x=1",
+    "\u202eright to left\u0085\ufeff",
+    "\U0001f41b" * 20,
+)
+DEEP = "[" * 30_000 + "]" * 30_000
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    folder = tmp_path_factory.mktemp("hostile") / "study"
+    with served(folder, familiarization=1, test=3, participants=10_000) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def tester(site: Served) -> Person:
+    """Someone at the first test trial, who gets no further here."""
+    return site.person(id="tester").walk("test")
+
+
+def counts(site: Served) -> dict[str, int]:
+    """Rows of each table."""
+    with site.store.engine.connect() as connection:
+        return {
+            table.name: connection.scalar(sa.select(sa.func.count()).select_from(table)) or 0
+            for table in (SESSIONS, ANSWERS, EVENTS, RAW_IDS)
+        }
+
+
+def assert_refused(answer: Any, status: int = 422, error: str = "bad_request") -> str:
+    """A refusal of bounded length; its sentence."""
+    assert answer.status_code == status, answer.text[:300]
+    refusal = wire.Refusal.model_validate_json(answer.content)
+    assert refusal.error == error
+    assert len(answer.content) < 1500
+    assert "Traceback" not in answer.text and "<" not in refusal.message
+    return refusal.message
+
+
+def post(person: Person, path: str, content: bytes, kind: str | None = "application/json") -> Any:
+    headers = {"authorization": f"Bearer {person.token}"}
+    if kind is not None:
+        headers["content-type"] = kind
+    return person.client.post(path, content=content, headers=headers)
+
+
+def changed(**values: Any) -> bytes:
+    return json.dumps({**answer_body(0), **values}).encode()
+
+
+BODIES = {
+    "nothing": b"",
+    "no JSON": b"response=yes",
+    "half": changed()[:-5],
+    "null": b"null",
+    "a list": b"[]",
+    "a number": b"1",
+    "a text": b'"x"',
+    "invalid UTF-8": changed().replace(b"yes", b"y\xffs"),
+    "UTF-16": changed().decode().encode("utf-16"),
+    "packed": gzip.compress(changed()),
+    "deep": DEEP.encode(),
+    "deep in details": changed().replace(b'"details": {', b'"details": {"x": ' + b"[" * 5000),
+    "deep and complete": changed(details={"x": json.loads("[" * 9 + "]" * 9)}),
+    "a key twice": changed()[:-1] + b', "response": "no"}',
+    "a key of details twice": changed().replace(b'"details": {', b'"details": {"a": 1, "a": 2, '),
+    "NaN": changed(rt_ms=float("nan")),
+    "Infinity": changed(rt_ms=float("inf")),
+    "minus Infinity": changed(rt_ms=float("-inf")),
+    "beyond a double": changed().replace(b"812.5", b"1e999"),
+    "NaN in details": changed(details={"x": float("nan")}),
+    "beyond a double in details": changed(details={"x": 12321}).replace(b"12321", b"1e999"),
+    "a huge number": changed(rt_ms=10**400),
+    "digits beyond reading": changed().replace(b"812.5", b"1" * 10_000),
+    "a huge number in details": changed(details={"x": 10**30}),
+    "NUL": changed(details={"x": "a\x00b"}),
+    "NUL in a key": changed(details={"a\x00": 1}),
+    "half a character": changed(details={"x": "\ud800"}),
+    "half a character as key": changed(details={"\udfff": 1}),
+}
+VALUES: dict[str, dict[str, Any]] = {
+    "negative time": {"rt_ms": -1},
+    "time beyond a day": {"rt_ms": 86_400_001},
+    "time as text": {"rt_ms": "812.5"},
+    "time as bool": {"rt_ms": True},
+    "no time": {"rt_ms": None},
+    "negative fixation": {"fixation_ms": -0.001},
+    "huge cue": {"cue_ms": 1e300},
+    "negative trial": {"trial": -1},
+    "half a trial": {"trial": 0.5},
+    "trial as text": {"trial": "0"},
+    "trial beyond all": {"trial": 10**15},
+    "unknown phase": {"phase": "demo"},
+    "unknown response": {"response": "maybe"},
+    "response in capitals": {"response": "YES"},
+    "unknown input": {"input": "<script>"},
+    "short key": {"key": "short"},
+    "key with more than letters": {"key": "abcdefgh'--"},
+    "key with an end of line": {"key": "abcdefgh\n"},
+    "long key": {"key": "a" * 65},
+    "negative frames": {"frames_shown": -5},
+    "huge window": {"window_width": 10**9},
+    "too many details": {"details": {str(number): 0 for number in range(31)}},
+    "too long details": {"details": {"x": "y" * 17_000}},
+    "a long name in details": {"details": {"n" * 201: 1}},
+    "details as a list": {"details": [1]},
+    "a stimulus": {"stimulus": "collide_tiny_tes_0000"},
+    "a session": {"session": "0" * 32},
+    "correct": {"correct": True},
+    "a script as name": {"<script>alert(1)</script>": 1},
+}
+
+
+class TestAnswers:
+    @pytest.mark.parametrize("name", BODIES)
+    def test_what_is_no_message(self, site: Served, tester: Person, name: str) -> None:
+        before = counts(site)
+        assert_refused(post(tester, "/api/answers", BODIES[name]))
+        assert counts(site) == before and tester.state()["trial"] == 0
+
+    @pytest.mark.parametrize("name", VALUES)
+    def test_what_no_answer_holds(self, site: Served, tester: Person, name: str) -> None:
+        before = counts(site)
+        message = assert_refused(post(tester, "/api/answers", changed(**VALUES[name])))
+        field = next(iter(VALUES[name]))
+        assert field[:4].strip("<") in message, "the refusal says where"
+        assert counts(site) == before and tester.state()["trial"] == 0
+
+    @pytest.mark.parametrize("kind", [
+        None, "", "text/plain", "application/x-www-form-urlencoded", "multipart/form-data",
+        "application/jsonx", "text/html; application/json", "application/octet-stream",
+    ])  # fmt: skip
+    def test_other_content_types(self, tester: Person, kind: str | None) -> None:
+        """Which also keeps other sites' forms out, that can send nothing else unasked."""
+        assert_refused(post(tester, "/api/answers", changed(), kind))
+        assert tester.state()["trial"] == 0
+
+    @pytest.mark.parametrize("trial", [1, 2, 3, 99_999])
+    def test_trials_that_do_not_come_now(self, tester: Person, trial: int) -> None:
+        refusal = tester.answer(trial, status=409)
+        assert refusal["error"] == "out_of_order" and refusal["state"]["trial"] == 0
+        refusal = tester.answer(trial, "familiarization", status=409)
+        assert refusal["error"] == "out_of_order"
+
+    def test_no_value_comes_back(self, tester: Person) -> None:
+        marker = "<b>marker</b>" + "m" * 10_000
+        for field in ("response", "key", "rt_ms", "phase", "details"):
+            answer = post(tester, "/api/answers", changed(**{field: marker}))
+            assert "marker" not in answer.text and "mmm" not in answer.text
+
+    def test_another_persons_token_answers_for_that_person_alone(self, site: Served) -> None:
+        one, two = site.person().walk("test"), site.person().walk("test")
+        key = "the-very-same-key"
+        one.answer(0, key=key, response="yes")
+        assert not two.answer(0, key=key, response="no")["duplicate"]
+        assert (one.state()["trial"], two.state()["trial"]) == (1, 1)
+
+
+class TestEverythingElse:
+    @pytest.mark.parametrize("name", [name for name in BODIES if "details" not in name])
+    @pytest.mark.parametrize("path", ["/api/enter", "/api/page", "/api/events"])
+    def test_bodies_of_other_endpoints(
+        self, site: Served, tester: Person, path: str, name: str
+    ) -> None:
+        before = counts(site)
+        assert_refused(post(tester, path, BODIES[name]))
+        assert counts(site) == before
+
+    @pytest.mark.parametrize("body", [
+        {"id": "x" * 201}, {"id": " "}, {"id": 5}, {"source": "facebook"}, {"language": "x" * 21},
+        {"recruiter": {"a": "x" * 501}}, {"recruiter": {str(i): "" for i in range(11)}},
+        {"recruiter": {"a": {"b": 1}}}, {"device": {"refresh_hz": -60}}, {"kind": "simulated"},
+        {"device": {"user_agent": "x" * 1001}}, {"device": {"screen_width": 1e9}},
+    ])  # fmt: skip
+    def test_who_enters(self, site: Served, body: Any) -> None:
+        before = counts(site)
+        assert_refused(site.client.post("/api/enter", json=body))
+        assert counts(site) == before
+
+    @pytest.mark.parametrize("body", [
+        {"page": "done"}, {"page": "test"}, {"page": ["consent"]}, {"page": "consent"},
+        {"page": "consent", "data": {"agreed": "yes"}}, {"page": "consent", "data": {"agreed": 1}},
+        {"page": "consent", "data": {"agreed": True, "extra": 1}},
+        {"page": "instructions", "data": {"x": [1]}}, {"page": "ready", "data": {"x" * 201: 1}},
+        {"page": "demographics", "data": {"age": -3, "gender": "a", "education": "b"}},
+        {"page": "demographics", "data": {"age": 1e300, "gender": "a", "education": "b"}},
+        {"page": "demographics", "data": {"age": 30, "gender": "a" * 5001, "education": "b"}},
+        {"page": "feedback", "data": {"difficulty": 6, "technical_problems": False, "text": ""}},
+        {"page": "feedback", "data": {"difficulty": 1, "technical_problems": 0, "text": ""}},
+        {"page": "feedback",
+         "data": {"difficulty": 1, "technical_problems": False, "text": "x" * 5001}},
+    ])  # fmt: skip
+    def test_pages(self, tester: Person, body: Any) -> None:
+        before = tester.state()
+        assert_refused(post(tester, "/api/page", json.dumps(body).encode()))
+        assert tester.state() == before
+
+    @pytest.mark.parametrize("page", ["demographics", "feedback"])
+    def test_pages_that_do_not_come_now(self, tester: Person, page: str) -> None:
+        assert tester.page(page, status=409)["error"] == "wrong_stage"
+
+    @pytest.mark.parametrize("event", [
+        {"kind": "<script>", "at_ms": 1}, {"kind": "ok", "at_ms": -1}, {"kind": "ok", "at_ms": "1"},
+        {"kind": "x" * 41, "at_ms": 1}, {"kind": "ok", "at_ms": 1, "data": {"a": {"b": 1}}},
+        {"kind": "ok", "at_ms": 1, "data": {"a": "x" * 5001}}, {"kind": "ok"}, "hidden", None,
+    ])  # fmt: skip
+    def test_events(self, site: Served, tester: Person, event: Any) -> None:
+        before = counts(site)
+        good = {"kind": "hidden", "at_ms": 1}
+        assert_refused(post(tester, "/api/events", json.dumps({"events": [good, event]}).encode()))
+        assert_refused(post(tester, "/api/events", json.dumps({"events": [good] * 51}).encode()))
+        assert counts(site) == before
+
+    @pytest.mark.parametrize("query", [
+        "load=true&load=false", "load=1", "load=%00", "load[]=true", "x=" + "y" * 3000, "%ff=%fe",
+    ])  # fmt: skip
+    def test_queries(self, tester: Person, query: str) -> None:
+        assert tester.ask("GET", f"/api/session?{query}")["stage"] == "test"
+
+
+class TestTexts:
+    @pytest.mark.parametrize("text", NASTY)
+    def test_every_text_is_stored_as_it_is_and_does_nothing(self, site: Served, text: str) -> None:
+        person = site.person(
+            id=text.strip(), language="en", recruiter={text.strip()[:100]: text},
+            device={"user_agent": text},
+        )  # fmt: skip
+        person.walk("test")
+        for trial in range(3):
+            person.answer(trial, details={text[:100]: text})
+        person.ask("POST", "/api/events",
+                   {"events": [{"kind": "error", "at_ms": 1, "data": {"text": text}}]})  # fmt: skip
+        person.page("demographics", age=30, gender=text, education=text)
+        person.page("feedback", difficulty=1, technical_problems=False, text=text)
+        reference = person.state()["reference"]
+        with site.store.engine.connect() as connection:
+            session = connection.execute(
+                sa.select(SESSIONS).where(SESSIONS.c.reference == reference)
+            ).one()
+            answers = connection.execute(
+                sa.select(ANSWERS).where(ANSWERS.c.session == session.session)
+            ).all()
+            raw = connection.execute(
+                sa.select(RAW_IDS).where(RAW_IDS.c.participant == session.participant)
+            ).one()
+        assert (session.gender, session.feedback) == (text.strip(), text.strip())
+        assert session.device["user_agent"] == text
+        assert (raw.raw_id, list(raw.recruiter.values())) == (text.strip(), [text])
+        assert len(answers) == 4
+        assert json.loads(answers[-1].details) == {text[:100]: text}
+        for _, answer in person.heard:
+            assert text not in answer.text
+            assert "set-cookie" not in answer.headers
+
+    @pytest.mark.parametrize("text", NASTY)
+    def test_texts_where_names_are_expected(self, site: Served, text: str) -> None:
+        refused = [({"scenario": text}, "bad_link"), ({"pass": text}, "bad_link"),
+                   ({"source": text}, "bad_request")]  # fmt: skip
+        for body, error in refused:
+            answer = site.client.post("/api/enter", json=body)
+            assert_refused(answer, wire.REFUSALS[error], error)
+        for path in ("/api/texts/{}", "/api/trials/{}", "/static/{}", "/media/{}"):
+            answer = site.client.get(path.format(quote(text, safe="")))
+            assert_refused(answer, 404, "not_found")
+
+
+class TestSignatures:
+    def test_another_studys_signature_is_none_here(self, site: Served, tmp_path: Path) -> None:
+        other = make_tiny_study(tmp_path / "other", familiarization=1, test=3, size=64)
+        keys = Secrets.load(other.folder)
+        path = sign_media(other, keys, "collide", 1, "test", 0, "movie")
+        assert_refused(site.client.get(path), 404, "not_found")
+
+    def test_unknown_trials_and_scenarios_are_not_found(self, site: Served) -> None:
+        more = replace(site.study, scenarios=("collide", "drop"))
+        for scenario, phase, trial in (
+            ("collide", "test", 3), ("collide", "test", 999_999), ("drop", "test", 0),
+            ("collide", "familiarization", 1),
+        ):  # fmt: skip
+            path = sign_media(more, site.secrets, scenario, 1, phase, trial, "movie")
+            assert_refused(site.client.get(path), 404, "not_found")
+
+
+TRAVERSALS = (
+    "/static/../../study.py", "/static/%2e%2e/%2e%2e/study.py", "/static/..%2f..%2fstudy.py",
+    "/static/..%5c..%5cstudy.py", "/static/....//....//study.py", "/static//etc/passwd",
+    "/static/%2fetc%2fpasswd", "/static/./main.js", "/static/main.js/", "/static/main.js%00",
+    "/static/main.js%00.css", "/static/%252e%252e/study.py", "/static/\\..\\study.py",
+    "/media/../study.toml", "/media/%2e%2e%2fsecret.json", "/media/%2fetc%2fpasswd",
+    "/static/vendor/../../wire.py", "//etc/passwd", "/..%2f..%2fetc/passwd", "/%ff%fe",
+    "/api/../secret.json", "/%2e%2e/secret.json", "/experimenter/static/..%2f..%2fgate.py",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def port(site: Served) -> Iterator[int]:
+    with running(site.client.app) as found:
+        yield found
+
+
+class TestRawRequests:
+    """What no client library sends, on a real server."""
+
+    @pytest.mark.parametrize("path", TRAVERSALS)
+    def test_no_path_leads_out(self, port: int, path: str) -> None:
+        rest = b" HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n"
+        answer = exchange(port, b"GET " + path.encode() + rest)
+        assert answer.startswith((b"HTTP/1.1 404", b"HTTP/1.1 400", b"HTTP/1.1 303"))
+        assert b"root:" not in answer and b"import" not in answer and b"hash_key" not in answer
+
+    @pytest.mark.parametrize("words", [
+        b"\x00" * 100, b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03", b"GET\r\n\r\n",
+        b"GET / HTTP/9.9\r\n\r\n", b"GET /\xff\xfe HTTP/1.1\r\nHost: x\r\n\r\n",
+        b"GET / HTTP/1.1\r\nBad Header\r\n\r\n", b"GET / HTTP/1.1\r\n: x\r\n\r\n",
+        b"POST /api/enter HTTP/1.1\r\nHost: x\r\nContent-Length: 5\r\n"
+        b"Transfer-Encoding: chunked\r\n\r\n0\r\n\r\n",
+        b"POST /api/enter HTTP/1.1\r\nHost: x\r\nContent-Length: 5\r\nContent-Length: 6\r\n\r\n{}",
+        b"POST /api/enter HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n\r\n",
+        b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n",
+    ])  # fmt: skip
+    def test_what_is_no_http(self, site: Served, port: int, words: bytes) -> None:
+        before = counts(site)
+        answer = exchange(port, words)
+        assert b"Traceback" not in answer and not answer.startswith(b"HTTP/1.1 200")
+        assert counts(site) == before
+        alive = exchange(port, b"GET /api/health HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n")
+        assert alive.endswith(b'{"ok":true}')
+
+    def test_a_name_cannot_begin_a_header(self, port: int) -> None:
+        start = b"GET /api/texts/x%0d%0aSet-Cookie:%20a=b HTTP/1.1\r\nHost: x\r\n"
+        answer = exchange(port, start + b"Connection: close\r\n\r\n")
+        assert answer.startswith(b"HTTP/1.1 404") and b"a=b" not in answer
+
+    def test_a_host_of_ones_own_choice_appears_nowhere(self, port: int) -> None:
+        for path in (b"/", b"/api/session/", b"/static", b"/experimenter"):
+            answer = exchange(
+                port, b"GET " + path + b" HTTP/1.1\r\nHost: evil.example\r\nConnection: close\r\n"
+                b"X-Forwarded-Host: evil.example\r\nX-Forwarded-For: 1.1.1.1\r\n\r\n"
+            )  # fmt: skip
+            assert b"evil.example" not in answer
+
+    def test_a_whole_address_is_taken_as_its_path(self, port: int) -> None:
+        answer = exchange(port, b"GET http://evil.example/static/../wire.py HTTP/1.1\r\n"
+                                b"Host: x\r\nConnection: close\r\n\r\n")  # fmt: skip
+        assert answer.startswith((b"HTTP/1.1 404", b"HTTP/1.1 400"))
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20),
+    lambda inner: (
+        st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=9), inner, max_size=4)
+    ),
+    max_leaves=20,
+)
+
+
+@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(st.dictionaries(st.sampled_from(sorted(wire.Answer.model_fields)), JSON), st.booleans())
+def test_any_json_is_a_message_or_refused(values: dict[str, Any], whole: bool) -> None:
+    body = {**(answer_body(0) if whole else {}), **values}
+    try:
+        message = parse_message(json.dumps(body).encode(), wire.Answer)
+    except BadBodyError:
+        return
+    # What was taken is plain JSON that every database can store.
+    json.dumps(message.model_dump(), allow_nan=False).encode()
+    assert 0 <= message.rt_ms <= wire.DAY_MS
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.binary(max_size=200))
+def test_any_bytes_are_refused(body: bytes) -> None:
+    with pytest.raises(BadBodyError):
+        parse_message(body, wire.Answer)

@@ -1,0 +1,180 @@
+"""Links to hand out, and how people get their credit."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import pytest
+
+pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
+
+from physion.cli.main import main
+from physion.errors import BadInputError
+from physion.experiment.study.identity import Secrets
+from physion.experiment.study.recruitment import (
+    MTURK_HOSTS,
+    RECRUITERS,
+    completion,
+    kind_of_pass,
+    links,
+    pass_word,
+    session_code,
+)
+from physion.experiment.study.study import Recruitment, Study
+from support.experiment.app_walk import served
+from support.experiment.tiny_study import make_tiny_study
+
+SONA = "https://uni.sona-systems.com/webstudy_credit.aspx?experiment_id=12&credit_token=ab9"
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Study:
+    folder: Path = tmp_path_factory.mktemp("recruited") / "study"
+    return make_tiny_study(
+        folder, familiarization=1, test=1, size=64, scenarios=("collide", "drop"),
+        recruitment=Recruitment(prolific_code="C0DE", sona_address=SONA, link_code="THANKS"),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def secrets(study: Study) -> Secrets:
+    return Secrets.load(study.folder)
+
+
+def session(source: str, name: str = "5e55") -> Any:
+    return SimpleNamespace(source=source, session=name)
+
+
+def raw(raw_id: str = "1234", **recruiter: str) -> Any:
+    return SimpleNamespace(raw_id=raw_id, recruiter=recruiter)
+
+
+class TestLinks:
+    def test_each_recruiter_and_scenario_has_one(self, study: Study, secrets: Secrets) -> None:
+        found = links(study, secrets, "https://lab.example.org/")
+        assert [(one.name, one.scenario) for one in found] == [
+            (name, scenario)
+            for scenario in ("collide", "drop")
+            for name in ("link", "prolific", "sona", "mturk", "preview", "simulated")
+        ]
+        for one in found:
+            assert one.address.startswith(f"https://lab.example.org/?scenario={one.scenario}")
+
+    def test_placeholders_are_as_recruiters_want_them(self, study: Study, secrets: Secrets) -> None:
+        found = {one.name: one.address for one in links(study, secrets, "http://x:8000")}
+        assert found["prolific"].endswith(
+            "&PROLIFIC_PID={{%PROLIFIC_PID%}}&STUDY_ID={{%STUDY_ID%}}&SESSION_ID={{%SESSION_ID%}}"
+        )
+        assert found["sona"].endswith("&id=%SURVEY_CODE%")
+        by_source = {one.source: one for one in RECRUITERS}
+        for name in ("prolific", "sona"):
+            given = set(parse_qs(urlsplit(found[name]).query)) - {"scenario"}
+            assert given == {by_source[name].id, *by_source[name].others}
+
+    def test_what_the_study_lacks_is_said(self, study: Study, secrets: Secrets) -> None:
+        found = {one.name: one.lacks for one in links(study, secrets, "http://x")}
+        assert found["prolific"] == found["sona"] == found["link"] == ""
+        assert "embed_from" in found["mturk"]
+        bare = replace(study, recruitment=Recruitment(), embed_from=MTURK_HOSTS)
+        found = {one.name: one.lacks for one in links(bare, secrets, "http://x")}
+        assert "prolific_code" in found["prolific"] and "sona_address" in found["sona"]
+        assert found["mturk"] == ""
+
+    @pytest.mark.parametrize("base", [
+        "", "lab.example.org", "ftp://lab.example.org", "https://", "https://x/deeper",
+        "https://x/?a=b", "https://x/#a", "https://user@x", "https://x:99999", "javascript:x",
+    ])  # fmt: skip
+    def test_a_base_that_is_no_site_is_refused(
+        self, study: Study, secrets: Secrets, base: str
+    ) -> None:
+        with pytest.raises(BadInputError, match="base-url"):
+            links(study, secrets, base)
+
+    def test_the_verb_prints_them(self, study: Study, capsys: pytest.CaptureFixture[str]) -> None:
+        words = ["experiment", "links", str(study.folder), "--base-url", "https://a.example"]
+        assert main(words) == 0
+        printed = capsys.readouterr().out
+        assert "https://a.example/?scenario=drop&pass=preview-" in printed
+        assert "study.toml lacks embed_from" in printed
+        assert main([*words, "--json"]) == 0
+        found = json.loads(capsys.readouterr().out)["links"]
+        assert len(found) == 12
+        assert set(found[0]) == {"name", "scenario", "address", "goes_to", "lacks"}
+        assert main([*words[:4], "nothing"]) == 2
+        assert capsys.readouterr().err.startswith("physion: --base-url 'nothing'")
+
+
+class TestPasses:
+    def test_a_word_stands_for_its_kind_alone(self, secrets: Secrets) -> None:
+        for kind in ("preview", "simulated"):
+            word = pass_word(secrets, kind)  # type: ignore[arg-type]
+            assert kind_of_pass(secrets, word) == kind
+        signature = pass_word(secrets, "preview").partition("-")[2]
+        others = (f"simulated-{signature}", f"person-{signature}", signature, "é-é")
+        longer = (f"preview-{signature}0", f"preview-{signature[:-1]}")
+        for word in ("", "preview", "preview-", *others, *longer):
+            assert kind_of_pass(secrets, word) is None, word
+
+    def test_links_open_sessions_of_their_kinds(self, tmp_path: Path) -> None:
+        with served(tmp_path / "s", familiarization=1, test=1) as site:
+            for one in links(site.study, site.secrets, "http://x"):
+                asked = parse_qs(urlsplit(one.address).query)
+                if one.name not in ("link", "preview", "simulated"):
+                    continue
+                more = {"pass": asked["pass"][0]} if "pass" in asked else {}
+                state = site.person(scenario=asked["scenario"][0], **more).last["state"]
+                assert state["kind"] == {"link": "person"}.get(one.name, one.name)
+
+
+class TestCompletion:
+    def test_prolific(self, study: Study, secrets: Secrets) -> None:
+        found = completion(study, secrets, session("prolific"), raw())
+        assert found.code == "C0DE"
+        assert found.url == "https://app.prolific.com/submissions/complete?cc=C0DE"
+        # Ids are not needed for it.
+        assert completion(study, secrets, session("prolific")) == found
+
+    def test_sona_gets_the_survey_code_and_keeps_its_own_words(
+        self, study: Study, secrets: Secrets
+    ) -> None:
+        found = completion(study, secrets, session("sona"), raw("77&x=1"))
+        assert found.url is not None and found.url.startswith(SONA.partition("?")[0])
+        assert parse_qs(urlsplit(found.url).query) == {
+            "experiment_id": ["12"], "credit_token": ["ab9"], "survey_code": ["77&x=1"]
+        }  # fmt: skip
+        with_place = replace(study.recruitment, sona_address=f"{SONA}&survey_code=XXXX")
+        again = completion(replace(study, recruitment=with_place), secrets, session("sona"),
+                           raw("77&x=1"))  # fmt: skip
+        assert again.url == found.url
+        assert completion(study, secrets, session("sona")).url is None
+
+    def test_mturk_takes_a_form_of_its_own_host_alone(self, study: Study, secrets: Secrets) -> None:
+        own = session_code(secrets, "5e55")
+        assert len(own) == 10 and own != session_code(secrets, "5e56")
+        for host in MTURK_HOSTS:
+            sent = raw("w", assignmentId="a1", turkSubmitTo=f"{host}/")
+            found = completion(study, secrets, session("mturk"), sent)
+            assert found.url == f"{host}/mturk/externalSubmit"
+            assert found.post == {"assignmentId": "a1", "code": own}
+        for host in ("https://evil.example", "https://www.mturk.com.evil.example", "",
+                     "javascript:alert(1)", "http://www.mturk.com"):  # fmt: skip
+            sent = raw("w", assignmentId="a1", turkSubmitTo=host)
+            found = completion(study, secrets, session("mturk"), sent)
+            assert (found.code, found.url, found.post) == (own, None, None)
+        assert completion(study, secrets, session("mturk")).code == own
+
+    def test_one_code_for_all_at_mturk(self, study: Study, secrets: Secrets) -> None:
+        decided = replace(study.recruitment, mturk_code="SAME")
+        one = replace(study, recruitment=decided)
+        assert completion(one, secrets, session("mturk"), raw()).code == "SAME"
+
+    def test_plain_links(self, study: Study, secrets: Secrets) -> None:
+        found = completion(study, secrets, session("link"))
+        assert (found.code, found.url) == ("THANKS", None)
+        bare = completion(replace(study, recruitment=Recruitment()), secrets, session("link"))
+        assert (bare.code, bare.url) == (None, None)

@@ -1,0 +1,274 @@
+"""The server process: starts, says where it is, stops without losing anything, fails in a line."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import signal
+import socket
+import ssl
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
+
+from physion.cli.experiment.init import Options
+from physion.cli.main import main
+from physion.experiment.server import Address
+from physion.experiment.study.study import Limits, Study
+from support.experiment.app_walk import answer_body, served
+from support.experiment.live_app import HOST, read_all, running
+from support.experiment.tiny_study import make_tiny_study
+from support.programs import find_program
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Study:
+    folder = tmp_path_factory.mktemp("server") / "study"
+    return make_tiny_study(folder, familiarization=1, test=3, size=64)
+
+
+@pytest.fixture(scope="module")
+def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A certificate for localhost that signs itself, and its key."""
+    openssl = find_program("openssl")
+    folder = tmp_path_factory.mktemp("https")
+    certificate, key = folder / "cert.pem", folder / "key.pem"
+    subprocess.run(
+        [openssl, "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "1", "-subj",
+         "/CN=localhost", "-addext", "subjectAltName=DNS:localhost,IP:127.0.0.1",
+         "-keyout", key, "-out", certificate],
+        check=True, capture_output=True,
+    )  # fmt: skip
+    return certificate, key
+
+
+@dataclass
+class Process:
+    """A server of its own with the address that it said."""
+
+    process: subprocess.Popen[str]
+    said: dict[str, str]
+
+    @property
+    def port(self) -> int:
+        return int(self.said["address"].rpartition(":")[2])
+
+    def end(self, number: signal.Signals) -> tuple[int, str]:
+        """Exit code after a signal, and what went to standard error."""
+        self.process.send_signal(number)
+        _, errors = self.process.communicate(timeout=30)
+        return self.process.returncode, errors
+
+
+@contextlib.contextmanager
+def started(folder: Path, *words: str) -> Iterator[Process]:
+    command = [sys.executable, "-m", "physion.cli.main", "experiment", "serve", str(folder),
+               "--port", "0", "--json", *words]  # fmt: skip
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        assert line, process.communicate(timeout=30)[1]
+        yield Process(process, json.loads(line))
+    finally:
+        process.kill()
+        process.communicate(timeout=30)
+
+
+def ask(port: int, method: str, path: str, body: Any = None, token: str = "") -> Any:
+    connection = http.client.HTTPConnection(HOST, port, timeout=10)
+    headers = {"content-type": "application/json", "authorization": f"Bearer {token}"}
+    connection.request(method, path, None if body is None else json.dumps(body), headers)
+    return json.loads(connection.getresponse().read())
+
+
+@pytest.mark.slow
+def test_a_stop_ends_requests_in_work_and_keeps_every_answer(study: Study) -> None:
+    with started(study.folder) as server:
+        entered = ask(server.port, "POST", "/api/enter", {})
+        token = entered["token"]
+        for name, data in (("consent", {"agreed": True}), ("instructions", {})):
+            state = ask(server.port, "POST", "/api/page", {"page": name, "data": data}, token)
+        assert state["stage"] == "familiarization"
+        body = json.dumps(answer_body(0, "familiarization")).encode()
+        lines = ["POST /api/answers HTTP/1.1", "Host: x", f"Authorization: Bearer {token}"]
+        lines += ["Content-Type: application/json", f"Content-Length: {len(body)}", "", ""]
+        head = "\r\n".join(lines)
+        with (
+            socket.create_connection((HOST, server.port), timeout=10) as idle,
+            socket.create_connection((HOST, server.port), timeout=10) as connection,
+        ):
+            idle.sendall(b"GET /api/health HTTP/1.1\r\nHost: x\r\n\r\n")
+            heard = b""
+            while not heard.endswith(b'{"ok":true}'):
+                heard += idle.recv(65536)
+            assert heard.startswith(b"HTTP/1.1 200")
+            connection.sendall(head.encode() + body[:10])
+            ended: list[tuple[int, str]] = []
+            thread = threading.Thread(target=lambda: ended.append(server.end(signal.SIGTERM)))
+            thread.start()
+            assert read_all(idle) == b"", "idle connections end at once"
+            connection.sendall(body[10:])
+            answer = read_all(connection)
+            thread.join(30)
+    assert answer.startswith(b"HTTP/1.1 200") and b'"duplicate":false' in answer
+    assert ended == [(0, "")]
+    # Nothing is left that a second server would have to clear away, and the answer is there.
+    with started(study.folder) as server:
+        assert ask(server.port, "GET", "/api/session", token=token)["stage"] == "ready"
+        assert server.end(signal.SIGINT) == (0, "")
+
+
+def test_https_and_what_is_said(study: Study, certificate: tuple[Path, Path]) -> None:
+    words = ("--https-cert", str(certificate[0]), "--https-key", str(certificate[1]),
+             "--log-requests", "--host", "127.0.0.1")  # fmt: skip
+    with started(study.folder, *words) as server:
+        assert server.said["address"] == f"https://127.0.0.1:{server.port}"
+        assert server.said["experimenter"] == f"{server.said['address']}/experimenter"
+        context = ssl.create_default_context(cafile=certificate[0])
+        connection = http.client.HTTPSConnection(HOST, server.port, timeout=10, context=context)
+        connection.request("GET", "/?PROLIFIC_PID=5f0c")
+        answer = connection.getresponse()
+        assert answer.status == 200 and b"<!doctype html>" in answer.read()
+        assert answer.getheader("strict-transport-security") == "max-age=31536000"
+        assert answer.getheader("server") is None
+        connection.close()
+        code, errors = server.end(signal.SIGTERM)
+    assert code == 0
+    assert "GET / 200" in errors and "5f0c" not in errors
+
+
+@pytest.mark.parametrize("trusted", [True, False])
+def test_a_proxys_word_counts_only_where_it_is_named(tmp_path: Path, trusted: bool) -> None:
+    limits = Limits(sessions_per_minute=1, sessions_at_once=1)
+    proxies = ["127.0.0.1"] if trusted else ["10.0.0.1"]
+    settings = {"proxy_headers": True, "forwarded_allow_ips": proxies}
+    with (
+        served(tmp_path / "s", familiarization=1, test=1, limits=limits) as site,
+        running(site.client.app, **settings) as port,
+    ):
+        statuses, secure = [], []
+        for address in ("1.1.1.1", "2.2.2.2", "2.2.2.2"):
+            connection = http.client.HTTPConnection(HOST, port, timeout=10)
+            headers = {"content-type": "application/json", "x-forwarded-for": address,
+                       "x-forwarded-proto": "https"}  # fmt: skip
+            connection.request("POST", "/api/enter", "{}", headers)
+            answer = connection.getresponse()
+            statuses.append(answer.status)
+            secure.append(answer.getheader("strict-transport-security") is not None)
+    assert statuses == ([200, 200, 429] if trusted else [200, 429, 429])
+    assert secure == [trusted] * 3
+
+
+class TestFaults:
+    """One line on standard error, exit code 2."""
+
+    def fail(self, capsys: pytest.CaptureFixture[str], *words: str) -> str:
+        assert main(["experiment", "serve", *words]) == 2
+        printed = capsys.readouterr()
+        assert printed.out == ""
+        assert printed.err.count("\n") == 1 and printed.err.startswith("physion: ")
+        return printed.err
+
+    def test_no_study(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        assert "physion experiment init" in self.fail(capsys, str(tmp_path / "nothing"))
+
+    def test_a_port_in_use(self, study: Study, capsys: pytest.CaptureFixture[str]) -> None:
+        with socket.create_server((HOST, 0)) as taken:
+            port = str(taken.getsockname()[1])
+            error = self.fail(capsys, str(study.folder), "--port", port)
+        assert f"cannot listen on 127.0.0.1 port {port}: Address already in use;" in error
+
+    @pytest.mark.parametrize("host", ["no.such.host.invalid", "256.1.1.1", "203.0.113.7"])
+    def test_a_host_that_is_not_ours(
+        self, study: Study, capsys: pytest.CaptureFixture[str], host: str
+    ) -> None:
+        words = (str(study.folder), "--host", host, "--port", "0", "--behind-proxy", "10.0.0.1")
+        assert f"cannot listen on {host} port 0" in self.fail(capsys, *words)
+
+    def test_certificates(
+        self, study: Study, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        folder, wrong = str(study.folder), tmp_path / "wrong.pem"
+        wrong.write_text("no certificate")
+        assert "belong together" in self.fail(capsys, folder, "--https-cert", str(wrong))
+        for path in (wrong, tmp_path / "missing.pem"):
+            words = ("--https-cert", str(path), "--https-key", str(path), "--port", "0")
+            assert f"certificate {path}" in self.fail(capsys, folder, *words)
+
+    def test_proxies(self, study: Study, capsys: pytest.CaptureFixture[str]) -> None:
+        for name in ("proxy.example.org", "*", ""):
+            assert "--behind-proxy" in self.fail(capsys, str(study.folder), "--behind-proxy", name)
+
+    def test_a_second_server(self, study: Study, capsys: pytest.CaptureFixture[str]) -> None:
+        from physion.experiment.store.store import Store
+        from physion.experiment.study.identity import Secrets
+
+        store = Store.open(study, Secrets.load(study.folder))
+        try:
+            self.fail(capsys, str(study.folder), "--port", "0")
+        finally:
+            store.close()
+
+
+@pytest.mark.parametrize(("address", "readable"), [
+    (Address(), False),
+    (Address("localhost"), False),
+    (Address("::1"), False),
+    (Address("0.0.0.0"), True),
+    (Address("192.0.2.1"), True),
+    (Address("lab.example.org"), True),
+    (Address("0.0.0.0", proxies=("10.0.0.1",)), False),
+    (Address("0.0.0.0", certificate=Path("c"), key=Path("k")), False),
+])  # fmt: skip
+def test_who_could_read_along(address: Address, readable: bool) -> None:
+    assert address.is_readable_on_the_way() == readable
+
+
+@pytest.mark.parametrize("port", ["80000", "65536", "-1"])
+def test_ports_that_there_are_not_are_refused(
+    study: Study, capsys: pytest.CaptureFixture[str], port: str
+) -> None:
+    assert main(["experiment", "serve", str(study.folder), f"--port={port}"]) == 2
+    said = capsys.readouterr().err
+    assert f"--port must be from 0 to 65535, not {port}" in said and said.count("\n") == 1
+
+
+def test_a_folder_without_a_study_is_none(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert main(["experiment", "serve", str(tmp_path)]) == 2
+    said = capsys.readouterr().err
+    assert "this is no study folder; make one with physion experiment init" in said
+    assert said.count("\n") == 1
+
+
+def test_what_is_not_filled_in_is_said_when_it_is_served(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def said(**settings: Any) -> str:
+        folder = tmp_path / str(len(list(tmp_path.iterdir())))
+        make_tiny_study(folder, test=2, familiarization=1, size=64, **settings)
+        (folder / "secret.json").unlink()  # so that it ends after the study was read
+        assert main(["experiment", "serve", str(folder)]) == 2
+        return capsys.readouterr().err
+
+    warning = "physion: warning: contact in study.toml is not filled in"
+    assert warning in said(contact=Options(Path("x")).contact)
+    assert "warning" not in said(contact="Ada, ada@example.org")
+
+
+def test_the_warning_is_printed(
+    study: Study, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert main(["experiment", "serve", str(tmp_path / "nothing"), "--host", "0.0.0.0"]) == 2
+    assert "travel unencrypted" in capsys.readouterr().err

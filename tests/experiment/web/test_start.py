@@ -1,0 +1,52 @@
+"""The server is there soon: what takes seconds to import is imported where it is used."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
+
+import httpx2
+
+from physion.analysis.people.exclusions import RULE_SETS
+from physion.experiment.simulated.server_process import OwnServer
+from physion.experiment.study.study_checks import EXCLUSIONS
+from support.experiment.tiny_study import make_tiny_study
+
+SLOW_TO_IMPORT = (
+    "numpy",
+    "pandas",
+    "scipy",
+    "sklearn",
+    "statsmodels",
+    "matplotlib",
+    "numba",
+    "mujoco",
+)
+
+
+def test_rules_are_those_of_the_analysis() -> None:
+    assert tuple(RULE_SETS) == EXCLUSIONS
+
+
+def test_serving_imports_nothing_slow() -> None:
+    found = f"[name for name in {SLOW_TO_IMPORT} if name in sys.modules]"
+    code = f"import sys, physion.experiment.server; print({found})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_requests_are_logged_without_what_tells_who_comes(tmp_path: Path) -> None:
+    folder = make_tiny_study(tmp_path / "study", test=2, familiarization=1).folder
+    with OwnServer(folder, options=["--log-requests"]) as server:
+        asked = httpx2.get(f"{server.url}/?PROLIFIC_PID=SECRET", trust_env=False)
+        httpx2.get(f"{server.url}/no%0Asuch", trust_env=False)
+        lines = server.last_words().splitlines()
+    assert asked.status_code == 200
+    for request in ("GET / 200", "GET /no%0Asuch 404"):
+        assert sum(line.endswith(request) for line in lines) == 1
+    assert not [line for line in lines if "SECRET" in line]

@@ -1,0 +1,318 @@
+"""Cloth: falls, drapes, rests, keeps its area, obeys its stiffness, and is deterministic."""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from physion.errors import BadInputError
+from physion.physics.cloth.sheet import sheet_springs, sheet_triangles, sheet_vertices
+from physion.physics.cloth.simulate import ClothMotion, ClothSettings, settle_solids, simulate_cloth
+from physion.physics.cloth.solids import fill_shape, particles_of, surface_particles
+from physion.physics.cloth.solver import smallest_distance
+from physion.physics.engine import simulate
+from physion.physics.labels import CLOTH_CONTACT_GAP, label_contact
+from physion.physics.replay import area_under_curve
+from physion.physics.trajectory import ENVIRONMENT, Contacts, Trajectory
+from physion.scenes.scene import Body, Camera, Cloth, Roles, Scene
+from physion.scenes.tdw.read_logs import read_scenes
+from support.paths import FIND_TESTS
+
+REST = ClothSettings().rest_distance
+SPACING = ClothSettings().particle_spacing
+
+
+def draped(
+    *bodies: Body, height: float = 1.0, resolution: int = 21, size: float = 1.0, **cloth: float
+) -> Scene:
+    """A square cloth above bodies; the question is between it and the first body."""
+    sheet = Cloth("cloth", (0.0, 0.0, height), (size, size, 0.0), resolution=resolution, **cloth)
+    return Scene(
+        "test", "drape", bodies, Roles("cloth", bodies[0].name), Camera((3, 0, 2)), (sheet,)
+    )
+
+
+def still(scene: Scene, frames: int, settings: ClothSettings | None = None) -> ClothMotion:
+    """Let the cloth fall on bodies that keep their poses."""
+    positions = np.array([body.position for body in scene.bodies])
+    rotations = np.array([body.rotation for body in scene.bodies])
+    return simulate_cloth(
+        scene, np.tile(positions, (frames, 1, 1)), np.tile(rotations, (frames, 1, 1)), settings
+    )
+
+
+def far_away() -> Body:
+    return Body("patient", "cube", (50.0, 0.0, 0.0))
+
+
+def ball() -> Body:
+    return Body("patient", "sphere", (0.0, 0.0, 0.2), (0.5, 0.5, 0.5))
+
+
+def area(vertices: np.ndarray, resolution: int) -> float:
+    a, b, c = (vertices[corner] for corner in sheet_triangles(resolution).T)
+    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+
+
+def strain(vertices: np.ndarray, scene: Scene) -> np.ndarray:
+    springs = sheet_springs(scene.cloths[0])
+    a, b = vertices[springs.ends[:, 0]], vertices[springs.ends[:, 1]]
+    return np.asarray(np.linalg.norm(a - b, axis=1) / springs.lengths - 1)
+
+
+def test_free_fall_is_that_of_a_point_and_keeps_the_sheet_flat() -> None:
+    settings = ClothSettings(damping=0.0)
+    scene = draped(far_away(), height=2.0)
+    motion = still(scene, 41, settings)
+    step = 0.01 / settings.substeps
+    steps = 40 * settings.substeps
+    # Symplectic Euler: after n steps a point has fallen g dt^2 n (n + 1) / 2.
+    fallen = 9.81 * step**2 * steps * (steps + 1) / 2
+    assert motion.vertices[40, :, 2] == pytest.approx(2.0 - fallen, abs=1e-5)
+    assert np.abs(strain(motion.vertices[40].astype(float), scene)).max() < 1e-5
+
+
+def test_damping_slows_the_fall_as_the_law_says() -> None:
+    motion = still(draped(far_away(), height=2.0), 51)
+    time = 0.5
+    fallen = 9.81 * (time - 1 + np.exp(-time))
+    assert 2.0 - motion.vertices[50, 0, 2] == pytest.approx(fallen, rel=0.01)
+
+
+def test_drapes_over_a_ball_without_going_through() -> None:
+    motion = still(draped(ball(), resolution=31, stretch=1.0), 151)
+    gaps = np.linalg.norm(motion.vertices - [0.0, 0.0, 0.45], axis=2).min(axis=1) - 0.25
+    # The cushion is soft for some frames at the impact, but nothing gets through to the ball.
+    assert gaps.min() > 0.03
+    last = motion.vertices[-1]
+    assert last[:, 2].max() > 0.7 + REST / 2
+    assert last[:, 2].min() < 0.5
+
+
+def test_area_is_roughly_kept() -> None:
+    scene = draped(ball(), resolution=21, stretch=1.0)
+    vertices = still(scene, 151).vertices[-1].astype(float)
+    assert area(vertices, 21) == pytest.approx(1.0, abs=0.15)
+
+
+def test_rests_on_the_floor() -> None:
+    motion = still(draped(far_away(), height=0.3), 151)
+    gap = ClothSettings().floor_gap
+    assert motion.vertices[-1, :, 2] == pytest.approx(gap, abs=2e-3)
+    assert np.abs(motion.vertices[-1] - motion.vertices[-2]).max() < 1e-4
+    floor = motion.contacts.frames_of(ENVIRONMENT, 1)
+    fallen = int(np.flatnonzero(motion.vertices[:, 0, 2] <= gap + 1e-3)[0])
+    assert abs(int(floor[0]) - fallen) <= 1
+
+
+def test_the_floor_carries_the_weight_of_the_cloth() -> None:
+    motion = still(draped(far_away(), height=0.1, mass=0.5), 101)
+    contacts = motion.contacts
+    late = (contacts.frame > 50) & (contacts.bodies[:, 0] == ENVIRONMENT)
+    assert contacts.impulse[late].mean() == pytest.approx(0.5 * 9.81 * 0.01, rel=0.05)
+
+
+def test_energy_does_not_blow_up() -> None:
+    motion = still(draped(ball(), resolution=21, stretch=1.0, bend=1.0), 201)
+    vertices = motion.vertices.astype(float)
+    speed = np.diff(vertices, axis=0) / 0.01
+    energy = 0.5 * (speed**2).sum(axis=2) + 9.81 * vertices[1:, :, 2]
+    assert (energy.mean(axis=1) <= 9.81 * 1.0 + 1e-6).all()
+    assert energy.mean(axis=1)[-1] < 0.65 * energy.mean(axis=1)[0]
+    assert np.sqrt((speed**2).sum(axis=2)).max() < 10.0
+
+
+def test_stiffer_cloth_stretches_less() -> None:
+    worst = [
+        float(np.quantile(strain(still(scene, 101).vertices[-1].astype(float), scene), 0.9))
+        for scene in (draped(ball(), resolution=31, stretch=k, bend=0.0) for k in (0.1, 0.4, 1.0))
+    ]
+    assert worst[0] > worst[1] > worst[2]
+
+
+def test_stiffer_bending_lifts_an_overhanging_sheet() -> None:
+    post = Body("patient", "cube", (0.0, 0.0, 0.0), (0.3, 0.3, 0.6))
+    rims = []
+    for bend in (0.0, 1.0):
+        scene = draped(post, height=0.9, resolution=21, stretch=1.0, bend=bend)
+        rims.append(float(still(scene, 81).vertices[-1, :, 2].mean()))
+    assert rims[1] > rims[0] + 0.01
+
+
+def test_friction_holds_a_sheet_that_hangs_over_to_one_side() -> None:
+    post = Body("patient", "cube", (0.25, 0.0, 0.0), (0.4, 1.2, 0.6))
+    scene = draped(post, height=0.75, resolution=21, stretch=1.0)
+    slid = [
+        float(still(scene, 61, ClothSettings(particle_friction=mu)).vertices[-1, :, 0].mean())
+        for mu in (0.0, 1.0)
+    ]
+    assert slid[0] < slid[1] - 0.005
+
+
+def test_a_moving_body_takes_the_cloth_along() -> None:
+    scene = draped(Body("patient", "cube", (0.0, 0.0, 0.0), (0.8, 0.8, 0.3)), height=0.45)
+    frames = 121
+    positions = np.zeros((frames, 1, 3))
+    positions[60:, 0, 0] = np.linspace(0, 0.3, 61)
+    rotations = np.tile([1.0, 0, 0, 0], (frames, 1, 1))
+    moved = simulate_cloth(scene, positions, rotations).vertices
+    assert moved[-1, :, 0].mean() > moved[60, :, 0].mean() + 0.15
+
+
+def test_distance_equals_brute_force() -> None:
+    rng = np.random.default_rng(0)
+    body = Body("b", "cone", (0.3, -0.2, 0.1), (0.4, 0.5, 0.6), (0.8, 0.3, -0.4, 0.2))
+    w, x, y, z = np.asarray(body.rotation) / np.linalg.norm(body.rotation)
+    turn = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    world = particles_of(body, SPACING) @ turn.T + body.position
+    points = rng.uniform([-1.0, -1.0, 0.6], [1.0, 1.0, 2.6], (40, 3))
+    brute = np.linalg.norm(points[:, None] - world[None], axis=2).min()
+    found = smallest_distance(
+        points, surface_particles(body, SPACING), np.array(body.position), turn
+    )
+    assert found == pytest.approx(brute, abs=1e-12)
+
+
+def test_recorded_distance_is_that_of_the_recorded_vertices() -> None:
+    motion = still(draped(ball()), 81)
+    world = particles_of(ball(), SPACING) + ball().position
+    for frame in (0, 30, 60, 80):
+        apart = np.linalg.norm(motion.vertices[frame][:, None] - world[None], axis=2).min()
+        assert motion.distance[frame] == pytest.approx(apart - REST, abs=1e-6)
+
+
+def test_contacts_name_the_cloth_and_the_body_that_meet() -> None:
+    motion = still(draped(ball(), far_away_named("other")), 81)
+    assert len(motion.contacts.frames_of(0, 2)) > 10
+    assert not len(motion.contacts.frames_of(1, 2))
+    rows = (motion.contacts.bodies == [0, 2]).all(axis=1)
+    normals = motion.contacts.normal[rows]
+    assert np.linalg.norm(normals, axis=1) == pytest.approx(1.0, abs=1e-5)
+    assert np.median(normals[:, 2]) > 0.9
+    assert motion.contacts.impulse[rows].max() > 0
+    pressed = np.flatnonzero(motion.distance < 0)
+    assert set(pressed) <= set(motion.contacts.frames_of(0, 2).tolist())
+
+
+def far_away_named(name: str) -> Body:
+    return replace(far_away(), name=name)
+
+
+@pytest.mark.parametrize("name", ["cube", "cylinder", "sphere", "cone", "pyramid"])
+def test_particles_fill_a_shape_evenly(name: str) -> None:
+    spacing, scale = 0.02, (0.5, 0.6, 0.7)
+    _, filled = fill_shape(name, scale, spacing)
+    particles = particles_of(Body("b", name, (0, 0, 0), scale), spacing)
+    fill = {"cube": 1, "cylinder": np.pi / 4, "sphere": np.pi / 6, "cone": np.pi / 12}
+    volume = {**fill, "pyramid": 0.75**2 * 2 / 3}[name] * np.prod(scale)
+    assert filled.sum() * spacing**3 == pytest.approx(volume, rel=0.1)
+    assert particles[:, 2].min() > 0 and particles[:, 2].max() < scale[2]
+    assert np.abs(particles[:, :2].mean(axis=0)).max() < 1e-9
+
+
+def test_solids_settle_on_the_floor_whatever_way_they_are_turned() -> None:
+    tilted = replace(ball(), shape="cube", kinematic=True, rotation=(0.92, 0.38, 0.0, 0.0))
+    scene = replace(draped(tilted), settle_frames=100, floor=-0.2)
+    settled = settle_solids(scene)
+    motion = still(settled, 1)
+    assert motion.vertices.shape[0] == 1
+    assert -0.2 < settled.bodies[0].position[2] < scene.bodies[0].position[2]
+    unsettled = replace(scene, settle_frames=0)
+    assert settle_solids(unsettled) is unsettled
+
+
+def test_a_state_can_be_gone_on_from() -> None:
+    scene = draped(far_away(), height=2.0)
+    whole = still(scene, 31).vertices
+    speed = (whole[20] - whole[19]) / 0.01
+    positions = np.tile(scene.bodies[0].position, (11, 1, 1))
+    rotations = np.tile(scene.bodies[0].rotation, (11, 1, 1))
+    rest = simulate_cloth(scene, positions, rotations, vertices=whole[20], velocities=speed)
+    assert np.abs(rest.vertices[10] - whole[30]).max() < 0.01
+    with pytest.raises(BadInputError, match="vertices"):
+        simulate_cloth(scene, positions, rotations, vertices=whole[20][:-1])
+    with pytest.raises(BadInputError, match="positions"):
+        simulate_cloth(scene, positions[:, 0], rotations)
+
+
+def test_triangles_face_up() -> None:
+    vertices = sheet_vertices(Cloth("c", (0.0, 0.0, 0.0), resolution=4))
+    a, b, c = (vertices[corner] for corner in sheet_triangles(4).T)
+    assert (np.cross(b - a, c - a)[:, 2] > 0).all()
+
+
+def test_rows_run_along_x_then_y() -> None:
+    vertices = sheet_vertices(Cloth("c", (1.0, 2.0, 3.0), (2.0, 4.0, 0.0), resolution=3))
+    assert vertices[0].tolist() == [0, 0, 3]
+    assert vertices[1].tolist() == [0, 2, 3]
+    assert vertices[3].tolist() == [1, 0, 3]
+    with pytest.raises(BadInputError, match="2 vertices a side"):
+        sheet_vertices(Cloth("c", (0, 0, 0), resolution=1))
+
+
+SCRIPT = """
+import numpy as np, hashlib
+from tests.physics.cloth.test_cloth import ball, draped, still
+print(hashlib.sha256(still(draped(ball()), 61).vertices.tobytes()).hexdigest())
+"""
+
+
+def test_same_bytes_in_another_process() -> None:
+    here = hashlib.sha256(still(draped(ball()), 61).vertices.tobytes()).hexdigest()
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT], env=FIND_TESTS, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == here
+
+
+def test_label_asks_for_pressure_not_for_a_touch() -> None:
+    scene = draped(ball())
+    frames = 3
+    gaps = np.array([0.2, CLOTH_CONTACT_GAP + 1e-4, 0.1], np.float32)
+    zeros = np.zeros((frames, 1, 3), np.float32)
+    rotations = np.tile(np.float32([1, 0, 0, 0]), (frames, 1, 1))
+    vertices = np.zeros((frames, 4, 3), np.float32)
+    moved = Trajectory(
+        zeros, rotations, zeros, zeros, vertices, gaps, Contacts.empty(), False, "test"
+    )
+    assert not label_contact(scene, moved).contact
+    gaps[1] = CLOTH_CONTACT_GAP - 1e-4
+    labels = label_contact(scene, moved)
+    assert labels.contact and labels.first_frame == 1
+
+
+@pytest.mark.slow
+def test_official_trials_are_told_apart_above_chance(official: Path) -> None:
+    """A quarter of the official cloth trials: enough to see skill, too few to measure it well."""
+    trials = read_scenes(official / "scenes", "drape").unique()[0][::4]
+    distances, contacts = [], []
+    for trial in trials:
+        scene = settle_solids(trial.scene)
+        distances.append(float(still(scene, 151).distance.min()))
+        contacts.append(trial.outcome.contact)
+    assert area_under_curve(-np.array(distances), np.array(contacts)) > 0.6
+
+
+def test_the_engine_lays_cloth_over_bodies_and_goes_on_from_a_state() -> None:
+    solid = replace(ball(), kinematic=True)
+    scene = replace(draped(solid), settle_frames=100)
+    whole = simulate(scene, frames=61)
+    assert whole.cloth_vertices.shape == (61, 21 * 21, 3)
+    # A ball of radius 0.25 stands so that its lowest particle is the floor gap above the floor.
+    assert 0.0 <= whole.positions[0, 0, 2] < ClothSettings().floor_gap
+    assert len(whole.contacts.frames_of(0, 1))
+    later = simulate(scene, start=whole.state(40), frames=21)
+    assert np.abs(later.cloth_vertices[0] - whole.cloth_vertices[40]).max() < 1e-6
+    assert np.abs(later.cloth_vertices[20] - whole.cloth_vertices[60]).max() < 0.05

@@ -1,0 +1,324 @@
+"""What holds for the scenes of every scenario."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+import re
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from physion.errors import BadInputError, BadSceneError, UnknownNameError
+from physion.numerics.rotations import rotate_vectors
+from physion.scenes.looks import RED, YELLOW, mistakable, with_role_colors
+from physion.scenes.sampling.placement import CameraRule, SceneryRule, place_camera, world_bounds
+from physion.scenes.sampling.preset import get_preset, parse_presets
+from physion.scenes.sampling.registry import Scenario, sample_scene, scenarios
+from physion.scenes.scenarios.collide import Params as Collide
+from physion.scenes.scenarios.dominoes import Params as Dominoes
+from physion.scenes.scenarios.drop import Params as Drop
+from physion.scenes.scene import Body, Scene
+from physion.scenes.shapes.primitives import shape
+from physion.scenes.shapes.prop_names import expand_props
+from physion.seeds import child_generator, trial_seed
+from support.sound_scenes import (
+    assert_seen,
+    assert_valid,
+    body,
+    bounds,
+    overlap,
+    overlapping,
+    thing,
+)
+
+TRIALS = range(12)
+
+
+@pytest.fixture(params=scenarios.names())
+def scenario(request: pytest.FixtureRequest) -> Scenario:
+    return scenarios.get(request.param)
+
+
+def draw(scenario: Scenario, index: int, distractors: int = 2, occluders: int = 1) -> Scene:
+    rule = dataclasses.replace(
+        scenario.params().scenery, distractors=distractors, occluders=occluders
+    )
+    params = dataclasses.replace(scenario.params(), scenery=rule)
+    return scenario.sample(params, trial_seed("test", scenario.name, "train", index))
+
+
+def test_overlap_tells_apart() -> None:
+    cube = shape("cube").mesh.vertices
+    assert overlap(cube, cube + np.array([0.9, 0.9, 0.9]))
+    assert not overlap(cube, cube + np.array([1.01, 0, 0]))
+    # Boxes meet, hulls do not: a cone beside the tip of another.
+    cone = shape("cone").mesh.vertices
+    assert not overlap(cone, cone + np.array([0.9, 0, 0.5]))
+
+
+def test_scene_is_valid_and_says_who_is_who(scenario: Scenario) -> None:
+    for index in TRIALS:
+        scene = draw(scenario, index)
+        assert scene.scenario == scenario.name
+        assert scene.ending.min_frames == 151
+        assert_valid(scene)
+
+
+def test_same_seed_same_scene_other_seed_other_scene(scenario: Scenario) -> None:
+    assert draw(scenario, 3).to_json() == draw(scenario, 3).to_json()
+    digests = {draw(scenario, index).physics_digest() for index in TRIALS}
+    assert len(digests) == len(TRIALS)
+    assert len({draw(scenario, index).name for index in TRIALS}) == len(TRIALS)
+
+
+def test_json_round_trip(scenario: Scenario) -> None:
+    scene = draw(scenario, 0)
+    assert Scene.from_json(scene.to_json()) == scene
+
+
+def test_agent_and_patient_are_in_the_picture(scenario: Scenario) -> None:
+    for index in TRIALS:
+        assert_seen(draw(scenario, index))
+
+
+def test_nothing_overlaps_at_the_start(scenario: Scenario) -> None:
+    for index in TRIALS:
+        assert not overlapping(draw(scenario, index)), index
+
+
+def test_scenery_stands_clear_of_the_scene(scenario: Scenario) -> None:
+    for index in TRIALS:
+        scene = draw(scenario, index, distractors=2, occluders=2)
+        scenery = [bounds(one) for one in scene.bodies if one.scenery]
+        assert len(scenery) == 4
+        for a, b in itertools.product(map(bounds, stands(scene)), scenery):
+            assert (a[1, :2] < b[0, :2]).any() or (b[1, :2] < a[0, :2]).any()
+
+
+def stands(scene: Scene) -> list[Body]:
+    """Solids, without a plate that reaches so near to the camera that occluders stand on it."""
+    near = math.hypot(*scene.camera.position[:2]) / 2
+    flat = {
+        one.name
+        for one in scene.bodies
+        if one.kinematic and one.scale[2] < 0.05 and math.hypot(*one.scale[:2]) / 2 > near
+    }
+    assert len(flat) <= 1
+    return [one for one in scene.bodies if not one.scenery and one.name not in flat]
+
+
+def test_scenery_changes_neither_motion_nor_camera_nor_looks(scenario: Scenario) -> None:
+    for index in TRIALS:
+        bare, full = draw(scenario, index, 0, 0), draw(scenario, index, 3, 2)
+        assert len(full.bodies) == len(bare.bodies) + 5
+        assert full.bodies[: len(bare.bodies)] == bare.bodies
+        assert full.camera == bare.camera and full.pushes == bare.pushes
+        assert full.physics_digest() == bare.physics_digest()
+        more = draw(scenario, index, 2, 1)
+        by_name = {thing.name: thing for thing in full.bodies}
+        assert by_name["distractor_0"].shape == body(more, "distractor_0").shape
+
+
+def test_scenery_stands_behind_and_before(scenario: Scenario) -> None:
+    for index in TRIALS:
+        scene = draw(scenario, index)
+        toward = np.array(scene.camera.position[:2])
+        assert np.dot(body(scene, "distractor_0").position[:2], toward) < 0
+        assert np.dot(body(scene, "occluder_0").position[:2], toward) > 0
+
+
+def test_role_colors(scenario: Scenario) -> None:
+    scene = draw(scenario, 0)
+    bodies = list(scene.bodies)
+    for i, color in enumerate([(0.9, 0.1, 0.2), (0.8, 0.8, 0.1)], start=2):
+        look = dataclasses.replace(bodies[i].look, color=color)
+        bodies[i] = dataclasses.replace(bodies[i], look=look)
+    scene = dataclasses.replace(scene, bodies=tuple(bodies))
+    painted = with_role_colors(scene)
+    assert painted == with_role_colors(scene)
+    assert thing(painted, scene.roles.agent).look.color == RED
+    assert thing(painted, scene.roles.patient).look.color == YELLOW
+    assert painted.physics_digest() == scene.physics_digest()
+    for name in scene.names():
+        before, after = thing(scene, name).look, thing(painted, name).look
+        assert after.texture == before.texture
+        if name in (scene.roles.agent, scene.roles.patient):
+            continue
+        near = any(mistakable(before.color, c) for c in (RED, YELLOW))
+        assert near == (before.color != after.color)
+        assert not any(mistakable(after.color, c) for c in (RED, YELLOW))
+
+
+def test_what_passes_for_red_or_yellow() -> None:
+    assert mistakable((0.9, 0.2, 0.1), RED) and mistakable((0.45, 0.05, 0.05), RED)
+    assert mistakable((0.8, 0.8, 0.1), YELLOW) and mistakable((0.5, 0.48, 0.05), YELLOW)
+    for fine in [(0.45, 0.3, 0.18), (0.1, 0.1, 0.9), (0.1, 0.0, 0.0), (0.85, 0.84, 0.8)]:
+        assert not mistakable(fine, RED) and not mistakable(fine, YELLOW)
+
+
+def test_unknown_scenario_gives_the_closest() -> None:
+    with pytest.raises(UnknownNameError, match="dominoes"):
+        sample_scene("domino", trial_seed("test", "domino", "train", 0))
+
+
+def test_default_parameters_are_used_and_recorded() -> None:
+    scene = sample_scene("drop", trial_seed("test", "drop", "train", 0))
+    assert scene.parameters["height"] == [1.25, 1.5]
+
+
+def test_camera_that_cannot_see_says_so() -> None:
+    far = Body("far", "cube", (0.0, 40.0, 0.0))
+    rule = CameraRule((1.0, 1.0), (45.0, 45.0), (1.0, 1.0))
+    with pytest.raises(BadSceneError, match=r"^no camera shows far: [^\d]*$"):
+        place_camera(np.random.default_rng(0), rule, 0.5, (far,))
+
+
+def test_scenery_stands_apart_or_says_that_it_does_not_fit() -> None:
+    params, crowded = get_preset("dominoes", "default").params, Counter[str]()
+    for count in (4, 12):
+        rule = dataclasses.replace(params.scenery, distractors=count, occluders=count // 2)
+        for index in TRIALS:
+            seed = trial_seed("test", "dominoes", "crowd", index)
+            try:
+                scene = sample_scene("dominoes", seed, dataclasses.replace(params, scenery=rule))
+            except BadSceneError as error:
+                crowded[str(error)] += 1
+                continue
+            props = [one for one in scene.bodies if one.scenery]
+            assert len(props) == count + count // 2
+            for one, other in itertools.combinations(props, 2):
+                reach = math.hypot(*one.scale[:2]) + math.hypot(*other.scale[:2])
+                assert math.dist(one.position[:2], other.position[:2]) >= reach / 2
+    assert 0 < sum(crowded.values()) < 2 * len(TRIALS)
+    assert all(re.match(r"no room for (distractor|occluder)_\d+ beside \w+: ", c) for c in crowded)
+
+
+@pytest.mark.parametrize("key", ["distractors", "occluders"])
+def test_there_are_at_most_a_dozen_of_each(key: str) -> None:
+    text = f'scenario = "drop"\n[presets.many.params]\nscenery.{key} = 13'
+    with pytest.raises(BadInputError, match=f"many': scenery: {key} is 13, allowed is 0 to 12"):
+        parse_presets(text, "own.toml")
+
+
+def test_camera_follows_the_official_rule() -> None:
+    for i in range(20):
+        rng = child_generator(trial_seed("test", "camera", "x", i), "camera")
+        camera = place_camera(rng, CameraRule((2.0, 2.0), (0.0, 90.0), (1.5, 2.5)), 0.7, ())
+        x, y, z = camera.position
+        assert math.hypot(x, y) == pytest.approx(2 * math.sqrt(2))
+        assert 45 <= math.degrees(math.atan2(y, x)) <= 135
+        assert 1.5 <= z <= 2.5 and camera.target == (0, 0, 0.7)
+
+
+def still_row(**changed: object) -> Dominoes:
+    """Two metres of upright dominoes that stand where they should."""
+    middle = dataclasses.replace(Dominoes().middle, turn_deg=(0.0, 0.0))
+    values = {"length": 2.0, "middle": middle, "spacing_jitter": 0.0, "lateral_jitter": 0.0}
+    return dataclasses.replace(Dominoes(), **(values | changed))
+
+
+def test_dominoes_rows() -> None:
+    seed = trial_seed("test", "dominoes", "train", 0)
+    for count in (0, 1, 4, 8):
+        scene = sample_scene("dominoes", seed, still_row(middles=count))
+        row = [b.position[0] for b in scene.bodies if b.name.startswith("middle")]
+        assert row == pytest.approx(np.linspace(-1, 1, count + 2)[1:-1])
+    gaps = set()
+    for index in range(30):
+        seed = trial_seed("test", "dominoes", "train", index)
+        scene = sample_scene("dominoes", seed, still_row(middles=4, remove_middle=True))
+        gaps |= {f"middle_{i}" for i in range(4)} - {b.name for b in scene.bodies}
+        assert sum(b.name.startswith("middle") for b in scene.bodies) == 3
+    assert len(gaps) == 4, "any of them may be left out"
+
+
+def test_dominoes_say_what_does_not_fit() -> None:
+    seed = trial_seed("test", "dominoes", "train", 0)
+    with pytest.raises(BadSceneError, match=r"2 m long .*100 tries: no room left for all 30 in"):
+        sample_scene("dominoes", seed, still_row(middles=30))
+    with pytest.raises(BadSceneError, match="probe and target would start inside"):
+        sample_scene("dominoes", seed, still_row(middles=0, length=0.05))
+    with pytest.raises(BadSceneError, match="probe and target would start inside"):
+        sample_scene("collide", seed, dataclasses.replace(Collide(), length=0.2))
+
+
+def test_pushes_turn_with_the_probe() -> None:
+    probe = dataclasses.replace(Dominoes().probe, turn_deg=(40.0, 60.0))
+    for index in TRIALS:
+        seed = trial_seed("test", "dominoes", "train", index)
+        for turned in (True, False):
+            scene = sample_scene("dominoes", seed, still_row(probe=probe, turned_push=turned))
+            x, y, _ = scene.pushes[0].impulse
+            w, *_, z = body(scene, "probe").rotation
+            expected = 2 * math.atan2(z, w) if turned else 0.0
+            assert math.atan2(y, x) == pytest.approx(expected)
+        assert 40 <= math.degrees(2 * math.atan2(z, w)) <= 60
+
+
+def test_drop_stands_on_what_is_below() -> None:
+    zone = Drop().zone
+    for center, height in (((0.0, 0.0), 0.01), ((0.0, 1.0), 0.01), ((0.0, 3.0), 0.0)):
+        params = dataclasses.replace(Drop(), zone=dataclasses.replace(zone, center=center))
+        scene = sample_scene("drop", trial_seed("test", "drop", "train", 1), params)
+        assert bounds(body(scene, "lower"))[0, 2] == pytest.approx(height)
+        assert body(scene, "zone").position == (*center, 0.0)
+
+
+def test_drop_falls_free_and_is_looked_at() -> None:
+    large = dataclasses.replace(Drop().dropped, scale=(0.9, 1.0))
+    for index in TRIALS:
+        seed = trial_seed("test", "drop", "train", index)
+        params = dataclasses.replace(Drop(), dropped=large, camera_height=(0.5, 1.5))
+        scene = sample_scene("drop", seed, params)
+        target, lower = body(scene, "target"), body(scene, "lower")
+        assert bounds(target)[0, 2] - bounds(lower)[1, 2] >= 0.1 - 1e-9
+        fall = target.position[2]
+        assert scene.camera.target == pytest.approx((0, 0, fall / 2))
+        assert 0.5 * fall <= scene.camera.position[2] <= 1.5 * fall
+        low = sample_scene("drop", seed, dataclasses.replace(params, camera_height=(0.0, 0.0)))
+        assert low.camera.position[2] == low.floor + 0.25, "not lower than the rule allows"
+
+
+def test_drop_turns_as_it_is_told() -> None:
+    upright = dataclasses.replace(Drop().dropped, turn_deg=(0.0, 0.0))
+    params = dataclasses.replace(Drop(), dropped=upright, even_turn=False)
+    seed = trial_seed("test", "drop", "train", 0)
+    assert body(sample_scene("drop", seed, params), "target").rotation == (1, 0, 0, 0)
+    even = dataclasses.replace(params, even_turn=True)
+    ups = []
+    for index in range(300):
+        scene = sample_scene("drop", trial_seed("test", "drop", "train", index), even)
+        ups.append(rotate_vectors(body(scene, "target").rotation, (0, 0, 1))[2])
+    # On a ball every height is as likely; three even angles give a variance of 1/4.
+    assert np.var(ups) == pytest.approx(1 / 3, abs=0.05) and abs(np.mean(ups)) < 0.1
+
+
+def test_collide_places() -> None:
+    lifted = dataclasses.replace(Collide(), lift=0.2, zone_jitter=0.3)
+    asides = []
+    for index in range(40):
+        scene = sample_scene("collide", trial_seed("test", "collide", "train", index), lifted)
+        assert body(scene, "probe").position == (-1.0, 0.0, 0.2)
+        assert body(scene, "target").position == (1.0, 0.0, 0.0)
+        asides.append(body(scene, "zone").position[1])
+    assert -0.3 <= min(asides) < -0.15 < 0.15 < max(asides) <= 0.3
+
+
+def test_push_has_the_speed_that_was_drawn() -> None:
+    for index in TRIALS:
+        for name, fastest in (("dominoes", 0.75), ("collide", 10.0)):
+            scene = draw(scenarios.get(name), index)
+            (push,) = scene.pushes
+            speed = math.hypot(*push.impulse) / body(scene, push.body).mass
+            assert speed <= fastest + 1e-9 and push.impulse[0] > 0
+            low, high = world_bounds(body(scene, push.body))
+            assert (low <= push.point).all() and (push.point <= high).all()
+
+
+def test_scenery_rule_defaults_have_props() -> None:
+    rule = SceneryRule()
+    for prop in expand_props(rule.distractor_props + rule.occluder_props):
+        assert shape(f"prop:{prop}").pieces

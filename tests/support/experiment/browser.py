@@ -1,0 +1,205 @@
+"""A real browser that takes part in a study on a real server, and what tests ask of both.
+
+Chromium is the one named by $PHYSION_BROWSER, else that of the system. With $PHYSION_SCREENSHOTS
+every page is also written there as a picture, to be looked at.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+import sqlalchemy as sa
+
+from physion.experiment.simulated.server_process import OwnServer
+from physion.experiment.store.database import open_database, sqlite_url
+from physion.experiment.store.tables import ANSWERS, EVENTS, SESSIONS
+from physion.experiment.study.identity import Secrets, participant_hash
+from physion.experiment.study.study import Recruitment, Study, Timing
+from support.experiment.tiny_study import make_tiny_study
+from support.programs import absent, find_chromium
+
+SIZE = {"width": 1280, "height": 800}
+SHORT = Timing(fixation_ms=(60, 120), cue_ms=500, flash_hz=2.0)
+OFFLINE = re.compile(r"ERR_(INTERNET_DISCONNECTED|CONNECTION_REFUSED)|status of (409|503)")
+"""What browsers say of requests that a test lets fail."""
+
+
+# As long as it lives, its event loop runs in this thread, and others could not start theirs.
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Any]:
+    """A running browser for one file of tests; they are skipped where there is none."""
+    if importlib.util.find_spec("playwright") is None:
+        absent("playwright is absent: install the extra 'dev'")
+    driver = importlib.import_module("playwright.sync_api")
+    path = find_chromium()
+    with driver.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@contextlib.contextmanager
+def served(folder: Path, **settings: Any) -> Iterator[tuple[Study, OwnServer]]:
+    """A tiny study on a server of its own."""
+    given: dict[str, Any] = {
+        "test": 3,
+        "familiarization": 2,
+        "timing": SHORT,
+        "recruitment": Recruitment(link_code="TINY-CODE", link_address="https://lab.example/done"),
+    }
+    study = make_tiny_study(folder, **{**given, **settings})
+    with OwnServer(study.folder) as server:
+        yield study, server
+
+
+class Visit:
+    """One participant's browser: takes the steps of a session and notes what goes wrong."""
+
+    def __init__(self, chromium: Any, url: str, name: str = "", **context: Any) -> None:
+        self.url, self.name = url, name
+        self.complaints: list[str] = []
+        self.requests: list[str] = []
+        self.context = chromium.new_context(**{"viewport": SIZE, "locale": "en-US", **context})
+        self.context.set_default_timeout(20_000)
+        self.page = self.open_tab()
+        self._pictures = 0
+
+    def open_tab(self) -> Any:
+        """Another tab of the same browser."""
+        page = self.context.new_page()
+        page.on("console", lambda said: self._console(said))
+        page.on("pageerror", lambda error: self.complaints.append(f"error: {error}"))
+        page.on("request", lambda request: self.requests.append(request.url))
+        return page
+
+    def _console(self, said: Any) -> None:
+        if said.type in ("error", "warning"):
+            self.complaints.append(f"{said.type}: {said.text}")
+
+    def __enter__(self) -> Visit:
+        return self
+
+    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
+        if kind is not None and "PHYSION_SCREENSHOTS" in os.environ:
+            self.picture("failed")
+        self.context.close()
+
+    def hosts(self) -> set[str]:
+        """Hosts that anything was asked of; blobs have none."""
+        return {urlsplit(url).netloc for url in self.requests if not url.startswith("blob:")}
+
+    def unexpected(self) -> list[str]:
+        """Complaints that have nothing to do with a connection that a test took away."""
+        return [line for line in self.complaints if not OFFLINE.search(line)]
+
+    def picture(self, what: str) -> None:
+        """A picture of the page, where they are wanted."""
+        folder = os.environ.get("PHYSION_SCREENSHOTS")
+        if folder and self.name:
+            self._pictures += 1
+            Path(folder).mkdir(parents=True, exist_ok=True)
+            self.page.screenshot(path=f"{folder}/{self.name}-{self._pictures:02d}-{what}.png")
+
+    def go(self, query: str = "") -> None:
+        """Open the study by an address with these parameters."""
+        self.page.goto(f"{self.url}/{query}")
+
+    def heading(self, wanted: str | None = None) -> str:
+        """The heading of the page, once there is one (and it is the one that is wanted)."""
+        at = self.page.locator("h1", has_text=wanted) if wanted else self.page.locator("h1")
+        at.wait_for()
+        return str(at.inner_text())
+
+    def press(self, *keys: str) -> None:
+        for key in keys:
+            self.page.keyboard.press(key)
+
+    def main_button(self) -> Any:
+        """The button by which a page goes on."""
+        return self.page.locator("main .button:not(.quiet):enabled")
+
+    def wait_for_answer(self) -> None:
+        """Until the buttons of a trial can be pressed."""
+        self.page.locator(".answer:enabled").first.wait_for()
+
+    def left(self) -> str:
+        """The response whose button stands left."""
+        return str(self.page.locator(".answer").first.get_attribute("data-response"))
+
+    def answer(self, response: str, by: str = "mouse") -> None:
+        """Answer the trial as soon as that is possible."""
+        self.wait_for_answer()
+        if by == "keyboard":
+            self.press("f" if self.left() == response else "j")
+        else:
+            self.page.click(f".answer[data-response={response}]")
+        # Until the next page is there, so that nothing is pressed on this one again.
+        self.page.locator(".answer:enabled").first.wait_for(state="detached")
+
+    def see_feedback(self) -> str:
+        """See the whole movie and go on; what was said of the answer."""
+        self.main_button().wait_for()
+        verdict = str(self.page.locator(".verdict").inner_text())
+        self.main_button().click()
+        return verdict
+
+    def begin(self, query: str = "") -> None:
+        """From the consent to the first trial."""
+        self.go(query)
+        self.heading()
+        self.main_button().click()
+        self.page.locator("#language").wait_for(state="detached")
+        for _ in range(3):
+            self.heading()
+            self.main_button().click()
+
+    def practise(self, trials: int) -> None:
+        for trial in range(trials):
+            self.answer("yes" if trial % 2 == 0 else "no")
+            self.see_feedback()
+
+    def begin_test(self, title: str = "You are ready") -> None:
+        self.heading(title)
+        self.main_button().click()
+
+    def finish(self) -> None:
+        """Demographics and feedback, until the result is shown."""
+        self.page.fill("#age", "33")
+        self.page.select_option("#gender", "female")
+        self.page.select_option("#education", "master")
+        self.main_button().click()
+        self.page.check("#difficulty-4")
+        self.page.check("#technical-no")
+        self.page.fill("#text", "<img src=x onerror=alert(1)> 'ok'")
+        self.main_button().click()
+        self.page.locator("#code").wait_for()
+
+
+def rows_of(study: Study, raw_id: str) -> tuple[Any, list[Any], list[Any]]:
+    """Session, answers in their order, and events of who came by ``?participant=``."""
+    participant = participant_hash(Secrets.load(study.folder), "link", raw_id)
+    engine = open_database(sqlite_url(study.folder), must_exist=True)
+    try:
+        with engine.connect() as connection:
+            session = connection.execute(
+                sa.select(SESSIONS).where(SESSIONS.c.participant == participant)
+            ).one()
+            answers, events = (
+                list(connection.execute(sa.select(table).where(of)).all())
+                for table, of in (
+                    (ANSWERS, ANSWERS.c.session == session.session),
+                    (EVENTS, EVENTS.c.session == session.session),
+                )
+            )
+    finally:
+        engine.dispose()
+    order = {"familiarization": 0, "test": 1}
+    return session, sorted(answers, key=lambda row: (order[row.phase], row.trial)), events

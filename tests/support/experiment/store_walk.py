@@ -1,0 +1,105 @@
+"""Walking sessions through the store without HTTP, for tests; and stores to walk in."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Coroutine, Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import pytest
+from sqlalchemy import select
+
+from physion.experiment.protocol.messages import Answer, AnswerStored, Enter, PageDone, State
+from physion.experiment.store.store import Refused, Store
+from physion.experiment.store.tables import ANSWERS
+from physion.experiment.study.identity import Secrets
+from physion.experiment.study.study import Study
+from support.experiment.tiny_study import make_tiny_study
+
+T = TypeVar("T")
+PAGES: dict[str, dict[str, Any]] = {
+    "consent": {"agreed": True},
+    "instructions": {},
+    "ready": {},
+    "demographics": {"age": 31, "gender": "woman", "education": "master"},
+    "feedback": {"difficulty": 2, "technical_problems": False, "text": "fine"},
+}
+STAGES = ("consent", "instructions", "familiarization", "ready", "test", "demographics",
+          "feedback", "done")  # fmt: skip
+
+
+def run(coroutine: Coroutine[Any, Any, T]) -> T:
+    return asyncio.run(coroutine)
+
+
+def answer(trial: int, phase: Any = "test", key: str | None = None, **more: Any) -> Answer:
+    values = {"response": "yes", "rt_ms": 512.5, "input": "mouse", **more}
+    return Answer(key=key or f"{phase}-{trial:04d}", phase=phase, trial=trial, **values)
+
+
+def enter(store: Store, person: str | None = None, **more: Any) -> str:
+    return run(store.enter(Enter(id=person, **more))).token
+
+
+def give(store: Store, token: str, trial: int, phase: Any = "test", **more: Any) -> AnswerStored:
+    return run(store.answer(token, answer(trial, phase, **more)))
+
+
+def page(store: Store, token: str, name: Any, **data: Any) -> State:
+    return run(store.page(token, PageDone(page=name, data=data or PAGES.get(name, {}))))
+
+
+def walk(store: Store, token: str, stage: str) -> str:
+    """Go on until a stage is reached, answering yes; the token again."""
+    while True:
+        state = run(store.state(token))
+        if state.stage == stage:
+            return token
+        assert STAGES.index(state.stage) < STAGES.index(stage)
+        if state.trial is None:
+            page(store, token, state.stage)
+        else:
+            give(store, token, state.trial, state.stage)
+
+
+def refusal(coroutine: Coroutine[Any, Any, Any]) -> Refused:
+    with pytest.raises(Refused) as caught:
+        run(coroutine)
+    return caught.value
+
+
+def rows(store: Store, table: Any = ANSWERS) -> list[Any]:
+    with store.engine.connect() as connection:
+        return list(connection.execute(select(table)))
+
+
+@pytest.fixture(scope="session")
+def small_study(tmp_path_factory: pytest.TempPathFactory) -> Study:
+    """Two scenarios of 3 familiarization and 4 test trials."""
+    folder: Path = tmp_path_factory.mktemp("small") / "study"
+    return make_tiny_study(
+        folder, test=4, familiarization=3, scenarios=("collide", "drop"), size=64,
+        participants=3, percentile_from=2,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def small_secrets(small_study: Study) -> Secrets:
+    return Secrets.load(small_study.folder)
+
+
+@pytest.fixture
+def store(small_study: Study, small_secrets: Secrets, database_url: str) -> Iterator[Store]:
+    """A store on an empty database, once of each kind."""
+    opened = Store.open(small_study, small_secrets, database_url)
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def sqlite_store(small_study: Study, small_secrets: Secrets, tmp_path: Path) -> Iterator[Store]:
+    """A store on an empty SQLite database, for what no database has a say in."""
+    opened = Store.open(small_study, small_secrets, f"sqlite:///{tmp_path / 'a.sqlite'}")
+    yield opened
+    opened.close()

@@ -1,0 +1,11 @@
+"""Where the tests lie, and how another Python process finds them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+TESTS = Path(__file__).parents[1]
+ROOT = TESTS.parent
+FIND_TESTS = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS), str(ROOT)])}
+"""Lets a new process import ``support`` and ``tests``."""

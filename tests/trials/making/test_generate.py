@@ -1,0 +1,455 @@
+"""Making many trials: whatever is killed or broken on the way, the folder stays right."""
+
+from __future__ import annotations
+
+import errno
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from physion.atomic import folder_lock, write_atomic
+from physion.compute.local import LocalExecutor, SerialExecutor
+from physion.errors import BadInputError, PhysionError, UnknownNameError
+from physion.trials.dataset import Dataset
+from physion.trials.index import build_index, index_row
+from physion.trials.layout import TrialPaths, find_trials
+from physion.trials.making.generate import Report, generate
+from physion.trials.making.plan import Settings, Task, plan_dataset, plan_scenes
+from physion.trials.trial_file import Trial
+from physion.trials.video import count_frames, read_frames
+from support.hand_made import make_by_hand, make_scene, tree_digest
+from support.paths import TESTS
+
+FILES = {"h5", "_img.mp4", "_observed.mp4", "_map.png"}
+
+
+def scenes_named(*names: str) -> list[Task]:
+    return plan_scenes("tests", [make_scene(name) for name in names])
+
+
+def run(folder: Path, tasks: list[Task], **options: Any) -> Report:
+    options.setdefault("executor", SerialExecutor())
+    return generate(folder, tasks, make=make_by_hand, **options)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four trials, made without interruption."""
+    folder = tmp_path_factory.mktemp("finished") / "set"
+    run(folder, scenes_named("a", "b", "c", "d"))
+    return folder
+
+
+def test_index_equals_the_files(finished: Path) -> None:
+    dataset = Dataset(finished)
+    assert dataset.trials() == ["a", "b", "c", "d"]
+    for paths in find_trials(finished):
+        row = index_row(paths)
+        stored = dataset.index[dataset.index["trial"] == paths.trial].iloc[0]
+        for name, value in row.items():
+            assert (value is None and stored[name] is not True) or stored[name] == value, name
+        trial = dataset.trial(paths.trial)
+        assert stored["contact"] == trial.labels.contact == (paths.trial in "bd")
+        assert stored["digest"] == trial.trajectory.digest()
+        assert stored["agent_share"] == 64 / 1024 and stored["patient_share"] == 512 / 1024
+    assert dataset.index["first_frame"].isna().tolist() == [True, False, True, False]
+
+
+def test_observed_movie_is_cut_and_the_full_one_is_not(finished: Path) -> None:
+    dataset = Dataset(finished)
+    paths = dataset.paths("a")
+    assert count_frames(paths.observed_movie) == 45 == len(read_frames(paths.observed_movie))
+    assert count_frames(paths.movie) == 60 == len(dataset.frames("a"))
+    assert dataset.observed_frames("a", stride=6).shape == (8, 32, 32, 3)
+
+
+def test_observed_view_needs_no_file_with_the_future(finished: Path, tmp_path: Path) -> None:
+    shutil.copytree(finished, tmp_path / "set")
+    for paths in find_trials(tmp_path / "set"):
+        paths.movie.unlink()
+        paths.trial_file.unlink()
+    observed = Dataset(tmp_path / "set").observed
+    assert [observed.frames(name).shape[0] for name in observed.trials] == [45] * 4
+    with pytest.raises(BadInputError, match="46 frames"):
+        observed.frames("a", count=46)
+    with pytest.raises(UnknownNameError, match="closest"):
+        observed.frames("aa")
+
+
+def test_observed_view_refuses_a_movie_that_shows_more(finished: Path, tmp_path: Path) -> None:
+    shutil.copytree(finished, tmp_path / "set")
+    paths = Dataset(tmp_path / "set").paths("a")
+    shutil.copy(paths.movie, paths.observed_movie)
+    with pytest.raises(BadInputError, match="more than the 45 observed"):
+        Dataset(tmp_path / "set").observed_frames("a")
+
+
+def test_second_run_does_nothing(finished: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in finished.rglob("*")}
+    report = run(finished, scenes_named("a", "b", "c", "d"))
+    assert (report.made, report.kept, report.exit_code) == ([], ["a", "b", "c", "d"], 0)
+    after = {path: path.stat().st_mtime_ns for path in finished.rglob("*")}
+    # The folder itself changes, since the lock comes and goes.
+    assert {p: t for p, t in after.items() if p != finished} == before
+
+
+def test_any_missing_file_is_made_again(finished: Path, tmp_path: Path) -> None:
+    shutil.copytree(finished, tmp_path / "set")
+    for index, path in enumerate(Dataset(tmp_path / "set").paths("b").all().values()):
+        path.unlink()
+        report = run(tmp_path / "set", scenes_named("a", "b", "c", "d"))
+        assert report.made == ["b"] and index < 4
+    assert tree_digest(tmp_path / "set") == tree_digest(finished)
+
+
+def test_more_trials_later_change_none_of_the_first(finished: Path, tmp_path: Path) -> None:
+    assert run(tmp_path / "s", scenes_named("a", "b")).made == ["a", "b"]
+    assert run(tmp_path / "s", scenes_named("a", "b", "c", "d")).made == ["c", "d"]
+    assert tree_digest(tmp_path / "s") == tree_digest(finished)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_workers_and_order_do_not_matter(workers: int, finished: Path, tmp_path: Path) -> None:
+    # Scenes keep the index that they have in their set, whatever the order of work.
+    tasks = scenes_named("a", "b", "c", "d")
+    random.Random(workers).shuffle(tasks)
+    report = run(tmp_path / "s", tasks, executor=LocalExecutor(workers))
+    assert report.exit_code == 0
+    assert tree_digest(tmp_path / "s") == tree_digest(finished)
+
+
+def test_a_failing_trial_is_told_and_the_others_go_on(tmp_path: Path) -> None:
+    report = run(tmp_path / "s", scenes_named("a", "bad", "c"))
+    assert report.exit_code == 1 and report.made == ["a", "c"]
+    assert report.failed == {"bad": "bad cannot be made"}
+    note = (tmp_path / "s" / "failures" / "bad.txt").read_text()
+    assert "Traceback" in note and "make_by_hand" in note and '"name":"bad"' in note
+    assert Dataset(tmp_path / "s").trials() == ["a", "c"]
+
+
+def test_a_poison_trial_is_put_aside(tmp_path: Path) -> None:
+    report = run(tmp_path / "s", scenes_named("a", "die", "c"), executor=LocalExecutor(1))
+    assert report.made == ["a", "c"] and "SIGKILL" in report.failed["die"]
+    assert "tries: 3" in (tmp_path / "s" / "failures" / "die.txt").read_text()
+
+
+def test_note_of_a_failure_goes_when_the_trial_is_made(tmp_path: Path) -> None:
+    folder = tmp_path / "s"
+    run(folder, scenes_named("a"))
+    (folder / "failures").mkdir()
+    (folder / "failures" / "b.txt").write_text("old")
+    run(folder, scenes_named("a", "b"))
+    assert not list((folder / "failures").iterdir())
+
+
+class Fault:
+    """Makes the k-th call of a system function fail."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, name: str, number: int, code: int) -> None:
+        self.calls, self._number, self._code = 0, number, code
+        self._real: Callable[..., Any] = getattr(os, name)
+        monkeypatch.setattr(os, name, self)
+
+    def __call__(self, *arguments: Any) -> Any:
+        self.calls += 1
+        if self.calls == self._number:
+            if self._real is os_write:
+                self._real(arguments[0], bytes(arguments[1][: len(arguments[1]) // 2]))
+            raise OSError(self._code, os.strerror(self._code))
+        return self._real(*arguments)
+
+
+os_write = os.write
+
+
+def check_only_whole_files(folder: Path) -> None:
+    """Every file under its own name can be read to its end."""
+    for path in folder.rglob("*"):
+        if path.is_file():
+            assert not path.name.endswith(".part"), path
+    for paths in find_trials(folder):
+        assert paths.complete()
+        assert len(Trial.open(paths.trial_file).trajectory) == 60
+        assert len(read_frames(paths.movie)) == 60
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO])
+@pytest.mark.parametrize("name", ["write", "replace", "fsync"])
+def test_a_fault_at_every_step_leaves_only_whole_files(
+    name: str, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clean = tmp_path / "clean"
+    with monkeypatch.context() as patch:
+        counter = Fault(patch, name, 0, code)
+        run(clean, scenes_named("a"))
+    # Settings, six files of the trial, index; fsync also for each folder.
+    assert counter.calls == {"write": 8, "replace": 8, "fsync": 16}[name]
+    for number in range(1, counter.calls + 1):
+        folder = tmp_path / f"{number}"
+        with monkeypatch.context() as patch:
+            Fault(patch, name, number, code)
+            with pytest.raises(PhysionError, match=f"cannot write into {folder}: "):
+                run(folder, scenes_named("a"))
+        check_only_whole_files(folder)
+        run(folder, scenes_named("a"))
+        assert tree_digest(folder) == tree_digest(clean)
+
+
+def test_a_full_disk_stops_the_run_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    counter = Fault(monkeypatch, "write", 10, errno.ENOSPC)
+    with pytest.raises(PhysionError, match=r"No space left.*1 new trials are whole"):
+        run(tmp_path / "s", scenes_named("a", "b", "c"))
+    assert counter.calls == 10, "no later trial is tried"
+
+
+LIMITED = """
+import resource, sys
+sys.path.insert(0, sys.argv[2])
+from pathlib import Path
+from support.paths import TESTS
+from support.hand_made import make_by_hand, make_scene
+from physion.compute.local import SerialExecutor
+from physion.errors import PhysionError
+from physion.trials.making.generate import generate
+from physion.trials.making.plan import plan_scenes
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+tasks = plan_scenes("tests", [make_scene("a")])
+try:
+    generate(Path(sys.argv[1]), tasks, make=make_by_hand, executor=SerialExecutor())
+except PhysionError as error:
+    print(error)
+    sys.exit(error.exit_code)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs resource limits")
+def test_the_system_refusing_to_write_more_is_an_error_and_not_a_crash(
+    finished: Path, tmp_path: Path
+) -> None:
+    """A real refusal in the middle of a file: libraries that write by themselves crash here."""
+    arguments = [str(tmp_path / "s"), str(TESTS)]
+    done = subprocess.run(
+        [sys.executable, "-c", LIMITED, *arguments], capture_output=True, text=True
+    )
+    assert done.returncode == 2 and "File too large" in done.stdout, done.stderr
+    check_only_whole_files(tmp_path / "s")
+    run(tmp_path / "s", scenes_named("a", "b", "c", "d"))
+    assert tree_digest(tmp_path / "s") == tree_digest(finished)
+
+
+KILLED = """
+import sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[2])
+from support.paths import TESTS
+from support.hand_made import make_by_hand, make_scene
+from physion.compute.local import LocalExecutor
+from physion.trials.making.generate import generate
+from physion.trials.making.plan import plan_scenes
+def track(outcomes, what, total):
+    for outcome in outcomes:
+        print(outcome.key, flush=True)
+        yield outcome
+if __name__ == "__main__":
+    names = [f"t{n:02d}" for n in range(int(sys.argv[3]))]
+    tasks = plan_scenes("tests", [make_scene(name) for name in names])
+    generate(Path(sys.argv[1]), tasks, make=make_by_hand, executor=LocalExecutor(1), track=track)
+"""
+
+
+def run_and_kill(folder: Path, trials: int, after: int, delay: float) -> int:
+    """Make trials in processes of their own; kill all of them ``delay`` s after so many trials."""
+    script = folder.with_suffix(".py")
+    script.write_text(KILLED)
+    command = [
+        sys.executable,
+        str(script),
+        str(folder),
+        str(TESTS),
+        str(trials),
+    ]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
+    assert process.stdout is not None
+    for _ in range(after):
+        process.stdout.readline()
+    time.sleep(delay)
+    os.killpg(process.pid, signal.SIGKILL)
+    code = process.wait()
+    process.stdout.close()
+    for paths in find_trials(folder):
+        assert paths.complete()
+        Trial.open(paths.trial_file)
+    return code
+
+
+@pytest.mark.parametrize(
+    ("kills", "trials"), [(1, 8), pytest.param(20, 60, marks=pytest.mark.slow)]
+)
+def test_killed_runs_resume_to_the_same_tree(kills: int, trials: int, tmp_path: Path) -> None:
+    chance = random.Random(kills)
+    killed = [
+        run_and_kill(tmp_path / "killed", trials, after=2, delay=chance.uniform(0, 0.05))
+        for _ in range(kills)
+    ]
+    assert killed == [-signal.SIGKILL] * kills
+    assert 0 < len(find_trials(tmp_path / "killed")) < trials
+    tasks = scenes_named(*(f"t{number:02d}" for number in range(trials)))
+    report = run(tmp_path / "killed", tasks)
+    assert len(report.kept) >= 2 * kills and len(report.made) + len(report.kept) == trials
+    run(tmp_path / "whole", tasks)
+    assert tree_digest(tmp_path / "killed") == tree_digest(tmp_path / "whole")
+
+
+def test_leftovers_of_killed_writers_are_removed(finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "s"
+    run(folder, scenes_named("a", "b"))
+    (folder / "testing" / "drop" / ".1234-abcd.part").write_bytes(b"half")
+    run(folder, scenes_named("a", "b", "c", "d"))
+    assert tree_digest(folder) == tree_digest(finished)
+
+
+def test_two_runs_on_one_folder_are_refused(tmp_path: Path) -> None:
+    with folder_lock(tmp_path), pytest.raises(PhysionError, match="another process is writing"):
+        run(tmp_path, scenes_named("a"))
+    assert run(tmp_path, scenes_named("a")).made == ["a"]
+
+
+def test_other_settings_and_foreign_folders_are_refused(finished: Path, tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="other settings"):
+        run(finished, scenes_named("a"), settings=Settings(width=64))
+    (tmp_path / "thesis.tex").write_text("precious")
+    with pytest.raises(BadInputError, match=r"holds 'thesis\.tex'"):
+        run(tmp_path, scenes_named("a"))
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_folder_that_cannot_be_written_is_one_clear_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("no folder")
+    for folder in (tmp_path / "file", tmp_path / "file" / "below", Path("/proc/physion")):
+        with pytest.raises(BadInputError, match="cannot write into"):
+            run(folder, scenes_named("a"))
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write all")
+def test_read_only_folder_is_one_clear_error(tmp_path: Path) -> None:
+    tmp_path.chmod(0o555)
+    with pytest.raises(BadInputError, match="Permission denied"):
+        run(tmp_path, scenes_named("a"))
+
+
+def test_broken_trials_are_found_when_the_index_is_made(finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "s"
+    shutil.copytree(finished, folder)
+    paths = Dataset(folder).paths("b")
+    paths.trial_file.write_bytes(paths.trial_file.read_bytes()[:-7])
+    (folder / "index.parquet").unlink()
+    report = run(folder, scenes_named("a", "b", "c", "d"))
+    assert list(report.failed) == ["b"] and "cut short" in report.failed["b"]
+    assert report.exit_code == 1 and Dataset(folder).trials() == ["a", "c", "d"]
+
+
+def test_renamed_trials_are_found(finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "s"
+    shutil.copytree(finished, folder)
+    old, new = Dataset(folder).paths("b"), TrialPaths(folder, "testing", "drop", "other")
+    for name, path in old.all().items():
+        path.rename(new.all()[name])
+    table, problems = build_index(folder)
+    assert table["trial"].tolist() == ["a", "c", "d"]
+    assert "is trial 'b' of testing/drop: it was moved or renamed" in problems["other"]
+
+
+def test_missing_and_broken_indexes_are_refused(finished: Path, tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="does not exist"):
+        Dataset(tmp_path / "none")
+    with pytest.raises(BadInputError, match=r"has no index\.parquet"):
+        Dataset(tmp_path)
+    for content in (b"", b"PAR1 no", (finished / "index.parquet").read_bytes()[:-100]):
+        (tmp_path / "index.parquet").write_bytes(content)
+        with pytest.raises(BadInputError, match=r"index\.parquet cannot be read"):
+            Dataset(tmp_path)
+    table = Dataset(finished).index
+    for message, wrong in (
+        ("lacks the columns", table.drop(columns="digest")),
+        ("column 'trial' has", table.assign(trial="../../etc/passwd")),
+        ("names twice", table.assign(trial="a")),
+    ):
+        wrong.to_parquet(tmp_path / "index.parquet")
+        with pytest.raises(BadInputError, match=message):
+            Dataset(tmp_path)
+
+
+def test_plan_gives_every_trial_its_own_seed_and_name() -> None:
+    counts = {"training": 5, "readout": 4, "testing": 3, "familiarization": 1}
+    presets = {"drop": ["default", "debug"]}
+    tasks = plan_dataset("d", ["drop", "collide"], counts, presets)
+    assert len({task.trial for task in tasks}) == len(tasks) == 26
+    assert len({task.seed().entropy for task in tasks}) == 26
+    assert {t.presets for t in tasks if t.scenario == "drop"} == {("default", "debug")}
+    practice = next(t for t in tasks if (t.scenario, t.split) == ("collide", "familiarization"))
+    assert practice.presets == ("familiarization",)
+    longer = plan_dataset("d", ["drop"], {"training": 9}, presets)
+    assert longer[:5] == [t for t in tasks if (t.scenario, t.split) == ("drop", "training")]
+
+
+@pytest.mark.parametrize("name", ["../up", "a/b", "", ".hidden", "a b", "x" * 201, "nul\0"])
+def test_names_that_are_no_file_names_are_refused(name: str) -> None:
+    with pytest.raises(BadInputError, match="file name"):
+        scenes_named(name)
+
+
+def test_bad_plans_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UnknownNameError, match="closest: testing"):
+        Task("d", "drop", "test", 0)
+    with pytest.raises(UnknownNameError, match="unknown scenario 'dropp'; closest: drop"):
+        plan_dataset("d", ["dropp"], {"testing": 1})
+    with pytest.raises(UnknownNameError, match="preset of drop 'defaultt'; closest: default"):
+        plan_dataset("d", ["drop"], {"testing": 1}, {"drop": ["defaultt"]})
+    with pytest.raises(BadInputError, match="two trials are called 'A'"):
+        scenes_named("a", "A")
+    with pytest.raises(BadInputError, match="one dataset"):
+        run(tmp_path / "s", [Task("d", "drop", "testing", 0), Task("e", "drop", "testing", 1)])
+    for wrong in ({"width": 33}, {"passes": ("colour",)}, {"look": "blue"}):
+        with pytest.raises(BadInputError):
+            Settings(**wrong)  # type: ignore[arg-type]
+
+
+def test_progress_sees_every_outcome(tmp_path: Path) -> None:
+    seen: list[tuple[str, str, int]] = []
+
+    def track(outcomes: Any, what: str, total: int) -> Iterator[Any]:
+        for outcome in outcomes:
+            seen.append((outcome.key, what, total))
+            yield outcome
+
+    run(tmp_path / "s", scenes_named("a", "b"), track=track)
+    assert seen == [("a", "generating", 2), ("b", "generating", 2)]
+
+
+def test_writers_of_one_path_do_not_meet(tmp_path: Path) -> None:
+    """Two processes that write the same path at once: one of the two contents, never a mixture."""
+    path = tmp_path / "f"
+    script = (
+        "import sys; from pathlib import Path; from physion.atomic import write_atomic\n"
+        "for _ in range(200): write_atomic(Path(sys.argv[1]), sys.argv[2].encode() * 20000)\n"
+    )
+    writers = [
+        subprocess.Popen([sys.executable, "-c", script, str(path), letter]) for letter in "xy"
+    ]
+    while any(writer.poll() is None for writer in writers):
+        content = path.read_bytes() if path.exists() else b"x" * 20000
+        assert content in (b"x" * 20000, b"y" * 20000)
+        time.sleep(0.002)
+    assert [writer.returncode for writer in writers] == [0, 0]
+    assert [item.name for item in tmp_path.iterdir()] == ["f"]
+    with pytest.raises(FileNotFoundError):
+        write_atomic(tmp_path / "no" / "f", b"")

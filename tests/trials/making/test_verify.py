@@ -1,0 +1,167 @@
+"""Verification finds whatever was changed."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from physion.compute.local import SerialExecutor
+from physion.errors import BadInputError
+from physion.trials.dataset import Dataset
+from physion.trials.index import build_index, read_index, write_index
+from physion.trials.layout import TrialPaths
+from physion.trials.making.generate import generate
+from physion.trials.making.make import make_trial
+from physion.trials.making.plan import Job, Settings, Task, plan_dataset, plan_scenes
+from physion.trials.making.verify import verify_dataset
+from physion.trials.video import encode_movie, read_frames
+from support.hand_made import make_by_hand, make_parts, make_scene
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    tasks = plan_scenes("tests", [make_scene("a"), make_scene("b")])
+    generate(tmp_path / "s", tasks, make=make_by_hand, executor=SerialExecutor())
+    return tmp_path / "s"
+
+
+def test_an_untouched_dataset_has_no_fault(folder: Path) -> None:
+    assert verify_dataset(folder, again=0).faults == []
+
+
+@pytest.mark.parametrize("name", ["trial_file", "movie", "observed_movie", "map"])
+def test_one_changed_byte_in_any_file_is_found(name: str, folder: Path) -> None:
+    path = Dataset(folder).paths("b").all()[name]
+    data = bytearray(path.read_bytes())
+    data[-20] ^= 1
+    path.write_bytes(data)
+    faults = verify_dataset(folder, again=0).faults
+    assert faults and all("b" in fault for fault in faults)
+    if name != "trial_file":
+        assert any(f"b: {name}_sha256 is" in fault for fault in faults)
+
+
+def test_missing_unlisted_and_relabelled_trials_are_found(folder: Path) -> None:
+    Dataset(folder).paths("a").map.unlink()
+    extra = TrialPaths(folder, "testing", "drop", "c")
+    extra.trial_file.write_bytes(make_parts("c").pack())
+    table = Dataset(folder).index
+    table.loc[table["trial"] == "b", "contact"] = False
+    write_index(folder, table)
+    faults = "\n".join(verify_dataset(folder, again=0).faults)
+    assert "c.h5 is not in the index" in faults
+    assert "a_map.png cannot be read" in faults
+    assert "b: contact is True, the index says False" in faults
+
+
+def test_movies_of_a_wrong_length_are_found(folder: Path) -> None:
+    paths = Dataset(folder).paths("a")
+    paths.observed_movie.write_bytes(encode_movie(read_frames(paths.movie, count=50)))
+    assert any("has 50 frames, not 45" in fault for fault in verify_dataset(folder, again=0).faults)
+
+
+def test_simulating_again_finds_another_motion(folder: Path, tmp_path: Path) -> None:
+    scene = make_scene("real", cloth=False)
+    job = Job(Task("t", "drop", "testing", 0, scene=scene), tmp_path / "r", Settings(64, 64))
+    make_trial(job)
+    from physion.trials.index import build_index
+
+    write_index(tmp_path / "r", build_index(tmp_path / "r")[0])
+    assert verify_dataset(tmp_path / "r", again=-1).faults == []
+    parts = make_parts("a")
+    lie = dataclasses.replace(parts.metadata, digest="0" * 64)
+    paths = Dataset(folder).paths("a")
+    paths.trial_file.write_bytes(parts._replace(metadata=lie).pack())
+    assert any(
+        "does not fit its digest" in fault for fault in verify_dataset(folder, again=0).faults
+    )
+
+
+def test_a_folder_without_index_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="has no index"):
+        verify_dataset(tmp_path)
+
+
+def test_a_label_that_the_contacts_contradict_is_found(folder: Path) -> None:
+    """A whole trial file with a wrong label, and an index that repeats it."""
+    paths = Dataset(folder).paths("b")
+    parts = make_parts("b")
+    wrong = dataclasses.replace(parts.labels, contact=not parts.labels.contact, first_frame=None)
+    paths.trial_file.write_bytes(parts._replace(labels=wrong).pack())
+    table, _ = build_index(folder)
+    write_index(folder, table)
+    assert any("labels/contact" in fault for fault in verify_dataset(folder, again=0).faults)
+
+
+@pytest.fixture(scope="module")
+def sampled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two sampled trials with movies, robustness and stored passes."""
+    folder = tmp_path_factory.mktemp("sampled") / "d"
+    settings = Settings(width=64, height=64, jitters=2, passes=("depth", "flow"))
+    tasks = plan_dataset("verify", ["collide"], {"testing": 2}, {"collide": ["default"]})
+    assert not generate(folder, tasks, settings, executor=SerialExecutor()).failed
+    return folder
+
+
+def test_a_sampled_dataset_comes_out_the_same_again(sampled: Path) -> None:
+    assert verify_dataset(sampled, again=-1).faults == []
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("dataset.json", "sha256"),
+        ("choices/testing_collide.json", "sha256"),
+        ("index.parquet", "index.parquet"),
+    ],
+)
+def test_one_changed_byte_beside_the_trials_is_found(
+    sampled: Path, tmp_path: Path, name: str, says: str
+) -> None:
+    content = (sampled / name).read_bytes()
+    for place in np.linspace(1, len(content) - 2, 12).astype(int):
+        folder = tmp_path / str(place)
+        shutil.copytree(sampled, folder)
+        changed = bytearray(content)
+        changed[place] ^= 1
+        (folder / name).write_bytes(changed)
+        try:
+            faults = verify_dataset(folder, again=0).faults
+        except BadInputError as error:
+            faults = [str(error)]
+        assert any(says in fault or name in fault for fault in faults), place
+
+
+def test_strangers_and_trials_of_other_splits_are_named(sampled: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "d"
+    shutil.copytree(sampled, folder)
+    (folder / "testing" / "collide" / "stray_img.mp4").write_bytes(b"x")
+    index = read_index(folder)
+    index["observed_contact"] = True
+    index["contact"] = ~index["contact"]
+    index["scene_digest"] = "0" * 64
+    write_index(folder, index)
+    faults = "\n".join(verify_dataset(folder, again=0).faults)
+    assert "stray_img.mp4 belongs to no trial" in faults
+    assert "its physics belongs to training" in faults
+    assert "the balance of its split wants the other" in faults
+    assert "nothing is left to predict" in faults
+    assert "the same physics as" in faults
+
+
+def test_a_trial_made_again_is_indexed_again(sampled: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "d"
+    shutil.copytree(sampled, folder)
+    index = read_index(folder)
+    index.loc[0, "frames"] = 7
+    write_index(folder, index)
+    paths = Dataset(folder).paths(str(index["trial"][0]))
+    paths.trial_file.unlink()
+    tasks = plan_dataset("verify", ["collide"], {"testing": 2}, {"collide": ["default"]})
+    settings = Settings(width=64, height=64, jitters=2, passes=("depth", "flow"))
+    report = generate(folder, tasks, settings, executor=SerialExecutor())
+    assert len(report.made) == 1 and verify_dataset(folder, again=0).faults == []

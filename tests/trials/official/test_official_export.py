@@ -1,0 +1,477 @@
+"""Our trials in the official layout, read by a small reader in the style of official ones."""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import io
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from PIL import Image
+
+from physion.cli import export as export_verb
+from physion.compute.local import SerialExecutor
+from physion.errors import BadInputError
+from physion.physics.cloth.simulate import ClothSettings
+from physion.rendering.camera import View
+from physion.scenes.scene import Body, Camera, Joint, Roles, Scene
+from physion.scenes.shapes.primitives import shape
+from physion.trials.dataset import Dataset
+from physion.trials.official.export_folder import export_official
+from physion.trials.official.names import CLOTH_DISTANCE
+from physion.trials.official.write_hdf5 import _of_stack
+from physion.trials.official.write_objects import OfficialObjects
+from physion.trials.trial_file import Trial
+from physion.trials.video import count_frames
+from support.official_hand_made import CLOTH, FRAMES, PART, RIGID, SIZE, TOUCH, make_dataset
+
+CONFIGS = {"collide": "Collide/collide_testing/0003", "drape": "Drape/drape_testing/0000"}
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_dataset(tmp_path_factory.mktemp("official") / "dataset")
+
+
+@pytest.fixture(scope="module")
+def exported(dataset: Path) -> Path:
+    out = dataset.parent / "exported"
+    report = export_official(dataset, out, executor=SerialExecutor())
+    assert report.made == (RIGID, CLOTH) and not report.failed and report.exit_code == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def rigid(dataset: Path) -> Trial:
+    return Dataset(dataset).trial(RIGID)
+
+
+@pytest.fixture(scope="module")
+def cloth(dataset: Path) -> Trial:
+    return Dataset(dataset).trial(CLOTH)
+
+
+# An official reader: what one finds in the code of others, in short.
+
+
+def read_label(path: Path) -> bool:
+    with h5py.File(path, "r") as f:
+        labels = [np.array(f["frames"][k]["labels"]["target_contacting_zone"]) for k in f["frames"]]
+        return bool(np.any(labels))
+
+
+def read_state(path: Path) -> dict[str, np.ndarray]:
+    with h5py.File(path, "r") as f:
+        keys = sorted(f["frames"].keys())
+        assert keys == [f"{i:04d}" for i in range(len(keys))]
+        names = ("positions", "rotations", "velocities", "angular_velocities", "forwards")
+        return {
+            name: np.stack([f["frames"][key]["objects"][name][:] for key in keys]) for name in names
+        }
+
+
+def read_image(path: Path, frame: int, name: str) -> np.ndarray:
+    with h5py.File(path, "r") as f:
+        return np.array(Image.open(io.BytesIO(f["frames"][f"{frame:04d}"]["images"][name][:])))
+
+
+def read_depth(path: Path, frame: int) -> np.ndarray:
+    with h5py.File(path, "r") as f:
+        image = np.flip(f["frames"][f"{frame:04d}"]["images"]["_depth"][:].astype(float), 0)
+    value = image[..., 0] + image[..., 1] / 256 + image[..., 2] / 65536
+    return value * ((100 - 0.1) / 256)
+
+
+def official_turn(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    t = 2 * np.cross(q[..., :3], v)
+    return v + q[..., 3:] * t + np.cross(q[..., :3], t)
+
+
+def static(path: Path, name: str) -> Any:
+    with h5py.File(path, "r") as f:
+        return f["static"][name][()]
+
+
+def order(path: Path, trial: Trial) -> list[int]:
+    """Where the objects of a file are in our scene, by their masses, which all differ."""
+    things = [*trial.scene.bodies, *trial.scene.cloths]
+    masses = [np.float32(thing.mass) for thing in things]
+    return [masses.index(mass) for mass in static(path, "mass")]
+
+
+def test_motion_is_the_same_in_the_other_axes(exported: Path, rigid: Trial) -> None:
+    path = exported / f"{CONFIGS['collide']}.hdf5"
+    state, ours, at = read_state(path), rigid.trajectory, order(path, rigid)
+    assert len(state["positions"]) == FRAMES
+    np.testing.assert_array_equal(state["positions"], ours.positions[:, at][..., [0, 2, 1]])
+    np.testing.assert_array_equal(state["velocities"], ours.velocities[:, at][..., [0, 2, 1]])
+    np.testing.assert_array_equal(
+        state["angular_velocities"], -ours.angular_velocities[:, at][..., [0, 2, 1]]
+    )
+    np.testing.assert_allclose(np.linalg.norm(state["rotations"], axis=-1), 1, atol=1e-6)
+    forwards = official_turn(state["rotations"], np.array([0.0, 0.0, 1.0]))
+    np.testing.assert_allclose(state["forwards"], forwards, atol=1e-6)
+
+
+def test_static_arrays_cover_all_objects_in_the_official_order(
+    exported: Path, rigid: Trial
+) -> None:
+    path = exported / f"{CONFIGS['collide']}.hdf5"
+    names = [name.decode() for name in static(path, "model_names").tolist()]
+    assert names == ["cube", "cone", "sphere", "prop:vase"]  # zone, target, probe, the rest
+    ids = static(path, "object_ids").tolist()
+    assert ids == [1, 2, 3, 4]
+    roles = [static(path, f"{role}_id") for role in ("zone", "target", "probe", "ramp")]
+    assert roles == [1, 2, 3, -1]
+    assert static(path, "distractors").tolist() == [b"prop:vase"]
+    assert static(path, "occluders").tolist() == []
+    np.testing.assert_allclose(static(path, "scale")[0], [0.5, 0.01, 0.9], atol=1e-7)
+    assert static(path, "mass").tolist() == [500, 1, 3, 7]
+    for name in ("mass", "static_friction", "dynamic_friction", "bounciness", "color"):
+        assert len(static(path, name)) == len(ids)
+    assert static(path, "static_friction")[1] == np.float32(0.3)
+    assert static(path, "dynamic_friction")[1] == np.float32(0.2)
+    assert static(path, "bounciness")[1] == np.float32(0.1)
+    # In the trial's own look.
+    np.testing.assert_allclose(static(path, "color")[[0, 1]], [[1, 1, 0], [1, 0, 0]])
+    np.testing.assert_allclose(static(path, "push_force"), [2.0, 0.1, 0.5])
+    np.testing.assert_allclose(static(path, "push_position"), [-1.1, 0.2, 0.2])
+    assert static(path, "push_time") == 4
+    assert static(path, "stimulus_name") == RIGID.encode()
+
+
+def test_meshes_boxes_and_poses_belong_together(exported: Path, rigid: Trial) -> None:
+    path, frame = exported / f"{CONFIGS['collide']}.hdf5", 20
+    at = order(path, rigid)
+    with h5py.File(path, "r") as f:
+        state = {k: v[:] for k, v in f[f"frames/{frame:04d}/objects"].items()}
+        for place, index in enumerate(at):
+            body = rigid.scene.bodies[index]
+            vertices = f["static"]["mesh"][f"vertices_{place}"][:]
+            faces = f["static"]["mesh"][f"faces_{place}"][:]
+            world = (
+                official_turn(state["rotations"][place], vertices * f["static"]["scale"][place])
+                + state["positions"][place]
+            )
+            # The renderer draws the same surface.
+            mesh = shape(body.shape).mesh
+            from physion.numerics.rotations import rotation_matrix
+
+            ours = (mesh.vertices * body.scale) @ rotation_matrix(
+                rigid.trajectory.rotations[frame, index]
+            ).T + rigid.trajectory.positions[frame, index]
+            np.testing.assert_allclose(world, ours[:, [0, 2, 1]], atol=1e-5)
+            corners = vertices[faces].astype(float)
+            normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            volume = np.einsum("ij,ij->", corners.mean(1), normals) / 6
+            assert volume > 0  # outwards, as a cross product of the numbers
+            for side, axis in (("front", 2), ("right", 0), ("top", 1)):
+                away = state[side][place] - state["center"][place]
+                reach = (world - state["center"][place]) @ away / (away @ away)
+                assert reach.max() == pytest.approx(1, abs=1e-3)
+                assert vertices[:, axis].max() > vertices[:, axis].min()
+
+
+def test_pictures_and_camera(exported: Path, rigid: Trial) -> None:
+    path, frame = exported / f"{CONFIGS['collide']}.hdf5", 30
+    drawn = rigid.render(frame, ("color", "depth", "ids"))
+    np.testing.assert_array_equal(read_image(path, frame, "_img"), drawn.color)
+    depth = read_depth(path, frame)
+    near = drawn.depth < 99
+    np.testing.assert_allclose(depth[near], drawn.depth[near], atol=1e-5)
+    seen, colors = read_image(path, frame, "_id"), static(path, "object_segmentation_colors")
+    for place, index in enumerate(order(path, rigid)):
+        # As an official reader has it, which takes a pixel for an object by any of its channels.
+        np.testing.assert_array_equal((seen == colors[place]).any(-1), drawn.ids == index + 1)
+    with h5py.File(path, "r") as f:
+        matrices = f[f"frames/{frame:04d}/camera_matrices"]
+        both = matrices["projection_matrix"][:].reshape(4, 4) @ matrices["camera_matrix"][
+            :
+        ].reshape(4, 4)
+        centers = f[f"frames/{frame:04d}/objects/center"][:]
+    clip = np.column_stack([centers, np.ones(len(centers))]) @ both.T
+    pixel = (clip[:, :2] / clip[:, 3:] * [1, -1] + 1) / 2 * SIZE
+    wanted, _ = View(rigid.scene.camera, SIZE, SIZE).project(centers[:, [0, 2, 1]])
+    np.testing.assert_allclose(pixel, wanted, atol=1e-3)
+    assert read_image(path, frame, "_normals").shape == (SIZE, SIZE, 3)
+    assert read_image(path, frame, "_flow").any()
+    assert not read_image(path, FRAMES - 1, "_flow").any()
+
+
+def test_flow_in_pixels_stands_apart(exported: Path, rigid: Trial) -> None:
+    with h5py.File(exported / f"{CONFIGS['collide']}.hdf5", "r") as f:
+        assert set(f) == {"static", "frames", "physion"}
+        flow = f["physion/flow"][7]
+    np.testing.assert_array_equal(flow, rigid.render(7, ("flow",)).flow.astype(np.float16))
+
+
+def test_only_gzip_is_needed(exported: Path) -> None:
+    known = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE}
+
+    def check(_: str, thing: Any) -> None:
+        if isinstance(thing, h5py.Dataset):
+            plan = thing.id.get_create_plist()
+            assert {plan.get_filter(i)[0] for i in range(plan.get_nfilters())} <= known
+
+    for config in CONFIGS.values():
+        with h5py.File(exported / f"{config}.hdf5", "r") as f:
+            f.visititems(check)
+
+
+def test_contacts_belong_to_pairs(exported: Path, rigid: Trial) -> None:
+    path = exported / f"{CONFIGS['collide']}.hdf5"
+    contacts = rigid.trajectory.contacts
+    with h5py.File(path, "r") as f:
+        for frame, state in ((TOUCH, b"enter"), (TOUCH + 1, b"stay"), (PART, b"exit")):
+            group = f[f"frames/{frame:04d}/collisions"]
+            assert group["object_ids"][:].tolist() == [[1, 2]]
+            assert group["states"][:].tolist() == [state]
+            row = np.flatnonzero(contacts.frame == min(frame, PART - 1))[0]
+            normal, point = group["contacts"][0]
+            np.testing.assert_array_equal(point, contacts.point[row][[0, 2, 1]])
+            # Unity's normal runs from the second to the first, ours from the first.
+            np.testing.assert_array_equal(normal, -contacts.normal[row][[0, 2, 1]])
+            zone, cone = 1, 3
+            away = (
+                rigid.trajectory.velocities[frame, cone] - rigid.trajectory.velocities[frame, zone]
+            )
+            np.testing.assert_allclose(group["relative_velocities"][0], away[[0, 2, 1]])
+        assert len(f[f"frames/{PART + 1:04d}/collisions/object_ids"]) == 0
+        floor = f["frames/0003/env_collisions"]
+        assert floor["object_ids"][:].tolist() == [2]
+        row = np.flatnonzero(contacts.frame == 3)[0]
+        np.testing.assert_array_equal(floor["contacts"][0, 0], contacts.normal[row][[0, 2, 1]])
+        for frame in f["frames"].values():
+            for name in ("collisions", "env_collisions"):
+                assert len(frame[name]["contacts"]) == len(frame[name]["object_ids"])
+
+
+def test_labels(exported: Path, rigid: Trial) -> None:
+    path = exported / f"{CONFIGS['collide']}.hdf5"
+    assert read_label(path) == rigid.labels.contact is True
+    with h5py.File(path, "r") as f:
+        labels = [frame["labels"] for frame in f["frames"].values()]
+        touching = [bool(label["target_contacting_zone"][()]) for label in labels]
+        assert [i for i, touch in enumerate(touching) if touch] == list(range(TOUCH, PART))
+        assert [bool(label["trial_end"][()]) for label in labels] == [False] * (FRAMES - 1) + [True]
+        assert bool(labels[-1]["trial_complete"][()]) and not labels[-1]["trial_timeout"][()]
+        assert [i for i, label in enumerate(labels) if label["target_on_ground"][()]] == [3]
+        moved = rigid.trajectory.positions[-1, 3] - rigid.trajectory.positions[0, 3]
+        np.testing.assert_allclose(labels[-1]["target_delta_position"][:], moved[[0, 2, 1]])
+        assert labels[-1]["target_has_moved"][()] and not labels[0]["target_has_moved"][()]
+
+
+def test_cloth_has_particles_and_distances(exported: Path, cloth: Trial) -> None:
+    path = exported / f"{CONFIGS['drape']}.hdf5"
+    assert [name.decode() for name in static(path, "model_names")][1] == "cloth_square"
+    with h5py.File(path, "r") as f:
+        frame = f["frames/0020"]
+        sheet = frame["particles/2"][:]
+        ours = cloth.trajectory.cloth_vertices[20]
+        np.testing.assert_array_equal(sheet[:, :3], ours[:, [0, 2, 1]])
+        np.testing.assert_allclose(1 / sheet[:, 3].sum(), 0.5 / len(ours) ** 2, rtol=1e-5)
+        before = cloth.trajectory.cloth_vertices[19]
+        speed = (ours - before)[:, [0, 2, 1]] / 0.01
+        np.testing.assert_allclose(frame["velocities/2"][:], speed, atol=1e-3)
+        assert frame["particles/1"].shape[1] == 4  # the zone, a solid
+        assert "target_has_moved" not in frame["labels"]
+        gaps = [v["labels/minimum_distance_target_to_zone"][()] for v in f["frames"].values()]
+    np.testing.assert_allclose(gaps, cloth.trajectory.cloth_distance + CLOTH_DISTANCE, atol=1e-6)
+    touching = [gap < 0.1222 for gap in gaps]  # the official rule tells our outcome
+    assert touching.index(True) == cloth.labels.first_frame
+    assert read_label(path) == cloth.labels.contact
+
+
+def test_ids_are_int64_and_measures_float32(exported: Path) -> None:
+    """Section 4 of the reference; of masses and turns one kind alone."""
+    with h5py.File(exported / f"{CONFIGS['collide']}.hdf5", "r") as f:
+        for frame in f["frames"].values():
+            for name in ("collisions", "env_collisions"):
+                assert frame[name]["object_ids"].dtype == f["static/object_ids"].dtype == np.int64
+        kinds = {name: d.dtype for name, d in f["static"].items() if isinstance(d, h5py.Dataset)}
+        assert kinds["probe_mass"] == kinds["target_rotation"] == np.float32
+        assert not [name for name, kind in kinds.items() if kind == np.float64]
+        np.testing.assert_allclose(
+            f["static/target_rotation"][:], f["static/initial_rotation"][1], atol=1e-6
+        )
+
+
+def test_drape_says_how_cloth_was_simulated(exported: Path, cloth: Trial, official: Path) -> None:
+    sent: dict[str, dict[str, Any]] = {}
+    for path in sorted((official / "scenes/drape").glob("*/tdw_commands.json.gz")):
+        for line in gzip.decompress(path.read_bytes()).decode().splitlines():
+            if (start := line.find("[")) >= 0 and "flex" in line:
+                commands, _ = json.JSONDecoder().raw_decode(line[start:])
+                sent |= {c["$type"]: c for c in commands if "flex" in c.get("$type", "")}
+    settings, sheet = ClothSettings(), cloth.scene.cloths[0]
+    with h5py.File(exported / f"{CONFIGS['drape']}.hdf5", "r") as f:
+        static = f["static"]
+        container = {name: d[()] for name, d in static["container"].items()}
+        for name in ("collision_distance", "static_friction", "dynamic_friction"):
+            assert container[name] == np.float32(sent["create_flex_container"][name])
+        assert container["substep_count"] == settings.substeps
+        assert container["solid_rest"] == np.float32(settings.rest_distance)
+        solids = {name: d[:] for name, d in static["solid_actors"].items()}
+        assert static["model_names"][[1, 3]].tolist() == [b"cloth_square", b"prop:vase"]
+        assert solids["object_id"].tolist() == [1, 3, 5]  # neither the cloth nor the scenery
+        for name in ("mass_scale", "mesh_expansion", "particle_spacing"):
+            assert (solids[name] == np.float32(sent["set_flex_solid_actor"][name])).all()
+        cloths = {name: d[:].tolist() for name, d in static["cloth_actors"].items()}
+        assert cloths.pop("object_id") == [2]
+        for name in ("stretch", "bend", "tether"):
+            value = np.float32(getattr(sheet, name))
+            assert cloths.pop(f"{name}_stiffness") == [value]
+        assert cloths == {n: [sent["set_flex_cloth_actor"][n]] for n in cloths} and cloths
+        assert not len(static["soft_actors"]) and not len(static["fluid_actors"])
+    with h5py.File(exported / f"{CONFIGS['collide']}.hdf5", "r") as f:
+        assert "container" not in f["static"]
+
+
+def test_metadata_has_all_official_keys(exported: Path, official: Path) -> None:
+    ours = {
+        scenario: json.loads((exported / config).with_name("metadata.json").read_text())[0]
+        for scenario, config in CONFIGS.items()
+    }
+    for scenario, record in ours.items():
+        for path in sorted((official / "scenes" / scenario).glob("*/metadata.json")):
+            theirs = json.loads(path.read_text())[0]
+            assert theirs.keys() <= record.keys(), path
+            for key, value in theirs.items():
+                same = isinstance(value, type(record[key]))
+                assert same or value is None or record[key] is None, key
+        stats = json.loads((exported / CONFIGS[scenario]).with_name("trial_stats.json").read_text())
+        published = json.loads(path.with_name("trial_stats.json").read_text())
+        assert published.keys() <= stats.keys()
+
+
+def test_metadata_is_measured(exported: Path, rigid: Trial) -> None:
+    record = json.loads((exported / CONFIGS["collide"]).with_name("metadata.json").read_text())[0]
+    scene = rigid.scene
+    assert record["stimulus_name"] == RIGID and record["controller_name"] == "Collision"
+    assert record["num_frames"] == FRAMES
+    assert record["does_target_contact_zone"] and not record["does_target_miss_zone"]
+    assert record["first_target_contact_zone_frame"] == TOUCH
+    assert record["first_target_hit_ground_frame"] == 3
+    share = rigid.shares[scene.index("cone")]
+    assert record["target_visible_area"] == pytest.approx(share, abs=5e-4)
+    assert record["num_distractors"] == 1 and record["num_occluders"] == 0
+    assert record["push_time"] == 4
+    last = rigid.render(FRAMES - 1, ("ids",)).ids == scene.index("cone") + 1
+    first = rigid.ids == scene.index("cone") + 1
+    line = np.linspace(-1, 1, SIZE)
+    moved = [
+        (line[:, None] * last).sum() / last.sum() - (line[:, None] * first).sum() / first.sum(),
+        (line[None] * last).sum() / last.sum() - (line[None] * first).sum() / first.sum(),
+    ]
+    np.testing.assert_allclose(record["final_target_mask_displacement"], moved, atol=1e-3)
+
+
+def test_core_folders_hold_both_looks(exported: Path, dataset: Path) -> None:
+    paths = Dataset(dataset).paths(RIGID)
+    core = exported / "Collide"
+    free, own = paths.free_movie.read_bytes(), paths.movie.read_bytes()
+    assert (core / f"mp4s/{RIGID}_img.mp4").read_bytes() == free
+    marked = core / "mp4s-redyellow/collide_testing-redyellow_0003_img.mp4"
+    assert marked.read_bytes() == own
+    assert (core / "collide_testing/0003_img.mp4").read_bytes() == own
+    assert (core / f"maps/{RIGID}_map.png").read_bytes() == paths.map.read_bytes()
+    rows = list(csv.reader((exported / "labels.csv").open()))
+    assert rows == [
+        ["", "ground truth outcome"],
+        [f"{RIGID}_img", "True"],
+        [f"{CLOTH}_img", "True"],
+    ]
+    table = list(csv.DictReader((exported / "stimulus_names_and_labels.csv").open()))
+    assert [row["scenario"] for row in table] == ["collide", "drape"]
+    for row in table:
+        assert all((exported / row[f"{kind}_url"]).is_file() for kind in ("stim", "map", "hdf5"))
+
+
+def test_a_second_run_keeps_what_is_whole(exported: Path, dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(exported, out)
+    whole = out / f"{CONFIGS['drape']}.hdf5"
+    stamp = whole.stat().st_mtime_ns
+    cut = out / f"{CONFIGS['collide']}.hdf5"
+    cut.write_bytes(cut.read_bytes()[:5000])
+    report = export_official(dataset, out, executor=SerialExecutor())
+    assert report.made == (RIGID,) and report.kept == (CLOTH,)
+    assert whole.stat().st_mtime_ns == stamp
+    assert cut.read_bytes() == (exported / f"{CONFIGS['collide']}.hdf5").read_bytes()
+
+
+def test_a_missing_movie_is_rendered_and_a_bad_trial_fails_alone(
+    exported: Path, dataset: Path, tmp_path: Path
+) -> None:
+    copy, out = tmp_path / "dataset", tmp_path / "out"
+    shutil.copytree(dataset, copy)
+    Dataset(copy).paths(RIGID).trial_file.write_bytes(b"no trial")
+    report = export_official(copy, out, executor=SerialExecutor())
+    assert report.made == (CLOTH,) and set(report.failed) == {RIGID} and report.exit_code == 1
+    assert not (out / "Collide").exists()
+    assert count_frames(out / "Drape/drape_testing/0000_img.mp4") == FRAMES
+
+
+def test_choices_and_refusals(dataset: Path, tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="no trial"):
+        export_official(dataset, tmp_path / "out", split="training")
+    with pytest.raises(BadInputError, match="outside"):
+        export_official(dataset, dataset / "out")
+    with pytest.raises(BadInputError, match="it is no dataset"):
+        export_official(tmp_path, tmp_path / "out")
+
+
+def test_stacks_are_described_as_there(dataset: Path) -> None:
+    """Contain and Link: base and attachment by name, links from the lowest to the highest."""
+    parts = [
+        Body("zone", "cube", (0, 0, 0), kinematic=True),
+        Body("target", "torus", (0, 0, 0.4)),
+        Body("probe", "sphere", (1, 0, 0)),
+        Body("base", "cone", (0, 0, 0.1)),
+        Body("attachment", "cylinder", (0, 0, 0.2)),
+        Body("member_0", "torus", (0, 0, 0.3)),
+        Body("cap", "cube", (0, 0, 0.9)),
+    ]
+    scene = Scene(
+        "a",
+        "link",
+        tuple(parts),
+        Roles("target", "zone", "probe"),
+        Camera((3.0, 0.0, 1.0)),
+        joints=(Joint("base", "attachment"),),
+    )
+    told = _of_stack(OfficialObjects(scene, Dataset(dataset).trial(RIGID).trajectory))
+    assert told == {
+        "base_id": 4,
+        "use_base": True,
+        "base_type": "cone",
+        "attachment_id": 5,
+        "use_attachment": True,
+        "attachent_type": "cylinder",
+        "attachment_fixed": True,
+        "link_type": "torus",
+        "num_links": 2,
+        "target_link_idx": 1,
+        "use_cap": True,
+    }
+
+
+def test_the_verb(
+    dataset: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(export_verb, "LocalExecutor", lambda workers: SerialExecutor())
+    options = export_verb.Options(dataset, tmp_path / "out", scenario="drape", workers=1, json=True)
+    assert export_verb.main(options) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["made"] == [CLOTH] and Path(said["index"]).is_file()
+    with pytest.raises(BadInputError, match="needs a folder"):
+        export_verb.main(export_verb.Options(dataset))

@@ -1,0 +1,385 @@
+"""The card of a dataset says what the index says, and its metadata keeps the rules of Croissant."""
+
+from __future__ import annotations
+
+import dataclasses
+import fnmatch
+import hashlib
+import json
+import os
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from physion.cli.main import main as cli
+from physion.errors import BadInputError
+from physion.trials.files import encode_png, write_files
+from physion.trials.index import COLUMNS, build_index, read_index, write_index
+from physion.trials.layout import TrialPaths, find_trials
+from physion.trials.publishing.card import write_card
+from physion.trials.publishing.facts import MEANINGS, meaning
+from support.hand_made import SIZE, make_parts
+from support.programs import find_program
+
+RAI_WORDS = {
+    "dataCollection", "dataCollectionType", "dataCollectionMissingData", "dataCollectionRawData",
+    "dataCollectionTimeframe", "dataImputationProtocol", "dataManipulationProtocol",
+    "dataPreprocessingProtocol", "dataAnnotationProtocol", "dataAnnotationPlatform",
+    "dataAnnotationAnalysis", "dataReleaseMaintenancePlan", "personalSensitiveInformation",
+    "dataSocialImpact", "dataBiases", "dataLimitations", "dataUseCases", "annotationsPerItem",
+    "annotatorDemographics", "machineAnnotationTools",
+}  # fmt: skip
+"""All properties of the responsible-AI vocabulary 1.0."""
+RAI_MANY = {
+    "dataCollectionType", "dataPreprocessingProtocol", "dataBiases", "dataLimitations",
+    "dataUseCases", "machineAnnotationTools", "personalSensitiveInformation",
+}  # fmt: skip
+SCHEMA_ORG_WORDS = {
+    "name", "description", "url", "license", "version", "datePublished", "creator", "keywords",
+    "distribution", "contentUrl", "contentSize", "encodingFormat", "sha256",
+}  # fmt: skip
+TYPES = {"sc:Text", "sc:Integer", "sc:Float", "sc:Boolean"}
+
+
+def _make(folder: Path, split: str, trial: str, **changes: Any) -> None:
+    """A hand-made trial; its movies and map are no more than names with bytes."""
+    changes = {"seed": "ff", **changes}
+    contact = changes.pop("contact", True)
+    robust = changes.pop("robust", None)
+    parts = make_parts(trial, cloth=False, contact_frame=50 if contact else None)
+    meta = dataclasses.replace(parts.metadata, split=split, dataset="mine", **changes)
+    labels = dataclasses.replace(parts.labels, robust=robust)
+    files = {
+        "movie": f"movie {trial}".encode(),
+        "observed_movie": b"observed",
+        "map": encode_png(np.zeros((SIZE, SIZE, 4), np.uint8)),
+        "trial_file": parts._replace(metadata=meta, labels=labels).pack(),
+    }
+    write_files(TrialPaths(folder, split, "drop", trial), files)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four training trials, one with contact, and two testing trials, one of them imported."""
+    folder = tmp_path_factory.mktemp("mine")
+    for number in range(4):
+        _make(folder, "training", f"train{number}", contact=number == 0, completed=number < 3)
+    _make(folder, "testing", "test0", robust=0.75, look="redyellow")
+    _make(folder, "testing", "test1", robust=1.0, look="redyellow", seed=None)
+    table, problems = build_index(folder)
+    assert not problems
+    write_index(folder, table)
+    chosen = {"min_visible": 0.0005, "robust": 0.5, "observed_contact": False}
+    (folder / "dataset.json").write_text(json.dumps({"dataset": "mine", "settings": chosen}))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def metadata(dataset: Path) -> dict[str, Any]:
+    """What `croissant.json` says."""
+    card = write_card(dataset, published="2026-11-21")
+    data = json.loads(card.metadata.read_text())
+    assert isinstance(data, dict)
+    return data
+
+
+def _front_matter(text: str) -> dict[str, Any]:
+    yaml = pytest.importorskip("yaml")
+    _, front, _ = text.split("---\n", 2)
+    return dict(yaml.safe_load(front))
+
+
+def test_the_front_matter_is_what_the_hub_reads(dataset: Path, tmp_path: Path) -> None:
+    card = write_card(dataset, tmp_path, license="CC-BY-4.0")
+    front = _front_matter(card.readme.read_text())
+    assert front["license"] == "cc-by-4.0"
+    assert front["pretty_name"] == "Physion: mine"
+    assert front["size_categories"] == ["n<1K"]
+    assert front["task_categories"] == ["video-classification"]
+    assert front["configs"] == [{"config_name": "index", "data_files": "index.parquet"}]
+
+
+def test_counts_and_rates_are_those_of_the_index(dataset: Path, tmp_path: Path) -> None:
+    text = write_card(dataset, tmp_path).readme.read_text()
+    lines = text.splitlines()
+    assert "| training | drop | 4 | 0.250 | 0 | 60 | - | free |" in lines
+    assert "| testing | drop | 2 | 1.000 | 0 | 60 | 0.875 | redyellow |" in lines
+    assert "6 simulated physical scenes, 6 of them with movies" in text
+    assert "- Agent and patient touch in 0.250 of the 4 training trials." in lines
+    assert "5 scenes were drawn at random" in text and "1 scene was imported" in text
+    assert "In 1 of 6 trials something still moved" in text
+    assert "0.875 of cases, measured on 2 of 6 trials" in text
+    assert "min_visible = 0.0005, robust = 0.5, observed_contact = False" in text
+
+
+def test_the_card_follows_the_index(dataset: Path, tmp_path: Path) -> None:
+    """Other data, other numbers: nothing of it is written down beforehand."""
+    _make(tmp_path, "training", "only", contact=False)
+    table, _ = build_index(tmp_path)
+    write_index(tmp_path, table)
+    text = write_card(tmp_path).readme.read_text()
+    assert "| training | drop | 1 | 0.000 | 0 | 60 | - | free |" in text
+    assert "imported from records" not in text and "were chosen with" not in text
+    assert "was not measured" in text
+
+
+def test_states_alone_have_no_movies_to_describe(tmp_path: Path) -> None:
+    _make(tmp_path, "training", "only", movies=False)
+    paths = find_trials(tmp_path)[0]
+    for path in (paths.movie, paths.observed_movie, paths.map):
+        path.unlink()
+    table, problems = build_index(tmp_path)
+    assert not problems
+    write_index(tmp_path, table)
+    card = write_card(tmp_path)
+    metadata = json.loads(card.metadata.read_text())
+    assert [item["@id"] for item in metadata["distribution"]] == ["index.parquet", "trial-files"]
+    assert "none of them with movies" in metadata["description"]
+    assert "H.264" not in card.metadata.read_text()
+
+
+def test_every_column_has_a_meaning() -> None:
+    assert all(meaning(column) for column in COLUMNS)
+    assert set(MEANINGS) <= set(COLUMNS)
+
+
+def test_required_properties_are_there(metadata: dict[str, Any]) -> None:
+    """Those that specification 1.0 requires of every dataset."""
+    assert metadata["@type"] == "sc:Dataset"
+    assert metadata["conformsTo"] == [
+        "http://mlcommons.org/croissant/1.0",
+        "http://mlcommons.org/croissant/RAI/1.0",
+    ]
+    for name in ("description", "license", "name", "url", "creator", "datePublished"):
+        assert metadata[name], name
+    assert metadata["license"] == "https://spdx.org/licenses/MIT.html"
+    assert metadata["datePublished"] == "2026-11-21"
+
+
+def test_the_context_stands_in_the_file_and_knows_every_word(metadata: dict[str, Any]) -> None:
+    context = metadata["@context"]
+    assert isinstance(context, dict), "an address would have to be fetched"
+    assert context["@vocab"] == "https://schema.org/"
+    assert context["cr"] == "http://mlcommons.org/croissant/"
+    assert context["rai"] == "http://mlcommons.org/croissant/RAI/"
+
+    def check(node: Any) -> None:
+        for item in node if isinstance(node, list) else []:
+            check(item)
+        if not isinstance(node, dict):
+            return
+        for key, value in node.items():
+            if key.startswith("@"):
+                continue
+            if key.startswith("rai:"):
+                assert key.removeprefix("rai:") in RAI_WORDS, key
+            else:
+                assert key in context or key in SCHEMA_ORG_WORDS, key
+            if key != "data":
+                check(value)
+
+    check({key: value for key, value in metadata.items() if key != "@context"})
+
+
+def test_responsible_properties_have_their_cardinality(metadata: dict[str, Any]) -> None:
+    said = {k.removeprefix("rai:"): v for k, v in metadata.items() if k.startswith("rai:")}
+    for name in (
+        "dataCollection",
+        "dataBiases",
+        "dataLimitations",
+        "dataUseCases",
+        "personalSensitiveInformation",
+    ):
+        assert said[name], name
+    for name, value in said.items():
+        texts = value if name in RAI_MANY else [value]
+        assert isinstance(texts, list) and all(isinstance(t, str) and t for t in texts), name
+
+
+def _nodes(node: Any) -> list[dict[str, Any]]:
+    """All objects within ``node``."""
+    if isinstance(node, list):
+        return [found for item in node for found in _nodes(item)]
+    if not isinstance(node, dict):
+        return []
+    return [node] + [
+        found for key, item in node.items() if key != "@context" for found in _nodes(item)
+    ]
+
+
+def test_identifiers_are_unique_and_references_lead_somewhere(metadata: dict[str, Any]) -> None:
+    nodes = _nodes(metadata)
+    defined = [node["@id"] for node in nodes if "@id" in node and len(node) > 1]
+    pointed = [node["@id"] for node in nodes if set(node) == {"@id"}]
+    assert len(defined) == len(set(defined)) and len(pointed) > len(COLUMNS)
+    assert set(pointed) <= set(defined)
+    for records in metadata["recordSet"]:
+        for field in records["field"]:
+            assert field["@id"] == f"{records['@id']}/{field['name']}"
+            assert field["dataType"] in TYPES and field["@type"] == "cr:Field"
+
+
+def test_the_file_of_the_index_is_described_truly(dataset: Path, metadata: dict[str, Any]) -> None:
+    file = metadata["distribution"][0]
+    data = (dataset / file["contentUrl"]).read_bytes()
+    assert file["@type"] == "cr:FileObject" and file["encodingFormat"] == "application/x-parquet"
+    assert file["sha256"] == hashlib.sha256(data).hexdigest()
+    assert file["contentSize"] == f"{len(data)} B"
+
+
+def test_file_sets_hold_the_files_that_they_say(dataset: Path, metadata: dict[str, Any]) -> None:
+    sets = {item["@id"]: item for item in metadata["distribution"][1:]}
+    assert set(sets) == {"trial-files", "movies", "observed-movies", "maps"}
+    files = [p.relative_to(dataset).as_posix() for p in dataset.rglob("*.*") if p.is_file()]
+    found = {
+        name: {file for file in files if fnmatch.fnmatchcase(file, item["includes"])}
+        for name, item in sets.items()
+    }
+    paths = find_trials(dataset)
+    for name, attribute in (
+        ("trial-files", "trial_file"),
+        ("movies", "movie"),
+        ("observed-movies", "observed_movie"),
+        ("maps", "map"),
+    ):
+        expected = {getattr(p, attribute).relative_to(dataset).as_posix() for p in paths}
+        assert found[name] == expected, name
+
+
+def test_fields_are_the_columns_of_the_index(dataset: Path, metadata: dict[str, Any]) -> None:
+    trials = next(r for r in metadata["recordSet"] if r["@id"] == "trials")
+    table = read_index(dataset)
+    columns = {field["source"]["extract"]["column"]: field for field in trials["field"]}
+    assert list(columns) == list(table.columns)
+    for name, field in columns.items():
+        kind = field["dataType"]
+        plain = table[name].dropna()
+        assert {
+            "sc:Text": pd.api.types.is_string_dtype,
+            "sc:Integer": pd.api.types.is_integer_dtype,
+            "sc:Float": pd.api.types.is_float_dtype,
+            "sc:Boolean": pd.api.types.is_bool_dtype,
+        }[kind](plain.dtype), name
+
+
+def test_splits_and_scenarios_are_enumerated(metadata: dict[str, Any]) -> None:
+    records = {r["@id"]: r for r in metadata["recordSet"]}
+    assert records["splits"]["dataType"] == "cr:Split"
+    assert [row["splits/name"] for row in records["splits"]["data"]] == ["testing", "training"]
+    assert [row["scenarios/name"] for row in records["scenarios"]["data"]] == ["drop"]
+    fields = {field["name"]: field for field in records["trials"]["field"]}
+    assert fields["split"]["references"] == {"field": {"@id": "splits/name"}}
+
+
+def _validate(path: Path) -> str:
+    """What MLCommons' own program says of a file; skips where it is not installed.
+
+    It lives best in an environment of its own, as it brings type stubs that mypy would read.
+    """
+    program = find_program("mlcroissant", variable="MLCROISSANT")
+    nowhere = dict.fromkeys(("http_proxy", "https_proxy"), "http://127.0.0.1:9")
+    done = subprocess.run(
+        [program, "validate", "--jsonld", str(path)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, **nowhere},
+    )
+    return done.stdout + done.stderr
+
+
+@pytest.mark.slow
+def test_the_reference_validator_agrees(
+    dataset: Path, metadata: dict[str, Any], tmp_path: Path
+) -> None:
+    said = _validate(dataset / "croissant.json")
+    assert "Done." in said and "WARN" not in said.upper() and "error" not in said
+    broken = json.loads(json.dumps(metadata))
+    del broken["distribution"][0]["sha256"]
+    (tmp_path / "croissant.json").write_text(json.dumps(broken))
+    assert "1 error(s)" in _validate(tmp_path / "croissant.json")
+
+
+def test_same_arguments_same_bytes(dataset: Path, tmp_path: Path) -> None:
+    cards = [write_card(dataset, tmp_path / n, published="2026-11-21") for n in ("one", "two")]
+    assert cards[0].readme.read_bytes() == cards[1].readme.read_bytes()
+    assert cards[0].metadata.read_bytes() == cards[1].metadata.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("argument", "value"),
+    [
+        ("license", "do what you want"),
+        ("version", "1.0"),
+        ("url", "my page"),
+        ("published", "yesterday"),
+    ],
+)
+def test_bad_terms_are_named(dataset: Path, tmp_path: Path, argument: str, value: str) -> None:
+    with pytest.raises(BadInputError, match=value):
+        write_card(dataset, tmp_path / "out", **{argument: value})
+    assert not (tmp_path / "out").exists()
+
+
+def test_folders_without_trials_are_refused(dataset: Path, tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match=r"no index\.parquet"):
+        write_card(tmp_path)
+    write_index(tmp_path, read_index(dataset).iloc[:0])
+    with pytest.raises(BadInputError, match="no trial"):
+        write_card(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("README.md", "# My own words\n"),
+        ("README.md", '---\ntitle: x\n---\npretty_name: "Physion: mine"\n'),
+        ("croissant.json", '{"description": "somebody else\'s"}'),
+        ("croissant.json", "not JSON"),
+        ("croissant.json", "[]"),
+    ],
+)
+def test_files_of_others_are_not_written_over(
+    dataset: Path, tmp_path: Path, name: str, text: str
+) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(BadInputError, match=r"is not a card of ours.*move it away"):
+        write_card(dataset, tmp_path)
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, text)]
+
+
+def test_a_card_takes_the_place_of_an_older_one(dataset: Path, tmp_path: Path) -> None:
+    write_card(dataset, tmp_path, version="1.0.0")
+    card = write_card(dataset, tmp_path, version="1.0.1")
+    assert "Version 1.0.1" in card.readme.read_text()
+    assert json.loads(card.metadata.read_text())["version"] == "1.0.1"
+
+
+def test_a_link_is_not_taken_for_a_card(dataset: Path, tmp_path: Path) -> None:
+    (tmp_path / "README.md").symlink_to(tmp_path / "nowhere")
+    with pytest.raises(BadInputError, match="not a card of ours"):
+        write_card(dataset, tmp_path)
+
+
+def test_the_verb_takes_the_terms(dataset: Path, tmp_path: Path) -> None:
+    terms = ["--license", "CC-BY-4.0", "--creator", "A Lab", "--version", "2.1.0"]
+    terms += ["--url", "https://example.org/x", "--published", "2026-01-31"]
+    words = ["export", str(dataset), str(tmp_path), "--layout", "card", *terms]
+    assert cli(words) == 0
+    said = json.loads((tmp_path / "croissant.json").read_text())
+    assert said["license"].endswith("CC-BY-4.0.html") and said["creator"]["name"] == "A Lab"
+    assert (said["version"], said["url"]) == ("2.1.0", "https://example.org/x")
+    assert said["datePublished"] == "2026-01-31"
+
+
+def test_the_verb_refuses_terms_of_another_layout(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli(["export", str(dataset), str(tmp_path / "out"), "--creator", "me"]) == 2
+    assert "--layout card" in capsys.readouterr().err
+    assert cli(["export", str(dataset), "--layout", "card", "--parts", "seen"]) == 2
+    assert "--layout webdataset" in capsys.readouterr().err
