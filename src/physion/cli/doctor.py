@@ -11,20 +11,19 @@ import tempfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import physion
 from physion.cli.output import console
 
 EXTRAS = {
-    "models": ("torch", "torchvision", "timm", "lightning-fabric", "safetensors"),
+    "models": ("torch", "timm", "lightning-fabric", "safetensors"),
     "experiment": (
         *("fastapi", "uvicorn", "sqlalchemy", "alembic", "psycopg"),
         *("argon2-cffi", "jinja2", "python-multipart", "httpx2"),
     ),
-    "ray": ("ray",),
-    "slurm": ("submitit",),
-    "dev": ("pytest", "pytest-xdist", "hypothesis", "ruff", "mypy", "import-linter"),
+    "dev": ("pytest", "pytest-xdist", "hypothesis", "ruff", "mypy", "import-linter", "trimesh"),
 }
 CORE = (
-    *("numpy", "scipy", "mujoco", "numba", "trimesh", "h5py", "hdf5plugin", "av", "pillow"),
+    *("numpy", "scipy", "mujoco", "numba", "h5py", "hdf5plugin", "av", "pillow"),
     *("pandas", "pyarrow", "scikit-learn", "statsmodels", "matplotlib", "tyro", "rich"),
 )
 
@@ -77,7 +76,7 @@ def machine() -> list[Check]:
     version = platform.python_version()
     fresh = tuple(map(int, version.split(".")[:2])) >= (3, 11)
     return [
-        Check("physion", importlib.metadata.version("physion")),
+        Check("physion", physion.__version__),
         Check("python", version, fresh, remedy="" if fresh else "install Python 3.11 or newer"),
         Check("system", platform.platform()),
         Check("cores", str(cores)),

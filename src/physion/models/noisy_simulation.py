@@ -20,12 +20,12 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+import physion
 from physion.errors import BadInputError
 from physion.models.interface import Provenance, Spec, make_config
 from physion.models.observed import cut_to_observed
@@ -207,7 +207,7 @@ class NoisySimulation:
             init="none",
             encoder_type="true state",
             dynamics_type="physics engine",
-            versions=f"{self._engine.name}, physion {version('physion')}",
+            versions=f"{self._engine.name}, physion {physion.__version__}",
         )
 
 

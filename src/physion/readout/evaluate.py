@@ -7,12 +7,12 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
+import physion
 from physion.compute.executor import Executor
 from physion.errors import BadInputError, MissingExtraError
 from physion.models.interface import Encodes, Model, PredictsContact, Simulates, build_model
@@ -201,7 +201,7 @@ def _digest(
     settings["readouts"] = [readout.value for readout in readouts]
     own = getattr(model, "config", None)
     described = dataclasses.asdict(own) if dataclasses.is_dataclass(own) else {}  # type: ignore[arg-type]
-    words = [_VERSION, version("physion"), settings, dataclasses.asdict(model.provenance())]
+    words = [_VERSION, physion.__version__, settings, dataclasses.asdict(model.provenance())]
     sha = hashlib.sha256(json.dumps([*words, described], sort_keys=True, default=str).encode())
     if isinstance(model, Encodes):
         sha.update(model.encoder_digest().encode())
