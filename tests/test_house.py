@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 
 import pytest
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 ROOT = Path(__file__).parents[1]
 SOURCES = sorted((ROOT / "src").rglob("*.py"))
@@ -40,6 +42,33 @@ def test_the_core_runs_without_torch(module: str) -> None:
 
 def _calls(tree: ast.AST) -> list[tuple[str, ast.Call]]:
     return [(ast.unparse(node.func), node) for node in ast.walk(tree) if isinstance(node, ast.Call)]
+
+
+def _module(path: Path) -> str:
+    parts = path.relative_to(ROOT / "src").with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def _imports(path: Path, modules: set[str]) -> set[str]:
+    """Modules of the package that a module imports anywhere, inside functions too."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {name.name for name in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            members = {f"{node.module}.{name.name}" for name in node.names}
+            found |= members & modules or {node.module}
+    return (found & modules) - {_module(path)}
+
+
+def test_no_import_ring() -> None:
+    """Each strongly connected component of the graph of imports is a single module."""
+    modules = [_module(path) for path in SOURCES]
+    imports = [_imports(path, set(modules)) for path in SOURCES]
+    graph = [[name in found for name in modules] for found in imports]
+    count, labels = connected_components(csr_array(graph), connection="strong")
+    rings = [[m for m, of in zip(modules, labels, strict=True) if of == k] for k in range(count)]
+    assert not [ring for ring in rings if len(ring) > 1]
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT / "src")))

@@ -33,11 +33,12 @@ import numpy as np
 from physion.atomic import folder_lock, remove_leftovers, write_atomic
 from physion.compute.executor import Executor
 from physion.errors import BadInputError
+from physion.stimulus_names import FOLDERS
 from physion.trials.dataset import Dataset
 from physion.trials.files import encode_png
 from physion.trials.layout import TrialPaths
 from physion.trials.making.generate import Track
-from physion.trials.official.names import FOLDERS, TRIAL_FILE, redyellow_name, split_name
+from physion.trials.official.names import TRIAL_FILE, redyellow_name, split_name
 from physion.trials.official.read_hdf5 import OfficialFile
 from physion.trials.official.run import OfficialReport, run_all
 from physion.trials.official.write_metadata import trial_stats

@@ -19,48 +19,23 @@ import json
 import re
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from physion.atomic import folder_lock, remove_leftovers
 from physion.compute.executor import Executor
 from physion.errors import BadInputError, UnknownNameError
+from physion.stimulus_names import FOLDERS, guess_scenario, plain_name
 from physion.trials.index import build_index, write_index
 from physion.trials.layout import INDEX, SAFE_NAME, SETTINGS, TrialPaths
 from physion.trials.making.generate import Track
 from physion.trials.making.plan import SPLITS
-from physion.trials.official.names import (
-    FOLDERS,
-    guess_scenario,
-    plain_name,
-    redyellow_name,
-    split_name,
-)
+from physion.trials.official.job import ImportJob
+from physion.trials.official.names import redyellow_name, split_name
 from physion.trials.official.run import OfficialReport, run_all
 
-IMPORTED = "imported"
-"""Name of a dataset of others' files, unless it is given one."""
 MAX_LIST_BYTES = 2**28
 """Largest metadata.json or labels.csv that is read."""
-
-
-@dataclass(frozen=True)
-class ImportJob:
-    """One official trial to bring over.
-
-    ``source`` is its HDF5 file, or its movie where it has no state. ``scenario`` is None where no
-    name betrays it; ``contact`` is the recorded outcome, as far as lists beside the file say so,
-    and ``first_frame`` the first frame of contact. ``dataset`` is None where a file of ours may
-    keep the name that it has, and those of others are `IMPORTED`.
-    """
-
-    source: Path
-    paths: TrialPaths
-    index: int
-    dataset: str | None
-    contact: bool | None = None
-    first_frame: int | None = None
 
 
 def import_official(

@@ -7,14 +7,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-import physion
 from physion.errors import BadInputError
 from physion.physics.labels import Labels, label_contact
 from physion.physics.trajectory import Trajectory
 from physion.rendering.renderer import Renderer, role_map
-from physion.scenes.scene import FRAME_TIME, OBSERVED_FRAMES, PLAYBACK_RATE, Scene
+from physion.scenes.scene import OBSERVED_FRAMES, PLAYBACK_RATE, Scene
 from physion.trials.files import encode_png, write_files
-from physion.trials.official.import_folder import IMPORTED, ImportJob
+from physion.trials.official.job import ImportJob, imported_metadata
 from physion.trials.official.movies import (
     PICTURES,
     Movies,
@@ -26,7 +25,7 @@ from physion.trials.official.read_hdf5 import OfficialFile
 from physion.trials.official.read_motion import MotionReader
 from physion.trials.official.read_scene import SceneReader
 from physion.trials.official.round_trip import restored_files, stored_trial
-from physion.trials.trial_file import Metadata, TrialWriter
+from physion.trials.trial_file import TrialWriter
 
 UNSEEN_SIZE = (256, 256)
 """Width and height in pixels of the id map of a trial without any picture."""
@@ -140,43 +139,3 @@ def _ids(
     drawn = Renderer(scene, trajectory, *size).render(0, ("ids",)).ids
     assert drawn is not None, "the renderer left out ids"
     return drawn
-
-
-def imported_metadata(
-    job: ImportJob,
-    scene: Scene,
-    trajectory: Trajectory,
-    ids: NDArray[np.int16],
-    *,
-    look: str,
-    movies: bool,
-    rate: int,
-    recorded: bool | None,
-    free_movies: bool = False,
-) -> Metadata:
-    """Where an imported trial comes from; ``rate`` is its movies' frames a second."""
-    return Metadata(
-        trial=job.paths.trial,
-        dataset=job.dataset or IMPORTED,
-        scenario=job.paths.scenario,
-        split=job.paths.split,
-        index=job.index,
-        preset=None,
-        seed=None,
-        look=look,
-        width=ids.shape[1],
-        height=ids.shape[0],
-        frames=len(trajectory),
-        observed_frames=OBSERVED_FRAMES,
-        frame_time=FRAME_TIME,
-        playback_rate=rate,
-        completed=bool(trajectory.completed),
-        engine=trajectory.engine,
-        renderer="imported",
-        package=f"physion {physion.__version__}",
-        digest=trajectory.digest(),
-        scene_digest=scene.physics_digest(),
-        movies=movies,
-        free_movies=free_movies,
-        recorded_contact=recorded,
-    )

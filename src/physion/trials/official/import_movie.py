@@ -18,11 +18,11 @@ from physion.physics.labels import Labels
 from physion.physics.trajectory import Contacts, Trajectory
 from physion.rendering.renderer import role_map
 from physion.scenes.scene import OBSERVED_FRAMES, Body, Camera, Roles, Scene
+from physion.stimulus_names import plain_name
 from physion.trials.files import encode_png, write_files
-from physion.trials.official.import_folder import ImportJob
-from physion.trials.official.import_hdf5 import imported_metadata
+from physion.trials.official.job import ImportJob, imported_metadata
 from physion.trials.official.movies import beside, read_movie
-from physion.trials.official.names import decode_picture, plain_name, redyellow_name
+from physion.trials.official.names import decode_picture, redyellow_name
 from physion.trials.trial_file import TrialWriter
 
 ENGINE = "imported: movie alone"

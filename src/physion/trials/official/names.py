@@ -8,7 +8,6 @@ from __future__ import annotations
 import io
 import re
 import warnings
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -20,28 +19,6 @@ from physion.physics.labels import CLOTH_CONTACT_GAP
 
 Bytes = NDArray[np.uint8]
 
-FOLDERS = {
-    "dominoes": "Dominoes",
-    "support": "Support",
-    "collide": "Collide",
-    "contain": "Contain",
-    "drop": "Drop",
-    "link": "Link",
-    "roll": "Roll",
-    "drape": "Drape",
-}
-"""Folders of the published archives by scenario."""
-CONTROLLERS = {
-    "dominoes": "MultiDominoes",
-    "support": "Tower",
-    "collide": "Collision",
-    "contain": "Containment",
-    "drop": "Drop",
-    "link": "Linking",
-    "roll": "RollingSliding",
-    "drape": "ClothSagging",
-}
-"""``controller_name`` of the metadata by scenario."""
 ROOMS = {"box": "box", "bright": "tdw"}
 """What the official files call our rooms."""
 RAMPS = ("ramp_with_platform_30", "ramp_with_platform_60")
@@ -61,21 +38,6 @@ FLOW_FULL = 0.02
 
 _DEPTH_RANGE = 100.0 - 0.1
 _NUMBERED = re.compile(r"(?P<config>.+)_(?P<number>\d{4})$")
-_WORDS = {
-    # Some rolling stimuli are called after the collision in them: the first that fits decides.
-    "roll": "roll",
-    "domino": "dominoes",
-    "tower": "support",
-    "support": "support",
-    "collision": "collide",
-    "collide": "collide",
-    "contain": "contain",
-    "link": "link",
-    "drop": "drop",
-    "cloth": "drape",
-    "drape": "drape",
-}
-"""How words in the names of stimuli begin, by scenario."""
 
 
 def split_name(trial: str) -> tuple[str, str]:
@@ -91,27 +53,6 @@ def redyellow_name(trial: str) -> str:
     """The stimulus name of the version with red agent and yellow patient."""
     config, number = split_name(trial)
     return f"{config}-redyellow_{number}"
-
-
-def plain_name(name: str) -> str:
-    """The stimulus that a file of any look shows: no ending, no ``-redyellow``."""
-    for ending in (".mp4", ".hdf5", ".png", "_img", "_map"):
-        name = name.removesuffix(ending)
-    return name.replace("-redyellow", "")
-
-
-def guess_scenario(stimulus: str, controller: str, folders: Sequence[str]) -> str | None:
-    """The scenario that the name of a stimulus, its controller or its folders betray, or None."""
-    for word, scenario in _WORDS.items():
-        if re.search(rf"(?:^|[_-]){word}", stimulus, re.IGNORECASE):
-            return scenario
-    for scenario, name in CONTROLLERS.items():
-        if controller == name:
-            return scenario
-    if re.fullmatch(r"test\d+_\d{4}", stimulus):
-        return "drape"
-    titles = {title.lower(): scenario for scenario, title in FOLDERS.items()}
-    return next((titles[name.lower()] for name in folders if name.lower() in titles), None)
 
 
 def segmentation_colors(count: int) -> Bytes:

@@ -21,11 +21,12 @@ from physion.physics.labels import contact_frames
 from physion.physics.trajectory import ENVIRONMENT, Contacts, Trajectory
 from physion.rendering.renderer import role_map
 from physion.scenes.scene import FRAME_TIME, OBSERVED_FRAMES, Cloth
+from physion.stimulus_names import plain_name
 from physion.trials.files import encode_png
 from physion.trials.official.axes import to_official_camera
-from physion.trials.official.import_folder import ImportJob
+from physion.trials.official.job import ImportJob
 from physion.trials.official.movies import PICTURES, SourceMovie, beside, make_movies, stored_frames
-from physion.trials.official.names import TRIAL_FILE, plain_name
+from physion.trials.official.names import TRIAL_FILE
 from physion.trials.official.read_hdf5 import OfficialFile
 from physion.trials.official.read_motion import MotionReader
 from physion.trials.official.write_objects import OfficialObjects

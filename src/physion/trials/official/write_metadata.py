@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.trials.official.names import CONTROLLERS, ROOMS
+from physion.stimulus_names import CONTROLLERS
+from physion.trials.official.names import ROOMS
 from physion.trials.official.write_frames import FrameWriter
 
 HIDDEN = 0.005
