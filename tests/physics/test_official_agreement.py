@@ -6,45 +6,44 @@ from pathlib import Path
 
 import pytest
 
+from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
-from physion.physics.rigid.engine import MujocoEngine
 from physion.scenes.tdw.read_logs import read_scenes
 
+# Floors lie 0.03 below what was measured (benchmarks/results/replay.md) and at least 0.05 above
+# the base rate, which always guessing the commoner outcome gives. Link's measured agreement is its
+# base rate plus 0.05, so its floor is what was measured.
+FLOORS = [("dominoes", 40, 0.97), ("collide", 40, 0.89)]
+SLOW_FLOORS = [
+    ("drop", 200, 0.91),
+    ("roll", 100, 0.80),
+    ("support", 240, 0.76),
+    ("contain", 205, 0.80),
+    ("link", 100, 0.69),
+]
 
-def agreement(official: Path, folder: str, limit: int) -> float:
-    """Share of the first trials of a scenario whose outcome is the recorded one."""
+
+def check_agreement(official: Path, folder: str, limit: int, floor: float) -> None:
+    """Check the fraction of the first trials of a scenario whose outcome is the recorded one."""
     trials, _ = read_scenes(official / "scenes" / folder, limit=limit).unique()
-    engine = MujocoEngine()
-    same = [
-        label_contact(t.scene, engine.simulate(t.scene)).contact == t.outcome.contact
-        for t in trials
-    ]
-    assert len(same) >= limit // 2
-    return sum(same) / len(same)
+    recorded = [trial.outcome.contact for trial in trials]
+    simulated = [label_contact(t.scene, simulate(t.scene)).contact for t in trials]
+    assert len(trials) >= limit // 2
+    yes = sum(recorded) / len(recorded)
+    assert floor >= max(yes, 1 - yes) + 0.05 - 1e-9
+    assert sum(a == b for a, b in zip(recorded, simulated, strict=True)) / len(trials) >= floor
 
 
-# Floors lie two or more trials below what was measured on these slices, above what chance gives.
-@pytest.mark.parametrize(
-    ("folder", "limit", "floor"), [("dominoes", 40, 0.95), ("collide", 40, 0.85)]
-)
+@pytest.mark.parametrize(("folder", "limit", "floor"), FLOORS)
 def test_outcomes_agree_with_the_recorded_ones(
     official: Path, folder: str, limit: int, floor: float
 ) -> None:
-    assert agreement(official, folder, limit) >= floor
+    check_agreement(official, folder, limit, floor)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("folder", "limit", "floor"),
-    [
-        ("drop", 200, 0.84),
-        ("roll", 100, 0.78),
-        ("support", 240, 0.75),
-        ("contain", 205, 0.66),
-        ("link", 100, 0.62),
-    ],
-)
+@pytest.mark.parametrize(("folder", "limit", "floor"), SLOW_FLOORS)
 def test_outcomes_agree_in_whole_scenarios(
     official: Path, folder: str, limit: int, floor: float
 ) -> None:
-    assert agreement(official, folder, limit) >= floor
+    check_agreement(official, folder, limit, floor)
