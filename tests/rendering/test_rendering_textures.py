@@ -18,7 +18,7 @@ from physion.scenes.looks import MATERIALS, RED, TEXTURES
 from physion.scenes.scene import Camera, Look, Scene
 from physion.scenes.shapes.primitives import shape
 from physion.scenes.shapes.prop_names import PREFIX, PROPS
-from physion.scenes.shapes.prop_parts import Prop
+from physion.scenes.shapes.prop_parts import PropShape
 from support.rendered_scenes import body, resting, scene_of
 
 NEAR = Camera((1.3, 1.0, 0.9), (0.0, 0.0, 0.35))
@@ -124,10 +124,10 @@ def lamp_scene(role: bool) -> Scene:
 
 def test_parts_of_props_have_their_own_colours_unless_they_play_a_role() -> None:
     prop = shape("prop:lamp")
-    assert isinstance(prop, Prop)
+    assert isinstance(prop, PropShape)
     free, role = (assemble(scene, rooms.get("empty")) for scene in map(lamp_scene, (False, True)))
     painted = free.material[free.objects == 2]
-    assert len(set(painted)) == 1 + len(prop.own)
+    assert len(set(painted)) == 1 + len(prop.own_looks)
     # Triangles of two colours are two surfaces.
     surfaces = free.surface[free.objects == 2]
     pairs = set(zip(surfaces.tolist(), painted.tolist(), strict=True))
@@ -144,7 +144,7 @@ def test_paint_follows_the_mesh_of_every_prop() -> None:
     made = assemble(scene_of(ends[0], *bodies, ends[1]), rooms.get("empty"))
     for i, name in enumerate(PROPS):
         prop = shape(PREFIX + name)
-        assert isinstance(prop, Prop)
+        assert isinstance(prop, PropShape)
         rows = made.material[made.objects == i + 2]
         assert len(rows) == len(prop.paint)
         for slot in set(prop.paint.tolist()):

@@ -11,7 +11,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from physion.errors import BadSceneError
-from physion.scenes.scene import Body, Camera, Cloth, Contact, Joint, Look, Push, Roles, Scene
+from physion.scenes.scene import (
+    Body,
+    Camera,
+    Cloth,
+    Joint,
+    Look,
+    Push,
+    Roles,
+    Scene,
+    SurfaceMaterial,
+)
 
 numbers = st.floats(-1e6, 1e6, allow_nan=False)
 sizes = st.floats(1e-3, 1e3)
@@ -36,7 +46,7 @@ def test_json_loses_nothing(
     text: str,
     frame: int,
 ) -> None:
-    body = Body("red", "bowl", point, size, mass=mass, contact=Contact(0.1, 0.2, 0.3))
+    body = Body("red", "bowl", point, size, mass=mass, contact=SurfaceMaterial(0.1, 0.2, 0.3))
     scene = replace(
         small_scene(),
         bodies=(body, Body("zone", "cube", (1.0, 0.0, 0.0), look=Look((0.1, 0.2, 0.3), "metal"))),

@@ -10,7 +10,7 @@ import numpy as np
 from physion.physics.labels import label_contact
 from physion.physics.trajectory import ENVIRONMENT, Contacts, Trajectory
 from physion.rendering.renderer import Renderer, role_map
-from physion.scenes.scene import Body, Camera, Cloth, Contact, Look, Push, Roles, Scene
+from physion.scenes.scene import Body, Camera, Cloth, Look, Push, Roles, Scene, SurfaceMaterial
 from physion.trials.files import write_files
 from physion.trials.index import build_index, write_index
 from physion.trials.layout import TrialPaths
@@ -39,7 +39,9 @@ def make_scene(name: str, cloth: bool) -> Scene:
         Body(
             "distractor_0", "prop:vase", (-1.0, -1.5, 0.0), (0.4, 0.4, 0.7), mass=7.0, scenery=True
         ),
-        Body("cone", "cone", (0.0, 0.1, 0.3), (0.2, 0.3, 0.4), contact=Contact(0.3, 0.2, 0.1)),
+        Body(
+            "cone", "cone", (0.0, 0.1, 0.3), (0.2, 0.3, 0.4), contact=SurfaceMaterial(0.3, 0.2, 0.1)
+        ),
     ]
     stiffness = {"stretch": 0.2, "bend": 0.3, "tether": 0.9}
     sheet = Cloth("sheet", (0.2, 0.1, 0.9), (0.8, 0.8, 0.0), resolution=5, **stiffness)

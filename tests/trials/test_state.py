@@ -18,12 +18,12 @@ from physion.scenes.scene import (
     Body,
     Camera,
     Cloth,
-    Contact,
     Ending,
     Look,
     Push,
     Roles,
     Scene,
+    SurfaceMaterial,
 )
 from physion.trials import state
 from physion.trials.trial_file import Trial, TrialWriter
@@ -67,7 +67,7 @@ def collision() -> Trial:
                 (-0.5, 0.0, 0.0),
                 scale=(0.3, 0.3, 0.3),
                 mass=0.5,
-                contact=Contact(0.4, 0.3, 0.2),
+                contact=SurfaceMaterial(0.4, 0.3, 0.2),
                 look=Look((0.1, 0.2, 0.3), "metal"),
             ),
             Body("cone", "cone", (0.0, 0.8, 0.0), (0.4, 0.4, 0.8), kinematic=True),

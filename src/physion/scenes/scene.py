@@ -34,8 +34,8 @@ GRAVITY = 9.81
 
 
 @dataclass(frozen=True, slots=True)
-class Contact:
-    """How a surface rubs and bounces; coefficients of a pair are the averages of both bodies."""
+class SurfaceMaterial:
+    """Friction and restitution of a surface; a contact uses the means of both bodies' values."""
 
     static_friction: float = 0.5
     dynamic_friction: float = 0.5
@@ -65,7 +65,9 @@ class Body:
     scale: Vec3 = (1.0, 1.0, 1.0)
     rotation: Quat = (1.0, 0.0, 0.0, 0.0)
     mass: float = 1.0
-    contact: Contact = Contact()
+    # The surface material. The field keeps its first name: it is a key of the scene's JSON, which
+    # decides the physics digest and thereby the split that a scene belongs to.
+    contact: SurfaceMaterial = SurfaceMaterial()
     kinematic: bool = False
     scenery: bool = False
     drag: float = 0.0

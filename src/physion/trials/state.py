@@ -26,7 +26,7 @@ from physion.physics.rigid.hulls import collision_hulls
 from physion.physics.rigid.mass import hull_mass
 from physion.physics.trajectory import ENVIRONMENT
 from physion.rendering.camera import intrinsics, view_matrix
-from physion.scenes.scene import FRAME_TIME, Body, Cloth, Contact, Scene, Vec3
+from physion.scenes.scene import FRAME_TIME, Body, Cloth, Scene, SurfaceMaterial, Vec3
 from physion.scenes.shapes.primitives import shape
 from physion.trials.trial_file import Trial
 
@@ -222,7 +222,7 @@ def _body_row(body: Body) -> dict[str, Any]:
 def _cloth_row(cloth: Cloth) -> dict[str, Any]:
     return {
         **_thing_row(cloth, "cloth", "sheet", cloth.size),
-        **dict.fromkeys((field.name for field in dataclasses.fields(Contact)), np.nan),
+        **dict.fromkeys((field.name for field in dataclasses.fields(SurfaceMaterial)), np.nan),
         "kinematic": False,
         "scenery": False,
     }

@@ -19,11 +19,11 @@ from physion.physics.rigid.engine import MujocoEngine, RigidRun
 from physion.physics.rigid.settings import Settings
 from physion.physics.trajectory import ENVIRONMENT, Trajectory
 from physion.scenes.sampling.registry import sample_scene
-from physion.scenes.scene import Body, Camera, Contact, Ending, Joint, Push, Roles, Scene
+from physion.scenes.scene import Body, Camera, Ending, Joint, Push, Roles, Scene, SurfaceMaterial
 from physion.seeds import trial_seed
 
 G = 9.81
-ROUGH = Contact(0.5, 0.5, 0.0)
+ROUGH = SurfaceMaterial(0.5, 0.5, 0.0)
 ZONE = Body("zone", "cube", (9.0, 9.0, 0.0), (1, 1, 0.01), kinematic=True)
 
 
@@ -67,7 +67,7 @@ def test_sliding_block_stops_where_coulomb_says(doubling: bool, factor: float) -
     assert np.abs(path.velocities[-1, 0]).max() < 1e-3
 
 
-def on_slope(angle: float, friction: Contact) -> Scene:
+def on_slope(angle: float, friction: SurfaceMaterial) -> Scene:
     """A block on a fixed board that is tilted about y."""
     c, s = math.cos(angle / 2), math.sin(angle / 2)
     up = np.array([math.sin(angle), 0, math.cos(angle)])
@@ -81,9 +81,9 @@ def on_slope(angle: float, friction: Contact) -> Scene:
 
 def test_static_friction_holds_on_a_slope_and_dynamic_does_not() -> None:
     angle = math.atan(0.6)
-    held = run(on_slope(angle, Contact(0.7, 0.1, 0)), frames=60, friction_doubling=False)
+    held = run(on_slope(angle, SurfaceMaterial(0.7, 0.1, 0)), frames=60, friction_doubling=False)
     assert np.linalg.norm(held.positions[-1, 0] - held.positions[0, 0]) < 2e-3
-    slid = run(on_slope(angle, Contact(0.5, 0.1, 0)), frames=60, friction_doubling=False)
+    slid = run(on_slope(angle, SurfaceMaterial(0.5, 0.1, 0)), frames=60, friction_doubling=False)
     way = np.linalg.norm(slid.positions[-1, 0] - slid.positions[0, 0])
     expected = 0.5 * G * (math.sin(angle) - 0.1 * math.cos(angle)) * 0.59**2
     assert way == pytest.approx(expected, rel=0.06)
@@ -103,16 +103,18 @@ def test_ball_rolls_on() -> None:
 
 @pytest.mark.parametrize("bounce", [0.0, 0.5, 0.9])
 def test_bounce_returns_the_coefficient_of_the_speed(bounce: float) -> None:
-    block = Body("a", "cube", (0, 0, 1.0), (0.3, 0.3, 0.3), contact=Contact(0.5, 0.5, bounce))
-    path = run(scene_of(block), frames=100, floor=Contact(0.5, 0.5, bounce))
+    block = Body(
+        "a", "cube", (0, 0, 1.0), (0.3, 0.3, 0.3), contact=SurfaceMaterial(0.5, 0.5, bounce)
+    )
+    path = run(scene_of(block), frames=100, floor=SurfaceMaterial(0.5, 0.5, bounce))
     height = path.positions[:, 0, 2]
     ground = int(np.argmin(height))
     assert height[ground:].max() == pytest.approx(bounce**2, abs=0.06)
 
 
 def test_slow_contact_does_not_bounce() -> None:
-    block = Body("a", "cube", (0, 0, 0.1), (0.3, 0.3, 0.3), contact=Contact(0.5, 0.5, 1.0))
-    path = run(scene_of(block), frames=60, floor=Contact(0.5, 0.5, 1.0))
+    block = Body("a", "cube", (0, 0, 0.1), (0.3, 0.3, 0.3), contact=SurfaceMaterial(0.5, 0.5, 1.0))
+    path = run(scene_of(block), frames=60, floor=SurfaceMaterial(0.5, 0.5, 1.0))
     assert path.positions[30:, 0, 2].max() < 5e-3
 
 
@@ -143,7 +145,7 @@ def test_drag_takes_its_share() -> None:
 def test_joined_bodies_move_as_one_and_keep_their_materials() -> None:
     base = Body("base", "cube", (0, 0, 0), (0.4, 0.4, 0.2), mass=3.0, contact=ROUGH)
     pole = Body(
-        "pole", "cylinder", (0, 0, 0.2), (0.1, 0.1, 0.6), mass=1.0, contact=Contact(0, 0, 0)
+        "pole", "cylinder", (0, 0, 0.2), (0.1, 0.1, 0.6), mass=1.0, contact=SurfaceMaterial(0, 0, 0)
     )
     held = scene_of(
         base,
@@ -215,7 +217,7 @@ def test_a_trial_ends_when_all_sleep_but_not_before_its_least_frames() -> None:
 
 
 def test_a_sleeping_body_is_hit_with_its_whole_mass() -> None:
-    ice = Contact(0, 0, 0)
+    ice = SurfaceMaterial(0, 0, 0)
     still = Body("a", "cube", (0, 0, 0), (0.2, 0.2, 0.2), contact=ice, drag=0)
     hammer = Body("b", "cube", (-1.5, 0, 0), (0.2, 0.2, 0.2), contact=ice, drag=0)
     push = Push("b", (2.0, 0, 0), frame=60)
@@ -235,7 +237,7 @@ def test_a_sleeping_body_is_hit_with_its_whole_mass() -> None:
 def test_momentum_is_conserved_and_energy_never_grows(
     speed: float, mass: float, offset: float, bounce: float
 ) -> None:
-    material = Contact(0.4, 0.3, bounce)
+    material = SurfaceMaterial(0.4, 0.3, bounce)
     a = Body("a", "cube", (0, 0, 9), (0.3, 0.3, 0.3), contact=material, angular_drag=0)
     b = Body("b", "cylinder", (-0.6, offset, 9), (0.3, 0.3, 0.3), mass=mass, contact=material)
     b = replace(b, angular_drag=0)

@@ -21,24 +21,24 @@ from physion.scenes.sampling.parameters import (
     Axes,
     Count,
     Counts,
+    FloorPosition,
     Length,
     Lengths,
     Masses,
-    Place,
     Range,
     Room,
+    Rotations,
     Shapes,
     Sizes,
-    Turns,
     check_params,
     draw_axes,
     draw_count,
     draw_frame,
-    draw_turn,
+    draw_rotation,
     drawn_limits,
     pick,
-    place,
     read_params,
+    retry,
     uniform,
 )
 from physion.scenes.sampling.registry import as_record, sample_scene, scenarios
@@ -46,10 +46,10 @@ from physion.scenes.sampling.rules import (
     BodyRule,
     PushRule,
     ZoneRule,
-    above_floor,
     draw_body,
     draw_push,
     draw_zone,
+    raised_to_floor,
     require_apart,
 )
 from physion.scenes.scene import Body, Look
@@ -111,7 +111,7 @@ def test_the_last_frame_is_left_out() -> None:
 
 @given(SEEDS, axes(-360, 360))
 def test_turns_are_rotations(rng: np.random.Generator, limits: Axes) -> None:
-    turn = draw_turn(rng, limits)
+    turn = draw_rotation(rng, limits)
     assert math.isclose(math.hypot(*turn), 1.0)
     if isinstance(limits[0], float):
         assert turn[1] == turn[2] == 0, "one angle turns about the upright"
@@ -119,10 +119,10 @@ def test_turns_are_rotations(rng: np.random.Generator, limits: Axes) -> None:
 
 def test_three_angles_turn_as_unity_does() -> None:
     rng = np.random.default_rng(0)
-    turn = draw_turn(rng, ((90.0, 90.0), (0.0, 0.0), (90.0, 90.0)))
+    turn = draw_rotation(rng, ((90.0, 90.0), (0.0, 0.0), (90.0, 90.0)))
     # About x first, which lays z along -y, then about z, which brings that along x.
     assert rotate_vectors(turn, (0, 0, 1)) == pytest.approx([1, 0, 0], abs=1e-12)
-    turn = draw_turn(rng, ((90.0, 90.0), (90.0, 90.0), (0.0, 0.0)))
+    turn = draw_rotation(rng, ((90.0, 90.0), (90.0, 90.0), (0.0, 0.0)))
     assert rotate_vectors(turn, (0, 0, 1)) == pytest.approx([1, 0, 0], abs=1e-12)
 
 
@@ -164,7 +164,7 @@ def test_bodies_are_as_their_rule_says(
     assert within(body.contact.restitution, bounce)
     assert body.contact.static_friction >= body.contact.dynamic_friction
     assert within(body.contact.static_friction, (static[0], max(static[1], dynamic[1])))
-    raised = above_floor(body)
+    raised = raised_to_floor(body)
     corners = rotate_vectors(raised.rotation, shape(kind).mesh.vertices * raised.scale)
     lowest = corners[:, 2].min() + raised.position[2]
     assert lowest > -1e-9 and raised.position[:2] == body.position[:2]
@@ -226,17 +226,17 @@ def test_apart_or_not() -> None:
 
 def test_placing_says_what_stands_in_the_way() -> None:
     answers = iter(["too wide"] * 3 + ["too high"] + [None])
-    place(5, "it", lambda: next(answers))
+    retry(5, "it", lambda: next(answers))
     for order in (["too wide", "too high", "too wide"], ["too high", "too wide", "too wide"]):
         answers = iter(order)
         with pytest.raises(BadSceneError, match=r"^it could not be placed in 3 tries: too wide$"):
-            place(3, "it", lambda: next(answers))  # noqa: B023  # called at once
+            retry(3, "it", lambda: next(answers))  # noqa: B023  # called at once
 
 
 @dataclass(frozen=True)
 class Inner:
     size: Sizes = (1.0, 1.0)
-    turn: Turns = (0.0, 0.0)
+    turn: Rotations = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -247,7 +247,7 @@ class Sample:
     angle: Angle = 0.0
     count: Count = 2
     counts: Counts = (1, 3)
-    spot: Place = (0.0, 0.0)
+    spot: FloorPosition = (0.0, 0.0)
     names: Shapes = ("cube",)
     room: Room = "box"
     flag: bool = False

@@ -15,12 +15,18 @@ import pytest
 
 from physion.errors import BadInputError, BadSceneError
 from physion.physics.engine import simulate
-from physion.scenes.sampling.clearance import GAP, beside, cleared, needed_rise
+from physion.scenes.sampling.clearance import GAP, is_clear_of, raised_clear_of, required_rise
 from physion.scenes.sampling.parameters import LEAST_MASS, Range, yaw
 from physion.scenes.sampling.placement import world_bounds
 from physion.scenes.sampling.preset import get_preset, load_presets, parse_presets
 from physion.scenes.sampling.registry import sample_scene
-from physion.scenes.sampling.stacks import SMALLEST, StackRule, choose, top_of, weighed
+from physion.scenes.sampling.stacks import (
+    SMALLEST,
+    StackRule,
+    choose_position,
+    top_height,
+    with_mass_by_volume,
+)
 from physion.scenes.scenarios import contain, link, support
 from physion.scenes.scene import Body, Scene
 from physion.scenes.shapes.primitives import TORUS_INNER
@@ -53,26 +59,26 @@ def test_rise_of_boxes_is_exact() -> None:
     low = Body("low", "cube", (0.0, 0.0, 0.0))
     for height, rise in [(0.0, 1.0), (0.7, 0.3), (1.0, 0.0), (2.0, 0.0)]:
         high = Body("high", "cube", (0.4, 0.4, height), (0.5, 0.5, 0.5))
-        assert needed_rise(high, (low,)) == pytest.approx(rise, abs=1e-9)
-    assert needed_rise(dataclasses.replace(high, position=(0.76, 0.0, 0.2)), (low,)) == 0
+        assert required_rise(high, (low,)) == pytest.approx(rise, abs=1e-9)
+    assert required_rise(dataclasses.replace(high, position=(0.76, 0.0, 0.2)), (low,)) == 0
     turned = Body("high", "cube", (0.0, 0.0, 0.9), (1, 1, 1), yaw(0.5))
-    assert needed_rise(turned, (low,)) == pytest.approx(0.1, abs=1e-9)
-    assert cleared(turned, (low,)).position[2] == pytest.approx(1.0 + GAP)
+    assert required_rise(turned, (low,)) == pytest.approx(0.1, abs=1e-9)
+    assert raised_clear_of(turned, (low,)).position[2] == pytest.approx(1.0 + GAP)
     # Something high over its head counts as well: it is to end above everything.
     roof = Body("roof", "cube", (0.0, 0.0, 5.0), (1.0, 1.0, 0.5))
-    assert needed_rise(turned, (low, roof)) == pytest.approx(4.6, abs=1e-9)
+    assert required_rise(turned, (low, roof)) == pytest.approx(4.6, abs=1e-9)
 
 
 def test_ball_goes_as_deep_as_it_can() -> None:
     cone = Body("cone", "cone", (0.0, 0.0, 0.0))
     ball = Body("ball", "sphere", (0.0, 0.0, 0.0), (0.4, 0.4, 0.4))
-    assert needed_rise(ball, (cone,)) == pytest.approx(1.0, abs=0.01)  # on the tip
+    assert required_rise(ball, (cone,)) == pytest.approx(1.0, abs=0.01)  # on the tip
     ring = Body("ring", "torus", (0.0, 0.0, 0.0))
-    assert needed_rise(ball, (ring,)) == 0  # through the hole
+    assert required_rise(ball, (ring,)) == 0  # through the hole
     # On the middles of the 16 inner edges, 0.19 high, where the corner is cut.
     wide = dataclasses.replace(ball, scale=(1.0, 1.0, 1.0), position=(0.0, 0.0, -0.5))
     edge = math.sqrt(0.5**2 - (TORUS_INNER * math.cos(math.pi / 16)) ** 2)
-    assert needed_rise(wide, (ring,)) == pytest.approx(0.19 + edge, abs=0.01)
+    assert required_rise(wide, (ring,)) == pytest.approx(0.19 + edge, abs=0.01)
 
 
 @pytest.mark.parametrize("holder", ["bowl", "torus", "pipe", "cone", "prop:basket"])
@@ -84,8 +90,8 @@ def test_cleared_bodies_are_free_and_not_too_high(holder: str, shape: str) -> No
         below = Body("below", holder, (0.0, 0.0, 0.0), tuple(rng.uniform(0.3, 1.0, 3)))
         at = (*rng.uniform(-0.1, 0.1, 2), 0.01)
         above = Body("above", shape, at, (size, size, size), yaw(rng.uniform(0, 6)))
-        rise = needed_rise(above, (below,))
-        free = cleared(above, (below,))
+        rise = required_rise(above, (below,))
+        free = raised_clear_of(above, (below,))
         assert not meet(free, below)
         if rise > 0:
             x, y, z = free.position
@@ -94,15 +100,17 @@ def test_cleared_bodies_are_free_and_not_too_high(holder: str, shape: str) -> No
 
 def test_beside_is_about_level_rectangles() -> None:
     one = Body("one", "cube", (0.0, 0.0, 5.0))
-    assert beside(one, (Body("far", "cube", (1.1, 0.0, 0.0)), Body("off", "cube", (0.3, 2, 0))))
-    assert not beside(one, (Body("near", "cube", (0.9, 0.9, 0.0)),))
+    assert is_clear_of(
+        one, (Body("far", "cube", (1.1, 0.0, 0.0)), Body("off", "cube", (0.3, 2, 0)))
+    )
+    assert not is_clear_of(one, (Body("near", "cube", (0.9, 0.9, 0.0)),))
 
 
 def test_masses_are_those_of_the_official_logs() -> None:
     cap = Body("cap", "cylinder", (0, 0, 0), (0.2, 0.2, 0.4), mass=2.0)
-    assert weighed(cap).mass == pytest.approx(0.256)
+    assert with_mass_by_volume(cap).mass == pytest.approx(0.256)
     ring = Body("ring", "torus", (0, 0, 0), (0.35, 0.35, 0.35), mass=2.0)
-    assert weighed(ring, 0.25).mass == pytest.approx(0.1715)
+    assert with_mass_by_volume(ring, 0.25).mass == pytest.approx(0.1715)
     stand = dataclasses.replace(
         link.STAND,
         attachment=dataclasses.replace(
@@ -145,10 +153,10 @@ def test_the_agent_is_one_of_at_least_one(module: ModuleType, count: str) -> Non
 
 def test_choice_of_the_agent() -> None:
     rng = np.random.default_rng(0)
-    assert {choose(rng, 4, (0, 50)) for _ in range(99)} == {0, 1, 2, 3}
-    assert {choose(rng, 3, (1, 2)) for _ in range(99)} == {1, 2}
-    assert {choose(rng, 2, (1, 2)) for _ in range(9)} == {1}
-    assert {choose(rng, 1, (1, 2)) for _ in range(9)} == {0}
+    assert {choose_position(rng, 4, (0, 50)) for _ in range(99)} == {0, 1, 2, 3}
+    assert {choose_position(rng, 3, (1, 2)) for _ in range(99)} == {1, 2}
+    assert {choose_position(rng, 2, (1, 2)) for _ in range(9)} == {1}
+    assert {choose_position(rng, 1, (1, 2)) for _ in range(9)} == {0}
     for index in range(8):
         params = get_preset("link", "nl2-3_mg01_aCone_bCyl_boxroom").params
         scene = draw(link, params, index)
@@ -165,7 +173,7 @@ def test_towers_stand_and_shrink() -> None:
     assert [b.scale[0] for b in blocks] == pytest.approx([0.7, 0.6, 0.5, 0.4])
     assert [b.position[2] for b in blocks] == pytest.approx([0.01, 0.71, 1.31, 1.81])
     assert target.position == pytest.approx((0, 0, 2.21))
-    assert scene.camera.target == pytest.approx((0, 0, top_of(target) / 2))
+    assert scene.camera.target == pytest.approx((0, 0, top_height(target) / 2))
     assert [b.mass for b in blocks] == pytest.approx([2 * (b.scale[0] / 0.5) ** 3 for b in blocks])
     (push,) = scene.pushes
     assert push.frame == 15 and push.impulse[1] == push.impulse[2] == 0
@@ -201,10 +209,10 @@ def test_links_are_on_the_pole_and_below_the_cap() -> None:
             joints = [(joint.parent, joint.child) for joint in scene.joints]
             assert joints == [("base", "attachment"), ("attachment", "cap")]
             pole, cap = body(scene, "attachment"), body(scene, "cap")
-            assert pole.position[2] == pytest.approx(top_of(body(scene, "base")))
-            assert cap.position[2] == pytest.approx(top_of(pole))
+            assert pole.position[2] == pytest.approx(top_height(body(scene, "base")))
+            assert cap.position[2] == pytest.approx(top_height(pole))
             for ring in [*members(scene, "member"), body(scene, "target")]:
-                assert pole.position[2] <= ring.position[2] and top_of(ring) < cap.position[2]
+                assert pole.position[2] <= ring.position[2] and top_height(ring) < cap.position[2]
 
 
 def test_what_cannot_be_placed_says_why() -> None:
@@ -222,12 +230,12 @@ def test_what_cannot_be_placed_says_why() -> None:
 def test_stands() -> None:
     boxed = draw(contain, get_preset("contain", "box").params)
     basket, cone = body(boxed, "attachment"), body(boxed, "base")
-    assert basket.shape == "prop:basket" and basket.position[2] >= top_of(cone)
+    assert basket.shape == "prop:basket" and basket.position[2] >= top_height(cone)
     factors = np.array(basket.scale) / NATURAL_SIZES["basket"]
     assert factors == pytest.approx(factors[0]) and 0.5 <= factors[0] <= 0.6
     assert not boxed.joints
     plain = draw(contain, get_preset("contain", "bowl").params)
-    rim = top_of(body(plain, "base"))
+    rim = top_height(body(plain, "base"))
     assert "attachment" not in plain.names()
     lowest = min((*members(plain, "member"), body(plain, "target")), key=lambda b: b.position[2])
     # Dropped into the bowl from its rim, as officially, not from the bottom.
@@ -296,7 +304,9 @@ def test_official_trials_could_have_been_drawn(scenario: str, official: Path) ->
             assert within(aside, (0.0, params.stack.jitter))
             # Some official blocks are so small that a cube of 1 kg would be below the least mass.
             heavy = dataclasses.replace(one, mass=1e4)
-            assert within([1e4 * one.mass / weighed(heavy, share).mass], params.stack.member.mass)
+            assert within(
+                [1e4 * one.mass / with_mass_by_volume(heavy, share).mass], params.stack.member.mass
+            )
             assert one.shape in params.stack.member.shapes
         if scenario == "link":
             assert len(scene.joints) == params.stand.attached + params.stand.capped
@@ -329,5 +339,5 @@ def test_bounds_of_the_probe_are_free(official: Path) -> None:
         for scene in official_trials(official, scenario):
             probe = body(scene, str(scene.roles.probe))
             others = [b for b in scene.bodies if not b.kinematic and b is not probe]
-            assert beside(probe, others), scene.name
+            assert is_clear_of(probe, others), scene.name
             assert world_bounds(probe)[0, 2] >= 0

@@ -20,7 +20,7 @@ from physion.physics.cloth.simulate import settle_solids
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
 from physion.physics.rigid.hulls import collision_hulls
-from physion.scenes.sampling.parameters import three_turns
+from physion.scenes.sampling.parameters import euler_rotation
 from physion.scenes.sampling.placement import on_screen, world_bounds, world_corners
 from physion.scenes.sampling.preset import Preset, load_presets, parse_presets
 from physion.scenes.sampling.registry import sample_scene
@@ -251,7 +251,7 @@ def test_probes_of_collisions_are_tumbled_and_start_above_the_floor() -> None:
         assert push.point[2] == pytest.approx(
             probe.position[2] + 0.35 * min(0.8, float(shape(probe.shape).bounds[1, 2]))
         )
-        turns = [three_turns(a, a, a) for a in np.arange(-180, 180, 0.25)]
+        turns = [euler_rotation(a, a, a) for a in np.arange(-180, 180, 0.25)]
         assert np.abs(np.array(turns) @ probe.rotation).max() > 0.99999
     assert 0 < raised < 50
 

@@ -31,7 +31,7 @@ from physion.scenes.shapes.prop_names import (
     read_model_bounds,
 )
 from physion.scenes.shapes.prop_names import PROPS as NAMES
-from physion.scenes.shapes.prop_parts import Prop
+from physion.scenes.shapes.prop_parts import PropShape
 from physion.scenes.shapes.props import NATURAL_SIZES
 
 PROPS = [name for name in shapes.names() if name.startswith("prop:")]
@@ -68,8 +68,8 @@ def test_prop_is_cheap_to_draw(name: str) -> None:
 @pytest.mark.parametrize("name", PROPS)
 def test_prop_is_modelled_at_its_natural_size(name: str) -> None:
     prop, size = shape(name), NATURAL_SIZES[name.removeprefix(PREFIX)]
-    assert isinstance(prop, Prop)
-    assert prop.made == pytest.approx(size, rel=0.01)
+    assert isinstance(prop, PropShape)
+    assert prop.modelled_size == pytest.approx(size, rel=0.01)
     assert min(size) > 0.01 and max(size) < 3.0, "a thing that one person can carry"
 
 
@@ -88,11 +88,11 @@ def test_triangles_have_area_and_the_highest_faces_up(name: str) -> None:
 @pytest.mark.parametrize("name", PROPS)
 def test_parts_with_looks_of_their_own_are_never_taken_for_agent_or_patient(name: str) -> None:
     prop = shape(name)
-    assert isinstance(prop, Prop)
+    assert isinstance(prop, PropShape)
     assert len(prop.paint) == len(prop.mesh.faces)
-    assert set(prop.paint) <= set(range(len(prop.own) + 1))
+    assert set(prop.paint) <= set(range(len(prop.own_looks) + 1))
     assert 0 in prop.paint, "some of a prop has the look of its body"
-    for look in (*prop.own, *(prop_look(np.random.default_rng(i), name) for i in range(20))):
+    for look in (*prop.own_looks, *(prop_look(np.random.default_rng(i), name) for i in range(20))):
         assert look.texture in TEXTURES
         assert not any(mistakable(look.color, role) for role in (RED, YELLOW))
 

@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull
 from physion.numerics.linear_algebra import dot, multiply, norm
 from physion.physics.cloth.solver import Solids
 from physion.scenes.scene import Body, Vec3
-from physion.scenes.shapes.primitives import Piece, shape
+from physion.scenes.shapes.primitives import ConvexPiece, shape
 
 Points = NDArray[np.float64]
 Filled = NDArray[np.bool_]
@@ -41,12 +41,12 @@ def fill_shape(name: str, scale: Vec3, spacing: float) -> tuple[Points, Filled]:
     return origin, filled.reshape(tuple(int(n) for n in sizes))
 
 
-def _inside(piece: Piece, points: Points) -> Filled:
+def _inside(piece: ConvexPiece, points: Points) -> Filled:
     """Which ``points`` (P, 3) of the shape's frame at unit scale lie in a convex piece."""
     if piece.kind == "convex":
         planes = ConvexHull(piece.vertices).equations
         return np.asarray((multiply(points, planes[:, :3].T) + planes[:, 3] <= 1e-9).all(axis=1))
-    local = multiply(points - np.asarray(piece.center), piece.turn) / np.asarray(piece.half)
+    local = multiply(points - np.asarray(piece.center), piece.rotation) / np.asarray(piece.half)
     if piece.kind == "box":
         return np.asarray((np.abs(local) <= 1 + 1e-9).all(axis=1))
     if piece.kind == "sphere":

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from physion.physics.rigid.manifold import hull_faces
 from physion.scenes.scene import Vec3
-from physion.scenes.shapes.primitives import Piece, ball_mesh, shape
+from physion.scenes.shapes.primitives import ConvexPiece, ball_mesh, shape
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -43,7 +43,7 @@ def _unit_hulls(name: str) -> tuple[Hull, ...]:
     return tuple(Hull(points, tuple(hull_faces(points))) for points in corners)
 
 
-def _corners(piece: Piece) -> Array:
+def _corners(piece: ConvexPiece) -> Array:
     if piece.kind == "convex":
         return piece.vertices
     if piece.kind == "sphere":

@@ -6,9 +6,9 @@ import hashlib
 import json
 from dataclasses import asdict, dataclass
 
-from physion.scenes.scene import FRAME_TIME, GRAVITY, Contact
+from physion.scenes.scene import FRAME_TIME, GRAVITY, SurfaceMaterial
 
-FLOOR_MATERIAL = Contact(static_friction=0.6, dynamic_friction=0.6, restitution=0.0)
+FLOOR_MATERIAL = SurfaceMaterial(static_friction=0.6, dynamic_friction=0.6, restitution=0.0)
 """Unity's default material; the official scenes never set one for the floor."""
 
 
@@ -59,7 +59,7 @@ class Settings:
     max_angular_velocity: float = 7.0
     sleep_threshold: float = 0.01
     wake_time: float = 0.4
-    floor: Contact = FLOOR_MATERIAL
+    floor: SurfaceMaterial = FLOOR_MATERIAL
 
     def tag(self) -> str:
         """Eight hexadecimal digits that change whenever a setting does."""

@@ -21,7 +21,7 @@ FLOORS = {"box": 0.0, "bright": 0.0043, "empty": 0.0}
 that was put at 0 ends .004 or .005 higher than in ``box_room_2018``."""
 
 
-class Staged(Protocol):
+class SceneParams(Protocol):
     """What the parameters of every scenario have in common."""
 
     @property
@@ -68,7 +68,7 @@ class Palette:
 def build_scene(
     scenario: str,
     seed: np.random.SeedSequence,
-    params: Staged,
+    params: SceneParams,
     *,
     bodies: Sequence[Body],
     roles: Roles,

@@ -31,9 +31,9 @@ MOST_EXCHANGES = 200
 
 
 def _slope_grid() -> Points:
-    turns = 2 * np.pi * np.arange(16) / 16
+    angles = 2 * np.pi * np.arange(16) / 16
     tilts = tan(np.radians([0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0, 87.0, 89.5]))
-    ways = np.stack([cos(turns), sin(turns)], axis=1)
+    ways = np.stack([cos(angles), sin(angles)], axis=1)
     return np.asarray((tilts[:, None, None] * ways).reshape(-1, 2))
 
 
@@ -41,13 +41,13 @@ SLOPES = _slope_grid()
 """(K, 2): slopes along x and y, up to nearly upright."""
 
 
-def cleared(body: Body, obstacles: Sequence[Body]) -> Body:
+def raised_clear_of(body: Body, obstacles: Sequence[Body]) -> Body:
     """The body, raised above every one of ``obstacles`` that it would start in or under."""
-    rise = needed_rise(body, obstacles)
+    rise = required_rise(body, obstacles)
     return raised(body, rise + GAP) if rise > 0 else body  # type: ignore[no-any-return]
 
 
-def needed_rise(body: Body, obstacles: Sequence[Body]) -> float:
+def required_rise(body: Body, obstacles: Sequence[Body]) -> float:
     """Metres by which ``body`` must rise until nothing of ``obstacles`` is in or above it."""
     (x0, y0, bottom), (x1, y1, _) = world_bounds(body)
     parts = _corners(body)
@@ -67,7 +67,7 @@ def needed_rise(body: Body, obstacles: Sequence[Body]) -> float:
     return need
 
 
-def beside(body: Body, others: Sequence[Body]) -> bool:
+def is_clear_of(body: Body, others: Sequence[Body]) -> bool:
     """Whether the level rectangle round ``body`` is free of those round ``others``."""
     low, high = world_bounds(body)
     boxes = [world_bounds(other) for other in others]
@@ -76,9 +76,9 @@ def beside(body: Body, others: Sequence[Body]) -> bool:
 
 def _corners(body: Body) -> list[Points]:
     """World corners (K, 3) of each convex piece."""
-    place = np.array(body.position)
+    offset = np.array(body.position)
     return [
-        rotate_vectors(body.rotation, piece * body.scale) + place
+        rotate_vectors(body.rotation, piece * body.scale) + offset
         for piece in _unit_corners(body.shape)
     ]
 

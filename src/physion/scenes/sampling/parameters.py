@@ -63,7 +63,7 @@ Sides = Annotated[Range, Quantity("m", SMALLEST_SIDE, 50.0)]
 Distances = Annotated[Range, Quantity("m", 0.1, 50.0)]
 """Lengths between things that may not be at the same place."""
 Offsets = Annotated[Range, Quantity("m", -50.0, 50.0)]
-Place = Annotated[tuple[float, float], Quantity("m as [x, y]", -50.0, 50.0)]
+FloorPosition = Annotated[tuple[float, float], Quantity("m as [x, y]", -50.0, 50.0)]
 Sizes = Annotated[Axes, Quantity("m", SMALLEST_SIDE, 200.0)]
 """Scale of a shape whose unit size is about a metre."""
 Slope = Annotated[float, Quantity("m", -1.0, 1.0)]
@@ -72,10 +72,10 @@ LEAST_MASS = 0.001
 Masses = Annotated[Range, Quantity("kg", LEAST_MASS, 10000.0)]
 Angles = Annotated[Range, Quantity("degrees", -360.0, 360.0)]
 Angle = Annotated[float, Quantity("degrees", -360.0, 360.0)]
-Turns = Annotated[Axes, Quantity("degrees", -360.0, 360.0)]
+Rotations = Annotated[Axes, Quantity("degrees", -360.0, 360.0)]
 """A turn about the upright, or about x, y and z (of Unity's x, z and y)."""
-Share = Annotated[float, Quantity("", 0.0, 1.0)]
-Shares = Annotated[Range, Quantity("", 0.0, 1.0)]
+Fraction = Annotated[float, Quantity("", 0.0, 1.0)]
+Fractions = Annotated[Range, Quantity("", 0.0, 1.0)]
 Multiples = Annotated[Range, Quantity("times", 0.0, 100.0)]
 SizeFactors = Annotated[Range, Quantity("times", 0.01, 100.0)]
 """Multiples of a size, which leave something of it."""
@@ -132,17 +132,17 @@ def is_range(axes: Axes) -> bool:
     return not isinstance(axes[0], tuple)
 
 
-def draw_turn(rng: np.random.Generator, turn: Axes) -> Quat:
+def draw_rotation(rng: np.random.Generator, angles_deg: Axes) -> Quat:
     """A rotation: by one angle about z, or as Unity turns by three (about z, then x, then y).
 
     The three angles are about our x, y, z; Unity calls our y its z, and turns the other way.
     """
-    if is_range(turn):
-        return yaw(math.radians(uniform(rng, typing.cast(Range, turn))))
-    return three_turns(*draw_axes(rng, turn))
+    if is_range(angles_deg):
+        return yaw(math.radians(uniform(rng, typing.cast(Range, angles_deg))))
+    return euler_rotation(*draw_axes(rng, angles_deg))
 
 
-def three_turns(x_deg: float, y_deg: float, z_deg: float) -> Quat:
+def euler_rotation(x_deg: float, y_deg: float, z_deg: float) -> Quat:
     """The rotation by degrees about y, then about x, then about z: Unity's order."""
     about_x, about_y, about_z = (
         axis_angle_quaternion(axis, math.radians(angle))
@@ -311,7 +311,7 @@ def _read_quantity(kind: Any, value: Any, where: str, quantity: Quantity) -> Any
     if kind == tuple[int, int]:
         low, high = _range(value, where, quantity)
         return (_number(int, low, where, quantity), _number(int, high, where, quantity))
-    if quantity == _note(Place):
+    if quantity == _note(FloorPosition):
         if not isinstance(value, list | tuple) or len(value) != 2:
             raise BadInputError(f"{where} must be a place [x, y] in m, not {_told(value)}")
         return tuple(_number(float, part, where, quantity) for part in value)
@@ -343,7 +343,7 @@ def _number(kind: type[Any], value: Any, where: str, quantity: Quantity) -> Any:
     return kind(value)
 
 
-def place(tries: int, what: str, attempt: typing.Callable[[], str | None]) -> None:
+def retry(tries: int, what: str, attempt: typing.Callable[[], str | None]) -> None:
     """Call ``attempt`` until it returns None, at most ``tries`` times.
 
     It returns what stands in the way otherwise; `BadSceneError` says what did so most often. That

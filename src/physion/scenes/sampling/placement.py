@@ -24,12 +24,12 @@ from physion.scenes.sampling.parameters import (
     Angle,
     Angles,
     Distances,
+    Fraction,
+    Fractions,
     Lengths,
     Props,
     Quantity,
     Range,
-    Share,
-    Shares,
     Sides,
     pick,
     uniform,
@@ -44,7 +44,7 @@ CLEARANCE = 0.25
 """Metres kept free between the scene and scenery."""
 CAMERA_TRIES = 200
 NEAREST_OCCLUDER = 0.85
-"""Largest share of the way to the camera at which scenery may stand."""
+"""Largest fraction of the distance to the camera at which scenery may stand."""
 
 STEPS_ASIDE = (0, 1, -1, 2, -2, 3, -3, 4, -4, 5, -5, 6, -6)
 """Places at which a prop is tried, one after the other, in angles between neighbours."""
@@ -70,7 +70,7 @@ class CameraRule:
     radius: Distances = (1.75, 1.75)
     angle_deg: Angles = (45.0, 225.0)
     height: Lengths = (0.75, 2.0)
-    mirror: Share = 0.0
+    mirror: Fraction = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,14 +86,14 @@ class SceneryRule:
     occluders: PropCount = 0
     distractor_props: Props = ("full",)
     occluder_props: Props = ("vase", "plant", "lamp", "globe")
-    distractor_distance: Shares = (0.4, 1.0)
-    occluder_distance: Shares = (0.6, 0.8)
+    distractor_distance: Fractions = (0.4, 1.0)
+    occluder_distance: Fractions = (0.6, 0.8)
     distractor_spacing_deg: Angle = 15.0
     occluder_spacing_deg: Angle = 10.0
     yaw_deg: Angle = 30.0
     distractor_size: Sides = (0.5, 1.5)
     occluder_size: Sides = (0.25, 1.5)
-    occlusion: Share = 0.75
+    occlusion: Fraction = 0.75
 
 
 def world_corners(body: Body) -> NDArray[np.float64]:
@@ -156,28 +156,28 @@ def place_scenery(
         props = rule.distractor_props, rule.distractor_size, rule.distractor_distance
         drawn = _draw_prop(distractors, f"distractor_{i}", *props, rule.yaw_deg)
         spacing = math.radians(rule.distractor_spacing_deg)
-        turn = math.pi + (i - (rule.distractors - 1) / 2) * spacing
-        placed.append(_first_free(drawn, camera, keep_out, turn, spacing, placed))
+        angle = math.pi + (i - (rule.distractors - 1) / 2) * spacing
+        placed.append(_first_free(drawn, camera, keep_out, angle, spacing, placed))
     for i in range(rule.occluders):
         props = rule.occluder_props, rule.occluder_size, rule.occluder_distance
         drawn = _draw_prop(occluders, f"occluder_{i}", *props, rule.yaw_deg)
         spacing = math.radians(rule.occluder_spacing_deg)
-        turn = (i - (rule.occluders - 1) / 2) * spacing
-        size = _occluding_size(drawn, camera, keep_out, turn, rule)
+        angle = (i - (rule.occluders - 1) / 2) * spacing
+        size = _occluding_size(drawn, camera, keep_out, angle, rule)
         drawn = replace(drawn, size=size)
-        placed.append(_first_free(drawn, camera, keep_out, turn, spacing, placed))
+        placed.append(_first_free(drawn, camera, keep_out, angle, spacing, placed))
     return tuple(placed)
 
 
 @dataclass(frozen=True)
-class _Drawn:
+class _DrawnProp:
     """What chance decided about a prop; where it stands follows from the rest of the scene."""
 
     name: str
     shape: str
     size: NDArray[np.float64]
     yaw: float
-    share: float
+    fraction: float
     look: Look
 
 
@@ -188,31 +188,31 @@ def _draw_prop(
     limits: Range,
     distance: Range,
     yaw_deg: float,
-) -> _Drawn:
+) -> _DrawnProp:
     prop = pick(rng, expand_props(props))
     size = np.array(NATURAL_SIZES[prop])
     largest = float(size.max())
     size = size * float(np.clip(largest, *limits)) / largest
-    turn = math.radians(uniform(rng, (-yaw_deg, yaw_deg)))
-    return _Drawn(
-        name, f"prop:{prop}", size, turn, uniform(rng, distance), prop_look(rng, f"prop:{prop}")
+    angle = math.radians(uniform(rng, (-yaw_deg, yaw_deg)))
+    return _DrawnProp(
+        name, f"prop:{prop}", size, angle, uniform(rng, distance), prop_look(rng, f"prop:{prop}")
     )
 
 
 def _first_free(
-    drawn: _Drawn,
+    drawn: _DrawnProp,
     camera: Camera,
     keep_out: NDArray[np.float64],
-    turn: float,
+    angle: float,
     spacing: float,
     placed: Sequence[Body],
 ) -> Body:
     """The prop at its angle or, where another prop is, steps of ``spacing`` beside it or behind."""
     for times, step in itertools.product(FARTHER, STEPS_ASIDE):
-        at = turn + step * spacing
+        at = angle + step * spacing
         if abs(step) > 3 and abs(cos(at)) < cos(FARTHEST_ASIDE):
             continue
-        body = _standing(replace(drawn, share=drawn.share * times), camera, keep_out, at)
+        body = _standing(replace(drawn, fraction=drawn.fraction * times), camera, keep_out, at)
         if not any(_footprints_meet(body, other) for other in placed):
             return body
     raise BadSceneError(
@@ -221,44 +221,46 @@ def _first_free(
     )
 
 
-def _standing(drawn: _Drawn, camera: Camera, keep_out: NDArray[np.float64], turn: float) -> Body:
-    place = _place(drawn, camera, keep_out, turn)
+def _standing(
+    drawn: _DrawnProp, camera: Camera, keep_out: NDArray[np.float64], angle: float
+) -> Body:
+    position = _position(drawn, camera, keep_out, angle)
     azimuth = arctan2(camera.position[1], camera.position[0])
     return Body(
         name=drawn.name,
         shape=drawn.shape,
-        position=(float(place[0]), float(place[1]), 0.0),
+        position=(float(position[0]), float(position[1]), 0.0),
         scale=(float(drawn.size[0]), float(drawn.size[1]), float(drawn.size[2])),
-        rotation=yaw(azimuth + turn + drawn.yaw),
+        rotation=yaw(azimuth + angle + drawn.yaw),
         kinematic=True,
         scenery=True,
         look=drawn.look,
     )
 
 
-def _place(
-    drawn: _Drawn, camera: Camera, keep_out: NDArray[np.float64], turn: float
+def _position(
+    drawn: _DrawnProp, camera: Camera, keep_out: NDArray[np.float64], angle: float
 ) -> NDArray[np.float64]:
     """Where (2,) a prop stands: clear of the scene, and not in the camera's face."""
     x, y, _ = camera.position
-    azimuth, whole = arctan2(y, x) + turn, math.sqrt(x * x + y * y)
-    way = np.array([cos(azimuth), sin(azimuth)])
-    place = _clear(way, drawn.share * whole / math.sqrt(2), drawn.size, keep_out)
-    if cos(turn) > 0:
-        place *= min(1.0, NEAREST_OCCLUDER * whole / float(norm(place)))
-    return place
+    azimuth, whole = arctan2(y, x) + angle, math.sqrt(x * x + y * y)
+    direction = np.array([cos(azimuth), sin(azimuth)])
+    position = _clear(direction, drawn.fraction * whole / math.sqrt(2), drawn.size, keep_out)
+    if cos(angle) > 0:
+        position *= min(1.0, NEAREST_OCCLUDER * whole / float(norm(position)))
+    return position
 
 
 def _occluding_size(
-    drawn: _Drawn,
+    drawn: _DrawnProp,
     camera: Camera,
     keep_out: NDArray[np.float64],
-    turn: float,
+    angle: float,
     rule: SceneryRule,
 ) -> NDArray[np.float64]:
     """A size whose top ends at its share of the line of sight; width grows along within limits."""
-    place = _place(drawn, camera, keep_out, turn)
-    along = float(norm(place) / norm(camera.position[:2]))
+    position = _position(drawn, camera, keep_out, angle)
+    along = float(norm(position) / norm(camera.position[:2]))
     sight = camera.target[2] + (camera.position[2] - camera.target[2]) * along
     top = max(rule.occlusion * sight, 0.05)
     factor = min(top / drawn.size[2], rule.occluder_size[1] / max(drawn.size))
@@ -272,15 +274,15 @@ def _footprints_meet(body: Body, other: Body) -> bool:
 
 
 def _clear(
-    way: NDArray[np.float64],
+    direction: NDArray[np.float64],
     distance: float,
     size: NDArray[np.float64],
     keep_out: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """The first place along ``way`` from ``distance`` on that is clear of the scene's rectangle."""
+    """Return the first position along ``direction``, from ``distance`` on, outside the scene."""
     room = CLEARANCE + float(norm(size[:2])) / 2
     low, high = keep_out[0, :2] - room, keep_out[1, :2] + room
     with np.errstate(divide="ignore"):
-        exits = np.where(way > 0, high / way, low / way)
-    inside = bool(((way * distance > low) & (way * distance < high)).all())
-    return np.asarray(way * (float(exits.min()) if inside else distance))
+        exits = np.where(direction > 0, high / direction, low / direction)
+    inside = bool(((direction * distance > low) & (direction * distance < high)).all())
+    return np.asarray(direction * (float(exits.min()) if inside else distance))

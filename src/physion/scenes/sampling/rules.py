@@ -12,28 +12,28 @@ from physion.numerics.elementary import cos, sin
 from physion.scenes.sampling.parameters import (
     Angles,
     EarlyFrames,
+    FloorPosition,
+    Fractions,
     Frictions,
     Length,
     Masses,
     Materials,
     Multiple,
     Multiples,
-    Place,
+    Rotations,
     Shapes,
-    Shares,
     Sizes,
     Speeds,
-    Turns,
     draw_axes,
     draw_frame,
-    draw_turn,
+    draw_rotation,
+    euler_rotation,
     is_range,
     pick,
-    three_turns,
     uniform,
 )
 from physion.scenes.sampling.placement import world_bounds
-from physion.scenes.scene import Body, Contact, Look, Push, Vec3
+from physion.scenes.scene import Body, Look, Push, SurfaceMaterial, Vec3
 from physion.scenes.shapes.primitives import shape
 
 STATIC_OVER_DYNAMIC = 10.0
@@ -54,12 +54,12 @@ class BodyRule:
 
     shapes: Shapes = ("cube",)
     scale: Sizes = (1.0, 1.0)
-    turn_deg: Turns = (0.0, 0.0)
+    turn_deg: Rotations = (0.0, 0.0)
     tumbled: bool = False
     mass: Masses = (2.0, 2.0)
     static_friction: Frictions = (0.5, 0.5)
     dynamic_friction: Frictions = (0.5, 0.5)
-    restitution: Shares = (0.0, 0.0)
+    restitution: Fractions = (0.0, 0.0)
     textures: Materials = ("wood_cedar",)
 
     def check_values(self) -> str | None:
@@ -83,7 +83,7 @@ class ZoneRule:
 
     shapes: Shapes = ("cube",)
     scale: Sizes = ((0.5, 0.5), (2.0, 2.0), (0.01, 0.01))
-    center: Place = (0.0, 0.0)
+    center: FloorPosition = (0.0, 0.0)
     friction: Frictions = (0.1, 0.1)
     mass: Masses = (500.0, 500.0)
     textures: Materials = ("wood_ash",)
@@ -121,19 +121,19 @@ def draw_body(
     """A body of ``rule`` with its pivot at ``position``."""
     kind, scale = pick(rng, rule.shapes), draw_axes(rng, rule.scale)
     if rule.tumbled and is_range(rule.turn_deg):
-        turn = three_turns(*draw_axes(rng, rule.turn_deg))
+        rotation = euler_rotation(*draw_axes(rng, rule.turn_deg))
     else:
-        turn = draw_turn(rng, rule.turn_deg)
+        rotation = draw_rotation(rng, rule.turn_deg)
     mass = uniform(rng, rule.mass)
     dynamic = uniform(rng, rule.dynamic_friction)
     static = max(uniform(rng, rule.static_friction), dynamic)
-    contact = Contact(static, dynamic, uniform(rng, rule.restitution))
+    material = SurfaceMaterial(static, dynamic, uniform(rng, rule.restitution))
     return Body(
-        name, kind, position, scale, turn, mass, contact, angular_drag=angular_drag, look=look
+        name, kind, position, scale, rotation, mass, material, angular_drag=angular_drag, look=look
     )
 
 
-def above_floor(body: Body) -> Body:
+def raised_to_floor(body: Body) -> Body:
     """The body, raised if any of it is under the floor: turned ones reach below their pivot."""
     missing = max(0.0, -float(world_bounds(body)[0, 2]))
     x, y, z = body.position
@@ -151,7 +151,7 @@ def require_apart(one: Body, other: Body) -> None:
 
 
 def draw_zone(
-    rng: np.random.Generator, rule: ZoneRule, look: Look, place: tuple[float, float] = (0.0, 0.0)
+    rng: np.random.Generator, rule: ZoneRule, look: Look, position: tuple[float, float] = (0.0, 0.0)
 ) -> Body:
     """The patient called ``zone``, on the floor at ``place`` plus the rule's own centre."""
     kind, scale = pick(rng, rule.shapes), draw_axes(rng, rule.scale)
@@ -159,22 +159,22 @@ def draw_zone(
     return Body(
         "zone",
         kind,
-        (place[0] + rule.center[0], place[1] + rule.center[1], 0.0),
+        (position[0] + rule.center[0], position[1] + rule.center[1], 0.0),
         scale,
         mass=uniform(rng, rule.mass),
-        contact=Contact(STATIC_OVER_DYNAMIC * friction, friction, 0.0),
+        contact=SurfaceMaterial(STATIC_OVER_DYNAMIC * friction, friction, 0.0),
         kinematic=True,
         look=look,
     )
 
 
-def draw_push(rng: np.random.Generator, rule: PushRule, body: Body, turn: float = 0.0) -> Push:
+def draw_push(rng: np.random.Generator, rule: PushRule, body: Body, rotation: float = 0.0) -> Push:
     """A push on ``body``; its heading is turned by ``turn`` radians.
 
     The point is at most as high as the body's own top: flat shapes are not pushed in the air.
     """
     speed, rise = uniform(rng, rule.speed), uniform(rng, rule.rise)
-    heading = math.radians(uniform(rng, rule.heading_deg)) + turn
+    heading = math.radians(uniform(rng, rule.heading_deg)) + rotation
     right, ahead, up = draw_axes(rng, ((-rule.point_jitter, rule.point_jitter),) * 3)
     frame = draw_frame(rng, rule.frame)
     height = min(rule.height, float(shape(body.shape).bounds[1, 2])) * body.scale[2]

@@ -10,12 +10,12 @@ import numpy as np
 
 from physion.numerics.linear_algebra import norm
 from physion.scenes.sampling.build import Palette, raised
-from physion.scenes.sampling.clearance import GAP, cleared
+from physion.scenes.sampling.clearance import GAP, raised_clear_of
 from physion.scenes.sampling.parameters import (
     LEAST_MASS,
     Counts,
     CountsFromOne,
-    Share,
+    Fraction,
     Slope,
     draw_count,
     uniform,
@@ -54,7 +54,7 @@ class StackRule:
     member: BodyRule = PLAIN
     count: Counts = (2, 2)
     gradient: Slope = 0.0
-    jitter: Share = 0.0
+    jitter: Fraction = 0.0
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class Stand:
         return self.holders if self.cap is None else (*self.holders, self.cap)
 
 
-def weighed(body: Body, share: float = 1.0) -> Body:
+def with_mass_by_volume(body: Body, share: float = 1.0) -> Body:
     """The body with a ``share`` of its mass by volume, ``body.mass`` being that of the unit.
 
     It keeps the least mass that a body may have.
@@ -112,7 +112,7 @@ def weighed(body: Body, share: float = 1.0) -> Body:
     return replace(body, mass=max(mass, LEAST_MASS))
 
 
-def top_of(body: Body) -> float:
+def top_height(body: Body) -> float:
     """Height in metres of the top of an upright body."""
     return body.position[2] + float(shape(body.shape).bounds[1, 2]) * body.scale[2]
 
@@ -146,9 +146,9 @@ def draw_stack(
         x, y, z = (max(side + grown, SMALLEST) for side in body.scale)
         right, ahead = (side * uniform(rng, (-rule.jitter, rule.jitter)) for side in (x, y))
         body = replace(body, scale=(x, y, z), position=(right, ahead, start))
-        body = cleared(weighed(body, mass_share), (*obstacles, *bodies))
+        body = raised_clear_of(with_mass_by_volume(body, mass_share), (*obstacles, *bodies))
         bodies.append(body)
-        start = top_of(body)
+        start = top_height(body)
     return bodies
 
 
@@ -156,38 +156,40 @@ def draw_stand(
     rng: np.random.Generator, rule: StandRule, zone: Body, base_look: Look, attachment_look: Look
 ) -> Stand:
     """A base in the middle of the scene, with what ``rule`` puts on it."""
-    base = weighed(_draw_part(rng, rule.base, "base", 0.0, base_look))
+    base = with_mass_by_volume(_draw_part(rng, rule.base, "base", 0.0, base_look))
     through = base.shape in OPEN_BELOW
-    height = 0.0 if through else top_of(base)
-    base = cleared(base, (zone,))
-    top = base.position[2] if through else top_of(base)
+    height = 0.0 if through else top_height(base)
+    base = raised_clear_of(base, (zone,))
+    top = base.position[2] if through else top_height(base)
     start = height + zone.scale[2]
     if not rule.attached:
         return Stand((base,), None, (), top, start)
     pole = _draw_part(rng, rule.attachment, "attachment", top, attachment_look)
-    pole = cleared(weighed(pole, ATTACHMENT_SHARES.get(pole.shape, 1.0)), (zone, base))
+    pole = raised_clear_of(
+        with_mass_by_volume(pole, ATTACHMENT_SHARES.get(pole.shape, 1.0)), (zone, base)
+    )
     joints = [Joint("base", "attachment")] if rule.joined else []
     if pole.shape == "cone":
         start += CONE_RISE * float(norm(pole.scale[:2])) / pole.scale[2]
     if not rule.capped:
         return Stand((base, pole), None, tuple(joints), top, start)
-    cap = weighed(_draw_part(rng, rule.base, "cap", top_of(pole), base_look))
+    cap = with_mass_by_volume(_draw_part(rng, rule.base, "cap", top_height(pole), base_look))
     joints += [Joint("attachment", "cap")] if rule.joined else []
     # Officially the cap raises the stack as if it were a second base.
-    start += top_of(cap) - cap.position[2]
+    start += top_height(cap) - cap.position[2]
     return Stand((base, pole), cap, tuple(joints), top, start)
 
 
-def lowered(stack: Sequence[Body], stand: Stand) -> list[Body] | None:
+def lowered_under_cap(stack: Sequence[Body], stand: Stand) -> list[Body] | None:
     """The stack, as low as it must be to end below the cap; None if it does not fit there."""
     if stand.cap is None or not stack:
         return list(stack)
-    above = max(top_of(stack[-1]) + GAP - stand.cap.position[2], 0.0)
+    above = max(top_height(stack[-1]) + GAP - stand.cap.position[2], 0.0)
     low = stack[0].position[2] - above
     return [raised(body, -above) for body in stack] if low >= stand.top else None
 
 
-def choose(rng: np.random.Generator, count: int, choice: tuple[int, int]) -> int:
+def choose_position(rng: np.random.Generator, count: int, choice: tuple[int, int]) -> int:
     """One of ``count`` positions, within ``choice`` as far as there are such, else the highest."""
     allowed = range(count)[choice[0] : choice[1] + 1]
     at = int(rng.integers(max(len(allowed), 1)))

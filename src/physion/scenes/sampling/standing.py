@@ -7,9 +7,9 @@ from typing import Protocol
 
 import numpy as np
 
-from physion.scenes.sampling.build import Palette, Staged, build_scene
-from physion.scenes.sampling.clearance import beside, cleared
-from physion.scenes.sampling.parameters import place
+from physion.scenes.sampling.build import Palette, SceneParams, build_scene
+from physion.scenes.sampling.clearance import is_clear_of, raised_clear_of
+from physion.scenes.sampling.parameters import retry
 from physion.scenes.sampling.rules import (
     BodyRule,
     PushRule,
@@ -22,12 +22,12 @@ from physion.scenes.sampling.stacks import (
     FilledStackRule,
     Stand,
     StandRule,
-    choose,
+    choose_position,
     draw_looks,
     draw_stack,
     draw_stand,
-    lowered,
-    top_of,
+    lowered_under_cap,
+    top_height,
 )
 from physion.scenes.scene import Body, Look, Roles, Scene, Vec3
 from physion.seeds import child_generator
@@ -38,7 +38,7 @@ STACK_MASS = 0.25
 """Bodies of the stack have this share of their mass by volume (official-system.md, 3.4)."""
 
 
-class Standing(Staged, Protocol):
+class StandParams(SceneParams, Protocol):
     """Parameters of a scenario with a stand."""
 
     @property
@@ -83,7 +83,7 @@ class Standing(Staged, Protocol):
 
 
 @dataclass
-class _Drawn:
+class _DrawnStand:
     stand: Stand
     stack: list[Body]
     probe: Body
@@ -91,7 +91,7 @@ class _Drawn:
 
 def sample_standing(
     scenario: str,
-    params: Standing,
+    params: StandParams,
     seed: np.random.SeedSequence,
     base_color: Vec3 | None,
     attachment_color: Vec3,
@@ -108,27 +108,27 @@ def sample_standing(
     probe_look = palette.look(params.probe.textures)
     zone = draw_zone(rng, params.zone, palette.look(params.zone.textures))
     looks = draw_looks(rng, params.stack, palette, params.monochrome)
-    at = choose(rng, len(looks), params.choice)
+    at = choose_position(rng, len(looks), params.choice)
     looks[at] = agent_look
-    chance = child_generator(seed, "push")
-    drawn: list[_Drawn] = []
+    push_rng = child_generator(seed, "push")
+    drawn: list[_DrawnStand] = []
 
     def attempt() -> str | None:
         stand = draw_stand(rng, params.stand, zone, base_look, attachment_look)
         around = (zone, *stand.holders)
         stack = draw_stack(rng, params.stack, stand.start, around, looks, "member", STACK_MASS)
-        fitting = lowered(stack, stand)
+        fitting = lowered_under_cap(stack, stand)
         start = (-params.length / 2, 0.0, 0.0)
-        probe = draw_body(chance, params.probe, "probe", start, probe_look, angular_drag=0.0)
-        probe = cleared(probe, (zone,))
+        probe = draw_body(push_rng, params.probe, "probe", start, probe_look, angular_drag=0.0)
+        probe = raised_clear_of(probe, (zone,))
         if fitting is None:
             return "the stack does not fit under the cap"
-        if not beside(probe, (*stand.bodies, *fitting)):
+        if not is_clear_of(probe, (*stand.bodies, *fitting)):
             return "the probe would start inside the stand"
-        drawn.append(_Drawn(stand, fitting, probe))
+        drawn.append(_DrawnStand(stand, fitting, probe))
         return None
 
-    place(TRIES, scenario, attempt)
+    retry(TRIES, scenario, attempt)
     found = drawn[0]
     target = replace(found.stack[at], name="target")
     others = [body for i, body in enumerate(found.stack) if i != at]
@@ -139,8 +139,8 @@ def sample_standing(
         bodies=(zone, target, found.probe, *found.stand.bodies, *others),
         roles=Roles("target", "zone", "probe"),
         max_frames=MAX_FRAMES,
-        aim_height=top_of(found.stack[-1]) / 2,
-        pushes=(draw_push(chance, params.push, found.probe),),
+        aim_height=top_height(found.stack[-1]) / 2,
+        pushes=(draw_push(push_rng, params.push, found.probe),),
         joints=found.stand.joints,
     )
 

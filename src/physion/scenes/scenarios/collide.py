@@ -14,10 +14,10 @@ from physion.scenes.sampling.rules import (
     BodyRule,
     PushRule,
     ZoneRule,
-    above_floor,
     draw_body,
     draw_push,
     draw_zone,
+    raised_to_floor,
     require_apart,
 )
 from physion.scenes.scene import Roles, Scene
@@ -67,18 +67,18 @@ class Params:
 @scenario("collide", Params)
 def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
     """Draw a ball at -x that is pushed towards a target at +x, with the zone beyond."""
-    placement, palette = child_generator(seed, "placement"), Palette.of(seed)
-    aside = uniform(placement, (-params.zone_jitter, params.zone_jitter))
-    zone = draw_zone(
-        placement, params.zone, palette.look(params.zone.textures), (params.length, aside)
-    )
+    rng, palette = child_generator(seed, "placement"), Palette.of(seed)
+    aside = uniform(rng, (-params.zone_jitter, params.zone_jitter))
+    zone = draw_zone(rng, params.zone, palette.look(params.zone.textures), (params.length, aside))
     look = palette.agent_look(params.target.textures)
-    place = (params.length / 2, 0.0, 0.0)
-    target = above_floor(draw_body(placement, params.target, "target", place, look))
-    chance = child_generator(seed, "push")
+    position = (params.length / 2, 0.0, 0.0)
+    target = raised_to_floor(draw_body(rng, params.target, "target", position, look))
+    push_rng = child_generator(seed, "push")
     look = palette.look(params.probe.textures, params.monochrome)
-    place = (-params.length / 2, 0.0, params.lift)
-    probe = above_floor(draw_body(chance, params.probe, "probe", place, look, angular_drag=0.0))
+    position = (-params.length / 2, 0.0, params.lift)
+    probe = raised_to_floor(
+        draw_body(push_rng, params.probe, "probe", position, look, angular_drag=0.0)
+    )
     require_apart(probe, target)
     require_apart(target, zone)
     return build_scene(
@@ -88,5 +88,5 @@ def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
         bodies=(zone, target, probe),
         roles=Roles("target", "zone", "probe"),
         max_frames=MAX_FRAMES,
-        pushes=(draw_push(chance, params.push, probe),),
+        pushes=(draw_push(push_rng, params.push, probe),),
     )

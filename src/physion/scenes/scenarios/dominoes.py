@@ -9,17 +9,17 @@ import numpy as np
 from physion.numerics.elementary import arctan2
 from physion.numerics.rotations import rotate_vectors
 from physion.scenes.sampling.build import Palette, build_scene
-from physion.scenes.sampling.parameters import Count, Length, Room, Share, place, uniform
+from physion.scenes.sampling.parameters import Count, Fraction, Length, Room, retry, uniform
 from physion.scenes.sampling.placement import CameraRule, SceneryRule, world_bounds
 from physion.scenes.sampling.registry import scenario
 from physion.scenes.sampling.rules import (
     BodyRule,
     PushRule,
     ZoneRule,
-    above_floor,
     draw_body,
     draw_push,
     draw_zone,
+    raised_to_floor,
     require_apart,
 )
 from physion.scenes.scene import Body, Look, Roles, Scene
@@ -63,8 +63,8 @@ class Params:
     middle: BodyRule = MIDDLE
     probe: BodyRule = PROBE
     zone: ZoneRule = ZONE
-    spacing_jitter: Share = 0.25
-    lateral_jitter: Share = 0.25
+    spacing_jitter: Fraction = 0.25
+    lateral_jitter: Fraction = 0.25
     remove_middle: bool = False
     push: PushRule = PUSH
     turned_push: bool = True
@@ -83,16 +83,16 @@ def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
     x, y, _ = zone.position
     zone = replace(zone, position=(x + zone.scale[0], y, 0.0))
     look = palette.agent_look(params.target.textures)
-    target = above_floor(draw_body(rng, params.target, "target", (half, 0.0, 0.0), look))
-    chance = child_generator(seed, "push")
+    target = raised_to_floor(draw_body(rng, params.target, "target", (half, 0.0, 0.0), look))
+    push_rng = child_generator(seed, "push")
     look = palette.look(params.probe.textures)
-    probe = above_floor(
-        draw_body(chance, params.probe, "probe", (-half, 0.0, 0.0), look, angular_drag=0.0)
+    probe = raised_to_floor(
+        draw_body(push_rng, params.probe, "probe", (-half, 0.0, 0.0), look, angular_drag=0.0)
     )
     require_apart(probe, target)
     require_apart(target, zone)
     row = _row(params, rng, palette, probe, target)
-    push = draw_push(chance, params.push, probe, heading(probe) if params.turned_push else 0.0)
+    push = draw_push(push_rng, params.push, probe, heading(probe) if params.turned_push else 0.0)
     return build_scene(
         "dominoes",
         seed,
@@ -125,7 +125,7 @@ def _row(
             return f"no room left for all {params.middles} in the middle"
         return None
 
-    place(ROW_TRIES, f"a row of dominoes {params.length:g} m long", attempt)
+    retry(ROW_TRIES, f"a row of dominoes {params.length:g} m long", attempt)
     return [body for i, body in enumerate(row) if i != removed]
 
 
@@ -139,7 +139,7 @@ def _draw_row(
         share = params.spacing_jitter
         x += spacing * uniform(rng, (1 - share, 1 + share))
         aside = uniform(rng, (-params.lateral_jitter, params.lateral_jitter))
-        body = above_floor(draw_body(rng, params.middle, f"middle_{i}", (0.0, 0.0, 0.0), look))
+        body = raised_to_floor(draw_body(rng, params.middle, f"middle_{i}", (0.0, 0.0, 0.0), look))
         low, high = (float(bound) for bound in world_bounds(body)[:, 0])
         first, last = taken + BODY_GAP - low, end - BODY_GAP - high
         if first > last:

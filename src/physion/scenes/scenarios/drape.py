@@ -13,23 +13,23 @@ import numpy as np
 from physion.scenes.sampling.build import Palette, build_scene
 from physion.scenes.sampling.parameters import (
     SMALLEST_SIDE,
+    FloorPosition,
+    Fraction,
+    Fractions,
     Length,
     Lengths,
     Masses,
     Materials,
     Offsets,
-    Place,
     Props,
     Quantity,
     Range,
     Room,
     Shapes,
-    Share,
-    Shares,
     Sides,
     SizeFactors,
     pick,
-    place,
+    retry,
     uniform,
     yaw,
 )
@@ -47,22 +47,22 @@ VERTEX_SPACING = 0.04
 """Metres between the vertices of a cloth: 51 along the official two metres (`Cloth`)."""
 
 
-class Setting(NamedTuple):
+class PropPlacement(NamedTuple):
     """Size of a prop in the world, its place on the floor, metres, and how it is turned."""
 
     size: Vec3
-    place: tuple[float, float]
-    turn_deg: float = 0.0
+    position: tuple[float, float]
+    angle_deg: float = 0.0
 
 
-SETTINGS = {
-    "floor_lamp": Setting((0.613, 0.503, 1.286), (0.058, -1.098)),
-    "sculpture": Setting((1.387, 1.414, 1.121), (0.029, -1.086)),
-    "desk_lamp": Setting((0.979, 0.231, 1.177), (0.187, -1.086), turn_deg=-90.0),
-    "armchair": Setting((0.915, 0.914, 0.833), (0.0, -1.4)),
+OFFICIAL_PROPS = {
+    "floor_lamp": PropPlacement((0.613, 0.503, 1.286), (0.058, -1.098)),
+    "sculpture": PropPlacement((1.387, 1.414, 1.121), (0.029, -1.086)),
+    "desk_lamp": PropPlacement((0.979, 0.231, 1.177), (0.187, -1.086), angle_deg=-90.0),
+    "armchair": PropPlacement((0.915, 0.914, 0.833), (0.0, -1.4)),
 }
 """The four models that stand behind the official scenes, as measured."""
-OTHER_PLACE = (0.0, -1.1)
+DEFAULT_PROP_POSITION = (0.0, -1.1)
 
 Frames = Annotated[int, Quantity("frames", 0, 10000)]
 
@@ -81,9 +81,9 @@ class ClothRule:
     """
 
     size: Sides = (2.0, 2.0)
-    stretch: Shares = (0.0, 1.0)
-    bend: Shares = (0.0, 1.0)
-    tether: Shares = (0.0, 1.0)
+    stretch: Fractions = (0.0, 1.0)
+    bend: Fractions = (0.0, 1.0)
+    tether: Fractions = (0.0, 1.0)
     x: Offsets = (-0.2, 0.2)
     y: Offsets = (-0.6, -0.4)
     height: Lengths = (1.3, 1.5)
@@ -112,8 +112,8 @@ class AnchorRule:
     taller: Length = 0.1
     between: Offsets = (-0.4, 0.4)
     jitter: Length = 0.1
-    extra: Share = 0.7
-    extra_left: Share = 0.65
+    extra: Fraction = 0.7
+    extra_left: Fraction = 0.65
     extra_distance: Length = 0.5
     extra_height: Length = 0.5
     mass: Masses = (25.0, 25.0)
@@ -134,13 +134,13 @@ class AnchorRule:
 class PropRule:
     """The large object behind the others.
 
-    ``size`` is times the official size (`SETTINGS`) or, of props that the study does not have,
-    times the natural one; ``shift`` is metres from its official place.
+    ``size`` is times the official size (`OFFICIAL_PROPS`) or, of props that the study does
+    not have, times the natural one; ``shift`` is metres from its official place.
     """
 
-    props: Props = tuple(SETTINGS)
+    props: Props = tuple(OFFICIAL_PROPS)
     size: SizeFactors = (1.0, 1.0)
-    shift: Place = (0.0, 0.0)
+    shift: FloorPosition = (0.0, 0.0)
     mass: Masses = (100.0, 100.0)
     textures: Materials = FAMILIES
 
@@ -159,7 +159,7 @@ class Params:
     cloth: ClothRule = ClothRule()
     anchors: AnchorRule = AnchorRule()
     zone: ZoneRule = ZONE
-    zone_share: Shares = (0.2, 0.8)
+    zone_share: Fractions = (0.2, 0.8)
     zone_y: Offsets = (-0.2, 0.4)
     prop: PropRule = PropRule()
     settle_frames: Frames = 100
@@ -209,16 +209,16 @@ def _draw_cloth(rule: ClothRule, rng: np.random.Generator, palette: Palette) -> 
 
 def _draw_prop(rule: PropRule, rng: np.random.Generator, palette: Palette) -> Body:
     name = pick(rng, rule.props)
-    found = SETTINGS.get(name, Setting(NATURAL_SIZES[name], OTHER_PLACE))
+    official = OFFICIAL_PROPS.get(name, PropPlacement(NATURAL_SIZES[name], DEFAULT_PROP_POSITION))
     factor = uniform(rng, rule.size)
-    width, depth, height = (side * factor for side in found.size)
-    across = found.turn_deg % 180 != 0
+    width, depth, height = (side * factor for side in official.size)
+    across = official.angle_deg % 180 != 0
     return Body(
         "prop",
         PREFIX + name,
-        (found.place[0] + rule.shift[0], found.place[1] + rule.shift[1], 0.0),
+        (official.position[0] + rule.shift[0], official.position[1] + rule.shift[1], 0.0),
         (depth, width, height) if across else (width, depth, height),
-        yaw(math.radians(found.turn_deg)),
+        yaw(math.radians(official.angle_deg)),
         mass=uniform(rng, rule.mass),
         kinematic=True,
         look=palette.look(rule.textures),
@@ -294,5 +294,5 @@ def _draw_apart(name: str, others: Sequence[Body], draw: Callable[[], Body]) -> 
                 return f"it meets {other.name}"
         return None
 
-    place(TRIES, name, attempt)
+    retry(TRIES, name, attempt)
     return drawn[-1]

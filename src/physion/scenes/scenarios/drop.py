@@ -19,7 +19,7 @@ from physion.scenes.sampling.parameters import (
 )
 from physion.scenes.sampling.placement import CameraRule, SceneryRule, world_bounds
 from physion.scenes.sampling.registry import scenario
-from physion.scenes.sampling.rules import BodyRule, ZoneRule, above_floor, draw_body, draw_zone
+from physion.scenes.sampling.rules import BodyRule, ZoneRule, draw_body, draw_zone, raised_to_floor
 from physion.scenes.scene import Body, Quat, Roles, Scene
 from physion.seeds import child_generator
 
@@ -117,7 +117,7 @@ def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
 
 def _standing(lower: Body, zone: Body) -> Body:
     """The lower body on the zone, where the official one starts inside it, or on the floor."""
-    lower = above_floor(lower)
+    lower = raised_to_floor(lower)
     below, body = world_bounds(zone), world_bounds(lower)
     apart = (below[1, :2] <= body[0, :2]).any() or (body[1, :2] <= below[0, :2]).any()
     x, y, z = lower.position
@@ -127,14 +127,14 @@ def _standing(lower: Body, zone: Body) -> Body:
 def _hung(params: Params, rng: np.random.Generator, palette: Palette, lower: Body) -> Body:
     """What falls, high enough to fall at least `FALL` metres."""
     x, y = (uniform(rng, (-params.jitter, params.jitter)) for _ in range(2))
-    place = (x, y, uniform(rng, params.height))
+    position = (x, y, uniform(rng, params.height))
     look = palette.agent_look(params.dropped.textures)
-    target = draw_body(rng, params.dropped, "target", place, look)
-    turn = random_rotation(rng)
+    target = draw_body(rng, params.dropped, "target", position, look)
+    rotation = random_rotation(rng)
     if params.even_turn:
-        target = replace(target, rotation=turn)
+        target = replace(target, rotation=rotation)
     missing = float(world_bounds(lower)[1, 2] + FALL - world_bounds(target)[0, 2])
-    return replace(target, position=(x, y, place[2] + max(0.0, missing)))
+    return replace(target, position=(x, y, position[2] + max(0.0, missing)))
 
 
 def random_rotation(rng: np.random.Generator) -> Quat:

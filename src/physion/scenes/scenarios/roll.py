@@ -10,12 +10,12 @@ import numpy as np
 
 from physion.scenes.sampling.build import Palette, build_scene
 from physion.scenes.sampling.parameters import (
+    FloorPosition,
     Frictions,
     Length,
     Masses,
     Materials,
     NamesOf,
-    Place,
     Room,
     Shapes,
     Sizes,
@@ -30,13 +30,13 @@ from physion.scenes.sampling.rules import (
     BodyRule,
     PushRule,
     ZoneRule,
-    above_floor,
     draw_body,
     draw_push,
     draw_zone,
+    raised_to_floor,
 )
 from physion.scenes.scenarios import collide
-from physion.scenes.scene import Body, Contact, Roles, Scene
+from physion.scenes.scene import Body, Roles, Scene, SurfaceMaterial
 from physion.seeds import child_generator
 
 TEMPLATES = ("ramp", "ledge", "collision")
@@ -109,7 +109,7 @@ class LedgeRule:
     length: Length = 1.5
     shapes: Shapes = ("half:cylinder",)
     scale: Sizes = ((0.05, 0.05), (100.0, 100.0), (0.05, 0.05))
-    center: Place = (0.0, 0.0)
+    center: FloorPosition = (0.0, 0.0)
     friction: Frictions = (0.5, 0.5)
     mass: Masses = (1000.0, 1000.0)
     textures: Materials = ("wood", "metal", "plastic")
@@ -172,13 +172,13 @@ def _sample_ramp(params: Params, seed: np.random.SeedSequence) -> Scene:
         draw_axes(rng, rule.scale),
         yaw(math.pi),  # down towards the zone
         uniform(rng, rule.mass),
-        Contact(friction, friction, 0.0),
+        SurfaceMaterial(friction, friction, 0.0),
         kinematic=True,
         look=palette.look(rule.textures),
     )
     top = float(world_corners(ramp)[:, 2].max()) - rule.lift
-    place = (ramp.position[0] - rule.start, 0.0, top + rule.drop)
-    target = draw_body(rng, rule.target, "target", place, look, angular_drag=0.0)
+    position = (ramp.position[0] - rule.start, 0.0, top + rule.drop)
+    target = draw_body(rng, rule.target, "target", position, look, angular_drag=0.0)
     return build_scene(
         "roll",
         seed,
@@ -216,12 +216,14 @@ def _sample_ledge(params: Params, seed: np.random.SeedSequence) -> Scene:
         (*rule.center, 0.0),
         draw_axes(rng, rule.scale),
         mass=uniform(rng, rule.mass),
-        contact=Contact(friction, friction, 0.0),
+        contact=SurfaceMaterial(friction, friction, 0.0),
         kinematic=True,
         look=palette.look(rule.textures),
     )
-    place = (-rule.length / 2, 0.0, 0.0)
-    target = above_floor(draw_body(rng, rule.target, "target", place, look, angular_drag=0.0))
+    position = (-rule.length / 2, 0.0, 0.0)
+    target = raised_to_floor(
+        draw_body(rng, rule.target, "target", position, look, angular_drag=0.0)
+    )
     push = draw_push(child_generator(seed, "push"), rule.push, target)
     return build_scene(
         "roll",

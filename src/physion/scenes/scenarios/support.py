@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from physion.scenes.sampling.build import Palette, build_scene
-from physion.scenes.sampling.clearance import beside, cleared
-from physion.scenes.sampling.parameters import Length, Room, place
+from physion.scenes.sampling.clearance import is_clear_of, raised_clear_of
+from physion.scenes.sampling.parameters import Length, Room, retry
 from physion.scenes.sampling.placement import CameraRule, SceneryRule
 from physion.scenes.sampling.registry import scenario
 from physion.scenes.sampling.rules import (
@@ -19,7 +19,13 @@ from physion.scenes.sampling.rules import (
     draw_push,
     draw_zone,
 )
-from physion.scenes.sampling.stacks import StackRule, draw_looks, draw_stack, top_of, weighed
+from physion.scenes.sampling.stacks import (
+    StackRule,
+    draw_looks,
+    draw_stack,
+    top_height,
+    with_mass_by_volume,
+)
 from physion.scenes.scene import Body, Roles, Scene
 from physion.seeds import child_generator
 
@@ -72,25 +78,27 @@ class Params:
 @scenario("support", Params)
 def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
     """Draw a tower in the middle of a plate, and a ball at -x that is pushed at its foot."""
-    placement, palette = child_generator(seed, "placement"), Palette.of(seed)
+    rng, palette = child_generator(seed, "placement"), Palette.of(seed)
     target_look = palette.agent_look(params.cap.textures)
     probe_look = palette.look(params.probe.textures)
-    zone = draw_zone(placement, params.zone, palette.look(params.zone.textures))
-    looks = draw_looks(placement, params.stack, palette, params.monochrome)
-    chance = child_generator(seed, "push")
+    zone = draw_zone(rng, params.zone, palette.look(params.zone.textures))
+    looks = draw_looks(rng, params.stack, palette, params.monochrome)
+    push_rng = child_generator(seed, "push")
     drawn: list[Body] = []
 
     def attempt() -> str | None:
         floor = zone.scale[2]
-        blocks = draw_stack(placement, params.stack, floor, (zone,), looks, "block")
-        top = top_of(blocks[-1]) if blocks else floor
-        cap = weighed(draw_body(placement, params.cap, "target", (0.0, 0.0, top), target_look))
+        blocks = draw_stack(rng, params.stack, floor, (zone,), looks, "block")
+        top = top_height(blocks[-1]) if blocks else floor
+        cap = with_mass_by_volume(
+            draw_body(rng, params.cap, "target", (0.0, 0.0, top), target_look)
+        )
         start = (-params.length / 2, 0.0, 0.0)
-        probe = draw_body(chance, params.probe, "probe", start, probe_look, angular_drag=0.0)
-        drawn[:] = [cleared(cap, (zone, *blocks)), cleared(probe, (zone,)), *blocks]
-        return None if beside(drawn[1], blocks) else "the probe would start inside the tower"
+        probe = draw_body(push_rng, params.probe, "probe", start, probe_look, angular_drag=0.0)
+        drawn[:] = [raised_clear_of(cap, (zone, *blocks)), raised_clear_of(probe, (zone,)), *blocks]
+        return None if is_clear_of(drawn[1], blocks) else "the probe would start inside the tower"
 
-    place(TRIES, "support", attempt)
+    retry(TRIES, "support", attempt)
     target, probe = drawn[:2]
     return build_scene(
         "support",
@@ -99,6 +107,6 @@ def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
         bodies=(zone, *drawn),
         roles=Roles("target", "zone", "probe"),
         max_frames=MAX_FRAMES,
-        aim_height=top_of(target) / 2,
-        pushes=(draw_push(chance, params.push, probe),),
+        aim_height=top_height(target) / 2,
+        pushes=(draw_push(push_rng, params.push, probe),),
     )

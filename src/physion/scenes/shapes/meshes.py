@@ -40,7 +40,7 @@ class Mesh:
         """The mesh scaled (factors above zero) along its axes, then shifted by ``offset``."""
         return Mesh(self.vertices * np.asarray(scale) + np.asarray(offset), self.faces, self.smooth)
 
-    def turned(self, matrix: Points) -> Mesh:
+    def rotated(self, matrix: Points) -> Mesh:
         """The mesh turned by the rotation ``matrix`` (3, 3)."""
         return Mesh(apply(matrix, self.vertices), self.faces, self.smooth)
 

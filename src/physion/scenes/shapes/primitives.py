@@ -75,7 +75,7 @@ PIPE_SECTORS, BOWL_SECTORS, BOWL_BANDS = 16, 12, 3
 
 
 @dataclass(frozen=True, eq=False)
-class Piece:
+class ConvexPiece:
     """A convex part of a shape for contacts.
 
     ``center`` and ``half`` (half sizes; a sphere's radius three times; a cylinder's rx, ry and
@@ -88,7 +88,7 @@ class Piece:
     center: Vec3
     half: Vec3
     vertices: Points
-    turn: Points
+    rotation: Points
 
     @property
     def mesh(self) -> Mesh:
@@ -102,7 +102,7 @@ class Piece:
         else:
             ends = [(0.0, -1.0), (1.0, -1.0), (1.0, 1.0), (0.0, 1.0)]
             solid = revolve(ends, ROUND_SEGMENTS).moved(self.half)
-        return solid.turned(self.turn).moved(offset=self.center)
+        return solid.rotated(self.rotation).moved(offset=self.center)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +127,7 @@ class Shape:
 
     name: str
     mesh: Mesh
-    pieces: tuple[Piece, ...]
+    pieces: tuple[ConvexPiece, ...]
     hollow: bool = False
 
     @property
@@ -175,28 +175,30 @@ def shape(name: str) -> Shape:
     return shapes.get(name)()
 
 
-def primitive(kind: Literal["box", "sphere", "cylinder"], center: Vec3, half: Vec3) -> Piece:
+def primitive(kind: Literal["box", "sphere", "cylinder"], center: Vec3, half: Vec3) -> ConvexPiece:
     """A piece that engines know by itself, its axes along the shape's."""
-    return Piece(kind, center, half, np.zeros((0, 3)), np.eye(3))
+    return ConvexPiece(kind, center, half, np.zeros((0, 3)), np.eye(3))
 
 
-def convex(points: NDArray[np.float64]) -> Piece:
+def convex(points: NDArray[np.float64]) -> ConvexPiece:
     """A piece that is the hull of ``points`` (K, 3)."""
     corners = hull(points).vertices
     low, high = corners.min(axis=0), corners.max(axis=0)
     center, half = (low + high) / 2, (high - low) / 2
-    return Piece("convex", _vec3(center), _vec3(half), corners, np.eye(3))
+    return ConvexPiece("convex", _vec3(center), _vec3(half), corners, np.eye(3))
 
 
 def ball_mesh(radius: float, segments: int = ROUND_SEGMENTS) -> Mesh:
     """A sphere about the origin, in ``segments`` meridians and half as many bands."""
     bands = segments // 2
-    turns = [-math.pi / 2 + math.pi * i / bands for i in range(bands + 1)]
-    rings = [(radius * cos(t), radius * sin(t)) for t in turns[1:-1]]
+    angles = [-math.pi / 2 + math.pi * i / bands for i in range(bands + 1)]
+    rings = [(radius * cos(t), radius * sin(t)) for t in angles[1:-1]]
     return revolve([(0.0, -radius), *rings, (0.0, radius)], segments, smooth=CURVED)
 
 
-def ring_pieces(sections: list[NDArray[np.float64]], sectors: int, steps: int) -> tuple[Piece, ...]:
+def ring_pieces(
+    sections: list[NDArray[np.float64]], sectors: int, steps: int
+) -> tuple[ConvexPiece, ...]:
     """Convex sectors of a ring: each section (K, 2) of (radius, height), swept over its share.
 
     ``steps`` is how many corners of the drawn circle a sector spans.
@@ -204,8 +206,8 @@ def ring_pieces(sections: list[NDArray[np.float64]], sectors: int, steps: int) -
     pieces = []
     for section in sections:
         for sector in range(sectors):
-            turns = 2 * math.pi * (sector + np.arange(steps + 1) / steps) / sectors
-            circle = np.stack([cos(turns), sin(turns)], axis=1)
+            angles = 2 * math.pi * (sector + np.arange(steps + 1) / steps) / sectors
+            circle = np.stack([cos(angles), sin(angles)], axis=1)
             points = [
                 np.column_stack([circle * r, np.full(len(circle), z)]) for r, z in section if r > 0
             ]
@@ -236,8 +238,8 @@ def _cylinder() -> Shape:
 @shapes.register("half:cylinder")
 def _half_cylinder() -> Shape:
     # Not an official shape: the official ledge is a stretched ball, sunk by half into the floor.
-    turns = np.linspace(0, math.pi, 9)
-    points = [(cos(t) / 2, y, sin(t) / 2) for t in turns for y in (-0.5, 0.5)]
+    angles = np.linspace(0, math.pi, 9)
+    points = [(cos(t) / 2, y, sin(t) / 2) for t in angles for y in (-0.5, 0.5)]
     return _solid("half:cylinder", hull(points, CURVED))
 
 
@@ -262,9 +264,9 @@ def _octahedron() -> Shape:
 
 @shapes.register("platonic")
 def _platonic() -> Shape:
-    turns = 2 * np.pi * np.arange(5) / 5
+    angles = 2 * np.pi * np.arange(5) / 5
     radius, rise = 1 / math.sqrt(5), 0.5 / math.sqrt(5)
-    upper = np.column_stack([radius * cos(turns), radius * sin(turns), np.full(5, rise)])
+    upper = np.column_stack([radius * cos(angles), radius * sin(angles), np.full(5, rise)])
     poles = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, -0.5]])
     corners = np.concatenate([upper, -upper, poles])
     return _solid("platonic", hull(corners).moved(offset=(0, 0, 0.5)))
@@ -272,8 +274,8 @@ def _platonic() -> Shape:
 
 @shapes.register("pentagon")
 def _pentagon() -> Shape:
-    turns = -np.pi / 2 + 2 * np.pi * np.arange(5) / 5
-    corners = 0.5 * np.stack([cos(turns), sin(turns)], axis=1)
+    angles = -np.pi / 2 + 2 * np.pi * np.arange(5) / 5
+    corners = 0.5 * np.stack([cos(angles), sin(angles)], axis=1)
     return _solid("pentagon", extrude(corners, 0.0, 1.0))
 
 
@@ -294,7 +296,7 @@ def _dumbbell() -> Shape:
     half = [(0.0, -end), (corner, -end), (corner, -head), (neck, -head)]
     profile = [*half, *((r, -z) for r, z in reversed(half))]
     lay = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-    mesh = revolve(profile, 4, phase=math.pi / 4).turned(lay).moved(offset=(0, 0, head))
+    mesh = revolve(profile, 4, phase=math.pi / 4).rotated(lay).moved(offset=(0, 0, head))
     heads = (primitive("box", (0.0, y, head), (head, head, head)) for y in (-2 * head, 2 * head))
     rod = primitive("box", (0.0, 0.0, head), (bar, head, bar))
     return Shape("dumbbell", mesh, (*heads, rod))
@@ -326,8 +328,8 @@ def bowl_outline(radius: float, height: float, flat: float, points: int) -> Outl
     middle = (radius * radius + height * height - flat * flat) / (2 * height)
     size = math.sqrt(flat * flat + middle * middle)
     first, last = arctan2(-middle, flat), arctan2(height - middle, radius)
-    turns = np.linspace(first, last, points)
-    return [(size * cos(t), middle + size * sin(t)) for t in turns]
+    angles = np.linspace(first, last, points)
+    return [(size * cos(t), middle + size * sin(t)) for t in angles]
 
 
 @shapes.register("bowl")

@@ -10,18 +10,18 @@ import numpy as np
 
 from physion.numerics.elementary import cos, sin
 from physion.scenes.scene import Look
-from physion.scenes.shapes.prop_parts import Part, prop
+from physion.scenes.shapes.prop_parts import PropPart, prop
 from physion.scenes.shapes.prop_solids import (
     arc,
     ball,
     board,
     curve,
     cushion,
+    lathe,
     limb,
     outline,
     sleeve,
     tube,
-    turned,
 )
 
 SHADE = Look((0.9, 0.85, 0.74), "fabric_linen")
@@ -33,7 +33,7 @@ CORNERS = ((1, 1), (-1, 1), (-1, -1), (1, -1))
 
 
 @prop("chair", (0.43, 0.497, 0.878))
-def _chair() -> Iterable[Part]:
+def _chair() -> Iterable[PropPart]:
     """A wooden dining chair with three slats and a padded seat."""
     yield board((0, 0.01, 0.43), (0.215, 0.215, 0.025))
     yield cushion((0, 0.01, 0.463), (0.205, 0.205, 0.022), 0.02, PAD)
@@ -48,9 +48,9 @@ def _chair() -> Iterable[Part]:
 
 
 @prop("cafe_chair", (0.46, 0.482, 0.864))
-def _cafe_chair() -> Iterable[Part]:
+def _cafe_chair() -> Iterable[PropPart]:
     """A bistro chair of bent tubes with a round seat."""
-    yield turned([(0.19, 0.44), (0.205, 0.45), (0.205, 0.465), (0.19, 0.475)])
+    yield lathe([(0.19, 0.44), (0.205, 0.45), (0.205, 0.465), (0.19, 0.475)])
     for x in (-1, 1):
         yield tube([(0.14 * x, 0.12, 0.45), (0.17 * x, 0.2, 0.0)], 0.011)
         yield tube([(0.14 * x, -0.13, 0.45), (0.17 * x, -0.24, 0.0)], 0.011)
@@ -65,24 +65,24 @@ def _cafe_chair() -> Iterable[Part]:
 
 
 @prop("armchair", (0.82, 0.865, 0.849))
-def _armchair() -> Iterable[Part]:
+def _armchair() -> Iterable[PropPart]:
     """An upholstered easy chair."""
     yield cushion((0, 0.0, 0.22), (0.36, 0.38, 0.12), 0.04)
     yield cushion((0, 0.06, 0.4), (0.27, 0.34, 0.085), 0.06)
     back = cushion((0, -0.28, 0.57), (0.33, 0.11, 0.28), 0.07)
-    yield back.turned((1, 0, 0), 0.16, (0, -0.28, 0.3))
+    yield back.rotated((1, 0, 0), 0.16, (0, -0.28, 0.3))
     for side in (-1, 1):
         yield cushion((0.335 * side, 0.02, 0.36), (0.075, 0.38, 0.25), 0.065)
         for y in (-0.32, 0.34):
-            yield turned([(0.018, 0.0), (0.028, 0.12)], look=DARK_WOOD, sides=10).moved(
+            yield lathe([(0.018, 0.0), (0.028, 0.12)], look=DARK_WOOD, sides=10).moved(
                 (0.31 * side, y, 0)
             )
 
 
 @prop("stool", (0.429, 0.427, 0.5))
-def _stool() -> Iterable[Part]:
+def _stool() -> Iterable[PropPart]:
     """A round wooden stool on four splayed legs."""
-    yield turned([(0.16, 0.455), (0.18, 0.465), (0.18, 0.49), (0.165, 0.5)])
+    yield lathe([(0.16, 0.455), (0.18, 0.465), (0.18, 0.49), (0.165, 0.5)])
     feet = [(0.2 * x, 0.2 * y, 0.015) for x, y in CORNERS]
     for x, y, z in feet:
         yield limb((x, y, z), (0.55 * x, 0.55 * y, 0.45), 0.015, 0.02)
@@ -92,11 +92,11 @@ def _stool() -> Iterable[Part]:
 
 
 @prop("bar_stool", (0.42, 0.42, 0.78))
-def _bar_stool() -> Iterable[Part]:
+def _bar_stool() -> Iterable[PropPart]:
     """A padded seat on a steel column with a foot ring."""
-    yield turned(outline([(0.16, 0.68), (0.185, 0.71), (0.19, 0.75), (0.16, 0.78)], 3))
-    yield turned([(0.1, 0.665), (0.16, 0.68)], look=CHROME, sides=16)
-    yield turned([(0.21, 0.0), (0.21, 0.012), (0.05, 0.035), (0.03, 0.06)], look=CHROME)
+    yield lathe(outline([(0.16, 0.68), (0.185, 0.71), (0.19, 0.75), (0.16, 0.78)], 3))
+    yield lathe([(0.1, 0.665), (0.16, 0.68)], look=CHROME, sides=16)
+    yield lathe([(0.21, 0.0), (0.21, 0.012), (0.05, 0.035), (0.03, 0.06)], look=CHROME)
     yield tube([(0, 0, 0.04), (0, 0, 0.67)], 0.026, CHROME, sides=12)
     hoop = arc((0, 0, 0.27), (0.15, 0, 0), (0, 0.15, 0), 0, 2 * math.pi, 21)[:-1]
     yield tube(hoop, 0.011, CHROME, sides=6, closed=True)
@@ -104,11 +104,11 @@ def _bar_stool() -> Iterable[Part]:
 
 
 @prop("table", (1.1, 1.1, 0.74))
-def _table() -> Iterable[Part]:
+def _table() -> Iterable[PropPart]:
     """A round dining table on a turned column with four feet."""
-    yield turned([(0.52, 0.7), (0.55, 0.715), (0.55, 0.735), (0.54, 0.74)], sides=32)
+    yield lathe([(0.52, 0.7), (0.55, 0.715), (0.55, 0.735), (0.54, 0.74)], sides=32)
     column = [(0.06, 0.08), (0.085, 0.2), (0.05, 0.4), (0.065, 0.58), (0.2, 0.705)]
-    yield turned(outline(column, 3), sides=16)
+    yield lathe(outline(column, 3), sides=16)
     for x, y in CORNERS:
         foot = [(0.02, 0.2), (0.14, 0.15), (0.28, 0.05), (0.33, 0.03)]
         path = [(x * r, y * r, z) for r, z in foot]
@@ -116,7 +116,7 @@ def _table() -> Iterable[Part]:
 
 
 @prop("coffee_table", (1.1, 0.6, 0.42))
-def _coffee_table() -> Iterable[Part]:
+def _coffee_table() -> Iterable[PropPart]:
     """A low table with a shelf under its top."""
     yield cushion((0, 0, 0.4), (0.55, 0.3, 0.02), 0.01)
     yield board((0, 0, 0.14), (0.47, 0.22, 0.01))
@@ -128,17 +128,17 @@ def _coffee_table() -> Iterable[Part]:
 
 
 @prop("side_table", (0.46, 0.46, 0.55))
-def _side_table() -> Iterable[Part]:
+def _side_table() -> Iterable[PropPart]:
     """A small round table with three slanting legs."""
-    yield turned([(0.215, 0.52), (0.23, 0.53), (0.23, 0.545), (0.22, 0.55)], sides=32)
-    yield turned([(0.12, 0.495), (0.12, 0.52)], sides=16)
-    for turn in np.arange(3) * 2 * math.pi / 3 + math.pi / 2:
-        x, y = cos(turn), sin(turn)
+    yield lathe([(0.215, 0.52), (0.23, 0.53), (0.23, 0.545), (0.22, 0.55)], sides=32)
+    yield lathe([(0.12, 0.495), (0.12, 0.52)], sides=16)
+    for angle in np.arange(3) * 2 * math.pi / 3 + math.pi / 2:
+        x, y = cos(angle), sin(angle)
         yield tube([(0.205 * x, 0.205 * y, 0.0), (0.1 * x, 0.1 * y, 0.52)], [0.011, 0.019])
 
 
 @prop("desk", (1.2, 0.6, 0.75))
-def _desk() -> Iterable[Part]:
+def _desk() -> Iterable[PropPart]:
     """A writing desk with a stack of drawers on one side."""
     yield board((0, 0, 0.735), (0.6, 0.3, 0.015))
     yield board((0.36, -0.01, 0.4), (0.2, 0.27, 0.32))
@@ -153,28 +153,28 @@ def _desk() -> Iterable[Part]:
 
 
 @prop("lamp", (0.4, 0.4, 0.62))
-def _lamp() -> Iterable[Part]:
+def _lamp() -> Iterable[PropPart]:
     """A table lamp: a turned foot under a cloth shade."""
     foot = [(0.1, 0.0), (0.1, 0.02), (0.06, 0.05), (0.09, 0.14), (0.1, 0.22), (0.05, 0.31)]
-    yield turned(outline([*foot, (0.018, 0.35)], 3), sides=20)
+    yield lathe(outline([*foot, (0.018, 0.35)], 3), sides=20)
     yield tube([(0, 0, 0.34), (0, 0, 0.45)], 0.012, CHROME)
     yield sleeve([(0.2, 0.36), (0.12, 0.62)], 0.006, SHADE)
     yield ball((0, 0, 0.46), (0.035, 0.035, 0.045), BULB, sides=10)
 
 
 @prop("floor_lamp", (0.46, 0.46, 1.6))
-def _floor_lamp() -> Iterable[Part]:
+def _floor_lamp() -> Iterable[PropPart]:
     """A thin pole on a heavy disc, a drum shade on top."""
-    yield turned([(0.15, 0.0), (0.15, 0.02), (0.14, 0.03), (0.02, 0.04)])
+    yield lathe([(0.15, 0.0), (0.15, 0.02), (0.14, 0.03), (0.02, 0.04)])
     yield tube([(0, 0, 0.03), (0, 0, 1.4)], 0.013)
     yield sleeve([(0.23, 1.28), (0.18, 1.6)], 0.006, SHADE)
     yield ball((0, 0, 1.42), (0.04, 0.04, 0.05), BULB, sides=10)
 
 
 @prop("desk_lamp", (0.22, 0.57, 0.573))
-def _desk_lamp() -> Iterable[Part]:
+def _desk_lamp() -> Iterable[PropPart]:
     """A jointed arm that holds a cone over the desk."""
-    base = turned([(0.11, 0.0), (0.11, 0.015), (0.1, 0.025), (0.02, 0.035)]).moved((0, -0.1, 0))
+    base = lathe([(0.11, 0.0), (0.11, 0.015), (0.1, 0.025), (0.02, 0.035)]).moved((0, -0.1, 0))
     yield base
     elbow, wrist = (0.0, -0.25, 0.3), (0.0, 0.09, 0.5)
     for x in (-0.012, 0.012):
@@ -183,7 +183,7 @@ def _desk_lamp() -> Iterable[Part]:
     for joint in (elbow, wrist):
         yield tube([(-0.025, *joint[1:]), (0.025, *joint[1:])], 0.018, sides=10)
     cone = sleeve([(0.105, 0.0), (0.095, 0.03), (0.045, 0.11)], 0.004)
-    cap = turned([(0.046, 0.108), (0.034, 0.12), (0.028, 0.175)], sides=16)
+    cap = lathe([(0.046, 0.108), (0.034, 0.12), (0.028, 0.175)], sides=16)
     bulb = ball((0, 0, 0.045), (0.035, 0.035, 0.045), BULB, sides=10)
     for part in (cone, cap, bulb):
-        yield part.moved((0, 0.15, 0.36)).turned((1, 0, 0), 0.5, wrist)
+        yield part.moved((0, 0.15, 0.36)).rotated((1, 0, 0), 0.5, wrist)

@@ -24,7 +24,7 @@ NATURAL_SIZES: dict[str, Vec3] = {}
 
 
 @dataclass(frozen=True)
-class Prop(Shape):
+class PropShape(Shape):
     """A shape whose triangles may have colours of their own.
 
     ``paint`` (triangles of the mesh,) is 0 where the look of the body is seen and i where
@@ -32,12 +32,12 @@ class Prop(Shape):
     """
 
     paint: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
-    own: tuple[Look, ...] = ()
-    made: Vec3 = (1.0, 1.0, 1.0)
+    own_looks: tuple[Look, ...] = ()
+    modelled_size: Vec3 = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class PropPart:
     """One closed solid of a prop, and the corners of the convex pieces that stand for it.
 
     ``look`` is its own colour and texture, None for those of the body. ``patches`` are looks of
@@ -49,20 +49,20 @@ class Part:
     look: Look | None = None
     patches: tuple[tuple[NDArray[np.bool_], Look], ...] = ()
 
-    def moved(self, offset: ArrayLike) -> Part:
+    def moved(self, offset: ArrayLike) -> PropPart:
         """The part shifted by ``offset``, metres."""
         shift = np.asarray(offset, np.float64)
         pieces = tuple(piece + shift for piece in self.pieces)
         return replace(self, mesh=self.mesh.moved(offset=shift), pieces=pieces)
 
-    def turned(self, axis: ArrayLike, angle: float, about: ArrayLike = (0, 0, 0)) -> Part:
+    def rotated(self, axis: ArrayLike, angle: float, about: ArrayLike = (0, 0, 0)) -> PropPart:
         """The part turned by ``angle`` radians about ``axis`` through the point ``about``."""
         matrix, center = axis_angle_matrix(axis, angle), np.asarray(about, np.float64)
         shift = center - apply(matrix, center)
         pieces = tuple(apply(matrix, piece) + shift for piece in self.pieces)
-        return replace(self, mesh=self.mesh.turned(matrix).moved(offset=shift), pieces=pieces)
+        return replace(self, mesh=self.mesh.rotated(matrix).moved(offset=shift), pieces=pieces)
 
-    def patched(self, where: Callable[[Points, Points], NDArray[np.bool_]], look: Look) -> Part:
+    def patched(self, where: Callable[[Points, Points], NDArray[np.bool_]], look: Look) -> PropPart:
         """The part with ``look`` on the triangles whose centres and normals (F, 3) are so."""
         corners = self.mesh.vertices[self.mesh.faces]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -70,7 +70,7 @@ class Part:
         return replace(self, patches=(*self.patches, (mask, look)))
 
 
-Maker = Callable[[], Iterable[Part]]
+Maker = Callable[[], Iterable[PropPart]]
 
 
 def prop(name: str, size: Vec3) -> Callable[[Maker], Maker]:
@@ -84,30 +84,30 @@ def prop(name: str, size: Vec3) -> Callable[[Maker], Maker]:
     return add
 
 
-def _fitted(name: str, parts: list[Part]) -> Prop:
+def _fitted(name: str, parts: list[PropPart]) -> PropShape:
     whole = merge((part.mesh for part in parts), smooth=CURVED)
     low, high = whole.bounds
     scale = 1 / (high - low)
     offset = -scale * np.array([*(low + high)[:2] / 2, low[2]])
     pieces = [convex(piece * scale + offset) for part in parts for piece in part.pieces]
     looks = [look for part in parts for look in (part.look, *(p[1] for p in part.patches))]
-    own = tuple(dict.fromkeys(look for look in looks if look is not None))
-    paint = np.concatenate([_paint(part, own) for part in parts])
+    own_looks = tuple(dict.fromkeys(look for look in looks if look is not None))
+    paint = np.concatenate([_paint(part, own_looks) for part in parts])
     x, y, z = (float(side) for side in high - low)
-    return Prop(
+    return PropShape(
         PREFIX + name,
         whole.moved(scale, offset),
         tuple(pieces),
         hollow=len(pieces) > 1,
         paint=paint,
-        own=own,
-        made=(x, y, z),
+        own_looks=own_looks,
+        modelled_size=(x, y, z),
     )
 
 
-def _paint(part: Part, own: tuple[Look, ...]) -> NDArray[np.int32]:
-    slot = 0 if part.look is None else 1 + own.index(part.look)
+def _paint(part: PropPart, own_looks: tuple[Look, ...]) -> NDArray[np.int32]:
+    slot = 0 if part.look is None else 1 + own_looks.index(part.look)
     paint = np.full(len(part.mesh.faces), slot, np.int32)
     for mask, look in part.patches:
-        paint[mask] = 1 + own.index(look)
+        paint[mask] = 1 + own_looks.index(look)
     return paint

@@ -12,8 +12,8 @@ from physion.numerics.elementary import cos, sin
 from physion.numerics.linear_algebra import norm, ordered_mean, unit
 from physion.scenes.scene import Look
 from physion.scenes.shapes.meshes import Points
-from physion.scenes.shapes.prop_parts import Part, prop
-from physion.scenes.shapes.prop_solids import ball, curve, limb, loft, ring, tube, turned
+from physion.scenes.shapes.prop_parts import PropPart, prop
+from physion.scenes.shapes.prop_solids import ball, curve, lathe, limb, loft, ring, tube
 from physion.seeds import child_generator, named_seed
 
 CLAY = Look((0.66, 0.42, 0.31), "plain")
@@ -29,7 +29,7 @@ TROUSERS = Look((0.18, 0.2, 0.28), "fabric_denim")
 SHOES = Look((0.1, 0.09, 0.09), "plastic_matte")
 
 
-def _leaf(path: ArrayLike, widths: ArrayLike, fold: float = 0.25) -> Part:
+def _leaf(path: ArrayLike, widths: ArrayLike, fold: float = 0.25) -> PropPart:
     """A leaf along ``path`` (K, 3): pointed at both ends, folded along its middle."""
     points = np.asarray(path, np.float64)
     way = points[-1] - points[0]
@@ -42,31 +42,31 @@ def _leaf(path: ArrayLike, widths: ArrayLike, fold: float = 0.25) -> Part:
     rings = np.stack([rim + width * across, points + thick, rim - width * across, points - thick])
     part = loft(np.swapaxes(rings, 0, 1))
     middle = len(points) // 2
-    return Part(
+    return PropPart(
         part.mesh, (np.concatenate(rings[:, : middle + 1]), np.concatenate(rings[:, middle:]))
     )
 
 
-def _pot(radius: float, height: float, look: Look) -> Iterable[Part]:
+def _pot(radius: float, height: float, look: Look) -> Iterable[PropPart]:
     """A flower pot with a rim, full of soil."""
     lip = 0.8 * height
     wall = [(0.7 * radius, 0.0), (0.92 * radius, lip), (radius, lip + 0.005), (radius, height)]
-    yield turned(wall, wall=0.1 * radius, look=look)
-    yield turned([(0.8 * radius, 0.6 * height), (0.88 * radius, 0.9 * height)], look=SOIL, sides=16)
+    yield lathe(wall, wall=0.1 * radius, look=look)
+    yield lathe([(0.8 * radius, 0.6 * height), (0.88 * radius, 0.9 * height)], look=SOIL, sides=16)
 
 
 @prop("plant", (0.46, 0.482, 0.676))
-def _plant() -> Iterable[Part]:
+def _plant() -> Iterable[PropPart]:
     """A garden plant: a tuft of arching blades in a clay pot."""
     yield from _pot(0.14, 0.22, CLAY)
     # The same plant for everybody.
     seed = named_seed("prop", "plant")
     rng = child_generator(seed, "blades")
     for i in range(34):
-        turn = i * math.pi * (3 - math.sqrt(5))
+        angle = i * math.pi * (3 - math.sqrt(5))
         reach = 0.04 + 0.22 * math.sqrt((i + 0.5) / 34)
         rise = 0.62 - 1.0 * reach + 0.1 * rng.random()
-        way = np.array([cos(turn), sin(turn), 0.0])
+        way = np.array([cos(angle), sin(angle), 0.0])
         stations = [(0.02, 0.19), (0.3 * reach, 0.19 + 0.6 * rise), (0.7 * reach, 0.16 + rise)]
         stations.append((reach, 0.19 + rise - 0.6 * reach))
         path = curve([r * way + [0, 0, z * 0.82 + 0.03] for r, z in stations], 2)
@@ -74,17 +74,17 @@ def _plant() -> Iterable[Part]:
 
 
 @prop("houseplant", (0.508, 0.473, 0.832))
-def _houseplant() -> Iterable[Part]:
+def _houseplant() -> Iterable[PropPart]:
     """A rubber plant: a stem with broad leaves all the way up, in a white pot."""
     yield from _pot(0.15, 0.25, GLAZED)
     stem = curve([(0, 0, 0.2), (0.015, 0.01, 0.4), (-0.01, 0.0, 0.6), (0.0, 0.0, 0.74)], 2)
     yield tube(stem, np.linspace(0.014, 0.006, len(stem)), STALK, sides=6)
     for i in range(17):
-        turn, share = i * math.pi * (3 - math.sqrt(5)), i / 16
-        size = 0.27 - 0.12 * share
-        way = np.array([cos(turn), sin(turn), 0.0])
-        lift = 0.25 + 0.75 * share
-        start = np.array([0, 0, 0.34 + 0.4 * share])
+        angle, fraction = i * math.pi * (3 - math.sqrt(5)), i / 16
+        size = 0.27 - 0.12 * fraction
+        way = np.array([cos(angle), sin(angle), 0.0])
+        lift = 0.25 + 0.75 * fraction
+        start = np.array([0, 0, 0.34 + 0.4 * fraction])
         bend = [
             (0.0, 0.0),
             (0.3, 0.28 * lift + 0.1),
@@ -96,7 +96,7 @@ def _houseplant() -> Iterable[Part]:
 
 
 @prop("cactus", (0.33, 0.2, 0.58))
-def _cactus() -> Iterable[Part]:
+def _cactus() -> Iterable[PropPart]:
     """A ribbed column with two arms, in a clay pot."""
     yield from _pot(0.1, 0.14, CLAY)
     yield _ribbed(np.array([(0, 0, z) for z in (0.1, 0.25, 0.4, 0.53)]), 0.05)
@@ -106,18 +106,18 @@ def _cactus() -> Iterable[Part]:
         yield _ribbed(curve(path, 3), 0.034)
 
 
-def _ribbed(path: Points, radius: float) -> Part:
+def _ribbed(path: Points, radius: float) -> PropPart:
     """A rounded tube with a star for its section."""
     part = tube(path, radius, sides=20, rounded=True)
     count = (len(part.mesh.vertices) - 2) // 20
     rings = part.mesh.vertices[:-2].reshape(count, 20, 3)
     middle = ordered_mean(rings, axis=1)[:, None]
     star = np.where(np.arange(20) % 2 == 0, 1.0, 0.8)[:, None]
-    return Part(loft(middle + star * (rings - middle)).mesh, part.pieces)
+    return PropPart(loft(middle + star * (rings - middle)).mesh, part.pieces)
 
 
 @prop("dog", (0.212, 0.886, 0.613))
-def _dog() -> Iterable[Part]:
+def _dog() -> Iterable[PropPart]:
     """A standing hound: dark saddle, white legs, chest and muzzle."""
     spine = [(-0.27, 0.385), (-0.2, 0.375), (-0.05, 0.365), (0.1, 0.355), (0.19, 0.375)]
     torso = tube(
@@ -148,7 +148,7 @@ def _dog() -> Iterable[Part]:
     yield wag.patched(lambda c, n: c[:, 2] > 0.52, WHITE_FUR)
 
 
-def _head(at: Sequence[float]) -> Iterable[Part]:
+def _head(at: Sequence[float]) -> Iterable[PropPart]:
     """A hound's head with its skull about ``at``, looking to +y."""
     x, y, z = at
     skull = tube(
@@ -166,11 +166,11 @@ def _head(at: Sequence[float]) -> Iterable[Part]:
         yield ball((x + 0.034 * side, y + 0.086, z + 0.018), (0.01, 0.009, 0.01), NOSE, sides=8)
         ear = ball((0, 0, -0.055), (0.013, 0.042, 0.068), sides=10)
         root = (x + 0.066 * side, y + 0.005, z + 0.035)
-        yield ear.turned((0, 1, 0), -0.28 * side).moved(root)
+        yield ear.rotated((0, 1, 0), -0.28 * side).moved(root)
 
 
 @prop("dog_sitting", (0.258, 0.573, 0.618))
-def _dog_sitting() -> Iterable[Part]:
+def _dog_sitting() -> Iterable[PropPart]:
     """The same hound, sitting upright."""
     spine = [(-0.11, 0.13), (-0.1, 0.2), (-0.02, 0.31), (0.06, 0.39)]
     torso = tube(
@@ -196,7 +196,7 @@ def _dog_sitting() -> Iterable[Part]:
 
 
 @prop("person", (0.565, 0.282, 1.75))
-def _person() -> Iterable[Part]:
+def _person() -> Iterable[PropPart]:
     """A standing man in a pullover and jeans."""
     for x in (-0.095, 0.095):
         yield tube(

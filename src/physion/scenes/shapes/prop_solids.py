@@ -15,18 +15,18 @@ from physion.numerics.linear_algebra import dot, multiply, norm, ordered_mean, u
 from physion.scenes.scene import Look, Vec3
 from physion.scenes.shapes.meshes import Mesh, Points, box, hull, revolve, solid_properties
 from physion.scenes.shapes.primitives import CURVED, ball_mesh
-from physion.scenes.shapes.prop_parts import Part
+from physion.scenes.shapes.prop_parts import PropPart
 
 SIDES = 24
 """Sides of what is turned."""
 
 
-def solid(mesh: Mesh, look: Look | None = None) -> Part:
+def solid(mesh: Mesh, look: Look | None = None) -> PropPart:
     """A convex mesh, which is its own piece."""
-    return Part(mesh, (mesh.vertices,), look)
+    return PropPart(mesh, (mesh.vertices,), look)
 
 
-def board(center: ArrayLike, half: ArrayLike, look: Look | None = None) -> Part:
+def board(center: ArrayLike, half: ArrayLike, look: Look | None = None) -> PropPart:
     """A box by its centre and half sizes."""
     return solid(box(center, half), look)
 
@@ -37,14 +37,16 @@ def block(
     bottom: float,
     top: float,
     look: Look | None = None,
-) -> Part:
+) -> PropPart:
     """A box that tapers: half sizes ``low`` at height ``bottom``, ``high`` at ``top``."""
     signs = [(x, y) for x in (-1, 1) for y in (-1, 1)]
     points = [(x * low[0], y * low[1], bottom) for x, y in signs]
     return solid(hull(points + [(x * high[0], y * high[1], top) for x, y in signs]), look)
 
 
-def cushion(center: ArrayLike, half: ArrayLike, radius: float, look: Look | None = None) -> Part:
+def cushion(
+    center: ArrayLike, half: ArrayLike, radius: float, look: Look | None = None
+) -> PropPart:
     """A box with edges rounded by ``radius``."""
     ball = ball_mesh(radius, 12).vertices
     inner = np.asarray(half, np.float64) - radius
@@ -59,24 +61,24 @@ def limb(
     thick: float,
     thin: float | None = None,
     look: Look | None = None,
-) -> Part:
+) -> PropPart:
     """A rounded limb from ``start`` to ``end``; radii ``thick`` and ``thin`` at the ends."""
     first = ball_mesh(thick, 10).moved(offset=start).vertices
     last = ball_mesh(thick if thin is None else thin, 10).moved(offset=end).vertices
     return solid(hull(np.concatenate([first, last]), CURVED), look)
 
 
-def ball(center: ArrayLike, half: ArrayLike, look: Look | None = None, sides: int = 16) -> Part:
+def ball(center: ArrayLike, half: ArrayLike, look: Look | None = None, sides: int = 16) -> PropPart:
     """An ellipsoid by its centre and half sizes."""
     return solid(ball_mesh(1.0, sides).moved(half, center), look)
 
 
-def turned(
+def lathe(
     outline: Sequence[tuple[float, float]],
     wall: float | None = None,
     look: Look | None = None,
     sides: int = SIDES,
-) -> Part:
+) -> PropPart:
     """An ``outline`` of (radius, height) from the bottom up, turned; hollow if it has a ``wall``.
 
     Its pieces are the full slices between neighbouring points.
@@ -93,14 +95,16 @@ def turned(
         for a, b in itertools.pairwise(outline)
         if b[1] > a[1]
     ]
-    return Part(revolve(profile, sides, smooth=CURVED), tuple(slices), look)
+    return PropPart(revolve(profile, sides, smooth=CURVED), tuple(slices), look)
 
 
-def sleeve(outline: Sequence[tuple[float, float]], wall: float, look: Look | None = None) -> Part:
+def sleeve(
+    outline: Sequence[tuple[float, float]], wall: float, look: Look | None = None
+) -> PropPart:
     """A turned wall, open above and below, as a lamp shade; its pieces are full slices."""
     inside = [(r - wall, z) for r, z in reversed(outline)]
     mesh = revolve([*outline, *inside], SIDES, closed=True, smooth=CURVED)
-    return replace(turned(outline, look=look), mesh=mesh)
+    return replace(lathe(outline, look=look), mesh=mesh)
 
 
 def curve(points: Sequence[Sequence[float]] | Sequence[Points], steps: int = 5) -> Points:
@@ -128,7 +132,7 @@ def tube(
     sides: int = 8,
     rounded: bool = False,
     closed: bool = False,
-) -> Part:
+) -> PropPart:
     """A tube along ``path`` (K, 3) with elliptic sections: one radius, one a point, or two.
 
     Of two radii the first lies level, across the path, where the path is not upright; ``rounded``
@@ -142,8 +146,8 @@ def tube(
     across, up, ways = _frames(points, closed)
     if rounded:
         points, sizes, across, up = _domed(points, sizes, across, up, ways)
-    turns = 2 * math.pi * np.arange(sides) / sides
-    section = np.stack([cos(turns), sin(turns)], axis=1)
+    angles = 2 * math.pi * np.arange(sides) / sides
+    section = np.stack([cos(angles), sin(angles)], axis=1)
     spokes = np.stack([across * sizes[:, :1], up * sizes[:, 1:]], axis=1)
     rings = points[:, None] + multiply(section, spokes)
     part = loft(rings, look, closed=closed)
@@ -155,7 +159,7 @@ def tube(
     return replace(part, pieces=tuple(pieces))
 
 
-def loft(rings: Points, look: Look | None = None, *, closed: bool = False) -> Part:
+def loft(rings: Points, look: Look | None = None, *, closed: bool = False) -> PropPart:
     """The skin over rings (K, S, 3) of corners, closed by fans; its pieces lie between rings."""
     count, sides = rings.shape[:2]
     at = np.arange(count * sides).reshape(count, sides)
@@ -175,22 +179,22 @@ def loft(rings: Points, look: Look | None = None, *, closed: bool = False) -> Pa
         mesh = replace(mesh, faces=np.ascontiguousarray(mesh.faces[:, ::-1]))
     around = [*rings, rings[0]] if closed else list(rings)
     pieces = tuple(np.concatenate(pair) for pair in itertools.pairwise(around))
-    return Part(mesh, pieces, look)
+    return PropPart(mesh, pieces, look)
 
 
 def arc(
     center: ArrayLike, right: ArrayLike, up: ArrayLike, first: float, last: float, count: int
 ) -> Points:
     """``count`` points (K, 3) of an ellipse with these half axes, between two angles in radians."""
-    turns = np.linspace(first, last, count)[:, None]
+    angles = np.linspace(first, last, count)[:, None]
     middle, x, y = (np.asarray(v, np.float64) for v in (center, right, up))
-    return np.asarray(middle + cos(turns) * x + sin(turns) * y)
+    return np.asarray(middle + cos(angles) * x + sin(angles) * y)
 
 
 def ring(x: float, y: float, z: float, sides: int = 12) -> list[Vec3]:
     """Corners of a level ellipse at height ``z``."""
-    turns = 2 * math.pi * np.arange(sides) / sides
-    return [(x * cos(t), y * sin(t), z) for t in turns]
+    angles = 2 * math.pi * np.arange(sides) / sides
+    return [(x * cos(t), y * sin(t), z) for t in angles]
 
 
 def _frames(points: Points, closed: bool) -> tuple[Points, Points, Points]:
@@ -214,12 +218,12 @@ def _domed(
     points: Points, sizes: Points, across: Points, up: Points, ways: Points
 ) -> tuple[Points, Points, Points, Points]:
     """The path with three more rings at each end, which close it like half a ball."""
-    turns = np.radians([84.0, 60.0, 30.0])[:, None]
-    first = points[0] - ways[0] * sin(turns) * sizes[0].min()
-    last = points[-1] + ways[-1] * sin(turns[::-1]) * sizes[-1].min()
+    angles = np.radians([84.0, 60.0, 30.0])[:, None]
+    first = points[0] - ways[0] * sin(angles) * sizes[0].min()
+    last = points[-1] + ways[-1] * sin(angles[::-1]) * sizes[-1].min()
     return (
         np.concatenate([first, points, last]),
-        np.concatenate([sizes[0] * cos(turns), sizes, sizes[-1] * cos(turns[::-1])]),
+        np.concatenate([sizes[0] * cos(angles), sizes, sizes[-1] * cos(angles[::-1])]),
         np.concatenate([across[:1].repeat(3, 0), across, across[-1:].repeat(3, 0)]),
         np.concatenate([up[:1].repeat(3, 0), up, up[-1:].repeat(3, 0)]),
     )

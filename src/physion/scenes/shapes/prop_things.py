@@ -12,18 +12,18 @@ from physion.numerics.elementary import arctan2, cos, power, sin
 from physion.scenes.scene import Look
 from physion.scenes.shapes.meshes import hull
 from physion.scenes.shapes.primitives import ball_mesh
-from physion.scenes.shapes.prop_parts import Part, prop
+from physion.scenes.shapes.prop_parts import PropPart, prop
 from physion.scenes.shapes.prop_solids import (
     arc,
     ball,
     block,
     board,
     cushion,
+    lathe,
     limb,
     loft,
     solid,
     tube,
-    turned,
 )
 
 SEA = Look((0.3, 0.46, 0.66), "plastic_glossy")
@@ -56,12 +56,12 @@ WORLD = """
 
 
 @prop("globe", (0.325, 0.3, 0.446))
-def _globe() -> Iterable[Part]:
+def _globe() -> Iterable[PropPart]:
     """A globe of the earth in a brass half ring on a wooden foot."""
-    yield turned([(0.12, 0.0), (0.12, 0.02), (0.1, 0.03), (0.03, 0.05), (0.02, 0.085)])
+    yield lathe([(0.12, 0.0), (0.12, 0.02), (0.1, 0.03), (0.03, 0.05), (0.02, 0.085)])
     center, radius = (0.0, 0.0, 0.285), 0.15
     tilt = math.radians(23.4)
-    earth = Part(ball_mesh(radius, 44), (ball_mesh(radius, 16).vertices,), SEA)
+    earth = PropPart(ball_mesh(radius, 44), (ball_mesh(radius, 16).vertices,), SEA)
     earth = earth.patched(lambda c, n: _world(c, "#"), LAND).patched(
         lambda c, n: _world(c, "*"), ICE
     )
@@ -69,7 +69,7 @@ def _globe() -> Iterable[Part]:
     frame = tube(half, [(0.008, 0.008)] * 13, BRASS)
     pins = (tube([(0, 0, s * 0.145), (0, 0, s * 0.172)], 0.007, BRASS) for s in (-1, 1))
     for part in (earth, frame, *pins):
-        yield part.turned((0, 1, 0), tilt).moved(center)
+        yield part.rotated((0, 1, 0), tilt).moved(center)
 
 
 def _world(centers: NDArray[np.float64], kind: str) -> NDArray[np.bool_]:
@@ -90,14 +90,14 @@ def _world(centers: NDArray[np.float64], kind: str) -> NDArray[np.bool_]:
 
 
 @prop("moon_globe", (0.3, 0.3, 0.36))
-def _moon_globe() -> Iterable[Part]:
+def _moon_globe() -> Iterable[PropPart]:
     """A globe of the moon on a low ring."""
-    yield turned([(0.1, 0.0), (0.1, 0.02), (0.07, 0.04), (0.085, 0.08)], look=BRASS)
+    yield lathe([(0.1, 0.0), (0.1, 0.02), (0.07, 0.04), (0.085, 0.08)], look=BRASS)
     yield ball((0, 0, 0.21), (0.15, 0.15, 0.15), sides=32)
 
 
 @prop("crate", (0.5, 0.5, 0.5))
-def _crate() -> Iterable[Part]:
+def _crate() -> Iterable[PropPart]:
     """A slatted wooden crate."""
     yield board((0, 0, 0.25), (0.215, 0.215, 0.24), INSIDE)
     for x in (-0.215, 0.215):
@@ -112,7 +112,7 @@ def _crate() -> Iterable[Part]:
 
 
 @prop("basket", (0.698, 0.696, 0.5))
-def _basket() -> Iterable[Part]:
+def _basket() -> Iterable[PropPart]:
     """A square woven basket with a thick rim, open above."""
     wall, flare = 0.02, 0.045
     yield block((0.3, 0.3), (0.3, 0.3), 0.0, wall)
@@ -128,7 +128,7 @@ def _basket() -> Iterable[Part]:
 
 
 @prop("carton", (0.797, 0.59, 0.432))
-def _carton() -> Iterable[Part]:
+def _carton() -> Iterable[PropPart]:
     """A cardboard box, its flaps open, with a label."""
     x, y, high, wall = 0.27, 0.19, 0.32, 0.004
     yield board((0, 0, wall), (x, y, wall))
@@ -136,19 +136,19 @@ def _carton() -> Iterable[Part]:
         yield board((side * x, 0, high / 2), (wall, y + wall, high / 2))
         yield board((0, side * y, high / 2), (x - wall, wall, high / 2))
         flap = board((0, 0, 0.075), (wall, y, 0.075))
-        yield flap.turned((0, 1, 0), side * 1.0).moved((side * x, 0, high))
+        yield flap.rotated((0, 1, 0), side * 1.0).moved((side * x, 0, high))
         flap = board((0, 0, 0.075), (x, wall, 0.075))
-        yield flap.turned((1, 0, 0), side * -0.75).moved((0, side * y, high))
+        yield flap.rotated((1, 0, 0), side * -0.75).moved((0, side * y, high))
         label = Look((0.92, 0.92, 0.9), "plain")
         yield board((side * 0.11, side * (y + wall), 0.17), (0.09, 0.002, 0.055), label)
 
 
 @prop("pillow", (0.16, 0.42, 0.42))
-def _pillow() -> Iterable[Part]:
+def _pillow() -> Iterable[PropPart]:
     """A throw pillow: plump in the middle, thin at the seams, drawn out at the corners."""
     sides, rings = 32, []
-    turns = 2 * math.pi * (np.arange(sides) + 0.5) / sides
-    c, s = cos(turns), sin(turns)
+    angles = 2 * math.pi * (np.arange(sides) + 0.5) / sides
+    c, s = cos(angles), sin(angles)
     square = np.stack([np.sign(c) * power(abs(c), 0.45), np.sign(s) * power(abs(s), 0.45)], axis=1)
     depths = np.array([-0.98, -0.85, -0.6, -0.3, 0.0, 0.3, 0.6, 0.85, 0.98])
     widths = 0.21 * power(1 - power(abs(depths), 1.6), 0.55) / np.abs(square).max()
@@ -156,13 +156,13 @@ def _pillow() -> Iterable[Part]:
         x = np.full((sides, 1), 0.08 * depth / 0.98)
         rings.append(np.concatenate([x, width * square], axis=1))
     mesh = loft(np.array(rings)).mesh
-    yield Part(mesh, (mesh.vertices,))
+    yield PropPart(mesh, (mesh.vertices,))
 
 
 @prop("sculpture", (0.64, 0.64, 0.72))
-def _sculpture() -> Iterable[Part]:
+def _sculpture() -> Iterable[PropPart]:
     """A seated buddha on a plinth."""
-    yield turned([(0.3, 0.0), (0.32, 0.02), (0.3, 0.05), (0.31, 0.08)])
+    yield lathe([(0.3, 0.0), (0.32, 0.02), (0.3, 0.05), (0.31, 0.08)])
     for side in (-1, 1):
         yield limb((side * 0.1, -0.04, 0.16), (side * 0.23, 0.1, 0.13), 0.075, 0.06)
         yield limb((side * 0.23, 0.1, 0.13), (-side * 0.06, 0.17, 0.12), 0.055, 0.04)
@@ -176,7 +176,7 @@ def _sculpture() -> Iterable[Part]:
 
 
 @prop("boat", (0.584, 2.8, 0.45))
-def _boat() -> Iterable[Part]:
+def _boat() -> Iterable[PropPart]:
     """A kayak with a cockpit."""
     rings = []
     stations = np.linspace(-1, 1, 15)
@@ -202,7 +202,7 @@ def _boat() -> Iterable[Part]:
 
 
 @prop("rod", (0.072, 1.0, 0.07))
-def _rod() -> Iterable[Part]:
+def _rod() -> Iterable[PropPart]:
     """A baseball bat, lying."""
     profile = [(-0.5, 0.024), (-0.485, 0.026), (-0.47, 0.016), (-0.2, 0.015), (0.1, 0.024)]
     profile += [(0.3, 0.033), (0.44, 0.036), (0.485, 0.032), (0.5, 0.02)]
@@ -212,6 +212,6 @@ def _rod() -> Iterable[Part]:
 
 
 @prop("slab", (0.4, 0.4, 0.03))
-def _slab() -> Iterable[Part]:
+def _slab() -> Iterable[PropPart]:
     """A plate or a coin."""
-    yield turned([(0.18, 0.0), (0.2, 0.01), (0.2, 0.02), (0.18, 0.03)])
+    yield lathe([(0.18, 0.0), (0.2, 0.01), (0.2, 0.02), (0.18, 0.03)])

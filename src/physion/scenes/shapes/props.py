@@ -15,6 +15,6 @@ from physion.scenes.shapes import (  # noqa: F401  # importing them registers th
     prop_vessels,
 )
 from physion.scenes.shapes.primitives import shapes
-from physion.scenes.shapes.prop_parts import NATURAL_SIZES, Prop
+from physion.scenes.shapes.prop_parts import NATURAL_SIZES, PropShape
 
-__all__ = ["NATURAL_SIZES", "Prop", "shapes"]
+__all__ = ["NATURAL_SIZES", "PropShape", "shapes"]

@@ -13,8 +13,8 @@ from typing import Any
 
 from physion.errors import BadInputError, PhysionError
 from physion.numerics.rotations import multiply_quaternions
-from physion.scenes.sampling.parameters import as_quaternion, three_turns
-from physion.scenes.scene import Contact, Push, Quat, Vec3
+from physion.scenes.sampling.parameters import as_quaternion, euler_rotation
+from physion.scenes.scene import Push, Quat, SurfaceMaterial, Vec3
 from physion.scenes.tdw.log_lines import Command
 
 IGNORED_COMMANDS = frozenset(
@@ -61,7 +61,7 @@ VANISHING_SCALE = 1e-4
 """Bodies scaled below this are placeholders of the official generator (no attachment, an empty
 end of the size gradient); they are left out and noted."""
 
-UNSET_CONTACT = Contact(0.6, 0.6, 0.0)
+UNSET_MATERIAL = SurfaceMaterial(0.6, 0.6, 0.0)
 """Unity's default material, for objects that were given none."""
 
 
@@ -80,7 +80,7 @@ def quaternion_from_euler(degrees: Any) -> Quat:
     """Unity's Euler angles (turn about z, then x, then y) as a quaternion in our axes."""
     # Swapping y and z mirrors space, so that turns go the other way; two whole turns are none.
     x, y, z = (-math.fmod(angle, 720.0) for angle in vector(degrees))
-    return three_turns(x, y, z)
+    return euler_rotation(x, y, z)
 
 
 def _to_our_axes(unity: Quat) -> Quat:
@@ -100,7 +100,7 @@ class LoggedObject:
     rotation: Quat
     scale: Vec3 = (1.0, 1.0, 1.0)
     mass: float | None = None
-    contact: Contact = UNSET_CONTACT
+    contact: SurfaceMaterial = UNSET_MATERIAL
     kinematic: bool = False
     drag: float = 0.0
     angular_drag: float = 0.05
@@ -229,11 +229,11 @@ class CommandReader:
     def do_rotate_object_by(self, command: Command) -> None:
         self._at_start()
         axis = {"pitch": "x", "yaw": "y", "roll": "z"}[command.get("axis", "yaw")]
-        turn = {"x": 0.0, "y": 0.0, "z": 0.0, axis: float(command["angle"])}
-        thing, by = self._object(command), quaternion_from_euler(turn)
+        angles = {"x": 0.0, "y": 0.0, "z": 0.0, axis: float(command["angle"])}
+        thing, by = self._object(command), quaternion_from_euler(angles)
         world = bool(command.get("is_world", True))
-        turns = (by, thing.rotation) if world else (thing.rotation, by)
-        thing.rotation = as_quaternion(multiply_quaternions(*turns))
+        factors = (by, thing.rotation) if world else (thing.rotation, by)
+        thing.rotation = as_quaternion(multiply_quaternions(*factors))
 
     def do_set_mass(self, command: Command) -> None:
         self._at_start()
@@ -241,7 +241,7 @@ class CommandReader:
 
     def do_set_physic_material(self, command: Command) -> None:
         self._at_start()
-        self._object(command).contact = Contact(
+        self._object(command).contact = SurfaceMaterial(
             float(command["static_friction"]),
             float(command["dynamic_friction"]),
             float(command["bounciness"]),

@@ -71,9 +71,9 @@ def read_metadata(path: Path) -> dict[str, dict[str, Any]]:
     if not isinstance(data, list) or not all(isinstance(record, dict) for record in data):
         raise BadInputError(f"{path} is not a list with one object a trial")
     records = {}
-    for place, record in enumerate(data):
+    for position, record in enumerate(data):
         match = re.search(r"_(\d{4,})$", str(record.get("stimulus_name")))
-        records[str(int(match.group(1)) if match else place)] = record
+        records[str(int(match.group(1)) if match else position)] = record
     return records
 
 

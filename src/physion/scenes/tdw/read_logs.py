@@ -38,19 +38,11 @@ from physion.scenes.tdw.log_lines import (
     read_metadata,
 )
 from physion.seeds import generator
+from physion.stimulus_names import CONTROLLERS
 
-SCENARIOS = {
-    "MultiDominoes": "dominoes",
-    "Tower": "support",
-    "Collision": "collide",
-    "Containment": "contain",
-    "Drop": "drop",
-    "Linking": "link",
-    "RollingSliding": "roll",
-    "ClothSagging": "drape",
-}
-"""Controller names of the official metadata. Some Roll trials were made by the Collide controller:
-a folder whose name says ``rolling`` is Roll."""
+SCENARIOS = {controller: scenario for scenario, controller in CONTROLLERS.items()}
+"""Scenario by ``controller_name`` of the official metadata. Some Roll trials were made by the
+Collide controller: a folder whose name contains ``rolling`` is Roll."""
 
 MAX_FRAMES = {"collide": 152, "contain": 452, "link": 452, "support": 602, "drape": 151}
 """Longest trial by scenario, frame 0 counted; 302 for the others (reference section 2.6)."""
@@ -63,7 +55,7 @@ FLEX_SETTLE_FRAMES = 100
 
 
 @dataclass(frozen=True)
-class Outcome:
+class RecordedOutcome:
     """What the official simulator recorded for a trial (its ``metadata.json``).
 
     Frames are counted from 0. ``displacement`` is the agent's final position minus its reference
@@ -82,7 +74,7 @@ class ImportedTrial:
     """A scene with what really happened in it. ``notes`` say what was left out."""
 
     scene: Scene
-    outcome: Outcome
+    outcome: RecordedOutcome
     notes: tuple[str, ...] = ()
 
 
@@ -253,8 +245,8 @@ class _SceneBuilder:
     def _look(self, thing: LoggedObject) -> Look:
         if thing.color is None and thing.model not in shapes:
             # Library models bring their own pictures: a model looks the same in every trial.
-            chance = generator("library model", thing.model)
-            return prop_look(chance, prop_for(thing.category, thing.model))
+            rng = generator("library model", thing.model)
+            return prop_look(rng, prop_for(thing.category, thing.model))
         return Look(thing.color or (0.8, 0.8, 0.8), thing.texture)
 
     def _body(self, thing: LoggedObject) -> Body:
@@ -305,14 +297,14 @@ class _SceneBuilder:
             look=replace(self._look(thing), texture="cloth"),
         )
 
-    def outcome(self) -> Outcome:
+    def outcome(self) -> RecordedOutcome:
         record = self.record
         contact = record.get("does_target_contact_zone")
         if not isinstance(contact, bool):
             raise BadInputError("metadata.json does not say does_target_contact_zone for it")
         first = record.get("first_target_contact_zone_frame")
         moved = record.get("final_target_displacement")
-        return Outcome(
+        return RecordedOutcome(
             contact=contact,
             first_frame=int(first) if isinstance(first, int) else None,
             frames=int(record.get("num_frames") or 0),

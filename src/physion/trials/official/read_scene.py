@@ -22,19 +22,19 @@ from physion.scenes.scene import (
     Body,
     Camera,
     Cloth,
-    Contact,
     Ending,
     Look,
     Push,
     Quat,
     Roles,
     Scene,
+    SurfaceMaterial,
     Vec3,
 )
 from physion.scenes.shapes.primitives import shapes
 from physion.scenes.shapes.prop_names import FALLBACK, prop_for
 from physion.scenes.tdw.commands import ROOMS as SCENE_ROOMS
-from physion.scenes.tdw.commands import UNSET_CONTACT, VANISHING_SCALE
+from physion.scenes.tdw.commands import UNSET_MATERIAL, VANISHING_SCALE
 from physion.seeds import generator
 from physion.trials.official.axes import (
     from_official_camera,
@@ -224,10 +224,10 @@ class SceneReader:
             rotation=rotation,
             scale=_vector(scale),
             mass=mass,
-            contact=Contact(
-                float(self._physics("static_friction", UNSET_CONTACT.static_friction)[place]),
-                float(self._physics("dynamic_friction", UNSET_CONTACT.dynamic_friction)[place]),
-                float(self._physics("bounciness", UNSET_CONTACT.restitution)[place]),
+            contact=SurfaceMaterial(
+                float(self._physics("static_friction", UNSET_MATERIAL.static_friction)[place]),
+                float(self._physics("dynamic_friction", UNSET_MATERIAL.dynamic_friction)[place]),
+                float(self._physics("bounciness", UNSET_MATERIAL.restitution)[place]),
             ),
             kinematic=(held and still) or scenery,
             scenery=scenery,
