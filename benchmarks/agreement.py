@@ -31,7 +31,7 @@ from physion.analysis.models.people_comparison import compare_everywhere
 from physion.analysis.people.answers import Answers
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.statistics.kappa import pair_values, pairwise_kappa, resampled_mean_kappa
-from physion.analysis.tables.stimuli import SCENARIOS
+from physion.stimulus_names import SCENARIOS
 
 RESULTS = Path(__file__).parent / "results" / "agreement.json"
 PEOPLE, STIMULI, MODELS, RESAMPLES = 100, 150, 20, 1000

@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from physion.analysis.tables.stimuli import SCENARIOS
 from physion.report import assembly, build
+from physion.stimulus_names import SCENARIOS
 
 RESULTS = Path(__file__).parent / "results"
 PEOPLE, STIMULI, PRACTICE = 100, 150, 10

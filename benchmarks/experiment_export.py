@@ -27,12 +27,12 @@ from typing import Any
 import numpy as np
 from sqlalchemy import insert
 
-from physion.analysis.tables.stimuli import SCENARIOS
 from physion.experiment.export.export_study import export_study
 from physion.experiment.store.database import open_database, upgrade
 from physion.experiment.store.tables import ANSWERS, EVENTS, PARTICIPANTS, SESSIONS, STUDIES
 from physion.experiment.study.stimuli import Stimulus
 from physion.experiment.study.study import Study
+from physion.stimulus_names import SCENARIOS
 
 RESULTS = Path(__file__).parent / "results"
 PRACTICE, TEST = 10, 150

@@ -17,8 +17,7 @@ from PIL import Image
 
 from physion.analysis import Comparison
 from physion.analysis.people.difficulty import below_chance
-from physion.analysis.tables.score_tables import MEAN
-from physion.analysis.tables.stimuli import SCENARIOS
+from physion.analysis.tables.stimuli import MEAN
 from physion.report.figures import by_scenario as figures
 from physion.report.figures import by_stimulus as figures_stimuli
 from physion.report.figures import figure_tables, theme
@@ -26,9 +25,10 @@ from physion.report.figures.plots import plots
 from physion.report.inputs import ReportInputs
 from physion.report.mixed_fits import fits_of_models
 from physion.report.page import blocks
-from physion.report.page.blocks import protocol_names
 from physion.report.page.document import Picture
 from physion.report.page.page import render_page
+from physion.report.words import number, protocol_names
+from physion.stimulus_names import SCENARIOS
 
 Maker = Callable[..., Comparison]
 
@@ -86,7 +86,7 @@ def test_points_are_the_stimuli_in_the_square_of_their_scenario(make_comparison:
         assert np.allclose(line.get_xydata(), expected)
     words = [text.get_text() for text in figure.axes[1].texts]
     r = np.corrcoef(*own.loc[own["scenario"] == "drop", ["p_contact", "p_yes"]].T.to_numpy())[0, 1]
-    assert words[1] == f"drop, r = {blocks.number(r)}"
+    assert words[1] == f"drop, r = {number(r)}"
 
 
 def test_bars_hold_every_stimulus_and_mark_the_tail() -> None:

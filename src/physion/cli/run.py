@@ -108,8 +108,8 @@ def plan_sampled(options: Options) -> Plan:
 def plan_official(options: Options) -> Plan:
     """The official scenes: those that people saw for testing, the others for the readout."""
     from physion.analysis.tables.responses import read_humans
-    from physion.analysis.tables.stimuli import canonical_name
     from physion.scenes.tdw.read_logs import read_scenes
+    from physion.stimulus_names import canonical_name
     from physion.trials.making.plan import check_names, plan_scenes
 
     assert options.scenes is not None
@@ -216,9 +216,9 @@ def write_report(
     """The report's page and its table of scores."""
     import pandas as pd
 
-    from physion.analysis.tables.stimuli import canonical_name
     from physion.report.build import compare_files
     from physion.report.page.movies import movies_of
+    from physion.stimulus_names import canonical_name
     from physion.trials.dataset import Dataset
 
     dataset = Dataset(folder(options) / "trials")

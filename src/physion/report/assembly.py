@@ -18,13 +18,13 @@ from physion.analysis.statistics.calibration import calibration_table
 from physion.analysis.statistics.paired import compare_models
 from physion.report.inputs import ReportInputs, permutations_of
 from physion.report.mixed_fits import fits_of_models, fits_of_people
-from physion.report.page.blocks import plural
 from physion.report.people_results import (
     PeopleResults,
     analyse_people,
     read_any_responses,
     rules_called,
 )
+from physion.report.words import plural
 
 
 def people_from_files(

@@ -44,8 +44,8 @@ from physion.analysis.tables.attributes import (
 )
 from physion.analysis.tables.attributes import COLUMNS as ATTRIBUTE_COLUMNS
 from physion.analysis.tables.csv_table import read_csv, read_table
-from physion.analysis.tables.stimuli import OFFICIAL_SCENARIOS, canonical_name, scenario_of
 from physion.errors import BadInputError, UnknownNameError
+from physion.stimulus_names import OFFICIAL_SCENARIOS, canonical_name, scenario_of
 
 
 @dataclass(frozen=True)

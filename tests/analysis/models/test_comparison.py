@@ -14,7 +14,7 @@ from physion.analysis.models.comparison import NO_LABEL, NOT_PREDICTED, NOT_SEEN
 from physion.analysis.people.participants import EXCLUDED, LEDGE
 from physion.analysis.tables.predictions import check_predictions, name_models
 from physion.analysis.tables.responses import read_humans, read_labels
-from physion.analysis.tables.score_tables import MEAN, POOLED
+from physion.analysis.tables.stimuli import MEAN, POOLED
 from physion.errors import BadInputError
 
 QUICK = Bootstrap(resamples=200)

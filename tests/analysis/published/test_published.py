@@ -25,8 +25,8 @@ from physion.analysis.published.tables import (
     read_published,
 )
 from physion.analysis.statistics.bootstrap import Bootstrap
-from physion.analysis.tables.stimuli import SCENARIOS
 from physion.errors import BadInputError
+from physion.stimulus_names import SCENARIOS
 
 
 @pytest.fixture(scope="module")

@@ -11,12 +11,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from physion.analysis.tables.stimuli import canonical_name
 from physion.errors import BadInputError
 from physion.experiment.study.stimuli import (
     COLUMNS,
     Stimulus,
-    analysis_name,
     read_stimuli,
     write_stimuli,
 )
@@ -172,14 +170,6 @@ def test_names_that_are_one_to_the_analysis_are_refused(
     assert first in str(raised.value) and second in str(raised.value)
     rows[3] = dataclasses.replace(rows[3], scenario="drop")
     write_stimuli(tmp_path / "stimuli.csv", rows)
-
-
-PARTS = st.sampled_from(["-redyellow", "_img", ".mp4", ".hdf5", "s", "_0001"])
-
-
-@given(st.lists(PARTS, max_size=6).map("".join))
-def test_names_are_those_of_the_analysis(name: str) -> None:
-    assert analysis_name(name) == canonical_name(name)
 
 
 def _stimuli() -> list[Stimulus]:

@@ -16,16 +16,14 @@ from PIL import Image
 from physion.errors import BadInputError
 from physion.rendering.camera import axes
 from physion.scenes.scene import Camera
+from physion.stimulus_names import CONTROLLERS, guess_scenario, plain_name
 from physion.trials.official.names import (
-    CONTROLLERS,
     decode_depth,
     decode_picture,
     encode_depth,
     encode_flow,
     encode_normals,
     encode_picture,
-    guess_scenario,
-    plain_name,
     redyellow_name,
     segmentation_colors,
     split_name,

@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from physion.analysis.tables.stimuli import SCENARIOS
 from physion.errors import BadInputError
 from physion.seeds import child_generator, named_seed
+from physion.stimulus_names import SCENARIOS
 
 Array = npt.NDArray[np.float64]
 

@@ -26,7 +26,7 @@ from physion.analysis.statistics.calibration import calibration_table
 from physion.analysis.statistics.kappa import correctness
 from physion.analysis.statistics.paired import compare_models
 from physion.analysis.tables.csv_table import require_columns
-from physion.analysis.tables.score_tables import MEAN
+from physion.analysis.tables.stimuli import MEAN
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from physion.analysis.statistics.agreement import rmsd
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.statistics.correlation import correlate_rows
 from physion.analysis.statistics.kappa import cross_kappa
-from physion.analysis.tables.score_tables import MEAN
+from physion.analysis.tables.stimuli import MEAN
 from physion.errors import BadInputError
 
 Array = npt.NDArray[np.float64]

@@ -14,7 +14,7 @@ from physion.analysis.people.people import accuracy_by_participant, all_answers,
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.statistics.clustered_logit import clustered_logit
 from physion.analysis.tables.csv_table import require_columns
-from physion.analysis.tables.score_tables import in_order
+from physion.analysis.tables.stimuli import in_order
 
 Array = npt.NDArray[np.float64]
 

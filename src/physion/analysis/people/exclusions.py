@@ -18,7 +18,7 @@ import pandas as pd
 from physion.analysis.people.participants import Responses
 from physion.analysis.people.session_measures import longest_streak, session_measures
 from physion.analysis.statistics.clustered_logit import clustered_logit
-from physion.analysis.tables.score_tables import in_order
+from physion.analysis.tables.stimuli import in_order
 from physion.errors import BadInputError
 from physion.seeds import generator
 

@@ -19,7 +19,7 @@ from scipy import stats
 
 from physion.analysis.tables.attributes import ATTRIBUTES
 from physion.analysis.tables.csv_table import require_columns
-from physion.analysis.tables.score_tables import in_order
+from physion.analysis.tables.stimuli import in_order
 
 Array = npt.NDArray[np.float64]
 

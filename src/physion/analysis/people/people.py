@@ -23,7 +23,7 @@ from physion.analysis.statistics.kappa import (
     pairwise_kappa,
     resampled_mean_of_pairs,
 )
-from physion.analysis.tables.score_tables import MEAN, in_order
+from physion.analysis.tables.stimuli import MEAN, in_order
 from physion.errors import BadInputError
 from physion.seeds import generator
 

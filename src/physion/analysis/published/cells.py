@@ -22,7 +22,7 @@ from physion.analysis.published.tables import (
     in_paper_order,
 )
 from physion.analysis.statistics.bootstrap import Bootstrap
-from physion.analysis.tables.stimuli import SCENARIOS
+from physion.stimulus_names import SCENARIOS
 
 EXPECTED = {"training": "all", "readout": "observed+simulated"}
 """The cell that the paper's main figure shows."""

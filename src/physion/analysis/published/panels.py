@@ -22,7 +22,7 @@ from physion.analysis.published.tables import (
     in_paper_order,
 )
 from physion.analysis.statistics.bootstrap import Bootstrap
-from physion.analysis.tables.score_tables import MEAN
+from physion.analysis.tables.stimuli import MEAN
 
 FIRST_SEED = ("SVG", "RPIN")
 """Models of which panels A to C show seed 0 alone."""

@@ -10,7 +10,7 @@ from physion.analysis.models.zones import released_zone
 from physion.analysis.people.people import spearman_brown
 from physion.analysis.published.tables import PublishedTables
 from physion.analysis.statistics.bootstrap import Bootstrap
-from physion.analysis.tables.score_tables import MEAN
+from physion.analysis.tables.stimuli import MEAN
 
 RECRUITED = 800
 PEOPLE_EXCLUDED = 112

@@ -21,8 +21,9 @@ import pandas as pd
 from physion.analysis.tables.csv_table import as_numbers, read_csv, refuse_duplicates
 from physion.analysis.tables.predictions import READOUTS
 from physion.analysis.tables.responses import read_humans
-from physion.analysis.tables.stimuli import SCENARIOS, scenario_name
+from physion.analysis.tables.stimuli import scenario_name
 from physion.errors import BadInputError, UnknownNameError
+from physion.stimulus_names import SCENARIOS
 
 MODELS = {
     "SVG": "SVG",

@@ -19,8 +19,8 @@ import numpy as np
 import pandas as pd
 
 from physion.analysis.tables.csv_table import refuse_duplicates, require_columns
-from physion.analysis.tables.stimuli import SCENARIOS, canonical_name, scenario_of
 from physion.errors import BadInputError
+from physion.stimulus_names import SCENARIOS, canonical_name, scenario_of
 
 ATTRIBUTES = ("elements", "distractors", "occluders")
 """``elements``: objects that the physics is about beside probe, agent and zone: dominoes between

@@ -27,9 +27,9 @@ from physion.analysis.people.participants import Responses, check_labels
 from physion.analysis.people.people import all_answers
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.tables.leaderboard_rows import SCORED, read_submission, score_models
-from physion.analysis.tables.score_tables import MEAN, POOLED
-from physion.analysis.tables.stimuli import SCENARIOS
+from physion.analysis.tables.stimuli import MEAN, POOLED
 from physion.errors import BadInputError, UnknownNameError
+from physion.stimulus_names import SCENARIOS
 
 LOWER_IS_BETTER = ("rmsd",)
 

@@ -18,7 +18,7 @@ from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.statistics.kappa import cross_kappa
 from physion.analysis.tables.csv_table import read_csv
 from physion.analysis.tables.predictions import REQUIRED, check_predictions, name_models
-from physion.analysis.tables.score_tables import MEAN, POOLED
+from physion.analysis.tables.stimuli import MEAN, POOLED
 from physion.errors import BadInputError
 
 Array = npt.NDArray[np.float64]

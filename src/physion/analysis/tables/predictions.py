@@ -8,14 +8,9 @@ import numpy as np
 import pandas as pd
 
 from physion.analysis.tables.csv_table import as_booleans, as_numbers, read_csv, require_columns
-from physion.analysis.tables.stimuli import (
-    OFFICIAL_SCENARIOS,
-    SCENARIOS,
-    canonical_name,
-    scenario_name,
-    scenario_of,
-)
+from physion.analysis.tables.stimuli import scenario_name
 from physion.errors import BadInputError
+from physion.stimulus_names import OFFICIAL_SCENARIOS, SCENARIOS, canonical_name, scenario_of
 
 REQUIRED = (
     "Model",

@@ -18,8 +18,9 @@ import numpy as np
 import pandas as pd
 
 from physion.analysis.tables.csv_table import as_booleans, as_numbers, read_csv, refuse_duplicates
-from physion.analysis.tables.stimuli import SCENARIOS, canonical_name, scenario_name
+from physion.analysis.tables.stimuli import scenario_name
 from physion.errors import BadInputError
+from physion.stimulus_names import SCENARIOS, canonical_name
 
 DominoesLook = Literal["plain", "redyellow", "pooled"]
 """Which people count for Dominoes: those who saw free colours with flashing overlays (the ones of

@@ -11,21 +11,9 @@ import pandas as pd
 from physion.analysis.models.scores import SCORES, scores, summands, why_no_r
 from physion.analysis.statistics import agreement
 from physion.analysis.statistics.bootstrap import Bootstrap
-from physion.analysis.tables.stimuli import SCENARIOS
-
-MEAN = "mean"
-"""Name of the row that averages the scores of the scenarios, each counting the same."""
-
-POOLED = "pooled"
-"""Name of the row over all stimuli together, so that larger scenarios count more."""
+from physion.analysis.tables.stimuli import MEAN, POOLED, in_order
 
 Array = npt.NDArray[np.float64]
-
-
-def in_order(scenarios: pd.Series) -> list[str]:
-    """The scenarios that occur: the eight in the order of the paper, then any other by name."""
-    found = {str(name) for name in scenarios}
-    return [name for name in SCENARIOS if name in found] + sorted(found - set(SCENARIOS))
 
 
 def score_table(stimuli: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:

@@ -14,7 +14,6 @@ import pandas as pd
 
 from physion.analysis.tables.csv_table import read_csv, read_table
 from physion.analysis.tables.predictions import READOUTS
-from physion.analysis.tables.stimuli import canonical_name
 from physion.analysis.tables.submission_rows import (
     Fault,
     alike,
@@ -27,6 +26,7 @@ from physion.analysis.tables.submission_rows import (
     shorten,
 )
 from physion.analysis.tables.submission_trials import Reference, coverage, labels, leaks
+from physion.stimulus_names import canonical_name
 
 __all__ = ["Checked", "Fault", "Reference", "read_index", "validate"]
 

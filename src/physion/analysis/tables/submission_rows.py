@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from physion.analysis.tables.predictions import DISTINGUISHING, READOUTS, REQUIRED
-from physion.analysis.tables.stimuli import scenario_of
+from physion.stimulus_names import scenario_of
 
 SUM_TOLERANCE = 1e-3
 """By how much the two probabilities may miss 1: what rounding to three decimals can cost."""

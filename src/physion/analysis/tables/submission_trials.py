@@ -14,8 +14,8 @@ import numpy as np
 import pandas as pd
 
 from physion.analysis.tables.predictions import DATASETS, DISTINGUISHING, READOUTS
-from physion.analysis.tables.stimuli import canonical_name, is_ledge, scenario_of
 from physion.analysis.tables.submission_rows import Fault, booleans, each
+from physion.stimulus_names import canonical_name, is_ledge, scenario_of
 
 TESTING = ("testing", "test")
 """Words for the split that may be predicted."""

@@ -1,26 +1,21 @@
-"""A study from lists of stimuli in the official form, and the movies that they name.
+"""Selection of a study's stimuli from stimulus lists in the official format, with their movies.
 
-A list is a JSON file as the study published them (one object a column, keyed by row) or a CSV file,
-with the columns ``stim_ID`` and ``target_hit_zone_label`` (does the agent touch the patient?) and,
-if it is called otherwise, the map's ``map_url``. Movies are ``STIM_ID.mp4``, all frames, cut here.
+A list is a JSON file as published by the official study (one object per column, keyed by row) or a
+CSV file. Its columns are ``stim_ID``, ``target_hit_zone_label`` (whether the agent touches the
+patient) and optionally ``map_url`` (name of the map, if it does not follow from the stimulus).
+Movies are called ``STIM_ID.mp4`` and contain all frames; they are cut to the observed frames later.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from physion.analysis.tables.stimuli import (
-    OFFICIAL_SCENARIOS,
-    SCENARIOS,
-    canonical_name,
-    scenario_of,
-)
 from physion.errors import BadInputError
 from physion.experiment.study.csv_rows import csv_rows
 from physion.experiment.study.init_trials import Choice, check_even
@@ -28,7 +23,14 @@ from physion.experiment.study.media import Source
 from physion.experiment.study.plain_files import read_plain
 from physion.experiment.study.stimuli import is_name
 from physion.seeds import generator
-from physion.trials.official.names import FOLDERS, plain_name
+from physion.stimulus_names import (
+    FOLDERS,
+    OFFICIAL_SCENARIOS,
+    SCENARIOS,
+    canonical_name,
+    plain_name,
+    scenario_of,
+)
 
 MAX_LIST_BYTES = 50_000_000
 ID, LABEL, MAP = "stim_ID", "target_hit_zone_label", "map_url"
@@ -38,7 +40,7 @@ _LABELS = {"true": True, "false": False, "1": True, "0": False}
 
 @dataclass(frozen=True)
 class Listed:
-    """One row of a list: the stimulus, whether there is contact, what its map is called."""
+    """One row of a stimulus list: name, contact label and file name of the map (may be empty)."""
 
     stim_id: str
     contact: bool
@@ -46,12 +48,12 @@ class Listed:
 
     @property
     def stimulus(self) -> str:
-        """The name that the analysis knows it by, without what only names the file."""
+        """Stimulus name as the analysis uses it, without the endings of the movie file."""
         return self.stim_id.removesuffix(".mp4").removesuffix("_img")
 
     @property
     def look(self) -> str:
-        """Colours of the movie, which the name tells."""
+        """Colours of the movie (``free`` or ``redyellow``), derived from its name."""
         return "redyellow" if _REDYELLOW in self.stim_id else "free"
 
 
@@ -64,11 +66,27 @@ def choose_listed(
     test: int | None = None,
     seed: int = 0,
 ) -> Choice:
-    """The stimuli of one list a scenario, all or ``test`` of them, balanced.
+    """Select the stimuli of a study from official lists, one list per scenario and phase.
 
-    ``familiarization`` lists, in their own order, those to practise on; which scenario a list
-    belongs to is told by its stimuli or its name. ``movies`` (and ``maps``) is a folder, as laid
-    out by PhysionTest-Core or flat. `BadInputError` names list and row of what is wrong.
+    Parameters
+    ----------
+    lists
+        Lists of test stimuli. The scenario of a list follows from its stimuli or its file name.
+    familiarization
+        Lists of familiarization stimuli, which are shown in the order of the list.
+    movies
+        Folder with the movies, flat or laid out as PhysionTest-Core.
+    maps
+        Folder with the maps; by default they are searched for next to the movies.
+    test
+        Number of test stimuli to draw from each list, half of them with contact. None: all.
+    seed
+        Seed of the draw.
+
+    Raises
+    ------
+    BadInputError
+        A list is invalid; the message names the list and the row.
     """
     sources: list[Source] = []
     for phase, paths in (("familiarization", familiarization), ("test", lists)):
@@ -80,16 +98,16 @@ def choose_listed(
                 raise BadInputError(f"{path} and {seen[scenario]} are both lists of {scenario}")
             seen[scenario] = path
             if phase == "test":
-                rows = _chosen(path, rows, scenario, test, seed)
-            files = _Files(movies, maps, scenario)
+                rows = _select(path, rows, scenario, test, seed)
+            files = _MediaFinder(movies, maps, scenario)
             sources += [_source(row, scenario, phase, i, files) for i, row in enumerate(rows)]
     return Choice(tuple(sources))
 
 
 def read_list(path: Path) -> list[Listed]:
-    """The rows of a list in their order; `BadInputError` names a bad row and column.
+    """Read and check the rows of a list; `BadInputError` names an invalid row and column.
 
-    Rows of JSON count from 1, those of CSV as a spreadsheet shows them.
+    Rows of JSON files count from 1, rows of CSV files as a spreadsheet shows them.
     """
     content = read_plain(path, MAX_LIST_BYTES)
     rows: Iterable[tuple[int, dict[str, Any]]]
@@ -110,7 +128,7 @@ def read_list(path: Path) -> list[Listed]:
             raise BadInputError(
                 f"{path}, row {number}: {LABEL} must be true or false, not {row[LABEL]!r}"
             )
-        # Addresses are never opened; the last word of one is a file name in our folder.
+        # URLs are never opened; only their last part is used, as a name in a local folder.
         map_name = str(row.get(MAP) or "").strip().rpartition("/")[2]
         listed = Listed(name, label, map_name if is_name(map_name) else "")
         if listed.stimulus in found:
@@ -122,27 +140,28 @@ def read_list(path: Path) -> list[Listed]:
 
 
 def list_scenario(path: Path, rows: Iterable[Listed]) -> str:
-    """The scenario that the names in a list betray, or else the name of the list."""
-    betrayed = {scenario_of(canonical_name(row.stim_id)) for row in rows}
-    if len(betrayed) == 1 and None not in betrayed:
-        return str(betrayed.pop())
-    words = path.stem.lower().replace("_", "-").split("-")
-    named = {OFFICIAL_SCENARIOS.get(word, word) for word in words}
-    named &= set(SCENARIOS)
-    if len(named) != 1:
+    """Return the scenario of a list, from its stimulus names or else from its file name."""
+    from_stimuli = {scenario_of(canonical_name(row.stim_id)) for row in rows}
+    if len(from_stimuli) == 1 and None not in from_stimuli:
+        return str(from_stimuli.pop())
+    parts = path.stem.lower().replace("_", "-").split("-")
+    from_name = {OFFICIAL_SCENARIOS.get(part, part) for part in parts}
+    from_name &= set(SCENARIOS)
+    if len(from_name) != 1:
         raise BadInputError(
             f"{path}: which scenario is it? Put one of {', '.join(SCENARIOS)} into the file's name"
         )
-    return named.pop()
+    return from_name.pop()
 
 
 def _json_rows(path: Path, content: bytes) -> list[dict[str, Any]]:
+    """Return the rows of a JSON list, with the columns that are used here."""
     try:
         columns = json.loads(content)
     except (ValueError, RecursionError) as error:
         raise BadInputError(f"{path} is not JSON: {error}") from error
     if not isinstance(columns, dict) or not all(isinstance(c, dict) for c in columns.values()):
-        raise BadInputError(f'{path} is not one object a column, {{"{ID}": {{"0": ...}}, ...}}')
+        raise BadInputError(f'{path} is not one object per column, {{"{ID}": {{"0": ...}}, ...}}')
     for name in (ID, LABEL):
         if name not in columns:
             raise BadInputError(
@@ -156,30 +175,30 @@ def _json_rows(path: Path, content: bytes) -> list[dict[str, Any]]:
     return [{name: columns[name][key] for name in wanted} for key in keys]
 
 
-def _chosen(
+def _select(
     path: Path, rows: list[Listed], scenario: str, count: int | None, seed: int
 ) -> list[Listed]:
-    """All rows, or so many, half of them with contact, in the order of the list."""
+    """Return all rows, or ``count`` random ones, half with contact, in the order of the list."""
     if count is None or count == len(rows):
         return rows
     check_even(count, "--test")
-    kinds = [[row for row in rows if row.contact == contact] for contact in (True, False)]
-    if count // 2 > min(map(len, kinds)):
+    by_label = [[row for row in rows if row.contact == contact] for contact in (True, False)]
+    if count // 2 > min(map(len, by_label)):
         raise BadInputError(
-            f"{path} has {len(kinds[0])} stimuli with and {len(kinds[1])} without contact, not "
-            f"{count // 2} of each"
+            f"{path} has {len(by_label[0])} stimuli with and {len(by_label[1])} without contact, "
+            f"not {count // 2} of each"
         )
-    draws = generator("study list", seed, scenario)
-    kept = {row for kind in kinds for row in _some(kind, count // 2, draws)}
+    rng = generator("study list", seed, scenario)
+    kept = {row for group in by_label for row in _sample(group, count // 2, rng)}
     return [row for row in rows if row in kept]
 
 
-def _some(kind: list[Listed], count: int, draws: np.random.Generator) -> list[Listed]:
-    return [kind[i] for i in draws.permutation(len(kind))[:count]]
+def _sample(rows: list[Listed], count: int, rng: np.random.Generator) -> list[Listed]:
+    return [rows[i] for i in rng.permutation(len(rows))[:count]]
 
 
-class _Files:
-    """Where the movies and maps of a scenario are looked for."""
+class _MediaFinder:
+    """Search paths for the movies and maps of one scenario."""
 
     def __init__(self, movies: Path, maps: Path | None, scenario: str) -> None:
         for folder in filter(None, (movies, maps)):
@@ -188,33 +207,27 @@ class _Files:
         title = FOLDERS[scenario]
         roots = [movies, movies / title, movies / title.lower()]
         self.movies = [root / sub for root in roots for sub in ("", "mp4s", "mp4s-redyellow")]
-        beside = [root / "maps" for root in (*roots, movies.parent)]
-        self.maps = [maps, maps / title, maps / "maps"] if maps else [*self.movies, *beside]
+        map_folders = [root / "maps" for root in (*roots, movies.parent)]
+        self.maps = [maps, maps / title, maps / "maps"] if maps else [*self.movies, *map_folders]
 
     def movie(self, row: Listed) -> Path:
-        """The movie of a stimulus, or where it should be."""
-        return _first(self.movies, [f"{row.stim_id.removesuffix('.mp4')}.mp4"])
+        """Return the path of the movie of a stimulus; if there is none, its expected path."""
+        return _first_existing(self.movies, [f"{row.stim_id.removesuffix('.mp4')}.mp4"])
 
     def map(self, row: Listed) -> Path:
-        """The map of a stimulus, which may lie there for both looks."""
+        """Return the path of the map of a stimulus, which both looks may share."""
         names = [row.map_name] if row.map_name else []
         names += [f"{row.stimulus}_map.png", f"{plain_name(row.stim_id)}_map.png"]
-        return _first(self.maps, names)
+        return _first_existing(self.maps, names)
 
 
-def _first(folders: Sequence[Path], names: Sequence[str]) -> Path:
-    """The first file that is there, else the first place."""
-    return next(_there(folders, names), folders[0] / names[0])
+def _first_existing(folders: Sequence[Path], names: Sequence[str]) -> Path:
+    """Return the first existing file with one of these names; if none exists, the first path."""
+    paths = [folder / name for folder in folders for name in names]
+    return next((path for path in paths if path.is_file()), paths[0])
 
 
-def _there(folders: Sequence[Path], names: Sequence[str]) -> Iterator[Path]:
-    for folder in folders:
-        for name in names:
-            if (folder / name).is_file():
-                yield folder / name
-
-
-def _source(row: Listed, scenario: str, phase: str, place: int, files: _Files) -> Source:
+def _source(row: Listed, scenario: str, phase: str, place: int, files: _MediaFinder) -> Source:
     return Source(
         stimulus=row.stimulus,
         scenario=scenario,

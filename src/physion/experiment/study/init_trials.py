@@ -1,7 +1,7 @@
-"""A study from a dataset of ours: which trials people see, and in which places.
+"""Selection of a study's stimuli from a generated dataset.
 
-Of each scenario as many testing trials with as without contact are drawn, and as many
-familiarization trials, whose order is the same for everybody.
+For each scenario, testing and familiarization trials are drawn, half of them with contact. The
+order of the familiarization trials is fixed here and the same for all participants.
 """
 
 from __future__ import annotations
@@ -13,30 +13,30 @@ from typing import Any, Literal
 
 import pandas as pd
 
-from physion.analysis.tables.stimuli import SCENARIOS
 from physion.errors import BadInputError, UnknownNameError
 from physion.experiment.study.media import Source
 from physion.seeds import generator
+from physion.stimulus_names import SCENARIOS
 from physion.trials.dataset import Dataset
 from physion.trials.layout import TrialPaths
 
 Look = Literal["free", "redyellow"]
 SPLITS = {"familiarization": "familiarization", "test": "testing"}
-"""Split of a dataset from which a phase takes its trials."""
+"""Split of the dataset from which the trials of each phase are drawn."""
 TEST, PRACTICE = 150, 10
-"""Trials of a session, as in the study."""
+"""Test and familiarization trials per session, as in the official study."""
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What was chosen; ``notes`` say where fewer were there than asked for."""
+    """Selected stimuli; ``notes`` report where fewer were available than requested."""
 
     sources: tuple[Source, ...]
     notes: tuple[str, ...] = ()
 
     @property
     def scenarios(self) -> tuple[str, ...]:
-        """Scenarios in the order of the paper, others after them."""
+        """Scenarios of the stimuli, in the order of the paper, then any others by name."""
         found = {source.scenario for source in self.sources}
         return tuple(in_paper_order(found))
 
@@ -50,11 +50,25 @@ def choose_trials(
     look: Look = "free",
     seed: int = 0,
 ) -> Choice:
-    """Testing and familiarization trials of a dataset; of all its tested scenarios by default.
+    """Select testing and familiarization trials of a dataset.
 
-    ``test`` and ``practice`` are even: half with contact, half without. The same dataset and seed
-    give the same choice. `BadInputError` where a scenario has no trial of one kind, where trials
-    have no movies, or none in the ``look``.
+    Parameters
+    ----------
+    dataset
+        Folder of the dataset.
+    scenarios
+        Scenarios to use; by default all that have testing trials.
+    test, practice
+        Number of test and familiarization trials per scenario; even, half of them with contact.
+    look
+        Colours of the movies.
+    seed
+        Seed of the draw. The same dataset and seed give the same selection.
+
+    Raises
+    ------
+    BadInputError
+        A scenario has no trial with (or without) contact, or trials have no movies in this look.
     """
     found = Dataset(dataset)
     tested = set(found.index["scenario"][found.index["split"] == SPLITS["test"]])
@@ -76,7 +90,7 @@ def choose_trials(
 def choose_familiarization(
     dataset: Path, scenario: str, *, count: int = PRACTICE, look: Look = "free", seed: int = 0
 ) -> Choice:
-    """The familiarization trials alone; as `choose_trials`."""
+    """Select the familiarization trials of one scenario only, as `choose_trials` does."""
     found = Dataset(dataset)
     rows, note = _draw(found, scenario, "familiarization", count, seed)
     sources = [_source(found, row, "familiarization", i, look) for i, row in enumerate(rows)]
@@ -90,7 +104,7 @@ def in_paper_order(scenarios: set[str]) -> Iterator[str]:
 
 
 def check_even(count: int, option: str) -> None:
-    """`BadInputError` unless half of so many trials can have contact."""
+    """Check that ``count`` is even and positive, so that half of the trials can have contact."""
     if count < 2 or count % 2:
         raise BadInputError(
             f"{option} must be even and 2 or more, half with contact and half without, not {count}"
@@ -100,37 +114,46 @@ def check_even(count: int, option: str) -> None:
 def _draw(
     dataset: Dataset, scenario: str, phase: str, count: int, seed: int
 ) -> tuple[list[dict[str, Any]], str]:
-    """Rows of the index in their places, and a note where there are fewer than asked for."""
+    """Draw ``count`` rows of the index, half of them with contact, in random order.
+
+    Returns the rows, and a note (else an empty text) if fewer trials were available.
+    """
     check_even(count, "--test" if phase == "test" else "--practice")
     split = SPLITS[phase]
     table = dataset.index
     table = table[(table["split"] == split) & (table["scenario"] == scenario)]
-    kinds = [table[table["contact"] == contact] for contact in (True, False)]
-    half = min(count // 2, *map(len, kinds))
+    by_label = [table[table["contact"] == contact] for contact in (True, False)]
+    half = min(count // 2, *map(len, by_label))
     if half == 0:
-        lacking = "with" if len(kinds[0]) == 0 else "without"
+        lacking = "with" if len(by_label[0]) == 0 else "without"
         raise BadInputError(
-            f"{dataset.folder} has no {split} trial of {scenario} {lacking} contact; make some: "
+            f"{dataset.folder} has no {split} trial of {scenario} {lacking} contact; generate some: "
             f"physion generate {dataset.folder} --scenario {scenario} --split {split} "
             f"--count {count}"
         )
-    # Each kind has a stream of its own, so that more trials of the one do not redraw the other.
-    chosen = pd.concat([_sample(kind, half, scenario, phase, seed) for kind in kinds])
-    order = generator("study places", seed, scenario, phase)
-    rows = chosen.iloc[order.permutation(len(chosen))].to_dict("records")
+    # Separate random streams for trials with and without contact: adding trials with one label
+    # does not change which trials with the other label are drawn.
+    chosen = pd.concat([_sample(group, half, scenario, phase, seed) for group in by_label])
+    rng = generator("study places", seed, scenario, phase)
+    rows = chosen.iloc[rng.permutation(len(chosen))].to_dict("records")
     note = ""
     if 2 * half < count:
-        note = f"{scenario}: {2 * half} {split} trials in place of {count}: no more are balanced"
+        note = (
+            f"{scenario}: {2 * half} {split} trials instead of {count}, since half must have "
+            "contact and no more are available"
+        )
     return rows, note
 
 
-def _sample(kind: pd.DataFrame, half: int, scenario: str, phase: str, seed: int) -> pd.DataFrame:
-    contact = str(bool(kind["contact"].iloc[0]))
-    draws = generator("study trials", seed, scenario, phase, contact)
-    return kind.iloc[draws.permutation(len(kind))[:half]]
+def _sample(group: pd.DataFrame, half: int, scenario: str, phase: str, seed: int) -> pd.DataFrame:
+    """Draw ``half`` rows of a table whose rows all have the same contact label."""
+    contact = str(bool(group["contact"].iloc[0]))
+    rng = generator("study trials", seed, scenario, phase, contact)
+    return group.iloc[rng.permutation(len(group))[:half]]
 
 
 def _source(dataset: Dataset, row: dict[str, Any], phase: str, place: int, look: Look) -> Source:
+    """Return the source files of one row of the index, with movies in the given look."""
     paths = TrialPaths(dataset.folder, row["split"], row["scenario"], row["trial"])
     free = row["look"] != look
     columns = {"movie": "movie", "observed": "observed_movie", "map": "map"}

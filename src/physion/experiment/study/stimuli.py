@@ -17,6 +17,7 @@ from physion.atomic import write_atomic
 from physion.errors import BadInputError, UnknownNameError
 from physion.experiment.study.csv_rows import csv_rows
 from physion.experiment.study.plain_files import read_plain
+from physion.stimulus_names import canonical_name
 
 STIMULI_FILE = "stimuli.csv"
 MEDIA_FOLDER = "media"
@@ -176,20 +177,13 @@ def check_apart(names: Iterable[tuple[str, str]], where: Path) -> None:
     """`BadInputError` where two (scenario, stimulus) are one and the same to the analysis."""
     seen: dict[tuple[str, str], str] = {}
     for scenario, name in names:
-        first = seen.setdefault((scenario, analysis_name(name)), name)
+        first = seen.setdefault((scenario, canonical_name(name)), name)
         if first == name:
             continue
         raise BadInputError(
             f"{where}: {first} and {name} of {scenario} are one stimulus to the analysis, which "
             "takes off -redyellow, _img, .mp4 and .hdf5; leave one of them out, or rename it"
         )
-
-
-def analysis_name(stimulus: str) -> str:
-    """What `physion.analysis.tables.stimuli.canonical_name` gives, whose import takes seconds."""
-    for ending in (".mp4", ".hdf5", "_img"):
-        stimulus = stimulus.removesuffix(ending)
-    return stimulus.replace("-redyellow", "")
 
 
 def _faults(s: Stimulus) -> Iterable[tuple[str, str]]:

@@ -18,9 +18,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from physion.analysis.tables.score_tables import MEAN
+from physion.analysis.tables.stimuli import MEAN
 from physion.report.figures.theme import LIGHT, Theme, legend, panels, style, title
-from physion.report.page.blocks import number, protocol_names
+from physion.report.words import number, protocol_names
 
 
 def label(agent: str, width: int = 48) -> str:

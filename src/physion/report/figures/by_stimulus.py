@@ -17,10 +17,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from physion.analysis.statistics.agreement import pearson
-from physion.analysis.tables.score_tables import in_order
+from physion.analysis.tables.stimuli import in_order
 from physion.report.figures.by_scenario import label
 from physion.report.figures.theme import HATCHES, LIGHT, Theme, legend, panels, style, title
-from physion.report.page.blocks import number
+from physion.report.words import number
 
 BINS = np.linspace(0, 1, 21)
 """Edges of the bars in the distribution of accuracy."""

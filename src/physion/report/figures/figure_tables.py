@@ -19,10 +19,10 @@ from physion.analysis.people.difficulty import THIRDS, below_chance, difficulty_
 from physion.analysis.statistics.calibration import brier, reliability_curve
 from physion.analysis.statistics.correlation import correlate_resampled, correlate_rows
 from physion.analysis.tables.predictions import DATASETS, READOUTS
-from physion.analysis.tables.score_tables import MEAN, POOLED, in_order
-from physion.analysis.tables.stimuli import OFFICIAL_SCENARIOS, SCENARIOS
+from physion.analysis.tables.stimuli import MEAN, POOLED, in_order
 from physion.report.figures.by_scenario import HALVES, HALVES_ZONE, PARTICIPANTS, SCENARIO_ZONE
-from physion.report.page.blocks import PROTOCOLS
+from physion.report.words import PROTOCOLS
+from physion.stimulus_names import OFFICIAL_SCENARIOS, SCENARIOS
 
 Array = npt.NDArray[np.float64]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -12,8 +11,8 @@ import numpy as np
 import pandas as pd
 
 from physion.analysis.models.comparison import Comparison
-from physion.analysis.tables.predictions import DATASETS
-from physion.analysis.tables.score_tables import MEAN, POOLED, in_order
+from physion.analysis.tables.stimuli import MEAN, POOLED, in_order
+from physion.report.words import number, plural
 
 MOST_BARS = 8
 """Models of which a card shows each; of more it shows the one it is about and the others' mean."""
@@ -22,36 +21,6 @@ MOST_BARS = 8
 def details(title: str, content: str) -> str:
     """A part that opens on a click; ``content`` is HTML."""
     return f"<details><summary>{escape(title)}</summary>\n{content}</details>"
-
-
-def plural(count: int, noun: str) -> str:
-    """``1 model``, ``2 models``, ``2 stimuli``."""
-    many = noun.removesuffix("us") + "i" if noun.endswith("us") else noun + "s"
-    return f"{count} {noun if count == 1 else many}"
-
-
-def protocol_names(text: str) -> str:
-    """``text`` with trainings called by their protocols: *all*, *all-but*, *only*.
-
-    Tables of the analysis name the column of the predictions, *dynamics training dataset same*; the
-    page and the figures write *only*. Of parts other than the dynamics the column stays in sight.
-    """
-    short = _RELATIVE.sub(lambda found: found[1] + PROTOCOLS[found[2]], text)
-    return short.replace(" · dynamics training dataset ", " · ")
-
-
-PROTOCOLS = {"same": "only", "all but this": "all-but"}
-"""What a training in relation to the tested scenario is called, by its name in predictions."""
-
-_RELATIVE = re.compile(rf"( · (?:{'|'.join(DATASETS)}) )(same|all but this)\b", re.IGNORECASE)
-
-
-def number(value: float, digits: int = 2) -> str:
-    """A number with so many decimals, a minus that is one, no minus zero; ``NaN`` if undefined."""
-    if pd.isna(value):
-        return "NaN"
-    # Adding zero turns -0.0 into 0.0.
-    return f"{round(float(value), digits) + 0.0:.{digits}f}".replace("-", "−")
 
 
 def p_value(value: float) -> str:

@@ -8,11 +8,11 @@ from pathlib import Path
 import pandas as pd
 
 from physion.analysis.models.comparison import Comparison
-from physion.analysis.tables.stimuli import canonical_name
 from physion.errors import BadInputError
 from physion.report.inputs import ReportInputs
 from physion.report.page import blocks
 from physion.report.page.document import data_uri
+from physion.stimulus_names import canonical_name
 
 _MIME = {
     ".mp4": "video/mp4",

@@ -7,11 +7,12 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 
-from physion.analysis.tables.score_tables import MEAN, POOLED, in_order
+from physion.analysis.tables.stimuli import MEAN, POOLED, in_order
 from physion.report.inputs import EXPECTED_METHODS, ReportInputs
 from physion.report.page import blocks, people_blocks, session_blocks, tests_of_models
 from physion.report.page.document import Picture, Section, figure, render_document
 from physion.report.page.movies import gaps
+from physion.report.words import plural, protocol_names
 
 
 def render_page(
@@ -38,7 +39,7 @@ def render_page(
         Section("What was left out", _left_out(inputs)),
     ]
     page = render_document(inputs.title, _summary(inputs), [s for s in sections if s.content])
-    return blocks.protocol_names(page)  # here, so that no table or caption has names of its own
+    return protocol_names(page)  # here, so that no table or caption has names of its own
 
 
 def _links(inputs: ReportInputs, folder: Path | None) -> Mapping[str, str]:
@@ -57,8 +58,8 @@ def _summary(inputs: ReportInputs) -> str:
     stimuli = comparison.stimuli["stimulus"].nunique()
     scenarios = in_order(comparison.stimuli["scenario"])
     words = [
-        f"{blocks.plural(len(comparison.agents), 'model')} on {blocks.plural(stimuli, 'stimulus')} "
-        f"of {blocks.plural(len(scenarios), 'scenario')} ({', '.join(scenarios)})."
+        f"{plural(len(comparison.agents), 'model')} on {plural(stimuli, 'stimulus')} "
+        f"of {plural(len(scenarios), 'scenario')} ({', '.join(scenarios)})."
     ]
     if comparison.has_people:
         mean = comparison.people.set_index("scenario").loc[MEAN]
@@ -72,7 +73,7 @@ def _summary(inputs: ReportInputs) -> str:
         flags = inputs.people.tables["flags"]
         words.append(
             f"Flagged and left out: {int(flags['flagged'].sum())} of "
-            f"{blocks.plural(len(flags), 'session')}; the main results are given with them too."
+            f"{plural(len(flags), 'session')}; the main results are given with them too."
         )
     if len(comparison.changed):
         words.append(

@@ -10,18 +10,11 @@ import pandas as pd
 
 from physion.analysis.people.difficulty import below_chance
 from physion.analysis.people.hypotheses import HYPOTHESES
-from physion.analysis.tables.score_tables import MEAN, in_order
+from physion.analysis.tables.stimuli import MEAN, in_order
 from physion.report.inputs import ReportInputs
-from physion.report.page.blocks import (
-    Column,
-    details,
-    number,
-    paragraph,
-    rows_table,
-    stimulus_link,
-    table,
-)
+from physion.report.page.blocks import Column, details, paragraph, rows_table, stimulus_link, table
 from physion.report.page.blocks import people as averages
+from physion.report.words import number
 
 MORE = "every scenario, and why an interval is missing, is in tables/measures.csv"
 

@@ -12,7 +12,7 @@ import pandas as pd
 
 from physion.analysis.published.cells import grid
 from physion.analysis.published.summary import TITLES, PublishedResults
-from physion.analysis.tables.score_tables import MEAN
+from physion.analysis.tables.stimuli import MEAN
 from physion.atomic import write_atomic
 from physion.report.figures.by_scenario import (
     PARTICIPANTS,
@@ -22,16 +22,9 @@ from physion.report.figures.by_scenario import (
 )
 from physion.report.figures.figure_tables import GROUPED_COLUMNS, MEASURE_COLUMNS
 from physion.report.figures.theme import Plot, Theme
-from physion.report.page.blocks import (
-    Column,
-    details,
-    number,
-    p_value,
-    paragraph,
-    rows_table,
-    table,
-)
+from physion.report.page.blocks import Column, details, p_value, paragraph, rows_table, table
 from physion.report.page.document import Section, figure, render_document
+from physion.report.words import number
 from physion.report.write import prepare_folder, write_csv, write_plot
 
 TITLE = "The published results of the original study, recomputed from its released tables"

@@ -7,7 +7,7 @@ from html import escape
 import pandas as pd
 
 from physion.analysis.people.exclusions import RULES, ExclusionRules
-from physion.analysis.tables.score_tables import MEAN, in_order
+from physion.analysis.tables.stimuli import MEAN, in_order
 from physion.report.inputs import ReportInputs
 from physion.report.page.blocks import Column, paragraph, rows_table, table, undefined
 from physion.report.people_results import PeopleResults

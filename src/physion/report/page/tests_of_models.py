@@ -9,7 +9,8 @@ import pandas as pd
 
 from physion.report.inputs import ReportInputs, permutations_of
 from physion.report.mixed_fits import MixedTable
-from physion.report.page.blocks import Column, details, number, paragraph, rows_table
+from physion.report.page.blocks import Column, details, paragraph, rows_table
+from physion.report.words import number
 
 
 def tests(inputs: ReportInputs) -> str:
