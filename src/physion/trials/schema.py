@@ -1,16 +1,16 @@
-"""The layout of a trial file, and how its fields are read without trusting the file.
+"""Layout of a trial file, and the reader that checks each field against it.
 
-A trial file is HDF5 behind a seal: the first 512 bytes (an HDF5 user block, which every HDF5
-reader skips) hold the length and the SHA-256 of the rest. Damage is found before the HDF5
-library, which may crash on it, sees a byte. A file that was made to harm can carry a right seal,
-so each field is checked as well before memory is given to it: no links out of the file, no types
-that run code or point elsewhere, no size beyond the limits.
+A trial file is an HDF5 file that begins with a 512-byte header (an HDF5 user block, which every
+HDF5 reader skips) with the length and the SHA-256 of the file: the seal. Damage is found before
+the HDF5 library, which may crash on it, reads anything. A file made to do harm can carry a valid
+seal, so each field is checked as well before memory is allocated for it; see
+`physion.trials.guarded_hdf5`.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,28 +20,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.errors import BadInputError
+from physion.trials.guarded_hdf5 import GuardedHdf5
 
 SCHEMA = 2
-"""Version of the layout; it rises when a reader of the old one could misread the new one."""
+"""Version of the layout, raised when a reader of the old layout could misread the new one."""
 SEAL_BYTES = 512
 MAX_FIELD_BYTES = 2**31
-"""Largest field that is read, in memory: 24 minutes of 256 x 256 colour."""
+"""Largest field that is read, in bytes of memory: 24 minutes of 256 x 256 colour."""
 MAX_CHUNK_BYTES = 2**28
+"""Largest chunk that is read, in bytes of memory."""
 WHOLE_BYTES = 2**20
-"""Fields up to this size are one chunk: a chunk a frame would cost more than the numbers."""
+"""Fields up to this many bytes are stored as one chunk, larger ones as one chunk per frame."""
 
 _MAGIC = b"PHYSION TRIAL"
-_FILTERS = {h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32, h5py.h5z.FILTER_DEFLATE, 32015}
-_HDF5_ERRORS = (OSError, KeyError, RuntimeError, ValueError, TypeError, MemoryError, AttributeError)
-"""What h5py raises on files that are not what they say."""
+_ZSTD = 32015
+"""Registered number of the Zstandard filter."""
+_FILTERS = {h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32, h5py.h5z.FILTER_DEFLATE, _ZSTD}
 
 
 @dataclass(frozen=True)
 class Field:
-    """One array of a trial file: its type, what its axes count, and what it means.
+    """Declaration of one array of a trial file.
 
-    An axis is a name whose length is the same in all fields, or a fixed number. Type ``text`` is
-    UTF-8 of fixed length, in an array of one element.
+    Parameters
+    ----------
+    dtype
+        NumPy type, or ``text``: UTF-8 of fixed length, in an array of one element.
+    axes
+        For each axis its length, or a name; axes of one name have one length in all fields.
+    meaning
+        What the values are, with their unit; stored as attribute ``meaning`` of the array.
     """
 
     dtype: str
@@ -67,7 +75,7 @@ FIELDS: Mapping[str, Field] = {
     "first_frame/ids": Field("<i2", ("row", "column"), "0 the room, i + 1 the i-th of Scene.names"),
     "first_frame/shares": Field("<f4", ("thing",), "share of the picture by Scene.names"),
 }
-"""Fields that every trial file has, by path."""
+"""Fields that every trial file has, by their path."""
 
 PASSES: Mapping[str, Field] = {
     "color": Field("|u1", ("frame", "row", "column", 3), "sRGB"),
@@ -76,11 +84,11 @@ PASSES: Mapping[str, Field] = {
     "ids": Field("<i2", ("frame", "row", "column"), "0 the room, i + 1 the i-th of Scene.names"),
     "flow": Field("<f2", ("frame", "row", "column", 2), "(right, down), pixels"),
 }
-"""Image passes, kept under ``passes/`` when asked for, one frame a chunk."""
+"""Image passes that can be stored under ``passes/``, one chunk per frame."""
 
 
 def seal(content: bytes) -> bytes:
-    """``content``, whose first 512 bytes are free, with its length and SHA-256 written there."""
+    """Return ``content`` with its length and SHA-256 written into its first 512 bytes."""
     rest = content[SEAL_BYTES:]
     lines = [_MAGIC + b" %d" % SCHEMA, b"length %d" % len(content)]
     lines += [b"sha256 " + hashlib.sha256(rest).hexdigest().encode()]
@@ -88,7 +96,7 @@ def seal(content: bytes) -> bytes:
 
 
 def check_seal(data: bytes, where: str) -> None:
-    """Raise `BadInputError` unless ``data`` is a whole, unchanged trial file of our version."""
+    """Raise `BadInputError` unless ``data`` is a whole, unchanged file of this schema version."""
     head = data[:SEAL_BYTES].rstrip(b"\0").split(b"\n")
     if not data:
         raise BadInputError(f"{where} is empty")
@@ -102,18 +110,24 @@ def check_seal(data: bytes, where: str) -> None:
     if head[1] != b"length %d" % len(data):
         promised = head[1].removeprefix(b"length ").decode("ascii", "replace")
         raise BadInputError(
-            f"{where} is cut short or grown: {len(data)} bytes, not {promised} (field 'seal')"
+            f"{where} is cut short or too long: {len(data)} bytes, not {promised} (field 'seal')"
         )
     if head[2] != b"sha256 " + hashlib.sha256(data[SEAL_BYTES:]).hexdigest().encode():
         raise BadInputError(
-            f"{where} is damaged: its bytes do not fit their SHA-256 (field 'seal')"
+            f"{where} is damaged: its bytes do not match their SHA-256 (field 'seal')"
         )
 
 
 def storage(array_shape: tuple[int, ...], dtype: np.dtype[Any], compatible: bool) -> dict[str, Any]:
-    """How h5py shall store an array: chunks, compression, checksum.
+    """Return the options with which h5py stores an array: chunks, compression, checksum.
 
-    ``compatible`` chooses gzip, which every reader has, over zstd, which reads five times faster.
+    Parameters
+    ----------
+    array_shape, dtype
+        Shape and type of the array; empty arrays get no options.
+    compatible
+        Compress with gzip, which every HDF5 reader has, instead of zstd, which reads five times
+        faster.
     """
     size = int(np.prod(array_shape)) * dtype.itemsize
     if size == 0:
@@ -129,130 +143,85 @@ def storage(array_shape: tuple[int, ...], dtype: np.dtype[Any], compatible: bool
     }
 
 
-class FieldReader:
-    """Reads fields of one open trial file, checking each against its declaration.
+class FieldReader(GuardedHdf5):
+    """Reader of the fields of one open trial file; checks each against its declaration.
 
-    Axes of one name must have one length in all fields. ``where`` names the file in errors.
+    ``where`` names the file in errors. Axes of one name must have the same length in all fields.
     """
 
     def __init__(self, file: h5py.File, where: str) -> None:
-        self.where = where
-        self._file = file
+        super().__init__(file, where, filters=_FILTERS, max_chunk_bytes=MAX_CHUNK_BYTES)
         self._lengths: dict[str, int] = {}
-        self._known: dict[str, h5py.Dataset] = {}
-        self._groups: dict[str, Any] = {}
+        self._checked: dict[str, h5py.Dataset] = {}
 
     def text(self, path: str) -> str:
-        """The text at ``path``."""
-        dataset = self._checked(path, FIELDS[path])
-        value = self._guard(path, lambda: bytes(dataset[0]).decode("utf-8"))
-        return str(value)
+        """Return the text at ``path``."""
+        dataset = self._dataset(path, FIELDS[path])
+        return self.guard(path, lambda: bytes(dataset[0]).decode("utf-8"))
 
     def array(self, path: str) -> NDArray[Any]:
-        """The array at ``path`` of the declared fields, whole."""
-        dataset = self._checked(path, FIELDS[path])
-        return np.asarray(self._guard(path, lambda: dataset[()]))
+        """Return the whole array of the declared field at ``path``."""
+        dataset = self._dataset(path, FIELDS[path])
+        return np.asarray(self.guard(path, lambda: dataset[()]))
 
     def image(self, name: str, frame: int) -> NDArray[Any]:
-        """One frame of the pass ``name``."""
+        """Return one frame of the image pass ``name``."""
         path = f"passes/{name}"
-        dataset = self._checked(path, PASSES[name])
-        return np.asarray(self._guard(path, lambda: dataset[frame]))
+        dataset = self._dataset(path, PASSES[name])
+        return np.asarray(self.guard(path, lambda: dataset[frame]))
 
     def passes(self) -> tuple[str, ...]:
-        """Names of the image passes that the file holds."""
-        group = self._member(self._file, "passes", "passes", optional=True)
+        """Return the names of the image passes that the file holds."""
+        group = self.find("passes")
         if group is None:
             return ()
         if not isinstance(group, h5py.Group):
-            raise self._bad("passes", "is not a group")
-        return tuple(self._guard("passes", lambda: [name for name in PASSES if name in group]))
+            raise self.bad("passes", "is not a group")
+        return self.guard("passes", lambda: tuple(name for name in PASSES if name in group))
 
     def check(self, path: str) -> None:
-        """Check the declaration of the field at ``path`` without reading its values."""
-        self._checked(path, FIELDS[path] if path in FIELDS else PASSES[path.split("/")[1]])
+        """Check the field at ``path`` against its declaration without reading its values."""
+        self._dataset(path, FIELDS[path] if path in FIELDS else PASSES[path.split("/")[1]])
 
-    def _checked(self, path: str, field: Field) -> h5py.Dataset:
-        if path in self._known:
-            return self._known[path]
-        *groups, name = path.split("/")
-        parent: Any = self._file
-        for group in groups:
-            if group not in self._groups:
-                self._groups[group] = self._member(parent, group, path)
-            parent = self._groups[group]
-        dataset = self._member(parent, name, path)
+    def _dataset(self, path: str, field: Field) -> h5py.Dataset:
+        """Return the array at ``path``, checked against ``field`` the first time it is used."""
+        if path in self._checked:
+            return self._checked[path]
+        dataset = self.find(path)
+        if dataset is None:
+            parent = self.find(path.rpartition("/")[0]) if "/" in path else None
+            inside = isinstance(parent, h5py.Dataset)
+            raise self.bad(path, "lies in something that is no group" if inside else "is missing")
         if not isinstance(dataset, h5py.Dataset):
-            raise self._bad(path, "is not an array")
-        self._guard(path, lambda: self._check_storage(path, dataset))
-        self._guard(path, lambda: self._check_type(path, dataset, field))
+            raise self.bad(path, "is not an array")
+        self.guard(path, lambda: self._check_layout(path, dataset))
+        self.check_storage(path, dataset)
+        self.guard(path, lambda: self._check_type(path, dataset, field))
         self._check_shape(path, dataset.shape, field)
-        self._known[path] = dataset
+        self._checked[path] = dataset
         return dataset
 
-    def _member(self, group: Any, name: str, path: str, optional: bool = False) -> Any:
-        """A member that lies in this very file: links elsewhere are refused, not followed."""
-        if not isinstance(group, h5py.Group):
-            raise self._bad(path, "lies in something that is no group")
-        link = self._guard(path, lambda: group.get(name, getlink=True))
-        if link is None:
-            if optional:
-                return None
-            raise self._bad(path, "is missing")
-        if not isinstance(link, h5py.HardLink):
-            raise self._bad(path, f"is a {type(link).__name__}, which trial files may not have")
-        return self._guard(path, lambda: group[name])
-
-    def _check_storage(self, path: str, dataset: h5py.Dataset) -> None:
-        plan = dataset.id.get_create_plist()
-        layout = plan.get_layout()
-        if layout == h5py.h5d.CONTIGUOUS and 0 in (dataset.shape or (1,)):
-            if plan.get_external_count():
-                raise self._bad(path, "is stored in another file")
-            return
-        if layout != h5py.h5d.CHUNKED:
-            raise self._bad(path, "is not stored in chunks")
-        filters = {plan.get_filter(index)[0] for index in range(plan.get_nfilters())}
-        if not filters <= _FILTERS:
-            raise self._bad(path, f"is packed with unknown filters {sorted(filters - _FILTERS)}")
-        if int(np.prod(dataset.chunks, dtype=object)) * dataset.dtype.itemsize > MAX_CHUNK_BYTES:
-            raise self._bad(path, f"has chunks of {dataset.chunks}, which is too large")
+    def _check_layout(self, path: str, dataset: h5py.Dataset) -> None:
+        """Check that the array is stored in chunks, which carry checksums, unless it is empty."""
+        layout = dataset.id.get_create_plist().get_layout()
+        empty = layout == h5py.h5d.CONTIGUOUS and 0 in (dataset.shape or (1,))
+        if layout != h5py.h5d.CHUNKED and not empty:
+            raise self.bad(path, "is not stored in chunks")
 
     def _check_type(self, path: str, dataset: h5py.Dataset, field: Field) -> None:
         kind = dataset.id.get_type()
         if field.dtype == "text":
             if not isinstance(kind, h5py.h5t.TypeStringID) or kind.is_variable_str():
-                raise self._bad(path, "is not text of fixed length")
+                raise self.bad(path, "is not text of fixed length")
         elif dataset.dtype != np.dtype(field.dtype):
-            raise self._bad(path, f"has type {dataset.dtype}, not {np.dtype(field.dtype)}")
+            raise self.bad(path, f"has type {dataset.dtype}, not {np.dtype(field.dtype)}")
 
     def _check_shape(self, path: str, shape: tuple[int, ...] | None, field: Field) -> None:
         if shape is None or len(shape) != len(field.axes):
-            raise self._bad(path, f"has shape {shape}, not {field.axes}")
+            raise self.bad(path, f"has shape {shape}, not {field.axes}")
         itemsize = 1 if field.dtype == "text" else np.dtype(field.dtype).itemsize
-        if int(np.prod(shape, dtype=object)) * itemsize > MAX_FIELD_BYTES:
-            raise self._bad(path, f"claims shape {shape}, which is too large to be true")
+        self.check_size(path, shape, itemsize, MAX_FIELD_BYTES)
         for axis, length in zip(field.axes, shape, strict=True):
             expected = axis if isinstance(axis, int) else self._lengths.setdefault(axis, length)
             if length != expected:
-                raise self._bad(path, f"has {length} entries along axis {axis!r}, not {expected}")
-
-    def _guard(self, path: str, read: Callable[[], Any]) -> Any:
-        """Call ``read`` and turn what HDF5 says about broken files into our one error."""
-        try:
-            return read()
-        except _HDF5_ERRORS as error:
-            raise self._bad(path, f"cannot be read: {' '.join(str(error).split())}") from error
-
-    def _bad(self, path: str, what: str) -> BadInputError:
-        return BadInputError(f"{self.where}: field {path!r} {what}")
-
-
-def open_image(data: bytes, where: str) -> h5py.File:
-    """Open the bytes of a trial file for reading; `BadInputError` if HDF5 cannot."""
-    import io
-
-    try:
-        return h5py.File(io.BytesIO(data), "r")
-    except _HDF5_ERRORS as error:
-        raise BadInputError(f"{where} is not HDF5: {' '.join(str(error).split())}") from error
+                raise self.bad(path, f"has {length} entries along axis {axis!r}, not {expected}")

@@ -28,6 +28,7 @@ from physion.physics.labels import Labels
 from physion.physics.trajectory import Contacts, Trajectory
 from physion.scenes.looks import with_role_colors
 from physion.scenes.scene import Scene
+from physion.trials.guarded_hdf5 import open_hdf5
 from physion.trials.schema import (
     FIELDS,
     PASSES,
@@ -35,7 +36,6 @@ from physion.trials.schema import (
     SEAL_BYTES,
     FieldReader,
     check_seal,
-    open_image,
     seal,
     storage,
 )
@@ -232,7 +232,7 @@ class Trial:
         check_seal(data, where)
         self._where = where
         self._renderers: dict[tuple[int, int, str], Renderer] = {}
-        self._reader = FieldReader(open_image(data, where), where)
+        self._reader = FieldReader(open_hdf5(io.BytesIO(data), where), where)
         for path in FIELDS:
             self._reader.check(path)
         for name in self.pass_names:

@@ -9,18 +9,16 @@ or run code, or of sizes that no trial has: those raise `BadInputError` with fil
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import AbstractContextManager
-from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from physion.errors import BadInputError
+from physion.trials.guarded_hdf5 import GuardedHdf5, open_hdf5
 from physion.trials.official.names import decode_picture
 
 MAX_FRAMES = 10_000
@@ -34,20 +32,16 @@ _FILTERS = {
     h5py.h5z.FILTER_FLETCHER32,
     h5py.h5z.FILTER_LZF,
 }
-_ERRORS = (OSError, KeyError, RuntimeError, ValueError, TypeError, MemoryError, AttributeError)
-"""What h5py raises on files that are not what they say."""
 
 
-class OfficialFile(AbstractContextManager["OfficialFile"]):
-    """An official HDF5 file, opened for reading; use it in a ``with`` statement.
+class OfficialFile(GuardedHdf5, AbstractContextManager["OfficialFile"]):
+    """Reader of one official HDF5 file, for use in a ``with`` statement.
 
     Paths are those of the file, such as ``static/mass`` or ``frames/0000/objects/positions``.
     """
 
     def __init__(self, file: h5py.File, where: str) -> None:
-        self.where = where
-        self._file = file
-        self._groups: dict[str, h5py.Group] = {}
+        super().__init__(file, where, filters=_FILTERS, max_chunk_bytes=MAX_BYTES)
 
     @classmethod
     def open(cls, path: Path) -> OfficialFile:
@@ -55,10 +49,7 @@ class OfficialFile(AbstractContextManager["OfficialFile"]):
         where = f"official file {path}"
         if path.is_symlink() or not path.is_file():
             raise BadInputError(f"{where} is no plain file")
-        try:
-            return cls(h5py.File(path, "r"), where)
-        except _ERRORS as error:
-            raise BadInputError(f"{where} is not HDF5: {' '.join(str(error).split())}") from error
+        return cls(open_hdf5(path, where), where)
 
     def __exit__(
         self,
@@ -80,16 +71,16 @@ class OfficialFile(AbstractContextManager["OfficialFile"]):
 
     def names(self, path: str) -> list[str]:
         """Names in the group at ``path``; none where there is no group."""
-        group = self._find(path)
+        group = self.find(path)
         if not isinstance(group, h5py.Group):
             return []
-        if self._guard(path, lambda: len(group)) > 100 * MAX_FRAMES:
+        if self.guard(path, lambda: len(group)) > 100 * MAX_FRAMES:
             raise self.bad(path, "has too many entries to be true")
-        return list(self._guard(path, lambda: list(group)))
+        return list(self.guard(path, lambda: list(group)))
 
     def has(self, path: str) -> bool:
         """Whether there is an array at ``path``, with or without the ending of a camera."""
-        return any(self._find(path + suffix) is not None for suffix in _SUFFIXES)
+        return any(self.find(path + suffix) is not None for suffix in _SUFFIXES)
 
     def numbers(self, path: str, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
         """Finite or not, the numbers at ``path``; None in ``shape`` stands for any length."""
@@ -102,7 +93,7 @@ class OfficialFile(AbstractContextManager["OfficialFile"]):
         )
         if not fits:
             raise self.bad(path, f"has shape {found}, not {shape}")
-        values = self._guard(path, lambda: dataset[()])
+        values = self.guard(path, lambda: dataset[()])
         return np.asarray(values, np.float64)
 
     def table(self, path: str, *row: int) -> NDArray[np.float64]:
@@ -137,7 +128,7 @@ class OfficialFile(AbstractContextManager["OfficialFile"]):
         dataset = self._dataset(path)
         if h5py.check_string_dtype(dataset.dtype) is None:
             raise self.bad(path, f"has type {dataset.dtype}, not text")
-        values = np.ravel(np.asarray(self._guard(path, lambda: dataset[()]), object))
+        values = np.ravel(np.asarray(self.guard(path, lambda: dataset[()]), object))
         texts = [value if isinstance(value, bytes) else str(value).encode() for value in values]
         if sum(len(text) for text in texts) > 100 * MAX_TEXT:
             raise self.bad(path, "holds more text than can be true")
@@ -148,7 +139,7 @@ class OfficialFile(AbstractContextManager["OfficialFile"]):
         dataset = self._dataset(path)
         if dataset.dtype != np.uint8 or len(dataset.shape) != 1:
             raise self.bad(path, f"is {dataset.dtype} {dataset.shape}, not a row of bytes")
-        return bytes(self._guard(path, lambda: dataset[()]))
+        return bytes(self.guard(path, lambda: dataset[()]))
 
     def picture(self, path: str) -> NDArray[np.uint8]:
         """The PNG or JPEG picture (H, W, 3) whose bytes are at ``path``."""
@@ -160,60 +151,21 @@ class OfficialFile(AbstractContextManager["OfficialFile"]):
 
     def _dataset(self, path: str) -> h5py.Dataset:
         for suffix in _SUFFIXES:
-            found = self._find(path + suffix)
+            found = self.find(path + suffix)
             if found is not None:
                 break
         else:
             raise self.bad(path, "is missing")
         if not isinstance(found, h5py.Dataset):
             raise self.bad(path, "is not an array")
-        self._guard(path, lambda: self._check(path, found))
-        return found
-
-    def _find(self, path: str) -> Any:
-        """The group or array at ``path``, None where there is none; links are refused."""
-        if path in self._groups:
-            return self._groups[path]
-        *parents, name = path.split("/")
-        parent = self._find("/".join(parents)) if parents else self._file
-        if not isinstance(parent, h5py.Group):
-            return None
-        link = self._guard(path, partial(parent.get, name, getlink=True))
-        if link is None:
-            return None
-        if not isinstance(link, h5py.HardLink):
-            raise self.bad(path, f"is a {type(link).__name__}, which is not followed")
-        found = self._guard(path, partial(parent.__getitem__, name))
-        if isinstance(found, h5py.Group):
-            self._groups[path] = found
+        self.guard(path, lambda: self._check(path, found))
         return found
 
     def _check(self, path: str, dataset: h5py.Dataset) -> None:
         if dataset.shape is None:
             raise self.bad(path, "is empty")
-        kind, item = dataset.dtype.kind, dataset.dtype.itemsize
+        kind, itemsize = dataset.dtype.kind, dataset.dtype.itemsize
         if kind not in "fiubSO" or (kind == "O" and h5py.check_string_dtype(dataset.dtype) is None):
             raise self.bad(path, f"has type {dataset.dtype}")
-        size = int(np.prod(dataset.shape, dtype=object)) * max(item, 1)
-        if size > MAX_BYTES:
-            raise self.bad(path, f"claims shape {dataset.shape}, which is too large to be true")
-        plan = dataset.id.get_create_plist()
-        if plan.get_layout() == h5py.h5d.VIRTUAL or plan.get_external_count():
-            raise self.bad(path, "is stored in another file")
-        filters = {plan.get_filter(place)[0] for place in range(plan.get_nfilters())}
-        if not filters <= _FILTERS:
-            raise self.bad(path, f"is packed with unknown filters {sorted(filters - _FILTERS)}")
-        chunk = int(np.prod(dataset.chunks or (1,), dtype=object)) * max(item, 1)
-        if chunk > MAX_BYTES:
-            raise self.bad(path, f"has chunks of {dataset.chunks}, which is too large to be true")
-
-    def _guard(self, path: str, read: Callable[[], Any]) -> Any:
-        """Call ``read`` and turn what HDF5 says about broken files into our one error."""
-        try:
-            return read()
-        except _ERRORS as error:
-            raise self.bad(path, f"cannot be read: {' '.join(str(error).split())}") from error
-
-    def bad(self, path: str, what: str) -> BadInputError:
-        """The error that says ``what`` is wrong with the field at ``path``."""
-        return BadInputError(f"{self.where}: field {path!r} {what}")
+        self.check_size(path, dataset.shape, itemsize, MAX_BYTES)
+        self.check_storage(path, dataset)
