@@ -12,13 +12,13 @@ from physion.compute.local import LocalExecutor
 from physion.errors import BadInputError
 from physion.models import build_model
 from physion.models.noisy_simulation import (
-    Config,
     NoisySimulation,
+    NoisySimulationConfig,
     add_noise,
-    ask,
+    cut_trial,
     fit_scale,
     log_likelihood,
-    run_task,
+    run_simulations,
 )
 from physion.physics.engine import simulate
 from physion.physics.trajectory import Contacts, State, Trajectory
@@ -90,7 +90,7 @@ class StraightEngine:
 
 
 def model(**options: Any) -> NoisySimulation:
-    return NoisySimulation(Config(**options), StraightEngine())
+    return NoisySimulation(NoisySimulationConfig(**options), StraightEngine())
 
 
 def test_without_noise_it_says_what_happens() -> None:
@@ -118,7 +118,7 @@ def test_contact_that_was_seen_needs_no_simulation() -> None:
     assert truth.contacts.frame[0] < 45
     # It flies out on the other side, so simulating on from frame 44 could find nothing.
     truth = replace(truth, velocities=truth.velocities * -1)
-    assert NoisySimulation(Config(), engine).predict_contact(trial, truth) == 1.0
+    assert NoisySimulation(NoisySimulationConfig(), engine).predict_contact(trial, truth) == 1.0
     assert engine.starts == []
 
 
@@ -144,7 +144,7 @@ def test_it_goes_on_from_the_last_observed_frame_under_the_trials_own_ending() -
     trial = scene(0.5)
     engine = StraightEngine()
     truth = engine.simulate(trial)
-    NoisySimulation(Config(samples=2), engine).predict_contact(trial, truth)
+    NoisySimulation(NoisySimulationConfig(samples=2), engine).predict_contact(trial, truth)
     assert [start.frame for start in engine.starts] == [44, 44]
     ending = engine.scenes[0].ending
     assert (ending.min_frames, ending.max_frames) == (151 - 44, 302 - 44)
@@ -152,8 +152,8 @@ def test_it_goes_on_from_the_last_observed_frame_under_the_trials_own_ending() -
 
 def test_noise_has_the_stated_size_and_spares_what_cannot_move() -> None:
     trial = scene()
-    question = ask(trial, StraightEngine().simulate(trial))
-    config = Config(position=0.1, velocity=0.3, mass=0.2)
+    question = cut_trial(trial, StraightEngine().simulate(trial))
+    config = NoisySimulationConfig(position=0.1, velocity=0.3, mass=0.2)
     pairs = [add_noise(question, config, 2.0, sample) for sample in range(400)]
     places = np.array([state.positions for _, state in pairs]) - question.state.positions
     speeds = np.array([state.velocities for _, state in pairs]) - question.state.velocities
@@ -171,8 +171,8 @@ def test_joined_bodies_move_together_and_a_cloth_moves_whole() -> None:
     trial = scene(joints=(Joint("ball", "box"),), cloths=(Cloth("sheet", (0, 0, 2), resolution=3),))
     base = StraightEngine().simulate(replace(trial, cloths=()))
     truth = replace(base, cloth_vertices=np.zeros((FRAMES, 9, 3), np.float32))
-    question = ask(trial, truth)
-    _, state = add_noise(question, Config(), 1.0, 0)
+    question = cut_trial(trial, truth)
+    _, state = add_noise(question, NoisySimulationConfig(), 1.0, 0)
     moved = state.positions - question.state.positions
     assert moved[0] == pytest.approx(moved[1]) and moved[0].any()
     cloth = state.cloth_vertices - question.state.cloth_vertices
@@ -184,8 +184,8 @@ def test_noise_depends_on_seed_trial_and_sample_alone() -> None:
     truth = StraightEngine().simulate(scene())
 
     def state(seed: int, name: str, sample: int) -> list[float]:
-        question = ask(scene(name=name), truth)
-        _, noisy = add_noise(question, Config(seed=seed), 1.0, sample)
+        question = cut_trial(scene(name=name), truth)
+        _, noisy = add_noise(question, NoisySimulationConfig(seed=seed), 1.0, sample)
         return noisy.positions.ravel().tolist()
 
     assert state(0, "a", 0) == state(0, "a", 0)
@@ -197,14 +197,14 @@ def test_noise_depends_on_seed_trial_and_sample_alone() -> None:
 
 def test_tasks_are_told_apart_by_all_that_decides_them() -> None:
     trial = scene(0.5)
-    question = ask(trial, StraightEngine().simulate(trial))
+    question = cut_trial(trial, StraightEngine().simulate(trial))
     base = model().task(question, 1.0)
     others = [
         model().task(question, 2.0),
         model(samples=3).task(question, 1.0),
         model(velocity=0.2).task(question, 1.0),
         model().task(replace(question, state=replace(question.state, frame=43)), 1.0),
-        model().task(ask(scene(0.4), StraightEngine().simulate(scene(0.4))), 1.0),
+        model().task(cut_trial(scene(0.4), StraightEngine().simulate(scene(0.4))), 1.0),
     ]
     assert model().task(question, 1.0).digest() == base.digest()
     assert len({base.digest(), *(task.digest() for task in others)}) == 6
@@ -229,9 +229,9 @@ def test_the_scale_is_the_one_under_which_outcomes_are_likeliest() -> None:
 @pytest.mark.parametrize("wrong", [{"samples": 0}, {"position": -1.0}, {"scales": ()}])
 def test_impossible_settings_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(BadInputError):
-        Config(**wrong)
+        NoisySimulationConfig(**wrong)
     with pytest.raises(BadInputError, match="fewer than the 45"):
-        ask(scene(), replace_length(StraightEngine().simulate(scene()), 44))
+        cut_trial(scene(), replace_length(StraightEngine().simulate(scene()), 44))
 
 
 def replace_length(trajectory: Trajectory, frames: int) -> Trajectory:
@@ -288,9 +288,9 @@ def test_other_processes_give_the_same_answers() -> None:
     tasks = {}
     for offset in (0.25, 0.35):
         trial = rolling(offset)
-        tasks[trial.name] = real.task(ask(trial, simulate(trial)), 1.0)
-    outcomes = {o.key: o.value for o in LocalExecutor(2).map(run_task, tasks)}
-    assert outcomes == {key: run_task(task) for key, task in tasks.items()}
+        tasks[trial.name] = real.task(cut_trial(trial, simulate(trial)), 1.0)
+    outcomes = {o.key: o.value for o in LocalExecutor(2).map(run_simulations, tasks)}
+    assert outcomes == {key: run_simulations(task) for key, task in tasks.items()}
 
 
 def test_trials_without_motion_are_refused() -> None:
@@ -298,5 +298,5 @@ def test_trials_without_motion_are_refused() -> None:
     unknown = replace(
         motion, positions=np.full_like(motion.positions, np.nan), engine="imported: movie alone"
     )
-    with pytest.raises(BadInputError, match="no motion to go on from"):
-        ask(scene(), unknown)
+    with pytest.raises(BadInputError, match="imported without motion"):
+        cut_trial(scene(), unknown)

@@ -70,6 +70,7 @@ def test_the_table_is_the_official_one_and_says_more(done: Evaluation, dots: Dat
     assert cell["Test Accuracy"].unique() == pytest.approx([hits.mean()])
     assert (table["Fit Trials"] == COUNTS["readout"]).all() and (table["Fold"] == -1).all()
     assert (table["Recorded Outcome"] == "").all()
+    assert (table["Fit Labels"] == "simulated").all()
     assert table["Validation Loss"].notna().all() and table["Copy-last Loss"].gt(0).all()
 
 
@@ -149,7 +150,7 @@ def test_a_broken_movie_is_one_clear_error_and_leaves_no_table(tmp_path: Path) -
 def test_unknown_and_impossible_readouts_are_refused(dots: Dataset, tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match="observed"):
         evaluate(dots, "frozen-encoder", tmp_path, options=TINY, config=EvaluationConfig(("obs",)))
-    with pytest.raises(BadInputError, match="cannot be read out"):
+    with pytest.raises(BadInputError, match="does not support the readout protocol"):
         evaluate(dots, "noisy-simulation", tmp_path, config=EvaluationConfig(("full",)))
     wrong = EvaluationConfig(training="but-all", accelerator="cpu")
     with pytest.raises(UnknownNameError, match="all-but"):

@@ -13,16 +13,18 @@ import pytest
 
 from physion.errors import BadInputError
 from physion.models import Provenance, Spec
-from physion.models.noisy_simulation import Config, NoisySimulation
+from physion.models.noisy_simulation import NoisySimulation, NoisySimulationConfig
 from physion.physics.trajectory import Contacts, State, Trajectory
 from physion.readout import EvaluationConfig, evaluate, evaluate_model
-from physion.readout.folds import plan_rounds
+from physion.readout.folds import plan_folds
 from physion.readout.simulations import SimulationReadout
 from physion.scenes.scene import Body, Camera, Roles, Scene
 from physion.training.protocols import Training
 
 FRAMES = 100
-CONFIG = Config(position=0.05, velocity=0.0, mass=0.0, scales=(0.0, 1.0, 40.0), samples=20)
+CONFIG = NoisySimulationConfig(
+    position=0.05, velocity=0.0, mass=0.0, scales=(0.0, 1.0, 40.0), samples=20
+)
 
 
 class Flight:
@@ -103,13 +105,13 @@ def test_the_noise_is_fitted_on_readout_trials_alone(tmp_path: Path, column: str
     """Fitted to the outcome recorded elsewhere, or to our own where there is none."""
     shelf: Any = Shelf()
     shelf.index["recorded_contact"] = pd.array([pd.NA] * len(shelf.index), "boolean")
-    (round_,) = plan_rounds(shelf.index, Training.ALL, 5, 0)
+    (fold,) = plan_folds(shelf.index, Training.ALL, 5, 0)
 
     def fitted(labels: pd.Series) -> tuple[float, np.ndarray]:
         shelf.index[column] = labels.astype(bool)
         reader = SimulationReadout(shelf, NoisySimulation(CONFIG, Flight()), tmp_path)
-        reader.prepare([round_])
-        (answers,) = reader.answers(round_)
+        reader.prepare([fold])
+        (answers,) = reader.predict(fold)
         return answers.noise_scale, answers.probability
 
     truth = shelf.index["contact"].copy()
@@ -119,6 +121,20 @@ def test_the_noise_is_fitted_on_readout_trials_alone(tmp_path: Path, column: str
     assert fitted(truth ^ tested)[0] == scale, "labels of tested trials must not matter"
     assert (fitted(truth ^ tested)[1] == probability).all()
     assert fitted(truth ^ ~tested)[0] != scale, "labels of readout trials must matter"
+
+
+@pytest.mark.parametrize(("known", "expected"), [(12, "recorded"), (0, "simulated"), (5, "mixed")])
+def test_the_table_names_the_outcomes_that_were_fitted(
+    tmp_path: Path, known: int, expected: str
+) -> None:
+    """Outcomes of tested trials do not count."""
+    shelf: Any = Shelf()
+    outcomes = shelf.index["recorded_contact"].astype("boolean")
+    outcomes[(shelf.index["split"] == "readout") & (np.arange(len(outcomes)) >= known)] = pd.NA
+    shelf.index["recorded_contact"] = outcomes
+    model = NoisySimulation(CONFIG, Flight())
+    table = evaluate_model(shelf, model, tmp_path, config=EvaluationConfig()).predictions
+    assert set(table["Fit Labels"]) == {expected}
 
 
 def test_predictions_are_shares_and_say_their_scale(tmp_path: Path) -> None:
@@ -138,18 +154,18 @@ def test_predictions_are_shares_and_say_their_scale(tmp_path: Path) -> None:
 def test_simulations_are_stored_and_not_made_again(tmp_path: Path) -> None:
     shelf: Any = Shelf(4, 3)
     engines = [Flight(), Flight(), Flight()]
-    (round_,) = plan_rounds(shelf.index, Training.ALL, 5, 0)
+    (fold,) = plan_folds(shelf.index, Training.ALL, 5, 0)
     found = []
     for engine, config in zip(engines, (CONFIG, CONFIG, replace(CONFIG, seed=1)), strict=True):
         reader = SimulationReadout(shelf, NoisySimulation(config, engine), tmp_path)
-        reader.prepare([round_])
-        found.append(reader.answers(round_)[0].probability)
+        reader.prepare([fold])
+        found.append(reader.predict(fold)[0].probability)
     assert engines[0].calls > 0 and engines[1].calls == 0
     assert engines[2].calls == engines[0].calls
     assert (found[0] == found[1]).all()
     next(tmp_path.rglob("*.json")).write_text('{"contacts": 3}')
     reader = SimulationReadout(shelf, NoisySimulation(CONFIG, engines[1]), tmp_path)
-    reader.prepare([round_])
+    reader.prepare([fold])
     assert engines[1].calls == 20
 
 
@@ -199,7 +215,8 @@ def test_other_state_models_are_shown_the_observed_part_alone(tmp_path: Path) ->
     table = evaluate_model(shelf, oracle, tmp_path, config=EvaluationConfig()).predictions
     assert set(oracle.shown) == {(45, 0)}, "neither later frames nor later contacts"
     assert len(table) == 10 and (table["Predicted Prob_true"] == 0).all()
-    with pytest.raises(BadInputError, match="no probability"):
+    assert set(table["Fit Labels"]) == {""}, "nothing is fitted"
+    with pytest.raises(BadInputError, match="not a probability"):
         evaluate_model(shelf, Oracle(1.5), tmp_path / "b", config=EvaluationConfig())
 
 
@@ -209,11 +226,11 @@ def test_the_road_on_real_trials(tmp_path: Path) -> None:
     from physion.compute.local import LocalExecutor, SerialExecutor
     from physion.trials.dataset import Dataset
     from physion.trials.making.generate import generate
-    from physion.trials.making.plan import Settings, plan_dataset
+    from physion.trials.making.plan import GenerateSettings, plan_dataset
 
     tasks = plan_dataset("road", ("drop",), {"readout": 4, "testing": 3})
     report = generate(
-        tmp_path / "data", tasks, Settings(width=64, height=64), executor=SerialExecutor()
+        tmp_path / "data", tasks, GenerateSettings(width=64, height=64), executor=SerialExecutor()
     )
     assert not report.failed
     dataset = Dataset(tmp_path / "data")

@@ -245,10 +245,10 @@ def test_held_out_trials_are_not_trained_on(count: int) -> None:
 def test_training_sets_of_the_three_protocols() -> None:
     names = ["roll", "drop", "link", "drop"]
     every, but, only = (training_sets(protocol, names) for protocol in Training)
-    assert [(s.name, s.asked) for s in every] == [("all", ("drop", "link", "roll"))]
+    assert [(s.name, s.tested) for s in every] == [("all", ("drop", "link", "roll"))]
     assert {s.name: s.trained for s in but}["no_drop"] == ("link", "roll")
-    assert all(set(s.trained).isdisjoint(s.asked) for s in but)
-    assert next((s.name, s.trained, s.asked) for s in only) == ("drop", ("drop",), ("drop",))
+    assert all(set(s.trained).isdisjoint(s.tested) for s in but)
+    assert next((s.name, s.trained, s.tested) for s in only) == ("drop", ("drop",), ("drop",))
     with pytest.raises(BadInputError, match="two scenarios"):
         training_sets(Training.ALL_BUT, ["drop"])
     with pytest.raises(UnknownNameError, match="all-but"):

@@ -1,4 +1,4 @@
-"""Models that look at trials or simulate them."""
+"""Models that encode or simulate trials."""
 
 from physion.models.interface import Clip, Model, Provenance, Spec, build_model, models
 

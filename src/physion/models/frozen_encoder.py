@@ -1,4 +1,4 @@
-"""A frozen image encoder with dynamics on its features: pVGG, pDeIT, and any other timm network.
+"""Frozen image encoder with dynamics on its features: pVGG, pDeIT, and any other timm network.
 
 Tensors (B clips, T frames, D features of one frame, c = ``spec.context``):
 
@@ -7,8 +7,8 @@ Tensors (B clips, T frames, D features of one frame, c = ``spec.context``):
 - context (B, c, D): features of the observed frames, the input of the dynamics.
 - next feature (B, D): their output.
 
-Source: reference/models.md, sections 1.1 and 1.2. Unlike the released code, Adam keeps its
-moments from step to step, and a rollout never overwrites the features that it started from.
+Source: docs/official-system.md, section 5.3. Unlike the released code, Adam keeps its moments
+between steps, and a rollout does not overwrite the features that it started from.
 """
 
 from __future__ import annotations
@@ -37,20 +37,20 @@ from physion.models.weights import (
 from physion.seeds import stable_hash
 
 _FAMILIES = {"vgg19": "pVGG", "vgg16_bn": "pVGG", "deit_base_patch16_224": "pDeIT"}
-"""Encoders whose trained versions have a name of their own in the paper."""
+"""Names that the paper gives to models with these encoders."""
 
 
 @dataclass(frozen=True, slots=True)
-class Config:
-    """A frozen-encoder model.
+class FrozenEncoderConfig:
+    """Settings of `FrozenEncoder`.
 
-    - ``encoder``: any timm name. ``image_size``: pixels a side; 224 is what weights are made for.
+    - ``encoder``: any timm name. ``image_size``: pixels per side; most weights expect 224.
     - ``weights``: ``imagenet``, ``random``, or the path of a state dict.
     - ``dynamics``: ``mlp`` (all context features at once) or ``lstm`` (one after the other).
-    - ``hidden``: units of the one hidden layer.
-    - ``residual``: predict the change from the last feature, starting at "no change", rather than
-      the feature itself as the published models do. On few trials only the former is any good.
-    - ``seed``: of random encoders and of the first weights of the dynamics.
+    - ``hidden``: units of the hidden layer.
+    - ``residual``: predict the change from the last feature, initially zero, instead of the
+      feature itself as the published models do. With few training trials only this works well.
+    - ``seed``: of random encoders and of the initial weights of the dynamics.
     - ``stride``, ``context``, ``total``: see `Spec`.
     """
 
@@ -73,7 +73,7 @@ class Config:
 
 
 class MlpDynamics(nn.Module):
-    """All context features through one hidden layer: (B, c, D) to (B, D)."""
+    """One hidden layer on all context features: (B, c, D) to (B, D)."""
 
     def __init__(self, size: int, context: int, hidden: int) -> None:
         super().__init__()
@@ -81,7 +81,7 @@ class MlpDynamics(nn.Module):
         self.outer = nn.Linear(hidden, size)
 
     def forward(self, context: Tensor) -> Tensor:
-        """The next feature."""
+        """Return the next feature."""
         out: Tensor = self.outer(torch.relu(self.inner(context.flatten(1))))
         return out
 
@@ -95,23 +95,23 @@ class LstmDynamics(nn.Module):
         self.outer = nn.Linear(hidden, size)
 
     def forward(self, context: Tensor) -> Tensor:
-        """The next feature."""
+        """Return the next feature."""
         states, _ = self.inner(context)
         out: Tensor = self.outer(states[:, -1])
         return out
 
 
 class FrozenEncoder(nn.Module):
-    """See the module. Only the dynamics are parameters; the encoder is loaded when first used."""
+    """Frozen encoder with dynamics. The encoder is no parameter and is loaded at first use."""
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: FrozenEncoderConfig) -> None:
         super().__init__()
         mean, std = input_statistics(config.encoder)
         self.config = config
         self.spec = Spec(config.image_size, mean, std, config.stride, config.context, config.total)
         self.feature_size = feature_size(config.encoder, config.image_size)
         self._weights = EncoderWeights(config.weights, config.seed)
-        # In a tuple, so that torch does not take the encoder for a part that is trained or saved.
+        # A tuple hides the encoder from torch, which would otherwise train and save it.
         self._encoder: tuple[nn.Module, ...] = ()
         kind = MlpDynamics if config.dynamics == "mlp" else LstmDynamics
         with torch.random.fork_rng(devices=[]):
@@ -125,7 +125,7 @@ class FrozenEncoder(nn.Module):
 
     @torch.no_grad()
     def encode(self, frames: Tensor) -> Tensor:
-        """Features (B, T, D) of uint8 frames (B, T, H, W, 3), on the device of ``frames``."""
+        """Return features (B, T, D) of uint8 frames (B, T, H, W, 3), on their device."""
         size = self.spec.image_size
         if frames.dtype != torch.uint8 or frames.ndim != 5 or frames.shape[2:] != (size, size, 3):
             raise BadInputError(
@@ -140,19 +140,19 @@ class FrozenEncoder(nn.Module):
         return features.float().view(frames.shape[0], frames.shape[1], -1)
 
     def simulate(self, context: Tensor, steps: int) -> Tensor:
-        """Roll the dynamics on from ``context`` (B, c, D): (B, steps, D), a sliding window."""
-        window, made = context, []
+        """Roll the dynamics out from ``context`` (B, c, D) and return (B, steps, D)."""
+        window, simulated = context, []
         for _ in range(steps):
             following = self._next(window)
-            made.append(following)
+            simulated.append(following)
             window = torch.cat([window[:, 1:], following[:, None]], dim=1)
-        return torch.stack(made, dim=1)
+        return torch.stack(simulated, dim=1)
 
     def adapt(self, features: Tensor) -> None:
-        """Take the mean (D,) and the one scale of training features (trials, time, D).
+        """Store the mean (D,) and one common scale of training features (trials, time, D).
 
-        The dynamics then work on numbers of order one whatever the encoder's units. One scale for
-        all features leaves the relative weights in the loss as they are.
+        The dynamics standardise their inputs and outputs by them. A common scale keeps the
+        relative weights of the features in the loss.
         """
         flat = features.flatten(0, 1).double()
         self.center.copy_(flat.mean(0))
@@ -160,9 +160,9 @@ class FrozenEncoder(nn.Module):
         self.scale.fill_(deviation if deviation > 0 else 1.0)
 
     def loss(self, batch: Mapping[str, Tensor]) -> Tensor:
-        """Mean squared error of the next feature over every window of ``batch["features"]``.
+        """Return the mean squared error of the next feature over all windows of a batch.
 
-        In units of the squared scale of the training features (see `adapt`).
+        ``batch["features"]`` is (B, T, D). The unit is the squared scale of `adapt`.
         """
         features = batch["features"]
         count = self.config.context
@@ -171,24 +171,24 @@ class FrozenEncoder(nn.Module):
         return functional.mse_loss(self._step(windows[:, :count]), target)
 
     def forward(self, batch: Mapping[str, Tensor]) -> Tensor:
-        """The loss: what a training strategy wraps."""
+        """Return the loss; Fabric wraps this method."""
         return self.loss(batch)
 
     def encoder_digest(self) -> str:
-        """Key of cached features; models that differ in their dynamics alone share it."""
+        """Return the key of cached features, which does not depend on the dynamics."""
         parts = [self.config.encoder, self.config.image_size, self._weights.identity()]
         parts += [self.spec.mean, self.spec.std, f"timm{timm.__version__}", "penultimate"]
         return hashlib.sha256(repr(parts).encode()).hexdigest()
 
     def name(self) -> str:
-        """``pVGG-mlp`` and its like only for trained weights, else ``random-<encoder>-mlp``."""
+        """Return the name for tables: ``pVGG-mlp`` etc., or ``random-<encoder>-mlp``."""
         if self.config.weights == RANDOM:
             return f"random-{self.config.encoder}-{self.config.dynamics}"
         family = _FAMILIES.get(self.config.encoder, self.config.encoder)
         return f"{family}-{self.config.dynamics}"
 
     def provenance(self) -> Provenance:
-        """Name, weights and versions, for the tables."""
+        """Return name, weights and versions for the table of predictions."""
         trained = self.config.weights == IMAGENET
         return Provenance(
             model=self.name(),
@@ -206,10 +206,10 @@ class FrozenEncoder(nn.Module):
         return self.config.weights == RANDOM
 
     def _step(self, window: Tensor) -> Tensor:
-        """The next feature, centred and scaled."""
-        given = (window - self.center) / self.scale
-        out: Tensor = self.dynamics(given)
-        return given[:, -1] + out if self.config.residual else out
+        """Return the next feature, standardised."""
+        inputs = (window - self.center) / self.scale
+        out: Tensor = self.dynamics(inputs)
+        return inputs[:, -1] + out if self.config.residual else out
 
     def _next(self, window: Tensor) -> Tensor:
         return self._step(window) * self.scale + self.center
@@ -222,32 +222,34 @@ class FrozenEncoder(nn.Module):
 
 
 def frozen_encoder(**options: Any) -> FrozenEncoder:
-    """Any timm encoder with MLP or LSTM dynamics; options are the fields of `Config`."""
-    return FrozenEncoder(make_config(Config, "frozen-encoder", options))
+    """Build any timm encoder with MLP or LSTM dynamics (options: `FrozenEncoderConfig`)."""
+    return FrozenEncoder(make_config(FrozenEncoderConfig, "frozen-encoder", options))
 
 
 def pvgg_mlp(**options: Any) -> FrozenEncoder:
-    """VGG-19 with an MLP (the released code has vgg16_bn: ``encoder="vgg16_bn"``)."""
+    """Build VGG-19 with an MLP (the released code uses vgg16_bn: ``encoder="vgg16_bn"``)."""
     return _published("pVGG-mlp", "vgg19", "mlp", options)
 
 
 def pvgg_lstm(**options: Any) -> FrozenEncoder:
-    """VGG-19 with an LSTM."""
+    """Build VGG-19 with an LSTM."""
     return _published("pVGG-lstm", "vgg19", "lstm", options)
 
 
 def pdeit_mlp(**options: Any) -> FrozenEncoder:
-    """DeiT base with an MLP."""
+    """Build DeiT base with an MLP."""
     return _published("pDeIT-mlp", "deit_base_patch16_224", "mlp", options)
 
 
 def pdeit_lstm(**options: Any) -> FrozenEncoder:
-    """DeiT base with an LSTM."""
+    """Build DeiT base with an LSTM."""
     return _published("pDeIT-lstm", "deit_base_patch16_224", "lstm", options)
 
 
 def _published(
     name: str, encoder: str, dynamics: Literal["mlp", "lstm"], options: Mapping[str, Any]
 ) -> FrozenEncoder:
-    base = Config(encoder=encoder, image_size=224, dynamics=dynamics, residual=False)
-    return FrozenEncoder(make_config(Config, name, {**dataclasses.asdict(base), **options}))
+    base = FrozenEncoderConfig(encoder=encoder, image_size=224, dynamics=dynamics, residual=False)
+    return FrozenEncoder(
+        make_config(FrozenEncoderConfig, name, {**dataclasses.asdict(base), **options})
+    )

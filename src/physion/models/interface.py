@@ -1,8 +1,8 @@
-"""What a model is: something that sees clips, or goes on simulating scenes, and can be asked.
+"""Model interface: the specification of a model's inputs, and its optional capabilities.
 
-No model has to do everything. What it offers, it offers by having the method: `encode` (it sees),
-`simulate` (it imagines what comes), `loss` (it learns), `predict_contact` (it answers by itself).
-This module needs no torch, so that models that simulate scenes run without it.
+A model implements one or more of the methods `encode` (features of clips), `simulate` (future
+features), `loss` (training) and `predict_contact` (P(contact) without a readout). This module does
+not import torch, so that simulators run without it.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 
 @dataclass(frozen=True, slots=True)
 class Spec:
-    """What a model wants to see.
+    """Specification of the clips that a model receives.
 
-    - ``image_size``: pixels a side; clips are scaled to it.
-    - ``mean``, ``std``: of the red, green and blue channel in 0..1, which the model itself takes
-      away from the uint8 frames it is given.
-    - ``stride``: movie frames from one clip frame to the next (6 of 30 a second: 5 a second).
-    - ``context``: clip frames inside the observed part; ``total``: clip frames in all.
-    - ``modalities``: what a clip must hold; so far ``rgb``, or ``state`` for simulators.
+    - ``image_size``: pixels per side; clips are scaled to it.
+    - ``mean``, ``std``: of the red, green and blue channel in 0..1. The model itself normalises
+      its uint8 frames with them.
+    - ``stride``: movie frames between clip frames (6 at 30 frames/s: 5 clip frames/s).
+    - ``context``: clip frames in the observed part; ``total``: clip frames of the whole clip.
+    - ``modalities``: content of a clip: ``rgb``, or ``state`` for simulators.
 
     The defaults are those of the released frozen-encoder models: movie frames 0, 6, ..., 36 of
-    the 45 observed ones, and 0, 6, ..., 144 in all.
+    the 45 observed ones, and 0, 6, ..., 144 of the whole movie.
     """
 
     image_size: int = 224
@@ -65,20 +65,20 @@ class Spec:
             )
 
     def observed_indices(self) -> tuple[int, ...]:
-        """Movie frames of the context, all of them observed."""
+        """Return the movie frames of the context; all are observed."""
         return tuple(range(0, self.context * self.stride, self.stride))
 
     def all_indices(self) -> tuple[int, ...]:
-        """Movie frames of the whole clip."""
+        """Return the movie frames of the whole clip."""
         return tuple(range(0, self.total * self.stride, self.stride))
 
 
 @dataclass(frozen=True)
 class Clip:
-    """What a model sees of one trial.
+    """Frames of one trial, as a model receives them.
 
     - ``frames`` (T, H, W, 3): uint8, sRGB, at the model's stride and size.
-    - ``indices``: the movie frame of each; ``observed``: none of them lies in the future.
+    - ``indices`` (T,): movie frame of each. ``observed``: whether all are in the observed part.
     """
 
     trial: str
@@ -105,11 +105,10 @@ class Clip:
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """Where a model's numbers come from; goes into every row of its predictions.
+    """Origin of a model, which is written to every row of its predictions.
 
-    ``init`` says what the weights were before training here: ``imagenet``, ``local:<sha256>``,
-    ``random``, or ``none`` for a model without weights. The other fields are the columns of the
-    official result files.
+    ``init`` names the initial weights: ``imagenet``, ``local:<sha256>``, ``random``, or ``none``
+    for a model without weights. The other fields are columns of the official result files.
     """
 
     model: str
@@ -125,72 +124,71 @@ class Provenance:
 
 
 class Model(Protocol):
-    """Every model: what it wants to see, and where it comes from."""
+    """Common interface of all models."""
 
     @property
     def spec(self) -> Spec:
-        """What the model wants to see."""
+        """Specification of the clips that the model receives."""
         ...
 
     def provenance(self) -> Provenance:
-        """Name, weights and versions, for the tables."""
+        """Return name, weights and versions for the table of predictions."""
         ...
 
 
 @runtime_checkable
 class Encodes(Protocol):
-    """A model that sees."""
+    """Model that computes features of clips."""
 
     def encode(self, frames: Tensor) -> Tensor:
-        """Features of clips.
+        """Return features (batch, time, features), float32, of clips.
 
-        ``frames`` (batch, time, height, width, 3): uint8, sRGB, of ``spec.image_size``.
-        Returns (batch, time, features): float32. Time may be shorter for a model that sees
-        several frames at once.
+        ``frames`` is (batch, time, height, width, 3), uint8, sRGB, of ``spec.image_size``. The
+        time of the features may be shorter for a model that combines several frames.
         """
         ...
 
     def encoder_digest(self) -> str:
-        """Hexadecimal SHA-256 of all that decides the features: the key of their cache."""
+        """Return the hexadecimal SHA-256 of all that determines the features, as cache key."""
         ...
 
 
 @runtime_checkable
 class Simulates(Protocol):
-    """A model that imagines what comes next, in its own features."""
+    """Model that predicts future features."""
 
     def simulate(self, context: Tensor, steps: int) -> Tensor:
-        """``context`` (batch, spec.context, features) goes on for (batch, steps, features)."""
+        """Return (batch, steps, features) that follow ``context`` (batch, context, features)."""
         ...
 
 
 @runtime_checkable
 class Learns(Protocol):
-    """A model whose dynamics train on clips, without any label; a torch ``Module`` as well."""
+    """Model with dynamics that train on features without labels; also a torch ``Module``."""
 
     def adapt(self, features: Tensor) -> None:
-        """Look once at all training features (trials, time, features) before training starts."""
+        """Set statistics from all training features (trials, time, features) before training."""
         ...
 
     def loss(self, batch: Mapping[str, Tensor]) -> Tensor:
-        """Scalar loss of ``batch["features"]`` (batch, time, features), float32."""
+        """Return the scalar loss of ``batch["features"]`` (batch, time, features), float32."""
         ...
 
 
 @runtime_checkable
 class PredictsContact(Protocol):
-    """A model that answers without a readout."""
+    """Model that returns P(contact) without a readout."""
 
     def predict_contact(self, scene: Any, trajectory: Any) -> float:
-        """P(agent touches patient) in 0..1, from a `Scene` and its `Trajectory`.
+        """Return P(agent touches patient) in 0..1, from a `Scene` and its `Trajectory`.
 
-        Nothing of the trajectory after the last observed frame may be used.
+        Frames after the observed part must not be used.
         """
         ...
 
 
 ModelFactory = Callable[..., Model]
-"""Called with the fields of the model's config as keywords."""
+"""Function that builds a model from the fields of its config."""
 
 models: Registry[ModelFactory] = Registry(
     "model",
@@ -203,14 +201,14 @@ models: Registry[ModelFactory] = Registry(
         "noisy-simulation": "physion.models.noisy_simulation:noisy_simulation",
     },
 )
-"""All models by name. Another package adds one by an entry point in the group physion.models."""
+"""All models by name; other packages add theirs with the entry point group physion.models."""
 
 
 def build_model(name: str, **options: Any) -> Model:
-    """The model called ``name``, with ``options`` in place of the defaults of its config.
+    """Build the model called ``name``; ``options`` override the defaults of its config.
 
-    Unknown names and options get the closest ones; a model whose libraries are not installed
-    raises `MissingExtraError`.
+    Raises `UnknownNameError` with the closest names for an unknown model or option, and
+    `MissingExtraError` for a model whose libraries are not installed.
     """
     try:
         factory = models.get(name)
@@ -222,7 +220,7 @@ def build_model(name: str, **options: Any) -> Model:
 
 
 def make_config(kind: type[C], model: str, options: Mapping[str, Any]) -> C:
-    """A config of the dataclass ``kind``; an unknown option gets the three closest names."""
+    """Build a config of the dataclass ``kind``; raise `UnknownNameError` for an unknown option."""
     known = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
     for option in options:
         if option not in known:

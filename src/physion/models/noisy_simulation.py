@@ -1,16 +1,17 @@
-"""A model that knows the physics, but neither the exact state nor the exact masses.
+"""Noisy simulation: the physics engine, started from the true state with noise added.
 
-From the true state at the end of the observed part it adds normal noise to positions, velocities
-and masses, simulates on, and does so several times: P(contact) is the share of simulations in
-which agent and patient touch. It has no weights and needs no torch.
+At the last observed frame, normal noise is added to positions, velocities and masses, and the
+engine simulates the rest of the trial. P(contact) is the fraction of such simulations in which
+agent and patient touch. The model has no weights and needs no torch.
 
-- noise of positions (bodies, 2): metres, along x and y; vertical noise would only sink what lies
-  on the floor into it, or drop it. Bodies that a joint holds move together; a cloth moves whole.
-- noise of velocities (bodies, 3): metres per second.
-- noise of masses (bodies,): the logarithm of the factor, so 0.1 is about 10 %.
-- P(contact): in 0..1, a multiple of 1 / samples. It is 1 if the contact was already observed.
+- Noise of positions (bodies, 2): metres, along x and y only, because vertical noise would push
+  objects on the floor into it or drop them. Bodies connected by joints move together, and a cloth
+  moves as a whole.
+- Noise of velocities (bodies, 3): metres per second.
+- Noise of masses (bodies,): of the logarithm, so that 0.1 is about 10 %.
+- P(contact): in 0..1, a multiple of 1 / samples; 1 if the contact was already observed.
 
-The same normal numbers are used at every noise level, so that levels differ by the level alone.
+All noise levels use the same normal random numbers, multiplied by the level.
 """
 
 from __future__ import annotations
@@ -39,12 +40,14 @@ LAST_OBSERVED = OBSERVED_FRAMES - 1
 
 
 @dataclass(frozen=True, slots=True)
-class Config:
-    """Levels of noise (standard deviations), and how often to simulate.
+class NoisySimulationConfig:
+    """Settings of `NoisySimulation`.
 
-    - ``position`` metres, ``velocity`` metres per second, ``mass`` relative; ``scale`` multiplies
-      all three. ``scales`` are the values of it to choose from by `fit_scale`; one value: no fit.
-    - ``samples``: simulations a trial. ``engine``: by name. ``seed``: of the noise.
+    - ``position`` (metres), ``velocity`` (metres per second), ``mass`` (relative): standard
+      deviations of the noise. ``scale`` multiplies all three.
+    - ``scales``: values of ``scale`` among which `fit_scale` chooses; with one value nothing is
+      fitted.
+    - ``samples``: simulations per trial. ``engine``: name of the engine. ``seed``: of the noise.
     """
 
     position: float = 0.01
@@ -58,14 +61,14 @@ class Config:
 
     def __post_init__(self) -> None:
         if min(self.position, self.velocity, self.mass, self.scale, *self.scales) < 0:
-            raise BadInputError("noise levels and scales must not be below zero")
+            raise BadInputError("noise levels and scales must not be negative")
         if self.samples < 1 or not self.scales:
             raise BadInputError("noisy-simulation needs at least one sample and one scale")
 
 
 @dataclass(frozen=True)
-class Question:
-    """A trial as the model gets it: nothing of it lies after the last observed frame."""
+class ObservedTrial:
+    """Trial as the model receives it: the scene and its state at the last observed frame."""
 
     scene: Scene
     state: State
@@ -73,29 +76,30 @@ class Question:
 
 
 @dataclass(frozen=True)
-class Task:
-    """Some simulations of one trial, for an executor: a value that travels to another process.
+class SimulationTask:
+    """Simulations of one trial at one noise level, which an executor can send to a process.
 
-    ``built`` is an engine to use in this process; None has the one named by the config built.
+    ``built`` is an engine object for use in this process; if None, the engine named in the config
+    is built.
     """
 
-    question: Question
-    config: Config
+    trial: ObservedTrial
+    config: NoisySimulationConfig
     scale: float
     samples: tuple[int, ...]
     built: Engine | None = field(default=None, compare=False)
 
     def digest(self) -> str:
-        """Hexadecimal SHA-256 of all that decides the answers."""
-        state = self.question.state
+        """Return the hexadecimal SHA-256 of all inputs of the simulations."""
+        state = self.trial.state
         settings = dataclasses.asdict(replace(self.config, scale=self.scale, scales=(1.0,)))
-        words: list[Any] = [
-            self.question.scene.physics_digest(),
-            self.question.scene.name,
+        parts: list[Any] = [
+            self.trial.scene.physics_digest(),
+            self.trial.scene.name,
             settings,
         ]
-        words += [self.samples, self.question.observed_contact, state.frame, self._engine().name]
-        sha = hashlib.sha256(json.dumps(words, sort_keys=True).encode())
+        parts += [self.samples, self.trial.observed_contact, state.frame, self._engine().name]
+        sha = hashlib.sha256(json.dumps(parts, sort_keys=True).encode())
         for item in dataclasses.fields(state)[1:]:
             sha.update(np.ascontiguousarray(getattr(state, item.name)).tobytes())
         return sha.hexdigest()
@@ -105,30 +109,35 @@ class Task:
         return engine
 
 
-def ask(scene: Scene, trajectory: Trajectory) -> Question:
-    """Cut a trial off after its last observed frame.
+def cut_trial(scene: Scene, trajectory: Trajectory) -> ObservedTrial:
+    """Return the part of a trial that a model may use: the state at the last observed frame.
 
-    `BadInputError` if it does not get there, or was imported as a movie alone, without motion.
+    Raises `BadInputError` if the trial is shorter, or was imported as a movie without motion.
     """
     seen = cut_to_observed(scene, trajectory)
     if not np.isfinite(seen.positions).all():
         raise BadInputError(
-            f"trial {scene.name!r} has movies alone ({trajectory.engine}): no motion to go on from"
+            f"trial {scene.name!r} was imported without motion ({trajectory.engine})"
         )
-    return Question(scene, seen.state(LAST_OBSERVED), label_contact(scene, seen).contact)
+    return ObservedTrial(scene, seen.state(LAST_OBSERVED), label_contact(scene, seen).contact)
 
 
-def run_task(task: Task) -> tuple[bool, ...]:
-    """Did agent and patient touch in each of the simulations of ``task``?"""
-    if task.question.observed_contact:
+def run_simulations(task: SimulationTask) -> tuple[bool, ...]:
+    """Return for each simulation of ``task`` whether agent and patient touch."""
+    if task.trial.observed_contact:
         return (True,) * len(task.samples)
     engine = task._engine()
     return tuple(_touches(task, engine, sample) for sample in task.samples)
 
 
-def add_noise(question: Question, config: Config, scale: float, sample: int) -> tuple[Scene, State]:
-    """The trial as one noisy observer takes it to be; sample and trial name decide the noise."""
-    scene, state = question.scene, question.state
+def add_noise(
+    trial: ObservedTrial, config: NoisySimulationConfig, scale: float, sample: int
+) -> tuple[Scene, State]:
+    """Return scene and state with noise added.
+
+    The noise is a function of the config's seed, the scene's name and ``sample``.
+    """
+    scene, state = trial.scene, trial.state
     rng = child_generator(trial_seed(config.seed, scene.scenario, scene.name, sample), "noise")
     count = len(scene.bodies)
     cloths = len(scene.cloths)
@@ -136,9 +145,9 @@ def add_noise(question: Question, config: Config, scale: float, sample: int) -> 
     shift[:, :2] = rng.normal(size=(count + cloths, 2)) * config.position * scale
     kick = rng.normal(size=(count + cloths, 3)) * config.velocity * scale
     factors = np.exp(rng.normal(size=count) * config.mass * scale)
-    leaders = _leaders(scene)
+    roots = _joint_roots(scene)
     still = np.array([b.kinematic or b.scenery for b in scene.bodies] + [False] * cloths)
-    shift, kick, still = shift[leaders], kick[leaders], still[leaders]
+    shift, kick, still = shift[roots], kick[roots], still[roots]
     shift[still] = kick[still] = 0.0
     owner = np.repeat(np.arange(cloths), [cloth.resolution**2 for cloth in scene.cloths])
     bodies = tuple(
@@ -155,53 +164,65 @@ def add_noise(question: Question, config: Config, scale: float, sample: int) -> 
     return replace(scene, bodies=bodies), noisy
 
 
-def log_likelihood(shares: NDArray[Any], samples: int, outcomes: NDArray[Any]) -> float:
-    """Mean log-probability of ``outcomes`` (n,) given ``shares`` (n,) of contacts in ``samples``.
+def log_likelihood(fractions: NDArray[Any], samples: int, outcomes: NDArray[Any]) -> float:
+    """Return the mean log-likelihood of ``outcomes`` (n,); NaN for n = 0.
 
-    Half a contact and half a miss are added, so that no share is a certainty. NaN for n = 0.
+    The probability of a contact is (k + 0.5) / (samples + 1), where k = fraction * samples is the
+    number of simulations with a contact, so that it is never 0 or 1.
     """
-    if len(shares) == 0:
+    if len(fractions) == 0:
         return float("nan")
-    p = (np.asarray(shares, float) * samples + 0.5) / (samples + 1)
+    p = (np.asarray(fractions, float) * samples + 0.5) / (samples + 1)
     return float(np.mean(np.where(np.asarray(outcomes, bool), np.log(p), np.log1p(-p))))
 
 
 def fit_scale(
-    shares: Mapping[float, NDArray[Any]], samples: int, outcomes: NDArray[Any], default: float
+    fractions: Mapping[float, NDArray[Any]], samples: int, outcomes: NDArray[Any], default: float
 ) -> float:
-    """The scale under which ``outcomes`` are likeliest; the smallest of equals.
+    """Return the scale with the highest likelihood of ``outcomes``; among equals the smallest.
 
-    ``shares[scale]`` (n,) and ``outcomes`` (n,) are of readout trials, never of tested ones.
-    Without a trial, or with one scale only, there is nothing to choose: the only scale, or
-    ``default``.
+    Parameters
+    ----------
+    fractions
+        For each scale the fractions (n,) of simulations with a contact.
+    samples
+        Simulations per trial.
+    outcomes
+        Contact or not (n,), of fit trials alone.
+    default
+        Scale to return if there is no trial. A single scale is always returned.
     """
-    scales = sorted(shares)
+    scales = sorted(fractions)
     if len(scales) == 1:
         return scales[0]
     if len(outcomes) == 0:
         return default
-    return max(scales, key=lambda s: (log_likelihood(shares[s], samples, outcomes), -s))
+    return max(scales, key=lambda s: (log_likelihood(fractions[s], samples, outcomes), -s))
 
 
 class NoisySimulation:
-    """See the module."""
+    """Model that simulates the rest of a trial several times with noise; see the module."""
 
-    def __init__(self, config: Config, engine: Engine | None = None) -> None:
+    def __init__(self, config: NoisySimulationConfig, engine: Engine | None = None) -> None:
         self.config = config
         self.spec = Spec(modalities=("state",))
         self._built = engine
         self._engine: Engine = engine if engine is not None else engines.get(config.engine)()
 
     def predict_contact(self, scene: Scene, trajectory: Trajectory) -> float:
-        """P(agent touches patient), from the observed part of ``trajectory`` alone."""
-        return float(np.mean(run_task(self.task(ask(scene, trajectory), self.config.scale))))
+        """Return P(agent touches patient), from the observed frames of ``trajectory`` alone."""
+        return float(
+            np.mean(run_simulations(self.task(cut_trial(scene, trajectory), self.config.scale)))
+        )
 
-    def task(self, question: Question, scale: float) -> Task:
-        """All simulations of a trial at one noise level."""
-        return Task(question, self.config, scale, tuple(range(self.config.samples)), self._built)
+    def task(self, trial: ObservedTrial, scale: float) -> SimulationTask:
+        """Return the task with all simulations of a trial at one noise level."""
+        return SimulationTask(
+            trial, self.config, scale, tuple(range(self.config.samples)), self._built
+        )
 
     def provenance(self) -> Provenance:
-        """Name and versions, for the tables."""
+        """Return name and versions for the table of predictions."""
         return Provenance(
             model="noisy-simulation",
             init="none",
@@ -212,13 +233,13 @@ class NoisySimulation:
 
 
 def noisy_simulation(**options: Any) -> NoisySimulation:
-    """The model; options are the fields of `Config`, and ``engine`` a name of an engine."""
-    return NoisySimulation(make_config(Config, "noisy-simulation", options))
+    """Build the model; ``options`` are the fields of `NoisySimulationConfig`."""
+    return NoisySimulation(make_config(NoisySimulationConfig, "noisy-simulation", options))
 
 
-def _touches(task: Task, engine: Engine, sample: int) -> bool:
-    scene, state = add_noise(task.question, task.config, task.scale, sample)
-    # The trial's own rules of ending, counted on from the frame where the simulation starts.
+def _touches(task: SimulationTask, engine: Engine, sample: int) -> bool:
+    scene, state = add_noise(task.trial, task.config, task.scale, sample)
+    # The scene's limits of length count from its frame 0; the simulation starts later.
     ending = replace(
         scene.ending,
         min_frames=max(1, scene.ending.min_frames - state.frame),
@@ -228,14 +249,14 @@ def _touches(task: Task, engine: Engine, sample: int) -> bool:
     return label_contact(scene, engine.simulate(scene, start=state, until_contact=True)).contact
 
 
-def _leaders(scene: Scene) -> NDArray[np.int64]:
-    """For each body and cloth the one that it is joined to, through all joints, or itself."""
+def _joint_roots(scene: Scene) -> NDArray[np.int64]:
+    """Return for each body and cloth the index of the root of its chain of joints, or its own."""
     parents = {joint.child: joint.parent for joint in scene.joints}
-    leaders = []
+    roots = []
     for name in scene.names():
         seen = {name}
         while name in parents and parents[name] not in seen:
             name = parents[name]
             seen.add(name)
-        leaders.append(scene.index(name))
-    return np.array(leaders, dtype=np.int64)
+        roots.append(scene.index(name))
+    return np.array(roots, dtype=np.int64)

@@ -1,4 +1,4 @@
-"""The observed part of a motion, for models that are given states instead of pictures."""
+"""Observed part of a trajectory, for models that receive states instead of images."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from physion.scenes.scene import OBSERVED_FRAMES, Scene
 
 
 def cut_to_observed(scene: Scene, trajectory: Trajectory) -> Trajectory:
-    """The first `OBSERVED_FRAMES` frames and their contacts; nothing tells how it went on.
+    """Return the first `OBSERVED_FRAMES` frames of a trajectory and their contacts.
 
-    `BadInputError` for a trajectory that is shorter.
+    Raises `BadInputError` for a shorter trajectory.
     """
     if len(trajectory) < OBSERVED_FRAMES:
         raise BadInputError(
@@ -20,7 +20,7 @@ def cut_to_observed(scene: Scene, trajectory: Trajectory) -> Trajectory:
             f"{OBSERVED_FRAMES} observed ones"
         )
     contacts = trajectory.contacts
-    seen = contacts.frame < OBSERVED_FRAMES
+    observed = contacts.frame < OBSERVED_FRAMES
     return replace(
         trajectory,
         positions=trajectory.positions[:OBSERVED_FRAMES],
@@ -31,11 +31,11 @@ def cut_to_observed(scene: Scene, trajectory: Trajectory) -> Trajectory:
         cloth_distance=trajectory.cloth_distance[:OBSERVED_FRAMES],
         contacts=replace(
             contacts,
-            frame=contacts.frame[seen],
-            bodies=contacts.bodies[seen],
-            point=contacts.point[seen],
-            normal=contacts.normal[seen],
-            impulse=contacts.impulse[seen],
+            frame=contacts.frame[observed],
+            bodies=contacts.bodies[observed],
+            point=contacts.point[observed],
+            normal=contacts.normal[observed],
+            impulse=contacts.impulse[observed],
         ),
         completed=False,
     )

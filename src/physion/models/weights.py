@@ -27,28 +27,28 @@ from physion.seeds import stable_hash
 
 IMAGENET, RANDOM = "imagenet", "random"
 _WRAPPERS = ("state_dict", "model", "model_state_dict")
-"""Keys under which training scripts keep the state dict inside a checkpoint."""
+"""Keys of the state dict in the checkpoints of common training scripts."""
 
 
 @dataclass(frozen=True, slots=True)
 class EncoderWeights:
-    """Which weights an encoder has: ``imagenet``, ``random`` (with a seed), or a local file.
+    """Weights of an encoder: ``imagenet``, ``random`` (with a seed), or the path of a file.
 
-    A local file is a state dict, ``.safetensors`` or a torch file of plain tensors; it is known
-    by its SHA-256, so that a file that changes is another encoder.
+    The file holds a state dict, as ``.safetensors`` or as a torch file of plain tensors, and is
+    identified by its SHA-256.
     """
 
     source: str
     seed: int = 0
 
     def init(self) -> str:
-        """The word for the tables: ``imagenet``, ``random`` or ``local:<first 12 of sha256>``."""
+        """Return the value of the column *Init*: imagenet, random, or local:<start of SHA-256>."""
         if self.source in (IMAGENET, RANDOM):
             return self.source
         return f"local:{_file_sha256(Path(self.source))[:12]}"
 
     def identity(self) -> str:
-        """All that decides the weights, in one string."""
+        """Return one string that identifies the weights."""
         if self.source == RANDOM:
             return f"random:{self.seed}:torch{torch.__version__}"
         if self.source == IMAGENET:
@@ -57,17 +57,17 @@ class EncoderWeights:
 
 
 def check_encoder_name(name: str) -> None:
-    """`UnknownNameError` with the closest names unless timm knows ``name``."""
+    """Raise `UnknownNameError` with the closest names unless timm knows ``name``."""
     if not timm.is_model(name):
         raise UnknownNameError("timm encoder", name, timm.list_models())
 
 
 def create_encoder(name: str, image_size: int, weights: EncoderWeights) -> nn.Module:
-    """A frozen timm encoder without its classifier, in evaluation mode.
+    """Build a frozen timm encoder without its classifier, in evaluation mode.
 
-    Takes (batch, 3, image_size, image_size) float32 and gives (batch, features): what timm feeds
-    to the classifier (the class token of a transformer, the pooled map of a convolutional net,
-    for VGG the second fully connected layer before its ReLU, as released).
+    It maps (batch, 3, image_size, image_size) float32 to (batch, features), the input of timm's
+    classifier: the class token of a transformer, the pooled map of a convolutional network, and
+    for VGG the second fully connected layer before its ReLU, as in the released code.
     """
     check_encoder_name(name)
     with torch.random.fork_rng(devices=[]):
@@ -82,20 +82,20 @@ def create_encoder(name: str, image_size: int, weights: EncoderWeights) -> nn.Mo
 
 
 def feature_size(name: str, image_size: int) -> int:
-    """Features of one frame, found without computing or storing a single weight."""
+    """Return the number of features of one frame, without creating the weights."""
     check_encoder_name(name)
     with torch.device("meta"):
         encoder = _create(name, image_size, pretrained=False).eval()
         features = encoder(torch.zeros(1, 3, image_size, image_size))
     if features.ndim != 2:
-        raise BadInputError(f"encoder {name!r} gives {tuple(features.shape)}, not one row a frame")
+        raise BadInputError(f"encoder {name!r} gives {tuple(features.shape)}, not a row per frame")
     return int(features.shape[1])
 
 
 def input_statistics(
     name: str,
 ) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """Mean and standard deviation of the channels that the encoder was made for."""
+    """Return mean and standard deviation of the channels with which the encoder was trained."""
     check_encoder_name(name)
     known = timm.get_pretrained_cfg(name, allow_unregistered=False)
     assert known is not None, "checked above"
@@ -105,11 +105,11 @@ def input_statistics(
 
 def _create(name: str, image_size: int, *, pretrained: bool) -> nn.Module:
     known = timm.get_pretrained_cfg(name, allow_unregistered=False)
-    # Only networks of a fixed size (transformers) want to be told another one.
+    # Only networks of a fixed input size (transformers) take this argument.
     fixed: dict[str, Any] = (
         {"img_size": image_size} if known is not None and known.fixed_input_size else {}
     )
-    offline = _no_way_to_hub() if pretrained else contextlib.nullcontext()
+    offline = _offline_without_network() if pretrained else contextlib.nullcontext()
     try:
         with offline:
             model: nn.Module = timm.create_model(
@@ -118,18 +118,18 @@ def _create(name: str, image_size: int, *, pretrained: bool) -> nn.Module:
     except Exception as error:
         if not pretrained:
             raise
-        # timm lets whatever its downloader raises through, and that depends on its version.
+        # The exceptions of timm's downloader depend on its version.
         raise BadInputError(
             f"imagenet weights of {name!r} could not be fetched "
-            f"({type(error).__name__}: {_first_line(error)}); use weights=<file> with a state dict "
-            "that you have, or weights=random, which the tables will say"
+            f"({type(error).__name__}: {_first_line(error)}); use weights=<file> with a state dict"
+            ", or weights=random (the tables name it)"
         ) from error
     return model
 
 
 @contextlib.contextmanager
-def _no_way_to_hub() -> Iterator[None]:
-    """Without a network, look in the local cache alone: the hub's retries take most of a minute."""
+def _offline_without_network() -> Iterator[None]:
+    """Use the local cache alone without a network; the hub would retry for most of a minute."""
     host = urlsplit(hub.ENDPOINT).hostname or ""
     proxied = any(name.lower().endswith("s_proxy") for name in os.environ)
     before = hub.HF_HUB_OFFLINE
@@ -155,7 +155,7 @@ def _load_local(encoder: nn.Module, name: str, path: Path) -> None:
         result = encoder.load_state_dict(state, strict=False)
     except RuntimeError as error:
         raise BadInputError(f"{path} does not fit encoder {name!r}: {error}") from error
-    # Left-over classifier weights are fine; an encoder that stays half random is not.
+    # Unused classifier weights are harmless; missing encoder weights would stay random.
     if result.missing_keys:
         raise BadInputError(
             f"{path} lacks {len(result.missing_keys)} tensors of encoder {name!r}, "
@@ -164,9 +164,10 @@ def _load_local(encoder: nn.Module, name: str, path: Path) -> None:
 
 
 def read_state_dict(path: Path) -> dict[str, Tensor]:
-    """Tensors by name from ``.safetensors`` or a torch file; a pickle of anything else is refused.
+    """Read tensors by name from ``.safetensors`` or a torch file of plain tensors.
 
-    Nothing in the file is ever executed: torch files are read with ``weights_only``.
+    Torch files are read with ``weights_only``, so that no code in the file is executed. Raises
+    `BadInputError` for any other content.
     """
     if not path.is_file():
         raise BadInputError(

@@ -1,4 +1,4 @@
-"""From what a model sees or simulates to predictions."""
+"""Readouts: predictions of contact from the features or the simulations of a model."""
 
 from physion.readout.evaluate import Evaluation, EvaluationConfig, evaluate, evaluate_model
 from physion.readout.protocols import Readout

@@ -1,4 +1,4 @@
-"""Answers of any model that predicts the contact itself, without a readout or a fit."""
+"""Predictions of models that return P(contact) themselves, without a readout or a fit."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ import numpy as np
 from physion.errors import BadInputError
 from physion.models.interface import PredictsContact
 from physion.models.observed import cut_to_observed
-from physion.readout.folds import Asked, Round
+from physion.readout.folds import Fold, ScenarioSplit
 from physion.readout.protocols import Readout
-from physion.readout.table import Answers
+from physion.readout.table import ScenarioPredictions
 from physion.trials.dataset import Dataset
 
 
 @dataclass
 class ContactReadout:
-    """Asks the model about every tested trial; it is given the motion cut to its observed part.
+    """Predictor that asks the model for P(contact) of every tested trial.
 
-    A trial that cannot be asked is left out of the answers and named in ``problems``.
+    The model receives the motion of the observed frames alone. Trials that fail have no
+    prediction; ``problems`` maps their names to the reasons.
     """
 
     dataset: Dataset
@@ -30,27 +31,28 @@ class ContactReadout:
     def __post_init__(self) -> None:
         self.problems: dict[str, str] = {}
 
-    def answers(self, round_: Round) -> list[Answers]:
-        """All predictions of a round."""
-        return [self._answer(round_, asked) for asked in round_.asked]
+    def predict(self, fold: Fold) -> list[ScenarioPredictions]:
+        """Return the predictions of a fold, one entry per scenario."""
+        return [self._predict_scenario(fold, split) for split in fold.scenarios]
 
-    def _answer(self, round_: Round, asked: Asked) -> Answers:
-        found: dict[str, float] = {}
-        for done, trial in enumerate(asked.test, start=1):
+    def _predict_scenario(self, fold: Fold, split: ScenarioSplit) -> ScenarioPredictions:
+        predicted: dict[str, float] = {}
+        for done, trial in enumerate(split.test, start=1):
             try:
-                found[trial] = self._probability(trial)
+                predicted[trial] = self._probability(trial)
             except BadInputError as error:
                 self.problems[trial] = str(error)
             if self.progress is not None:
-                self.progress("trials", done, len(asked.test))
-        return Answers(
-            scenario=asked.scenario,
+                self.progress("trials", done, len(split.test))
+        return ScenarioPredictions(
+            scenario=split.scenario,
             protocol=Readout.OBSERVED_SIMULATED,
-            trials=tuple(found),
-            probability=np.array(list(found.values()), np.float64),
+            trials=tuple(predicted),
+            probability=np.array(list(predicted.values()), np.float64),
             train_accuracy=float("nan"),
             fit_trials=0,
-            fold=round_.fold,
+            fold=fold.number,
+            fit_labels="",
         )
 
     def _probability(self, trial: str) -> float:
@@ -59,5 +61,5 @@ class ContactReadout:
             opened.scene, cut_to_observed(opened.scene, opened.trajectory)
         )
         if not 0 <= p <= 1:
-            raise BadInputError(f"trial {trial!r}: the model answers {p}, no probability")
+            raise BadInputError(f"trial {trial!r}: the model returned {p}, not a probability")
         return float(p)

@@ -1,4 +1,4 @@
-"""From a dataset and a model to a table of predictions."""
+"""Evaluation of a model on a dataset: predictions of every testing trial."""
 
 from __future__ import annotations
 
@@ -18,51 +18,50 @@ from physion.errors import BadInputError, MissingExtraError
 from physion.models.interface import Encodes, Model, PredictsContact, Simulates, build_model
 from physion.models.noisy_simulation import NoisySimulation
 from physion.readout.contacts import ContactReadout
-from physion.readout.folds import Round, plan_rounds
+from physion.readout.folds import Fold, plan_folds
 from physion.readout.logistic import ReadoutConfig
 from physion.readout.protocols import Readout
 from physion.readout.simulations import SimulationReadout
-from physion.readout.table import Answers, make_table, read_table, write_table
+from physion.readout.table import ScenarioPredictions, make_table, read_table, write_table
 from physion.training.protocols import Training
 from physion.trials.dataset import Dataset
 
 if TYPE_CHECKING:
     from physion.training.loop import TrainingConfig
 
-Progress = Callable[[str, int, int], None]
-"""Called with what is being done, how many are done, and how many there are."""
+"""Called with the name of a stage, the number of finished items, and their total."""
 
-_VERSION = 1
-"""Raised whenever the same evaluation could give other predictions."""
+_VERSION = 2
+"""To be increased with every change that can alter the table of an evaluation."""
 
 
 @dataclass(frozen=True)
 class EvaluationConfig:
-    """How models are evaluated."""
+    """Settings of an evaluation."""
 
     readouts: tuple[str, ...] = ()
-    """Protocols by name (observed, observed+simulated, full); empty: all that the model can do."""
+    """Protocols: observed, observed+simulated, full. Default: all that the model supports."""
     training: str = "all"
-    """Which scenarios train the dynamics: all, all-but, or only."""
+    """Scenarios that train the dynamics: all, all-but or only the tested one."""
     steps: int = 1000
     """Training steps of the dynamics."""
     batch: int = 32
-    """Clips a training step."""
+    """Clips per training step."""
     learning_rate: float = 1e-3
-    """Learning rate of Adam; the released code had 1e-2."""
+    """Learning rate of Adam; 1e-2 in the released code."""
     readout: ReadoutConfig = field(default_factory=ReadoutConfig)
-    """How a readout is fitted."""
+    """Settings of the readout."""
     folds: int = 5
-    """Parts of the cross-fit of a dataset without a readout split."""
+    """Folds of the cross-validation of a dataset without a readout split."""
     seed: int = 0
     """Seed of folds and training."""
     accelerator: str = "auto"
-    """Where networks run, by Lightning's name: auto, cpu, cuda, ..."""
+    """Device of the networks, by Lightning's name: auto, cpu, cuda, ..."""
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The table of predictions, its file, and the trials without one with the reason."""
+    """Table of predictions, its file, and the reasons of trials that have none."""
 
     predictions: pd.DataFrame
     path: Path
@@ -79,12 +78,31 @@ def evaluate(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> Evaluation:
-    """Predict every testing trial of ``dataset`` by the model called ``model``.
+    """Predict every testing trial of ``dataset`` with the model called ``model``.
 
-    ``options`` are fields of the model's config. Everything goes below ``folder``: the table in
-    ``predictions/<model>-<hash>.csv``, and what makes a second run quick in ``features/``,
-    ``training/`` and ``simulations/``. A table that is there already, of the same trials, model
-    and config, is returned as it is. ``executor`` runs simulations, by default in this process.
+    Parameters
+    ----------
+    dataset
+        Trials of the splits testing, readout and training (see `plan_folds`).
+    model
+        Name in the registry of models.
+    folder
+        Output folder. The table goes to ``predictions/<model>-<hash>.csv``; caches go to
+        ``features/``, ``training/`` and ``simulations/``. An existing table of the same trials,
+        model and config is returned without a new evaluation.
+    options
+        Fields of the model's config.
+    config
+        Settings of the evaluation.
+    executor
+        Runs simulations; by default they run in this process.
+    progress
+        Called after every finished item.
+
+    Raises
+    ------
+    BadInputError
+        If a protocol does not fit the model, or no trial could be predicted.
     """
     config = config if config is not None else EvaluationConfig()
     built = build_model(model, **dict(options or {}))
@@ -102,46 +120,47 @@ def evaluate_model(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> Evaluation:
-    """`evaluate` for a model that is built already."""
+    """Predict every testing trial with a model that is already built; see `evaluate`."""
     provenance = model.provenance()
     readouts = _readouts(model, config)
     name = f"{provenance.model}-{_digest(dataset, model, config, readouts)[:12]}.csv"
     path = folder / "predictions" / name
     if path.is_file():
         return Evaluation(read_table(path), path, {})
-    rounds = plan_rounds(dataset.index, Training.named(config.training), config.folds, config.seed)
+    folds = plan_folds(dataset.index, Training.named(config.training), config.folds, config.seed)
     if isinstance(model, NoisySimulation):
         simulations = SimulationReadout(dataset, model, folder, executor, progress)
-        simulations.prepare(rounds)
-        answers = _collect(simulations.answers, rounds, progress)
+        simulations.prepare(folds)
+        predictions = _collect(simulations.predict, folds, progress)
         problems: Mapping[str, str] = simulations.problems
     elif isinstance(model, PredictsContact):
         contacts = ContactReadout(dataset, model, progress)
-        answers, problems = _collect(contacts.answers, rounds, progress), contacts.problems
+        predictions, problems = _collect(contacts.predict, folds, progress), contacts.problems
     else:
-        answers, problems = _read_out(dataset, model, folder, readouts, config, rounds, progress)
-    if not any(part.trials for part in answers):
-        reason = next(iter(problems.values()), "no trial was asked")
+        predictions = _read_features(dataset, model, folder, readouts, config, folds, progress)
+        problems = {}
+    if not any(part.trials for part in predictions):
+        reason = next(iter(problems.values()), "there is no trial to predict")
         raise BadInputError(f"{provenance.model} predicts no trial: {reason}")
-    table = make_table(answers, provenance, dataset.index)
+    table = make_table(predictions, provenance, dataset.index)
     if not problems:
         write_table(table, path)
         return Evaluation(read_table(path), path, {})
-    # Under a name of its own, so that the missing trials are tried again by the next run.
+    # Another name than a complete table has, so that the next run retries the missing trials.
     partial = path.with_suffix(".partial.csv")
     write_table(table, partial)
     return Evaluation(read_table(partial), partial, problems)
 
 
-def _read_out(
+def _read_features(
     dataset: Dataset,
     model: Model,
     folder: Path,
     readouts: tuple[Readout, ...],
     config: EvaluationConfig,
-    rounds: list[Round],
+    folds: list[Fold],
     progress: Progress | None,
-) -> tuple[list[Answers], dict[str, str]]:
+) -> list[ScenarioPredictions]:
     try:
         from physion.readout.features import FeatureReadout, make_fabric
     except ModuleNotFoundError as error:
@@ -150,18 +169,20 @@ def _read_out(
     reader = FeatureReadout(
         dataset, model, readouts, _training(config), config.readout, fabric, folder, progress
     )
-    return _collect(reader.answers, rounds, progress), {}
+    return _collect(reader.predict, folds, progress)
 
 
 def _collect(
-    answers: Callable[[Round], list[Answers]], rounds: list[Round], progress: Progress | None
-) -> list[Answers]:
-    made: list[Answers] = []
-    for done, round_ in enumerate(rounds, start=1):
-        made += answers(round_)
+    predict: Callable[[Fold], list[ScenarioPredictions]],
+    folds: list[Fold],
+    progress: Progress | None,
+) -> list[ScenarioPredictions]:
+    predictions: list[ScenarioPredictions] = []
+    for done, fold in enumerate(folds, start=1):
+        predictions += predict(fold)
         if progress is not None:
-            progress("rounds", done, len(rounds))
-    return made
+            progress("folds", done, len(folds))
+    return predictions
 
 
 def _training(config: EvaluationConfig) -> TrainingConfig:
@@ -171,7 +192,10 @@ def _training(config: EvaluationConfig) -> TrainingConfig:
 
 
 def _readouts(model: Model, config: EvaluationConfig) -> tuple[Readout, ...]:
-    """The protocols asked for, or all that the model can do; `BadInputError` for one it cannot."""
+    """Return the requested protocols, or all that the model supports.
+
+    Raises `BadInputError` for a protocol that the model does not support.
+    """
     if isinstance(model, PredictsContact):
         possible = {Readout.OBSERVED_SIMULATED}
     elif not isinstance(model, Encodes):
@@ -180,29 +204,30 @@ def _readouts(model: Model, config: EvaluationConfig) -> tuple[Readout, ...]:
         possible = set(Readout)
     else:
         possible = {Readout.OBSERVED, Readout.FULL}
-    asked = [Readout.named(name) for name in config.readouts]
-    impossible = [readout.value for readout in asked if readout not in possible]
+    requested = [Readout.named(name) for name in config.readouts]
+    impossible = [readout.value for readout in requested if readout not in possible]
     if impossible or not possible:
         raise BadInputError(
-            f"{model.provenance().model} cannot be read out under {impossible or 'any protocol'}; "
-            f"it can under {[readout.value for readout in Readout if readout in possible]}"
+            f"{model.provenance().model} does not support the readout protocol "
+            f"{', '.join(impossible) or '(none at all)'}; "
+            f"supported: {[readout.value for readout in Readout if readout in possible]}"
         )
-    chosen = asked or [readout for readout in Readout if readout in possible]
+    chosen = requested or [readout for readout in Readout if readout in possible]
     return tuple(readout for readout in Readout if readout in chosen)
 
 
 def _digest(
     dataset: Dataset, model: Model, config: EvaluationConfig, readouts: tuple[Readout, ...]
 ) -> str:
-    """Hash of trials, labels, model and config: everything that decides the table."""
+    """Return the SHA-256 of all inputs of the table: trials, labels, model and config."""
     columns = ["trial", "scenario", "split", "contact", "digest", "movie_sha256"]
     columns += ["observed_movie_sha256", "recorded_contact"]
     settings = dataclasses.asdict(config)
     settings["readouts"] = [readout.value for readout in readouts]
-    own = getattr(model, "config", None)
-    described = dataclasses.asdict(own) if dataclasses.is_dataclass(own) else {}  # type: ignore[arg-type]
-    words = [_VERSION, physion.__version__, settings, dataclasses.asdict(model.provenance())]
-    sha = hashlib.sha256(json.dumps([*words, described], sort_keys=True, default=str).encode())
+    model_config = getattr(model, "config", None)
+    options = dataclasses.asdict(model_config) if dataclasses.is_dataclass(model_config) else {}  # type: ignore[arg-type]
+    parts = [_VERSION, physion.__version__, settings, dataclasses.asdict(model.provenance())]
+    sha = hashlib.sha256(json.dumps([*parts, options], sort_keys=True, default=str).encode())
     if isinstance(model, Encodes):
         sha.update(model.encoder_digest().encode())
     sha.update(dataset.index[columns].to_csv(index=False).encode())

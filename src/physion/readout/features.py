@@ -1,4 +1,4 @@
-"""Answers of a model that sees: its features, read out by logistic regression."""
+"""Predictions of a model that encodes frames: logistic regression on its features."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from torch import nn
 
 from physion.models.interface import Learns, Model
-from physion.readout.folds import Asked, Round
+from physion.readout.folds import Fold, ScenarioSplit
 from physion.readout.logistic import ReadoutConfig, fit_readout
 from physion.readout.protocols import Readout, flatten_time
-from physion.readout.table import Answers
+from physion.readout.table import ScenarioPredictions, describe_labels
 from physion.seeds import stable_hash
 from physion.training.clips import FeatureStore, FullClips, Progress, observed_clips
 from physion.training.dynamics import DynamicsReport, simulate_features, train_dynamics
@@ -31,11 +31,10 @@ _UNKNOWN = float("nan")
 
 @dataclass
 class FeatureReadout:
-    """Trains the dynamics of each round, and reads the features of its trials out.
+    """Predictor that trains the dynamics of each fold and fits readouts on the features.
 
-    Under *observed* and *observed+simulated* the readout gets features of the observed movies
-    alone; whole movies are opened for *full*, and to train dynamics on trials that are not tested
-    in that round.
+    The protocols *observed* and *observed+simulated* read the observed movies alone. Whole movies
+    are opened for *full*, and to train the dynamics on trials that the fold does not test.
     """
 
     dataset: Dataset
@@ -52,75 +51,75 @@ class FeatureReadout:
         self._store = FeatureStore(self.model, features, self.fabric)
         if isinstance(self.model, nn.Module):
             self.fabric.to_device(self.model)
-            self._fresh = copy.deepcopy(self.model.state_dict())
+            self._initial_state = copy.deepcopy(self.model.state_dict())
         self._observed = observed_clips(self.dataset, self.model.spec)
         self._labels = dict(
             zip(self.dataset.index["trial"], self.dataset.index["contact"], strict=True)
         )
 
-    def answers(self, round_: Round) -> list[Answers]:
-        """All predictions of a round."""
-        report = self._train(round_)
-        rollouts = self._simulate(round_)
+    def predict(self, fold: Fold) -> list[ScenarioPredictions]:
+        """Return the predictions of a fold, one entry per scenario and protocol."""
+        report = self._train(fold)
+        rollouts = self._simulate(fold)
         return [
-            self._read_out(round_, asked, protocol, rollouts, report)
-            for asked in round_.asked
+            self._predict_scenario(fold, split, protocol, rollouts, report)
+            for split in fold.scenarios
             for protocol in self.readouts
         ]
 
-    def _train(self, round_: Round) -> DynamicsReport | None:
+    def _train(self, fold: Fold) -> DynamicsReport | None:
         model = self.model
         wanted = Readout.OBSERVED_SIMULATED in self.readouts
         if not (wanted and isinstance(model, nn.Module) and isinstance(model, Learns)):
             return None
         clips = FullClips(self.dataset, self.model.spec)
-        features = self._store.features(clips, round_.train, self.progress)
-        # Every round starts from the same weights, not from what another one learnt.
-        model.load_state_dict(self._fresh)
+        features = self._store.features(clips, fold.train, self.progress)
+        # Every fold starts from the same initial weights.
+        model.load_state_dict(self._initial_state)
         folder = self.folder / "training" if self.folder is not None else None
         return train_dynamics(
             self.model, features, self.training, self.fabric, folder=folder, progress=self.progress
         )
 
-    def _simulate(self, round_: Round) -> dict[str, Floats]:
+    def _simulate(self, fold: Fold) -> dict[str, Floats]:
         if Readout.OBSERVED_SIMULATED not in self.readouts:
             return {}
-        trials = list(dict.fromkeys(t for a in round_.asked for t in (*a.fit, *a.test)))
+        trials = list(dict.fromkeys(t for s in fold.scenarios for t in (*s.fit, *s.test)))
         context = self._store.features(self._observed, trials, self.progress)
         steps = self.model.spec.total - self.model.spec.context
-        made = simulate_features(self.model, context, steps, self.fabric)
-        return dict(zip(trials, made, strict=True))
+        simulated = simulate_features(self.model, context, steps, self.fabric)
+        return dict(zip(trials, simulated, strict=True))
 
-    def _read_out(
+    def _predict_scenario(
         self,
-        round_: Round,
-        asked: Asked,
+        fold: Fold,
+        split: ScenarioSplit,
         protocol: Readout,
         rollouts: dict[str, Floats],
         report: DynamicsReport | None,
-    ) -> Answers:
-        trials = [*asked.fit, *asked.test]
+    ) -> ScenarioPredictions:
+        trials = [*split.fit, *split.test]
         if protocol.sees_future:
             clips = FullClips(self.dataset, self.model.spec)
-            given = flatten_time(self._store.features(clips, trials, self.progress))
+            inputs = flatten_time(self._store.features(clips, trials, self.progress))
         else:
-            seen = self._store.features(self._observed, trials, self.progress)
-            parts = [seen]
+            parts = [self._store.features(self._observed, trials, self.progress)]
             if protocol is Readout.OBSERVED_SIMULATED:
                 parts.append(np.stack([rollouts[trial] for trial in trials]))
-            given = flatten_time(*parts)
-        count = len(asked.fit)
-        labels = np.array([bool(self._labels[trial]) for trial in asked.fit], bool)
-        fitted = fit_readout(given[:count], labels, given[count:], self.readout)
-        return Answers(
-            scenario=asked.scenario,
+            inputs = flatten_time(*parts)
+        count = len(split.fit)
+        labels = np.array([bool(self._labels[trial]) for trial in split.fit], bool)
+        fitted = fit_readout(inputs[:count], labels, inputs[count:], self.readout)
+        return ScenarioPredictions(
+            scenario=split.scenario,
             protocol=protocol,
-            trials=asked.test,
+            trials=split.test,
             probability=fitted.probability,
             train_accuracy=fitted.train_accuracy,
             fit_trials=count,
-            fold=round_.fold,
-            training_set=round_.training.name if report else "",
+            fold=fold.number,
+            fit_labels=describe_labels([False] * count),
+            training_set=fold.training.name if report else "",
             training_seed=str(self.training.seed) if report else "",
             c=fitted.c,
             cv_accuracy=fitted.cv_accuracy,
@@ -131,7 +130,7 @@ class FeatureReadout:
 
 
 def make_fabric(accelerator: str, seed: int) -> Fabric:
-    """One device by Lightning's name (``auto``, ``cpu``, ``cuda``, ``mps``), seeded."""
+    """Return a seeded Fabric on one device; ``accelerator`` is Lightning's name."""
     torch.manual_seed(stable_hash("fabric", seed) % 2**63)
     options: dict[str, Any] = {"accelerator": accelerator, "devices": 1}
     return Fabric(**options)

@@ -1,4 +1,4 @@
-"""Which trials train dynamics, which fit a readout, and which are then predicted."""
+"""Folds of an evaluation: which trials train the dynamics, fit a readout, and are predicted."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ TRAINING, READOUT, TESTING = "training", "readout", "testing"
 
 
 @dataclass(frozen=True)
-class Asked:
-    """One scenario in a round: fit a readout on ``fit``, then predict ``test``."""
+class ScenarioSplit:
+    """The trials of one scenario that fit a readout, and those that it predicts."""
 
     scenario: str
     fit: tuple[str, ...]
@@ -25,27 +25,46 @@ class Asked:
 
 
 @dataclass(frozen=True)
-class Round:
-    """One training of dynamics on ``train`` and all the readouts that use it.
+class Fold:
+    """One training of the dynamics and the scenarios that are predicted with it.
 
-    ``fold`` counts the parts of a cross-fit; -1 where the dataset has a readout split of its own.
-    No trial of any ``test`` is in ``train`` or in any ``fit`` of its round.
+    ``number`` counts the folds of a cross-validation from 0; it is -1 where the dataset has a
+    readout split of its own. No trial of any ``test`` is in ``train`` or in any ``fit`` of the
+    same fold.
     """
 
     training: TrainingSet
     train: tuple[str, ...]
-    asked: tuple[Asked, ...]
-    fold: int
+    scenarios: tuple[ScenarioSplit, ...]
+    number: int
 
 
-def plan_rounds(index: pd.DataFrame, protocol: Training, folds: int, seed: int) -> list[Round]:
-    """The rounds of an evaluation; every trial of the testing split is predicted once.
+def plan_folds(index: pd.DataFrame, protocol: Training, folds: int, seed: int) -> list[Fold]:
+    """Return the folds of an evaluation, in which every testing trial is predicted once.
 
-    Readouts are fitted on the split *readout*, and dynamics trained on *training* (or, without
-    one, on *readout*). A dataset whose scenarios lack a readout split is cross-fitted: its testing
-    trials are dealt into ``folds`` parts, balanced by label, and each part is predicted by what
-    was fitted on the others. Trials that are the same physics (equal ``digest``) stay in one part,
-    and a readout or training trial whose physics occurs in a tested trial is not used.
+    Readouts are fitted on the readout split; dynamics are trained on the training split, or on
+    the readout split where there is none. If a scenario has no readout trial, the testing trials
+    are cross-validated instead: they are divided into ``folds`` groups, and each group is
+    predicted by what was fitted on the others.
+
+    Trials with the same physics (equal ``digest``) always share a group, and a readout or training
+    trial with the physics of a testing trial is not used.
+
+    Parameters
+    ----------
+    index
+        Index of a dataset.
+    protocol
+        Which scenarios train the dynamics.
+    folds
+        Number of groups of a cross-validation, at least 2.
+    seed
+        Seed of the assignment to groups.
+
+    Raises
+    ------
+    BadInputError
+        If there is no testing trial, or fewer than 2 folds for a cross-validation.
     """
     tested = index[index["split"] == TESTING]
     if len(tested) == 0:
@@ -58,46 +77,48 @@ def plan_rounds(index: pd.DataFrame, protocol: Training, folds: int, seed: int) 
     sets = training_sets(protocol, scenarios)
     if set(scenarios) <= set(fit["scenario"]):
         pool = train if len(train) else fit
-        return [_round(s, pool, fit, tested, -1) for s in sets]
+        return [_make_fold(s, pool, fit, tested, -1) for s in sets]
     if folds < 2:
-        raise BadInputError(f"a cross-fit needs at least 2 folds, not {folds}")
-    part = deal(tested, folds, seed)
-    rounds = []
-    for fold in sorted(set(part.values())):
-        held = tested["trial"].map(part) == fold
+        raise BadInputError(f"a cross-validation needs at least 2 folds, not {folds}")
+    numbers = assign_folds(tested, folds, seed)
+    planned = []
+    for number in sorted(set(numbers.values())):
+        held = tested["trial"].map(numbers) == number
         rest = pd.concat([fit, tested[~held]])
         pool = train if len(train) else rest
-        rounds += [_round(s, pool, rest, tested[held], fold) for s in sets]
-    return rounds
+        planned += [_make_fold(s, pool, rest, tested[held], number) for s in sets]
+    return planned
 
 
-def deal(table: pd.DataFrame, folds: int, seed: int) -> Mapping[str, int]:
-    """The part (0 to folds - 1) of each trial: balanced by scenario and label, same by same digest.
+def assign_folds(table: pd.DataFrame, folds: int, seed: int) -> Mapping[str, int]:
+    """Return the fold (0 to folds - 1) of each trial, balanced by scenario and label.
 
-    Depends on seed, digests and labels alone, not on the order of rows.
+    Trials with equal digests get the same fold. The result depends on seed, digests and labels
+    alone, not on the order of rows.
     """
-    part: dict[str, int] = {}
+    assigned: dict[str, int] = {}
     for _, rows in table.groupby("scenario", sort=True):
         groups = rows.groupby("digest")["contact"].mean()
         order = sorted(groups.index, key=lambda d: (groups[d] > 0.5, stable_hash(seed, str(d))))
-        place = {digest: i % folds for i, digest in enumerate(order)}
-        part |= {
-            str(trial): place[digest]
+        numbers = {digest: i % folds for i, digest in enumerate(order)}
+        assigned |= {
+            str(trial): numbers[digest]
             for trial, digest in zip(rows["trial"], rows["digest"], strict=True)
         }
-    return part
+    return assigned
 
 
-def _round(
-    training: TrainingSet, pool: pd.DataFrame, fit: pd.DataFrame, test: pd.DataFrame, fold: int
-) -> Round:
-    asked = [
-        Asked(scenario, _trials(fit, (scenario,)), _trials(test, (scenario,)))
-        for scenario in training.asked
+def _make_fold(
+    training: TrainingSet, pool: pd.DataFrame, fit: pd.DataFrame, test: pd.DataFrame, number: int
+) -> Fold:
+    splits = [
+        ScenarioSplit(scenario, _trials(fit, (scenario,)), _trials(test, (scenario,)))
+        for scenario in training.tested
     ]
-    kept = tuple(one for one in asked if one.test)
-    return Round(training, _trials(pool, training.trained), kept, fold)
+    kept = tuple(split for split in splits if split.test)
+    return Fold(training, _trials(pool, training.trained), kept, number)
 
 
 def _trials(table: pd.DataFrame, scenarios: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the sorted names of the trials of ``scenarios``."""
     return tuple(sorted(str(t) for t in table["trial"][table["scenario"].isin(scenarios)]))

@@ -1,14 +1,16 @@
 """L2 logistic regression on few trials with very many features, solved exactly.
 
-With d features and n trials, d >> n, the solution lies in the span of the trials. So all that is
-needed of the features is the n x n matrix of inner products; its eigenvectors turn the problem
-into one of at most n dimensions, without any approximation, and Newton's method solves that to the
-rounding error. The objective is that of scikit-learn, whose converged solution is the same:
+The objective is that of scikit-learn:
 
     C * sum(log(1 + exp(-y f))) + |w|^2 / 2,    f = w . x + b,  y in {-1, 1},  b not penalised.
 
-The released study stopped lbfgs after 200 iterations, which is not the optimum
-(reference/models.md, section 3.1); ``released=True`` does as they did.
+With d features and n trials, d >> n, the solution w lies in the span of the n trials, so that
+the n x n Gram matrix of inner products is all that is needed of the features. Its
+eigenvectors reduce the problem, without approximation, to at most n dimensions, where Newton's
+method solves it to rounding error.
+
+The released code stopped lbfgs after 200 iterations, before the optimum
+(docs/official-system.md, section 5.4); ``released=True`` does the same.
 """
 
 from __future__ import annotations
@@ -31,23 +33,23 @@ Array = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
 
 C_GRID: tuple[float, ...] = tuple(float(c) for c in np.logspace(-8, 8, 17))
-"""Inverse penalties that cross-validation chooses from."""
+"""Inverse penalties among which cross-validation chooses."""
 FOLDS = 5
 _CHUNK = 4096
-"""Feature columns that are standardised at a time: bounds the memory."""
+"""Feature columns that are standardised at a time, which limits the memory."""
 _ITERATIONS = 200
 _TOLERANCE = 1e-9
-"""On the gradient, as a share of its two terms, which cancel at the optimum."""
+"""Tolerance of the gradient, relative to its two terms, which cancel at the optimum."""
 
 
 @dataclass(frozen=True)
 class ReadoutConfig:
-    """How a readout is fitted.
+    """Settings of a readout.
 
     - ``grid``: inverse penalties C, ascending. ``folds``: of the cross-validation that chooses.
     - ``seed``: of the folds and of undersampling.
-    - ``balance``: drop trials of the more frequent answer until both are equally frequent, as
-      the released code did for fitting (never for testing).
+    - ``balance``: undersample the more frequent label of the fit trials, as the released code did;
+      tested trials are never undersampled.
     - ``released``: scikit-learn's lbfgs with 200 iterations instead of the exact optimum.
     """
 
@@ -59,20 +61,20 @@ class ReadoutConfig:
 
     def __post_init__(self) -> None:
         if not self.grid or min(self.grid) <= 0 or list(self.grid) != sorted(set(self.grid)):
-            raise BadInputError(f"grid of C must ascend and be above zero, not {self.grid}")
+            raise BadInputError(f"grid of C must be ascending and positive, not {self.grid}")
         if self.folds < 2:
             raise BadInputError(f"cross-validation needs at least 2 folds, not {self.folds}")
 
 
 @dataclass(frozen=True)
 class FittedReadout:
-    """What a readout found.
+    """Predictions and fit statistics of a readout.
 
     - ``probability`` (m,): P(contact) of the test trials, 0..1.
-    - ``train_accuracy``: on the trials it was fitted on, 0..1; ``cv_accuracy``: mean over folds at
+    - ``train_accuracy``: accuracy on the fit trials, 0..1; ``cv_accuracy``: mean over folds at
       the chosen C, NaN without cross-validation.
     - ``c``: the chosen inverse penalty, NaN where nothing was fitted.
-    - ``note``: why a fit was not an ordinary one, else empty.
+    - ``note``: what was unusual about the fit, or empty.
     """
 
     probability: Array
@@ -85,13 +87,26 @@ class FittedReadout:
 def fit_readout(
     train: NDArray[Any], labels: Booleans, test: NDArray[Any], config: ReadoutConfig | None = None
 ) -> FittedReadout:
-    """Fit on ``train`` (n, d) with ``labels`` (n,) and answer for ``test`` (m, d).
+    """Fit a readout on ``train`` and predict ``test``.
 
-    Features are standardised by the mean and deviation of the trials that are fitted; a constant
-    feature counts nothing. With one answer only in ``labels`` there is nothing to fit, and the
-    probability is that of Laplace's rule of succession. With fewer than two trials of an answer
-    there is no cross-validation, and C is the middle of the grid. NaN or infinite features raise
-    `BadInputError`.
+    Parameters
+    ----------
+    train
+        Features (n, d) of the fit trials. They set the mean and standard deviation by which all
+        features are standardised; a constant feature is ignored.
+    labels
+        Contact or not (n,). If all are equal, nothing is fitted and the probability is that of
+        Laplace's rule of succession. If a label occurs fewer than twice there is no
+        cross-validation, and C is the middle of the grid.
+    test
+        Features (m, d) of the trials to predict.
+    config
+        Settings of the readout.
+
+    Raises
+    ------
+    BadInputError
+        If shapes do not match, or a feature is not finite.
     """
     config = config if config is not None else ReadoutConfig()
     labels = np.asarray(labels, bool)
@@ -101,23 +116,23 @@ def fit_readout(
         train, labels = train[kept], labels[kept]
     hits, count = int(labels.sum()), len(labels)
     if hits in (0, count):
-        share = (hits + 1) / (count + 2)
+        p = (hits + 1) / (count + 2)
         note = "no trial to fit" if count == 0 else "one answer only"
-        accuracy = float("nan") if count == 0 else float(np.mean(labels == (share > 0.5)))
-        return FittedReadout(np.full(len(test), share), accuracy, float("nan"), float("nan"), note)
+        accuracy = float("nan") if count == 0 else float(np.mean(labels == (p > 0.5)))
+        return FittedReadout(np.full(len(test), p), accuracy, float("nan"), float("nan"), note)
     c, cv_accuracy, note = _choose(train, labels, config)
     everything = np.concatenate([train, test])
     grid = tuple(value for value in config.grid if value <= c)
-    scores = _decide(everything, np.arange(count), labels, grid, config)[:, -1]
+    scores = _decision_values(everything, np.arange(count), labels, grid, config)[:, -1]
     probability = 1 / (1 + np.exp(-np.clip(scores, -700, 700)))
     accuracy = float(np.mean((scores[:count] > 0) == labels))
     return FittedReadout(probability[count:], accuracy, cv_accuracy, c, note)
 
 
 def undersample(labels: Booleans, seed: int) -> NDArray[np.int64]:
-    """Sorted rows that keep all trials of the rarer answer and as many of the other, at random.
+    """Return sorted rows with all trials of the rarer label and as many, random, of the other.
 
-    All rows where one answer does not occur at all.
+    Returns all rows if a label does not occur.
     """
     yes, no = np.flatnonzero(labels), np.flatnonzero(~labels)
     count = min(len(yes), len(no))
@@ -129,9 +144,9 @@ def undersample(labels: Booleans, seed: int) -> NDArray[np.int64]:
 
 
 def gram(features: NDArray[Any], fitted: NDArray[np.int64]) -> Array:
-    """Inner products (n, k) of all rows with the ``fitted`` ones, standardised by the latter.
+    """Return inner products (n, k) of all rows with the ``fitted`` rows, which also standardise.
 
-    Works through the columns in chunks, so that d is bounded by the features themselves alone.
+    Works on chunks of columns, so that no standardised copy of all features is needed.
     """
     out = np.zeros((len(features), len(fitted)))
     for start in range(0, features.shape[1], _CHUNK):
@@ -145,9 +160,10 @@ def gram(features: NDArray[Any], fitted: NDArray[np.int64]) -> Array:
 
 
 def solve_path(kernel: Array, labels: Booleans, grid: tuple[float, ...]) -> tuple[Array, Array]:
-    """Weights (k, len(grid)) on the rows of ``kernel`` (k, k) and intercepts, one for each C.
+    """Return dual weights (k, len(grid)) and intercepts (len(grid),) for each C of ``grid``.
 
-    The answer of a trial with inner products ``g`` (k,) is ``g @ weights + intercept``.
+    ``kernel`` (k, k) is the Gram matrix of the fit trials. The decision value of a trial with
+    inner products ``g`` (k,) is ``g @ weights + intercept``.
     """
     values, vectors = linalg.eigh(kernel)
     kept = values > max(values[-1], 0.0) * 1e-12
@@ -156,9 +172,9 @@ def solve_path(kernel: Array, labels: Booleans, grid: tuple[float, ...]) -> tupl
     back = vectors[:, kept] / roots
     design = np.column_stack([rotated, np.ones(len(labels))])
     signs = np.where(labels, 1.0, -1.0)
-    share = labels.mean()
+    base_rate = labels.mean()
     solution = np.zeros(design.shape[1])
-    solution[-1] = np.log(share / (1 - share))
+    solution[-1] = np.log(base_rate / (1 - base_rate))
     weights, intercepts = [], []
     for c in grid:
         solution = _newton(design, signs, c, solution)
@@ -168,19 +184,19 @@ def solve_path(kernel: Array, labels: Booleans, grid: tuple[float, ...]) -> tupl
 
 
 def _newton(design: Array, signs: Array, c: float, start: Array) -> Array:
-    """The optimum for one C, from the solution for the next smaller one."""
+    """Return the optimum for one C, starting from the solution for the next smaller one."""
     penalty = np.full(design.shape[1], 1.0 / (c * len(signs)))
     penalty[-1] = 0.0
     x = start
     value, margins = _objective(design, signs, penalty, x)
     for _ in range(_ITERATIONS):
-        miss = 1 / (1 + np.exp(np.clip(margins, -700, 700)))
-        gradient = penalty * x - design.T @ (signs * miss) / len(signs)
+        error = 1 / (1 + np.exp(np.clip(margins, -700, 700)))
+        gradient = penalty * x - design.T @ (signs * error) / len(signs)
         if 0 < np.abs(gradient).max() <= _TOLERANCE * np.abs(penalty * x).max():
             break
-        curvature = miss * (1 - miss) / len(signs)
+        curvature = error * (1 - error) / len(signs)
         hessian = (design * curvature[:, None]).T @ design
-        # The tiny addition keeps the intercept solvable when every trial is far from the border.
+        # 1e-15 keeps the Hessian regular when every trial is far from the decision boundary.
         hessian[np.diag_indices_from(hessian)] += penalty + 1e-15
         step = -linalg.solve(hessian, gradient, assume_a="pos")
         slope, length = float(gradient @ step), 1.0
@@ -206,7 +222,10 @@ def _objective(design: Array, signs: Array, penalty: Array, x: Array) -> tuple[f
 def _choose(
     train: NDArray[Any], labels: Booleans, config: ReadoutConfig
 ) -> tuple[float, float, str]:
-    """The C of the highest mean accuracy over folds (the smallest of equals), and that accuracy."""
+    """Return the C with the highest mean accuracy over folds, that accuracy, and a note.
+
+    Among equal accuracies the smallest C is taken.
+    """
     folds = min(config.folds, int(labels.sum()), int((~labels).sum()))
     if len(config.grid) == 1 or folds < 2:
         note = "" if len(config.grid) == 1 else "too few trials to choose C"
@@ -214,7 +233,7 @@ def _choose(
     splitter = StratifiedKFold(folds, shuffle=True, random_state=config.seed)
     accuracies = []
     for fitted, held in splitter.split(np.zeros(len(labels)), labels):
-        scores = _decide(train, fitted, labels[fitted], config.grid, config)
+        scores = _decision_values(train, fitted, labels[fitted], config.grid, config)
         accuracies.append(np.mean((scores[held] > 0) == labels[held][:, None], axis=0))
     mean = np.mean(accuracies, axis=0)
     best = int(np.argmax(mean))
@@ -222,19 +241,19 @@ def _choose(
     return config.grid[best], float(mean[best]), note
 
 
-def _decide(
+def _decision_values(
     features: NDArray[Any],
     fitted: NDArray[np.int64],
     labels: Booleans,
     grid: tuple[float, ...],
     config: ReadoutConfig,
 ) -> Array:
-    """Answers (n, len(grid)) of all rows by readouts fitted on the ``fitted`` ones."""
+    """Return decision values (n, len(grid)) of all rows; readouts are fitted on ``fitted`` rows."""
     if not config.released:
         kernel = gram(features, fitted)
         weights, intercepts = solve_path(kernel[fitted], labels, grid)
-        answers: Array = kernel @ weights + intercepts
-        return answers
+        values: Array = kernel @ weights + intercepts
+        return values
     columns = []
     for c in grid:
         model = make_pipeline(StandardScaler(), LogisticRegression(C=c, max_iter=200))

@@ -1,4 +1,4 @@
-"""What a readout is given of a clip: the three protocols of the study.
+"""The three readout protocols of the study: which features of a clip a readout receives.
 
 | protocol | official | features |
 |---|---|---|
@@ -6,7 +6,8 @@
 | *observed+simulated* | B | encoder, observed frames; dynamics, the rest |
 | *full* | A | encoder, all frames |
 
-*full* is detection: it sees the answer. It tells how much of it the encoder's features hold.
+*full* is detection, not prediction: the frames show the outcome. It measures how much of the
+outcome the features of the encoder contain.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from physion.errors import BadInputError, UnknownNameError
 
 
 class Readout(Enum):
-    """A readout protocol; the value is its name in the paper."""
+    """Readout protocol; the value is its name in the paper."""
 
     OBSERVED = "observed"
     OBSERVED_SIMULATED = "observed+simulated"
@@ -29,17 +30,17 @@ class Readout(Enum):
 
     @property
     def letter(self) -> str:
-        """The ``Readout Type`` of the official result files."""
+        """Value of ``Readout Type`` in the official result files."""
         return {"observed": "C", "observed+simulated": "B", "full": "A"}[self.value]
 
     @property
     def sees_future(self) -> bool:
-        """Does it see frames after the observed part?"""
+        """Whether the readout receives frames after the observed part."""
         return self is Readout.FULL
 
     @classmethod
     def named(cls, name: str) -> Readout:
-        """The protocol called ``name``; `UnknownNameError` with the closest names."""
+        """Return the protocol called ``name``; raise `UnknownNameError` with the closest names."""
         try:
             return cls(name)
         except ValueError:
@@ -47,7 +48,7 @@ class Readout(Enum):
 
 
 def flatten_time(*parts: NDArray[Any]) -> NDArray[np.float32]:
-    """Features (n, T, D) of several parts, one after the other in time, as (n, T_all * D)."""
+    """Concatenate features (n, T, D) in time and flatten them to (n, T_all * D)."""
     joined = np.concatenate([np.asarray(part, np.float32) for part in parts], axis=1)
     if joined.ndim != 3:
         raise BadInputError(f"features must be (trials, time, features), not {joined.shape}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,7 +38,7 @@ OFFICIAL_COLUMNS = (
     "Dynamics Training Dataset",
     "Dynamics Training Seed",
 )
-"""Columns of the official files, in their order (reference/official-system.md, section 5.5)."""
+"""Columns of the official files, in their order (docs/official-system.md, section 5.5)."""
 
 OWN_COLUMNS = (
     "Protocol",
@@ -54,15 +55,20 @@ OWN_COLUMNS = (
     "Note",
     "Versions",
 )
-"""What we add: the protocol by its name; ``Init``, what the weights were; the outcome in the
-official recording, empty where there is none (``Actual Outcome`` is that of the trial shown); which
-labels the readout was fitted on and on how many trials; -1 or the part of a cross-fit; the rest
-empty where it does not apply."""
+"""Columns that this package adds.
+
+- ``Protocol``: readout protocol by its name. ``Init``: initial weights of the model.
+- ``Recorded Outcome``: outcome in the official recording, empty where there is none;
+  ``Actual Outcome`` is that of the trial as simulated here.
+- ``Fit Labels``: outcomes that the readout or the noise level was fitted on (`describe_labels`).
+- ``Fit Trials``: number of trials in the fit. ``Fold``: fold of a cross-validation, or -1.
+- The others are empty where they do not apply.
+"""
 
 
 @dataclass(frozen=True)
-class Answers:
-    """Predictions of one scenario under one protocol in one round; arrays are over ``trials``."""
+class ScenarioPredictions:
+    """Predictions of one scenario under one protocol in one fold; arrays are over ``trials``."""
 
     scenario: str
     protocol: Readout
@@ -71,6 +77,7 @@ class Answers:
     train_accuracy: float
     fit_trials: int
     fold: int
+    fit_labels: str
     training_set: str = ""
     training_seed: str = ""
     c: float = float("nan")
@@ -81,11 +88,28 @@ class Answers:
     note: str = ""
 
 
-def make_table(answers: list[Answers], provenance: Provenance, index: pd.DataFrame) -> pd.DataFrame:
-    """One row a protocol and tested trial, sorted; the accuracy of testing is over all rounds."""
+def describe_labels(recorded: Sequence[bool]) -> str:
+    """Return which outcomes a fit used: ``recorded``, ``simulated``, ``mixed``, or "" for no trial.
+
+    ``recorded`` says for each fit trial whether its outcome comes from the official recording.
+    """
+    if not recorded:
+        return ""
+    if all(recorded):
+        return "recorded"
+    return "mixed" if any(recorded) else "simulated"
+
+
+def make_table(
+    predictions: list[ScenarioPredictions], provenance: Provenance, index: pd.DataFrame
+) -> pd.DataFrame:
+    """Return the sorted table of predictions, one row per protocol and tested trial.
+
+    Accuracies are means over all folds of a protocol and scenario.
+    """
     truth = index.set_index("trial")
     rows = []
-    for part in answers:
+    for part in predictions:
         for trial, p in zip(part.trials, part.probability, strict=True):
             recorded = truth["recorded_contact"][trial]
             rows.append(
@@ -112,7 +136,7 @@ def make_table(answers: list[Answers], provenance: Provenance, index: pd.DataFra
                     "Protocol": part.protocol.value,
                     "Init": provenance.init,
                     "Recorded Outcome": "" if pd.isna(recorded) else bool(recorded),
-                    "Fit Labels": "simulated",
+                    "Fit Labels": part.fit_labels,
                     "Fit Trials": part.fit_trials,
                     "Fold": part.fold,
                     "Readout C": part.c,
@@ -134,7 +158,7 @@ def make_table(answers: list[Answers], provenance: Provenance, index: pd.DataFra
 
 
 def write_table(table: pd.DataFrame, path: Path) -> None:
-    """Write a CSV file, atomically; the same table gives the same bytes."""
+    """Write a CSV file atomically; equal tables give equal bytes."""
     buffer = io.StringIO()
     table.to_csv(buffer, index=False, lineterminator="\n")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -142,7 +166,7 @@ def write_table(table: pd.DataFrame, path: Path) -> None:
 
 
 def read_table(path: Path) -> pd.DataFrame:
-    """A table that `write_table` wrote; words stay words, empty ones empty."""
+    """Read a table that `write_table` wrote; texts stay texts, and empty ones stay empty."""
     numbers = {
         "Train Accuracy", "Test Accuracy", "Predicted Prob_false", "Predicted Prob_true",
         "Readout C", "CV Accuracy", "Noise Scale", "Validation Loss", "Copy-last Loss",

@@ -1,1 +1,1 @@
-"""Clips, features, and the training of dynamics on them."""
+"""Training: clips, features, and dynamics that are trained on them."""

@@ -1,4 +1,4 @@
-"""Windows of features to train dynamics on, drawn by seed and step alone."""
+"""Training batches: windows of features, sampled as a function of seed and step."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class WindowBatches:
-    """Random windows of ``features`` (trials, time, features), ``length`` steps each.
+    """Random windows of ``length`` time steps of ``features`` (trials, time, features).
 
-    The batch of a step is a function of the seed and the step, never of the steps before, so
-    that training that was stopped goes on with the very batches it would have had.
+    A batch is a function of the seed and the step alone, so that a resumed training receives
+    the same batches as one that was not interrupted.
     """
 
     features: Floats
@@ -38,37 +38,39 @@ class WindowBatches:
             )
 
     def __call__(self, step: int) -> dict[str, Tensor]:
-        """``features`` (size, length, features) of the step."""
+        """Return ``features`` (size, length, features) of a step."""
         rng = generator("batch", self.seed, step)
         trials = rng.integers(len(self.features), size=self.size)
         starts = rng.integers(self.features.shape[1] - self.length + 1, size=self.size)
-        moments = starts[:, None] + np.arange(self.length)
-        return {"features": torch.from_numpy(self.features[trials[:, None], moments])}
+        times = starts[:, None] + np.arange(self.length)
+        return {"features": torch.from_numpy(self.features[trials[:, None], times])}
 
     def digest(self) -> str:
-        """Hexadecimal SHA-256 of the features and of how windows are drawn."""
+        """Return the hexadecimal SHA-256 of the features and of the settings of the windows."""
         sha = hashlib.sha256(repr((self.features.shape, self.length, self.size)).encode())
         sha.update(np.ascontiguousarray(self.features).tobytes())
         return sha.hexdigest()
 
 
-def hold_out(count: int, share: float, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Sorted rows to train on and rows held out to validate, ``share`` of ``count``.
+def hold_out(count: int, fraction: float, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the sorted rows for training and those held out for validation.
 
-    At least one row is held out where there are two or more; a single row is both.
+    ``fraction`` of ``count`` rows is held out, but at least one if there are two or more; a single
+    row is used for both.
     """
     if count < 2:
         rows = np.arange(count)
         return rows, rows
-    held = min(count - 1, max(1, round(share * count)))
+    held = min(count - 1, max(1, round(fraction * count)))
     order = generator("hold out", seed).permutation(count)
     return np.sort(order[held:]), np.sort(order[:held])
 
 
 def copy_last_loss(features: Floats, context: int) -> float:
-    """Mean squared error of saying that the next feature is the last one, over all windows.
+    """Return the mean squared error of predicting the last feature again, over all windows.
 
-    ``features`` (trials, time, features). It is what any dynamics must beat; NaN without a window.
+    ``features`` is (trials, time, features). This is the baseline of dynamics; NaN if no window
+    fits.
     """
     change = np.diff(features.astype(np.float64), axis=1)[:, context - 1 :]
     return float(np.mean(change**2)) if change.size else float("nan")

@@ -1,7 +1,7 @@
-"""Clips of trials, and the features that an encoder makes of them, each computed once.
+"""Clips of trials, and a store of the features that an encoder computes of them.
 
-Under a protocol that must predict, the only source is `ObservedClips`: it holds the observed
-movies, which are cut, and not the dataset, so there is no way from it to a later frame.
+Protocols that must predict read from `ObservedClips` alone. It holds only the observed movies,
+which are cut files, and not the dataset, so that it cannot reach a later frame.
 """
 
 from __future__ import annotations
@@ -25,19 +25,18 @@ from physion.scenes.scene import OBSERVED_FRAMES
 from physion.trials.dataset import Dataset, ObservedDataset
 
 Floats = NDArray[np.float32]
-Progress = Callable[[str, int, int], None]
-"""Called with what is being done, how many are done, and how many there are."""
+"""Called with the name of a stage, the number of finished items, and their total."""
 
 _FEATURE_VERSION = 1
-"""Raised whenever the same movie and encoder could give other features."""
+"""To be increased with every change that can alter the features of a movie and encoder."""
 
 
 class FutureFrameError(BadInputError):
-    """A frame after the observed part was asked of a source that only shows the observed part."""
+    """Error for a request of a frame after the observed part from `ObservedClips`."""
 
 
 class ClipSource(Protocol):
-    """Hands out clips of one part of the trials."""
+    """Source of clips."""
 
     @property
     def indices(self) -> tuple[int, ...]:
@@ -45,16 +44,16 @@ class ClipSource(Protocol):
         ...
 
     def clip(self, trial: str) -> Clip:
-        """The clip of a trial."""
+        """Return the clip of a trial."""
         ...
 
     def key(self, trial: str) -> str:
-        """SHA-256 of the movie that the clip comes from."""
+        """Return the SHA-256 of the movie of a trial's clip."""
         ...
 
 
 class ObservedClips:
-    """Clips of the observed part; made from the observed movies and their hashes alone."""
+    """Source of clips of the observed part, from the observed movies and their hashes alone."""
 
     def __init__(self, movies: ObservedDataset, hashes: dict[str, str], spec: Spec) -> None:
         self._movies, self._hashes, self._spec = movies, hashes, spec
@@ -65,16 +64,16 @@ class ObservedClips:
         return self._spec.observed_indices()
 
     def clip(self, trial: str) -> Clip:
-        """The context of a trial."""
+        """Return the context frames of a trial."""
         return self.read(trial, self.indices)
 
     def read(self, trial: str, indices: Sequence[int]) -> Clip:
-        """Any observed frames of a trial; `FutureFrameError` for one at or after frame 45."""
+        """Return observed frames of a trial; raise `FutureFrameError` for frame 45 or later."""
         late = [index for index in indices if index >= OBSERVED_FRAMES]
         if late or min(indices, default=0) < 0:
             raise FutureFrameError(
-                f"trial {trial!r}: frame {(late or [min(indices)])[0]} is not among the "
-                f"{OBSERVED_FRAMES} observed frames, and nothing later can be shown here"
+                f"trial {trial!r}: frame {(late or [min(indices)])[0]} is not one of the "
+                f"{OBSERVED_FRAMES} observed frames"
             )
         stride, count = _steps(indices)
         size = self._spec.image_size
@@ -82,14 +81,14 @@ class ObservedClips:
         return Clip(trial, frames, tuple(indices), observed=True)
 
     def key(self, trial: str) -> str:
-        """SHA-256 of the observed movie."""
+        """Return the SHA-256 of the observed movie of a trial."""
         return str(_look_up(self._hashes, trial))
 
 
 class FullClips:
-    """Clips of whole movies: to train dynamics on, and for the protocol *full*.
+    """Source of clips of whole movies, for the training of dynamics and the protocol *full*.
 
-    A trial ends early when every body sleeps, so a clip goes on with its last frame.
+    The last frame of a movie that is shorter than a clip is repeated.
     """
 
     def __init__(self, dataset: Dataset, spec: Spec) -> None:
@@ -104,31 +103,31 @@ class FullClips:
         return self._spec.all_indices()
 
     def clip(self, trial: str) -> Clip:
-        """The whole clip of a trial."""
+        """Return the whole clip of a trial."""
         spec = self._spec
         length = int(_look_up(self._lengths, trial))
         count = min(spec.total, 1 + (length - 1) // spec.stride)
         size = (spec.image_size, spec.image_size)
         frames = self._dataset.frames(trial, count=count, stride=spec.stride, size=size)
-        rest = np.repeat(frames[-1:], spec.total - len(frames), axis=0)
-        return Clip(trial, np.concatenate([frames, rest]), self.indices, observed=False)
+        padding = np.repeat(frames[-1:], spec.total - len(frames), axis=0)
+        return Clip(trial, np.concatenate([frames, padding]), self.indices, observed=False)
 
     def key(self, trial: str) -> str:
-        """SHA-256 of the full movie."""
+        """Return the SHA-256 of the full movie of a trial."""
         return str(_look_up(self._hashes, trial))
 
 
 def observed_clips(dataset: Dataset, spec: Spec) -> ObservedClips:
-    """The observed part of a dataset at a model's size and stride."""
+    """Return the source of the observed clips of a dataset, at the size and stride of ``spec``."""
     table: pd.DataFrame = dataset.index
     hashes = dict(zip(table["trial"], table["observed_movie_sha256"], strict=True))
     return ObservedClips(dataset.observed, hashes, spec)
 
 
 class FeatureStore:
-    """Features of clips by one encoder, kept as ``.npy`` files under the hash of their content.
+    """Store of the features of one encoder, as ``.npy`` files named by a hash of their inputs.
 
-    ``folder`` None keeps nothing. ``batch`` clips go through the encoder at a time.
+    If ``folder`` is None, nothing is stored. The encoder processes ``batch`` clips at a time.
     """
 
     def __init__(
@@ -142,28 +141,29 @@ class FeatureStore:
     def features(
         self, clips: ClipSource, trials: Sequence[str], progress: Progress | None = None
     ) -> Floats:
-        """Features (trials, time, features) in the order of ``trials``; stored ones are read.
+        """Return features (trials, time, features) in the order of ``trials``.
 
-        A feature that is not finite raises `BadInputError` with the name of the trial.
+        Stored features are read, others computed and stored. Raises `BadInputError` with the name
+        of the trial if a feature is not finite.
         """
-        found: dict[str, Floats] = {}
+        known: dict[str, Floats] = {}
         missing = []
         for trial in dict.fromkeys(trials):
             stored = self._read(clips, trial)
             if stored is None:
                 missing.append(trial)
             else:
-                found[trial] = stored
+                known[trial] = stored
         for start in range(0, len(missing), self._batch):
-            some = missing[start : start + self._batch]
-            for trial, features in zip(some, self._encode(clips, some), strict=True):
+            group = missing[start : start + self._batch]
+            for trial, features in zip(group, self._encode(clips, group), strict=True):
                 self._write(clips, trial, features)
-                found[trial] = features
+                known[trial] = features
             if progress is not None:
                 progress("features", min(start + self._batch, len(missing)), len(missing))
         if not trials:
             return np.zeros((0, len(clips.indices), 0), np.float32)
-        return np.stack([found[trial] for trial in trials])
+        return np.stack([known[trial] for trial in trials])
 
     def _encode(self, clips: ClipSource, trials: list[str]) -> Floats:
         frames = np.stack([clips.clip(trial).frames for trial in trials])
@@ -174,7 +174,7 @@ class FeatureStore:
             if not np.isfinite(values).all():
                 raise BadInputError(
                     f"trial {trial!r}: the encoder gives features that are not finite; "
-                    "are its weights damaged?"
+                    "check its weights"
                 )
         return features
 
@@ -207,7 +207,7 @@ class FeatureStore:
 
 
 def _steps(indices: Sequence[int]) -> tuple[int, int]:
-    """Stride and count of ``indices``, which must be 0, s, 2 s, ..."""
+    """Return stride and count of ``indices``, which must be 0, s, 2 s, ..."""
     stride = indices[1] - indices[0] if len(indices) > 1 else 1
     if stride < 1 or list(indices) != list(range(0, stride * len(indices), stride)):
         raise BadInputError(f"frames must start at 0 in equal steps, not {list(indices)}")

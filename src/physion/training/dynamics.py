@@ -1,4 +1,4 @@
-"""Train a model's dynamics on features of whole clips, and say whether they beat standing still."""
+"""Training of dynamics on features of whole clips, with the copy-last baseline."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from physion.training.loop import Progress, TrainingConfig, TrainingResult, trai
 Floats = NDArray[np.float32]
 
 HELD_OUT = 0.1
-"""Share of the training trials whose loss is only looked at."""
+"""Fraction of the training trials that are held out for validation."""
 
 
 @dataclass(frozen=True)
 class DynamicsReport:
-    """How a training went; losses are mean squared errors of one step, in squared features.
+    """Losses of a training, as mean squared errors of the next feature.
 
-    ``validation`` and ``copy_last`` are of the held-out trials, after training: dynamics that have
-    learnt anything are below ``copy_last``.
+    ``validation`` and ``copy_last`` (the baseline of `copy_last_loss`) are of the held-out trials
+    after training; dynamics that have learnt something have ``validation`` < ``copy_last``.
     """
 
     training: TrainingResult
@@ -49,8 +49,8 @@ def train_dynamics(
 ) -> DynamicsReport:
     """Train ``model`` in place on ``features`` (trials, time, features) of whole clips.
 
-    With a ``folder`` the checkpoint lies in a sub-folder named by the hash of config, model and
-    data, so that another setting never meets it.
+    If ``folder`` is given, the checkpoint is kept in a sub-folder that is named by the hash of
+    config, model and data. Raises `BadInputError` for a model that cannot be trained.
     """
     if not (isinstance(model, nn.Module) and isinstance(model, Learns)):
         raise BadInputError(f"model {model.provenance().model!r} has nothing to train")
@@ -59,9 +59,11 @@ def train_dynamics(
     batches = WindowBatches(features[rows], context + 1, config.batch, config.seed)
     identity: dict[str, Any] = {"data": batches.digest(), "model": _describe(model)}
     settings = {**dataclasses.asdict(config), **identity}
-    own = folder / hash_config(settings)[:16] if folder is not None else None
+    subfolder = folder / hash_config(settings)[:16] if folder is not None else None
     model.adapt(torch.from_numpy(features[rows]))
-    result = train(model, batches, config, fabric, folder=own, identity=identity, progress=progress)
+    result = train(
+        model, batches, config, fabric, folder=subfolder, identity=identity, progress=progress
+    )
     return DynamicsReport(
         result,
         one_step_loss(model, features[held], fabric),
@@ -72,35 +74,38 @@ def train_dynamics(
 def simulate_features(
     model: Model, context: Floats, steps: int, fabric: Fabric, *, batch: int = 64
 ) -> Floats:
-    """Roll ``context`` (trials, context, features) on: (trials, steps, features), float32."""
+    """Return features (trials, steps, features), float32, simulated from ``context``.
+
+    ``context`` is (trials, context, features).
+    """
     if not isinstance(model, Simulates):
         raise BadInputError(f"model {model.provenance().model!r} does not simulate")
-    made = []
+    simulated = []
     with torch.inference_mode():
         for start in range(0, len(context), batch):
-            given = fabric.to_device(torch.from_numpy(context[start : start + batch].copy()))
-            made.append(model.simulate(given, steps).cpu().numpy())
+            inputs = fabric.to_device(torch.from_numpy(context[start : start + batch].copy()))
+            simulated.append(model.simulate(inputs, steps).cpu().numpy())
     empty = np.zeros((0, steps, context.shape[2]), np.float32)
-    return np.concatenate(made).astype(np.float32) if made else empty
+    return np.concatenate(simulated).astype(np.float32) if simulated else empty
 
 
 def one_step_loss(model: Model, features: Floats, fabric: Fabric) -> float:
-    """Mean squared error of the next feature over all windows of ``features``, in their own units.
+    """Return the mean squared error of the next feature over all windows of ``features``.
 
-    The counterpart of `copy_last_loss`; NaN without a window.
+    It has the unit of `copy_last_loss`, to which it compares; NaN if no window fits.
     """
     context = model.spec.context
     total, count = 0.0, 0
     for start in range(features.shape[1] - context):
-        given, following = features[:, start : start + context], features[:, start + context]
-        made = simulate_features(model, given, 1, fabric)[:, 0]
-        total += float(np.square(made.astype(np.float64) - following).sum())
+        inputs, following = features[:, start : start + context], features[:, start + context]
+        predicted = simulate_features(model, inputs, 1, fabric)[:, 0]
+        total += float(np.square(predicted.astype(np.float64) - following).sum())
         count += following.size
     return total / count if count else float("nan")
 
 
 def _describe(model: Any) -> dict[str, Any]:
-    """The model's config where it has one; without weights of the encoder, which data tells."""
+    """Return provenance and config of a model; the features identify the encoder's weights."""
     described: dict[str, Any] = dataclasses.asdict(model.provenance())
     config = getattr(model, "config", None)
     if dataclasses.is_dataclass(config) and not isinstance(config, type):

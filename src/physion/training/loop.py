@@ -1,4 +1,4 @@
-"""The training loop: seeded, resumable to the bit on a CPU, ended by a loss that is not finite."""
+"""Training loop: seeded, resumable with identical results on a CPU, stopped by a bad loss."""
 
 from __future__ import annotations
 
@@ -25,25 +25,24 @@ from physion.training.checkpoint import (
 )
 
 CHECKPOINT, METRICS = "checkpoint.safetensors", "metrics.jsonl"
-_FREE = ("steps", "log_every", "checkpoint_every")
-"""Settings that do not change the curve, only how far and how often it is written down."""
+_NOT_HASHED = ("steps", "log_every", "checkpoint_every")
+"""Settings that do not change the losses, only their number and how often they are written."""
 
 Batches = Callable[[int], Mapping[str, Tensor]]
-Progress = Callable[[str, int, int], None]
 
 
 class TrainingStoppedError(PhysionError):
-    """The loss became NaN or infinite. The last checkpoint before it stays."""
+    """Error for a loss that became NaN or infinite; the last checkpoint before it is kept."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrainingConfig:
-    """How dynamics are trained.
+    """Settings of the training of dynamics.
 
-    - ``steps``, ``batch`` (windows a step), ``learning_rate`` of Adam, whose moments are kept
-      from step to step. The released setting is 1000, 32 and 1e-2, with moments thrown away.
-    - ``seed``: of batches and of anything random inside the model.
-    - ``log_every``, ``checkpoint_every``: steps.
+    - ``steps``, ``batch`` (windows per step), ``learning_rate`` of Adam. The released code used
+      1000, 32 and 1e-2, and reset Adam's moments at every step; here they are kept.
+    - ``seed``: of the batches and of random operations in the model.
+    - ``log_every``, ``checkpoint_every``: intervals in steps.
     """
 
     steps: int = 1000
@@ -57,12 +56,12 @@ class TrainingConfig:
         if min(self.steps, self.batch, self.log_every, self.checkpoint_every) < 1:
             raise BadInputError("steps, batch, log_every and checkpoint_every must be at least 1")
         if not 0 < self.learning_rate < math.inf:
-            raise BadInputError(f"learning rate must be above zero, not {self.learning_rate}")
+            raise BadInputError(f"learning rate must be positive, not {self.learning_rate}")
 
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """``losses``: one a step, from the first step on, also those before a resume."""
+    """Result of a training; ``losses`` has one value per step, including those before a resume."""
 
     losses: tuple[float, ...]
     config_hash: str
@@ -78,14 +77,34 @@ def train(
     identity: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> TrainingResult:
-    """Train ``model`` in place for ``config.steps`` steps; its ``forward(batch)`` is the loss.
+    """Train ``model`` in place for ``config.steps`` steps.
 
-    ``batches(step)`` gives the batch of a step, steps counted from 0. With a ``folder`` a
-    checkpoint and ``metrics.jsonl`` are kept there, and training goes on from what is there;
-    ``identity`` (JSON values) then says which model and data it is. Raises `TrainingStoppedError`
-    with the step of a loss that is not finite, `BadInputError` for a checkpoint of another config.
+    Parameters
+    ----------
+    model
+        Module whose ``forward(batch)`` returns the loss.
+    batches
+        Function that returns the batch of a step (from 0).
+    config
+        Settings of the training.
+    fabric
+        Device.
+    folder
+        Where a checkpoint and ``metrics.jsonl`` are kept, and from which training resumes; None
+        keeps nothing.
+    identity
+        JSON values that identify model and data, part of the checkpoint's hash.
+    progress
+        Called after every step.
+
+    Raises
+    ------
+    TrainingStoppedError
+        If a loss is not finite; the message names the step.
+    BadInputError
+        If the checkpoint in ``folder`` belongs to another config.
     """
-    settings = {k: v for k, v in dataclasses.asdict(config).items() if k not in _FREE}
+    settings = {k: v for k, v in dataclasses.asdict(config).items() if k not in _NOT_HASHED}
     config_hash = hash_config({"training": settings, "identity": dict(identity or {})})
     trained = [parameter for parameter in model.parameters() if parameter.requires_grad]
     optimizer = torch.optim.Adam(trained, lr=config.learning_rate)
@@ -93,7 +112,7 @@ def train(
     path = folder / CHECKPOINT if folder is not None else None
     wrapped, wrapped_optimizer = fabric.setup(model, optimizer)
     if path is not None and path.is_file():
-        # After the set-up, so that the optimiser's state follows the weights to their device.
+        # After the set-up, so that the optimiser's state is on the device of the weights.
         losses = list(load_checkpoint(path, config_hash, model, optimizer).losses)
         if len(losses) > config.steps:
             raise BadInputError(f"{path} has {len(losses)} steps, more than the {config.steps}")
@@ -101,10 +120,10 @@ def train(
     for step in range(len(losses), config.steps):
         loss = _step(wrapped, wrapped_optimizer, batches(step), step, config.seed, fabric)
         losses.append(loss)
-        done = step + 1 == config.steps
-        if path is not None and (done or (step + 1) % config.checkpoint_every == 0):
-            story = Checkpoint(step + 1, tuple(losses), config_hash, dict(identity or {}))
-            save_checkpoint(path, story, model, optimizer)
+        last = step + 1 == config.steps
+        if path is not None and (last or (step + 1) % config.checkpoint_every == 0):
+            checkpoint = Checkpoint(step + 1, tuple(losses), config_hash, dict(identity or {}))
+            save_checkpoint(path, checkpoint, model, optimizer)
             _write_metrics(path.with_name(METRICS), losses, config.log_every)
         if progress is not None:
             progress("training", step + 1, config.steps)
@@ -115,7 +134,7 @@ def train(
 def _step(
     model: Any, optimizer: Any, batch: Mapping[str, Tensor], step: int, seed: int, fabric: Fabric
 ) -> float:
-    # Seeded by the step, so that what is random in a model needs no stored generator.
+    # Seeded by the step, so that no state of a generator has to be stored.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(stable_hash("step", seed, step) % 2**63)
         optimizer.zero_grad(set_to_none=True)
@@ -124,7 +143,7 @@ def _step(
         if not math.isfinite(value):
             raise TrainingStoppedError(
                 f"training stopped at step {step}: the loss is {value}; "
-                "lower the learning rate, or look at the features of that batch"
+                "lower the learning rate, or check the features of that batch"
             )
         fabric.backward(loss)
         optimizer.step()
@@ -132,7 +151,7 @@ def _step(
 
 
 def _write_metrics(path: Path, losses: list[float], every: int) -> None:
-    """All of them anew: a resume can then neither double nor lose a line."""
+    """Write all losses again, so that a resume neither repeats nor loses a line."""
     kept = [i for i in range(len(losses)) if i % every == 0 or i + 1 == len(losses)]
     lines = [json.dumps({"step": i, "loss": losses[i]}) + "\n" for i in kept]
     write_atomic(path, "".join(lines).encode())

@@ -1,4 +1,4 @@
-"""On which scenarios dynamics are trained, and on which they are then asked."""
+"""Training protocols: which scenarios train the dynamics that are tested on a scenario."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from physion.errors import BadInputError, UnknownNameError
 
 
 class Training(Enum):
-    """A training protocol; the value is its name in the study."""
+    """Training protocol; the value is its name in the study."""
 
     ALL = "all"
     ALL_BUT = "all-but"
@@ -18,7 +18,7 @@ class Training(Enum):
 
     @classmethod
     def named(cls, name: str) -> Training:
-        """The protocol called ``name``; `UnknownNameError` with the closest names."""
+        """Return the protocol called ``name``; raise `UnknownNameError` with the closest names."""
         try:
             return cls(name)
         except ValueError:
@@ -27,19 +27,19 @@ class Training(Enum):
 
 @dataclass(frozen=True, slots=True)
 class TrainingSet:
-    """Dynamics trained on scenarios ``trained`` and asked about scenarios ``asked``.
+    """Scenarios that train the dynamics (``trained``), and those tested with it (``tested``).
 
-    ``name`` is what stands under *Dynamics Training Dataset*: ``all``, ``no_<scenario>`` or
+    ``name`` is the value of *Dynamics Training Dataset*: ``all``, ``no_<scenario>`` or
     ``<scenario>``.
     """
 
     name: str
     trained: tuple[str, ...]
-    asked: tuple[str, ...]
+    tested: tuple[str, ...]
 
 
 def training_sets(protocol: Training, scenarios: Sequence[str]) -> list[TrainingSet]:
-    """The trainings that a protocol needs for ``scenarios``: one, or one a scenario."""
+    """Return the trainings that a protocol needs: one in all, or one per scenario."""
     names = tuple(sorted(set(scenarios)))
     if not names:
         raise BadInputError("there is no scenario to train on")
