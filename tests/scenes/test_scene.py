@@ -83,13 +83,15 @@ def test_impossible_scenes_are_refused(change: dict[str, object], complaint: str
 @pytest.mark.parametrize(
     ("path", "value", "complaint"),
     [
-        (("nonsense",), 1, "unknown fields"),
+        (("nonsense",), 1, "unknown key"),
         (("camera", "fov"), "wide", "scene.camera.fov"),
         (("camera", "fov"), True, "scene.camera.fov"),
         (("bodies", 0, "position"), [0, 0], "3 values"),
         (("bodies", 0, "kinematic"), 1, "kinematic"),
         (("name",), None, "scene.name"),
         (("bodies",), {}, "list"),
+        (("parameters",), [], "scene.parameters must be an object"),
+        (("floor",), 10**400, "scene.floor must be a finite number"),
     ],
 )
 def test_bad_json_names_the_field(

@@ -253,9 +253,12 @@ EVIL: dict[str, tuple[str, Callable[[h5py.File], None]]] = {
         "scene.*cannot be read",
         replace_with("scene", np.array([b"\xff"]), **CHUNKED),
     ),
-    "labels": ("labels has", replace_with("labels", np.array([b'{"a": 1}']), **CHUNKED)),
+    "labels": (
+        "labels: unknown key 'a'",
+        replace_with("labels", np.array([b'{"a": 1}']), **CHUNKED),
+    ),
     "labels type": (
-        r"labels\.contact is 'yes'",
+        r"labels\.contact must be true or false, not 'yes'",
         replace_with("labels", np.array([b'{"contact": "yes"}']), **CHUNKED),
     ),
     "labels part": (

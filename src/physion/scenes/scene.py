@@ -8,16 +8,15 @@ bottom face. Everything is frozen and serialises to JSON and back without loss.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import hashlib
 import json
 import math
-import types
-import typing
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
+from physion.dataclass_json import parse_json, read_dataclass, shown
 from physion.errors import BadSceneError
 
 Vec3: TypeAlias = tuple[float, float, float]
@@ -178,17 +177,20 @@ class Scene:
 
     def __post_init__(self) -> None:
         names = self.names()
-        doubled = sorted({name for name in names if names.count(name) > 1})
-        if doubled:
-            raise BadSceneError(f"scene {self.name!r}: two things are called {doubled}")
+        repeated = sorted(name for name, count in Counter(names).items() if count > 1)
+        if repeated:
+            raise BadSceneError(
+                f"scene {self.name!r}: two things are called {shown(repeated)}; bodies and cloths "
+                "need different names"
+            )
         used = [self.roles.agent, self.roles.patient, *(push.body for push in self.pushes)]
         used += [name for joint in self.joints for name in (joint.parent, joint.child)]
         used += [self.roles.probe] if self.roles.probe else []
         missing = sorted(set(used) - set(names))
         if missing:
             raise BadSceneError(
-                f"scene {self.name!r}: roles, pushes or joints name {missing}, "
-                f"but there are only {names}"
+                f"scene {self.name!r}: roles, pushes or joints name {shown(missing)}, "
+                f"but its bodies and cloths are {shown(names)}"
             )
         for body in self.bodies:
             if not (body.mass > 0 and min(body.scale) > 0):
@@ -231,58 +233,4 @@ class Scene:
     @classmethod
     def from_json(cls, text: str) -> Scene:
         """Read what `to_json` wrote; `BadSceneError` says which field is missing or unknown."""
-        try:
-            data = json.loads(text)
-        except json.JSONDecodeError as error:
-            raise BadSceneError(f"scene is not JSON: {error}") from error
-        built = _build(cls, data, "scene")
-        assert isinstance(built, cls)
-        return built
-
-
-@functools.cache
-def _type_hints(kind: Any) -> dict[str, Any]:
-    """Declared types of a dataclass; resolving them anew for each body would take the most time."""
-    return typing.get_type_hints(kind)
-
-
-def _build(kind: Any, data: Any, where: str) -> Any:
-    """Turn parsed JSON into a value of the type ``kind``, checking every field on the way."""
-    origin = typing.get_origin(kind)
-    if dataclasses.is_dataclass(kind):
-        if not isinstance(data, dict):
-            raise BadSceneError(f"{where} must be an object, not {type(data).__name__}")
-        hints = _type_hints(kind)  # type: ignore[arg-type]  # a class can be hashed
-        unknown = sorted(data.keys() - hints.keys())
-        if unknown:
-            raise BadSceneError(f"{where} has unknown fields {unknown}; known: {sorted(hints)}")
-        values = {key: _build(hints[key], value, f"{where}.{key}") for key, value in data.items()}
-        try:
-            return kind(**values)  # type: ignore[operator]
-        except TypeError as error:
-            raise BadSceneError(f"{where}: {error}") from error
-    if origin is tuple:
-        if not isinstance(data, list):
-            raise BadSceneError(f"{where} must be a list, not {type(data).__name__}")
-        args = typing.get_args(kind)
-        if args[-1] is Ellipsis:
-            return tuple(_build(args[0], item, f"{where}[{i}]") for i, item in enumerate(data))
-        if len(data) != len(args):
-            raise BadSceneError(f"{where} must hold {len(args)} values, not {len(data)}")
-        return tuple(
-            _build(arg, item, f"{where}[{i}]")
-            for i, (arg, item) in enumerate(zip(args, data, strict=True))
-        )
-    if origin is types.UnionType:
-        if data is None:
-            return None
-        return _build(typing.get_args(kind)[0], data, where)
-    if kind is float:
-        if isinstance(data, bool) or not isinstance(data, int | float) or not math.isfinite(data):
-            raise BadSceneError(f"{where} must be a finite number, not {data!r}")
-        return float(data)
-    if kind in (int, str, bool):
-        if type(data) is not kind:
-            raise BadSceneError(f"{where} must be {kind.__name__}, not {data!r}")
-        return data
-    return data  # the free JSON of `parameters`
+        return read_dataclass(cls, parse_json(text, "scene", BadSceneError), "scene", BadSceneError)

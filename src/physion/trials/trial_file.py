@@ -7,11 +7,8 @@ the disk is full, and leaves files that look whole when it is killed.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import io
 import json
-import types
-import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.atomic import write_atomic
+from physion.dataclass_json import parse_json, read_dataclass
 from physion.errors import BadInputError
 from physion.physics.labels import Labels
 from physion.physics.trajectory import Contacts, Trajectory
@@ -250,12 +248,12 @@ class Trial:
     @cached_property
     def metadata(self) -> Metadata:
         """Where the trial comes from."""
-        return _from_json(Metadata, self._reader.text("metadata"), f"{self._where}: metadata")
+        return self._read_json(Metadata, "metadata")
 
     @cached_property
     def labels(self) -> Labels:
         """Whether and when agent and patient touch."""
-        return _from_json(Labels, self._reader.text("labels"), f"{self._where}: labels")
+        return self._read_json(Labels, "labels")
 
     @cached_property
     def scene(self) -> Scene:
@@ -264,6 +262,10 @@ class Trial:
             return Scene.from_json(self._reader.text("scene"))
         except BadInputError as error:
             raise BadInputError(f"{self._where}: field 'scene': {error}") from error
+
+    def _read_json(self, kind: type[T], name: str) -> T:
+        where = f"{self._where}: {name}"
+        return read_dataclass(kind, parse_json(self._reader.text(name), where), where)
 
     def shown(self, look: str | None = None) -> Scene:
         """The scene in the colours of a look: ``redyellow``, ``free``, or the trial's own."""
@@ -364,29 +366,3 @@ def _arrays(trajectory: Trajectory, ids: NDArray[Any], things: int) -> dict[str,
 
 def _to_json(value: Any) -> str:
     return json.dumps(dataclasses.asdict(value), separators=(",", ":"), sort_keys=True)
-
-
-@functools.cache
-def _hints(kind: Any) -> dict[str, Any]:
-    return typing.get_type_hints(kind)
-
-
-def _from_json(kind: type[T], text: str, where: str) -> T:
-    """A flat dataclass from its JSON, every value checked against its declared type."""
-    try:
-        data = json.loads(text)
-    except ValueError as error:
-        raise BadInputError(f"{where} is not JSON: {error}") from error
-    hints = _hints(kind)  # type: ignore[arg-type]  # a class can be hashed
-    if not isinstance(data, dict) or not data.keys() <= hints.keys():
-        keys = sorted(data) if isinstance(data, dict) else type(data).__name__
-        raise BadInputError(f"{where} has {keys}, known are {sorted(hints)}")
-    for name, value in data.items():
-        hint = hints[name]
-        allowed = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
-        if type(value) not in allowed:
-            raise BadInputError(f"{where}.{name} is {value!r}, not {hint}")
-    try:
-        return kind(**data)
-    except TypeError as error:
-        raise BadInputError(f"{where}: {error}") from error

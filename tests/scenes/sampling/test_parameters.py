@@ -77,11 +77,13 @@ def within(value: float, limits: Range) -> bool:
     return limits[0] - 1e-9 <= value <= limits[1] + 1e-9
 
 
+@settings(deadline=None)
 @given(SEEDS, ranges(-50, 50))
 def test_draws_are_in_range(rng: np.random.Generator, limits: Range) -> None:
     assert within(uniform(rng, limits), limits)
 
 
+@settings(deadline=None)
 @given(SEEDS, axes(0.005, 200))
 def test_sizes_are_in_range(rng: np.random.Generator, limits: Axes) -> None:
     drawn = draw_axes(rng, limits)
@@ -90,6 +92,7 @@ def test_sizes_are_in_range(rng: np.random.Generator, limits: Axes) -> None:
         assert len(set(drawn)) == 1, "one draw for all axes"
 
 
+@settings(deadline=None)
 @given(SEEDS, st.integers(0, 50), st.integers(0, 50))
 def test_counts_reach_both_ends(rng: np.random.Generator, one: int, other: int) -> None:
     low, high = sorted((one, other))
@@ -97,6 +100,7 @@ def test_counts_reach_both_ends(rng: np.random.Generator, one: int, other: int) 
     assert {draw_count(rng, (low, low + 1)) for _ in range(64)} == {low, low + 1}
 
 
+@settings(deadline=None)
 @given(SEEDS, ranges(0, 300))
 def test_frames_are_whole_and_in_range(rng: np.random.Generator, limits: Range) -> None:
     frame = draw_frame(rng, limits)
@@ -109,6 +113,7 @@ def test_the_last_frame_is_left_out() -> None:
     assert draw_frame(rng, (30.0, 30.0)) == 30
 
 
+@settings(deadline=None)
 @given(SEEDS, axes(-360, 360))
 def test_turns_are_rotations(rng: np.random.Generator, limits: Axes) -> None:
     turn = draw_rotation(rng, limits)
@@ -126,6 +131,7 @@ def test_three_angles_turn_as_unity_does() -> None:
     assert rotate_vectors(turn, (0, 0, 1)) == pytest.approx([1, 0, 0], abs=1e-12)
 
 
+@settings(deadline=None)
 @given(SEEDS, st.lists(st.sampled_from(SOLIDS), min_size=1, max_size=5))
 def test_names_are_picked_from_those_given(rng: np.random.Generator, names: list[str]) -> None:
     assert pick(rng, names) in names
@@ -206,6 +212,7 @@ def test_push_points_jitter_about_the_body_and_not_above(
     assert all(abs(a - b) <= jitter for a, b in zip(point, (0, 0, top), strict=True))
 
 
+@settings(deadline=None)
 @given(SEEDS, ranges(0, 10), st.floats(-5, 5), st.floats(-5, 5))
 def test_zones_are_fixed_flat_and_slippery_once_they_slip(
     rng: np.random.Generator, friction: Range, x: float, y: float
@@ -272,6 +279,7 @@ def test_nested_tables_change_what_they_name() -> None:
 LIMITS = {"length": (0, 50), "angle": (-360, 360), "count": (0, 50)}
 
 
+@settings(deadline=None)
 @given(st.sampled_from(sorted(LIMITS)), st.floats() | st.integers(-(10**6), 10**6))
 def test_numbers_are_taken_within_their_limits_only(key: str, value: float) -> None:
     low, high = LIMITS[key]
@@ -321,6 +329,7 @@ JUNK = st.recursive(
 )
 
 
+@settings(deadline=None)
 @given(st.sampled_from([field.name for field in dataclasses.fields(Sample)]), JUNK)
 def test_any_value_is_read_or_refused_by_its_key(key: str, value: Any) -> None:
     try:
@@ -333,6 +342,7 @@ def test_any_value_is_read_or_refused_by_its_key(key: str, value: Any) -> None:
     assert refused.startswith(f"here: {key}")
 
 
+@settings(deadline=None)
 @given(st.text(max_size=8).filter(lambda key: key not in Sample.__dataclass_fields__))
 def test_unknown_keys_are_refused(key: str) -> None:
     with pytest.raises(BadInputError, match=r"^here: unknown key .*known: length, width"):

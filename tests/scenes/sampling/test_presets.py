@@ -283,8 +283,11 @@ BAD = {
         PARAMS + "push.frame = [0, 151]",
         "preset 'mine': push: frame is 151, allowed is 0 to 150 frames",
     ),
-    "unknown property": (OTHER + "param = {}", "preset 'mine': unknown key 'param'; known: about"),
-    "bad about": (OTHER + "about = 3", "preset 'mine': about must be str, not 3"),
+    "unknown property": (
+        OTHER + "param = {}",
+        "preset 'mine': unknown key 'param'; did you mean 'params'? known: about",
+    ),
+    "bad about": (OTHER + "about = 3", "preset 'mine': about must be a text, not 3"),
     "bad published": (
         OTHER + 'published = { trials = "a", contact = 0, frames = 151 }',
         "preset 'mine': published: trials must be a number (0 to 1e+06), not 'a'",

@@ -8,7 +8,6 @@ size or a turn a single number, a range, or one of either for each axis.
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import functools
 import math
 import typing
@@ -19,6 +18,7 @@ from typing import Annotated, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from physion.dataclass_json import check_keys, field_types
 from physion.errors import BadInputError, BadSceneError, UnknownNameError
 from physion.numerics.rotations import axis_angle_quaternion, multiply_quaternions
 from physion.scenes.scene import Ending, Quat, Vec3
@@ -170,12 +170,8 @@ def read_params(kind: type[Any], table: Mapping[str, Any], where: str, base: Any
     default ``kind()``. `BadInputError` names the key, ``where`` it stands, and what is allowed.
     """
     base = kind() if base is None else base
-    hints = _hints(kind)
-    for key in table:
-        if key not in hints:
-            close = difflib.get_close_matches(key, hints, n=1)
-            meant = f"did you mean {close[0]!r}? " if close else ""
-            raise BadInputError(f"{where}: unknown key {key!r}; {meant}known: {', '.join(hints)}")
+    hints = field_types(kind)
+    check_keys(table, hints, where)
     values = {
         key: _read(hints[key], value, f"{where}: {key}", getattr(base, key))
         for key, value in table.items()
@@ -190,7 +186,7 @@ def check_params(params: Any, where: str) -> None:
 
 
 def _check_each(params: Any, where: str) -> None:
-    for key, hint in _hints(type(params)).items():
+    for key, hint in field_types(type(params)).items():
         value = getattr(params, key)
         if not dataclasses.is_dataclass(hint):
             _read(hint, value, f"{where}: {key}", value)
@@ -207,7 +203,7 @@ def check_together(params: Any, where: str) -> None:
     Parameters, and those nested in them, say so by a method ``check_values``: it returns what is
     wrong, beginning with the key, or None.
     """
-    for key, hint in _hints(type(params)).items():
+    for key, hint in field_types(type(params)).items():
         if dataclasses.is_dataclass(hint):
             check_together(getattr(params, key), f"{where}: {key}")
     check = getattr(params, "check_values", None)
@@ -219,7 +215,7 @@ def check_together(params: Any, where: str) -> None:
 def drawn_limits(params: Any) -> dict[str, str]:
     """What each key of the parameters allows, in words, nested keys joined by dots."""
     allowed: dict[str, str] = {}
-    for key, hint in _hints(type(params)).items():
+    for key, hint in field_types(type(params)).items():
         value = getattr(params, key)
         if dataclasses.is_dataclass(value):
             allowed |= {f"{key}.{name}": text for name, text in drawn_limits(value).items()}
@@ -233,15 +229,6 @@ def _told(value: Any) -> str:
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(_told, value))}]"
     return repr(value.item() if isinstance(value, np.generic) else value)
-
-
-def _hints(kind: Any) -> dict[str, Any]:
-    return _cached_hints(kind)
-
-
-@functools.cache
-def _cached_hints(kind: Any) -> dict[str, Any]:
-    return typing.get_type_hints(kind, include_extras=True)
 
 
 def _note(hint: Any) -> Quantity | NamesOf | None:
@@ -261,7 +248,7 @@ def _word(hint: Any) -> str:
 def _read(hint: Any, value: Any, where: str, base: Any) -> Any:
     if dataclasses.is_dataclass(hint):
         if not isinstance(value, Mapping):
-            raise BadInputError(f"{where} must be a table of {', '.join(_hints(hint))}")
+            raise BadInputError(f"{where} must be a table of {', '.join(field_types(hint))}")
         return read_params(hint, value, where, base)  # type: ignore[arg-type]
     note = _note(hint)
     if isinstance(note, Quantity):

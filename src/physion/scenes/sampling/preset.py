@@ -18,6 +18,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
 
+from physion.dataclass_json import check_keys, shown
 from physion.errors import BadInputError, UnknownNameError
 from physion.scenes.sampling.parameters import Quantity, check_together, read_params
 from physion.scenes.sampling.registry import scenarios
@@ -125,7 +126,7 @@ def parse_presets(text: str, where: str, *, own: bool = True) -> Mapping[str, Pr
         data = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         raise BadInputError(f"{where} is not TOML: {error}") from error
-    _check_keys(data, _FILE_KEYS, where)
+    check_keys(data, _FILE_KEYS, where)
     scenario = data.get("scenario")
     if not isinstance(scenario, str):
         raise BadInputError(f"{where} needs scenario = one of {scenarios.names()}")
@@ -138,12 +139,12 @@ def parse_presets(text: str, where: str, *, own: bool = True) -> Mapping[str, Pr
         here = f"{where}: preset {name!r}"
         if not isinstance(entry, Mapping):
             raise BadInputError(f"{here} must be a table")
-        _check_keys(entry, _PRESET_KEYS, here)
+        check_keys(entry, _PRESET_KEYS, here)
         base = shared
         if "based_on" in entry:
             chosen = entry["based_on"]
             if not isinstance(chosen, str):
-                raise BadInputError(f"{here}: based_on must name a preset, not {chosen!r}")
+                raise BadInputError(f"{here}: based_on must name a preset, not {shown(chosen)}")
             if chosen in presets:
                 base = presets[chosen].params
             elif chosen in known:
@@ -162,7 +163,8 @@ def parse_presets(text: str, where: str, *, own: bool = True) -> Mapping[str, Pr
 def _preset(name: str, scenario: str, params: Any, entry: Mapping[str, Any], here: str) -> Preset:
     for key, kind in (("about", str), ("official", str), ("seed", int)):
         if key in entry and type(entry[key]) is not kind:
-            raise BadInputError(f"{here}: {key} must be {kind.__name__}, not {entry[key]!r}")
+            wanted = "a text" if kind is str else "a whole number"
+            raise BadInputError(f"{here}: {key} must be {wanted}, not {shown(entry[key])}")
     published = _published(_table(entry, "published", here), here) if "published" in entry else None
     return Preset(
         name,
@@ -201,9 +203,3 @@ def _table(data: Mapping[str, Any], key: str, where: str) -> Mapping[str, Any]:
     if not isinstance(found, Mapping):
         raise BadInputError(f"{where}: {key} must be a table")
     return found
-
-
-def _check_keys(data: Mapping[str, Any], known: tuple[str, ...], where: str) -> None:
-    for key in data:
-        if key not in known:
-            raise BadInputError(f"{where}: unknown key {key!r}; known: {', '.join(known)}")
