@@ -254,7 +254,7 @@ EVIL: dict[str, tuple[str, Callable[[h5py.File], None]]] = {
         replace_with("scene", np.array([b"\xff"]), **CHUNKED),
     ),
     "labels": (
-        "labels: unknown key 'a'",
+        "unknown key 'a'",
         replace_with("labels", np.array([b'{"a": 1}']), **CHUNKED),
     ),
     "labels type": (

@@ -306,7 +306,10 @@ BAD = {
         "shared: unknown key 'lenth'; did you",
     ),
     "no scenario": ("[presets.mine]", "needs scenario = one of"),
-    "unknown file key": ('scenario = "collide"\n[preset.mine]', "unknown key 'preset'; known: "),
+    "unknown file key": (
+        'scenario = "collide"\n[preset.mine]',
+        "unknown key 'preset'; did you mean 'presets'? known: ",
+    ),
     "not TOML": ("scenario = collide", "is not TOML: "),
 }
 
