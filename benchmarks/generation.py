@@ -29,7 +29,7 @@ import physion
 from physion.scenes.sampling.registry import scenarios
 from physion.trials.making.choose import Slot, choose
 from physion.trials.making.make import make_trial
-from physion.trials.making.plan import FULL_COUNTS, Job, Settings, plan_dataset
+from physion.trials.making.plan import FULL_COUNTS, GenerateJob, GenerateSettings, plan_dataset
 from physion.trials.trial_file import Trial
 
 RESULTS = Path(__file__).parent / "results"
@@ -39,7 +39,7 @@ PAIR_COUNT = 6
 """Trials a scenario that two workers make together."""
 
 
-def measure(scenario: str, split: str, count: int, settings: Settings) -> dict[str, float]:
+def measure(scenario: str, split: str, count: int, settings: GenerateSettings) -> dict[str, float]:
     """Means over ``count`` trials: processor seconds to choose and to make, frames, bytes."""
     folder = Path(tempfile.mkdtemp())
     rows = []
@@ -48,7 +48,7 @@ def measure(scenario: str, split: str, count: int, settings: Settings) -> dict[s
             begin = time.process_time()
             filled = choose(Slot(task, settings)).fill(task)
             chosen = time.process_time()
-            job = Job(filled, folder, settings)
+            job = GenerateJob(filled, folder, settings)
             make_trial(job)
             made = time.process_time()
             frames = Trial.open(job.paths.trial_file).metadata.frames
@@ -109,8 +109,8 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=4)
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
-    settings = Settings()
-    warm = Settings(jitters=1)
+    settings = GenerateSettings()
+    warm = GenerateSettings(jitters=1)
     rows: dict[str, dict[str, dict[str, float]]] = {}
     for name in scenarios.names():
         measure(name, "readout", 1, warm)  # compiled code is loaded here
@@ -123,8 +123,8 @@ def main() -> None:
             flush=True,
         )
     state = {
-        "with robustness": measure("collide", "training", 20, Settings(movies=False)),
-        "without": measure("collide", "training", 20, Settings(movies=False, jitters=0)),
+        "with robustness": measure("collide", "training", 20, GenerateSettings(movies=False)),
+        "without": measure("collide", "training", 20, GenerateSettings(movies=False, jitters=0)),
     }
     for name, row in state.items():
         print(f"collide, state alone, {name}: {row['trials_per_s']:.1f} trials/s a core")

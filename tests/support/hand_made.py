@@ -17,7 +17,7 @@ from physion.physics.labels import Labels, label_contact
 from physion.physics.trajectory import Contacts, Trajectory
 from physion.scenes.scene import Body, Camera, Cloth, Roles, Scene
 from physion.trials.files import encode_png, write_files
-from physion.trials.making.plan import Job
+from physion.trials.making.plan import GenerateJob
 from physion.trials.trial_file import Metadata, TrialWriter
 from physion.trials.video import encode_movie
 
@@ -126,7 +126,7 @@ def make_parts(name: str = "tiny", *, cloth: bool = True, contact_frame: int | N
     return Parts(metadata, scene, trajectory, label_contact(scene, trajectory), ids)
 
 
-def make_by_hand(job: Job) -> str:
+def make_by_hand(job: GenerateJob) -> str:
     """Write a trial without engine and renderer; what happens depends on the trial's name.
 
     ``*bad*`` fails, ``*die*`` kills its process.

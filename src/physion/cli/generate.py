@@ -12,10 +12,11 @@ import tyro
 
 from physion.cli.output import console, track
 from physion.compute.local import LocalExecutor
+from physion.compute.run_tasks import RunReport
 from physion.errors import BadInputError
 from physion.scenes.sampling.registry import scenarios
-from physion.trials.making.generate import Report, generate
-from physion.trials.making.plan import FULL_COUNTS, SPLITS, Settings, plan_dataset
+from physion.trials.making.generate import generate
+from physion.trials.making.plan import FULL_COUNTS, SPLITS, GenerateSettings, plan_dataset
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,9 @@ class Options:
     published configurations. Needs one --scenario."""
     name: str = "physion"
     """Name of the dataset: another name draws other trials."""
-    settings: Annotated[Settings, tyro.conf.arg(name="")] = field(default_factory=Settings)
+    settings: Annotated[GenerateSettings, tyro.conf.arg(name="")] = field(
+        default_factory=GenerateSettings
+    )
     """How trials are chosen, rendered and stored."""
     workers: int = os.cpu_count() or 1
     """Processes."""
@@ -69,7 +72,7 @@ def main(options: Options) -> int:
     return report.exit_code
 
 
-def _print(report: Report, json: bool) -> None:
+def _print(report: RunReport, json: bool) -> None:
     if json:
         values = {"made": report.made, "kept": report.kept, "failed": dict(report.failed)}
         print(json_module.dumps(values | {"index": str(report.index)}, default=list))

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 from physion.cli.output import console
 
 if TYPE_CHECKING:
-    from physion.trials.official.run import OfficialReport
+    from physion.compute.run_tasks import RunReport
 
 SHOWN_NOTES = 5
 
 
-def print_report(report: OfficialReport, as_json: bool) -> int:
+def print_report(report: RunReport, as_json: bool) -> int:
     """Print what was done, as one JSON object or as lines for people; the exit code."""
     if as_json:
         values = {"made": report.made, "kept": report.kept, "failed": dict(report.failed)}

@@ -19,7 +19,7 @@ from physion.errors import BadInputError
 
 if TYPE_CHECKING:
     from physion.scenes.tdw.read_logs import ImportedTrial
-    from physion.trials.making.plan import Task
+    from physion.trials.making.plan import TrialTask
 
 SAMPLED_SCENARIOS = ("dominoes", "collide", "drop")
 
@@ -60,7 +60,7 @@ class Options:
 class Plan:
     """What is to be made, the recorded outcomes by stimulus, and what could not be imported."""
 
-    tasks: list[Task]
+    tasks: list[TrialTask]
     recorded: Mapping[str, bool]
     failures: list[str]
 
@@ -126,7 +126,7 @@ def plan_official(options: Options) -> Plan:
     # A scene that only looks different is no new scene to fit on.
     known = {trial.scene.physics_digest() for trial in parts["testing"]}
     parts["readout"] = [t for t in parts["readout"] if t.scene.physics_digest() not in known]
-    tasks: list[Task] = []
+    tasks: list[TrialTask] = []
     for split, trials in parts.items():
         scenes = [trial.scene for trial in few(trials, options.limit)]
         tasks += plan_scenes("official", scenes, split, recorded)
@@ -149,16 +149,16 @@ def few(trials: Iterable[ImportedTrial], limit: int | None) -> list[ImportedTria
     return [trial for group in groups.values() for trial in group[:limit]]
 
 
-def make_trials(options: Options, tasks: list[Task]) -> list[str]:
+def make_trials(options: Options, tasks: list[TrialTask]) -> list[str]:
     """Simulate, label, render and store what is missing; why some trials failed."""
     from physion.compute.local import LocalExecutor
     from physion.trials.making.generate import generate
-    from physion.trials.making.plan import Settings
+    from physion.trials.making.plan import GenerateSettings
 
     report = generate(
         folder(options) / "trials",
         tasks,
-        Settings(width=options.size, height=options.size, look="redyellow", jitters=0),
+        GenerateSettings(width=options.size, height=options.size, look="redyellow", jitters=0),
         executor=LocalExecutor(workers=options.workers),
         track=track,
     )

@@ -19,7 +19,7 @@ R = TypeVar("R")
 
 
 @dataclass(frozen=True)
-class Outcome(Generic[R]):
+class TaskOutcome(Generic[R]):
     """How one task ended.
 
     - ``key``: the task's name. ``error``: one line, None where the task succeeded.
@@ -46,7 +46,7 @@ class Outcome(Generic[R]):
 class Executor(Protocol):
     """Runs tasks. Implementations: this machine's processes, Ray, Slurm."""
 
-    def map(self, function: Callable[[T], R], tasks: Mapping[str, T]) -> Iterator[Outcome[R]]:
+    def map(self, function: Callable[[T], R], tasks: Mapping[str, T]) -> Iterator[TaskOutcome[R]]:
         """Run ``function`` on every task and yield outcomes as they come, in any order.
 
         An exception of the function becomes a failed outcome and is not tried again: the same

@@ -16,7 +16,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, TypeVar
 
-from physion.compute.executor import Outcome
+from physion.compute.executor import TaskOutcome
 from physion.errors import PhysionError
 
 T = TypeVar("T")
@@ -33,7 +33,7 @@ _PATIENCE = 5.0
 class SerialExecutor:
     """Runs the tasks one after the other in this process: for a debugger, and for tiny sets."""
 
-    def map(self, function: Callable[[T], R], tasks: Mapping[str, T]) -> Iterator[Outcome[R]]:
+    def map(self, function: Callable[[T], R], tasks: Mapping[str, T]) -> Iterator[TaskOutcome[R]]:
         """See `physion.compute.executor.Executor`; outcomes come in the order of the tasks."""
         for key, task in tasks.items():
             yield _attempt(key, function, task)
@@ -56,14 +56,14 @@ class LocalExecutor:
             raise PhysionError(f"{workers} workers and {tries} tries: both must be at least 1")
         self.tries, self.timeout = tries, timeout
 
-    def map(self, function: Callable[[T], R], tasks: Mapping[str, T]) -> Iterator[Outcome[R]]:
+    def map(self, function: Callable[[T], R], tasks: Mapping[str, T]) -> Iterator[TaskOutcome[R]]:
         """See `physion.compute.executor.Executor`."""
         waiting = deque(_Job(key, task) for key, task in tasks.items())
         team = [_Worker(function) for _ in range(min(self.workers, len(tasks)))]
         stillborn = 0
         try:
             while team:
-                done: list[Outcome[R]] = []
+                done: list[TaskOutcome[R]] = []
                 for worker in self._woken(team):
                     outcome = worker.listen(self.timeout)
                     if outcome is not None:
@@ -100,14 +100,14 @@ class LocalExecutor:
             or worker.overdue(self.timeout)
         ]
 
-    def _bury(self, worker: _Worker, waiting: deque[_Job]) -> list[Outcome[Any]]:
+    def _bury(self, worker: _Worker, waiting: deque[_Job]) -> list[TaskOutcome[Any]]:
         """Take back the task of a dead worker, or give it up if it has killed enough of them."""
         job = worker.job
         worker.stop()
         if job is None:
             return []
         if job.tries >= self.tries:
-            return [Outcome(job.key, error=worker.last_words(), tries=job.tries)]
+            return [TaskOutcome(job.key, error=worker.last_words(), tries=job.tries)]
         # At the end, so that a poison task does not hold up the others.
         waiting.append(_Job(job.key, job.task, job.tries + 1))
         return []
@@ -152,7 +152,7 @@ class _Worker:
             return False
         return time.monotonic() - self.since >= timeout
 
-    def listen(self, timeout: float | None) -> Outcome[Any] | None:
+    def listen(self, timeout: float | None) -> TaskOutcome[Any] | None:
         """The outcome that the worker sent, or None; sets ``lost`` where it will send no more."""
         try:
             if self.pipe.poll():
@@ -162,7 +162,7 @@ class _Worker:
                     return None
                 job, self.job = self.job, None
                 assert job is not None and message.key == job.key, "answers follow questions"
-                outcome: Outcome[Any] = dataclasses.replace(message, tries=job.tries)
+                outcome: TaskOutcome[Any] = dataclasses.replace(message, tries=job.tries)
                 return outcome
         except (EOFError, ConnectionResetError):
             self.lost = True
@@ -225,20 +225,20 @@ def _serve(pipe: Connection, function: Callable[..., Any]) -> None:
             except (BrokenPipeError, ConnectionResetError):
                 raise
             except Exception as error:
-                pipe.send(Outcome(key, error=f"the result cannot be sent: {error}"))
+                pipe.send(TaskOutcome(key, error=f"the result cannot be sent: {error}"))
     except (EOFError, BrokenPipeError, ConnectionResetError):
         return
 
 
-def _attempt(key: str, function: Callable[[T], R], task: T) -> Outcome[R]:
+def _attempt(key: str, function: Callable[[T], R], task: T) -> TaskOutcome[R]:
     """Run the function and turn an exception into a failed outcome."""
     try:
-        return Outcome(key, function(task))
+        return TaskOutcome(key, function(task))
     except Exception as error:
         number = error.errno if isinstance(error, OSError) else None
         text = " ".join(str(error).split()) or "no message"
         line = text if isinstance(error, PhysionError) else f"{type(error).__name__}: {text}"
-        return Outcome(key, error=line, traceback=traceback.format_exc(), errno=number)
+        return TaskOutcome(key, error=line, traceback=traceback.format_exc(), errno=number)
 
 
 @contextlib.contextmanager

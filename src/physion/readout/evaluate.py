@@ -14,6 +14,7 @@ import pandas as pd
 
 import physion
 from physion.compute.executor import Executor
+from physion.compute.progress import Progress
 from physion.errors import BadInputError, MissingExtraError
 from physion.models.interface import Encodes, Model, PredictsContact, Simulates, build_model
 from physion.models.noisy_simulation import NoisySimulation
@@ -29,7 +30,6 @@ from physion.trials.dataset import Dataset
 if TYPE_CHECKING:
     from physion.training.loop import TrainingConfig
 
-"""Called with the name of a stage, the number of finished items, and their total."""
 
 _VERSION = 2
 """To be increased with every change that can alter the table of an evaluation."""

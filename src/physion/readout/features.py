@@ -14,13 +14,14 @@ from lightning_fabric import Fabric
 from numpy.typing import NDArray
 from torch import nn
 
+from physion.compute.progress import Progress
 from physion.models.interface import Learns, Model
 from physion.readout.folds import Fold, ScenarioSplit
 from physion.readout.logistic import ReadoutConfig, fit_readout
 from physion.readout.protocols import Readout, flatten_time
 from physion.readout.table import ScenarioPredictions, describe_labels
 from physion.seeds import stable_hash
-from physion.training.clips import FeatureStore, FullClips, Progress, observed_clips
+from physion.training.clips import FeatureStore, FullClips, observed_clips
 from physion.training.dynamics import DynamicsReport, simulate_features, train_dynamics
 from physion.training.loop import TrainingConfig
 from physion.trials.dataset import Dataset

@@ -7,7 +7,7 @@ them; the column *Fit Labels* of the predictions says which outcomes were used.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from physion.atomic import write_atomic
 from physion.compute.executor import Executor
 from physion.compute.local import SerialExecutor
+from physion.compute.progress import Progress
 from physion.errors import BadInputError
 from physion.models.noisy_simulation import (
     LAST_OBSERVED,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -19,13 +19,13 @@ from lightning_fabric import Fabric
 from numpy.typing import NDArray
 
 from physion.atomic import write_atomic
+from physion.compute.progress import Progress
 from physion.errors import BadInputError, UnknownNameError
 from physion.models.interface import Clip, Encodes, Model, Spec
 from physion.scenes.scene import OBSERVED_FRAMES
 from physion.trials.dataset import Dataset, ObservedDataset
 
 Floats = NDArray[np.float32]
-"""Called with the name of a stage, the number of finished items, and their total."""
 
 _FEATURE_VERSION = 1
 """To be increased with every change that can alter the features of a movie and encoder."""

@@ -13,11 +13,12 @@ from lightning_fabric import Fabric
 from numpy.typing import NDArray
 from torch import nn
 
+from physion.compute.progress import Progress
 from physion.errors import BadInputError
 from physion.models.interface import Learns, Model, Simulates
 from physion.training.batches import WindowBatches, copy_last_loss, hold_out
 from physion.training.checkpoint import hash_config
-from physion.training.loop import Progress, TrainingConfig, TrainingResult, train
+from physion.training.loop import TrainingConfig, TrainingResult, train
 
 Floats = NDArray[np.float32]
 

@@ -15,6 +15,7 @@ from lightning_fabric import Fabric
 from torch import Tensor, nn
 
 from physion.atomic import write_atomic
+from physion.compute.progress import Progress
 from physion.errors import BadInputError, PhysionError
 from physion.seeds import stable_hash
 from physion.training.checkpoint import (

@@ -13,10 +13,13 @@ from physion.atomic import write_atomic
 from physion.trials.layout import TrialPaths
 
 
-def encode_png(picture: NDArray[np.uint8]) -> bytes:
-    """The bytes of a PNG file of ``picture`` (H, W, 3 or 4), sRGB and alpha, 0..255."""
+def encode_png(picture: NDArray[np.uint8], compress_level: int = 6) -> bytes:
+    """Return the bytes of a PNG file of ``picture`` (H, W, 3 or 4), sRGB and alpha, 0..255.
+
+    ``compress_level`` is zlib's, from 0 (fast) to 9 (small).
+    """
     buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, format="png", compress_level=6)
+    Image.fromarray(picture).save(buffer, format="png", compress_level=compress_level)
     return buffer.getvalue()
 
 

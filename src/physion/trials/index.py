@@ -13,53 +13,12 @@ import pyarrow as pa
 from physion.atomic import write_atomic
 from physion.errors import BadInputError
 from physion.scenes.scene import Scene
+from physion.trials.columns import FILES, INDEX_COLUMNS
 from physion.trials.layout import INDEX, SAFE_NAME, TrialPaths, find_trials
 from physion.trials.trial_file import Trial
 
-FILES = ("trial_file", "movie", "observed_movie", "map", "free_movie", "free_observed_movie")
-"""Files that a trial may have, by the names of their columns."""
-COLUMNS = {
-    "trial": "string",
-    "dataset": "string",
-    "scenario": "string",
-    "split": "string",
-    "index": "int64",
-    "preset": "string",
-    "seed": "string",
-    "attempt": "Int64",
-    "scene_digest": "string",
-    "contact": "bool",
-    "first_frame": "Int64",
-    "observed_contact": "bool",
-    "min_distance": "Float64",
-    "robust": "Float64",
-    "recorded_contact": "boolean",
-    "frames": "int64",
-    "observed_frames": "int64",
-    "completed": "bool",
-    "physics_seconds": "float64",
-    "playback_seconds": "float64",
-    "elements": "int64",
-    "distractors": "Int64",
-    "occluders": "Int64",
-    "agent_share": "float64",
-    "patient_share": "float64",
-    "look": "string",
-    "width": "int64",
-    "height": "int64",
-    "engine": "string",
-    "renderer": "string",
-    "package": "string",
-    "digest": "string",
-    **{
-        f"{file}{what}": kind
-        for file in FILES
-        for what, kind in (("", "string"), ("_bytes", "Int64"), ("_sha256", "string"))
-    },
-}
-"""Columns and their pandas types. ``trial`` is unique; ``*_share`` are shares of frame 0;
-``digest`` is the trajectory's; paths are relative to the dataset's folder, with forward slashes,
-and missing where a trial has no such file; the rest is as in `Labels` and `Metadata`."""
+COLUMNS = {name: column.dtype for name, column in INDEX_COLUMNS.items()}
+"""Pandas types by column, in the stored order."""
 
 
 def index_row(paths: TrialPaths) -> dict[str, Any]:

@@ -17,8 +17,8 @@ from physion.seeds import trial_seed
 from physion.trials.dataset import Dataset
 from physion.trials.making import choose as choosing
 from physion.trials.making.choose import (
-    Choice,
-    Choices,
+    ChoiceRecord,
+    ChosenScene,
     Slot,
     choose,
     choose_all,
@@ -29,12 +29,12 @@ from physion.trials.making.choose import (
 )
 from physion.trials.making.generate import generate
 from physion.trials.making.make import scene_of
-from physion.trials.making.plan import SPLITS, Settings, Task, plan_dataset
+from physion.trials.making.plan import SPLITS, GenerateSettings, TrialTask, plan_dataset
 
-QUICK = Settings(width=64, height=64, jitters=0, min_visible=0.0, movies=False)
+QUICK = GenerateSettings(width=64, height=64, jitters=0, min_visible=0.0, movies=False)
 
 
-def slots(split: str, count: int, scenario: str = "collide") -> list[Task]:
+def slots(split: str, count: int, scenario: str = "collide") -> list[TrialTask]:
     return plan_dataset("choose", [scenario], {split: count}, {scenario: ["default"]})
 
 
@@ -153,13 +153,13 @@ def test_a_damaged_record_of_choices_is_named(tmp_path: Path) -> None:
     for text in ("{", "[1]", '{"0": {"presets": 1}}', '{"a": {}}'):
         path.write_text(text)
         with pytest.raises(BadInputError, match=r"c\.json is no record of choices"):
-            Choices(path)
-    record = Choices(tmp_path / "d.json")
-    record.by_index = {0: Choice("default", 3, "a" * 64, 0.5)}
+            ChoiceRecord(path)
+    record = ChoiceRecord(tmp_path / "d.json")
+    record.by_index = {0: ChosenScene("default", 3, "a" * 64, 0.5)}
     record.save()
     (tmp_path / "d.json").write_text((tmp_path / "d.json").read_text().replace("3", "4"))
     with pytest.raises(BadInputError, match="was changed"):
-        Choices(tmp_path / "d.json")
+        ChoiceRecord(tmp_path / "d.json")
 
 
 def test_a_preset_that_hardly_varies_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -190,10 +190,13 @@ def test_a_draw_that_comes_out_differently_is_refused(tmp_path: Path) -> None:
 
 def test_a_killed_search_goes_on(tmp_path: Path) -> None:
     path = tmp_path / "c.json"
-    before = Choices(path)
-    before.by_index = {0: Choice("default", 3, "a" * 64, 0.5), 1: Choice("debug", 0, "a" * 64, 1)}
+    before = ChoiceRecord(path)
+    before.by_index = {
+        0: ChosenScene("default", 3, "a" * 64, 0.5),
+        1: ChosenScene("debug", 0, "a" * 64, 1),
+    }
     before.save()
-    after = Choices(path)
+    after = ChoiceRecord(path)
     assert [task.index for task in after.missing(slots("testing", 3))] == [1, 2], "1 repeats 0"
     assert after.by_index == {0: before.by_index[0]}
 
@@ -209,7 +212,7 @@ def test_no_draw_says_why() -> None:
 
 
 def test_a_dataset_of_states_alone(tmp_path: Path) -> None:
-    settings = Settings(width=64, height=64, movies=False, jitters=2, playback="real")
+    settings = GenerateSettings(width=64, height=64, movies=False, jitters=2, playback="real")
     tasks = slots("readout", 2)
     report = generate(tmp_path / "d", tasks, settings, executor=SerialExecutor())
     assert not report.failed

@@ -18,12 +18,13 @@ import pytest
 
 from physion.atomic import folder_lock, write_atomic
 from physion.compute.local import LocalExecutor, SerialExecutor
+from physion.compute.run_tasks import RunReport
 from physion.errors import BadInputError, PhysionError, UnknownNameError
 from physion.trials.dataset import Dataset
 from physion.trials.index import build_index, index_row
 from physion.trials.layout import TrialPaths, find_trials
-from physion.trials.making.generate import Report, generate
-from physion.trials.making.plan import Settings, Task, plan_dataset, plan_scenes
+from physion.trials.making.generate import generate
+from physion.trials.making.plan import GenerateSettings, TrialTask, plan_dataset, plan_scenes
 from physion.trials.trial_file import Trial
 from physion.trials.video import count_frames, read_frames
 from support.hand_made import make_by_hand, make_scene, tree_digest
@@ -32,11 +33,11 @@ from support.paths import TESTS
 FILES = {"h5", "_img.mp4", "_observed.mp4", "_map.png"}
 
 
-def scenes_named(*names: str) -> list[Task]:
+def scenes_named(*names: str) -> list[TrialTask]:
     return plan_scenes("tests", [make_scene(name) for name in names])
 
 
-def run(folder: Path, tasks: list[Task], **options: Any) -> Report:
+def run(folder: Path, tasks: list[TrialTask], **options: Any) -> RunReport:
     options.setdefault("executor", SerialExecutor())
     return generate(folder, tasks, make=make_by_hand, **options)
 
@@ -206,7 +207,7 @@ def test_a_fault_at_every_step_leaves_only_whole_files(
 
 def test_a_full_disk_stops_the_run_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     counter = Fault(monkeypatch, "write", 10, errno.ENOSPC)
-    with pytest.raises(PhysionError, match=r"No space left.*1 new trials are whole"):
+    with pytest.raises(PhysionError, match=r"No space left.*1 new trials are complete"):
         run(tmp_path / "s", scenes_named("a", "b", "c"))
     assert counter.calls == 10, "no later trial is tried"
 
@@ -325,7 +326,7 @@ def test_two_runs_on_one_folder_are_refused(tmp_path: Path) -> None:
 
 def test_other_settings_and_foreign_folders_are_refused(finished: Path, tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="other settings"):
-        run(finished, scenes_named("a"), settings=Settings(width=64))
+        run(finished, scenes_named("a"), settings=GenerateSettings(width=64))
     (tmp_path / "thesis.tex").write_text("precious")
     with pytest.raises(BadInputError, match=r"holds 'thesis\.tex'"):
         run(tmp_path, scenes_named("a"))
@@ -409,7 +410,7 @@ def test_names_that_are_no_file_names_are_refused(name: str) -> None:
 
 def test_bad_plans_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match="closest: testing"):
-        Task("d", "drop", "test", 0)
+        TrialTask("d", "drop", "test", 0)
     with pytest.raises(UnknownNameError, match="unknown scenario 'dropp'; closest: drop"):
         plan_dataset("d", ["dropp"], {"testing": 1})
     with pytest.raises(UnknownNameError, match="preset of drop 'defaultt'; closest: default"):
@@ -417,10 +418,13 @@ def test_bad_plans_are_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="two trials are called 'A'"):
         scenes_named("a", "A")
     with pytest.raises(BadInputError, match="one dataset"):
-        run(tmp_path / "s", [Task("d", "drop", "testing", 0), Task("e", "drop", "testing", 1)])
+        run(
+            tmp_path / "s",
+            [TrialTask("d", "drop", "testing", 0), TrialTask("e", "drop", "testing", 1)],
+        )
     for wrong in ({"width": 33}, {"passes": ("colour",)}, {"look": "blue"}):
         with pytest.raises(BadInputError):
-            Settings(**wrong)  # type: ignore[arg-type]
+            GenerateSettings(**wrong)  # type: ignore[arg-type]
 
 
 def test_progress_sees_every_outcome(tmp_path: Path) -> None:

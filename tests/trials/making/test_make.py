@@ -24,25 +24,25 @@ from physion.trials.dataset import Dataset
 from physion.trials.index import index_row
 from physion.trials.making.generate import generate
 from physion.trials.making.make import make_trial
-from physion.trials.making.plan import Job, Settings, Task, plan_dataset
+from physion.trials.making.plan import GenerateJob, GenerateSettings, TrialTask, plan_dataset
 from physion.trials.trial_file import Trial
 from physion.trials.video import read_frames
 from support.hand_made import make_scene, tree_digest
 
 PASSES = ("color", "depth", "flow", "ids", "normals")
-SMALL = Settings(width=64, height=64, look="redyellow", passes=PASSES)
-TASK = Task("tests", "collide", "testing", 3)
+SMALL = GenerateSettings(width=64, height=64, look="redyellow", passes=PASSES)
+TASK = TrialTask("tests", "collide", "testing", 3)
 
 
 @pytest.fixture(scope="module")
-def job(tmp_path_factory: pytest.TempPathFactory) -> Job:
+def job(tmp_path_factory: pytest.TempPathFactory) -> GenerateJob:
     """A collide trial with all passes, made."""
-    job = Job(TASK, tmp_path_factory.mktemp("made"), SMALL)
+    job = GenerateJob(TASK, tmp_path_factory.mktemp("made"), SMALL)
     assert make_trial(job) == "collide_testing_0003"
     return job
 
 
-def test_state_and_labels_are_those_of_the_scene(job: Job) -> None:
+def test_state_and_labels_are_those_of_the_scene(job: GenerateJob) -> None:
     trial = Trial.open(job.paths.trial_file)
     again = simulate(trial.scene)
     assert again.digest() == trial.trajectory.digest() == trial.metadata.digest
@@ -52,7 +52,7 @@ def test_state_and_labels_are_those_of_the_scene(job: Job) -> None:
     assert trial.metadata.frame_time == 0.01 and trial.metadata.playback_rate == 30
 
 
-def test_stored_passes_are_rendered_again_from_the_state(job: Job) -> None:
+def test_stored_passes_are_rendered_again_from_the_state(job: GenerateJob) -> None:
     trial = Trial.open(job.paths.trial_file)
     for frame in (0, 44, trial.metadata.frames - 1):
         again, stored = trial.render(frame, PASSES), trial.passes(frame)
@@ -62,7 +62,7 @@ def test_stored_passes_are_rendered_again_from_the_state(job: Job) -> None:
     np.testing.assert_array_equal(trial.ids, trial.passes(0)["ids"])
 
 
-def test_movies_show_the_rendered_frames(job: Job) -> None:
+def test_movies_show_the_rendered_frames(job: GenerateJob) -> None:
     trial = Trial.open(job.paths.trial_file)
     full, observed = read_frames(job.paths.movie), read_frames(job.paths.observed_movie)
     assert len(full) == trial.metadata.frames and len(observed) == 45
@@ -74,7 +74,7 @@ def test_movies_show_the_rendered_frames(job: Job) -> None:
     assert np.abs(full[0] - later).mean() > np.abs(full[-1] - later).mean()
 
 
-def test_map_is_red_on_the_agent_and_yellow_on_the_patient(job: Job) -> None:
+def test_map_is_red_on_the_agent_and_yellow_on_the_patient(job: GenerateJob) -> None:
     trial = Trial.open(job.paths.trial_file)
     picture = np.asarray(Image.open(io.BytesIO(job.paths.map.read_bytes())))
     roles, ids = trial.scene.roles, trial.ids
@@ -88,8 +88,8 @@ def test_map_is_red_on_the_agent_and_yellow_on_the_patient(job: Job) -> None:
     assert not picture[others, 3].any()
 
 
-def test_looks_change_colours_and_nothing_else(job: Job, tmp_path: Path) -> None:
-    free = Job(TASK, tmp_path, Settings(width=64, height=64, look="free"))
+def test_looks_change_colours_and_nothing_else(job: GenerateJob, tmp_path: Path) -> None:
+    free = GenerateJob(TASK, tmp_path, GenerateSettings(width=64, height=64, look="free"))
     make_trial(free)
     red, other = Trial.open(job.paths.trial_file), Trial.open(free.paths.trial_file)
     assert red.metadata.digest == other.metadata.digest and red.labels == other.labels
@@ -105,9 +105,9 @@ def test_looks_change_colours_and_nothing_else(job: Job, tmp_path: Path) -> None
 
 
 def test_state_alone_is_small_and_passes_are_only_kept_when_asked_for(
-    job: Job, tmp_path: Path
+    job: GenerateJob, tmp_path: Path
 ) -> None:
-    bare = Job(TASK, tmp_path, Settings(width=64, height=64, look="redyellow"))
+    bare = GenerateJob(TASK, tmp_path, GenerateSettings(width=64, height=64, look="redyellow"))
     make_trial(bare)
     assert Trial.open(bare.paths.trial_file).pass_names == ()
     assert bare.paths.movie.read_bytes() == job.paths.movie.read_bytes()
@@ -120,21 +120,21 @@ def test_short_trials_and_unknown_presets_are_refused(tmp_path: Path) -> None:
         make_scene("short", cloth=False), ending=Ending(min_frames=20, max_frames=30)
     )
     with pytest.raises(BadInputError, match=r"'short' has .* frames; nothing is left to predict"):
-        make_trial(Job(Task("d", "drop", "testing", 0, scene=scene), tmp_path, SMALL))
+        make_trial(GenerateJob(TrialTask("d", "drop", "testing", 0, scene=scene), tmp_path, SMALL))
     with pytest.raises(UnknownNameError, match="preset of drop 'hard'"):
-        make_trial(Job(Task("d", "drop", "testing", 0, "hard"), tmp_path, SMALL))
+        make_trial(GenerateJob(TrialTask("d", "drop", "testing", 0, "hard"), tmp_path, SMALL))
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow
 def test_fresh_processes_make_the_same_bytes_whatever_their_environment(
-    job: Job, tmp_path: Path
+    job: GenerateJob, tmp_path: Path
 ) -> None:
     script = (
         "import sys; from pathlib import Path\n"
         "from physion.trials.making.make import make_trial\n"
         "from physion.trials.making.plan import *\n"
-        f"make_trial(Job({TASK!r}, Path(sys.argv[1]), {SMALL!r}))\n"
+        f"make_trial(GenerateJob({TASK!r}, Path(sys.argv[1]), {SMALL!r}))\n"
     )
     strange = {
         "PYTHONHASHSEED": "7",
@@ -157,7 +157,7 @@ def test_dataset_of_every_scenario_with_real_workers(tmp_path: Path) -> None:
     report = generate(
         tmp_path / "two",
         tasks,
-        Settings(width=64, height=64, look="redyellow"),
+        GenerateSettings(width=64, height=64, look="redyellow"),
         executor=LocalExecutor(2),
     )
     assert report.exit_code == 0 and len(report.made) == len(tasks)
@@ -167,7 +167,7 @@ def test_dataset_of_every_scenario_with_real_workers(tmp_path: Path) -> None:
     serial = generate(
         tmp_path / "one",
         tasks[::-1],
-        Settings(width=64, height=64, look="redyellow"),
+        GenerateSettings(width=64, height=64, look="redyellow"),
         executor=SerialExecutor(),
     )
     assert serial.exit_code == 0
@@ -178,13 +178,13 @@ def test_dataset_of_every_scenario_with_real_workers(tmp_path: Path) -> None:
 def test_official_scenes_become_trials(official: Path, tmp_path: Path) -> None:
     found = read_scenes(official / "scenes", scenario="dominoes", limit=2)
     tasks = [
-        Task("official", "dominoes", "testing", i, None, trial.scene, trial.outcome.contact)
+        TrialTask("official", "dominoes", "testing", i, None, trial.scene, trial.outcome.contact)
         for i, trial in enumerate(found.trials)
     ]
     report = generate(
         tmp_path / "s",
         tasks,
-        Settings(width=64, height=64, look="redyellow"),
+        GenerateSettings(width=64, height=64, look="redyellow"),
         executor=SerialExecutor(),
     )
     assert report.exit_code == 0

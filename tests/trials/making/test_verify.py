@@ -16,7 +16,13 @@ from physion.trials.index import build_index, read_index, write_index
 from physion.trials.layout import TrialPaths
 from physion.trials.making.generate import generate
 from physion.trials.making.make import make_trial
-from physion.trials.making.plan import Job, Settings, Task, plan_dataset, plan_scenes
+from physion.trials.making.plan import (
+    GenerateJob,
+    GenerateSettings,
+    TrialTask,
+    plan_dataset,
+    plan_scenes,
+)
 from physion.trials.making.verify import verify_dataset
 from physion.trials.video import encode_movie, read_frames
 from support.hand_made import make_by_hand, make_parts, make_scene
@@ -66,7 +72,9 @@ def test_movies_of_a_wrong_length_are_found(folder: Path) -> None:
 
 def test_simulating_again_finds_another_motion(folder: Path, tmp_path: Path) -> None:
     scene = make_scene("real", cloth=False)
-    job = Job(Task("t", "drop", "testing", 0, scene=scene), tmp_path / "r", Settings(64, 64))
+    job = GenerateJob(
+        TrialTask("t", "drop", "testing", 0, scene=scene), tmp_path / "r", GenerateSettings(64, 64)
+    )
     make_trial(job)
     from physion.trials.index import build_index
 
@@ -101,7 +109,7 @@ def test_a_label_that_the_contacts_contradict_is_found(folder: Path) -> None:
 def sampled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two sampled trials with movies, robustness and stored passes."""
     folder = tmp_path_factory.mktemp("sampled") / "d"
-    settings = Settings(width=64, height=64, jitters=2, passes=("depth", "flow"))
+    settings = GenerateSettings(width=64, height=64, jitters=2, passes=("depth", "flow"))
     tasks = plan_dataset("verify", ["collide"], {"testing": 2}, {"collide": ["default"]})
     assert not generate(folder, tasks, settings, executor=SerialExecutor()).failed
     return folder
@@ -162,6 +170,6 @@ def test_a_trial_made_again_is_indexed_again(sampled: Path, tmp_path: Path) -> N
     paths = Dataset(folder).paths(str(index["trial"][0]))
     paths.trial_file.unlink()
     tasks = plan_dataset("verify", ["collide"], {"testing": 2}, {"collide": ["default"]})
-    settings = Settings(width=64, height=64, jitters=2, passes=("depth", "flow"))
+    settings = GenerateSettings(width=64, height=64, jitters=2, passes=("depth", "flow"))
     report = generate(folder, tasks, settings, executor=SerialExecutor())
     assert len(report.made) == 1 and verify_dataset(folder, again=0).faults == []

@@ -18,6 +18,7 @@ from PIL import Image
 
 from physion.cli import import_trials as import_verb
 from physion.compute.local import SerialExecutor
+from physion.compute.run_tasks import RunReport
 from physion.errors import BadInputError, UnknownNameError
 from physion.numerics.rotations import rotation_matrix
 from physion.rendering.camera import View
@@ -29,7 +30,6 @@ from physion.trials.layout import TrialPaths
 from physion.trials.making.verify import verify_dataset
 from physion.trials.official.export_folder import export_official
 from physion.trials.official.import_folder import import_official
-from physion.trials.official.run import OfficialReport
 from physion.trials.trial_file import Trial, TrialWriter
 from physion.trials.video import count_frames, encode_movie, read_frames
 from support.official_hand_made import (
@@ -77,7 +77,7 @@ def imported(plain: Path) -> Path:
     return out
 
 
-def bring(folder: Path) -> OfficialReport:
+def bring(folder: Path) -> RunReport:
     """Import ``folder`` into ``<folder>-in``."""
     return import_official(folder, folder.with_name(folder.name + "-in"), executor=SerialExecutor())
 

@@ -17,11 +17,11 @@ import pytest
 
 from physion.cli.main import main as cli
 from physion.errors import BadInputError
+from physion.trials.columns import INDEX_COLUMNS
 from physion.trials.files import encode_png, write_files
 from physion.trials.index import COLUMNS, build_index, read_index, write_index
 from physion.trials.layout import TrialPaths, find_trials
 from physion.trials.publishing.card import write_card
-from physion.trials.publishing.facts import MEANINGS, meaning
 from support.hand_made import SIZE, make_parts
 from support.programs import find_program
 
@@ -143,8 +143,8 @@ def test_states_alone_have_no_movies_to_describe(tmp_path: Path) -> None:
 
 
 def test_every_column_has_a_meaning() -> None:
-    assert all(meaning(column) for column in COLUMNS)
-    assert set(MEANINGS) <= set(COLUMNS)
+    assert list(INDEX_COLUMNS) == list(COLUMNS)
+    assert all(column.meaning for column in INDEX_COLUMNS.values())
 
 
 def test_required_properties_are_there(metadata: dict[str, Any]) -> None:

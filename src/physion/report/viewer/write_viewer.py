@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,15 +10,13 @@ from typing import Any
 import pandas as pd
 
 from physion.atomic import write_atomic
+from physion.compute.progress import Track
 from physion.errors import BadInputError, UnknownNameError
 from physion.report.viewer import facts as viewer_facts
 from physion.report.viewer import motion as viewer_motion
 from physion.report.viewer import viewer_movies
 from physion.report.viewer.text import TrialData, render_viewer
 from physion.trials.dataset import Dataset
-
-Track = Callable[[Iterable[Any], str, int], Iterator[Any]]
-"""Passes items on and shows how far it is, as `physion.cli.output.track` does."""
 
 
 @dataclass(frozen=True)

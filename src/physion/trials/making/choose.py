@@ -14,12 +14,13 @@ the same slot ends with the same scene in any process and any order. A draw is r
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from physion.compute.executor import Executor, Outcome
+from physion.compute.executor import Executor, TaskOutcome
+from physion.compute.progress import Track, tracked
 from physion.errors import BadInputError, BadSceneError, PhysionError
 from physion.physics.engine import simulate
 from physion.physics.jitter import jitter_scene
@@ -29,7 +30,7 @@ from physion.scenes.sampling.preset import get_preset
 from physion.scenes.sampling.registry import sample_scene
 from physion.scenes.scene import Scene
 from physion.seeds import child_generator, stable_hash, trial_seed
-from physion.trials.making.plan import Settings, Task
+from physion.trials.making.plan import GenerateSettings, TrialTask
 from physion.trials.sealed import read_sealed, write_sealed
 
 BALANCED = ("readout", "testing", "familiarization")
@@ -50,11 +51,9 @@ SAVE_EVERY = 100
 JITTER = 0.001
 """Standard deviation in metres of the noise that measures robustness."""
 
-Track = Callable[[Iterable[Outcome[Any]], str, int], Iterator[Outcome[Any]]]
-
 
 @dataclass(frozen=True)
-class Choice:
+class ChosenScene:
     """What a slot took: its preset and attempt, and how robust its outcome is.
 
     ``digest`` is the scene's, ``refused`` counts refused draws by reason.
@@ -66,7 +65,7 @@ class Choice:
     robust: float | None
     refused: Mapping[str, int] = field(default_factory=dict)
 
-    def fill(self, task: Task) -> Task:
+    def fill(self, task: TrialTask) -> TrialTask:
         """The task with this choice in it."""
         return replace(
             task,
@@ -81,8 +80,8 @@ class Choice:
 class Slot:
     """A task whose draw is to be found; ``taken`` holds short digests of physics in use."""
 
-    task: Task
-    settings: Settings
+    task: TrialTask
+    settings: GenerateSettings
     taken: frozenset[int] = frozenset()
 
 
@@ -92,7 +91,7 @@ def split_of(digest: str) -> str:
     return next((split for split, parts in SPLIT_PARTS.items() if part in parts), "familiarization")
 
 
-def wanted_contact(task: Task) -> bool | None:
+def wanted_contact(task: TrialTask) -> bool | None:
     """The outcome that a slot is to have; None where any will do.
 
     Slots come in pairs, one with contact and one without, in an order that chance decides. The
@@ -106,7 +105,7 @@ def wanted_contact(task: Task) -> bool | None:
     return first != bool(second)
 
 
-def choose(slot: Slot) -> Choice:
+def choose(slot: Slot) -> ChosenScene:
     """Find the draw of a slot. A pure function; `PhysionError` says why there is none."""
     task, refused = slot.task, Counter[str]()
     params = {name: get_preset(task.scenario, name).params for name in task.presets}
@@ -139,7 +138,7 @@ def choose(slot: Slot) -> Choice:
             continue
         reason, robust = judge(scene, seed, task, slot.settings)
         if reason is None:
-            return Choice(name, attempt, digest, robust, dict(refused))
+            return ChosenScene(name, attempt, digest, robust, dict(refused))
         refused[reason] += 1
     counts = "; ".join(f"{reason}: {count}" for reason, count in refused.most_common(4))
     raise PhysionError(
@@ -149,7 +148,7 @@ def choose(slot: Slot) -> Choice:
 
 
 def judge(
-    scene: Scene, seed: Any, task: Task, settings: Settings
+    scene: Scene, seed: Any, task: TrialTask, settings: GenerateSettings
 ) -> tuple[str | None, float | None]:
     """Why a draw cannot be taken, or None; and its robustness, if it was measured."""
     trajectory = simulate(scene, until_contact=True)
@@ -182,7 +181,7 @@ def short(digest: str) -> int:
     return int(digest[:16], 16)
 
 
-def _visible(scene: Scene, trajectory: Trajectory, settings: Settings) -> bool:
+def _visible(scene: Scene, trajectory: Trajectory, settings: GenerateSettings) -> bool:
     # Compiled code, which is loaded by whoever renders.
     from physion.rendering.renderer import Renderer
 
@@ -192,16 +191,16 @@ def _visible(scene: Scene, trajectory: Trajectory, settings: Settings) -> bool:
     return all((ids == scene.index(name) + 1).mean() >= settings.min_visible for name in roles)
 
 
-class Choices:
+class ChoiceRecord:
     """The choices of one split of one scenario, kept in a file so that a killed run goes on."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.by_index: dict[int, Choice] = {}
+        self.by_index: dict[int, ChosenScene] = {}
         if path.is_file():
             try:
                 rows = read_sealed(path)
-                self.by_index = {int(index): Choice(**row) for index, row in rows.items()}
+                self.by_index = {int(index): ChosenScene(**row) for index, row in rows.items()}
             except (BadInputError, ValueError, TypeError) as error:
                 raise BadInputError(
                     f"{path} is no record of choices ({error}); delete it to have it made again"
@@ -213,7 +212,7 @@ class Choices:
         self.path.parent.mkdir(exist_ok=True)
         write_sealed(self.path, rows)
 
-    def missing(self, tasks: Collection[Task]) -> list[Task]:
+    def missing(self, tasks: Collection[TrialTask]) -> list[TrialTask]:
         """Tasks without a choice, and those whose physics a task of lower index has."""
         wanted = {task.index: task for task in tasks}
         first: dict[str, int] = {}
@@ -231,25 +230,23 @@ class Choices:
 
 
 def choose_all(
-    groups: Mapping[Path, Collection[Task]],
-    settings: Settings,
+    groups: Mapping[Path, Collection[TrialTask]],
+    settings: GenerateSettings,
     executor: Executor,
     track: Track | None = None,
-) -> tuple[dict[str, Choice], dict[str, Outcome[Choice]]]:
+) -> tuple[dict[str, ChosenScene], dict[str, TaskOutcome[ChosenScene]]]:
     """Choices by trial name, and failures by name, for tasks by the file of their choices.
 
     Each group is one split of one scenario. Slots are searched side by side, and those that found
     the physics of a slot before them search on, so that the result does not depend on who was
     first.
     """
-    records = {path: Choices(path) for path in groups}
-    failed: dict[str, Outcome[Choice]] = {}
+    records = {path: ChoiceRecord(path) for path in groups}
+    failed: dict[str, TaskOutcome[ChosenScene]] = {}
     while todo := _slots(groups, records, settings, failed.keys()):
         outcomes = executor.map(choose, {name: slot for name, (_, slot) in todo.items()})
         unsaved: set[Path] = set()
-        for done, outcome in enumerate(
-            track(outcomes, "choosing", len(todo)) if track else outcomes, start=1
-        ):
+        for done, outcome in enumerate(tracked(outcomes, "choosing", len(todo), track), start=1):
             if outcome.error is not None:
                 failed[outcome.key] = outcome
                 continue
@@ -269,9 +266,9 @@ def choose_all(
 
 
 def _slots(
-    groups: Mapping[Path, Collection[Task]],
-    records: Mapping[Path, Choices],
-    settings: Settings,
+    groups: Mapping[Path, Collection[TrialTask]],
+    records: Mapping[Path, ChoiceRecord],
+    settings: GenerateSettings,
     failed: Collection[str],
 ) -> dict[str, tuple[Path, Slot]]:
     """What is still to be chosen, by trial name; choices that came twice are dropped before."""
@@ -284,7 +281,7 @@ def _slots(
     return todo
 
 
-def _save(records: Mapping[Path, Choices], unsaved: set[Path]) -> None:
+def _save(records: Mapping[Path, ChoiceRecord], unsaved: set[Path]) -> None:
     for path in sorted(unsaved):
         records[path].save()
     unsaved.clear()

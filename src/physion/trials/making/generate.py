@@ -8,15 +8,15 @@ of processes, and a killed run goes on where it stopped.
 from __future__ import annotations
 
 import dataclasses
-import errno
 import json
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from physion.atomic import folder_lock, remove_leftovers, write_atomic
-from physion.compute.executor import Executor, Outcome
+from physion.compute.executor import Executor, TaskOutcome
+from physion.compute.progress import Track
+from physion.compute.run_tasks import FATAL_ERRNOS, RunReport, run_tasks
 from physion.errors import BadInputError, PhysionError
 from physion.physics.engine import engines
 from physion.scenes.sampling.preset import get_preset
@@ -24,44 +24,19 @@ from physion.scenes.sampling.registry import as_record
 from physion.seeds import stable_hash
 from physion.trials.index import build_index, read_index, write_index
 from physion.trials.layout import CHOICES, FAILURES, INDEX, SETTINGS, find_trials
-from physion.trials.making.plan import Job, Settings, Task, check_names
+from physion.trials.making.plan import GenerateJob, GenerateSettings, TrialTask, check_names
 from physion.trials.sealed import read_sealed, write_sealed
-
-Track = Callable[[Iterable[Outcome[Any]], str, int], Iterator[Outcome[Any]]]
-"""Passes outcomes on and shows how far it is, as `physion.cli.output.track` does."""
-
-HOPELESS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EIO}
-"""System errors that every later trial would meet too."""
-
-
-@dataclass(frozen=True)
-class Report:
-    """What a run of `generate` did.
-
-    ``made`` and ``kept`` name trials that were made and that were there already; ``failed`` says
-    why, by name. ``index`` is the path of the index.
-    """
-
-    made: Sequence[str]
-    kept: Sequence[str]
-    failed: Mapping[str, str]
-    index: Path
-
-    @property
-    def exit_code(self) -> int:
-        """0, or 1 where a trial failed."""
-        return 1 if self.failed else 0
 
 
 def generate(
     folder: Path,
-    tasks: Sequence[Task],
-    settings: Settings | None = None,
+    tasks: Sequence[TrialTask],
+    settings: GenerateSettings | None = None,
     *,
     executor: Executor | None = None,
     track: Track | None = None,
-    make: Callable[[Job], str] | None = None,
-) -> Report:
+    make: Callable[[GenerateJob], str] | None = None,
+) -> RunReport:
     """Make all trials of ``tasks`` that ``folder`` does not hold yet, then its index.
 
     A trial that fails leaves its traceback in ``failures/`` and the others go on. Trials of
@@ -81,12 +56,12 @@ def generate(
         from physion.trials.making.make import make_trial
 
         make = make_trial
-    settings = settings or Settings()
+    settings = settings or GenerateSettings()
     check_names(tasks)
     datasets = {task.dataset for task in tasks}
     if len(datasets) != 1:
         raise BadInputError(f"one folder takes one dataset, not {sorted(datasets) or 'none'}")
-    jobs = {task.trial: Job(task, folder, settings) for task in tasks}
+    jobs = {task.trial: GenerateJob(task, folder, settings) for task in tasks}
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with folder_lock(folder):
@@ -94,24 +69,32 @@ def generate(
             remove_leftovers(folder)
             missing = {name: job for name, job in jobs.items() if not job.complete()}
             chosen, unchosen = _choose(folder, jobs, missing, settings, executor, track)
-            made, failed = _run(folder, chosen, executor, track, make)
+            made, failed = run_tasks(
+                make,
+                chosen,
+                folder=folder,
+                what="generating",
+                executor=executor,
+                track=track,
+                on_outcome=lambda outcome: _note_outcome(folder, outcome, chosen[outcome.key]),
+            )
             problems = _update_index(folder, set(made))
     except OSError as error:
         raise BadInputError(f"cannot write into {folder}: {error.strerror or error}") from error
     kept = [name for name in jobs if name not in missing]
-    return Report(made, kept, {**unchosen, **failed, **problems}, folder / INDEX)
+    return RunReport(list(made), kept, {**unchosen, **failed, **problems}, folder / INDEX)
 
 
 def _choose(
     folder: Path,
-    jobs: Mapping[str, Job],
-    missing: Mapping[str, Job],
-    settings: Settings,
+    jobs: Mapping[str, GenerateJob],
+    missing: Mapping[str, GenerateJob],
+    settings: GenerateSettings,
     executor: Executor,
     track: Track | None,
-) -> tuple[dict[str, Job], dict[str, str]]:
+) -> tuple[dict[str, GenerateJob], dict[str, str]]:
     """The missing jobs with their draws chosen, and why some could not be chosen."""
-    groups: dict[Path, list[Task]] = {}
+    groups: dict[Path, list[TrialTask]] = {}
     for job in jobs.values():
         if job.task.presets:
             path = folder / CHOICES / f"{job.task.split}_{job.task.scenario}.json"
@@ -128,55 +111,31 @@ def _choose(
 
     choices, outcomes = choose_all(wanted, settings, executor, track)
     for name, outcome in outcomes.items():
-        if outcome.errno in HOPELESS:
+        if outcome.errno in FATAL_ERRNOS:
             raise PhysionError(f"cannot write into {folder}: {outcome.error}")
         if name in chosen:
             failed[name] = str(outcome.error)
-            _note_failure(folder, outcome, chosen.pop(name))
+            _note_outcome(folder, outcome, chosen.pop(name))
     for name in choices.keys() & chosen.keys():
         job = chosen[name]
         chosen[name] = dataclasses.replace(job, task=choices[name].fill(job.task))
     return chosen, failed
 
 
-def _run(
-    folder: Path,
-    jobs: Mapping[str, Job],
-    executor: Executor,
-    track: Track | None,
-    make: Callable[[Job], str],
-) -> tuple[list[str], dict[str, str]]:
-    """Run the jobs; names of the trials made in the order of the jobs, and the failures."""
-    made: set[str] = set()
-    failed: dict[str, str] = {}
-    outcomes = executor.map(make, jobs)
-    try:
-        for outcome in track(outcomes, "generating", len(jobs)) if track else outcomes:
-            if outcome.error is None:
-                made.add(outcome.key)
-                (folder / FAILURES / f"{outcome.key}.txt").unlink(missing_ok=True)
-                continue
-            if outcome.errno in HOPELESS:
-                raise PhysionError(
-                    f"cannot write into {folder}: {outcome.error}; {len(made)} new trials are "
-                    "whole, and the same command goes on from there"
-                )
-            failed[outcome.key] = outcome.error
-            _note_failure(folder, outcome, jobs[outcome.key])
-    finally:
-        # Workers must have stopped before the folder is given to someone else.
-        if isinstance(outcomes, Generator):
-            outcomes.close()
-    return [name for name in jobs if name in made], failed
+def _note_outcome(folder: Path, outcome: TaskOutcome[Any], job: GenerateJob) -> None:
+    """Write the traceback of a failed trial and its scene, if imported, into ``failures/``.
 
-
-def _note_failure(folder: Path, outcome: Outcome[Any], job: Job) -> None:
-    """Leave the traceback and the scene, if it came from outside, where one can look at them."""
+    The file of an earlier failure is removed if the trial succeeded.
+    """
+    path = folder / FAILURES / f"{outcome.key}.txt"
+    if outcome.error is None:
+        path.unlink(missing_ok=True)
+        return
     text = f"{outcome.error}\ntries: {outcome.tries}\n\n{outcome.traceback}\n"
     if job.task.scene is not None:
         text += job.task.scene.to_json() + "\n"
-    (folder / FAILURES).mkdir(exist_ok=True)
-    write_atomic(folder / FAILURES / f"{outcome.key}.txt", text.encode())
+    path.parent.mkdir(exist_ok=True)
+    write_atomic(path, text.encode())
 
 
 def _update_index(folder: Path, made: set[str]) -> dict[str, str]:
@@ -201,7 +160,9 @@ def _update_index(folder: Path, made: set[str]) -> dict[str, str]:
     return problems
 
 
-def _fix_settings(folder: Path, dataset: str, settings: Settings, tasks: Sequence[Task]) -> None:
+def _fix_settings(
+    folder: Path, dataset: str, settings: GenerateSettings, tasks: Sequence[TrialTask]
+) -> None:
     """Write how the folder's trials are made, or raise where it was made another way.
 
     Each split of a scenario keeps the presets, with all their values, that it began with.
@@ -239,7 +200,7 @@ def _fix_settings(folder: Path, dataset: str, settings: Settings, tasks: Sequenc
     write_sealed(path, {**wanted, "presets": presets})
 
 
-def _presets_in_use(tasks: Sequence[Task]) -> dict[str, dict[str, str]]:
+def _presets_in_use(tasks: Sequence[TrialTask]) -> dict[str, dict[str, str]]:
     """A digest of the values of every preset, by split and scenario."""
     found: dict[str, dict[str, str]] = {}
     for key, names in {(f"{t.split}/{t.scenario}", t.presets): t for t in tasks if t.presets}:

@@ -21,7 +21,7 @@ from physion.scenes.sampling.preset import get_preset
 from physion.scenes.sampling.registry import sample_scene
 from physion.scenes.scene import FRAME_TIME, OBSERVED_FRAMES, Scene
 from physion.trials.files import encode_png, write_files
-from physion.trials.making.plan import Job, Task
+from physion.trials.making.plan import GenerateJob, TrialTask
 from physion.trials.trial_file import Metadata, TrialWriter, in_look
 from physion.trials.video import MovieEncoder
 
@@ -33,7 +33,7 @@ RENDERER = (
 maps; stored with every trial."""
 
 
-def make_trial(job: Job) -> str:
+def make_trial(job: GenerateJob) -> str:
     """Make one trial and write its files; its name. A pure function of the job.
 
     The trial file comes last, so that a trial with a trial file is complete.
@@ -52,7 +52,7 @@ def make_trial(job: Job) -> str:
     return task.trial
 
 
-def scene_of(task: Task) -> Scene:
+def scene_of(task: TrialTask) -> Scene:
     """The scene of a task in its free colours: the imported one, or one drawn by its seed."""
     if task.scene is not None:
         return task.scene
@@ -67,7 +67,9 @@ def scene_of(task: Task) -> Scene:
     return dataclasses.replace(scene, name=task.trial)
 
 
-def _files(job: Job, scene: Scene, trajectory: Trajectory, labels: Labels) -> dict[str, bytes]:
+def _files(
+    job: GenerateJob, scene: Scene, trajectory: Trajectory, labels: Labels
+) -> dict[str, bytes]:
     """The bytes of the trial's files, each frame of each look being rendered once."""
     settings = job.settings
     size = settings.width, settings.height
@@ -125,7 +127,7 @@ def _image(frame: Frame, name: str) -> NDArray[Any]:
     return image
 
 
-def _metadata(job: Job, scene: Scene, trajectory: Trajectory) -> Metadata:
+def _metadata(job: GenerateJob, scene: Scene, trajectory: Trajectory) -> Metadata:
     task, settings = job.task, job.settings
     sampled = task.scene is None
     return Metadata(

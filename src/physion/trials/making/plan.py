@@ -36,7 +36,7 @@ PLAYBACK_RATES = {"slow": PLAYBACK_RATE, "real": round(1 / FRAME_TIME)}
 
 
 @dataclass(frozen=True)
-class Task:
+class TrialTask:
     """One trial to make: what names it is all that decides it.
 
     A task without ``scene`` draws its scene from its scenario and ``preset`` (None for the
@@ -82,7 +82,7 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Settings:
+class GenerateSettings:
     """How trials are chosen, rendered and stored. One folder has one of it."""
 
     width: int = 256
@@ -144,12 +144,12 @@ class Settings:
 
 
 @dataclass(frozen=True)
-class Job:
+class GenerateJob:
     """A task with where and how to do it: all that a worker needs."""
 
-    task: Task
+    task: TrialTask
     folder: Path
-    settings: Settings
+    settings: GenerateSettings
 
     @property
     def paths(self) -> TrialPaths:
@@ -171,7 +171,7 @@ def plan_dataset(
     scenarios: Iterable[str],
     counts: Mapping[str, int],
     presets: Mapping[str, Sequence[str]] | None = None,
-) -> list[Task]:
+) -> list[TrialTask]:
     """Tasks for ``counts[split]`` trials of each scenario in each split.
 
     ``presets`` names the presets of a scenario, which its trials take in turn, by default those
@@ -189,7 +189,7 @@ def plan_dataset(
             for name in names:
                 get_preset(scenario, name)
             tasks += [
-                Task(dataset, scenario, split, index, presets=tuple(names))
+                TrialTask(dataset, scenario, split, index, presets=tuple(names))
                 for index in range(count)
             ]
     return tasks
@@ -200,18 +200,18 @@ def plan_scenes(
     scenes: Iterable[Scene],
     split: str = "testing",
     recorded: Mapping[str, bool] | None = None,
-) -> list[Task]:
+) -> list[TrialTask]:
     """Tasks for imported scenes, in their order; ``recorded`` gives outcomes by scene name."""
     outcomes = recorded or {}
     tasks = [
-        Task(dataset, scene.scenario, split, index, None, scene, outcomes.get(scene.name))
+        TrialTask(dataset, scene.scenario, split, index, None, scene, outcomes.get(scene.name))
         for index, scene in enumerate(scenes)
     ]
     check_names(tasks)
     return tasks
 
 
-def check_names(tasks: Iterable[Task]) -> None:
+def check_names(tasks: Iterable[TrialTask]) -> None:
     """Raise `BadInputError` where two tasks would write the same trial."""
     seen: set[str] = set()
     for task in tasks:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,22 +13,22 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from physion.compute.progress import Track, tracked
 from physion.errors import BadInputError
 from physion.physics.labels import label_contact
 from physion.scenes.sampling.preset import load_presets
 from physion.seeds import stable_hash
-from physion.trials.index import COLUMNS, FILES, as_table, index_bytes, index_row, read_index
+from physion.trials.columns import FILES
+from physion.trials.index import COLUMNS, as_table, index_bytes, index_row, read_index
 from physion.trials.layout import CHOICES, INDEX, SETTINGS, TrialPaths, find_trials
 from physion.trials.making.choose import BALANCED, robustness, split_of, wanted_contact
-from physion.trials.making.plan import Task
+from physion.trials.making.plan import TrialTask
 from physion.trials.sealed import read_sealed
 from physion.trials.trial_file import Trial
 from physion.trials.video import count_frames
 
 SAMPLE = 4
 """Trials that are made again by default."""
-
-Track = Callable[[Iterable[Any], str, int], Iterator[Any]]
 
 
 @dataclass
@@ -77,7 +77,7 @@ def verify_dataset(
     settings = _settings(folder)
     remade = _sample(table, again)
     rows = [row for _, row in table.iterrows()]
-    for row in track(rows, "verifying", len(rows)) if track else rows:
+    for row in tracked(rows, "verifying", len(rows), track):
         paths = TrialPaths(folder, row["split"], row["scenario"], row["trial"])
         try:
             result.faults += _compare(row, paths)
@@ -136,7 +136,7 @@ def _check_split(row: pd.Series[Any], settings: Mapping[str, Any]) -> list[str]:
     faults = []
     if (belongs := split_of(row["scene_digest"])) != row["split"]:
         faults.append(f"{row['trial']}: field 'scene_digest': its physics belongs to {belongs}")
-    task = Task(row["dataset"], row["scenario"], row["split"], int(row["index"]))
+    task = TrialTask(row["dataset"], row["scenario"], row["split"], int(row["index"]))
     if wanted_contact(task) not in (None, row["contact"]):
         faults.append(f"{row['trial']}: field 'contact': the balance of its split wants the other")
     if task.split in BALANCED and row["observed_contact"] and not settings["observed_contact"]:
@@ -266,7 +266,7 @@ def _draw_again(paths: TrialPaths, trial: Trial, settings: Mapping[str, Any]) ->
         return []
     if meta.attempt is None:
         return [f"{paths.trial_file}: field 'metadata' has a seed but no attempt"]
-    task = Task(
+    task = TrialTask(
         meta.dataset,
         meta.scenario,
         meta.split,

@@ -32,15 +32,15 @@ import numpy as np
 
 from physion.atomic import folder_lock, remove_leftovers, write_atomic
 from physion.compute.executor import Executor
+from physion.compute.progress import Track
+from physion.compute.run_tasks import RunReport, run_tasks
 from physion.errors import BadInputError
 from physion.stimulus_names import FOLDERS
 from physion.trials.dataset import Dataset
 from physion.trials.files import encode_png
 from physion.trials.layout import TrialPaths
-from physion.trials.making.generate import Track
 from physion.trials.official.names import TRIAL_FILE, redyellow_name, split_name
 from physion.trials.official.read_hdf5 import OfficialFile
-from physion.trials.official.run import OfficialReport, run_all
 from physion.trials.official.write_metadata import trial_stats
 from physion.trials.trial_file import Metadata, Trial
 from physion.trials.video import MovieEncoder, count_frames
@@ -98,7 +98,7 @@ def export_official(
     scenario: str | None = None,
     executor: Executor | None = None,
     track: Track | None = None,
-) -> OfficialReport:
+) -> RunReport:
     """Write the trials of a split and a scenario, or all, into ``out``; see the module.
 
     Trials that are there already, from the same motion in the same look, are kept; the lists and
@@ -120,13 +120,19 @@ def export_official(
             remove_leftovers(out)
             kept = {name for name, job in jobs.items() if _is_done(job)}
             missing = {name: job for name, job in jobs.items() if name not in kept}
-            made, failed = run_all(export_trial, missing, executor, track, "exporting", out)
+            made, failed = run_tasks(
+                export_trial,
+                missing,
+                folder=out,
+                what="exporting",
+                executor=executor,
+                track=track,
+            )
             index, broken = _write_lists(out)
     except OSError as error:
         raise BadInputError(f"cannot write into {out}: {error.strerror or error}") from error
-    return OfficialReport(
-        tuple(made), tuple(name for name in jobs if name in kept), {**failed, **broken}, {}, index
-    )
+    in_order = tuple(name for name in jobs if name in kept)
+    return RunReport(tuple(made), in_order, {**failed, **broken}, index)
 
 
 def export_trial(job: ExportJob) -> str:

@@ -24,15 +24,15 @@ from typing import Any
 
 from physion.atomic import folder_lock, remove_leftovers
 from physion.compute.executor import Executor
+from physion.compute.progress import Track
+from physion.compute.run_tasks import RunReport, run_tasks
 from physion.errors import BadInputError, UnknownNameError
 from physion.stimulus_names import FOLDERS, guess_scenario, plain_name
 from physion.trials.index import build_index, write_index
 from physion.trials.layout import INDEX, SAFE_NAME, SETTINGS, TrialPaths
-from physion.trials.making.generate import Track
 from physion.trials.making.plan import SPLITS
 from physion.trials.official.job import ImportJob
 from physion.trials.official.names import redyellow_name, split_name
-from physion.trials.official.run import OfficialReport, run_all
 
 MAX_LIST_BYTES = 2**28
 """Largest metadata.json or labels.csv that is read."""
@@ -47,7 +47,7 @@ def import_official(
     scenario: str | None = None,
     executor: Executor | None = None,
     track: Track | None = None,
-) -> OfficialReport:
+) -> RunReport:
     """Bring every official trial under ``folder`` into the dataset ``out``, then index it.
 
     ``name`` is the dataset's; ``split`` is where the trials go; by default both are those that
@@ -75,7 +75,14 @@ def import_official(
         with folder_lock(out):
             remove_leftovers(out)
             missing = {t: job for t, job in jobs.items() if not job.paths.trial_file.is_file()}
-            made, broken = run_all(import_trial, missing, executor, track, "importing", out)
+            made, broken = run_tasks(
+                import_trial,
+                missing,
+                folder=out,
+                what="importing",
+                executor=executor,
+                track=track,
+            )
             table, problems = build_index(out)
             write_index(out, table)
     except OSError as error:
@@ -83,7 +90,7 @@ def import_official(
     notes = {trial: notes for trial, notes in made.items() if notes}
     failed = {**failed, **broken, **problems}
     kept = tuple(trial for trial in jobs if trial not in missing)
-    return OfficialReport(tuple(made), kept, failed, notes, out / INDEX)
+    return RunReport(tuple(made), kept, failed, out / INDEX, notes)
 
 
 def import_trial(job: ImportJob) -> tuple[str, ...]:

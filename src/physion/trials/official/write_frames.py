@@ -24,6 +24,7 @@ from physion.physics.trajectory import ENVIRONMENT
 from physion.rendering.camera import axes
 from physion.rendering.renderer import Frame
 from physion.scenes.scene import FRAME_TIME
+from physion.trials.files import encode_png
 from physion.trials.official.axes import (
     rotation_matrices,
     swap_axes,
@@ -36,7 +37,6 @@ from physion.trials.official.names import (
     encode_depth,
     encode_flow,
     encode_normals,
-    encode_picture,
     segmentation_colors,
 )
 from physion.trials.official.write_objects import OfficialObjects
@@ -115,8 +115,9 @@ class FrameWriter:
             "_flow": encode_flow(images.flow),
         }
         for name, picture in pictures.items():
-            # PNG is packed already.
-            group.create_dataset(name, data=encode_picture(picture))
+            # PNG is compressed already; level 2 takes half the time of 6 for a tenth more bytes.
+            data = np.frombuffer(encode_png(picture, compress_level=2), np.uint8)
+            group.create_dataset(name, data=data)
         depth = encode_depth(images.depth)
         packed: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": False}
         group.create_dataset("_depth", data=depth, chunks=depth.shape, **packed)

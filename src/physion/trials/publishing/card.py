@@ -13,9 +13,15 @@ import pandas as pd
 
 from physion.atomic import write_atomic
 from physion.errors import BadInputError
+from physion.trials.columns import INDEX_COLUMNS
 from physion.trials.layout import INDEX
 from physion.trials.publishing.croissant import Terms, croissant
-from physion.trials.publishing.facts import MEANINGS, SCENARIOS, SPLITS, Facts, meaning, read_facts
+from physion.trials.publishing.facts import (
+    SCENARIO_MEANINGS,
+    SPLIT_MEANINGS,
+    Facts,
+    read_facts,
+)
 
 CARD = "README.md"
 METADATA = "croissant.json"
@@ -125,8 +131,8 @@ def card_text(facts: Facts, terms: Terms) -> str:
         f"## How it was made\n{facts.collection()}\n\n"
         f"Creator: {name}. Version {terms.version}, {terms.published}. "
         f"Licence: {terms.license}.",
-        f"## Splits\n{_table(_counts(facts.index))}\n\n{_meanings('split', SPLITS, facts)}",
-        f"## Scenarios\n{_meanings('scenario', SCENARIOS, facts)}",
+        f"## Splits\n{_table(_counts(facts.index))}\n\n{_meanings('split', SPLIT_MEANINGS, facts)}",
+        f"## Scenarios\n{_meanings('scenario', SCENARIO_MEANINGS, facts)}",
         f"## Files\nOne folder for each split, in it one for each scenario. `{INDEX}` has one row "
         "for each trial, with the path, size and SHA-256 of its files; together they have "
         f"{facts.total_bytes() / 1e6:.1f} MB. `{METADATA}` says the same for machines. Who "
@@ -183,8 +189,11 @@ def _counts(index: pd.DataFrame) -> pd.DataFrame:
 
 
 def _columns(facts: Facts) -> pd.DataFrame:
-    rows = [{"column": f"`{name}`", "meaning": meaning(name)} for name in MEANINGS]
-    rows = [row for row in rows if row["column"].strip("`") in facts.index.columns]
+    rows = [
+        {"column": f"`{name}`", "meaning": column.meaning}
+        for name, column in INDEX_COLUMNS.items()
+        if name in facts.index.columns and not name.endswith(("_bytes", "_sha256"))
+    ]
     rows.append(
         {"column": "`*_bytes`, `*_sha256`", "meaning": "size and hash of the file named in `*`"}
     )

@@ -9,14 +9,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from physion.trials.index import COLUMNS
+from physion.trials.columns import FILES, INDEX_COLUMNS, IndexColumn
 from physion.trials.layout import INDEX
-from physion.trials.publishing.facts import MEANINGS, SCENARIOS, SPLITS, Facts, meaning
+from physion.trials.publishing.facts import SCENARIO_MEANINGS, SPLIT_MEANINGS, Facts
 
 CROISSANT = "http://mlcommons.org/croissant/1.0"
 RAI = "http://mlcommons.org/croissant/RAI/1.0"
 
 _TYPES = {"string": "sc:Text", "int64": "sc:Integer", "bool": "sc:Boolean", "float64": "sc:Float"}
+_TYPES |= {"Int64": "sc:Integer", "boolean": "sc:Boolean", "Float64": "sc:Float"}
+"""Type in the Croissant vocabulary by pandas type."""
 _FILES = {
     "trial-files": ("*/*/*.h5", "application/x-hdf5", "trial_file"),
     "movies": ("*/*/*_img.mp4", "video/mp4", "movie"),
@@ -143,7 +145,7 @@ def _distribution(facts: Facts) -> list[dict[str, Any]]:
             "@type": "cr:FileSet",
             "@id": name,
             "name": name,
-            "description": f"{MEANINGS[column][0].upper()}{MEANINGS[column][1:]}. The SHA-256 of "
+            "description": f"{FILES[column][0].upper()}{FILES[column][1:]}. The SHA-256 of "
             "each file is in the index.",
             "encodingFormat": kind,
             "includes": pattern,
@@ -158,8 +160,8 @@ def _enumerations(facts: Facts) -> list[dict[str, Any]]:
     """Splits and scenarios that occur, with what they mean."""
     sets = []
     for column, meanings, kind in (
-        ("split", SPLITS, "cr:Split"),
-        ("scenario", SCENARIOS, "sc:Enumeration"),
+        ("split", SPLIT_MEANINGS, "cr:Split"),
+        ("scenario", SCENARIO_MEANINGS, "sc:Enumeration"),
     ):
         name = f"{column}s"
         rows = [
@@ -192,18 +194,17 @@ def _trials() -> dict[str, Any]:
         "name": "trials",
         "description": "One record a trial.",
         "key": {"@id": "trials/trial"},
-        "field": [_field(name, kind) for name, kind in COLUMNS.items()],
+        "field": [_field(name, column) for name, column in INDEX_COLUMNS.items()],
     }
 
 
-def _field(name: str, kind: str) -> dict[str, Any]:
-    plain = {"Int64": "int64", "Float64": "float64", "boolean": "bool"}.get(kind, kind)
+def _field(name: str, column: IndexColumn) -> dict[str, Any]:
     field: dict[str, Any] = {
         "@type": "cr:Field",
         "@id": f"trials/{name}",
         "name": name,
-        "description": meaning(name),
-        "dataType": _TYPES[plain],
+        "description": column.meaning,
+        "dataType": _TYPES[column.dtype],
         "source": {"fileObject": {"@id": INDEX}, "extract": {"column": name}},
     }
     if name in ("split", "scenario"):

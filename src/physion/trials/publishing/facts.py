@@ -15,16 +15,17 @@ from typing import Any
 import pandas as pd
 
 from physion.errors import BadInputError
-from physion.trials.index import COLUMNS, FILES, read_index
+from physion.trials.columns import FILES, INDEX_COLUMNS
+from physion.trials.index import read_index
 from physion.trials.layout import INDEX, SETTINGS
 
-SPLITS = {
+SPLIT_MEANINGS = {
     "training": "for a model's own training",
     "readout": "for fitting a readout on a model's features",
     "testing": "for the test that models and people take",
     "familiarization": "for people to practise on",
 }
-SCENARIOS = {
+SCENARIO_MEANINGS = {
     "collide": "one object is thrown at another",
     "contain": "objects lie in a bowl or round a post, and something is thrown at them",
     "dominoes": "a row of upright objects topples",
@@ -34,47 +35,6 @@ SCENARIOS = {
     "roll": "an object rolls or slides down a ramp or off a ledge",
     "support": "a stack of objects stands or falls",
 }
-MEANINGS = {
-    "trial": "name of the trial, unique in the dataset",
-    "dataset": "name of the dataset, from which the seeds come",
-    "scenario": "kind of scene",
-    "split": "what the trial is for",
-    "index": "place of the trial in its split and scenario, from 0",
-    "preset": "parameter set of the scenario; missing for an imported scene",
-    "seed": "entropy of the trial's random numbers, hexadecimal; missing for an imported scene",
-    "attempt": "draws of this trial that were refused before; missing for an imported scene",
-    "scene_digest": "SHA-256 of all that decides the motion",
-    "elements": "bodies and cloths that take part, the patient not counted",
-    "distractors": "props behind the scene; missing for an imported scene",
-    "occluders": "props between camera and scene; missing for an imported scene",
-    "contact": "the label: agent and patient touch at some time of the trial",
-    "first_frame": "first frame in which they touch; missing without contact",
-    "observed_contact": "they touch already in the observed part: nothing is left to predict",
-    "min_distance": "smallest gap between cloth and the other thing, m; missing without cloth",
-    "robust": "share of jittered simulations with the same outcome; missing if not measured",
-    "recorded_contact": "outcome that an imported scene came with, else missing",
-    "frames": "frames of the whole trial",
-    "observed_frames": "frames that may be seen by who predicts",
-    "completed": "everything came to rest, rather than the time being over",
-    "physics_seconds": "how long the trial lasts in the simulated world",
-    "playback_seconds": "how long the full movie lasts",
-    "agent_share": "share of the first picture that the agent covers",
-    "patient_share": "share of the first picture that the patient covers",
-    "look": "redyellow (agent red, patient yellow) or free (colours of the scene)",
-    "width": "pixels",
-    "height": "pixels",
-    "engine": "physics engine and version",
-    "renderer": "renderer and version",
-    "package": "package and version",
-    "digest": "SHA-256 of the motion",
-    "trial_file": "scene, motion, contacts, label, first-frame ids (HDF5): holds the future",
-    "movie": "all frames (MP4): holds the future",
-    "observed_movie": "the observed frames alone (MP4)",
-    "map": "agent in red and patient in yellow in the first frame (PNG)",
-    "free_movie": "all frames in free colours (MP4): holds the future",
-    "free_observed_movie": "the observed frames alone in free colours (MP4)",
-}
-"""What each column of the index means; for a file, the path. Its size and hash follow from it."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +93,8 @@ class Facts:
 
     def missing(self) -> str:
         """Cells of the index without a value, by column."""
-        counts = self.index[[name for name in COLUMNS if name in MEANINGS]].isna().sum()
+        columns = [name for name in INDEX_COLUMNS if not name.endswith(("_bytes", "_sha256"))]
+        counts = self.index[columns].isna().sum()
         gaps = [f"{name} ({count})" for name, count in counts.items() if count]
         return f"Missing cells by column, of {len(self.index)}: {', '.join(gaps) or 'none'}."
 
@@ -197,14 +158,6 @@ def read_facts(folder: Path) -> Facts:
         except (ValueError, KeyError, TypeError) as error:
             raise BadInputError(f"{path} is damaged: {error}") from error
     return Facts(index, len(data), hashlib.sha256(data).hexdigest(), settings)
-
-
-def meaning(column: str) -> str:
-    """What a column of the index means."""
-    for ending, what in (("_bytes", "size in bytes of"), ("_sha256", "SHA-256 of")):
-        if column.endswith(ending):
-            return f"{what} the file named in {column.removesuffix(ending)}"
-    return MEANINGS[column]
 
 
 def _scenes(count: int) -> str:
