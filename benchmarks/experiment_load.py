@@ -44,11 +44,11 @@ import sqlalchemy as sa
 import uvloop
 
 from light_http import Connection, request
-from physion.experiment.simulated.server_process import HOST, OwnServer
+from physion.experiment.simulated.server_process import HOST, ServerProcess
 from physion.experiment.store.database import open_database, sqlite_url
 from physion.experiment.store.tables import ANSWERS, SESSIONS
 from physion.experiment.study.identity import Secrets
-from physion.experiment.study.recruitment import pass_word
+from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.study import Study
 
 ROOT = Path(__file__).parents[1]
@@ -229,7 +229,7 @@ async def log_in(browser: Any) -> None:
         raise ValueError(f"login: {answer.status_code}")
 
 
-async def play(name: str, server: OwnServer, word: str, options: argparse.Namespace) -> Row:
+async def play(name: str, server: ServerProcess, word: str, options: argparse.Namespace) -> Row:
     """One load; what was counted and measured while it ran."""
     tally = Tally()
     people = [Participant(n, server.port, word, tally) for n in range(options.people)]
@@ -296,10 +296,10 @@ def measure(name: str, options: argparse.Namespace, folder: Path) -> Row:
     words = [sys.executable]
     if options.profile:
         words += ["-m", "cProfile", "-o", str(options.profile)]
-    word = pass_word(Secrets.load(study.folder), "simulated")
+    word = make_pass(Secrets.load(study.folder), "simulated")
     with new_database(options.postgres) as database:
         command = (*words, "-m", "physion.cli.main")
-        with OwnServer(study.folder, database, command=command) as server:
+        with ServerProcess(study.folder, database, command=command) as server:
             row = uvloop.run(play(name, server, word, options))
         row.wrong = check(study, database, row.tally)
     return row

@@ -25,7 +25,7 @@ import numpy as np
 from physion.experiment.protocol.messages import Answer, Enter, PageDone, Phase
 from physion.experiment.store.store import Store
 from physion.experiment.study.identity import Secrets
-from physion.experiment.study.recruitment import pass_word
+from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.study import Study, Timing
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "experiment"))
@@ -95,7 +95,7 @@ def main() -> None:
         study = make_study(Path(folder))
         secrets = Secrets.load(Path(folder))
         store = Store.open(study, secrets, options.postgres)
-        word = pass_word(secrets, "simulated")
+        word = make_pass(secrets, "simulated")
         profile = cProfile.Profile()
         if options.profile:
             profile.enable()

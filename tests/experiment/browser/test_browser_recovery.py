@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
-from physion.experiment.study.orders import order_of
+from physion.experiment.study.orders import trial_order
 from physion.experiment.study.study import Recruitment, Study
 from support.experiment.browser import Visit, chromium, rows_of, served
 
@@ -40,7 +40,7 @@ def check_complete(study: Study, name: str, responses: list[str]) -> list[Any]:
     session, answers, _ = rows_of(study, name)
     assert session.finished_at is not None
     test = [row for row in answers if row.phase == "test"]
-    order = order_of(study, session.scenario, session.order_seed)["test"]
+    order = trial_order(study, session.scenario, session.order_seed)["test"]
     assert [row.stimulus for row in test] == [stimulus.stimulus for stimulus in order]
     assert [row.response for row in test] == responses
     return test

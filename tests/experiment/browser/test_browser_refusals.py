@@ -15,7 +15,7 @@ import sqlalchemy as sa
 from physion.experiment.store.database import open_database, sqlite_url
 from physion.experiment.store.tables import RAW_IDS, SESSIONS
 from physion.experiment.study.identity import Secrets
-from physion.experiment.study.recruitment import pass_word
+from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.study import Recruitment, Study
 from support.experiment.browser import Visit, chromium, rows_of, served
 
@@ -339,7 +339,7 @@ def test_recruiters(chromium: Any, site: tuple[Study, str]) -> None:
 
 def test_previews_need_no_id(chromium: Any, site: tuple[Study, str]) -> None:
     study, url = site
-    word = pass_word(Secrets.load(study.folder), "preview")
+    word = make_pass(Secrets.load(study.folder), "preview")
     with Visit(chromium, url) as visit:
         visit.go(f"?pass={word}")
         visit.heading("Taking part in this study")

@@ -30,9 +30,9 @@ from physion.experiment.study.identity import (
 from physion.experiment.study.orders import (
     draw_buttons,
     fixations,
-    order_of,
-    own_order_seed,
+    individual_order_seed,
     prepared_order_seed,
+    trial_order,
 )
 from physion.experiment.study.study import Study, Timing
 from physion.experiment.web.media_links import read_media_path, sign_media
@@ -109,20 +109,22 @@ def test_tokens_and_references_do_not_repeat() -> None:
 
 
 def test_orders_are_of_the_seed_alone(small_study: Study) -> None:
-    order = order_of(small_study, "collide", 11)
+    order = trial_order(small_study, "collide", 11)
     assert order["familiarization"] == small_study.phase("collide", "familiarization")
     assert set(order["test"]) == set(small_study.phase("collide", "test"))
     shuffled = replace(small_study, stimuli=small_study.stimuli[::-1])
-    assert order_of(shuffled, "collide", 11) == order
+    assert trial_order(shuffled, "collide", 11) == order
     # Pinned: an upgrade must not change the order of a session that is under way.
     assert [stimulus.place for stimulus in order["test"]] == [1, 0, 3, 2]
 
 
 def test_every_order_is_as_likely(small_study: Study) -> None:
-    seeds = [own_order_seed(small_study, "drop", f"person {number}") for number in range(4800)]
+    seeds = [
+        individual_order_seed(small_study, "drop", f"person {number}") for number in range(4800)
+    ]
     assert all(0 <= seed < 2**63 for seed in seeds)
     orders = Counter(
-        tuple(stimulus.place for stimulus in order_of(small_study, "drop", seed)["test"])
+        tuple(stimulus.place for stimulus in trial_order(small_study, "drop", seed)["test"])
         for seed in seeds
     )
     assert len(orders) == 24
@@ -133,7 +135,7 @@ def test_every_order_is_as_likely(small_study: Study) -> None:
 def test_seeds_differ_by_study_scenario_and_participant(small_study: Study) -> None:
     other = replace(small_study, seed=1)
     seeds = {
-        own_order_seed(study, scenario, person)
+        individual_order_seed(study, scenario, person)
         for study in (small_study, other)
         for scenario in ("collide", "drop")
         for person in ("a", "b")
@@ -162,7 +164,7 @@ def test_buttons_are_a_fair_coin_for_each_participant(small_study: Study) -> Non
 
 def test_addresses_of_media_lead_to_the_files(small_study: Study) -> None:
     for phase, kinds in (("familiarization", ("movie", "map", "full")), ("test", ("movie", "map"))):
-        for trial, stimulus in enumerate(order_of(small_study, "drop", 77)[phase]):
+        for trial, stimulus in enumerate(trial_order(small_study, "drop", 77)[phase]):
             for kind in kinds:
                 path = sign_media(small_study, KEYS, "drop", 77, phase, trial, kind)
                 expected = small_study.folder / getattr(stimulus, kind)

@@ -22,7 +22,7 @@ from physion.errors import BadInputError, UnknownNameError
 from physion.experiment.study import study_folder
 from physion.experiment.study.identity import Secrets, check_password
 from physion.experiment.study.init_trials import choose_familiarization, choose_trials
-from physion.experiment.study.media import Source, take_stimulus
+from physion.experiment.study.media import StimulusSource, import_stimulus
 from physion.experiment.study.study import Study, load_study
 from physion.experiment.study.study_folder import JOURNAL, make_study
 from physion.trials.index import write_index
@@ -67,8 +67,10 @@ def test_where_fewer_are_there_it_says_so(dataset: Path) -> None:
     chosen = choose_trials(dataset, scenarios=["roll"])
     assert Counter(s.phase for s in chosen.sources) == {"test": 6, "familiarization": 4}
     assert chosen.notes == (
-        "roll: 4 familiarization trials in place of 10: no more are balanced",
-        "roll: 6 testing trials in place of 150: no more are balanced",
+        "roll: 4 familiarization trials instead of 10, since half must have contact and no more "
+        "are available",
+        "roll: 6 testing trials instead of 150, since half must have contact and no more "
+        "are available",
     )
 
 
@@ -170,13 +172,13 @@ def test_a_failed_making_goes_on_where_it_stopped(
     taken: list[str] = []
     broken_at = 5
 
-    def take(source: Source, folder: Path) -> Any:
+    def take(source: StimulusSource, folder: Path) -> Any:
         if len(taken) == broken_at:
             raise KeyboardInterrupt
         taken.append(source.stimulus)
-        return take_stimulus(source, folder)
+        return import_stimulus(source, folder)
 
-    monkeypatch.setattr(study_folder, "take_stimulus", take)
+    monkeypatch.setattr(study_folder, "import_stimulus", take)
     sources = choose_trials(dataset).sources
     with pytest.raises(KeyboardInterrupt):
         make_study(_study(tmp_path / "study"), sources, "a password")
@@ -253,7 +255,7 @@ def test_the_command_makes_a_study(
     (password,) = (line.split()[-1] for line in out.splitlines() if "password" in line)
     assert check_password(Secrets.load(folder), password)
     assert f"physion experiment serve {folder}" in out
-    assert "roll: 6 testing trials in place of 150" in out
+    assert "roll: 6 testing trials instead of 150" in out
     assert "collide: 6 test and 4 familiarization trials" in out
 
 

@@ -28,7 +28,7 @@ def _ids(count: int, config: str = "pilot_it2_collision_yeet_box") -> list[str]:
 
 
 def _columns(ids: list[str]) -> dict[str, dict[str, Any]]:
-    """A list as published: one object a column, keyed by row."""
+    """A list as published: one object per column, keyed by row."""
     base = "https://bucket.s3.amazonaws.com"
     columns = {
         "stim_ID": ids,
@@ -145,7 +145,7 @@ def test_a_stimulus_in_both_lists_is_refused(
     words = ["--stimuli", str(stimuli), "--familiarization", str(stimuli)]
     words += ["--movies", str(tmp_path / "movies")]
     assert main(["experiment", "init", str(tmp_path / "study"), *words]) == 2
-    assert "is there already" in capsys.readouterr().err
+    assert "is already in row" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("layout", ["flat", "core", "core of a scenario", "maps apart"])
@@ -216,7 +216,7 @@ def test_fewer_may_be_taken_and_are_balanced(tmp_path: Path) -> None:
 
 REFUSED: dict[str, tuple[Any, str]] = {
     "no JSON": ("{", "is not JSON"),
-    "another form": ([{"stim_ID": "a"}], "one object a column"),
+    "another form": ([{"stim_ID": "a"}], "one object per column"),
     "no names": ({"target_hit_zone_label": {"0": True}}, "lacks the column stim_ID"),
     "no labels": ({"stim_ID": {"0": "a"}}, "lacks the column target_hit_zone_label"),
     "columns of other rows": (

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from physion.errors import BadInputError
-from physion.experiment.study.media import Source, clean_map, take_stimulus
+from physion.experiment.study.media import StimulusSource, clean_map, import_stimulus
 from physion.trials.video import encode_movie, read_frames
 from support.experiment.tiny_study import FULL, OBSERVED, draw, draw_map, read_number
 
@@ -21,7 +21,7 @@ SIZE = 64
 
 
 @pytest.fixture
-def source(tmp_path: Path) -> Source:
+def source(tmp_path: Path) -> StimulusSource:
     """A stimulus to practise on, in a folder of its own."""
     folder = tmp_path / "dataset"
     folder.mkdir()
@@ -29,7 +29,7 @@ def source(tmp_path: Path) -> Source:
     (folder / "a_img.mp4").write_bytes(encode_movie(frames))
     (folder / "a_observed.mp4").write_bytes(encode_movie(frames[:OBSERVED]))
     (folder / "a_map.png").write_bytes(draw_map(1, SIZE))
-    return Source(
+    return StimulusSource(
         "a", "collide", "familiarization", 0, True, "free", folder / "a_img.mp4",
         folder / "a_map.png", folder / "a_observed.mp4",
     )  # fmt: skip
@@ -42,8 +42,8 @@ def study(tmp_path: Path) -> Path:
     return folder
 
 
-def test_our_movies_are_copied_as_they_are(source: Source, study: Path) -> None:
-    found = take_stimulus(source, study)
+def test_our_movies_are_copied_as_they_are(source: StimulusSource, study: Path) -> None:
+    found = import_stimulus(source, study)
     assert source.observed is not None
     assert (study / found.movie).read_bytes() == source.observed.read_bytes()
     assert (study / found.full).read_bytes() == source.movie.read_bytes()
@@ -51,15 +51,15 @@ def test_our_movies_are_copied_as_they_are(source: Source, study: Path) -> None:
     assert (found.width, found.height, found.label) == (SIZE, SIZE, True)
 
 
-def test_names_are_those_of_the_content(source: Source, study: Path) -> None:
-    found = take_stimulus(source, study)
+def test_names_are_those_of_the_content(source: StimulusSource, study: Path) -> None:
+    found = import_stimulus(source, study)
     for name in (found.movie, found.map, found.full):
         assert Path(name).stem == hashlib.sha256((study / name).read_bytes()).hexdigest()
     assert len(list((study / "media").iterdir())) == 3
 
 
-def test_test_stimuli_come_without_their_end(source: Source, study: Path) -> None:
-    found = take_stimulus(replace(source, phase="test"), study)
+def test_test_stimuli_come_without_their_end(source: StimulusSource, study: Path) -> None:
+    found = import_stimulus(replace(source, phase="test"), study)
     assert (found.full, found.full_frames) == ("", 0)
     assert {path.name for path in (study / "media").iterdir()} == {
         Path(found.movie).name,
@@ -67,8 +67,10 @@ def test_test_stimuli_come_without_their_end(source: Source, study: Path) -> Non
     }
 
 
-def test_a_whole_movie_is_cut_to_exactly_the_observed_frames(source: Source, study: Path) -> None:
-    found = take_stimulus(replace(source, observed=None, phase="test"), study)
+def test_a_whole_movie_is_cut_to_exactly_the_observed_frames(
+    source: StimulusSource, study: Path
+) -> None:
+    found = import_stimulus(replace(source, observed=None, phase="test"), study)
     frames = read_frames(study / found.movie)
     assert [read_number(frame) for frame in frames] == list(range(OBSERVED))
     whole = read_frames(source.movie)
@@ -79,47 +81,47 @@ def test_a_whole_movie_is_cut_to_exactly_the_observed_frames(source: Source, stu
     assert len(packets) == OBSERVED
 
 
-def test_an_observed_movie_of_more_frames_is_refused(source: Source, study: Path) -> None:
+def test_an_observed_movie_of_more_frames_is_refused(source: StimulusSource, study: Path) -> None:
     assert source.observed is not None
     source.observed.write_bytes(encode_movie(draw(1, True, SIZE)[: OBSERVED + 1]))
     with pytest.raises(BadInputError, match="46 frames, not the 45") as raised:
-        take_stimulus(source, study)
+        import_stimulus(source, study)
     assert str(source.observed) in str(raised.value)
     source.observed.write_bytes(encode_movie(draw(1, True, SIZE)[: OBSERVED - 1]))
     with pytest.raises(BadInputError, match="44 frames, not the 45"):
-        take_stimulus(source, study)
+        import_stimulus(source, study)
     assert not list((study / "media").iterdir())
 
 
-def test_a_movie_that_is_too_short_is_refused(source: Source, study: Path) -> None:
+def test_a_movie_that_is_too_short_is_refused(source: StimulusSource, study: Path) -> None:
     source.movie.write_bytes(encode_movie(draw(1, True, SIZE)[: OBSERVED - 5]))
     with pytest.raises(BadInputError, match="40 frames, not 45"):
-        take_stimulus(replace(source, observed=None, phase="test"), study)
+        import_stimulus(replace(source, observed=None, phase="test"), study)
     source.movie.write_bytes(encode_movie(draw(1, True, SIZE)[:OBSERVED]))
     with pytest.raises(BadInputError, match="none after the 45"):
-        take_stimulus(source, study)
+        import_stimulus(source, study)
 
 
-def test_a_faster_movie_than_screens_is_refused(source: Source, study: Path) -> None:
+def test_a_faster_movie_than_screens_is_refused(source: StimulusSource, study: Path) -> None:
     source.movie.write_bytes(encode_movie(draw(1, True, SIZE), rate=100))
     with pytest.raises(BadInputError, match="--playback slow"):
-        take_stimulus(replace(source, observed=None), study)
+        import_stimulus(replace(source, observed=None), study)
 
 
-def test_whole_and_observed_movies_must_fit(source: Source, study: Path) -> None:
+def test_whole_and_observed_movies_must_fit(source: StimulusSource, study: Path) -> None:
     source.movie.write_bytes(encode_movie(draw(1, True, 2 * SIZE)))
     with pytest.raises(BadInputError, match=r"128 x 128 .* observed part 64 x 64"):
-        take_stimulus(source, study)
+        import_stimulus(source, study)
 
 
 @pytest.mark.parametrize("what", ["audio", "yuv444p", "untagged"])
 def test_what_browsers_may_not_play_rightly_is_encoded_again(
-    source: Source, study: Path, what: str
+    source: StimulusSource, study: Path, what: str
 ) -> None:
     foreign = _foreign(what)
     assert source.observed is not None
     source.observed.write_bytes(foreign)
-    found = take_stimulus(replace(source, phase="test"), study)
+    found = import_stimulus(replace(source, phase="test"), study)
     assert (study / found.movie).read_bytes() != foreign
     with av.open(str(study / found.movie)) as container:
         stream = container.streams.video[0]
@@ -129,37 +131,41 @@ def test_what_browsers_may_not_play_rightly_is_encoded_again(
     assert numbers == list(range(OBSERVED))
 
 
-def test_files_that_are_not_those_of_the_index_are_refused(source: Source, study: Path) -> None:
+def test_files_that_are_not_those_of_the_index_are_refused(
+    source: StimulusSource, study: Path
+) -> None:
     with pytest.raises(BadInputError, match="index"):
-        take_stimulus(replace(source, digests={"observed": "0" * 64}), study)
+        import_stimulus(replace(source, digests={"observed": "0" * 64}), study)
 
 
 @pytest.mark.parametrize("name", ["movie", "observed", "map"])
-def test_links_are_not_followed(source: Source, study: Path, name: str) -> None:
+def test_links_are_not_followed(source: StimulusSource, study: Path, name: str) -> None:
     path: Path = getattr(source, name)
     path.rename(path.with_suffix(".moved"))
     path.symlink_to(path.with_suffix(".moved"))
-    with pytest.raises(BadInputError, match=r"link|no plain file"):
-        take_stimulus(source, study)
+    with pytest.raises(BadInputError, match=r"link|not a regular file"):
+        import_stimulus(source, study)
 
 
-def test_a_link_in_the_study_is_replaced_by_the_file(source: Source, study: Path) -> None:
-    found = take_stimulus(source, study)
+def test_a_link_in_the_study_is_replaced_by_the_file(source: StimulusSource, study: Path) -> None:
+    found = import_stimulus(source, study)
     outside = study.parent / "outside.mp4"
     outside.write_bytes((study / found.movie).read_bytes())
     (study / found.movie).unlink()
     (study / found.movie).symlink_to(outside)
-    take_stimulus(source, study)
+    import_stimulus(source, study)
     assert not (study / found.movie).is_symlink()
 
 
 @pytest.mark.parametrize("damage", [b"", b"not a movie", None])
-def test_damaged_movies_are_refused(source: Source, study: Path, damage: bytes | None) -> None:
+def test_damaged_movies_are_refused(
+    source: StimulusSource, study: Path, damage: bytes | None
+) -> None:
     assert source.observed is not None
     whole = source.observed.read_bytes()
     source.observed.write_bytes(whole[: len(whole) * 2 // 3] if damage is None else damage)
     with pytest.raises(BadInputError, match=r"a_observed\.mp4"):
-        take_stimulus(source, study)
+        import_stimulus(source, study)
 
 
 # --- maps ----------------------------------------------------------------------------------------
@@ -185,10 +191,10 @@ def test_a_map_keeps_its_pixels_and_nothing_else() -> None:
     [
         ("no red", "no red for the agent"),
         ("no yellow", "no yellow for the patient"),
-        ("opaque", "nowhere transparent"),
-        ("size", "32 x 32 pixels large, its movie 64 x 64"),
-        ("jpeg", "no readable PNG"),
-        ("cut short", "no readable PNG"),
+        ("opaque", "no transparent pixel"),
+        ("size", "32 x 32 pixels, its movie 64 x 64"),
+        ("jpeg", "not a readable PNG"),
+        ("cut short", "not a readable PNG"),
     ],
 )
 def test_maps_that_point_out_nothing_are_refused(case: str, message: str) -> None:

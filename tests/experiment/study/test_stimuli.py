@@ -82,8 +82,8 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "an unknown look": ({"look": "blue"}, "look must be"),
     "a label of another kind": ({"label": "contact"}, "label must be True or False"),
     "no label": ({"label": ""}, "label must be True or False"),
-    "a negative place": ({"place": "-1"}, "place must be a whole number"),
-    "half a frame": ({"frames": "44.5"}, "frames must be a whole number"),
+    "a negative place": ({"place": "-1"}, "place must be an integer"),
+    "half a frame": ({"frames": "44.5"}, "frames must be an integer"),
     "no frame": ({"frames": "0"}, "frames must be from 1"),
     "no rate": ({"rate": "nan"}, "rate must be from 1"),
     "a rate in words": ({"rate": "slow"}, "rate must be a number"),
@@ -99,8 +99,8 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "no later frame to practise on": (
         {"phase": "familiarization", "full": "media/w9.mp4", "full_frames": "45"},
         "more than the 45 observed"),
-    "an outcome shown before": ({"movie": "media/w0.mp4"}, "whole movie of row 2"),
-    "a stimulus practised before": ({"stimulus": "a0"}, "is there already, in row 2"),
+    "an outcome shown before": ({"movie": "media/w0.mp4"}, "full movie of row 2"),
+    "a stimulus practised before": ({"stimulus": "a0"}, "is already in row 2"),
     "a place taken": ({"place": "0", "scenario": "collide"}, "place 0 of test"),
 }  # fmt: skip
 

@@ -19,9 +19,9 @@ from physion.experiment.study.study import (
     Screen,
     Study,
     Timing,
+    format_settings,
     load_study,
-    study_of,
-    study_to_toml,
+    parse_settings,
     write_settings,
 )
 from physion.experiment.study.study_checks import KEYS, TABLES
@@ -85,8 +85,8 @@ STUDIES = st.builds(
 @given(STUDIES)
 @settings(max_examples=200, deadline=None)
 def test_what_is_written_is_read_back(study: Study) -> None:
-    text = study_to_toml(study)
-    assert study_of(tomllib.loads(text), study.folder / "study.toml") == study
+    text = format_settings(study)
+    assert parse_settings(tomllib.loads(text), study.folder / "study.toml") == study
 
 
 def test_every_setting_is_written_with_its_comment(tmp_path: Path) -> None:
@@ -112,7 +112,7 @@ REFUSED: dict[str, tuple[str, Any, str]] = {
     "a title of two lines": ("title", "a\nb", "control characters"),
     "a number for a text": ("contact", 3, "one line of text"),
     "no scenario": ("scenarios", [], "1 to 100"),
-    "a scenario twice": ("scenarios", ["collide", "collide"], "nothing stands twice"),
+    "a scenario twice": ("scenarios", ["collide", "collide"], "without duplicates"),
     "a word for a list": ("scenarios", "collide", "a list"),
     "a language that is a path": ("languages", ["../en"], "a language such as en"),
     "no participant": ("participants", 0, "from 1"),
@@ -124,7 +124,7 @@ REFUSED: dict[str, tuple[str, Any, str]] = {
     "a site with a path": ("embed_from", ["https://a.org/x"], "without a path"),
     "a site without safety": ("embed_from", ["http://a.org"], "https://"),
     "a directive in a site": ("embed_from", ["https://a.org; script-src *"], "without a path"),
-    "fixation backwards": ("timing.fixation_ms", [1500, 500], "the smaller one first"),
+    "fixation backwards": ("timing.fixation_ms", [1500, 500], "the smaller first"),
     "fixation of one end": ("timing.fixation_ms", [500], "two whole numbers"),
     "a harmful flash": ("timing.flash_hz", 5, "from 0 to 3"),
     "a flash that is no number": ("timing.flash_hz", float("nan"), "a number"),
@@ -144,14 +144,14 @@ REFUSED: dict[str, tuple[str, Any, str]] = {
 @pytest.mark.parametrize("case", REFUSED)
 def test_a_bad_value_is_named_with_what_is_allowed(case: str) -> None:
     key, value, allowed = REFUSED[case]
-    tables = tomllib.loads(study_to_toml(_study()))
+    tables = tomllib.loads(format_settings(_study()))
     owner = tables
     *above, name = key.split(".")
     for table in above:
         owner = owner[table]
     owner[name] = value
     with pytest.raises(BadInputError, match="must be") as raised:
-        study_of(tables, Path("x/study.toml"))
+        parse_settings(tables, Path("x/study.toml"))
     message = str(raised.value)
     assert "x/study.toml" in message and key in message and allowed in message
 
@@ -165,24 +165,24 @@ def test_a_bad_value_is_named_with_what_is_allowed(case: str) -> None:
     ],
 )
 def test_unknown_keys_are_refused_with_the_closest(change: dict[str, Any], closest: str) -> None:
-    tables = {**tomllib.loads(study_to_toml(_study())), **change}
+    tables = {**tomllib.loads(format_settings(_study())), **change}
     with pytest.raises(BadInputError, match="unknown key") as raised:
-        study_of(tables, Path("study.toml"))
+        parse_settings(tables, Path("study.toml"))
     assert closest in str(raised.value)
 
 
 @pytest.mark.parametrize("name", ["name", "version", "title", "contact", "scenarios"])
 def test_what_a_lab_must_say_may_not_lack(name: str) -> None:
-    tables = tomllib.loads(study_to_toml(_study()))
+    tables = tomllib.loads(format_settings(_study()))
     del tables[name]
     with pytest.raises(BadInputError, match=f"lacks {name}"):
-        study_of(tables, Path("study.toml"))
+        parse_settings(tables, Path("study.toml"))
 
 
 def test_a_value_for_a_table_is_refused() -> None:
-    tables = {**tomllib.loads(study_to_toml(_study())), "timing": 3}
+    tables = {**tomllib.loads(format_settings(_study())), "timing": 3}
     with pytest.raises(BadInputError, match=r"\[timing\]"):
-        study_of(tables, Path("study.toml"))
+        parse_settings(tables, Path("study.toml"))
 
 
 def test_a_study_that_could_not_be_read_back_is_not_written(tmp_path: Path) -> None:
@@ -244,7 +244,7 @@ def test_missing_files_and_links_are_refused(tmp_path: Path, name: str) -> None:
         load_study(folder)
     path.unlink()
     path.mkdir()
-    with pytest.raises(BadInputError, match="no plain file"):
+    with pytest.raises(BadInputError, match="not a regular file"):
         load_study(folder)
 
 
@@ -253,7 +253,7 @@ def test_a_pipe_does_not_make_us_wait(tmp_path: Path) -> None:
     make_tiny_study(tmp_path)
     (tmp_path / "stimuli.csv").unlink()
     os.mkfifo(tmp_path / "stimuli.csv")
-    with pytest.raises(BadInputError, match="no plain file"):
+    with pytest.raises(BadInputError, match="not a regular file"):
         load_study(tmp_path)
 
 

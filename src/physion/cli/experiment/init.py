@@ -18,7 +18,7 @@ from physion.errors import BadInputError
 from physion.experiment.study.study_checks import NO_CONTACT
 
 if TYPE_CHECKING:
-    from physion.experiment.study.init_trials import Choice
+    from physion.experiment.study.init_trials import StimulusSelection
     from physion.experiment.study.study import Study
 
 
@@ -80,7 +80,7 @@ def main(options: Options) -> int:
     return 0
 
 
-def _choose(options: Options) -> Choice:
+def _choose(options: Options) -> StimulusSelection:
     from physion.experiment.study.init_trials import TEST, choose_trials
 
     if (options.trials is None) == (not options.stimuli):
@@ -101,7 +101,7 @@ def _choose(options: Options) -> Choice:
     )
 
 
-def _choose_listed(options: Options) -> Choice:
+def _choose_listed(options: Options) -> StimulusSelection:
     from physion.experiment.study.init_official import choose_listed
     from physion.experiment.study.init_trials import choose_familiarization
 
@@ -165,7 +165,7 @@ def _password(path: Path | None) -> str:
     return password
 
 
-def _print(options: Options, study: Study, chosen: Choice, password: str | None) -> None:
+def _print(options: Options, study: Study, chosen: StimulusSelection, password: str | None) -> None:
     from physion.cli.output import console
 
     counts = {

@@ -1,7 +1,7 @@
-"""Who is who: keys of a study, keyed hashes of ids, tokens, signatures, the password.
+"""Secret keys of a study, and what is derived from them: id hashes, tokens, signatures, password.
 
-Everything that must stay secret is in ``secret.json`` of the study folder, readable by its owner
-alone. Whoever loses the file can neither recognise a returning participant nor check a link.
+All secrets are in ``secret.json`` of the study folder, which only its owner may read. Without this
+file the server can neither recognise returning participants nor verify signed links.
 """
 
 from __future__ import annotations
@@ -27,14 +27,22 @@ MIN_PASSWORD = 8
 MAX_PASSWORD = 1000
 MAX_BYTES = 10_000
 REFERENCE_LETTERS = "23456789ABCDEFGHJKLMNPQRSTUVWXYZ"
-"""32 signs that nobody mistakes for one another."""
+"""32 letters and digits without look-alikes (no 0, O, 1, I)."""
 
 
 @dataclass(frozen=True)
 class Secrets:
-    """Keys of a study. ``hash_key`` hides ids, ``link_key`` signs links, media and forms.
+    """Secret keys of a study.
 
-    ``password_hash`` is argon2id; empty where no password was set, and then nobody logs in.
+    Attributes
+    ----------
+    hash_key
+        HMAC key for hashes of participant ids.
+    link_key
+        HMAC key for signatures of links, media URLs and forms.
+    password_hash
+        argon2id hash of the experimenter's password. Empty if none was set; then login is
+        impossible.
     """
 
     hash_key: bytes = field(repr=False)
@@ -43,11 +51,11 @@ class Secrets:
 
     @classmethod
     def create(cls, folder: Path, password: str | None = None) -> Secrets:
-        """New keys, written to ``folder``; refused where there are some already."""
+        """Create random keys and write them to ``folder``, which must not have any yet."""
         path = folder / SECRET_FILE
         if os.path.lexists(path):
             raise BadInputError(
-                f"{path} is there already; without it no participant would be recognised again"
+                f"{path} is there already; replacing it would make all participants unrecognisable"
             )
         secrets = cls(os.urandom(KEY_BYTES), os.urandom(KEY_BYTES))
         if password is not None:
@@ -57,15 +65,16 @@ class Secrets:
 
     @classmethod
     def load(cls, folder: Path) -> Secrets:
-        """The keys of a study folder. `BadInputError` where others may read the file."""
+        """Read the keys of a study folder; `BadInputError` if other users may read the file."""
         path = folder / SECRET_FILE
         if not os.path.lexists(path):
             raise BadInputError(
-                f"there is no {path}; physion experiment init makes one, or bring yours back"
+                f"there is no {path}; create a study with physion experiment init, or restore "
+                "the file from a backup"
             )
         content = read_plain(path, MAX_BYTES)
         if os.name == "posix" and path.stat().st_mode & (stat.S_IRWXG | stat.S_IRWXO):
-            raise BadInputError(f"others may read {path}; chmod 600 {path}")
+            raise BadInputError(f"other users may read {path}; run: chmod 600 {path}")
         return _parse(path, content)
 
 
@@ -88,57 +97,63 @@ def _parse(path: Path, content: bytes) -> Secrets:
         password_hash = values["password_hash"]
         good = all(len(key) == KEY_BYTES for key in keys) and isinstance(password_hash, str)
     except (ValueError, TypeError, KeyError, RecursionError) as error:
-        raise BadInputError(f"{path} is damaged; bring back a copy of it") from error
+        raise BadInputError(f"{path} is damaged; restore it from a backup") from error
     if not good:
-        raise BadInputError(f"{path} is damaged; bring back a copy of it")
+        raise BadInputError(f"{path} is damaged; restore it from a backup")
     return Secrets(keys[0], keys[1], password_hash)
 
 
 def participant_hash(secrets: Secrets, source: str, raw_id: str) -> str:
-    """32 hexadecimal digits for an id; without the key nobody can try out ids."""
+    """Return the keyed hash (32 hexadecimal digits) of a recruiter's id.
+
+    Without the key, the hash cannot be checked against guessed ids.
+    """
     return _mac(secrets.hash_key, source, raw_id)[:32]
 
 
 def new_token() -> str:
-    """What opens one session: 256 random bits, fit for a header."""
+    """Return a random access token for one session (256 bits, safe in an HTTP header)."""
     return token_urlsafe(32)
 
 
 def hash_token(token: str) -> str:
-    """What is stored of a token. It is random itself, so that a plain hash hides it."""
+    """Return the SHA-256 of a token, the form in which it is stored.
+
+    Tokens are random, so no key is needed to keep them from being guessed.
+    """
     return hashlib.sha256(token.encode("utf-8", "replace")).hexdigest()
 
 
 def new_session() -> str:
-    """The name of a new session."""
+    """Return a random identifier for a new session (32 hexadecimal digits)."""
     return token_hex(16)
 
 
 def new_reference() -> str:
-    """A short code that a participant can read out, as ``K7QF-29XM``; random, tells nothing."""
+    """Return a random session reference such as ``K7QF-29XM``, short enough to be read out."""
     letters = [REFERENCE_LETTERS[byte % 32] for byte in os.urandom(8)]
     return "".join(letters[:4]) + "-" + "".join(letters[4:])
 
 
-def sign(secrets: Secrets, *words: str) -> str:
-    """A signature of 32 hexadecimal digits of these words in this order."""
-    return _mac(secrets.link_key, *words)[:32]
+def sign(secrets: Secrets, *parts: str) -> str:
+    """Return a signature (32 hexadecimal digits) of the texts ``parts`` in this order."""
+    return _mac(secrets.link_key, *parts)[:32]
 
 
-def check_signature(secrets: Secrets, signature: str, *words: str) -> bool:
-    """Did `sign` make this signature of these words? Takes as long for a wrong one."""
-    return hmac.compare_digest(sign(secrets, *words).encode(), signature.encode("utf-8", "replace"))
+def check_signature(secrets: Secrets, signature: str, *parts: str) -> bool:
+    """Return whether `sign` made this signature of ``parts``, comparing in constant time."""
+    return hmac.compare_digest(sign(secrets, *parts).encode(), signature.encode("utf-8", "replace"))
 
 
 def set_password(folder: Path, password: str) -> Secrets:
-    """Give the experimenter a new password; keys stay."""
+    """Set a new experimenter password; the keys are kept."""
     secrets = replace(Secrets.load(folder), password_hash=_hash_password(password))
     _write(folder / SECRET_FILE, secrets)
     return secrets
 
 
 def check_password(secrets: Secrets, password: str) -> bool:
-    """Is this the experimenter's password? Takes some 50 ms on purpose."""
+    """Return whether this is the experimenter's password (deliberately slow, about 50 ms)."""
     from argon2 import PasswordHasher
     from argon2.exceptions import InvalidHashError, VerificationError
 
@@ -158,8 +173,9 @@ def _hash_password(password: str) -> str:
     return PasswordHasher().hash(password)
 
 
-def _mac(key: bytes, *words: str) -> str:
-    # Lengths in front, so that ("ab", "c") and ("a", "bc") differ.
-    encoded = [word.encode("utf-8", "surrogatepass") for word in words]
-    message = b"".join(len(word).to_bytes(4, "big") + word for word in encoded)
+def _mac(key: bytes, *parts: str) -> str:
+    """Return the HMAC-SHA256 of a list of texts, in hexadecimal digits."""
+    # Each text is preceded by its length, so that ("ab", "c") and ("a", "bc") differ.
+    encoded = [part.encode("utf-8", "surrogatepass") for part in parts]
+    message = b"".join(len(part).to_bytes(4, "big") + part for part in encoded)
     return hmac.new(key, message, hashlib.sha256).hexdigest()

@@ -18,8 +18,8 @@ import numpy as np
 
 from physion.errors import BadInputError
 from physion.experiment.study.csv_rows import csv_rows
-from physion.experiment.study.init_trials import Choice, check_even
-from physion.experiment.study.media import Source
+from physion.experiment.study.init_trials import StimulusSelection, check_even
+from physion.experiment.study.media import StimulusSource
 from physion.experiment.study.plain_files import read_plain
 from physion.experiment.study.stimuli import is_name
 from physion.seeds import generator
@@ -39,7 +39,7 @@ _LABELS = {"true": True, "false": False, "1": True, "0": False}
 
 
 @dataclass(frozen=True)
-class Listed:
+class ListedStimulus:
     """One row of a stimulus list: name, contact label and file name of the map (may be empty)."""
 
     stim_id: str
@@ -65,7 +65,7 @@ def choose_listed(
     *,
     test: int | None = None,
     seed: int = 0,
-) -> Choice:
+) -> StimulusSelection:
     """Select the stimuli of a study from official lists, one list per scenario and phase.
 
     Parameters
@@ -88,7 +88,7 @@ def choose_listed(
     BadInputError
         A list is invalid; the message names the list and the row.
     """
-    sources: list[Source] = []
+    sources: list[StimulusSource] = []
     for phase, paths in (("familiarization", familiarization), ("test", lists)):
         seen: dict[str, Path] = {}
         for path in paths:
@@ -101,10 +101,10 @@ def choose_listed(
                 rows = _select(path, rows, scenario, test, seed)
             files = _MediaFinder(movies, maps, scenario)
             sources += [_source(row, scenario, phase, i, files) for i, row in enumerate(rows)]
-    return Choice(tuple(sources))
+    return StimulusSelection(tuple(sources))
 
 
-def read_list(path: Path) -> list[Listed]:
+def read_list(path: Path) -> list[ListedStimulus]:
     """Read and check the rows of a list; `BadInputError` names an invalid row and column.
 
     Rows of JSON files count from 1, rows of CSV files as a spreadsheet shows them.
@@ -115,7 +115,7 @@ def read_list(path: Path) -> list[Listed]:
         rows = csv_rows(path, content, (ID, LABEL))
     else:
         rows = enumerate(_json_rows(path, content), start=1)
-    found: dict[str, Listed] = {}
+    found: dict[str, ListedStimulus] = {}
     for number, row in rows:
         name = str(row[ID]).strip()
         label = _LABELS.get(str(row[LABEL]).strip().lower())
@@ -130,7 +130,7 @@ def read_list(path: Path) -> list[Listed]:
             )
         # URLs are never opened; only their last part is used, as a name in a local folder.
         map_name = str(row.get(MAP) or "").strip().rpartition("/")[2]
-        listed = Listed(name, label, map_name if is_name(map_name) else "")
+        listed = ListedStimulus(name, label, map_name if is_name(map_name) else "")
         if listed.stimulus in found:
             raise BadInputError(f"{path}, row {number}: {name} is there already")
         found[listed.stimulus] = listed
@@ -139,7 +139,7 @@ def read_list(path: Path) -> list[Listed]:
     return list(found.values())
 
 
-def list_scenario(path: Path, rows: Iterable[Listed]) -> str:
+def list_scenario(path: Path, rows: Iterable[ListedStimulus]) -> str:
     """Return the scenario of a list, from its stimulus names or else from its file name."""
     from_stimuli = {scenario_of(canonical_name(row.stim_id)) for row in rows}
     if len(from_stimuli) == 1 and None not in from_stimuli:
@@ -176,8 +176,8 @@ def _json_rows(path: Path, content: bytes) -> list[dict[str, Any]]:
 
 
 def _select(
-    path: Path, rows: list[Listed], scenario: str, count: int | None, seed: int
-) -> list[Listed]:
+    path: Path, rows: list[ListedStimulus], scenario: str, count: int | None, seed: int
+) -> list[ListedStimulus]:
     """Return all rows, or ``count`` random ones, half with contact, in the order of the list."""
     if count is None or count == len(rows):
         return rows
@@ -193,7 +193,9 @@ def _select(
     return [row for row in rows if row in kept]
 
 
-def _sample(rows: list[Listed], count: int, rng: np.random.Generator) -> list[Listed]:
+def _sample(
+    rows: list[ListedStimulus], count: int, rng: np.random.Generator
+) -> list[ListedStimulus]:
     return [rows[i] for i in rng.permutation(len(rows))[:count]]
 
 
@@ -210,11 +212,11 @@ class _MediaFinder:
         map_folders = [root / "maps" for root in (*roots, movies.parent)]
         self.maps = [maps, maps / title, maps / "maps"] if maps else [*self.movies, *map_folders]
 
-    def movie(self, row: Listed) -> Path:
+    def movie(self, row: ListedStimulus) -> Path:
         """Return the path of the movie of a stimulus; if there is none, its expected path."""
         return _first_existing(self.movies, [f"{row.stim_id.removesuffix('.mp4')}.mp4"])
 
-    def map(self, row: Listed) -> Path:
+    def map(self, row: ListedStimulus) -> Path:
         """Return the path of the map of a stimulus, which both looks may share."""
         names = [row.map_name] if row.map_name else []
         names += [f"{row.stimulus}_map.png", f"{plain_name(row.stim_id)}_map.png"]
@@ -227,8 +229,10 @@ def _first_existing(folders: Sequence[Path], names: Sequence[str]) -> Path:
     return next((path for path in paths if path.is_file()), paths[0])
 
 
-def _source(row: Listed, scenario: str, phase: str, place: int, files: _MediaFinder) -> Source:
-    return Source(
+def _source(
+    row: ListedStimulus, scenario: str, phase: str, place: int, files: _MediaFinder
+) -> StimulusSource:
+    return StimulusSource(
         stimulus=row.stimulus,
         scenario=scenario,
         phase=phase,

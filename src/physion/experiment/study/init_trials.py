@@ -14,7 +14,7 @@ from typing import Any, Literal
 import pandas as pd
 
 from physion.errors import BadInputError, UnknownNameError
-from physion.experiment.study.media import Source
+from physion.experiment.study.media import StimulusSource
 from physion.seeds import generator
 from physion.stimulus_names import SCENARIOS
 from physion.trials.dataset import Dataset
@@ -28,10 +28,10 @@ TEST, PRACTICE = 150, 10
 
 
 @dataclass(frozen=True)
-class Choice:
+class StimulusSelection:
     """Selected stimuli; ``notes`` report where fewer were available than requested."""
 
-    sources: tuple[Source, ...]
+    sources: tuple[StimulusSource, ...]
     notes: tuple[str, ...] = ()
 
     @property
@@ -49,7 +49,7 @@ def choose_trials(
     practice: int = PRACTICE,
     look: Look = "free",
     seed: int = 0,
-) -> Choice:
+) -> StimulusSelection:
     """Select testing and familiarization trials of a dataset.
 
     Parameters
@@ -84,17 +84,17 @@ def choose_trials(
             rows, note = _draw(found, name, phase, count, seed)
             sources += [_source(found, row, phase, i, look) for i, row in enumerate(rows)]
             notes += [note] if note else []
-    return Choice(tuple(sources), tuple(notes))
+    return StimulusSelection(tuple(sources), tuple(notes))
 
 
 def choose_familiarization(
     dataset: Path, scenario: str, *, count: int = PRACTICE, look: Look = "free", seed: int = 0
-) -> Choice:
+) -> StimulusSelection:
     """Select the familiarization trials of one scenario only, as `choose_trials` does."""
     found = Dataset(dataset)
     rows, note = _draw(found, scenario, "familiarization", count, seed)
     sources = [_source(found, row, "familiarization", i, look) for i, row in enumerate(rows)]
-    return Choice(tuple(sources), (note,) if note else ())
+    return StimulusSelection(tuple(sources), (note,) if note else ())
 
 
 def in_paper_order(scenarios: set[str]) -> Iterator[str]:
@@ -127,7 +127,7 @@ def _draw(
     if half == 0:
         lacking = "with" if len(by_label[0]) == 0 else "without"
         raise BadInputError(
-            f"{dataset.folder} has no {split} trial of {scenario} {lacking} contact; generate some: "
+            f"{dataset.folder} has no {split} trial of {scenario} {lacking} contact; to make some: "
             f"physion generate {dataset.folder} --scenario {scenario} --split {split} "
             f"--count {count}"
         )
@@ -152,7 +152,9 @@ def _sample(group: pd.DataFrame, half: int, scenario: str, phase: str, seed: int
     return group.iloc[rng.permutation(len(group))[:half]]
 
 
-def _source(dataset: Dataset, row: dict[str, Any], phase: str, place: int, look: Look) -> Source:
+def _source(
+    dataset: Dataset, row: dict[str, Any], phase: str, place: int, look: Look
+) -> StimulusSource:
     """Return the source files of one row of the index, with movies in the given look."""
     paths = TrialPaths(dataset.folder, row["split"], row["scenario"], row["trial"])
     free = row["look"] != look
@@ -173,7 +175,7 @@ def _source(dataset: Dataset, row: dict[str, Any], phase: str, place: int, look:
             f"trial {row['trial']} of {dataset.folder} has no {lacking[0]} file; generate trials "
             "with movies"
         )
-    return Source(
+    return StimulusSource(
         stimulus=str(row["trial"]),
         scenario=str(row["scenario"]),
         phase=phase,

@@ -1,9 +1,9 @@
-"""Movies and maps of a study: cut to what may be seen, checked, and named by their content.
+"""Preparation of the movies and maps of a study: cut, check, and store under content hashes.
 
-A movie that is shown before the answer holds the observed frames and nothing after them. One that
-holds exactly these is copied byte by byte; from any other the observed frames are encoded anew,
-without the encoder ever seeing the next one. File names are SHA-256 of the content and so tell
-neither stimulus nor outcome.
+A movie that is shown before the answer contains the observed frames only. A file that already
+contains exactly these frames is copied unchanged; otherwise the observed frames are encoded into a
+new file, and the encoder never receives a later frame. File names are the SHA-256 of the content,
+so they reveal neither the stimulus nor its outcome.
 """
 
 from __future__ import annotations
@@ -29,16 +29,27 @@ from physion.trials.video import MovieEncoder, read_frames
 
 MAX_MOVIE_BYTES = 500_000_000
 MAX_RATE = 60
-"""Frames a second that a common screen shows; of a faster movie, frames would be left out."""
+"""Frames per second of common screens; a faster movie could not be shown with all its frames."""
 
 
 @dataclass(frozen=True)
-class Source:
-    """A stimulus that a study is to have, and where its files are.
+class StimulusSource:
+    """Description of a stimulus to be added to a study, with the paths of its source files.
 
-    ``movie`` has all frames, ``observed`` (where there is one) the observed ones alone, ``map``
-    agent and patient. ``digests`` are the SHA-256 that these three should have, where known. The
-    rest is as in `Stimulus`.
+    Attributes
+    ----------
+    movie
+        Movie with all frames.
+    map
+        PNG that marks agent and patient.
+    observed
+        Movie with the observed frames only; None if there is none.
+    frames
+        Number of observed frames.
+    digests
+        Expected SHA-256 of ``movie``, ``observed`` and ``map``, where known.
+
+    The other attributes are as in `Stimulus`.
     """
 
     stimulus: str
@@ -55,7 +66,7 @@ class Source:
 
     @property
     def files(self) -> dict[str, Path]:
-        """The files that are read, by their names here: the whole movie only where it is needed."""
+        """Files that will be read, by attribute name; the full movie only if it is needed."""
         found = {"map": self.map}
         if self.observed is not None:
             found["observed"] = self.observed
@@ -64,11 +75,14 @@ class Source:
         return found
 
 
-def take_stimulus(source: Source, folder: Path) -> Stimulus:
-    """Write the media of a stimulus into the study's ``folder``; its row.
+def import_stimulus(source: StimulusSource, folder: Path) -> Stimulus:
+    """Write the media of a stimulus into the study ``folder``; return its row of stimuli.csv.
 
-    `BadInputError` names the file where a movie has too few frames (or an observed one too many),
-    is damaged, is a link, is faster than screens, or where the map does not fit to it.
+    Raises
+    ------
+    BadInputError
+        A movie has the wrong number of frames, is damaged, is a link or exceeds `MAX_RATE`, or
+        the map does not match the movie. The message names the file.
     """
     practice = source.phase == "familiarization"
     shown = _observed(source)
@@ -94,7 +108,7 @@ def take_stimulus(source: Source, folder: Path) -> Stimulus:
 
 @dataclass(frozen=True)
 class _Movie:
-    """The bytes of a movie as it is served, and what it is like."""
+    """Bytes of a movie as it is served, its size in pixels and its rate in frames per second."""
 
     content: bytes
     width: int
@@ -102,8 +116,8 @@ class _Movie:
     rate: int
 
 
-def _observed(source: Source) -> _Movie:
-    """The movie of the observed frames alone."""
+def _observed(source: StimulusSource) -> _Movie:
+    """Return a movie of the observed frames only."""
     path = source.movie if source.observed is None else source.observed
     content = _read(source, "movie" if source.observed is None else "observed")
     found = _open(path)
@@ -116,8 +130,8 @@ def _observed(source: Source) -> _Movie:
     return _Movie(content, found.width, found.height, found.rate)
 
 
-def _whole(source: Source, shown: _Movie) -> tuple[bytes, int]:
-    """The bytes of the whole movie, which is shown after the answer, and its frames."""
+def _whole(source: StimulusSource, shown: _Movie) -> tuple[bytes, int]:
+    """Return the full movie, which is shown after the answer, and its number of frames."""
     content = _read(source, "movie")
     found = _open(source.movie)
     if (found.width, found.height, found.rate) != (shown.width, shown.height, shown.rate):
@@ -133,32 +147,36 @@ def _whole(source: Source, shown: _Movie) -> tuple[bytes, int]:
     return content if _playable(found) else _encode(source.movie, found, frames), frames
 
 
-def _read(source: Source, name: str) -> bytes:
+def _read(source: StimulusSource, name: str) -> bytes:
+    """Read one of the source's files and compare it with its expected SHA-256."""
     path = source.files[name]
     content = read_plain(path, MAX_MOVIE_BYTES)
     wanted = source.digests.get(name)
     if wanted is not None and hashlib.sha256(content).hexdigest() != wanted:
-        raise BadInputError(f"{path} is not the file that its dataset's index tells of; verify it")
+        raise BadInputError(
+            f"{path} does not have the SHA-256 in its dataset's index; run physion verify"
+        )
     return content
 
 
 def _open(path: Path) -> SourceMovie:
+    """Open a movie and check its rate."""
     movie = SourceMovie(path)
     if movie.rate > MAX_RATE:
         raise BadInputError(
-            f"movie {path} has {movie.rate} frames a second, more than the {MAX_RATE} that screens "
-            "show; generate trials with --playback slow"
+            f"movie {path} has {movie.rate} frames per second, more than the {MAX_RATE} that "
+            "screens show; generate trials with --playback slow"
         )
     return movie
 
 
 def _playable(movie: SourceMovie) -> bool:
-    """Every browser plays it, in the right colours, and there is nothing in it but pictures."""
+    """Return whether every browser plays the file as it is: H.264, yuv420p, no other stream."""
     return movie.copied and movie.pixels == "yuv420p" and movie.streams == 1
 
 
 def _encode(path: Path, movie: SourceMovie, frames: int) -> bytes:
-    """A new movie of the first ``frames`` frames."""
+    """Encode the first ``frames`` frames as a new movie."""
     try:
         encoder = MovieEncoder(movie.width, movie.height, frames, rate=movie.rate)
         for frame in itertools.islice(movie.frames(), frames):
@@ -169,29 +187,41 @@ def _encode(path: Path, movie: SourceMovie, frames: int) -> bytes:
 
 
 def _count(path: Path, frames: int) -> None:
-    """Decode all of a movie: it must have exactly so many frames, and promise no more."""
+    """Decode a movie completely and check that it has exactly ``frames`` frames."""
     found = len(read_frames(path, size=(16, 16)))
     if found != frames:
         raise BadInputError(
-            f"movie {path} has {found} frames, not the {frames} that people may observe"
+            f"movie {path} has {found} frames, not the {frames} that participants may observe"
         )
 
 
 def clean_map(content: bytes, size: tuple[int, int], path: Path) -> bytes:
-    """A map as a new PNG of its pixels alone, in ``size`` (width, height) as the movie has it.
+    """Re-encode a map as a PNG of its pixels only, without metadata.
 
-    `BadInputError` unless some of it is red, some yellow, and most of it lets the movie through.
+    Parameters
+    ----------
+    content
+        Bytes of the PNG file.
+    size
+        Width and height of the movie in pixels, which the map must have too.
+    path
+        Where ``content`` was read from; used in error messages only.
+
+    Raises
+    ------
+    BadInputError
+        The file is not a PNG of this size, or lacks red, yellow or transparent pixels.
     """
     try:
         with Image.open(io.BytesIO(content), formats=["PNG"]) as picture:
             if picture.size != size or max(size) > MAX_SIDE:
                 raise BadInputError(
-                    f"map {path} is {picture.width} x {picture.height} pixels large, its movie "
+                    f"map {path} is {picture.width} x {picture.height} pixels, its movie "
                     f"{size[0]} x {size[1]}"
                 )
             pixels = np.asarray(picture.convert("RGBA"))
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise BadInputError(f"map {path} is no readable PNG picture: {error}") from error
+        raise BadInputError(f"map {path} is not a readable PNG image: {error}") from error
     covered = pixels[..., 3] > 0
     red, green, blue = (pixels[..., channel] > 127 for channel in range(3))
     for role, found in (
@@ -201,12 +231,12 @@ def clean_map(content: bytes, size: tuple[int, int], path: Path) -> bytes:
         if not (found & covered).any():
             raise BadInputError(f"map {path} has no {role}")
     if covered.all():
-        raise BadInputError(f"map {path} is nowhere transparent: it would hide the movie")
+        raise BadInputError(f"map {path} has no transparent pixel: it would hide the movie")
     return encode_png(pixels)
 
 
 def _store(folder: Path, content: bytes, ending: str) -> str:
-    """Write a file under the name of its content, unless it is there; its path in the study."""
+    """Write a file named by its SHA-256 unless it exists; return its path within the study."""
     name = f"{MEDIA_FOLDER}/{hashlib.sha256(content).hexdigest()}{ending}"
     path = folder / name
     if path.is_symlink() or not path.is_file() or path.read_bytes() != content:

@@ -1,7 +1,7 @@
-"""Do the media of a study hold what its stimuli.csv says? Asked before a study is served.
+"""Comparison of a study's media files with its stimuli.csv, done before the study is served.
 
-A lab may edit stimuli.csv or put movies of its own there; one frame too many would show people what
-they are to predict.
+A lab may edit stimuli.csv or replace movies. A movie with one frame too many would show
+participants what they are asked to predict.
 """
 
 from __future__ import annotations
@@ -18,10 +18,16 @@ from physion.experiment.study.study import Study
 
 
 def check_media(study: Study) -> None:
-    """`BadInputError` names the first movie of other frames, size, rate or form, or other map.
+    """Check that all movies and maps of a study are as stimuli.csv describes them.
 
-    Movies are H.264, as every browser plays it, without sound. Frames are counted from the packets
-    of the file, without decoding them.
+    Movies must be H.264, which every browser plays, without sound. Frames are counted from the
+    packets of the file, without decoding.
+
+    Raises
+    ------
+    BadInputError
+        Frames, size, rate or codec of a movie, or the size of a map, differ. The message names
+        the first such file.
     """
     seen: set[tuple[str, int]] = set()
     for s in study.stimuli:
@@ -35,11 +41,12 @@ def check_media(study: Study) -> None:
 
 
 def _check_movie(path: Path, frames: int, s: Stimulus) -> None:
+    """Check the streams, frames, size, rate and codec of a movie."""
     check_plain(path)
     try:
         with av.open(str(path), metadata_errors="replace") as container:
             if len(container.streams) != 1 or not container.streams.video:
-                raise BadInputError(f"movie {path} must hold pictures and nothing else")
+                raise BadInputError(f"movie {path} must have one video stream and no other stream")
             stream = container.streams.video[0]
             context = stream.codec_context
             found = (context.width, context.height)
@@ -61,14 +68,15 @@ def _check_movie(path: Path, frames: int, s: Stimulus) -> None:
 
 
 def _check_map(path: Path, s: Stimulus) -> None:
+    """Check that a map is a PNG of the movie's size."""
     check_plain(path)
     try:
         with Image.open(path, formats=["PNG"]) as picture:
             found = picture.size
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise BadInputError(f"map {path} is no readable PNG picture: {error}") from error
+        raise BadInputError(f"map {path} is not a readable PNG image: {error}") from error
     if found != (s.width, s.height):
         raise BadInputError(
-            f"map {path} is {found[0]} x {found[1]} pixels large; stimuli.csv says "
+            f"map {path} is {found[0]} x {found[1]} pixels; stimuli.csv says "
             f"{s.width} x {s.height} of {s.stimulus}"
         )

@@ -1,8 +1,9 @@
-"""Orders of trials, lengths of fixation, order of buttons: functions of seeds, never stored.
+"""Trial orders, fixation durations and button order, computed from seeds and never stored.
 
-They must not change while a study runs, whatever is installed: a reload after an upgrade would show
-another order. So they rest on a hash alone, and not on numpy's generators, whose streams may change
-between versions. Sorting by hash values gives each order the same chance.
+They must not change while a study runs, not even when packages are upgraded: a page reloaded after
+an upgrade would otherwise show another order. They are therefore computed from a hash only, not
+from numpy's generators, whose streams may change between versions. Sorting by hash values makes all
+orders equally likely.
 """
 
 from __future__ import annotations
@@ -18,28 +19,28 @@ from physion.seeds import stable_hash
 Order = dict[str, tuple[Stimulus, ...]]
 
 
-def own_order_seed(study: Study, scenario: str, participant: str) -> int:
-    """Seed (63 bits) of the order that one participant alone gets in a scenario."""
+def individual_order_seed(study: Study, scenario: str, participant: str) -> int:
+    """Return the seed (63 bits) of the individual trial order of a participant in a scenario."""
     return stable_hash("own order", study.seed, scenario, participant) >> 65
 
 
 def prepared_order_seed(study: Study, secrets: Secrets, scenario: str, number: int) -> int:
-    """Seed (63 bits) of a prepared order, from number 1.
+    """Return the seed (63 bits) of a prepared order; ``number`` counts from 1.
 
-    It depends on the study's key: there are so few that else the lengths of the crosses would tell
-    which one it is, and with a public list of stimuli so the outcomes.
+    The seed depends on the study's secret key. There are few prepared orders, so without a key the
+    fixation durations would identify the order, and with a public list of stimuli the outcomes.
     """
-    word = sign(secrets, "prepared order", scenario, str(number))
-    return stable_hash("prepared order", study.seed, scenario, number, word) >> 65
+    signature = sign(secrets, "prepared order", scenario, str(number))
+    return stable_hash("prepared order", study.seed, scenario, number, signature) >> 65
 
 
-def order_of(study: Study, scenario: str, order_seed: int) -> Order:
-    """The stimuli of both phases: familiarization by place, the test by seed."""
-    return dict(_order(_Same(study), scenario, order_seed))
+def trial_order(study: Study, scenario: str, order_seed: int) -> Order:
+    """Return the stimuli of both phases in order: familiarization by place, test by seed."""
+    return dict(_order(_StudyKey(study), scenario, order_seed))
 
 
-class _Same:
-    """A study as the key of a cache: the very same object, since studies have no hash."""
+class _StudyKey:
+    """Cache key of a study, compared by object identity, since studies are not hashable."""
 
     __slots__ = ("study",)
 
@@ -50,12 +51,12 @@ class _Same:
         return id(self.study)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and self.study is other.study
+        return isinstance(other, _StudyKey) and self.study is other.study
 
 
-# Every request for a movie asks for the order of its session.
+# Cached because every request for a movie needs the order of its session.
 @lru_cache(maxsize=4096)
-def _order(key: _Same, scenario: str, order_seed: int) -> Order:
+def _order(key: _StudyKey, scenario: str, order_seed: int) -> Order:
     study = key.study
     test = sorted(
         study.phase(scenario, "test"),
@@ -65,7 +66,7 @@ def _order(key: _Same, scenario: str, order_seed: int) -> Order:
 
 
 def fixations(study: Study, scenario: str, order_seed: int, phase: str) -> tuple[int, ...]:
-    """Milliseconds of the cross before each trial of a phase; whole ones, all equally likely."""
+    """Return the duration in ms (integer, uniform) of the fixation cross before each trial."""
     count = len(study.phase(scenario, phase))
     if phase == PHASES[0] and not study.timing.fixation_in_familiarization:
         return (0,) * count
@@ -75,5 +76,5 @@ def fixations(study: Study, scenario: str, order_seed: int, phase: str) -> tuple
 
 
 def draw_buttons(study: Study, participant: str) -> Literal["yes-no", "no-yes"]:
-    """The buttons from left to right, the same in all scenarios of a participant."""
+    """Return the buttons from left to right; the same in all scenarios of a participant."""
     return "no-yes" if stable_hash("buttons", study.seed, participant) & 1 else "yes-no"

@@ -1,4 +1,4 @@
-"""Reading files of a study folder: plain ones of bounded size, and no link to anywhere else."""
+"""Safe reading of files in a study folder: regular files of limited size; links are refused."""
 
 from __future__ import annotations
 
@@ -10,22 +10,23 @@ from physion.errors import BadInputError
 
 
 def read_plain(path: Path, limit: int) -> bytes:
-    """The bytes of a plain file of at most ``limit`` bytes.
+    """Read a regular file of at most ``limit`` bytes.
 
-    A missing file, a link, a folder, a pipe and a larger file raise `BadInputError`.
+    Raises `BadInputError` if the file is missing, is larger, or is a link, a folder or a pipe.
     """
     try:
-        # A pipe must not make us wait, and nothing may change between looking and opening.
+        # Non-blocking, so that a pipe does not hang; the type is checked on the open descriptor,
+        # so that the file cannot be replaced between check and read.
         flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
         descriptor = os.open(path, flags | getattr(os, "O_BINARY", 0))
     except FileNotFoundError:
         raise BadInputError(f"{path} is missing") from None
     except OSError as error:
-        raise BadInputError(_why_not(path, error)) from error
+        raise BadInputError(_describe_error(path, error)) from error
     try:
         found = os.fstat(descriptor)
         if not stat.S_ISREG(found.st_mode):
-            raise BadInputError(f"{path} is no plain file")
+            raise BadInputError(f"{path} is not a regular file")
         if found.st_size > limit:
             raise BadInputError(f"{path} has {found.st_size} bytes, more than {limit}")
         with os.fdopen(descriptor, "rb", closefd=False) as file:
@@ -38,18 +39,19 @@ def read_plain(path: Path, limit: int) -> bytes:
 
 
 def check_plain(path: Path) -> None:
-    """`BadInputError` unless there is a plain file, itself and not through a link."""
+    """Raise `BadInputError` unless ``path`` is a regular file and not a link."""
     try:
         found = path.lstat()
     except OSError as error:
-        raise BadInputError(_why_not(path, error)) from error
+        raise BadInputError(_describe_error(path, error)) from error
     if not stat.S_ISREG(found.st_mode):
-        raise BadInputError(f"{path} is no plain file; links are not followed")
+        raise BadInputError(f"{path} is not a regular file; links are not followed")
 
 
-def _why_not(path: Path, error: OSError) -> str:
+def _describe_error(path: Path, error: OSError) -> str:
+    """Return the message for a file that cannot be opened."""
     if path.is_symlink():
-        return f"{path} is a link; links are not followed, put the file itself there"
+        return f"{path} is a link; links are not followed, replace it by the file itself"
     if isinstance(error, FileNotFoundError):
         return f"{path} is missing"
     return f"{path} cannot be read: {error.strerror}"

@@ -1,8 +1,8 @@
-"""Where participants come from and how they get their credit: Prolific, SONA, MTurk, plain links.
+"""Recruitment through Prolific, SONA, MTurk and plain links: entry links and completion credit.
 
-Names of parameters and addresses: the recruiters' own documentation (Prolific: placeholders of the
-study's address, ``submissions/complete?cc=``; SONA: ``%SURVEY_CODE%``, ``survey_code`` of the
-client-side completion address; MTurk: ExternalQuestion and its ``externalSubmit``).
+Parameter names and URLs follow the recruiters' documentation (Prolific: placeholders in the study
+URL, ``submissions/complete?cc=``; SONA: ``%SURVEY_CODE%`` and ``survey_code`` of the client-side
+completion URL; MTurk: ExternalQuestion and its ``externalSubmit``).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from physion.experiment.study.study import Study
 
 NO_ASSIGNMENT = "ASSIGNMENT_ID_NOT_AVAILABLE"
-"""What MTurk gives for ``assignmentId`` to who only looks at a task."""
+"""Value of ``assignmentId`` that MTurk sends while a worker previews a task."""
 RECRUITERS = (
     Recruiter(source="prolific", id="PROLIFIC_PID", others=["STUDY_ID", "SESSION_ID"]),
     Recruiter(
@@ -37,27 +37,27 @@ RECRUITERS = (
     Recruiter(source="link", id="participant", others=[]),
 )
 MTURK_HOSTS = ("https://www.mturk.com", "https://workersandbox.mturk.com")
-"""The only places that a form of ours is ever sent to besides our own."""
+"""The only foreign hosts to which a form of the participants' pages is ever submitted."""
 PROLIFIC_COMPLETION = "https://app.prolific.com/submissions/complete"
 
 
-def begins_nothing(enter: Enter) -> bool:
-    """Is this the look of someone at MTurk who has not accepted the task?"""
+def is_mturk_preview(enter: Enter) -> bool:
+    """Return whether this is a preview by an MTurk worker who has not accepted the task."""
     return enter.source == "mturk" and enter.recruiter.get("assignmentId") == NO_ASSIGNMENT
 
 
 _UNFILLED = re.compile(r"\{\{|\}\}|^%.*%$|\$\{", re.DOTALL)
-"""Prolific's ``{{%PROLIFIC_PID%}}``, SONA's ``%SURVEY_CODE%``, and what looks like them."""
+"""Placeholders such as Prolific's ``{{%PROLIFIC_PID%}}`` and SONA's ``%SURVEY_CODE%``."""
 
 
 def is_unfilled(enter: Enter) -> bool:
-    """Is the id, or another value of a recruiter, still the placeholder that stands for it?
+    """Return whether the id or another recruiter value is still an unreplaced placeholder.
 
-    Everybody who comes by such an address would be one and the same person.
+    All participants who came by such a URL would otherwise share one id.
     """
     for value in (enter.id or "", *enter.recruiter.values()):
         decoded = value
-        # Pages and recruiters may each have encoded it once more.
+        # The page and the recruiter may each have percent-encoded the value.
         for _ in range(3):
             if _UNFILLED.search(decoded.strip()):
                 return True
@@ -65,13 +65,13 @@ def is_unfilled(enter: Enter) -> bool:
     return False
 
 
-def pass_word(secrets: Secrets, kind: Kind) -> str:
-    """The word of a link whose sessions are of this kind: ``preview`` or ``simulated``."""
+def make_pass(secrets: Secrets, kind: Kind) -> str:
+    """Return the signed ``pass`` of links whose sessions are ``preview`` or ``simulated``."""
     return f"{kind}-{sign(secrets, 'pass', kind)}"
 
 
-def kind_of_pass(secrets: Secrets, word: str) -> Kind | None:
-    """The kind that a link's word stands for; None where we never gave this word."""
+def read_pass(secrets: Secrets, word: str) -> Kind | None:
+    """Return the session kind that a link's ``pass`` gives; None if its signature is invalid."""
     for kind in ("preview", "simulated"):
         name, _, signature = word.partition("-")
         if name == kind and check_signature(secrets, signature, "pass", kind):
@@ -80,34 +80,41 @@ def kind_of_pass(secrets: Secrets, word: str) -> Kind | None:
 
 
 def session_code(secrets: Secrets, session: str) -> str:
-    """Ten signs of a session that only this study can make, for a recruiter's form."""
+    """Return the signed completion code (10 characters) of a session, entered at MTurk."""
     digest = hashlib.sha256(sign(secrets, "completion", session).encode()).digest()
     return "".join(REFERENCE_LETTERS[byte % 32] for byte in digest[:10])
 
 
 def completion(study: Study, secrets: Secrets, session: Any, raw: Any = None) -> Completion:
-    """How the participant of a finished session gets the credit.
+    """Return the code, URL or form by which the participant of a finished session gets credit.
 
-    ``session`` is a row of SESSIONS. ``raw`` is the participant's row of RAW_IDS; without it (the
-    ids were deleted) addresses that need an id are left out, codes stay.
+    Parameters
+    ----------
+    study, secrets
+        The study and its keys.
+    session
+        Row of the table SESSIONS.
+    raw
+        Row of the table RAW_IDS of this participant. None if the ids were deleted: then URLs that
+        contain an id are left out, codes are still given.
     """
-    decided = study.recruitment
+    settings = study.recruitment
     if session.source == "prolific":
-        code = decided.prolific_code or None
+        code = settings.prolific_code or None
         return Completion(code=code, url=_with(PROLIFIC_COMPLETION, cc=code) if code else None)
     if session.source == "sona":
-        known = decided.sona_address and raw is not None
-        address = _with(decided.sona_address, survey_code=raw.raw_id) if known else None
+        known = settings.sona_address and raw is not None
+        address = _with(settings.sona_address, survey_code=raw.raw_id) if known else None
         return Completion(code=None, url=address)
     if session.source == "mturk":
-        own = session_code(secrets, session.session)
-        code = own if decided.mturk_code == "session" else decided.mturk_code or own
+        signed = session_code(secrets, session.session)
+        code = signed if settings.mturk_code == "session" else settings.mturk_code or signed
         return _mturk_form(code, {} if raw is None else raw.recruiter)
-    return Completion(code=decided.link_code or None, url=decided.link_address or None)
+    return Completion(code=settings.link_code or None, url=settings.link_address or None)
 
 
 def _mturk_form(code: str, recruiter: Mapping[str, str]) -> Completion:
-    """In MTurk's frame the answer is a form to MTurk itself; else the code is copied by hand."""
+    """Return the form that MTurk's frame submits; outside it, a code to be copied by hand."""
     host = recruiter.get("turkSubmitTo", "").rstrip("/")
     assignment = recruiter.get("assignmentId", "")
     if host not in MTURK_HOSTS or not assignment:
@@ -117,7 +124,7 @@ def _mturk_form(code: str, recruiter: Mapping[str, str]) -> Completion:
 
 
 def _with(address: str, **parameters: str) -> str:
-    """An address with these parameters in place of what it had by the same names."""
+    """Return a URL in which these query parameters are set or replaced."""
     parts = urlsplit(address)
     kept = [pair for pair in parse_qsl(parts.query, keep_blank_values=True)
             if pair[0] not in parameters]  # fmt: skip
@@ -126,8 +133,20 @@ def _with(address: str, **parameters: str) -> str:
 
 @dataclass(frozen=True)
 class Link:
-    """One address to hand out. ``goes_to``: who gets it, and where it is pasted. ``lacks``: what
-    study.toml has to say before people who come by it get their credit; empty where nothing.
+    """Entry link of a study.
+
+    Attributes
+    ----------
+    name
+        Recruiter, ``link``, ``preview`` or ``simulated``.
+    scenario
+        Scenario that the link leads to.
+    address
+        The URL.
+    goes_to
+        Who gets the link, and where it is entered.
+    lacks
+        Setting still missing in study.toml without which participants get no credit, or empty.
     """
 
     name: str
@@ -143,57 +162,59 @@ PLACEHOLDERS = {
     ),
     "sona": "id=%SURVEY_CODE%",
 }
-"""What the recruiters replace by their ids; not to be escaped."""
+"""Placeholders that the recruiters replace by ids; they must not be percent-encoded."""
 GOES_TO = {
-    "link": "anyone; add &participant=ID where you give people ids of your own",
-    "prolific": "Prolific: study address, with url parameters",
+    "link": "anyone; add &participant=ID if you assign ids yourself",
+    "prolific": "Prolific: study URL, with URL parameters",
     "sona": "SONA: Study URL",
     "mturk": "MTurk: ExternalURL of an ExternalQuestion (write & as &amp; in XML); MTurk adds ids",
-    "preview": "yourself and colleagues: never counted, never exported",
-    "simulated": "piloting by programs: marked as simulated for good",
+    "preview": "you and colleagues: never counted, never exported",
+    "simulated": "simulated participants: permanently marked as simulated",
 }
 
 
 def links(study: Study, secrets: Secrets, base_url: str) -> tuple[Link, ...]:
-    """Every address of the study by recruiter and scenario.
+    """Return all entry links of the study, by scenario and recruiter.
 
-    Raises:
-        BadInputError: ``base_url`` is not the root of a web site.
+    Raises
+    ------
+    BadInputError
+        ``base_url`` is not the root URL of a web site.
     """
     root = _root(base_url)
-    found = []
+    result = []
     for scenario in study.scenarios:
         for name, goes_to in GOES_TO.items():
-            words = [f"scenario={quote(scenario, safe='')}"]
+            query = [f"scenario={quote(scenario, safe='')}"]
             if name in ("preview", "simulated"):
-                words.append(f"pass={pass_word(secrets, name)}")  # type: ignore[arg-type]
+                query.append(f"pass={make_pass(secrets, name)}")  # type: ignore[arg-type]
             if name in PLACEHOLDERS:
-                words.append(PLACEHOLDERS[name])
-            address = f"{root}/?{'&'.join(words)}"
-            found.append(Link(name, scenario, address, goes_to, _lacks(study, name)))
-    return tuple(found)
+                query.append(PLACEHOLDERS[name])
+            address = f"{root}/?{'&'.join(query)}"
+            result.append(Link(name, scenario, address, goes_to, _lacks(study, name)))
+    return tuple(result)
 
 
-def undecided(study: Study) -> tuple[str, ...]:
-    """What must be filled in before people come, a line each.
+def missing_settings(study: Study) -> tuple[str, ...]:
+    """Return a warning for each setting that must be filled in before recruiting.
 
-    What single recruiters lack is said with their links, of which a study needs but some.
+    Settings of single recruiters are not included: `links` reports them with each link.
     """
     if study.contact != NO_CONTACT:
         return ()
     return (
-        "warning: contact in study.toml is not filled in: nobody who takes part can ask you or "
-        "have their data deleted; fill it in before people come",
+        "warning: contact in study.toml is not filled in: participants could not ask you questions "
+        "or have their data deleted; fill it in before recruiting",
     )
 
 
 def _lacks(study: Study, name: str) -> str:
-    """What the study has not decided yet for a recruiter."""
-    decided = study.recruitment
-    if name == "prolific" and not decided.prolific_code:
+    """Return the setting that is still missing for a recruiter, or an empty text."""
+    settings = study.recruitment
+    if name == "prolific" and not settings.prolific_code:
         return "prolific_code: the completion code that Prolific gives"
-    if name == "sona" and not decided.sona_address:
-        return "sona_address: the client-side completion address that SONA gives"
+    if name == "sona" and not settings.sona_address:
+        return "sona_address: the client-side completion URL that SONA gives"
     if name == "mturk" and not set(MTURK_HOSTS) & set(study.embed_from):
         hosts = ", ".join(f'"{host}"' for host in MTURK_HOSTS)
         return f"embed_from = [{hosts}]: MTurk shows the pages in a frame"
@@ -201,6 +222,7 @@ def _lacks(study: Study, name: str) -> str:
 
 
 def _root(base_url: str) -> str:
+    """Check that ``base_url`` is the root of a web site; return it without trailing slash."""
     try:
         parts = urlsplit(base_url)
         valid = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0

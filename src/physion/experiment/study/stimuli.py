@@ -1,6 +1,7 @@
-"""The stimuli of a study: what is shown, in which phase and place, and how it ends.
+"""The stimuli of a study: media files, phase, position and outcome of each.
 
-They stand in ``stimuli.csv`` of the study folder, one row a stimulus. The file is never served.
+They are stored in ``stimuli.csv`` of the study folder, one row per stimulus. The server never sends
+this file.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ MEDIA_FOLDER = "media"
 PHASES = ("familiarization", "test")
 LOOKS = ("free", "redyellow")
 NAME = r"[A-Za-z0-9][A-Za-z0-9._+-]{0,199}"
-"""Names of stimuli and scenarios: letters, digits and ._+- alone, so that no file system, address
-or spreadsheet reads anything into them."""
+"""Pattern of stimulus and scenario names: letters, digits and ._+- only, so that they have no
+special meaning in file systems, URLs or spreadsheets."""
 MAX_BYTES = 50_000_000
 MAX_FRAMES = 100_000
 MAX_SIDE = 10_000
@@ -35,12 +36,30 @@ MAX_SIDE = 10_000
 class Stimulus:
     """One row of ``stimuli.csv``.
 
-    ``place`` is the fixed place in familiarization, from 0; in the test it only makes the file
-    readable. ``label``: does the agent touch the patient? ``movie`` holds the observed frames
-    alone, ``full`` the whole movie (familiarization alone, else empty), ``map`` agent and patient
-    (PNG); all three are paths relative to the study folder. ``frames`` and ``full_frames`` count
-    the frames of both movies (0 where there is no full one), ``rate`` is frames a second,
-    ``width`` and ``height`` are pixels. ``look`` is ``free`` or ``redyellow``.
+    Attributes
+    ----------
+    stimulus, scenario
+        Names; together they identify the stimulus.
+    phase
+        ``familiarization`` or ``test``.
+    place
+        Position in familiarization, from 0. In the test it has no effect on the order.
+    label
+        Whether the agent touches the patient.
+    movie
+        Movie of the observed frames only. All paths are relative to the study folder.
+    map
+        PNG that marks agent and patient.
+    full
+        Full movie, in familiarization; empty in the test.
+    frames, full_frames
+        Number of frames of ``movie`` and ``full`` (0 if there is no full movie).
+    rate
+        Frames per second.
+    width, height
+        Size of movies and map in pixels.
+    look
+        Colours: ``free`` or ``redyellow``.
     """
 
     stimulus: str
@@ -63,12 +82,12 @@ COLUMNS = tuple(field.name for field in fields(Stimulus))
 
 
 def is_name(name: str) -> bool:
-    """Can a stimulus or scenario be called so?"""
+    """Return whether ``name`` is a valid name of a stimulus or scenario."""
     return re.fullmatch(NAME, name) is not None
 
 
 def read_stimuli(path: Path) -> tuple[Stimulus, ...]:
-    """The stimuli of a file, checked; `BadInputError` names the row and column of what is wrong.
+    """Read and check a stimuli file; `BadInputError` names the row and column of an error.
 
     Rows are counted as a spreadsheet shows them: the header is row 1.
     """
@@ -76,7 +95,7 @@ def read_stimuli(path: Path) -> tuple[Stimulus, ...]:
 
 
 def parse_stimuli(path: Path, content: bytes) -> tuple[Stimulus, ...]:
-    """The same from the bytes of a file that was read from ``path``."""
+    """Parse and check the content of a stimuli file that was read from ``path``."""
     found = []
     for row, cells in csv_rows(path, content, COLUMNS):
         if unknown := set(cells) - set(COLUMNS):
@@ -87,7 +106,7 @@ def parse_stimuli(path: Path, content: bytes) -> tuple[Stimulus, ...]:
 
 
 def write_stimuli(path: Path, stimuli: Iterable[Stimulus]) -> None:
-    """Write ``stimuli.csv``, atomically; what `read_stimuli` would refuse is refused here."""
+    """Check the stimuli as `read_stimuli` does, then write ``stimuli.csv`` atomically."""
     chosen = list(stimuli)
     check_stimuli(list(enumerate(chosen, start=2)), path)
     lines = io.StringIO(newline="")
@@ -99,7 +118,7 @@ def write_stimuli(path: Path, stimuli: Iterable[Stimulus]) -> None:
 
 
 def _flag(cell: str) -> bool:
-    # Spreadsheets write TRUE where Python writes True.
+    # Spreadsheets write TRUE, Python writes True.
     known = {"true": True, "false": False}
     if cell.lower() not in known:
         raise ValueError("True or False")
@@ -108,7 +127,7 @@ def _flag(cell: str) -> bool:
 
 def _whole(cell: str) -> int:
     if not re.fullmatch(r"[0-9]{1,9}", cell):
-        raise ValueError("a whole number from 0")
+        raise ValueError("an integer of at least 0")
     return int(cell)
 
 
@@ -128,6 +147,7 @@ _READ: Mapping[str, Callable[[str], str | int | float | bool]] = {
 
 
 def _parse(path: Path, row: int, cells: dict[str, str]) -> Stimulus:
+    """Convert the cells of one row; `BadInputError` names row and column of an invalid cell."""
     values: dict[str, str | int | float | bool] = {}
     for name, cell in cells.items():
         try:
@@ -146,7 +166,10 @@ _MAP = re.compile(rf"{MEDIA_FOLDER}/[A-Za-z0-9][A-Za-z0-9_-]{{0,99}}\.png")
 
 
 def check_stimuli(rows: list[tuple[int, Stimulus]], path: Path) -> None:
-    """Refuse what cannot be shown as it should be: each row by itself, then all together."""
+    """Check each stimulus, then that names, places and movies are consistent among all rows.
+
+    ``rows`` are pairs of row number and stimulus. `BadInputError` names the first invalid row.
+    """
     if not rows:
         raise BadInputError(f"{path} has no stimulus")
     for row, stimulus in rows:
@@ -158,10 +181,10 @@ def check_stimuli(rows: list[tuple[int, Stimulus]], path: Path) -> None:
     for row, s in rows:
         first = names.setdefault((s.scenario, s.stimulus), row)
         if first != row:
-            # In both phases it would be answered with its outcome known.
+            # In both phases, the outcome would be known when the test trial is answered.
             raise BadInputError(
-                f"{path}, row {row}: {s.stimulus} is there already, in row {first}; a scenario "
-                "shows each stimulus once"
+                f"{path}, row {row}: {s.stimulus} is already in row {first}; a scenario shows "
+                "each stimulus once"
             )
         first = places.setdefault((s.scenario, s.phase, s.place), row)
         if first != row:
@@ -169,12 +192,12 @@ def check_stimuli(rows: list[tuple[int, Stimulus]], path: Path) -> None:
                 f"{path}, row {row}: place {s.place} of {s.phase} of {s.scenario} is taken by "
                 f"row {first}"
             )
-    check_apart(((s.scenario, s.stimulus) for _, s in rows), path)
+    check_distinct_names(((s.scenario, s.stimulus) for _, s in rows), path)
     _check_futures(rows, path)
 
 
-def check_apart(names: Iterable[tuple[str, str]], where: Path) -> None:
-    """`BadInputError` where two (scenario, stimulus) are one and the same to the analysis."""
+def check_distinct_names(names: Iterable[tuple[str, str]], where: Path) -> None:
+    """Check that no two (scenario, stimulus) pairs have the same name in the analysis."""
     seen: dict[tuple[str, str], str] = {}
     for scenario, name in names:
         first = seen.setdefault((scenario, canonical_name(name)), name)
@@ -182,14 +205,14 @@ def check_apart(names: Iterable[tuple[str, str]], where: Path) -> None:
             continue
         raise BadInputError(
             f"{where}: {first} and {name} of {scenario} are one stimulus to the analysis, which "
-            "takes off -redyellow, _img, .mp4 and .hdf5; leave one of them out, or rename it"
+            "removes -redyellow, _img, .mp4 and .hdf5; remove or rename one of them"
         )
 
 
 def _faults(s: Stimulus) -> Iterable[tuple[str, str]]:
-    """Column and what would be allowed, for each fault of one row."""
+    """Yield the column and a description of its allowed values, for each error in one row."""
     practice = s.phase == "familiarization"
-    letters = "letters, digits and ._+- alone"
+    letters = "letters, digits and ._+- only"
     if not is_name(s.stimulus):
         yield "stimulus", letters
     if not is_name(s.scenario):
@@ -201,11 +224,11 @@ def _faults(s: Stimulus) -> Iterable[tuple[str, str]]:
     if not _MOVIE.fullmatch(s.movie):
         yield "movie", f"the path of a movie, {MEDIA_FOLDER}/NAME.mp4"
     if not _MAP.fullmatch(s.map):
-        yield "map", f"the path of a picture, {MEDIA_FOLDER}/NAME.png"
+        yield "map", f"the path of an image, {MEDIA_FOLDER}/NAME.png"
     if practice and not _MOVIE.fullmatch(s.full):
-        yield "full", f"the path of the whole movie, {MEDIA_FOLDER}/NAME.mp4, in familiarization"
+        yield "full", f"the path of the full movie, {MEDIA_FOLDER}/NAME.mp4, in familiarization"
     if not practice and s.full:
-        yield "full", "empty in the test: nobody sees how a test trial ends"
+        yield "full", "empty in the test: participants never see the outcome of a test trial"
     if not 1 <= s.frames <= MAX_FRAMES:
         yield "frames", f"from 1 to {MAX_FRAMES}"
     if practice and not s.frames < s.full_frames <= MAX_FRAMES:
@@ -213,18 +236,18 @@ def _faults(s: Stimulus) -> Iterable[tuple[str, str]]:
     if not practice and s.full_frames:
         yield "full_frames", "0 in the test"
     if not (math.isfinite(s.rate) and 1 <= s.rate <= 240):
-        yield "rate", "from 1 to 240 frames a second"
+        yield "rate", "from 1 to 240 frames per second"
     for side in ("width", "height"):
         if not 16 <= getattr(s, side) <= MAX_SIDE:
             yield side, f"from 16 to {MAX_SIDE} pixels"
 
 
 def _check_futures(rows: list[tuple[int, Stimulus]], path: Path) -> None:
-    """No movie that is shown before an answer may be one that shows an outcome."""
+    """Check that no movie shown before an answer is also the full movie of some stimulus."""
     whole = {s.full: row for row, s in rows if s.full}
     for row, s in rows:
         if s.movie in whole:
             raise BadInputError(
-                f"{path}, row {row}: movie is the whole movie of row {whole[s.movie]}; it must "
-                "hold the observed frames alone"
+                f"{path}, row {row}: movie is the full movie of row {whole[s.movie]}; it must "
+                "contain the observed frames only"
             )

@@ -1,14 +1,14 @@
-"""A study: a folder with everything that a lab decides about its experiment, readable and editable.
+"""A study: its settings, stimuli and texts, loaded from a folder of files that a lab can edit.
 
 ::
 
     STUDY/
-      study.toml            what is decided: this module
-      texts/en.toml, ...    words of every page, one file a language
-      stimuli.csv           what is shown and how it ends; never served
-      media/                movies and maps, named by their content
+      study.toml            settings: this module
+      texts/en.toml, ...    texts of all pages, one file per language
+      stimuli.csv           stimuli and their outcomes; never served
+      media/                movies and maps, named by the hash of their content
       secret.json           keys and the experimenter's password hash (mode 600)
-      responses.sqlite      the data, where no other database is given
+      responses.sqlite      the data, unless another database is given
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from physion.errors import BadInputError
 from physion.experiment.study.plain_files import check_plain, read_plain
 from physion.experiment.study.stimuli import MAX_BYTES as MAX_STIMULI_BYTES
 from physion.experiment.study.stimuli import PHASES, STIMULI_FILE, Stimulus, parse_stimuli
-from physion.experiment.study.study_file import check_tables, parse_toml, tables_to_toml
+from physion.experiment.study.study_file import check_tables, format_tables, parse_toml
 from physion.experiment.study.texts import TEXTS_FOLDER, read_texts
 
 STUDY_FILE = "study.toml"
@@ -34,8 +34,18 @@ MAX_BYTES = 1_000_000
 
 @dataclass(frozen=True)
 class Timing:
-    """What is shown for how long. ``flash_hz`` counts whole cycles, one on and one off; the
-    official study flashed at 1 Hz. Fixation is drawn for each trial between its two ends.
+    """Durations within a trial.
+
+    Attributes
+    ----------
+    fixation_ms
+        Shortest and longest duration of the fixation cross; drawn uniformly for each trial.
+    fixation_in_familiarization
+        Whether familiarization trials have a fixation cross too.
+    cue_ms
+        Duration of the cue on the first frame.
+    flash_hz
+        Full cycles (on and off) of the cue per second; 1 in the official study.
     """
 
     fixation_ms: tuple[int, int] = (500, 1500)
@@ -46,7 +56,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class Screen:
-    """Smallest window that the pages are made for, in CSS pixels."""
+    """Smallest browser window in which participants may take part, in CSS pixels."""
 
     min_width: int = 1024
     min_height: int = 600
@@ -54,13 +64,21 @@ class Screen:
 
 @dataclass(frozen=True)
 class Recruitment:
-    """Where participants come from, and how they get their credit.
+    """Settings of recruitment and completion credit.
 
-    ``prolific_code``: completion code, also put into the address of Prolific's completion page.
-    ``sona_address``: address of the SONA system with ``experiment_id`` and ``credit_token``; the
-    survey code is added. ``mturk_code``: "session" gives every session its own code, any other word
-    is the code of all. ``link_code``, ``link_address``: for people who came by a plain link.
-    ``id_needed``: refuse who comes without an id.
+    Attributes
+    ----------
+    id_needed
+        Whether participants without an id are refused.
+    prolific_code
+        Prolific's completion code, also part of the completion URL.
+    sona_address
+        SONA's completion URL with ``experiment_id`` and ``credit_token``; the survey code is
+        appended.
+    mturk_code
+        ``session``: each session gets its own code. Any other value is the code of all sessions.
+    link_code, link_address
+        Completion code and URL for participants who came by a plain link.
     """
 
     id_needed: bool = False
@@ -73,8 +91,15 @@ class Recruitment:
 
 @dataclass(frozen=True)
 class Limits:
-    """Requests that are let through: of a session and, for new sessions, of an address; so many at
-    once, then so many a second or minute. A class may sit behind one address.
+    """Rate limits (token buckets).
+
+    Attributes
+    ----------
+    requests_per_second, burst
+        Sustained rate and burst size of the requests of one session.
+    sessions_per_minute, sessions_at_once
+        Sustained rate and burst size of new sessions from one IP address, which a whole class may
+        share.
     """
 
     requests_per_second: float = 20.0
@@ -85,14 +110,46 @@ class Limits:
 
 @dataclass(frozen=True)
 class Study:
-    """``study.toml`` with the stimuli and texts that belong to it.
+    """Settings of ``study.toml`` with the stimuli and texts of the study.
 
-    ``participants``: complete sessions wanted for each scenario; who comes later is told that the
-    study is full. ``orders``: 0 gives each participant an order of their own; else so many prepared
-    orders, least used first (the official study had 125). ``exclusions``: the rules by which
-    sessions are flagged, a name of `physion.analysis.people.exclusions.RULE_SETS`.
-    ``percentile_from``: other finished people that it takes before anyone is told a percentile.
-    ``embed_from``: sites that may show the pages in a frame (MTurk), none by default.
+    Attributes
+    ----------
+    folder
+        The study folder.
+    name, version, title, contact
+        Identification of the study; ``title`` and ``contact`` are shown to participants.
+    scenarios
+        Scenarios in which people can take part.
+    languages
+        Languages of the texts; the first is the default.
+    consent_version
+        Version of the consent text, stored with each consent.
+    participants
+        Complete sessions wanted for each scenario; later participants are told that it is full.
+    seed
+        Seed of all trial orders.
+    orders
+        0: each participant gets an individual order. Otherwise the number of prepared orders, used
+        least often first (the official study had 125).
+    exclusions
+        Rule set by which sessions are flagged, a name in
+        `physion.analysis.people.exclusions.RULE_SETS`.
+    percentile_from
+        Number of other finished participants needed before a percentile is shown.
+    preload
+        Number of trials loaded ahead of the current one.
+    embed_from
+        Sites that may show the pages in a frame (MTurk); none by default.
+    timing, screen, recruitment, limits
+        The tables of ``study.toml``.
+    stimuli
+        Rows of ``stimuli.csv`` of the study's scenarios.
+    texts
+        Texts by language and key.
+    digest
+        SHA-256 of study.toml, texts and stimuli.csv.
+    stimuli_digest
+        SHA-256 of stimuli.csv.
     """
 
     folder: Path
@@ -117,11 +174,10 @@ class Study:
     stimuli: tuple[Stimulus, ...] = ()
     texts: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     digest: str = ""
-    """SHA-256 of study.toml, texts and stimuli.csv."""
     stimuli_digest: str = ""
 
     def phase(self, scenario: str, phase: str) -> tuple[Stimulus, ...]:
-        """The stimuli of one phase of a scenario, by place."""
+        """Return the stimuli of one phase of a scenario, sorted by place."""
         found = [s for s in self.stimuli if (s.scenario, s.phase) == (scenario, phase)]
         return tuple(sorted(found, key=lambda stimulus: stimulus.place))
 
@@ -130,21 +186,26 @@ _PARTS = {"timing": Timing, "screen": Screen, "recruitment": Recruitment, "limit
 
 
 def load_study(folder: Path | str) -> Study:
-    """The study in a folder: ``study.toml``, texts and stimuli, every value checked.
+    """Load and check the study in a folder: ``study.toml``, texts and stimuli.
 
-    `BadInputError` names the file, the key and what is allowed; a key that is unknown, a text that
-    a language lacks, a stimulus without its files and a link in place of a file are refused.
+    Raises
+    ------
+    BadInputError
+        A value is not allowed, a key is unknown, a text is missing in some language, or a media
+        file is missing or a link. The message names the file, the key and the allowed values.
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise BadInputError(f"there is no study folder {folder}; make one: physion experiment init")
+        raise BadInputError(
+            f"there is no study folder {folder}; create one with physion experiment init"
+        )
     path = folder / STUDY_FILE
     if not os.path.lexists(path):
         raise BadInputError(
-            f"{path} is missing: this is no study folder; make one with physion experiment init"
+            f"{path} is missing: this is no study folder; create one with physion experiment init"
         )
     content = read_plain(path, MAX_BYTES)
-    study = replace(study_of(parse_toml(path, content), path), folder=folder)
+    study = replace(parse_settings(parse_toml(path, content), path), folder=folder)
     texts, written = {}, []
     for language in study.languages:
         texts[language], text_file = read_texts(folder / TEXTS_FOLDER, language)
@@ -162,40 +223,42 @@ def load_study(folder: Path | str) -> Study:
     )
 
 
-def study_of(table: Mapping[str, Any], path: Path) -> Study:
-    """The settings in the tables of a ``study.toml`` that stands, or will stand, at ``path``.
+def parse_settings(table: Mapping[str, Any], path: Path) -> Study:
+    """Check the parsed content of a ``study.toml`` and return its settings as a study.
 
-    Stimuli and texts are left empty. Errors as of `load_study`.
+    Stimuli and texts are left empty. ``path`` is the path of the file, which need not exist yet.
+    Raises the errors of `load_study`.
     """
     values = check_tables(table, path)
     parts = {name: part(**values[name]) for name, part in _PARTS.items()}
     return Study(folder=path.parent, **values[""], **parts)
 
 
-def study_to_toml(study: Study) -> str:
-    """``study.toml`` of a study: every key with its comment; `study_of` gives it back.
+def format_settings(study: Study) -> str:
+    """Return the content of ``study.toml``: all keys with comments, as `parse_settings` reads it.
 
-    `BadInputError` names the key of a value that could not be read back.
+    Raises `BadInputError`, naming the key, if a value is not allowed in the file.
     """
     values = {name: vars(getattr(study, name)) for name in _PARTS}
-    return tables_to_toml({"": vars(study), **values}, study.folder / STUDY_FILE)
+    return format_tables({"": vars(study), **values}, study.folder / STUDY_FILE)
 
 
 def write_settings(study: Study) -> Path:
-    """Write ``study.toml`` into the study's folder, atomically; the path."""
+    """Write ``study.toml`` into the study's folder atomically; return its path."""
     path = study.folder / STUDY_FILE
-    write_atomic(path, study_to_toml(study).encode())
+    write_atomic(path, format_settings(study).encode())
     return path
 
 
 def _check_stimuli(study: Study, stimuli: tuple[Stimulus, ...], path: Path) -> None:
-    there = {(s.scenario, s.phase) for s in stimuli}
+    """Check that each scenario has stimuli in both phases, and that all media files exist."""
+    present = {(s.scenario, s.phase) for s in stimuli}
     for scenario in study.scenarios:
         for phase in PHASES:
-            if (scenario, phase) not in there:
+            if (scenario, phase) not in present:
                 raise BadInputError(
-                    f"{path} has no stimulus of {scenario} for {phase}; add some, or take "
-                    f"{scenario} out of scenarios in {STUDY_FILE}"
+                    f"{path} has no stimulus of {scenario} for {phase}; add some, or remove "
+                    f"{scenario} from scenarios in {STUDY_FILE}"
                 )
     for stimulus in stimuli:
         for name in filter(None, (stimulus.movie, stimulus.map, stimulus.full)):
@@ -203,7 +266,7 @@ def _check_stimuli(study: Study, stimuli: tuple[Stimulus, ...], path: Path) -> N
 
 
 def _digest(*parts: bytes) -> str:
-    """SHA-256 of parts, each with its length before it, so that no two lists are confused."""
+    """Return the SHA-256 of a list of byte strings, each preceded by its length."""
     hashed = hashlib.sha256()
     for part in parts:
         hashed.update(len(part).to_bytes(8, "big") + part)

@@ -1,4 +1,4 @@
-"""``study.toml`` as text: read into checked tables, and written with a comment above each key."""
+"""Reading and writing of ``study.toml``: parsing, checking, and output with comments."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from physion.errors import BadInputError, UnknownNameError
 from physion.experiment.study.study_checks import KEYS, TABLES, Key
 
 HEAD = """\
-# What this study decides. Words are in texts/, stimuli in stimuli.csv (which is never served).
-# Look at it with: physion experiment serve FOLDER
+# Settings of this study. Texts are in texts/, stimuli in stimuli.csv (which is never served).
+# To run it: physion experiment serve FOLDER
 """
 
 
 def parse_toml(path: Path, content: bytes) -> dict[str, Any]:
-    """The tables of a TOML file that was read from ``path``; `BadInputError` where it is none."""
+    """Parse the content of a TOML file that was read from ``path``."""
     try:
         return tomllib.loads(content.decode())
     except (ValueError, RecursionError) as error:
@@ -26,10 +26,15 @@ def parse_toml(path: Path, content: bytes) -> dict[str, Any]:
 
 
 def check_tables(tables: Mapping[str, Any], path: Path) -> dict[str, dict[str, Any]]:
-    """The values of a ``study.toml``, checked: by table (empty: the top) and key.
+    """Check all values of a ``study.toml``; return them by table (empty: top level) and key.
 
-    Keys that may be left out and are, are left out. `BadInputError` names the file, the key, and
-    what is allowed, or for an unknown key the closest ones.
+    Optional keys that are missing in the file are missing in the result.
+
+    Raises
+    ------
+    BadInputError
+        A value is not allowed, or a key is missing or unknown. The message names the file, the key
+        and the allowed values, or the known keys closest to an unknown one.
     """
     top = {key.name for key in KEYS if not key.table} | set(TABLES)
     _refuse_unknown(path, "", tables, top)
@@ -48,11 +53,11 @@ def check_tables(tables: Mapping[str, Any], path: Path) -> dict[str, dict[str, A
     return values
 
 
-def tables_to_toml(values: Mapping[str, Mapping[str, Any]], path: Path) -> str:
-    """The text of a ``study.toml``; `check_tables` gives the values back.
+def format_tables(values: Mapping[str, Mapping[str, Any]], path: Path) -> str:
+    """Return the text of a ``study.toml`` from which `check_tables` reads the same values.
 
-    ``values`` may hold more than the keys. `BadInputError` names the key of a value that could not
-    be read back from ``path``.
+    ``values`` may have further keys, which are ignored. `BadInputError` names the key of a value
+    that `check_tables` would refuse.
     """
     lines = [HEAD]
     for name in ("", *TABLES):
@@ -66,6 +71,7 @@ def tables_to_toml(values: Mapping[str, Mapping[str, Any]], path: Path) -> str:
 
 
 def _checked(path: Path, key: Key, value: Any) -> Any:
+    """Check one value; `BadInputError` names file, key and allowed values."""
     name = f"{key.table}.{key.name}" if key.table else key.name
     try:
         return key.check(value)
@@ -82,7 +88,8 @@ def _refuse_unknown(path: Path, table: str, given: Mapping[str, Any], known: set
 
 
 def _toml(value: Any) -> str:
+    """Return a value in TOML syntax."""
     if isinstance(value, tuple):
         return f"[{', '.join(_toml(one) for one in value)}]"
-    # Texts hold no control characters, and so a JSON string is a TOML string.
+    # Texts have no control characters, so their JSON strings are valid TOML strings.
     return json.dumps(value, ensure_ascii=False)

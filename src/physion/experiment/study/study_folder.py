@@ -1,56 +1,69 @@
-"""A new study folder, made from what was chosen for it; a killed making goes on where it stopped.
+"""Creation of a study folder from selected stimuli; an interrupted run can be resumed.
 
-While a folder is being made it has a journal with a line for every stimulus whose media are
-written. The same command finds them there. The journal goes last.
+During creation the folder contains a journal with one line for each stimulus whose media have been
+written. Running the same command again skips these stimuli. The journal is deleted last.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from physion.atomic import folder_lock, remove_leftovers, write_atomic
+from physion.compute.progress import Track
 from physion.errors import BadInputError
 from physion.experiment.study.identity import SECRET_FILE, Secrets, set_password
-from physion.experiment.study.media import Source, take_stimulus
+from physion.experiment.study.media import StimulusSource, import_stimulus
 from physion.experiment.study.stimuli import (
     MEDIA_FOLDER,
     STIMULI_FILE,
     Stimulus,
-    check_apart,
+    check_distinct_names,
     write_stimuli,
 )
 from physion.experiment.study.study import (
     STUDY_FILE,
     Study,
+    format_settings,
     load_study,
-    study_to_toml,
     write_settings,
 )
 from physion.experiment.study.texts import TEXTS_FOLDER, shipped_file
 
 JOURNAL = "init.journal"
 SHOWN = 3
-"""Missing files that an error names."""
-Track = Callable[[Iterable[Stimulus], str, int], Iterator[Stimulus]]
-"""Passes stimuli on and shows how far it is, as `physion.cli.output.track` does."""
+"""Maximum number of missing files named in an error message."""
 
 
 def make_study(
-    study: Study, sources: Sequence[Source], password: str, *, track: Track | None = None
+    study: Study, sources: Sequence[StimulusSource], password: str, *, track: Track | None = None
 ) -> Study:
-    """Make the folder of ``study`` with these stimuli and the shipped texts; the study, loaded.
+    """Create the folder of a study, with its stimuli and the texts of this package, and load it.
 
-    The folder is new or empty, or one that was left unfinished. `BadInputError` names all missing
-    files at once, and otherwise the first thing that is wrong; what was made till then is kept for
-    the next try.
+    Parameters
+    ----------
+    study
+        The settings, with the folder to create. The folder must be missing, empty, or left by an
+        interrupted run.
+    sources
+        The stimuli and their source files.
+    password
+        Password of the experimenter's pages.
+    track
+        Displays progress.
+
+    Raises
+    ------
+    BadInputError
+        Files are missing (the message names several) or something else is invalid. Media written
+        so far are kept for the next run.
     """
     check_sources(sources)
-    check_apart(((s.scenario, s.stimulus) for s in sources), study.folder / STIMULI_FILE)
-    study_to_toml(study)
+    check_distinct_names(((s.scenario, s.stimulus) for s in sources), study.folder / STIMULI_FILE)
+    format_settings(study)
     texts = {language: shipped_file(language) for language in study.languages}
     folder = study.folder
     _check_folder(folder)
@@ -71,8 +84,8 @@ def make_study(
     return made
 
 
-def check_sources(sources: Sequence[Source]) -> None:
-    """`BadInputError` names every file that is missing or is no plain file."""
+def check_sources(sources: Sequence[StimulusSource]) -> None:
+    """Check that all source files are regular files; the error names the first missing ones."""
     files = [path for source in sources for path in source.files.values()]
     missing = [path for path in dict.fromkeys(files) if path.is_symlink() or not path.is_file()]
     if missing:
@@ -84,20 +97,20 @@ def check_sources(sources: Sequence[Source]) -> None:
 
 
 def _check_folder(folder: Path) -> None:
-    """New, empty, or left unfinished by a making that was killed."""
+    """Check that the folder is missing, empty, or left by an interrupted run."""
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
-        raise BadInputError(f"{folder} is there already and no folder of its own")
+        raise BadInputError(f"{folder} already exists and is a link or not a folder")
     if not folder.exists():
         return
     found = {path.name for path in folder.iterdir()} - {".lock"}
     if JOURNAL in found:
-        # Whoever served it by hand has keys and perhaps answers that must not be lost.
+        # Other files may be keys or answers from serving the folder; they must not be lost.
         strange = found - {JOURNAL, MEDIA_FOLDER, TEXTS_FOLDER, STIMULI_FILE, STUDY_FILE,
                            SECRET_FILE}  # fmt: skip
         strange = {name for name in strange if not name.endswith(".part")}
         if strange:
             raise BadInputError(
-                f"{folder} was left unfinished but holds {min(strange)} too; choose another folder"
+                f"{folder} was left unfinished but contains {min(strange)}; choose another folder"
             )
     elif STUDY_FILE in found:
         raise BadInputError(
@@ -105,7 +118,9 @@ def _check_folder(folder: Path) -> None:
             "choose another folder for a new one"
         )
     elif found - {MEDIA_FOLDER} or any((folder / MEDIA_FOLDER).glob("*")):
-        raise BadInputError(f"{folder} is not empty (it has {min(found)}); choose a new folder")
+        raise BadInputError(
+            f"{folder} is not empty (it contains {min(found)}); choose a new folder"
+        )
 
 
 def _set_secrets(folder: Path, password: str) -> None:
@@ -116,7 +131,7 @@ def _set_secrets(folder: Path, password: str) -> None:
 
 
 def _remove_others(folder: Path, study: Study) -> None:
-    """Delete media of an earlier try that chose otherwise."""
+    """Delete media of an earlier run with other stimuli, which the study does not use."""
     remove_leftovers(folder)
     used = {name for s in study.stimuli for name in (s.movie, s.map, s.full)}
     for path in (folder / MEDIA_FOLDER).iterdir():
@@ -125,7 +140,7 @@ def _remove_others(folder: Path, study: Study) -> None:
 
 
 class _Journal:
-    """What is written already: a JSON line for each stimulus, with all that it was made from."""
+    """Record of the stimuli already written: one JSON line each, with a key of its source files."""
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._path = folder, folder / JOURNAL
@@ -134,25 +149,27 @@ class _Journal:
             for line in self._path.read_text(encoding="utf-8", errors="replace").splitlines():
                 self._read(line)
 
-    def take(self, sources: Sequence[Source]) -> Iterator[Stimulus]:
-        """The stimuli of ``sources``, their media written."""
+    def take(self, sources: Sequence[StimulusSource]) -> Iterator[Stimulus]:
+        """Yield the stimulus of each source, writing its media unless they exist."""
         with self._path.open("a", encoding="utf-8") as file:
-            # A line that a kill cut short must not spoil the next one.
+            # The last line may be incomplete after a crash; start a new one.
             file.write("\n")
             for source in sources:
                 key = _key(source)
                 stimulus = self._known.get(key)
                 if stimulus is None or not self._holds(stimulus):
-                    stimulus = take_stimulus(source, self._folder)
+                    stimulus = import_stimulus(source, self._folder)
                     row = dataclasses.asdict(stimulus)
                     file.write(json.dumps({"key": key, "row": row}) + "\n")
                     file.flush()
                 yield stimulus
 
     def remove(self) -> None:
+        """Delete the journal."""
         self._path.unlink()
 
     def _read(self, line: str) -> None:
+        """Parse one line; ignore it if it is damaged."""
         try:
             entry = json.loads(line)
             self._known[entry["key"]] = Stimulus(**entry["row"])
@@ -160,12 +177,13 @@ class _Journal:
             return
 
     def _holds(self, stimulus: Stimulus) -> bool:
+        """Return whether all media files of a stimulus exist."""
         files = [self._folder / n for n in (stimulus.movie, stimulus.map, stimulus.full) if n]
         return all(path.is_file() and not path.is_symlink() for path in files)
 
 
-def _key(source: Source) -> str:
-    """All that a stimulus is made from, the state of its files included."""
+def _key(source: StimulusSource) -> str:
+    """Return a key of all that a stimulus is made from, with size and time of its files."""
     values: dict[str, Any] = dataclasses.asdict(source)
     stats = [path.stat() for path in source.files.values()]
     values["stats"] = [(found.st_size, found.st_mtime_ns) for found in stats]

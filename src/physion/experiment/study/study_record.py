@@ -1,4 +1,4 @@
-"""The study folder as it is served, noted in the database beside the sessions made under it."""
+"""Registration of each served version of the study folder in the database."""
 
 from __future__ import annotations
 
@@ -9,17 +9,21 @@ from typing import Any
 from sqlalchemy import ColumnElement, Connection, func, select, update
 
 from physion.errors import BadInputError
-from physion.experiment.store.sessions import insert_new
+from physion.experiment.store.sessions import insert_or_skip
 from physion.experiment.store.tables import SESSIONS, STUDIES
 from physion.experiment.study.study import STUDY_FILE, Study
 
 
 def register(connection: Connection, study: Study, now: float) -> None:
-    """Note the state of the study folder; refuse one under which sessions could not go on.
+    """Store the current version of the study; refuse it if existing sessions could not continue.
 
-    Raises:
-        BadInputError: there are sessions of people or programs with other stimuli, or of a
-            scenario that the study has no more.
+    Previews that cannot continue are ended.
+
+    Raises
+    ------
+    BadInputError
+        There are sessions (of people or simulated participants) with other stimuli, or of a
+        scenario that the study no longer has.
     """
     other = SESSIONS.c.session.in_(
         select(SESSIONS.c.session)
@@ -31,21 +35,21 @@ def register(connection: Connection, study: Study, now: float) -> None:
     if count:
         raise BadInputError(
             f"{count} sessions were made with another stimuli.csv or other media; their orders of "
-            "trials would change. Bring the old stimuli back, or make a new study folder (or give "
+            "trials would change. Restore the old stimuli, or create a new study folder (or give "
             "another database) for the new ones"
         )
     for scenario, of_scenario in _by_scenario(connection, gone).items():
         raise BadInputError(
-            f"{of_scenario} sessions are of the scenario {scenario}, which {STUDY_FILE} has no "
-            f"more: put {scenario} back into scenarios (so that nobody new begins it, hand out "
-            "links of the others alone), or make a new study folder (or give another database) "
-            "without it"
+            f"{of_scenario} sessions are of the scenario {scenario}, which {STUDY_FILE} no longer "
+            f"has: put {scenario} back into scenarios (to stop recruiting for it, distribute only "
+            "links of the other scenarios), or create a new study folder (or give another "
+            "database) without it"
         )
-    # Previews are nobody's data: those that cannot go on simply end.
+    # Previews are not data: those that cannot continue are ended.
     ended = (other | gone) & SESSIONS.c.finished_at.is_(None) & SESSIONS.c.withdrawn_at.is_(None)
     connection.execute(update(SESSIONS).where(ended).values(withdrawn_at=now))
     connection.execute(
-        insert_new(connection, STUDIES),
+        insert_or_skip(connection, STUDIES),
         {
             "digest": study.digest,
             "name": study.name,
@@ -58,7 +62,7 @@ def register(connection: Connection, study: Study, now: float) -> None:
 
 
 def _by_scenario(connection: Connection, which: ColumnElement[bool]) -> dict[str, int]:
-    """Sessions that are somebody's data, counted by scenario in the order of names."""
+    """Count the sessions that are not previews, by scenario in alphabetical order."""
     columns = SESSIONS.c
     counts = select(columns.scenario, func.count()).where(which, columns.kind != "preview")
     rows = connection.execute(counts.group_by(columns.scenario).order_by(columns.scenario))
@@ -66,7 +70,7 @@ def _by_scenario(connection: Connection, which: ColumnElement[bool]) -> dict[str
 
 
 def _settings(study: Study) -> dict[str, Any]:
-    """All that the study decides and says, without stimuli: labels stay in the folder."""
+    """Return settings and texts as JSON values, without stimuli, whose labels stay private."""
     left_out = {"folder", "stimuli"}
     shallow = {name: value for name, value in vars(study).items() if name not in left_out}
     return json.loads(json.dumps(shallow, default=_plain))  # type: ignore[no-any-return]

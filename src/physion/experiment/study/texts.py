@@ -1,8 +1,8 @@
-"""All words of the participants' pages, one file a language.
+"""Texts of the participants' pages, one file per language.
 
-``texts/LANGUAGE.toml`` has one table a page with one line a text, ``[consent]`` and
-``title = "..."``; programs know that text as ``consent.title``. ``{words}`` in braces are put in by
-the pages. A study has copies of its own, so that a lab can change every word.
+``texts/LANGUAGE.toml`` has one table per page and one line per text: ``title = "..."`` in
+``[consent]`` has the key ``consent.title``. The pages replace placeholders in braces. Each study
+has its own copies, so that a lab can edit every text.
 """
 
 from __future__ import annotations
@@ -25,14 +25,16 @@ _PLACEHOLDER = re.compile(r"\{([a-z_]+)\}")
 
 
 def read_texts(folder: Path, language: str) -> tuple[dict[str, str], bytes]:
-    """The texts of a language by their keys, and the bytes of their file.
+    """Read and check the texts of a language; return them by key, and the bytes of the file.
 
-    `BadInputError` names a key that is missing, unknown, no text, or empty, and words in braces
-    that the pages do not put in.
+    Raises
+    ------
+    BadInputError
+        A key is missing, unknown, empty or not a text, or has an unknown placeholder in braces.
     """
     path = folder / f"{language}.toml"
     content = read_plain(path, MAX_BYTES)
-    texts = _flat(path, content)
+    texts = _parse(path, content)
     wanted = shipped_texts()
     for key in texts:
         if key not in wanted:
@@ -43,20 +45,20 @@ def read_texts(folder: Path, language: str) -> tuple[dict[str, str], bytes]:
                 f"{path} lacks the text {key}; in English it is: {original[:100]!r}"
             )
         known = set(_PLACEHOLDER.findall(original))
-        for word in set(_PLACEHOLDER.findall(texts[key])) - known:
+        for name in set(_PLACEHOLDER.findall(texts[key])) - known:
             allowed = ", ".join(f"{{{one}}}" for one in sorted(known)) or "none"
-            raise BadInputError(f"{path}: {key} has {{{word}}}; it may have {allowed}")
+            raise BadInputError(f"{path}: {key} has {{{name}}}; it may have {allowed}")
     return texts, content
 
 
 def shipped_languages() -> list[str]:
-    """Languages that the package brings, in alphabetical order."""
+    """Return the languages whose texts ship with the package, in alphabetical order."""
     files = resources.files("physion.experiment").joinpath(TEXTS_FOLDER).iterdir()
     return sorted(file.name.removesuffix(".toml") for file in files if file.name.endswith(".toml"))
 
 
 def shipped_file(language: str) -> bytes:
-    """The file of a language that the package brings; `UnknownNameError` for another one."""
+    """Return the shipped text file of a language; `UnknownNameError` if there is none."""
     if language not in shipped_languages():
         raise UnknownNameError("language", language, shipped_languages())
     folder = resources.files("physion.experiment").joinpath(TEXTS_FOLDER)
@@ -65,25 +67,27 @@ def shipped_file(language: str) -> bytes:
 
 @cache
 def shipped_texts() -> Mapping[str, str]:
-    """The English texts of the package: their keys are those that every language needs."""
-    return _flat(Path(TEXTS_FOLDER) / "en.toml", shipped_file("en"))
+    """Return the shipped English texts, whose keys every language must have."""
+    return _parse(Path(TEXTS_FOLDER) / "en.toml", shipped_file("en"))
 
 
-def _flat(path: Path, content: bytes) -> dict[str, str]:
-    found: dict[str, str] = {}
-    _walk(path, "", parse_toml(path, content), found)
-    return found
+def _parse(path: Path, content: bytes) -> dict[str, str]:
+    """Return the texts of a file by their full keys, such as ``consent.title``."""
+    texts: dict[str, str] = {}
+    _flatten(path, "", parse_toml(path, content), texts)
+    return texts
 
 
-def _walk(path: Path, above: str, table: Mapping[str, Any], found: dict[str, str]) -> None:
+def _flatten(path: Path, prefix: str, table: Mapping[str, Any], texts: dict[str, str]) -> None:
+    """Add the texts of a table and its sub-tables to ``texts``."""
     for name, value in table.items():
-        key = f"{above}{name}"
+        key = f"{prefix}{name}"
         if isinstance(value, Mapping):
-            _walk(path, f"{key}.", value, found)
+            _flatten(path, f"{key}.", value, texts)
         elif not isinstance(value, str) or not value.strip() or len(value) > MAX_TEXT:
             raise BadInputError(
                 f"{path}: {key} must be a text in quotes of 1 to {MAX_TEXT} characters, "
                 f"not {repr(value)[:100]}"
             )
         else:
-            found[key] = value
+            texts[key] = value
