@@ -24,9 +24,9 @@ from physion.scenes.shapes.primitives import shape
 from physion.seeds import child_generator, named_seed
 
 SPACING, CLOTH_SPACING = 0.05, 0.035
-"""Metres between particles, and those of scenes with cloth (official-system.md, section 6)."""
+"""Metres between particles, and those of scenes with cloth (docs/official-system.md, section 6)."""
 LIMIT = 3000
-"""Most particles of one object (official-system.md, section 6)."""
+"""Most particles of one object (docs/official-system.md, section 6)."""
 FINE = 4
 """Each particle's cube is cut into this many cells a side to see how full it is."""
 REACH = 1.12

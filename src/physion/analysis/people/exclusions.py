@@ -3,7 +3,7 @@
 Rules flag, they do not drop: `flag_sessions` gives one row a session and one column a rule, so that
 analyses can be done with and without the flagged ones, as preregistered. Rule sets are values:
 `PREREGISTERED` is the preregistration's text, `OFFICIAL_CODE` what the released code did instead
-(reference/experiment-and-analysis.md, section 2).
+(docs/official-system.md, section 7.2).
 """
 
 from __future__ import annotations

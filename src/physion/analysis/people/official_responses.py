@@ -1,8 +1,8 @@
 """Participant-level answers in the raw columns of the original study, made `Responses`.
 
 The study's exports are ``human_responses-<study>-<iteration>.csv`` (150 test trials a session) and
-``familiarization_human_responses-...`` (10 trials); reference/experiment-and-analysis.md, sections
-1 and 2, say what their columns mean. Their ``rt`` starts before the cue.
+``familiarization_human_responses-...`` (10 trials); docs/official-system.md, section 7.1,
+says what their columns mean. Their ``rt`` starts before the cue.
 """
 
 from __future__ import annotations

@@ -264,4 +264,4 @@ CLAIMS = (
         "number leaves out the sign",
     ),
 )
-"""In the order of the paper. Section and numbers: reference/paper.txt, Results and Discussion."""
+"""In the order of the paper. Section and numbers: Bear et al. (2021), Results and Discussion."""

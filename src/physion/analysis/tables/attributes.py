@@ -31,7 +31,7 @@ COLUMNS = ("stimulus", "scenario", "configuration", *ATTRIBUTES, "room", "source
 
 MISLABELLED = {"pilot_dominoes_4mid_tdwroom": {"elements": 8.0}}
 """Configurations whose name belies what was generated, and what their metadata say: this one's
-``num_middle_objects`` is 8 (reference/official-system.md, section 3.9). ``source`` stays *name*."""
+``num_middle_objects`` is 8 (docs/official-system.md, section 3.9). ``source`` stays *name*."""
 
 _NUMBERED = re.compile(r"_?\d{4}$")
 _PATTERNS: dict[str, tuple[re.Pattern[str], ...]] = {

@@ -38,7 +38,7 @@ class ClothSettings:
     """How cloth moves. The defaults are those of the official cloth trials.
 
     "official" means that the command logs set it, "default" a default of TDW's Flex container
-    (reference/official-system.md, section 3.8).
+    (docs/official-system.md, section 3.8).
 
     - ``substeps`` of a frame and ``iterations`` of each: passes over the constraints (default).
     - ``rest_distance``: metres that cloth particles keep from solid particles: the cloth's

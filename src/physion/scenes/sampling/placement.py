@@ -1,6 +1,6 @@
 """Where the camera stands, and what stands behind and before the scene.
 
-Rules of the official generator (reference/official-system.md, sections 2.4 and 2.5), with one
+Rules of the official generator (docs/official-system.md, sections 2.4 and 2.5), with one
 addition: a camera that does not see agent and patient is drawn again.
 """
 
@@ -41,17 +41,17 @@ from physion.scenes.shapes.prop_names import expand_props
 from physion.scenes.shapes.props import NATURAL_SIZES
 
 CLEARANCE = 0.25
-"""Metres kept free between the scene and scenery."""
+"""Distance between the bodies and the scenery, metres."""
 CAMERA_TRIES = 200
 NEAREST_OCCLUDER = 0.85
-"""Largest fraction of the distance to the camera at which scenery may stand."""
+"""Largest fraction of the distance to the camera at which an occluder may stand."""
 
 STEPS_ASIDE = (0, 1, -1, 2, -2, 3, -3, 4, -4, 5, -5, 6, -6)
-"""Places at which a prop is tried, one after the other, in angles between neighbours."""
+"""Positions tried one after the other for a prop, in multiples of the angle between neighbours."""
 FARTHER = (1.0, 1.5)
-"""Rows in which places are tried, in times the distance that was drawn."""
+"""Distances at which positions are tried, as multiples of the distance drawn."""
 FARTHEST_ASIDE = math.radians(80.0)
-"""Places more than a few steps aside are at most this far from straight behind or before."""
+"""Largest angle from straight behind or in front, for positions more than three steps aside."""
 
 PropCount = Annotated[int, Quantity("", 0, 12)]
 
@@ -60,11 +60,12 @@ PropCount = Annotated[int, Quantity("", 0, 12)]
 class CameraRule:
     """How the camera is drawn.
 
-    - ``radius``: metres; the official rule moves the camera by (radius, radius), so that its
-      horizontal distance from the middle is radius times the square root of 2.
+    - ``radius``: metres; the horizontal distance from the centre is this times the square root
+      of 2, since the official rule moves the camera by (radius, radius).
     - ``angle_deg``: degrees; the azimuth is this plus 45.
-    - ``height``: metres above the floor. Officially it may be 2 cm, where nobody can see a zone.
-    - ``mirror``: chance that left and right (the signs of x) are swapped.
+    - ``height``: metres above the floor. Officially it may be 2 cm, from where
+      a flat zone cannot be seen.
+    - ``mirror``: probability that x changes its sign (left and right are swapped).
     """
 
     radius: Distances = (1.75, 1.75)
@@ -75,11 +76,11 @@ class CameraRule:
 
 @dataclass(frozen=True, slots=True)
 class SceneryRule:
-    """How many props stand behind (``distractors``) and before (``occluders``) the scene.
+    """How many props stand behind (``distractors``) and in front (``occluders``), and which.
 
-    Distances are shares of the camera's radius, angles are degrees between neighbours, sizes are
-    metres of the largest side. ``occlusion`` is the share of the line of sight at which an
-    occluder's top ends.
+    - Distances: fractions of the camera's radius. Spacings: degrees between neighbours.
+    - Sizes: metres of the largest side. ``yaw_deg``: largest rotation about z.
+    - ``occlusion``: height of an occluder as a fraction of the height of the line of sight there.
     """
 
     distractors: PropCount = 0
@@ -97,19 +98,19 @@ class SceneryRule:
 
 
 def world_corners(body: Body) -> NDArray[np.float64]:
-    """(V, 3): the corners of a body's drawn mesh in the world, metres."""
+    """Return the vertices (V, 3) of a body's mesh in world coordinates, metres."""
     corners = shape(body.shape).mesh.vertices * body.scale
     return np.asarray(rotate_vectors(body.rotation, corners) + np.array(body.position))
 
 
 def world_bounds(body: Body) -> NDArray[np.float64]:
-    """(2, 3): smallest and largest coordinates of a body in the world, metres."""
+    """Return the smallest and largest world coordinates (2, 3) of a body, metres."""
     corners = world_corners(body)
     return np.stack([corners.min(axis=0), corners.max(axis=0)])
 
 
 def on_screen(camera: Camera, point: ArrayLike) -> tuple[float, float]:
-    """Where a square picture shows ``point``: right and up, from -1 to 1; infinite if behind."""
+    """Project ``point`` to a square image: (right, up) in -1..1, infinite if out of depth range."""
     forward = unit(np.subtract(camera.target, camera.position))
     right = unit(np.cross(forward, [0.0, 0.0, 1.0]))
     ray = np.subtract(point, camera.position)
@@ -123,9 +124,9 @@ def on_screen(camera: Camera, point: ArrayLike) -> tuple[float, float]:
 def place_camera(
     rng: np.random.Generator, rule: CameraRule, aim_height: float, seen: Sequence[Body]
 ) -> Camera:
-    """A camera that looks at the middle of the scene and shows the centres of all of ``seen``.
+    """Draw a camera that looks at the centre of the scene and shows the centres of all ``seen``.
 
-    Raises `BadSceneError` if `CAMERA_TRIES` draws show none such.
+    Raises `BadSceneError` if none of `CAMERA_TRIES` draws does.
     """
     centers = [ordered_mean(world_bounds(body), axis=0) for body in seen]
     for _ in range(CAMERA_TRIES):
@@ -138,7 +139,9 @@ def place_camera(
         if all(max(map(abs, on_screen(camera, center))) < 0.98 for center in centers):
             return camera
     names = " and ".join(body.name for body in seen)
-    raise BadSceneError(f"no camera shows {names}: widen the camera's ranges or move it away")
+    raise BadSceneError(
+        f"no camera shows {names}: widen the ranges of the camera or increase its radius"
+    )
 
 
 def place_scenery(
@@ -148,7 +151,7 @@ def place_scenery(
     distractors: np.random.Generator,
     occluders: np.random.Generator,
 ) -> tuple[Body, ...]:
-    """Props behind and before ``bodies``, drawn only, each kind on its own random stream."""
+    """Draw props behind and in front of ``bodies``; each kind has a random stream of its own."""
     bounds = np.array([world_bounds(body) for body in bodies])
     keep_out = np.stack([bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)])
     placed: list[Body] = []
@@ -171,7 +174,7 @@ def place_scenery(
 
 @dataclass(frozen=True)
 class _DrawnProp:
-    """What chance decided about a prop; where it stands follows from the rest of the scene."""
+    """Random properties of a prop; its position then depends on camera and bodies as well."""
 
     name: str
     shape: str
@@ -207,21 +210,21 @@ def _first_free(
     spacing: float,
     placed: Sequence[Body],
 ) -> Body:
-    """The prop at its angle or, where another prop is, steps of ``spacing`` beside it or behind."""
+    """Return the prop at the first position, at or next to its angle, free of other props."""
     for times, step in itertools.product(FARTHER, STEPS_ASIDE):
         at = angle + step * spacing
         if abs(step) > 3 and abs(cos(at)) < cos(FARTHEST_ASIDE):
             continue
-        body = _standing(replace(drawn, fraction=drawn.fraction * times), camera, keep_out, at)
-        if not any(_footprints_meet(body, other) for other in placed):
+        body = _place_prop(replace(drawn, fraction=drawn.fraction * times), camera, keep_out, at)
+        if not any(_footprints_overlap(body, other) for other in placed):
             return body
     raise BadSceneError(
-        f"no room for {drawn.name} beside {placed[-1].name}: make scenery fewer or smaller, or "
-        "its spacing wider"
+        f"no room for {drawn.name} beside {placed[-1].name}: use fewer or smaller props, or "
+        "increase the spacing of the scenery"
     )
 
 
-def _standing(
+def _place_prop(
     drawn: _DrawnProp, camera: Camera, keep_out: NDArray[np.float64], angle: float
 ) -> Body:
     position = _position(drawn, camera, keep_out, angle)
@@ -241,13 +244,15 @@ def _standing(
 def _position(
     drawn: _DrawnProp, camera: Camera, keep_out: NDArray[np.float64], angle: float
 ) -> NDArray[np.float64]:
-    """Where (2,) a prop stands: clear of the scene, and not in the camera's face."""
+    """Return the position (2,) of a prop: outside the bodies, and not too near to the camera."""
     x, y, _ = camera.position
-    azimuth, whole = arctan2(y, x) + angle, math.sqrt(x * x + y * y)
+    azimuth, reach = arctan2(y, x) + angle, math.sqrt(x * x + y * y)
     direction = np.array([cos(azimuth), sin(azimuth)])
-    position = _clear(direction, drawn.fraction * whole / math.sqrt(2), drawn.size, keep_out)
+    position = _position_outside(
+        direction, drawn.fraction * reach / math.sqrt(2), drawn.size, keep_out
+    )
     if cos(angle) > 0:
-        position *= min(1.0, NEAREST_OCCLUDER * whole / float(norm(position)))
+        position *= min(1.0, NEAREST_OCCLUDER * reach / float(norm(position)))
     return position
 
 
@@ -258,7 +263,10 @@ def _occluding_size(
     angle: float,
     rule: SceneryRule,
 ) -> NDArray[np.float64]:
-    """A size whose top ends at its share of the line of sight; width grows along within limits."""
+    """Return the size with which an occluder covers its fraction of the line of sight.
+
+    Width and depth scale with the height, within the limits of the rule.
+    """
     position = _position(drawn, camera, keep_out, angle)
     along = float(norm(position) / norm(camera.position[:2]))
     sight = camera.target[2] + (camera.position[2] - camera.target[2]) * along
@@ -267,21 +275,21 @@ def _occluding_size(
     return np.array([drawn.size[0] * factor, drawn.size[1] * factor, top])
 
 
-def _footprints_meet(body: Body, other: Body) -> bool:
-    """Whether the circles round two props' floor plans meet."""
+def _footprints_overlap(body: Body, other: Body) -> bool:
+    """Return whether the circles around the footprints of two props overlap."""
     reach = (norm(body.scale[:2]) + norm(other.scale[:2])) / 2
     return bool(norm(np.subtract(body.position[:2], other.position[:2])) < reach)
 
 
-def _clear(
+def _position_outside(
     direction: NDArray[np.float64],
     distance: float,
     size: NDArray[np.float64],
     keep_out: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Return the first position along ``direction``, from ``distance`` on, outside the scene."""
-    room = CLEARANCE + float(norm(size[:2])) / 2
-    low, high = keep_out[0, :2] - room, keep_out[1, :2] + room
+    margin = CLEARANCE + float(norm(size[:2])) / 2
+    low, high = keep_out[0, :2] - margin, keep_out[1, :2] + margin
     with np.errstate(divide="ignore"):
         exits = np.where(direction > 0, high / direction, low / direction)
     inside = bool(((direction * distance > low) & (direction * distance < high)).all())

@@ -32,7 +32,7 @@ _FILE_KEYS = ("scenario", "shared", "presets")
 
 @dataclass(frozen=True)
 class Published:
-    """What the original study reports of a configuration (official-system.md, section 3).
+    """What the original study reports of a configuration (docs/official-system.md, section 3).
 
     - ``trials``, ``contact``: of those generated for the test, how many and how many with contact.
     - ``frames``: mean length. ``tested``: how many are among the published 150.

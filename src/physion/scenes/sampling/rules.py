@@ -37,12 +37,12 @@ from physion.scenes.scene import Body, Look, Push, SurfaceMaterial, Vec3
 from physion.scenes.shapes.primitives import shape
 
 STATIC_OVER_DYNAMIC = 10.0
-"""Static over dynamic friction of a zone (reference/official-system.md, section 1)."""
+"""Static over dynamic friction of a zone (docs/official-system.md, section 1)."""
 
 
 @dataclass(frozen=True)
 class BodyRule:
-    """How a body that moves is drawn (defaults: section 2.1 of reference/official-system.md).
+    """How a body that moves is drawn (defaults: section 2.1 of docs/official-system.md).
 
     - ``shapes``: one of these, each as likely. ``scale``: metres at unit size.
     - ``turn_deg``: about the upright, or about three axes. ``mass``: kg. With ``tumbled`` a single

@@ -43,7 +43,7 @@ PLAIN = BodyRule()
 
 @dataclass(frozen=True)
 class StackRule:
-    """How bodies that stand on one another are drawn (reference/official-system.md, 3.2).
+    """How bodies that stand on one another are drawn (docs/official-system.md, 3.2).
 
     - ``member``: each body; its ``mass`` is that of a cube of 0.5 m a side, and is multiplied with
       the product of the body's scales over that of the cube's.
@@ -66,7 +66,7 @@ class FilledStackRule(StackRule):
 
 @dataclass(frozen=True)
 class StandRule:
-    """What a stack stands on or in (reference/official-system.md, 3.4 and 3.6).
+    """What a stack stands on or in (docs/official-system.md, 3.4 and 3.6).
 
     - ``base``: the lowest body. ``attachment``: one on its top, if ``attached``.
     - ``joined``: base and attachment are held together, and attachment and cap.

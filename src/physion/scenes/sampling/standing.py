@@ -35,7 +35,7 @@ from physion.seeds import child_generator
 TRIES = 100
 MAX_FRAMES = 452
 STACK_MASS = 0.25
-"""Bodies of the stack have this share of their mass by volume (official-system.md, 3.4)."""
+"""Bodies of the stack have this share of their mass by volume (docs/official-system.md, 3.4)."""
 
 
 class StandParams(SceneParams, Protocol):

@@ -40,7 +40,7 @@ SCENERY = SceneryRule(
 
 @dataclass(frozen=True)
 class Params:
-    """What is drawn for a trial of collide (reference/official-system.md, 2.1, 3.0 and 3.3).
+    """What is drawn for a trial of collide (docs/official-system.md, 2.1, 3.0 and 3.3).
 
     Defaults are the official class defaults, but for the heading of the push: the class has 20
     degrees, at which most pushes miss, all configurations have 8 or less.

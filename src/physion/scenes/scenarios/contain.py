@@ -48,7 +48,7 @@ SCENERY = SceneryRule()
 
 @dataclass(frozen=True)
 class Params:
-    """What is drawn for a trial of contain (reference/official-system.md, 2.1, 3.0 and 3.4).
+    """What is drawn for a trial of contain (docs/official-system.md, 2.1, 3.0 and 3.4).
 
     - ``length``: the probe starts at minus half of this, metres; the stand is in the middle.
     - ``stand``: the container, and what stands on it, which may be another container.

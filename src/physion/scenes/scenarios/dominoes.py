@@ -27,7 +27,7 @@ from physion.seeds import child_generator
 
 MAX_FRAMES = 302
 ZONE_GAP = 0.1
-"""Metres added between zone and target (official-system.md, section 3.1)."""
+"""Metres added between zone and target (docs/official-system.md, section 3.1)."""
 BODY_GAP = 0.01
 """Metres kept free between neighbours, which officially may start inside each other."""
 ROW_TRIES = 100
@@ -44,7 +44,7 @@ CAMERA, SCENERY = CameraRule(), SceneryRule()
 
 @dataclass(frozen=True)
 class Params:
-    """What is drawn for a trial of dominoes (reference/official-system.md, 2.1, 3.0 and 3.1).
+    """What is drawn for a trial of dominoes (docs/official-system.md, 2.1, 3.0 and 3.1).
 
     Defaults are the official configuration `pilot_dominoes_2mid_J025R30`, in which every second
     trial ends in contact; those of the official class are the preset `default_boxroom`.

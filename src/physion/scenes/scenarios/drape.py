@@ -147,7 +147,7 @@ class PropRule:
 
 @dataclass(frozen=True)
 class Params:
-    """What is drawn for a trial of drape (reference/official-system.md, 2.1, 3.0 and 3.8).
+    """What is drawn for a trial of drape (docs/official-system.md, 2.1, 3.0 and 3.8).
 
     Defaults are the official rules, with middling values of what the configurations differ in.
 

@@ -66,7 +66,7 @@ SCENERY = SceneryRule()
 
 @dataclass(frozen=True)
 class Params:
-    """What is drawn for a trial of drop (reference/official-system.md, 2.1, 3.0 and 3.5).
+    """What is drawn for a trial of drop (docs/official-system.md, 2.1, 3.0 and 3.5).
 
     Defaults are those of the official `simple` configurations, but for ``even_turn``. Masses are
     the values in use: the official mass arguments had no effect.

@@ -53,7 +53,7 @@ SCENERY = SceneryRule()
 
 @dataclass(frozen=True)
 class Params:
-    """What is drawn for a trial of link (reference/official-system.md, 2.1, 3.0 and 3.6).
+    """What is drawn for a trial of link (docs/official-system.md, 2.1, 3.0 and 3.6).
 
     - ``length``: the probe starts at minus half of this, metres; the pole is in the middle.
     - ``stand``: the base and the pole on it, which may have a cap that keeps the links on.

@@ -134,7 +134,7 @@ class CollisionRule:
 
 @dataclass(frozen=True)
 class Params:
-    """What is drawn for a trial of roll (reference/official-system.md, 2.1, 3.0 and 3.7).
+    """What is drawn for a trial of roll (docs/official-system.md, 2.1, 3.0 and 3.7).
 
     ``template`` names one of `TEMPLATES` or several, each as likely; only its rule is used.
     Defaults are the values of the published configurations, but for ``ramp.lift``, which is 0.01

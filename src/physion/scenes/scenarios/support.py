@@ -55,7 +55,7 @@ SCENERY = SceneryRule()
 
 @dataclass(frozen=True)
 class Params:
-    """What is drawn for a trial of support (reference/official-system.md, 2.1, 3.0 and 3.2).
+    """What is drawn for a trial of support (docs/official-system.md, 2.1, 3.0 and 3.2).
 
     - ``length``: the probe starts at minus half of this, metres; the tower stands in the middle.
     - ``stack``: the blocks of the tower, from below. ``cap``: what is on its top, the agent.

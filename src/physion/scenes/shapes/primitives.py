@@ -1,6 +1,6 @@
 """The primitives of every scene by name: how they look, collide, and how heavy they are.
 
-Sizes are those of the official model records (reference/official-system.md, section 1.2), with
+Sizes are those of the official model records (docs/official-system.md, section 1.2), with
 their (x, y up, z) written as our (x, z, y up): the pivot is the centre of the bottom face, so that
 a shape stands on z = 0. The records give bounds alone; their "volume" is not that of the solid but,
 as far as it can be checked, the summed volume of boxes round the convex colliders: for shapes that

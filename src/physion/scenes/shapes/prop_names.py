@@ -107,7 +107,7 @@ PROP_CATEGORIES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     }
 )
 """Props by the words of the official scenery: a category in the singular or plural, or ``full``,
-which is all that occur in the published trials (reference/official-system.md, section 1.2)."""
+which is all that occur in the published trials (docs/official-system.md, section 1.2)."""
 
 
 def expand_props(names: Sequence[str]) -> tuple[str, ...]:

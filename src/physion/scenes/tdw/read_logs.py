@@ -2,7 +2,7 @@
 
 A configuration is a folder with ``tdw_commands.json`` (or ``.json.gz``) and ``metadata.json``.
 The log holds one JSON list of commands a line, followed by ``trial N``; the lists of one trial are
-its frames, ``trial None`` prepares the room (reference/engines-and-rendering.md, "Format facts").
+its frames, ``trial None`` prepares the room (docs/official-system.md, section 8).
 """
 
 from __future__ import annotations

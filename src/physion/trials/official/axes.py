@@ -3,7 +3,7 @@
 Ours: z up, right-handed, quaternions (w, x, y, z). Official (Unity): y up, left-handed, quaternions
 (x, y, z, w). A point (x, y, z) of ours is (x, z, y) there. Swapping two axes mirrors space, so that
 directions of turning flip as well: that is the only difference between points and turns. Arrays
-may have any leading axes (reference/official-system.md, section 1).
+may have any leading axes (docs/official-system.md, section 1).
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What the official files call things, and how they pack pictures: shared by export and import.
 
-Facts are from reference/official-system.md, sections 1, 2.6 and 4.
+Facts are from docs/official-system.md, sections 1, 2.6 and 4.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Reads official HDF5 files without trusting them.
 
-Files of several makers differ (reference/official-system.md, sections 4 and 9): names may end in
+Files of several makers differ (docs/official-system.md, sections 4 and 9): names may end in
 ``_cam0``, frames may be counted from 0 or 1, labels may be missing, physics arrays may be shorter
 than the list of objects, pictures may be PNG or JPEG. All of that is read. Not read are links out
 of the file or across it, arrays stored elsewhere, packed with unknown filters, of types that point

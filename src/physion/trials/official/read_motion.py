@@ -1,6 +1,6 @@
 """How things moved in an official file: poses, contacts, cloth; as one of our trajectories.
 
-Official contact points are not tied to pairs (reference/official-system.md, section 9). Where
+Official contact points are not tied to pairs (docs/official-system.md, section 9). Where
 there are as many points as pairs, they are taken in order, as our own export writes them;
 otherwise every pair gets the point that lies nearest to both of its boxes.
 """

@@ -2,7 +2,7 @@
 
 ``container`` has one number for each parameter, the groups of actors one row for each object of
 their kind (``object_id``), all named as in the commands ``create_flex_container``,
-``set_flex_solid_actor`` and ``set_flex_cloth_actor`` (reference/official-system.md, sections 3.8
+``set_flex_solid_actor`` and ``set_flex_cloth_actor`` (docs/official-system.md, sections 3.8
 and 4.1). ``soft_actors`` and ``fluid_actors`` are empty, as in the originals.
 
 Left out is what our solver has nothing of: of the container ``radius`` (Flex's reach between

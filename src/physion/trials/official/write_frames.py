@@ -5,7 +5,7 @@ contact point, its deepest, in the same place of the list, so that contacts belo
 n``; the originals list several points a pair and none for pairs that part). A pair that parts
 ("exit") repeats where it touched last. What an object's normal points at is Unity's rule: from the
 second object of the record to the first, and from the environment to the object
-(reference/official-system.md, sections 2.6, 4.2 and 9).
+(docs/official-system.md, sections 2.6, 4.2 and 9).
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """One trial as an official HDF5 file: what never changes, every frame, and our own extras.
 
-Names, shapes and encodings are those of reference/official-system.md, section 4, with gzip alone.
+Names, shapes and encodings are those of docs/official-system.md, section 4, with gzip alone.
 Static arrays all have one entry for each object (the originals leave scenery out of masses and
 frictions, so that they do not line up). Ids and counts are int64, measures float32. What the
 official layout has no place for stands apart, under ``physion/``: the scene, labels and metadata as

@@ -1,6 +1,6 @@
 """What ``metadata.json`` and ``trial_stats.json`` say of trials, measured on their files.
 
-Keys, definitions and roundings are the official ones (reference/official-system.md, section 4.3),
+Keys, definitions and roundings are the official ones (docs/official-system.md, section 4.3),
 except that a room is called by its name (``box``, not ``b'box'``) and that where an object is not
 to be seen its place in the picture is null.
 """
