@@ -15,10 +15,11 @@ from sklearn.metrics import brier_score_loss, cohen_kappa_score
 from statsmodels.stats.contingency_tables import mcnemar
 from statsmodels.stats.multitest import multipletests
 
+from physion.analysis.metrics import measure_metrics
 from physion.analysis.models.model_people import (
-    MEASURES,
     Models,
-    compare_with_people,
+    measure_models,
+    measure_table,
     model_pairs,
     models_of,
 )
@@ -49,6 +50,7 @@ from support.simulated_people import study
 
 Array = npt.NDArray[np.float64]
 FEW = Bootstrap(resamples=50)
+MEASURES = [metric.name for metric in measure_metrics()]
 
 
 @pytest.fixture(scope="module")
@@ -64,6 +66,10 @@ def models(answers: Answers) -> Models:
     p[3, [0, 7]] = np.nan
     predicted = np.where(np.isnan(p), np.nan, p > 0.5)
     return Models(("people", "chance", "always", "gaps"), p, predicted)
+
+
+def measures(models: Models, answers: Answers, bootstrap: Bootstrap) -> pd.DataFrame:
+    return measure_table(measure_models(models, answers, bootstrap), bootstrap)
 
 
 def plain(
@@ -105,7 +111,7 @@ def plain(
 
 @pytest.mark.filterwarnings("ignore:Mean of empty slice")
 def test_every_measure_is_what_it_says(models: Models, answers: Answers) -> None:
-    table = compare_with_people(models, answers, FEW)
+    table = measures(models, answers, FEW)
     assert len(table) == 4 * len(MEASURES)
     for k, name in enumerate(models.names):
         expected = plain(k, models, answers, range(12), range(25))
@@ -124,7 +130,7 @@ def test_intervals_are_those_of_drawing_people_stimuli_or_both(
     models: Models, answers: Answers
 ) -> None:
     draws = Bootstrap(resamples=12, seed=3)
-    table = compare_with_people(models, answers, draws).set_index(["model", "measure"])
+    table = measures(models, answers, draws).set_index(["model", "measure"])
     people = draws_of_people(answers, draws).astype(int)
     stimuli = draws.weights(answers.scenario, 25).astype(int)
     for what in ("people", "stimuli", "both"):
@@ -146,7 +152,7 @@ def test_intervals_are_those_of_drawing_people_stimuli_or_both(
 def test_a_model_that_knows_people_is_best_and_noise_adds_up(answers: Answers) -> None:
     p = np.vstack([answers.shares(), np.random.default_rng(1).random(25)])
     models = Models(("people", "chance"), p, (p > 0.5).astype(float))
-    table = compare_with_people(models, answers, Bootstrap(resamples=300))
+    table = measures(models, answers, Bootstrap(resamples=300))
     table = table.set_index(["model", "measure"])
     assert table.loc[("people", "r"), "value"] == pytest.approx(1)
     assert table.loc[("people", "rmsd"), "value"] == pytest.approx(0, abs=1e-9)
@@ -164,7 +170,7 @@ def test_a_person_as_a_model_stands_in_the_zone_of_people(answers: Answers) -> N
                    answers.stimuli, answers.yes[others], answers.label,
                    answers.log_rt[others])  # fmt: skip
     as_model = Models(("person",), answers.yes[4:5], answers.yes[4:5])
-    table = compare_with_people(as_model, rest, FEW).set_index("measure")["value"]
+    table = measures(as_model, rest, FEW).set_index("measure")["value"]
     every = {}
     for k in range(12):
         chosen = np.arange(12) != k
@@ -222,7 +228,7 @@ def test_tables_become_models_and_what_has_no_counterpart_is_counted(answers: An
     with pytest.raises(BadInputError, match="twice"):
         models_of(pd.concat([rows, rows.iloc[[3]]]), answers)
     nothing, dropped = models_of(rows.assign(stimulus=rows.index.astype(str)), answers)
-    table = compare_with_people(nothing, answers, FEW)
+    table = measures(nothing, answers, FEW)
     assert table["value"].isna().all() and table["reason"].str.contains("predicts none").all()
     assert dropped["stimuli"].sum() == 100
 
@@ -280,7 +286,7 @@ def test_all_scenarios_and_their_mean() -> None:
             assert scores.loc[(model, "mean", measure), "value"] == pytest.approx(values.mean())
     answers = answers_of(test, "roll")
     models, _ = models_of(predictions, answers)
-    alone = compare_with_people(models, answers, FEW).set_index(["model", "measure"])
+    alone = measures(models, answers, FEW).set_index(["model", "measure"])
     here = scores.xs("roll", level="scenario").loc[alone.index]
     pd.testing.assert_frame_equal(here[alone.columns.drop("scenario")],
                                   alone.drop(columns="scenario"))  # fmt: skip

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from physion.analysis.people.answers import answers_of, share
+from physion.analysis.people.answers import answers_of, mean_over_people
 from physion.analysis.people.official_responses import read_official_responses
 from physion.analysis.people.participants import (
     CONFLICT,
@@ -292,6 +292,6 @@ def test_answers_as_arrays_hold_what_the_rows_say() -> None:
     np.testing.assert_allclose(answers.shares(), by_hand.loc[list(answers.stimuli)])
     weights = np.array([[2.0, 0, 1, 1]])
     drawn = np.repeat(answers.yes, weights[0].astype(int), axis=0)
-    np.testing.assert_allclose(share(answers.yes, weights)[0], np.nanmean(drawn, axis=0))
+    np.testing.assert_allclose(mean_over_people(answers.yes, weights)[0], np.nanmean(drawn, axis=0))
     with pytest.raises(BadInputError, match="no answer"):
         answers_of(test, "drape")

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import stats
 
-from physion.analysis.models.scores import scores, summands, why_no_r
+from physion.analysis.metrics import sample_of_rows, score_metrics
 from physion.analysis.statistics import agreement
+from physion.analysis.statistics.agreement import why_no_r
 from physion.analysis.statistics.bootstrap import Bootstrap
 
 Array = npt.NDArray[np.float64]
@@ -95,6 +96,11 @@ def test_ceiling_without_a_signal_is_undefined() -> None:
 # --- scores from sums ------------------------------------------------------------------------
 
 
+def scores(rows: pd.DataFrame, weights: Array) -> dict[str, Array]:
+    sample = sample_of_rows(rows, weights)
+    return {metric.name: metric(sample)[:, 0] for metric in score_metrics()}
+
+
 def rows_of(pair: Array, seed: int) -> pd.DataFrame:
     generator = np.random.default_rng(seed)
     n = pair.shape[1]
@@ -111,9 +117,9 @@ def rows_of(pair: Array, seed: int) -> pd.DataFrame:
 
 
 @given(pairs, st.integers(0, 99))
-def test_scores_from_sums_are_the_plain_metrics(pair: Array, seed: int) -> None:
+def test_metrics_from_sums_are_the_plain_ones(pair: Array, seed: int) -> None:
     rows = rows_of(pair, seed)
-    found = {key: float(value) for key, value in scores(summands(rows).sum(axis=0)).items()}
+    found = {key: value.item() for key, value in scores(rows, np.ones((1, len(rows)))).items()}
     same = rows[rows["label"] == rows["simulated"]]
     expected = {
         "accuracy": agreement.accuracy(rows["predicted"], rows["label"]),
@@ -132,7 +138,7 @@ def test_scores_from_sums_are_the_plain_metrics(pair: Array, seed: int) -> None:
 def test_resamples_are_what_drawing_rows_gives(pair: Array, seed: int) -> None:
     rows = rows_of(pair, seed)
     weights = Bootstrap(resamples=3, seed=seed).weights("collide", len(rows))
-    found = scores(weights @ summands(rows))
+    found = scores(rows, weights)
     for number, weight in enumerate(weights):
         drawn = rows.loc[np.repeat(rows.index, weight.astype(int))]
         plain = agreement.pearson(drawn["p_contact"], drawn["p_yes"])

@@ -15,37 +15,18 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from physion.analysis.people.answers import Answers, share
+from physion.analysis.metrics import RESAMPLED, Resampled, Sample, measure_metrics
+from physion.analysis.people.answers import Answers, mean_over_people
 from physion.analysis.people.people import draws_of_people
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.statistics.calibration import check_probabilities
-from physion.analysis.statistics.correlation import correlate_resampled
 from physion.analysis.statistics.kappa import (
     correctness,
     cross_kappa,
-    pair_values,
-    pairwise_kappa,
-    resampled_kappa,
-    resampled_mean_kappa,
 )
 from physion.errors import BadInputError
 
 Array = npt.NDArray[np.float64]
-
-MEASURES = ("accuracy", "difference", "r", "rmsd", "euclid_over_n", "kappa", "kappa_gap",
-            "error_consistency")  # fmt: skip
-"""- ``accuracy``: share of right answers;
-- ``difference``: accuracy less the mean accuracy of people on the same stimuli;
-- ``r``: Pearson's r of P(contact) with the share of people who say yes;
-- ``rmsd``: root of the mean squared difference of the same two;
-- ``euclid_over_n``: the "RMSE" of the released notebooks, rmsd / sqrt(stimuli);
-- ``kappa``: Cohen's kappa with each participant, mean over them;
-- ``kappa_gap``: kappa less the mean kappa of all pairs of participants: the preregistered yardstick
-  of how like people a model answers, best near 0;
-- ``error_consistency``: kappa of right and wrong with each participant, mean over them."""
-
-RESAMPLED = ("people", "stimuli", "both")
-"""What an interval draws with replacement."""
 
 TABLE_COLUMNS = (
     *("model", "scenario", "measure", "stimuli", "value"),
@@ -123,26 +104,22 @@ class Measured:
     answers: Answers
     values: dict[str, Array]
     pairs: dict[str, Array]
-    draws: dict[str, dict[str, Array]]
+    draws: dict[Resampled, dict[str, Array]]
 
 
 def measure_models(models: Models, answers: Answers, bootstrap: Bootstrap) -> Measured:
-    """Every measure of every model, and its resamples."""
-    values, pairs = _values(models, answers)
-    draws = {what: _resampled(models, answers, bootstrap, what) for what in RESAMPLED}
+    """Compute every measure of every model, and its resamples."""
+    sample = sample_of_models(models, answers)
+    values, pairs = {}, {}
+    for metric in measure_metrics():
+        values[metric.name] = metric(sample)[0]
+        if metric.by_participant is not None:
+            pairs[metric.name] = metric.by_participant(sample)
+    draws: dict[Resampled, dict[str, Array]] = {
+        what: {m.name: m(resamples) for m in measure_metrics() if what in m.resampled}
+        for what, resamples in _samples(models, answers, bootstrap).items()
+    }
     return Measured(models, answers, values, pairs, draws)
-
-
-def compare_with_people(
-    models: Models, answers: Answers, bootstrap: Bootstrap | None = None
-) -> pd.DataFrame:
-    """Every model's measures in one scenario, one row a model and measure; see `measure_table`.
-
-    To call for models and people that one has as arrays; `people_comparison.compare_everywhere`
-    does the same, and more, from tables of all scenarios.
-    """
-    draws = bootstrap or Bootstrap()
-    return measure_table(measure_models(models, answers, draws), draws)
 
 
 def measure_table(measured: Measured, bootstrap: Bootstrap) -> pd.DataFrame:
@@ -155,7 +132,7 @@ def measure_table(measured: Measured, bootstrap: Bootstrap) -> pd.DataFrame:
     """
     models, records = measured.models, []
     for k, name in enumerate(models.names):
-        for measure in MEASURES:
+        for measure in measured.values:
             value = float(measured.values[measure][k])
             draws = {what: measured.draws[what].get(measure) for what in RESAMPLED}
             own = {what: None if drawn is None else drawn[:, k] for what, drawn in draws.items()}
@@ -178,7 +155,7 @@ def measure_table(measured: Measured, bootstrap: Bootstrap) -> pd.DataFrame:
 
 
 def interval_columns(
-    value: float, draws: Mapping[str, Array | None], bootstrap: Bootstrap
+    value: float, draws: Mapping[Resampled, Array | None], bootstrap: Bootstrap
 ) -> tuple[dict[str, Any], list[str]]:
     """``value`` with ``low_`` and ``high_`` of each of `RESAMPLED`, and reasons for what is NaN."""
     record: dict[str, Any] = {"value": value}
@@ -196,87 +173,45 @@ def interval_columns(
     return record, reasons
 
 
-def _values(models: Models, answers: Answers) -> tuple[dict[str, Array], dict[str, Array]]:
-    """The value of each measure by model, and the (people, models) matrices behind two of them."""
-    everybody = np.ones((1, len(answers.sessions)))
-    everything = np.ones((1, len(answers.stimuli)))
-    found = _by_sums(models, answers, everything, share(answers.yes)[None], everybody)
-    pairs = {
-        "kappa": cross_kappa(answers.yes, models.predicted),
-        "error_consistency": cross_kappa(
-            answers.correct, correctness(models.predicted, answers.label)
-        ),
-    }
-    values = {name: rows[0] for name, rows in found.items()}
-    for name, matrix in pairs.items():
-        values[name] = share(matrix)
-    among = pair_values(pairwise_kappa(answers.yes))
-    known = among[np.isfinite(among)]
-    values["kappa_gap"] = values["kappa"] - (np.mean(known) if len(known) else np.nan)
-    return values, pairs
-
-
-def _resampled(models: Models, answers: Answers, draws: Bootstrap, what: str) -> dict[str, Array]:
-    """Each measure in each resample, (resamples, m); without what does not depend on the draw."""
-    b, n, s = draws.resamples, len(answers.sessions), len(answers.stimuli)
-    people = draws_of_people(answers, draws) if what != "stimuli" else np.ones((b, n))
-    stimuli = draws.weights(answers.scenario, s) if what != "people" else np.ones((b, s))
-    found = _by_sums(models, answers, stimuli, share(answers.yes, people), people)
-    right = correctness(models.predicted, answers.label)
-    drawn = None if what == "people" else stimuli
-    found["kappa"] = _drawn_kappa(answers.yes, models.predicted, drawn, people)
-    found["error_consistency"] = _drawn_kappa(answers.correct, right, drawn, people)
-    among = resampled_mean_kappa(answers.yes, drawn, people)
-    found["kappa_gap"] = found["kappa"] - among[:, None]
-    if what == "people":
-        del found["accuracy"]
-    return found
-
-
-def _drawn_kappa(theirs: Array, own: Array, stimuli: Array | None, people: Array) -> Array:
-    """Mean kappa over the people drawn, (resamples, m)."""
-    if stimuli is None:
-        return share(cross_kappa(theirs, own), people)
-    means = []
-    for model in own:
-        kappa = resampled_kappa(theirs, model, stimuli)
-        known = np.isfinite(kappa)
-        total = np.sum(np.where(known, kappa, 0.0) * people, axis=1)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            means.append(total / np.sum(known * people, axis=1))
-    return np.stack(means, axis=1)
-
-
-def _by_sums(
-    models: Models, answers: Answers, stimuli: Array, shares: Array, people: Array
-) -> dict[str, Array]:
-    """The measures that are functions of weighted sums over stimuli, (resamples, m).
-
-    ``stimuli`` (resamples, s) and ``people`` (resamples, n) count the draws, ``shares``
-    (resamples, s) is the share of yes among the people drawn.
-    """
-    has = (~np.isnan(models.p_contact)).astype(np.float64)
-    right = np.nan_to_num(correctness(models.predicted, answers.label))
-    x = np.nan_to_num(models.p_contact)
-    seen = np.isfinite(shares)
-    weights, y = np.where(seen, stimuli, 0.0), np.where(seen, shares, 0.0)
-    human = np.where(seen, share(answers.correct, people), 0.0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        n = weights @ has.T
-        accuracy = (stimuli @ right.T) / (stimuli @ has.T)
-        of_people = ((weights * human) @ has.T) / n
-        own = (weights @ right.T) / n
-        # (x - y)^2 with both around 0.5, so that little is lost in the subtractions.
-        a, c = np.where(has > 0, x - 0.5, 0.0), y - 0.5
-        square = weights @ (a * a).T - 2 * (weights * c) @ a.T + (weights * c * c) @ has.T
-        distance = np.sqrt(np.maximum(square, 0.0) / n)
+def _samples(models: Models, answers: Answers, draws: Bootstrap) -> dict[Resampled, Sample]:
+    """Return the resamples for the intervals, by what is drawn."""
+    people = draws_of_people(answers, draws)
+    stimuli = draws.weights(answers.scenario, len(answers.stimuli))
     return {
-        "accuracy": accuracy,
-        "difference": own - of_people,
-        "r": correlate_resampled(models.p_contact, shares, stimuli),
-        "rmsd": distance,
-        "euclid_over_n": distance / np.sqrt(n),
+        "people": sample_of_models(models, answers, None, people, "people"),
+        "stimuli": sample_of_models(models, answers, stimuli, None, "stimuli"),
+        "both": sample_of_models(models, answers, stimuli, people, "both"),
     }
+
+
+def sample_of_models(
+    models: Models,
+    answers: Answers,
+    stimuli: Array | None = None,
+    people: Array | None = None,
+    drawn: Resampled | None = None,
+) -> Sample:
+    """Return models and people with weights of stimuli (b, s) and of people (b, n).
+
+    Weights that are None count everything once.
+    """
+    resamples = 1 if people is None else len(people)
+    if stimuli is None:
+        stimuli = np.ones((resamples, len(answers.stimuli)))
+    p_yes, right = mean_over_people(answers.yes, people), mean_over_people(answers.correct, people)
+    everybody = np.ones((len(stimuli), len(answers.sessions)))
+    return Sample(
+        p_contact=models.p_contact,
+        predicted=models.predicted,
+        label=answers.label,
+        shown=answers.label,
+        p_yes=np.atleast_2d(p_yes),
+        human_accuracy=np.atleast_2d(right),
+        stimuli=stimuli,
+        answers=answers,
+        people=everybody if people is None else people,
+        drawn=drawn,
+    )
 
 
 def _over_people(values: Array) -> dict[str, float]:

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from physion.analysis.metrics import RESAMPLED
 from physion.analysis.models.model_people import (
-    MEASURES,
-    RESAMPLED,
     Measured,
     interval_columns,
     measure_models,
@@ -107,7 +106,7 @@ def _mean_table(measured: Sequence[Measured], bootstrap: Bootstrap) -> pd.DataFr
     """The mean over scenarios; their people and stimuli are drawn independently."""
     records = []
     for k, name in enumerate(measured[0].models.names):
-        for measure in MEASURES:
+        for measure in measured[0].values:
             values = [float(one.values[measure][k]) for one in measured]
             draws = {}
             for what in RESAMPLED:

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from physion.analysis.people.answers import Answers, share
+from physion.analysis.people.answers import Answers, mean_over_people
 from physion.analysis.statistics.agreement import rmsd
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.statistics.correlation import correlate_rows
@@ -33,7 +33,7 @@ def human_zones(answers: Answers, halves: Array | None = None) -> pd.DataFrame:
     no probability, which costs r and rmsd; halves are averages and reach more.
     """
     yes, n = answers.yes, len(answers.sessions)
-    others = share(yes, 1 - np.eye(n))
+    others = mean_over_people(yes, 1 - np.eye(n))
     right = answers.correct
     kappa, errors = cross_kappa(yes, yes), cross_kappa(right, right)
     for matrix in (kappa, errors):
@@ -41,12 +41,12 @@ def human_zones(answers: Answers, halves: Array | None = None) -> pd.DataFrame:
     apart = [rmsd_of(own, rest) for own, rest in zip(yes, others, strict=True)]
     upper = np.triu_indices(n, 1)
     found: list[tuple[str, str, npt.ArrayLike]] = [
-        ("accuracy", "participants", share(right.T)),
+        ("accuracy", "participants", mean_over_people(right.T)),
         ("r", "participants", correlate_rows(yes, others)),
         ("rmsd", "participants", apart),
         ("euclid_over_n", "participants", apart / np.sqrt(np.sum(~np.isnan(yes), axis=1))),
-        ("kappa", "participants", share(kappa)),
-        ("error_consistency", "participants", share(errors)),
+        ("kappa", "participants", mean_over_people(kappa)),
+        ("error_consistency", "participants", mean_over_people(errors)),
         ("kappa", "pairs", kappa[upper]),
         ("error_consistency", "pairs", errors[upper]),
     ]

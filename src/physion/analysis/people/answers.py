@@ -39,10 +39,10 @@ class Answers:
 
     def shares(self) -> Array:
         """Share of people who said yes, by stimulus, (s,)."""
-        return share(self.yes)
+        return mean_over_people(self.yes)
 
 
-def share(values: Array, weights: npt.ArrayLike | None = None) -> Array:
+def mean_over_people(values: Array, weights: npt.ArrayLike | None = None) -> Array:
     """Mean over people by stimulus of values (n, s) with gaps; NaN where nobody answered.
 
     With ``weights`` (resamples, n), how often each person is drawn: shape (resamples, s).

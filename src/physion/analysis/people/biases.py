@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pandas as pd
 from scipy import stats
 
-from physion.analysis.people.answers import Answers, share
+from physion.analysis.people.answers import Answers, mean_over_people
 from physion.analysis.people.people import accuracy_by_participant, all_answers, draws_of_people
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.statistics.clustered_logit import clustered_logit
@@ -76,7 +76,7 @@ def _mean_with_interval(
     name: str, own: Array, weights: Array, draws: Bootstrap
 ) -> dict[str, float]:
     known = np.isfinite(own)
-    drawn = share(own[:, None], weights)[:, 0]
+    drawn = mean_over_people(own[:, None], weights)[:, 0]
     low, high = draws.interval(drawn) if known.sum() > 1 else (np.nan, np.nan)
     mean = float(np.mean(own[known])) if known.any() else np.nan
     return {name: mean, f"{name}_low": low, f"{name}_high": high}

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pandas as pd
 from scipy import stats
 
-from physion.analysis.people.answers import share
+from physion.analysis.people.answers import mean_over_people
 from physion.analysis.people.people import split_halves
 from physion.analysis.statistics.correlation import correlate_rows
 from physion.analysis.statistics.paired import benjamini_hochberg
@@ -76,7 +76,7 @@ def r_by_third(
     """
     answers, truth = np.asarray(yes, np.float64), np.asarray(label, np.float64)
     models = np.atleast_2d(np.asarray(p_contact, np.float64))
-    shares = share(answers)
+    shares = mean_over_people(answers)
     third = difficulty_third(np.where(truth == 1, shares, 1 - shares)).to_numpy()
     rows: list[tuple[str, int, int, float, float, float]] = []
     for name in THIRDS:

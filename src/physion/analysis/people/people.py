@@ -14,7 +14,7 @@ import numpy.typing as npt
 import pandas as pd
 from scipy import stats
 
-from physion.analysis.people.answers import Answers, answers_of, share
+from physion.analysis.people.answers import Answers, answers_of, mean_over_people
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.statistics.correlation import correlate_rows
 from physion.analysis.statistics.kappa import (
@@ -55,8 +55,8 @@ def accuracy_by_stimulus(test: pd.DataFrame, bootstrap: Bootstrap | None = None)
     draws = bootstrap or Bootstrap()
     parts = []
     for answers in all_answers(test):
-        p_yes, accuracy = answers.shares(), share(answers.correct)
-        drawn = share(answers.correct, draws_of_people(answers, draws))
+        p_yes, accuracy = answers.shares(), mean_over_people(answers.correct)
+        drawn = mean_over_people(answers.correct, draws_of_people(answers, draws))
         bounds = [draws.interval(column) for column in drawn.T]
         table = pd.DataFrame({"scenario": answers.scenario, "stimulus": answers.stimuli})
         parts.append(
@@ -68,7 +68,7 @@ def accuracy_by_stimulus(test: pd.DataFrame, bootstrap: Bootstrap | None = None)
                 accuracy_high=[high for _, high in bounds],
                 p_yes=p_yes,
                 consistency=np.maximum(p_yes, 1 - p_yes),
-                mean_log_rt=share(answers.log_rt),
+                mean_log_rt=mean_over_people(answers.log_rt),
             )
         )
     return pd.concat(parts, ignore_index=True)
@@ -214,7 +214,7 @@ def split_halves(yes: Array, halves: int = HALVES, seed: int = 0) -> Array:
     rng = generator("halves", seed, n)
     order = rng.permuted(np.tile(np.arange(n), (halves, 1)), axis=1)
     first = (order < n // 2).astype(np.float64)
-    return correlate_rows(share(yes, first), share(yes, 1 - first))
+    return correlate_rows(mean_over_people(yes, first), mean_over_people(yes, 1 - first))
 
 
 def spearman_brown(r: npt.ArrayLike, factor: float = 2.0) -> Array:

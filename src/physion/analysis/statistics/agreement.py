@@ -94,3 +94,15 @@ def rmsd_floor(y: npt.ArrayLike, count: npt.ArrayLike) -> float:
     `sampling_variance`; NaN without stimuli or with one person alone."""
     noise = sampling_variance(y, count)
     return float(np.sqrt(np.mean(noise))) if len(noise) else float("nan")
+
+
+def why_no_r(x: npt.ArrayLike, y: npt.ArrayLike) -> str:
+    """In words why Pearson's r of these is undefined; empty where it is defined."""
+    a, b = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
+    if not np.isfinite(b).all():
+        return "r: no answers of people"
+    if len(a) < FEWEST:
+        return f"r: fewer than {FEWEST} stimuli"
+    if np.std(a) < CONSTANT:
+        return "r: the model's P(contact) is constant"
+    return "r: people's answers are constant" if np.std(b) < CONSTANT else ""

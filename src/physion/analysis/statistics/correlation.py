@@ -18,7 +18,7 @@ def correlate_rows(x: npt.ArrayLike, y: npt.ArrayLike) -> Array:
     a, b = np.asarray(x, dtype=np.float64) - 0.5, np.asarray(y, dtype=np.float64) - 0.5
     shared = np.isfinite(a) & np.isfinite(b)
     a, b = np.where(shared, a, 0.0), np.where(shared, b, 0.0)
-    return from_sums(
+    return correlation_from_sums(
         shared.sum(axis=1).astype(np.float64),
         a.sum(axis=1), b.sum(axis=1),
         (a * a).sum(axis=1), (b * b).sum(axis=1), (a * b).sum(axis=1),
@@ -35,13 +35,13 @@ def correlate_resampled(x: npt.ArrayLike, y: npt.ArrayLike, weights: npt.ArrayLi
     has_a, has_b = np.isfinite(a).astype(np.float64), np.isfinite(b)
     a, b = np.where(has_a > 0, a, 0.0), np.where(has_b, b, 0.0)
     w = np.where(has_b, np.asarray(weights, dtype=np.float64), 0.0)
-    return from_sums(
+    return correlation_from_sums(
         w @ has_a.T, w @ a.T, (w * b) @ has_a.T,
         w @ (a * a).T, (w * b * b) @ has_a.T, (w * b) @ a.T,
     )  # fmt: skip
 
 
-def from_sums(n: Array, x: Array, y: Array, xx: Array, yy: Array, xy: Array) -> Array:
+def correlation_from_sums(n: Array, x: Array, y: Array, xx: Array, yy: Array, xy: Array) -> Array:
     """r from sums of values that lie around 0, so that little is lost in the subtractions."""
     with np.errstate(divide="ignore", invalid="ignore"):
         spread_x, spread_y = xx / n - (x / n) ** 2, yy / n - (y / n) ** 2

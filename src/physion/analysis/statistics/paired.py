@@ -14,7 +14,7 @@ from scipy import stats
 
 from physion.analysis.statistics.agreement import pearson
 from physion.analysis.statistics.bootstrap import Bootstrap
-from physion.analysis.statistics.correlation import correlate_resampled, from_sums
+from physion.analysis.statistics.correlation import correlate_resampled, correlation_from_sums
 from physion.errors import BadInputError
 from physion.seeds import generator
 
@@ -95,7 +95,7 @@ def _swapped_r(a: Array, b: Array, y: Array, swap: Array) -> Array:
     """r with ``y`` of ``a``, in which the stimuli of ``swap`` have the value of ``b``."""
     change = swap @ np.stack([b - a, b * b - a * a, (b - a) * y], axis=1)
     n, ones = float(len(a)), np.ones(len(swap))
-    return from_sums(
+    return correlation_from_sums(
         n * ones, a.sum() + change[:, 0], y.sum() * ones,
         (a * a).sum() + change[:, 1], (y * y).sum() * ones, (a * y).sum() + change[:, 2],
     )  # fmt: skip

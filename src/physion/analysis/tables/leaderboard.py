@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from physion.analysis.metrics import leaderboard_metrics
 from physion.analysis.models.comparison import NOT_PREDICTED, compare
 from physion.analysis.people.exclusions import (
     PREREGISTERED,
@@ -26,14 +27,12 @@ from physion.analysis.people.exclusions import (
 from physion.analysis.people.participants import Responses, check_labels
 from physion.analysis.people.people import all_answers
 from physion.analysis.statistics.bootstrap import Bootstrap
-from physion.analysis.tables.leaderboard_rows import SCORED, read_submission, score_models
+from physion.analysis.tables.leaderboard_rows import read_submission, score_models
 from physion.analysis.tables.stimuli import MEAN, POOLED
 from physion.errors import BadInputError, UnknownNameError
 from physion.stimulus_names import SCENARIOS
 
-LOWER_IS_BETTER = ("rmsd",)
-
-COLUMNS = (
+FIRST_COLUMNS = (
     "rank",
     "model",
     "readout",
@@ -43,20 +42,25 @@ COLUMNS = (
     "of_scenarios",
     "stimuli",
     "of_stimuli",
-    *(f"{score}{end}" for score in (*SCORED, "kappa") for end in ("", "_low", "_high")),
-    "versions",
-    "agent",
-    "reason",
 )
-"""Columns of the table. ``scenarios`` and ``stimuli`` count what the scores rest on, out of
-``of_scenarios`` and ``of_stimuli``: what people saw or, without people, what all files name.
-``agent`` is the name by which the file's own rows are told apart; ``reason`` says what a score
-rests on where that is not everything, and why a score is NaN."""
+LAST_COLUMNS = ("versions", "agent", "reason")
+
+
+def columns() -> list[str]:
+    """Return the columns of the table: each metric with ``_low`` and ``_high`` between the names.
+
+        ``scenarios`` and ``stimuli`` count what the scores rest on, out of
+    ``of_scenarios`` and ``of_stimuli``: what people saw or, without people, what all files name.
+    ``agent`` is the name by which the file's own rows are told apart; ``reason`` says what a score
+    rests on where that is not everything, and why a score is NaN.
+    """
+    scores = [f"{one.name}{end}" for one in leaderboard_metrics() for end in ("", "_low", "_high")]
+    return [*FIRST_COLUMNS, *scores, *LAST_COLUMNS]
 
 
 @dataclass(frozen=True)
 class Leaderboard:
-    """The ranked table (`COLUMNS`), what was left out of each file (``file``, ``agent``,
+    """The ranked table (`columns`), what was left out of each file (``file``, ``agent``,
     ``scenario``, ``reason``, ``stimuli``), the files that could not be compared (``file``,
     ``reason``), the answers of people that were left out (`Responses.dropped`; None: there were no
     single answers), and the choices in words."""
@@ -130,7 +134,7 @@ def leaderboard(
     table = _with_asked(pd.concat(tables, ignore_index=True), asked, scenario)
     order = ["file", "agent", "scenario", "reason", "stimuli"]
     return Leaderboard(
-        sort_leaderboard(table.reindex(columns=list(COLUMNS))),
+        sort_leaderboard(table.reindex(columns=columns())),
         left_out[order],
         pd.DataFrame(refused, columns=["file", "reason"]),
         None if kept is None else kept.dropped,
@@ -202,14 +206,16 @@ def sort_leaderboard(
     """
     if by not in table.columns or by == "rank":
         raise UnknownNameError("column", by, [name for name in table.columns if name != "rank"])
+    scores = {metric.name: metric for metric in leaderboard_metrics()}
+    metric = scores.get(by.removesuffix("_low").removesuffix("_high"))
     if ascending is None:
         numeric = pd.api.types.is_numeric_dtype(table[by])
-        ascending = not numeric or by.removesuffix("_low").removesuffix("_high") in LOWER_IS_BETTER
+        ascending = not numeric or (metric is not None and metric.better == "lower")
     ties = [name for name in ("model", "readout", "training", "file", "agent") if name != by]
     order = table.sort_values(ties, kind="stable").sort_values(
         by, ascending=ascending, kind="stable", na_position="last"
     )
-    if by.removesuffix("_low").removesuffix("_high") in (*SCORED, "kappa"):
+    if metric is not None:
         after = _is_partial(order).astype(int).mask(order[by].isna(), 2)
         order = order.loc[after.sort_values(kind="stable").index]
     return order.assign(rank=np.arange(1, len(order) + 1)).reset_index(drop=True)

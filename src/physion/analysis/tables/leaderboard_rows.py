@@ -7,26 +7,18 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 
+from physion.analysis.metrics import Metric, leaderboard_metrics
 from physion.analysis.models.comparison import Comparison
-from physion.analysis.models.model_people import models_of
-from physion.analysis.people.answers import Answers, share
+from physion.analysis.models.model_people import models_of, sample_of_models
+from physion.analysis.people.answers import Answers
 from physion.analysis.people.people import draws_of_people
 from physion.analysis.statistics.bootstrap import Bootstrap
-from physion.analysis.statistics.kappa import cross_kappa
 from physion.analysis.tables.csv_table import read_csv
 from physion.analysis.tables.predictions import REQUIRED, check_predictions, name_models
 from physion.analysis.tables.stimuli import MEAN, POOLED
 from physion.errors import BadInputError
-
-Array = npt.NDArray[np.float64]
-
-SCORED = ("accuracy", "difference", "r", "rmsd")
-"""Scores by `scores.scores` that the table shows, each with ``_low`` and ``_high``."""
-
-KAPPA_NEEDS = "kappa: needs the answers of single participants"
 
 
 def read_submission(path: Path) -> tuple[pd.DataFrame, dict[str, str]]:
@@ -75,7 +67,12 @@ def score_models(
     chosen = found.scores[found.scores["scenario"] == scenario]
     if chosen.empty:
         raise BadInputError(f"nothing of scenario {scenario!r} can be compared")
-    scored = [f"{score}{end}" for score in SCORED for end in ("", "_low", "_high")]
+    scored = [
+        f"{metric.name}{end}"
+        for metric in leaderboard_metrics()
+        if metric.in_scores
+        for end in ("", "_low", "_high")
+    ]
     table = chosen[["agent", "model", "readout", "stimuli", "reason", *scored]].copy()
     counts = found.stimuli.groupby("agent")["scenario"].nunique()
     table["scenarios"] = table["agent"].map(counts) if scenario in (MEAN, POOLED) else 1
@@ -83,49 +80,49 @@ def score_models(
     table["training"] = table["agent"].map(training)
     if not found.has_people:
         return table
-    table[["kappa", "kappa_low", "kappa_high"]] = np.nan
-    if answers:
-        _add_kappa(table, found, answers, scenario, draws)
-    else:
-        table["reason"] = _also(table["reason"], KAPPA_NEEDS)
+    for metric in leaderboard_metrics():
+        if metric.in_scores:
+            continue
+        table[[metric.name, f"{metric.name}_low", f"{metric.name}_high"]] = np.nan
+        if answers:
+            _add_metric(table, metric, found, answers, scenario, draws)
+        else:
+            why = f"{metric.name}: needs the answers of single participants"
+            table["reason"] = _also(table["reason"], why)
     return table
 
 
-def _add_kappa(
+def _add_metric(
     table: pd.DataFrame,
-    found: Comparison,
+    metric: Metric,
+    comparison: Comparison,
     answers: Mapping[str, Answers],
     scenario: str,
     draws: Bootstrap,
 ) -> None:
-    """Mean kappa with the participants, averaged over scenarios, drawn over participants."""
-    for place, agent in table["agent"].items():
-        own = found.stimuli[found.stimuli["agent"] == agent]
+    """Add a metric with participants: mean over scenarios, interval by drawing participants."""
+    key = metric.name
+    for index, agent in table["agent"].items():
+        own = comparison.stimuli[comparison.stimuli["agent"] == agent]
         names = own["scenario"].unique() if scenario in (MEAN, POOLED) else [scenario]
         if scenario == POOLED or any(name not in answers for name in names):
-            why = "kappa: pooled over scenarios nobody answered all stimuli"
+            why = f"{key}: pooled over scenarios nobody answered all stimuli"
             if scenario != POOLED:
-                why = "kappa: no answers of single participants for every scenario"
-            table.loc[place, "reason"] = "; ".join(filter(None, [table["reason"][place], why]))
+                why = f"{key}: no answers of single participants for every scenario"
+            table.loc[index, "reason"] = "; ".join(filter(None, [table["reason"][index], why]))
             continue
         values, resampled = [], []
         for name in names:
-            value, drawn = _kappa(own[own["scenario"] == name], answers[name], draws)
-            values.append(value)
-            resampled.append(drawn)
+            models, _ = models_of(own[own["scenario"] == name], answers[name])
+            values.append(float(metric(sample_of_models(models, answers[name]))[0, 0]))
+            people = draws_of_people(answers[name], draws)
+            sample = sample_of_models(models, answers[name], None, people, "people")
+            resampled.append(metric(sample)[:, 0])
         low, high = draws.interval(np.mean(resampled, axis=0))
-        table.loc[place, ["kappa", "kappa_low", "kappa_high"]] = [np.mean(values), low, high]
+        table.loc[index, [key, f"{key}_low", f"{key}_high"]] = [np.mean(values), low, high]
         if not np.isfinite(np.mean(values)):
-            why = "kappa: undefined, model and people always give the same one answer"
-            table.loc[place, "reason"] = "; ".join(filter(None, [table["reason"][place], why]))
-
-
-def _kappa(rows: pd.DataFrame, answers: Answers, draws: Bootstrap) -> tuple[float, Array]:
-    """Mean over participants of kappa in one scenario, and that in each resample of them."""
-    models, _ = models_of(rows, answers)
-    pairs = cross_kappa(answers.yes, models.predicted)
-    drawn = share(pairs, draws_of_people(answers, draws))
-    return float(share(pairs)[0]), drawn[:, 0]
+            why = f"{key}: undefined, model and people always give the same one answer"
+            table.loc[index, "reason"] = "; ".join(filter(None, [table["reason"][index], why]))
 
 
 def _also(reasons: pd.Series, why: str) -> pd.Series:

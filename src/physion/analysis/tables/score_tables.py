@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from physion.analysis.models.scores import SCORES, scores, summands, why_no_r
+from physion.analysis.metrics import Sample, pool, sample_of_rows, score_metrics
 from physion.analysis.statistics import agreement
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.tables.stimuli import MEAN, POOLED, in_order
@@ -17,13 +17,22 @@ Array = npt.NDArray[np.float64]
 
 
 def score_table(stimuli: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
-    """The scores of every model, from a table of one row a model and stimulus.
+    """Return the scores of every model.
 
-    Rows: for each ``agent`` its scenarios, then `MEAN` and `POOLED`. Columns: ``agent``, ``model``,
-    ``readout``, ``scenario``, ``stimuli`` and ``changed`` (counts; those whose simulated outcome is
-    not the official one), every score of `scores.SCORES` with ``_low`` and ``_high``, ``ceiling``
-    of r and ``floor`` of the RMSD, ``reason`` (why a score or an interval is NaN, or says less than
-    it seems to, as where all labels are of one class; else empty).
+    Parameters
+    ----------
+    stimuli
+        One row a model and stimulus, as `comparison.Comparison.stimuli`.
+    bootstrap
+        Draws for the intervals: stimuli within each scenario.
+
+    Returns
+    -------
+    For each ``agent`` its scenarios, then `MEAN` and `POOLED`. Columns: ``agent``, ``model``,
+    ``readout``, ``scenario``; counts of ``stimuli`` and of ``changed`` ones, whose simulated
+    outcome is not the official one; every metric of `metrics.score_metrics` with ``_low`` and
+    ``_high``; ``ceiling`` of r and ``floor`` of the RMSD; ``reason``: why a score or an interval is
+    NaN, or means less than it seems to (for example if all labels are of one class); else empty.
     """
     # Sorted, so that a draw means the same stimulus whatever the order of the files.
     ordered = stimuli.sort_values("stimulus", kind="stable")
@@ -38,12 +47,11 @@ def score_table(stimuli: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
 def _agent_rows(rows: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
     names = in_order(rows["scenario"])
     parts = [rows[rows["scenario"] == name] for name in names]
-    # Row 0 of the sums is the sample itself, the rest are its resamples.
-    sums = [_all_sums(part, name, bootstrap) for part, name in zip(parts, names, strict=True)]
-    by_scenario = [scores(total) for total in sums]
-    mean = {key: np.mean([found[key] for found in by_scenario], axis=0) for key in SCORES}
+    samples = [_sample(part, name, bootstrap) for part, name in zip(parts, names, strict=True)]
+    by_scenario = [_scores(sample) for sample in samples]
+    mean = {key: np.mean([values[key] for values in by_scenario], axis=0) for key in by_scenario[0]}
     records = [
-        _record(name, part, found, bootstrap, why_no_r(part["p_contact"], part["p_yes"]))
+        _record(name, part, found, bootstrap, agreement.why_no_r(part["p_contact"], part["p_yes"]))
         for name, part, found in zip(names, parts, by_scenario, strict=True)
     ]
     undefined = [
@@ -55,8 +63,8 @@ def _agent_rows(rows: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
     records.append(_record(MEAN, rows, mean, bootstrap, "; ".join(whys)))
     for key in ("ceiling", "floor"):
         records[-1][key] = float(np.mean([record[key] for record in records[:-1]]))
-    pooled = scores(np.sum(sums, axis=0))
-    why = why_no_r(rows["p_contact"], rows["p_yes"])
+    pooled = _scores(pool(samples))
+    why = agreement.why_no_r(rows["p_contact"], rows["p_yes"])
     records.append(_record(POOLED, rows, pooled, bootstrap, why))
     table = pd.DataFrame(records)
     for place, column in enumerate(("agent", "model", "readout")):
@@ -64,10 +72,15 @@ def _agent_rows(rows: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
     return table
 
 
-def _all_sums(part: pd.DataFrame, stratum: str, bootstrap: Bootstrap) -> Array:
+def _sample(part: pd.DataFrame, stratum: str, bootstrap: Bootstrap) -> Sample:
+    """Return the stimuli of one scenario: in row 0 each once, below them the resamples."""
     weights = bootstrap.weights(stratum, len(part))
-    values = summands(part)
-    return np.vstack([values.sum(axis=0), weights @ values])
+    return sample_of_rows(part, np.vstack([np.ones(len(part)), weights]))
+
+
+def _scores(sample: Sample) -> dict[str, Array]:
+    """Return the values of every metric by stimulus, each of shape (1 + resamples,)."""
+    return {metric.name: metric(sample)[:, 0] for metric in score_metrics()}
 
 
 def _one_class(rows: pd.DataFrame) -> bool:
@@ -87,11 +100,11 @@ def _record(
         "stimuli": len(rows),
         "changed": int((rows["label"] != rows["simulated"]).sum()),
     }
-    for key in SCORES:
-        value = float(found[key][0])
+    for key, values in found.items():
+        value = float(values[0])
         # One stimulus, drawn again and again, would seem to be known without error.
         known = np.isfinite(value) and len(rows) > 1
-        low, high = bootstrap.interval(found[key][1:]) if known else (np.nan, np.nan)
+        low, high = bootstrap.interval(values[1:]) if known else (np.nan, np.nan)
         if known and np.isnan(low):
             reasons.append(f"{key}: undefined in most resamples, no interval")
         record |= {key: value, f"{key}_low": low, f"{key}_high": high}
