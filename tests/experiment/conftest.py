@@ -1,4 +1,4 @@
-"""Fixtures of all tests of the experiment: databases of both kinds, and stores on them."""
+"""Fixtures of all experiment tests: databases of both kinds, and stores on them."""
 
 from __future__ import annotations
 

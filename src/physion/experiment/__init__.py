@@ -1,1 +1,1 @@
-"""The experiment with people: a study folder, a web server, a store that loses nothing, exports."""
+"""The online experiment with people: study folder, web server, database and data export."""

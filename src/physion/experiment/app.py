@@ -1,4 +1,4 @@
-"""The application of one study: pages, endpoints, media and the experimenter's pages."""
+"""Web application of one study: participants' pages, API, media and experimenter's pages."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 
 
 def build_app(study: Study, secrets: Secrets, store: Store) -> FastAPI:
-    """Everything that one study serves. Nothing about the program itself is served."""
+    """Return the ASGI application of a study, without FastAPI's own documentation pages."""
     app = FastAPI(
         docs_url=None,
         redoc_url=None,
@@ -63,8 +63,8 @@ def _serve_pages(app: FastAPI) -> None:
 
     @app.get("/static/{name:path}")
     async def get_static(request: Request) -> Response:
-        found = files.get(request.path_params["name"])
-        return refuse("not_found") if found is None else found.response(request)
+        file = files.get(request.path_params["name"])
+        return refuse("not_found") if file is None else file.response(request)
 
 
 def _serve_media(app: FastAPI, study: Study, secrets: Secrets) -> None:
@@ -79,7 +79,7 @@ def _serve_media(app: FastAPI, study: Study, secrets: Secrets) -> None:
         try:
             return await files.response(path)
         except BadInputError as error:
-            log.error("a participant could not be shown a trial: %s", error)
+            log.error("a movie or map could not be sent to a participant: %s", error)
             return refuse("not_found", "This file is missing on the server.")
 
 

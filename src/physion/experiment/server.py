@@ -1,4 +1,4 @@
-"""The server process of one study: opens the store, listens, stops without losing anything."""
+"""Server process of one study: open the database, listen, and shut down without data loss."""
 
 from __future__ import annotations
 
@@ -23,20 +23,33 @@ from physion.experiment.app import build_app
 from physion.experiment.store.store import Store
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.media_checks import check_media
-from physion.experiment.study.recruitment import undecided
+from physion.experiment.study.recruitment import missing_settings
 from physion.experiment.study.study import load_study
-from physion.experiment.web.connections import CarefulProtocol
+from physion.experiment.web.connections import LimitedHeadProtocol
 
 STOP_SECONDS = 5
-"""Requests in work, and browsers that do not let go, are given so long to end."""
+"""Time that running requests and open connections get to end when the server shuts down."""
 KEEP_ALIVE_SECONDS = 75
-"""Longer than a trial, so that a participant's browser keeps its connection."""
+"""Longer than a trial, so that a participant's browser can reuse its connection."""
 OPEN_FILES = 65_536
+"""Wanted limit on open files (each connection is one), within the system's hard limit."""
 
 
 @dataclass(frozen=True)
 class Address:
-    """Where the server listens. ``proxies``: whose word on the client's address is believed."""
+    """Where the server listens and under which URL participants reach it.
+
+    Parameters
+    ----------
+    host, port
+        Address and port to listen on. Port 0 lets the system choose a free one.
+    base_url
+        Public URL of the study; empty if it is the listening address itself.
+    proxies
+        Addresses or networks of reverse proxies whose X-Forwarded-* headers are trusted.
+    certificate, key
+        PEM files for HTTPS; both or neither.
+    """
 
     host: str = "127.0.0.1"
     port: int = 8000
@@ -47,11 +60,11 @@ class Address:
 
     @property
     def scheme(self) -> str:
-        """By which this process itself is reached."""
+        """URL scheme under which this process itself is reached, without a proxy."""
         return "http" if self.certificate is None else "https"
 
     def is_readable_on_the_way(self) -> bool:
-        """Would other people's requests travel in clear?"""
+        """Return whether requests cross the network unencrypted: no HTTPS and no proxy."""
         return self.certificate is None and not self.proxies and not _is_loopback(self.host)
 
 
@@ -63,19 +76,35 @@ def serve(
     ready: Callable[[str], None] = lambda url: None,
     warn: Callable[[str], None] = lambda line: None,
 ) -> None:
-    """Serve the study in ``folder`` until SIGTERM or SIGINT. ``ready`` is told the address.
+    """Serve the study in ``folder`` until SIGTERM or SIGINT.
 
-    ``warn`` is told, a line each, what should be filled in before people come (`undecided`).
+    Parameters
+    ----------
+    folder
+        The study folder.
+    address
+        Where to listen.
+    database
+        URL of the database; SQLite in the study folder if None.
+    log_requests
+        Also log every request (method, path and status).
+    ready
+        Called with the URL once the server accepts connections.
+    warn
+        Called with one line for each setting that should be filled in before people take part
+        (`missing_settings`).
 
-    Raises:
-        PhysionError: no such study, a fault in it, a port in use, a bad certificate, a database
-            that cannot be reached or that another server uses.
+    Raises
+    ------
+    PhysionError
+        The study does not exist or is invalid, the port is in use, the certificate is bad, or the
+        database cannot be reached or is used by another server.
     """
     _check(address)
     _set_logging(log_requests)
     study = load_study(folder)
     check_media(study)
-    for line in undecided(study):
+    for line in missing_settings(study):
         warn(line)
     secrets = Secrets.load(folder)
     _allow_many_connections()
@@ -92,29 +121,35 @@ def serve(
 
 
 class _Server(uvicorn.Server):
-    """Uvicorn's server, which says when it is ready and leaves the process alive in the end."""
+    """Uvicorn server that reports when it is ready and returns, instead of exiting, on signals."""
 
     def __init__(self, config: uvicorn.Config, ready: Callable[[], None]) -> None:
         super().__init__(config)
         self._ready = ready
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Listen, then say so."""
+        """Start listening, then call ``ready``."""
         await super().startup(sockets)
         self._ready()
 
     @contextlib.contextmanager
     def capture_signals(self) -> Generator[None, None, None]:
-        """Signals end the serving alone; uvicorn would kill us before the store is closed."""
+        """Let signals end the serving only.
+
+        Uvicorn's own version raises the signal again afterwards, which would end the process before
+        the store is closed.
+        """
         if threading.current_thread() is not threading.main_thread():
             yield
             return
-        before = {one: signal.signal(one, self._stop) for one in (signal.SIGTERM, signal.SIGINT)}
+        before = {
+            number: signal.signal(number, self._stop) for number in (signal.SIGTERM, signal.SIGINT)
+        }
         try:
             yield
         finally:
-            for one, handler in before.items():
-                signal.signal(one, handler)
+            for number, handler in before.items():
+                signal.signal(number, handler)
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
         self.force_exit = self.should_exit and number == signal.SIGINT
@@ -122,10 +157,10 @@ class _Server(uvicorn.Server):
 
 
 def _configure(app: FastAPI, address: Address) -> uvicorn.Config:
-    """The settings of uvicorn, with everything off that the study does not need."""
+    """Return uvicorn's configuration, with every feature off that the study does not need."""
     config = uvicorn.Config(
         app,
-        http=CarefulProtocol,
+        http=LimitedHeadProtocol,
         ws="none",
         lifespan="on",
         log_config=None,
@@ -148,8 +183,8 @@ def _configure(app: FastAPI, address: Address) -> uvicorn.Config:
 
 def _listen(address: Address) -> socket.socket:
     try:
-        found = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM)[0]
-        return socket.create_server(found[4][:2], family=found[0], backlog=2048)
+        resolved = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM)[0]
+        return socket.create_server(resolved[4][:2], family=resolved[0], backlog=2048)
     except (OSError, UnicodeError) as error:
         number = error.errno if isinstance(error, OSError) else None
         reason = os.strerror(number) if number and number > 0 else error
@@ -161,7 +196,7 @@ def _listen(address: Address) -> socket.socket:
 
 def _check(address: Address) -> None:
     if not 0 <= address.port <= 65535:
-        # The system would take what is left of it by 65536.
+        # The system would silently use the port modulo 65536.
         raise BadInputError(f"--port must be from 0 to 65535, not {address.port}")
     if (address.certificate is None) != (address.key is None):
         raise BadInputError("--https-cert and --https-key belong together; give both or none")
@@ -182,14 +217,14 @@ def _is_loopback(host: str) -> bool:
 
 
 def _as_host(host: str) -> str:
-    """The host as part of an address; for all addresses, the one of this machine itself."""
+    """Return the host as written in a URL; the loopback address if it listens on all addresses."""
     if host in ("", "0.0.0.0", "::"):
         return "127.0.0.1"
     return f"[{host}]" if ":" in host else host
 
 
 def _set_logging(log_requests: bool) -> None:
-    """Faults go to standard error; requests, by path alone, where asked for."""
+    """Log errors to standard error and, with ``log_requests``, every request without its query."""
     logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.WARNING)
     logging.getLogger("physion.experiment").setLevel(
         logging.INFO if log_requests else logging.WARNING
@@ -197,10 +232,14 @@ def _set_logging(log_requests: bool) -> None:
 
 
 def _allow_many_connections() -> None:
-    """A browser opens up to six connections; the usual limit of 1024 files ends at 170 people."""
+    """Raise the limit on open files towards `OPEN_FILES`.
+
+    A browser opens up to six connections, so the usual limit of 1024 files is reached by 170
+    people.
+    """
     try:
         import resource
-    except ImportError:  # not on this system, which has no such limit either
+    except ImportError:  # Windows, which has no such limit
         return
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     most = OPEN_FILES if hard == resource.RLIM_INFINITY else min(OPEN_FILES, hard)

@@ -1,4 +1,4 @@
-"""No answer is lost on its way, in a real browser: proxies, firewalls, tokens that are gone."""
+"""Delivery of answers in a real browser, despite proxies, firewalls and lost tokens."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def to_the_test(visit: Visit, query: str) -> None:
 
 
 def forget_tokens(study: Study, session: str) -> None:
-    """As after an older copy of the database was put back."""
+    """Delete all tokens, as if an older backup of the database had been restored."""
     engine = open_database(sqlite_url(study.folder), must_exist=True)
     try:
         with engine.begin() as connection:
@@ -92,7 +92,7 @@ def test_what_others_answer_is_no_refusal(chromium: Any, site: tuple[Study, str]
 
 
 def test_a_token_that_is_gone(chromium: Any, site: tuple[Study, str]) -> None:
-    """The answer waits in the browser, and goes with the token of the next entering."""
+    """The answer waits in the browser and is sent with the token of the next entry."""
     study, url = site
     with Visit(chromium, url, "token") as visit:
         to_the_test(visit, "?participant=Gone")
@@ -122,7 +122,7 @@ def test_a_token_that_is_gone(chromium: Any, site: tuple[Study, str]) -> None:
 def test_a_refused_answer_is_noted_before_it_is_forgotten(
     chromium: Any, site: tuple[Study, str]
 ) -> None:
-    """What is noted of it outlives a browser that is closed in this very moment."""
+    """The event about it is stored even if the browser is closed at that moment."""
     study, url = site
     with Visit(chromium, url) as visit, Visit(chromium, url) as there:
         to_the_test(visit, "?participant=Noted")

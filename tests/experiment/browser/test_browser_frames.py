@@ -1,4 +1,4 @@
-"""On a machine that does nothing else every trial shows each of its 45 frames."""
+"""On an idle machine every trial shows all of its 45 frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What breaks on the way, in a real browser: reload, no connection, two tabs, a killed server."""
+"""Recovery in a real browser: reload, lost connection, two tabs, killed server."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Study, str]
 
 
 def to_the_test(visit: Visit, name: str) -> None:
-    """Up to the first trial of the test."""
+    """Go to the first test trial."""
     visit.begin(f"?participant={name}")
     visit.practise(1)
     visit.begin_test()
@@ -36,7 +36,7 @@ def to_the_test(visit: Visit, name: str) -> None:
 
 
 def check_complete(study: Study, name: str, responses: list[str]) -> list[Any]:
-    """Every trial of the test has one answer, in the session's own order."""
+    """Check that every test trial has one answer, in the session's order."""
     session, answers, _ = rows_of(study, name)
     assert session.finished_at is not None
     test = [row for row in answers if row.phase == "test"]
@@ -87,7 +87,7 @@ def test_a_reload_goes_on_at_the_same_trial(chromium: Any, site: tuple[Study, st
 
 
 def test_a_reload_where_the_browser_keeps_nothing(chromium: Any, site: tuple[Study, str]) -> None:
-    """The address still says who takes part, so that no second participation begins."""
+    """The URL still identifies the participant, so that no second session begins."""
     study, url = site
     with Visit(chromium, url) as visit:
         visit.context.add_init_script(
@@ -166,7 +166,7 @@ def test_a_form_stays_until_it_is_stored(chromium: Any, site: tuple[Study, str])
 
 
 def test_a_browser_that_is_closed_offline(chromium: Any, site: tuple[Study, str]) -> None:
-    """The answers are sent when the page is opened again, before it asks where to go on."""
+    """The answers are sent when the page is opened again, before it requests the state."""
     study, url = site
     with Visit(chromium, url) as visit:
         to_the_test(visit, "Closed")
@@ -218,7 +218,7 @@ def test_the_second_tab_takes_over(chromium: Any, site: tuple[Study, str]) -> No
 
 
 def test_another_device_answers_meanwhile(chromium: Any, site: tuple[Study, str]) -> None:
-    """Nobody tells this page of the other: it learns from the server's refusal, and goes on."""
+    """The page learns of the other device by the server's refusal, and continues."""
     study, url = site
     with Visit(chromium, url) as here, Visit(chromium, url) as there:
         to_the_test(here, "Devices")

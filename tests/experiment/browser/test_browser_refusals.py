@@ -1,4 +1,4 @@
-"""Who is turned away, and what goes wrong with movies and windows, in a real browser."""
+"""Refused visitors, and problems with movies and windows, in a real browser."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def test_without_script_the_page_says_so(chromium: Any, site: tuple[Study, str])
 
 
 def test_old_browsers_are_told_without_modules(chromium: Any, site: tuple[Study, str]) -> None:
-    """What a browser does that knows no modules: it runs the script marked nomodule alone."""
+    """A browser without modules only runs the script marked nomodule."""
     study, url = site
     with Visit(chromium, url) as visit:
         visit.context.route("**/static/main.js", lambda route: route.abort())
@@ -209,7 +209,7 @@ def test_a_page_that_is_hidden_is_noted(chromium: Any, site: tuple[Study, str]) 
 
 
 def test_a_trial_that_was_hidden_is_shown_again(chromium: Any, site: tuple[Study, str]) -> None:
-    """From the cross with its whole cue; hidden once the movie is over, it is not."""
+    """It restarts at the fixation cross, unless the page was hidden after the movie."""
     study, url = site
     with Visit(chromium, url) as visit:
         visit.begin("?participant=Again")
@@ -308,7 +308,7 @@ def test_declining_the_consent(chromium: Any, site: tuple[Study, str]) -> None:
 
 
 def test_recruiters(chromium: Any, site: tuple[Study, str]) -> None:
-    """Prolific's ids are kept apart, the address forgets them, and the code leads back."""
+    """Prolific's ids are stored apart and removed from the URL; the result links back."""
     study, url = site
     with Visit(chromium, url, "prolific") as visit:
         visit.go("?PROLIFIC_PID=5f00&STUDY_ID=s1&SESSION_ID=v1&language=de")

@@ -1,4 +1,4 @@
-"""A server that has too much to do, or was started again with other things, in a real browser."""
+"""A server that is overloaded, or restarted with other settings, in a real browser."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_who_comes_in_a_crowd_waits(chromium: Any, tmp_path: Path) -> None:
 
 
 def test_movies_whose_addresses_changed(chromium: Any, tmp_path: Path) -> None:
-    """The addresses that the page has are worth nothing any more: it asks for new ones."""
+    """The media URLs of the page have become invalid: it requests new ones."""
     with (
         served(tmp_path, test=3, familiarization=1, preload=1) as (study, server),
         Visit(chromium, server.url) as visit,
@@ -76,7 +76,7 @@ def test_movies_whose_addresses_changed(chromium: Any, tmp_path: Path) -> None:
 
 
 def change_addresses(folder: Path, server: Any) -> None:
-    """Start the server again with another key for the addresses of movies."""
+    """Restart the server with another key for media URLs."""
     server.kill()
     path = folder / SECRET_FILE
     content = json.loads(path.read_text())

@@ -1,4 +1,4 @@
-"""What people are told in the end, and how they get their credit, in a real browser."""
+"""The result page and completion credit, in a real browser."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Study, str]
 
 
 def take_part(visit: Visit, query: str) -> str:
-    """The words of the last page."""
+    """Complete a session and return the text of the last page."""
     visit.begin(query)
     visit.practise(1)
     visit.begin_test()
@@ -53,7 +53,7 @@ def correct(study: Study, name: str) -> int:
 
 
 def test_the_percentile_is_what_its_words_say(chromium: Any, site: tuple[Study, str]) -> None:
-    """Of two people who were equally right, the second stands in the middle of the others."""
+    """Of two people with equal scores, the second has the percentile 50."""
     study, url = site
     with Visit(chromium, url) as visit:
         assert "percentile" not in take_part(visit, "?participant=First")
@@ -64,7 +64,7 @@ def test_the_percentile_is_what_its_words_say(chromium: Any, site: tuple[Study, 
 
 
 def test_the_form_of_mturk_stays_in_its_frame(chromium: Any, site: tuple[Study, str]) -> None:
-    """From the first page to the last in a frame of MTurk's page, and handed in there."""
+    """The whole session runs in a frame of MTurk's page, and is submitted there."""
     _, url = site
     task = f"{MTURK}/projects/task"
     submit = f"{MTURK}/mturk/externalSubmit"
@@ -107,7 +107,7 @@ def test_the_form_of_mturk_stays_in_its_frame(chromium: Any, site: tuple[Study, 
     ],
 )
 def test_no_form_goes_to_anybody_else(chromium: Any, site: tuple[Study, str], address: str) -> None:
-    """Even if the server should say so."""
+    """Forms are not sent to other hosts, even if the server's result names one."""
     _, url = site
     with Visit(chromium, url) as visit:
         visit.go("?participant=Form")

@@ -137,7 +137,7 @@ def test_a_whole_session_by_keyboard_in_german(chromium: Any, site: tuple[Study,
 
 
 def test_timing_of_the_paper(chromium: Any, tmp_path: Path) -> None:
-    """Fixation, 2 s of flashing at 2 Hz, 45 frames and no later one, read off the pixels."""
+    """Fixation, 2 s of flashing at 2 Hz, and 45 frames and no later one, read from the pixels."""
     with (
         served(tmp_path, test=4, familiarization=1, preload=2, timing=Timing()) as (study, server),
         Visit(chromium, server.url) as visit,
@@ -176,7 +176,7 @@ def test_timing_of_the_paper(chromium: Any, tmp_path: Path) -> None:
 
 
 def loaded_of_test(visit: Visit) -> set[int]:
-    """Trials of the test whose movies were asked for so far, a moment later."""
+    """Return the test trials whose movies were requested so far, after a short pause."""
     visit.page.wait_for_timeout(300)
     found = (re.search(r"/t-(\d+)-movie-", address) for address in visit.requests)
     return {int(match[1]) for match in found if match}

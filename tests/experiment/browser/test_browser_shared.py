@@ -1,4 +1,4 @@
-"""Several people at one computer, one after the other, in a real browser."""
+"""Several people on one computer, one after the other, in a real browser."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def references(study: Study) -> list[str]:
 def test_nobody_gets_the_result_of_another(
     chromium: Any, site: tuple[Study, str], script: str
 ) -> None:
-    """A took part elsewhere, B here: who comes by A's link here is told no more than anywhere."""
+    """A took part elsewhere, B here: A's link shows no more here than anywhere else."""
     study, url = site
     a, b = ("Plain-A", "Plain-B") if script else ("A", "B")
     with Visit(chromium, url) as elsewhere:
@@ -88,7 +88,7 @@ def test_nobody_gets_the_result_of_another(
 
 
 def test_entering_twice_begins_one_session(chromium: Any, site: tuple[Study, str]) -> None:
-    """The answer to the first request is lost on the way, and the page asks again."""
+    """The response to the first request is lost, and the page retries."""
     study, url = site
     before = references(study)
     with Visit(chromium, url) as visit:

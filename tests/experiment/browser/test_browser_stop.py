@@ -1,4 +1,4 @@
-"""Asked whether to stop, and trials that are shown twice, in a real browser."""
+"""The question whether to stop, and trials that are shown twice, in a real browser."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_stopping_sends_what_was_answered(chromium: Any, site: tuple[Study, str]
 
 
 def test_a_trial_that_is_shown_twice_says_so(chromium: Any, site: tuple[Study, str]) -> None:
-    """Another device answered the trial before: the page learns it while the next one runs."""
+    """Another device answered the previous trial: the page learns it during the next one."""
     study, url = site
     with Visit(chromium, url) as visit, Visit(chromium, url) as there:
         to_the_test(visit, "Twice")

@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
-from physion.experiment.simulated.server_process import OwnServer
+from physion.experiment.simulated.server_process import ServerProcess
 from physion.experiment.store.database import open_database, sqlite_url
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.study import Study
@@ -28,7 +28,7 @@ PAGES = ("", "?kind=simulated", "/sessions", "/sessions?flag=any", "/export", "/
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Study, str]]:
     study = make_tiny_study(tmp_path_factory.mktemp("study"), test=20, scenarios=TWO, size=64)
-    with OwnServer(study.folder) as server:
+    with ServerProcess(study.folder) as server:
         add(study, 120)
         yield study, server.url + BASE
 

@@ -27,7 +27,7 @@ from physion.analysis.people.exclusions import PREREGISTERED, RULES, flag_sessio
 from physion.analysis.people.participants import clean
 from physion.experiment.export.answer_tables import read_tables
 from physion.experiment.export.export_study import export_study
-from physion.experiment.simulated.server_process import OwnServer
+from physion.experiment.simulated.server_process import ServerProcess
 from physion.experiment.store.tables import ANSWERS, EVENTS, RAW_IDS, SESSIONS
 from support.experiment.experimenter_client import BASE, TWO, Lab, Visitor, lab
 from support.experiment.experimenter_rows import insert_sessions
@@ -370,7 +370,7 @@ def is_alive(pid: int) -> bool:
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="no /proc to look for processes in")
 def test_no_process_is_left_by_a_killed_server(tmp_path: Path) -> None:
     study = make_tiny_study(tmp_path, size=64, languages=("en",))
-    with OwnServer(study.folder) as server:
+    with ServerProcess(study.folder) as server:
         with httpx2.Client(base_url=server.url, trust_env=False, follow_redirects=True) as client:
             form = re.search(r'name="form_token" value="(\w+)"', client.get(f"{BASE}/login").text)
             assert form is not None

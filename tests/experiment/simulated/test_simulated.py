@@ -1,4 +1,4 @@
-"""Simulated participants: how they answer, and what a simulation leaves in the database."""
+"""Simulated participants: their answers, and the rows of a simulation in the database."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 from physion.cli.main import main
 from physion.errors import UnknownNameError
-from physion.experiment.simulated.participants import Plan, Visit, simulate
+from physion.experiment.simulated.participants import SimulationPlan, Visit, simulate
 from physion.experiment.simulated.person import SimulatedPerson
-from physion.experiment.simulated.server_process import OwnServer
+from physion.experiment.simulated.server_process import ServerProcess
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.stimuli import Stimulus
 from physion.experiment.study.study import Study
@@ -44,26 +44,26 @@ def test_a_person_answers_the_same_again_and_others_differ() -> None:
 def test_people_are_right_as_often_as_they_should_be_and_slower_where_it_is_hard() -> None:
     people = [SimulatedPerson(0, number) for number in range(100)]
     stimuli = [_stimulus(number, number % 2 == 0) for number in range(60)]
-    chance = np.array([[p.chance(s) for s in stimuli] for p in people])
+    expected = np.array([[p.probability_correct(s) for s in stimuli] for p in people])
     answers = [[p.predict(s) for s in stimuli] for p in people]
     right = np.array([[(a.response == "yes") == s.label for a, s in zip(row, stimuli, strict=True)]
                       for row in answers])  # fmt: skip
     rt = np.array([[a.rt_ms for a in row] for row in answers])
-    # 6000 tosses: the mean is within 0.02 of its expectation (3 standard errors), leaning apart.
-    assert abs(right.mean() - chance.mean()) < 0.02
+    # 6000 draws: the mean is within 0.02 (3 standard errors) of its expectation without bias.
+    assert abs(right.mean() - expected.mean()) < 0.02
     assert 0.65 < right.mean() < 0.8
-    easy = chance.mean(axis=0) > np.median(chance.mean(axis=0))
+    easy = expected.mean(axis=0) > np.median(expected.mean(axis=0))
     assert right[:, easy].mean() > right[:, ~easy].mean() + 0.15
     assert np.log(rt[:, easy]).mean() < np.log(rt[:, ~easy]).mean()
     assert rt.min() > 0
 
 
-def test_a_share_of_the_people_leaves() -> None:
-    leaving = [SimulatedPerson(0, n).leaves_before(150, 0.1) for n in range(1000)]
-    places = [place for place in leaving if place is not None]
-    assert 70 < len(places) < 130
-    assert min(places) >= 0 and max(places) < 150 and len(set(places)) > 30
-    assert all(SimulatedPerson(0, n).leaves_before(150, 0.0) is None for n in range(100))
+def test_a_fraction_of_the_people_leaves() -> None:
+    leaving = [SimulatedPerson(0, n).dropout_trial(150, 0.1) for n in range(1000)]
+    trials = [trial for trial in leaving if trial is not None]
+    assert 70 < len(trials) < 130
+    assert min(trials) >= 0 and max(trials) < 150 and len(set(trials)) > 30
+    assert all(SimulatedPerson(0, n).dropout_trial(150, 0.0) is None for n in range(100))
 
 
 @pytest.fixture(scope="module")
@@ -73,11 +73,11 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Study:
 
 
 @pytest.fixture(scope="module")
-def served(study: Study) -> tuple[OwnServer, list[Visit], list[Visit]]:
-    """Two simulations on one server: some people leave, then they come back."""
-    plan = Plan(url="", participants=8, dropouts=0.5, seed=5)
+def served(study: Study) -> tuple[ServerProcess, list[Visit], list[Visit]]:
+    """Run two simulations on one server: some people leave, then they come back."""
+    plan = SimulationPlan(url="", participants=8, dropouts=0.5, seed=5)
     secrets = Secrets.load(study.folder)
-    with OwnServer(study.folder) as server:
+    with ServerProcess(study.folder) as server:
         plan = replace(plan, url=server.url)
         first = asyncio.run(simulate(study, secrets, plan))
         second = asyncio.run(simulate(study, secrets, replace(plan, dropouts=0.0)))
@@ -85,7 +85,7 @@ def served(study: Study) -> tuple[OwnServer, list[Visit], list[Visit]]:
 
 
 def test_people_finish_or_leave_and_come_back(
-    served: tuple[OwnServer, list[Visit], list[Visit]],
+    served: tuple[ServerProcess, list[Visit], list[Visit]],
 ) -> None:
     _, first, second = served
     assert {visit.outcome for visit in first} == {"done", "left"}
@@ -99,16 +99,16 @@ def test_people_finish_or_leave_and_come_back(
 
 
 def test_simulated_is_written_in_the_data_for_good(
-    study: Study, served: tuple[OwnServer, list[Visit], list[Visit]]
+    study: Study, served: tuple[ServerProcess, list[Visit], list[Visit]]
 ) -> None:
     _, first, second = served
     sessions = stored_sessions(study)
     assert len(sessions) == 8 and {session.kind for session in sessions.values()} == {"simulated"}
     assert all(session.finished_at for session in sessions.values())
-    told = [(visit.reference, a) for visit in (*first, *second) for a in visit.answers]
+    known = [(visit.reference, a) for visit in (*first, *second) for a in visit.answers]
     stored = stored_answers(study)
     assert len(stored) == 48
-    for reference, answer in told:
+    for reference, answer in known:
         row = stored[reference, answer.phase, answer.trial]
         assert (row.key, row.stimulus, row.response, row.rt_ms) == (
             answer.key, answer.stimulus, answer.response, answer.rt_ms
@@ -140,7 +140,7 @@ def test_another_study_s_server_refuses_the_pilot_link(
 ) -> None:
     mine = make_tiny_study(tmp_path / "mine", test=2, familiarization=1)
     other = make_tiny_study(tmp_path / "other", test=2, familiarization=1)
-    with OwnServer(other.folder) as server:
+    with ServerProcess(other.folder) as server:
         words = ["--participants", "2", "--url", server.url]
         assert main(["experiment", "simulate", str(mine.folder), *words]) == 1
     out = capsys.readouterr().out
@@ -149,18 +149,18 @@ def test_another_study_s_server_refuses_the_pilot_link(
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "option"),
     [(["--participants", "0"], "--participants"), (["--dropouts", "1.5"], "--dropouts"),
      (["--pace", "-1"], "--pace"), (["--url", "x", "--database", "y"], "--database")],
 )  # fmt: skip
 def test_bad_options_are_refused(
-    study: Study, words: list[str], told: str, capsys: pytest.CaptureFixture[str]
+    study: Study, words: list[str], option: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["experiment", "simulate", str(study.folder), *words]) == 2
-    assert told in capsys.readouterr().err
+    assert option in capsys.readouterr().err
 
 
 def test_an_unknown_scenario_is_refused_before_anything_is_sent(study: Study) -> None:
-    plan = Plan(url="http://127.0.0.1:1", scenario="colide")
+    plan = SimulationPlan(url="http://127.0.0.1:1", scenario="colide")
     with pytest.raises(UnknownNameError, match="collide"):
         asyncio.run(simulate(study, Secrets.load(study.folder), plan))

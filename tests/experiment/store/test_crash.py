@@ -1,9 +1,9 @@
-"""The server is killed under load, again and again: no acknowledged answer is lost or doubled.
+"""Crash tests: no acknowledged answer is lost or duplicated when the server is killed under load.
 
-Simulated participants go through the study while the server, or PostgreSQL under it, is ended as by
-``kill -9`` at random moments and started again. They ask again with the same key until they are
-answered, as the pages do. Afterwards every answer that was acknowledged must be in the database as
-it was sent, once, and every session must be complete.
+Simulated participants complete the study while the server, or its PostgreSQL server, is killed
+(SIGKILL) at random moments and started again. They retry with the same key until the server
+answers, as the pages do. Afterwards every acknowledged answer must be in the database exactly once
+and unaltered, and every session must be complete.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 import sqlalchemy as sa
 from sqlalchemy.engine import make_url
 
-from physion.experiment.simulated.participants import Plan, Visit, simulate
+from physion.experiment.simulated.participants import SimulationPlan, Visit, simulate
 from physion.experiment.store.database import open_database, sqlite_url
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.study import Limits, Study
@@ -35,13 +35,13 @@ PHASES = {"familiarization": 3, "test": 12}
 FAST = Limits(
     requests_per_second=10_000, burst=100_000, sessions_per_minute=100_000, sessions_at_once=100_000
 )
-"""Limits that do not slow the load down; they are tested elsewhere."""
+"""Rate limits high enough not to matter; they are tested elsewhere."""
 LONGEST_RUN_S = 0.4
-"""A kill comes at a random moment up to so long after the server is there."""
+"""Longest time in seconds between the start of the server and a kill."""
 
 
 class Load:
-    """Participants who keep coming until they are told to stop; then the last ones finish."""
+    """Waves of participants until the context ends, which waits for the last ones to finish."""
 
     def __init__(self, study: Study, url: str, people: int) -> None:
         self._study, self._secrets = study, Secrets.load(study.folder)
@@ -53,16 +53,16 @@ class Load:
 
     async def _run(self) -> None:
         try:
-            await asyncio.gather(*(self._come(place) for place in range(3)))
+            await asyncio.gather(*(self._run_waves(number) for number in range(3)))
         except BaseException as error:
             self.error = error
 
-    async def _come(self, place: int) -> None:
+    async def _run_waves(self, number: int) -> None:
         wave = 0
         while not self._stopping.is_set():
-            # Asked again soon and often, but so that the server still gets the processor.
-            plan = Plan(
-                self._url, self._people, seed=1000 * place + wave, dropouts=0.0, pace=0.01,
+            # Retry often, but leave processor time for the server.
+            plan = SimulationPlan(
+                self._url, self._people, seed=1000 * number + wave, dropouts=0.0, pace=0.01,
                 waits_s=(0.05, 0.4), patience_s=90.0, media=False,
             )  # fmt: skip
             self.waves.append(await simulate(self._study, self._secrets, plan))
@@ -74,7 +74,7 @@ class Load:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._stopping.set()
-        if kind is not None:  # there may be no server any more
+        if kind is not None:  # the server may have ended
             return
         self._thread.join(120)
         assert not self._thread.is_alive(), "the participants did not get to the end"
@@ -83,12 +83,12 @@ class Load:
 
     @property
     def visits(self) -> list[Visit]:
-        """Everybody who came."""
+        """The visits of all waves."""
         return [visit for wave in self.waves for visit in wave]
 
 
 def kill_again_and_again(server: QuickServer, kills: int, seed: int) -> None:
-    """Kill at random moments, most of them in work and some while the server starts."""
+    """Kill the server at random moments, mostly while it serves and sometimes while it starts."""
     rng = np.random.default_rng(seed)
     for number in range(kills):
         time.sleep(rng.random() * LONGEST_RUN_S)
@@ -101,15 +101,15 @@ def kill_again_and_again(server: QuickServer, kills: int, seed: int) -> None:
 
 
 def check(study: Study, visits: list[Visit], url: str | None = None) -> None:
-    """All that was acknowledged is there once and unaltered, and all sessions are complete."""
+    """Check that all acknowledged answers are stored unaltered and all sessions are complete."""
     assert {visit.outcome for visit in visits} == {"done"}, [
         visit for visit in visits if visit.outcome != "done"
     ][:3]
     stored, sessions = stored_answers(study, url), stored_sessions(study, url)
-    told = {(visit.reference, a.phase, a.trial): a for visit in visits for a in visit.answers}
-    assert len(told) == sum(len(visit.answers) for visit in visits), "acknowledged twice"
-    for place, answer in told.items():
-        row = stored[place]
+    known = {(visit.reference, a.phase, a.trial): a for visit in visits for a in visit.answers}
+    assert len(known) == sum(len(visit.answers) for visit in visits), "acknowledged twice"
+    for trial, answer in known.items():
+        row = stored[trial]
         sent = (answer.key, answer.stimulus, answer.response, answer.rt_ms)
         assert (row.key, row.stimulus, row.response, row.rt_ms) == sent
     assert len(sessions) == len(visits)
@@ -155,7 +155,7 @@ def test_postgresql_loses_nothing_when_the_server_is_killed(
 
 @pytest.fixture
 def own_postgres(postgres_cluster: Cluster) -> Iterator[str]:
-    """A database on our own cluster, which may be crashed."""
+    """A database on the temporary cluster, which tests may crash."""
     server = make_url(postgres_cluster.url).set(drivername="postgresql+psycopg")
     engine = sa.create_engine(server, isolation_level="AUTOCOMMIT", poolclass=sa.NullPool)
     with engine.connect() as connection:
@@ -182,7 +182,7 @@ def test_the_server_outlives_a_crash_of_postgresql_and_loses_nothing(
             time.sleep(rng.random())
             postgres_cluster.start()
         time.sleep(1)
-        assert server.pid == process and server.is_running, server.last_words()
+        assert server.pid == process and server.is_running, server.last_output()
         before = sum(len(visit.answers) for visit in load.visits)
     assert sum(len(visit.answers) for visit in load.visits) > before, "nobody went on"
     check(study, load.visits, own_postgres)

@@ -1,4 +1,4 @@
-"""Raw ids are deleted so that no byte of them stays; passwords are changed at the command line."""
+"""Deleting raw ids without leaving bytes behind, and changing passwords at the command line."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def raw_id(number: int) -> str:
 
 
 def fill(store: Store, count: int = 60) -> None:
-    """People with ids and parameters, some of whom come again, and data around them."""
+    """Add people with ids and parameters, some of whom enter again, and other data."""
     for number in range(count):
         more = {"STUDY_ID": f"visit-first-{number:04d}"}
         token = enter(store, raw_id(number), source="prolific", recruiter=more, scenario="drop")
@@ -121,7 +121,7 @@ def test_a_served_study_and_a_busy_reader_are_named(
     reader = sqlite3.connect(tmp_path / "responses.sqlite", isolation_level=None)
     reader.execute("BEGIN")
     reader.execute("SELECT count(*) FROM raw_ids").fetchone()
-    with pytest.raises(PhysionError, match="close it, and say"):
+    with pytest.raises(PhysionError, match="close that program and run"):
         forget(database, None)
     reader.close()
     forget(database, None)

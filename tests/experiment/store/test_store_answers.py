@@ -1,4 +1,4 @@
-"""Answers: each once, in order, safe, whatever is sent in whatever order; on both databases."""
+"""Storing answers: exactly once and in order, for any sequence of requests; on both databases."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from physion.experiment.protocol.messages import Answer, Enter, PageDone
 from physion.experiment.store.store import Refused, Store
 from physion.experiment.store.tables import ANSWERS, METADATA, SESSIONS, STUDIES
 from physion.experiment.study.identity import Secrets
-from physion.experiment.study.orders import order_of
+from physion.experiment.study.orders import trial_order
 from physion.experiment.study.study import Study
 from physion.experiment.web.media_links import read_media_path
 from support.experiment.store_walk import answer, enter, give, page, refusal, rows, run, walk
@@ -43,7 +43,7 @@ def test_an_answer_is_stored_as_it_was_sent(store: Store, small_study: Study) ->
                  "frames_dropped", "movie_ms", "visibility_changes", "window_width"):  # fmt: skip
         assert getattr(row, name) == getattr(sent, name)
     assert json.loads(row.details) == sent.details
-    assert row.stimulus == order_of(small_study, "drop", session.order_seed)["test"][0].stimulus
+    assert row.stimulus == trial_order(small_study, "drop", session.order_seed)["test"][0].stimulus
     assert row.frames_expected == 45 and not row.resumed
     assert session.answered_test == 1 and session.last_seen == row.answered_at
 
@@ -172,7 +172,7 @@ def test_many_people_at_once_lose_nothing(store: Store) -> None:
 
 
 class Machine:
-    """One store for all examples: making a database for each would take minutes."""
+    """State machine with one store for all examples; a database for each would take minutes."""
 
     def __init__(self, study: Study, secrets: Secrets, folder: Path) -> None:
         self.store = Store.open(study, secrets, f"sqlite:///{folder / 'a.sqlite'}")
@@ -216,7 +216,7 @@ def test_whatever_is_sent_rows_are_the_first_trials_once(machine: Machine, posts
         for kind, *rest in posts:
             if kind == "ready":
                 if len(model["familiarization"]) < 3:
-                    with pytest.raises(Refused, match="does not come now"):
+                    with pytest.raises(Refused, match="is not next"):
                         await store.page(token, PageDone(page="ready"))
                 else:
                     await store.page(token, PageDone(page="ready"))

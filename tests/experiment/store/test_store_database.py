@@ -1,4 +1,4 @@
-"""The database of a study: tables, versions, locks, durability settings, on both kinds."""
+"""The database of a study: tables, versions, locks and durability; on both kinds."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from physion.errors import BadInputError, PhysionError
 from physion.experiment.store.database import (
     check_version,
     connect_writer,
-    one_server,
     open_database,
+    server_lock,
     upgrade,
 )
 from physion.experiment.store.tables import METADATA, RAW_IDS
@@ -40,7 +40,7 @@ def test_upgrade_of_an_empty_database_gives_exactly_the_tables(database_url: str
 
 
 def test_errors_tell_no_values(database_url: str) -> None:
-    """Ids of people must not come into a log with the text of an error."""
+    """Participants' ids must not reach a log through an error message."""
     engine = open_database(database_url)
     upgrade(engine)
     row = {"participant": "0" * 32, "source": "sona", "raw_id": "Ada-5f1e", "seen": 1.0}
@@ -75,13 +75,13 @@ def test_tables_of_a_newer_version_are_refused(database_url: str) -> None:
 
 def test_a_second_server_is_refused_until_the_first_is_gone(database_url: str) -> None:
     engine, other = open_database(database_url), open_database(database_url)
-    with one_server(engine):
+    with server_lock(engine):
         writer = connect_writer(engine)
-        with pytest.raises(PhysionError, match="another"), one_server(other):
+        with pytest.raises(PhysionError, match="another"), server_lock(other):
             connect_writer(other)
         writer.invalidate()
         writer.close()
-    with one_server(other):
+    with server_lock(other):
         connect_writer(other).close()
     engine.dispose()
     other.dispose()
@@ -122,7 +122,7 @@ def test_other_addresses_are_refused(url: str) -> None:
 
 
 def test_missing_files_and_servers_are_named(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match="was the study served"):
+    with pytest.raises(BadInputError, match="has the study been served"):
         open_database(f"sqlite:///{tmp_path / 'none.sqlite'}", must_exist=True)
     with pytest.raises(BadInputError, match="no folder"):
         open_database(f"sqlite:///{tmp_path / 'none' / 'a.sqlite'}")

@@ -1,4 +1,4 @@
-"""Entering, pages, states and results, on both databases."""
+"""Entering, pages, states and results; on both databases."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from physion.experiment.store.sessions import ACTIVE_WITHIN
 from physion.experiment.store.store import Refused, Store
 from physion.experiment.store.tables import EVENTS, PARTICIPANTS, RAW_IDS, SESSIONS, STUDIES, TOKENS
 from physion.experiment.study.identity import Secrets, participant_hash
-from physion.experiment.study.recruitment import pass_word
+from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.study import Recruitment, Study
 from support.experiment.store_walk import (
     PAGES,
@@ -159,7 +159,7 @@ def test_who_leaves_gives_the_place_back_and_may_return(store: Store) -> None:
 
 
 def _let_time_pass(store: Store, person: str, seconds: float = ACTIVE_WITHIN + 1) -> None:
-    """Nothing is heard of someone for a while."""
+    """Make a session inactive, as if its last request were long ago."""
     own = SESSIONS.c.participant == participant_hash(store.secrets, "link", person)
     with store.engine.begin() as connection:
         earlier = SESSIONS.c.last_seen - seconds
@@ -168,7 +168,7 @@ def _let_time_pass(store: Store, person: str, seconds: float = ACTIVE_WITHIN + 1
 
 def test_previews_and_programs_take_nobodys_place(store: Store, small_secrets: Secrets) -> None:
     for kind in ("preview", "simulated"):
-        word = pass_word(small_secrets, kind)
+        word = make_pass(small_secrets, kind)
         for number in range(4):
             token = enter(store, f"p{number}", scenario="drop", **{"pass": word})
             assert run(store.state(token)).kind == kind
@@ -184,7 +184,7 @@ def test_previews_and_programs_take_nobodys_place(store: Store, small_secrets: S
 def test_words_that_we_never_gave_are_refused(
     sqlite_store: Store, small_secrets: Secrets, word: str
 ) -> None:
-    signature = pass_word(small_secrets, "simulated").partition("-")[2]
+    signature = make_pass(small_secrets, "simulated").partition("-")[2]
     asked = Enter.model_validate({"pass": word.replace("{0}", signature)})
     assert refusal(sqlite_store.enter(asked)).code == "bad_link"
     assert rows(sqlite_store, SESSIONS) == []
@@ -216,7 +216,7 @@ def test_ids_that_only_resemble_placeholders_are_ids(sqlite_store: Store) -> Non
 
 
 def test_what_a_session_is_never_changes(store: Store, small_secrets: Secrets) -> None:
-    token = enter(store, "Ada", scenario="drop", **{"pass": pass_word(small_secrets, "simulated")})
+    token = enter(store, "Ada", scenario="drop", **{"pass": make_pass(small_secrets, "simulated")})
     walk(store, token, "done")
     (session,) = rows(store, SESSIONS)
     assert session.kind == "simulated"
@@ -233,7 +233,7 @@ def test_ids_where_they_are_needed(
     strict = Store.open(needed, small_secrets, f"sqlite:///{tmp_path / 'strict.sqlite'}")
     try:
         assert refusal(strict.enter(Enter())).code == "id_needed"
-        preview = Enter.model_validate({"pass": pass_word(small_secrets, "preview")})
+        preview = Enter.model_validate({"pass": make_pass(small_secrets, "preview")})
         assert run(strict.enter(preview)).state.kind == "preview"
     finally:
         strict.close()
@@ -251,8 +251,8 @@ def test_a_visits_word_gives_the_same_session_again(
     walk(store, tokens[0], "test")
     assert {run(store.state(token)).stage for token in tokens} == {"test"}
     # Another word, an id beside it, another way to come: somebody else each.
-    simulated = {"pass": pass_word(small_secrets, "simulated")}
-    preview = {"pass": pass_word(small_secrets, "preview")}
+    simulated = {"pass": make_pass(small_secrets, "simulated")}
+    preview = {"pass": make_pass(small_secrets, "preview")}
     for _ in range(2):
         enter(store, visit=WORD[:-1])
         enter(store, "Ada", visit=WORD)
@@ -549,7 +549,7 @@ def test_percentiles_are_among_finished_people_of_the_scenario(
 
     first = finish("a", 1)
     assert store.result(first).percentile is None  # percentile_from=2
-    simulated = {"pass": pass_word(small_secrets, "simulated")}
+    simulated = {"pass": make_pass(small_secrets, "simulated")}
     finish("s", 4, **simulated)
     finish("other", 4, "collide")
     walk(store, enter(store, "unfinished", scenario="drop"), "feedback")
@@ -566,11 +566,13 @@ def test_percentiles_are_among_finished_people_of_the_scenario(
 
 
 def _order(store: Store, person: str, scenario: str, more: dict[str, Any]) -> tuple[Any, ...]:
-    from physion.experiment.study.orders import order_of, own_order_seed
+    from physion.experiment.study.orders import individual_order_seed, trial_order
 
     source = "simulated link" if more else "link"
-    seed = own_order_seed(store.study, scenario, participant_hash(store.secrets, source, person))
-    return order_of(store.study, scenario, seed)["test"]
+    seed = individual_order_seed(
+        store.study, scenario, participant_hash(store.secrets, source, person)
+    )
+    return trial_order(store.study, scenario, seed)["test"]
 
 
 def test_percentile_is_among_the_others() -> None:
@@ -584,7 +586,7 @@ def test_percentile_is_among_the_others() -> None:
 def test_previews_of_other_stimuli_are_in_no_result(
     small_study: Study, small_secrets: Secrets, database_url: str
 ) -> None:
-    word = {"pass": pass_word(small_secrets, "preview"), "scenario": "drop"}
+    word = {"pass": make_pass(small_secrets, "preview"), "scenario": "drop"}
     store = Store.open(small_study, small_secrets, database_url)
     old = [walk(store, enter(store, f"old{number}", **word), "done") for number in range(3)]
     assert store.result(old[0]).percentile == 50
@@ -703,7 +705,7 @@ def test_other_stimuli_are_refused_where_sessions_exist(
 
     other = replace(small_study, stimuli_digest="0" * 64, digest="1" * 64)
     store = reopen(small_study)
-    preview = enter(store, **{"pass": pass_word(small_secrets, "preview")})
+    preview = enter(store, **{"pass": make_pass(small_secrets, "preview")})
     store.close()
     store = reopen(other)  # a preview is nobody's data
     assert run(store.state(preview)).stage == "withdrawn"
@@ -731,7 +733,7 @@ def test_a_scenario_with_sessions_cannot_be_taken_out(
         stimuli=tuple(s for s in small_study.stimuli if s.scenario == "collide"),
         digest="3" * 64,
     )
-    preview = {"pass": pass_word(small_secrets, "preview"), "scenario": "drop"}
+    preview = {"pass": make_pass(small_secrets, "preview"), "scenario": "drop"}
     store = reopen(small_study)
     going = walk(store, enter(store, "P1", **preview), "test")
     done = walk(store, enter(store, "P2", **preview), "done")
@@ -740,7 +742,7 @@ def test_a_scenario_with_sessions_cannot_be_taken_out(
     for token in (going, done):
         for asked in (store.state(token), store.state(token, True), store.answer(token, answer(0))):
             assert refusal(asked).code == "unknown_token"
-        with pytest.raises(Refused, match="no more"):
+        with pytest.raises(Refused, match="no longer"):
             store.result(token)
     marks = {(row.finished_at is None, row.withdrawn_at is None) for row in rows(store, SESSIONS)}
     assert marks == {(True, False), (False, True)}

@@ -1,4 +1,4 @@
-"""The writer: groups, refusals, faults, lost connections; nothing acknowledged that is not kept."""
+"""The writer: groups, refusals, faults and lost connections; acknowledged means committed."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from physion.experiment.store.store import Refused, Store
 from physion.experiment.store.tables import EVENTS
 from physion.experiment.store.writer import Writer
 from physion.experiment.study.identity import Secrets
-from physion.experiment.study.recruitment import pass_word
+from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.study import Study
 from support.experiment.postgres import Cluster
 from support.experiment.store_walk import answer, enter, give, rows, run, walk
@@ -62,7 +62,7 @@ def kept(engine: Engine) -> set[int]:
 
 
 class Gate:
-    """A command that holds the writer until it is opened, so that a group gathers behind it."""
+    """A command that blocks the writer until it is opened, so that a group gathers behind it."""
 
     def __init__(self) -> None:
         self.reached, self.open = threading.Event(), threading.Event()
@@ -73,7 +73,7 @@ class Gate:
 
 
 def gather(writer: Writer, commands: list[Callable[[Connection], Any]]) -> list[Future[Any]]:
-    """Have the commands waiting all together, then let them go."""
+    """Queue all commands behind a gate, then open it."""
     gate = Gate()
     writer.submit(gate)
     assert gate.reached.wait(30)
@@ -140,7 +140,7 @@ def test_too_much_waiting_is_refused(engine: Engine) -> None:
         writer.submit(gate)
         assert gate.reached.wait(30)
         futures = [writer.submit(put(number)) for number in range(5)]
-        with pytest.raises(Refused, match="too much to do") as caught:
+        with pytest.raises(Refused, match="overloaded") as caught:
             writer.submit(put(99))
         assert caught.value.code == "unavailable"
         gate.open.set()
@@ -281,7 +281,7 @@ def test_restarts_of_postgresql_lose_nothing(
     stop = threading.Event()
 
     async def until_there(ask: Callable[[], Awaitable[T]]) -> T:
-        """As browsers do: whoever is told that the database is away asks again."""
+        """Retry while the database is unavailable, as browsers do."""
         until = time.monotonic() + 60
         while True:
             try:
@@ -326,7 +326,7 @@ def test_restarts_of_postgresql_lose_nothing(
         stop.set()
         await asyncio.gather(*people)
 
-    word = pass_word(small_secrets, "simulated")
+    word = make_pass(small_secrets, "simulated")
     try:
         asyncio.run(everybody())
         stored = [(row.key, row.trial) for row in rows(store)]

@@ -1,4 +1,4 @@
-"""Every endpoint: what it takes, what it gives, and what it refuses to whom."""
+"""Every endpoint: accepted requests, responses and refusals."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 
 
 def refused(answer: Any, status: int, error: str) -> dict[str, Any]:
-    """The refusal in an answer, which has no word more than `Refusal` has."""
+    """Return the refusal in a response, which has exactly the fields of `Refusal`."""
     assert answer.status_code == status, answer.text[:300]
     refusal = wire.Refusal.model_validate_json(answer.content)
     assert refusal.error == error

@@ -1,4 +1,4 @@
-"""What stands before the application: sizes, rates, headers, errors."""
+"""The middleware: limits on size and rate, headers, errors."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ async def _echo(request: Request) -> Response:
 
 
 async def _swallow(request: Request) -> Response:
-    """As frameworks do: whatever reading the body raises becomes an answer of their own."""
+    """Turn any error of reading the body into a response, as frameworks do."""
     try:
         return await _echo(request)
     except Exception:
@@ -99,7 +99,7 @@ def assert_refused(answer: bytes, status: int, error: str) -> None:
 
 
 class Trickle:
-    """Sends a body bit by bit and counts what was taken before the server answered."""
+    """Client that sends a body piece by piece and counts what the server read before answering."""
 
     def __init__(self, port: int, start: bytes, piece: bytes) -> None:
         self.sent = 0
@@ -302,16 +302,16 @@ class TestRates:
         limits = RateLimits(Limits())
         statuses = []
         for number in range(200):
-            wait = limits.before("GET", "/api/session", f"wrong{number}", "1.2.3.4", 0.0)
+            wait = limits.wait_time("GET", "/api/session", f"wrong{number}", "1.2.3.4", 0.0)
             statuses.append(wait > 0)
             if not wait:
-                limits.after(401, "/api/session", f"wrong{number}", "1.2.3.4", 0.0)
+                limits.record_status(401, "/api/session", f"wrong{number}", "1.2.3.4", 0.0)
         assert statuses.index(True) == 60 and all(statuses[60:])
         assert len(limits._tokens) == 0
-        assert limits.before("GET", "/api/session", "wrong", "5.6.7.8", 0.0) == 0
+        assert limits.wait_time("GET", "/api/session", "wrong", "5.6.7.8", 0.0) == 0
         # Those of the same address who have a session go on.
-        limits.after(200, "/api/session", "good", "1.2.3.4", 0.0)
-        assert limits.before("GET", "/api/session", "good", "1.2.3.4", 0.0) == 0
+        limits.record_status(200, "/api/session", "good", "1.2.3.4", 0.0)
+        assert limits.wait_time("GET", "/api/session", "good", "1.2.3.4", 0.0) == 0
 
     def test_new_sessions_are_counted_by_address(self) -> None:
         client = TestClient(make_app(limits=Limits(sessions_at_once=3)), client=("9.9.9.9", 1))

@@ -1,4 +1,4 @@
-"""Requests that no page of ours sends: refused in one way, nothing stored, nothing given away."""
+"""Hostile requests: they are refused uniformly, store nothing and reveal nothing."""
 
 from __future__ import annotations
 
@@ -50,12 +50,12 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 
 @pytest.fixture(scope="module")
 def tester(site: Served) -> Person:
-    """Someone at the first test trial, who gets no further here."""
+    """A person at the first test trial, who stays there in these tests."""
     return site.person(id="tester").walk("test")
 
 
 def counts(site: Served) -> dict[str, int]:
-    """Rows of each table."""
+    """Count the rows of each table."""
     with site.store.engine.connect() as connection:
         return {
             table.name: connection.scalar(sa.select(sa.func.count()).select_from(table)) or 0
@@ -64,7 +64,7 @@ def counts(site: Served) -> dict[str, int]:
 
 
 def assert_refused(answer: Any, status: int = 422, error: str = "bad_request") -> str:
-    """A refusal of bounded length; its sentence."""
+    """Check that a response is a short refusal and return its message."""
     assert answer.status_code == status, answer.text[:300]
     refusal = wire.Refusal.model_validate_json(answer.content)
     assert refusal.error == error
@@ -167,7 +167,7 @@ class TestAnswers:
         "application/jsonx", "text/html; application/json", "application/octet-stream",
     ])  # fmt: skip
     def test_other_content_types(self, tester: Person, kind: str | None) -> None:
-        """Which also keeps other sites' forms out, that can send nothing else unasked."""
+        """This also blocks forms of other sites, which can only send these content types."""
         assert_refused(post(tester, "/api/answers", changed(), kind))
         assert tester.state()["trial"] == 0
 
@@ -335,7 +335,7 @@ def port(site: Served) -> Iterator[int]:
 
 
 class TestRawRequests:
-    """What no client library sends, on a real server."""
+    """Raw requests that no client library sends, on a real server."""
 
     @pytest.mark.parametrize("path", TRAVERSALS)
     def test_no_path_leads_out(self, port: int, path: str) -> None:

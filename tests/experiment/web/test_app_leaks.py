@@ -1,4 +1,4 @@
-"""Nothing leaks: all that the server ever says before an answer is searched for how trials end."""
+"""Leak tests: no response before an answer may reveal the outcome of a trial."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from sqlalchemy import select
 
 from physion.experiment.store.tables import SESSIONS
 from physion.experiment.study.identity import sign
-from physion.experiment.study.orders import order_of
+from physion.experiment.study.orders import trial_order
 from physion.experiment.study.stimuli import Stimulus
 from physion.experiment.web.media_links import sign_media
 from physion.experiment.web.page_files import MEDIA_TYPES, PACKAGE
@@ -40,7 +40,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 
 
 def numbers(movie: bytes) -> list[int]:
-    """The numbers of the frames of a movie, read off their pixels."""
+    """Return the frame numbers of a movie, decoded from its pixels."""
     with av.open(io.BytesIO(movie)) as container:
         return [
             read_number(frame.to_ndarray(format="rgb24")) for frame in container.decode(video=0)
@@ -48,7 +48,7 @@ def numbers(movie: bytes) -> list[int]:
 
 
 def told(value: Any) -> Iterator[tuple[str, Any]]:
-    """Every name in a message that could tell an end, with what stands there."""
+    """Return all fields of a message that could reveal an outcome, with their values."""
     if isinstance(value, dict):
         for key, inner in value.items():
             if key in TELLING and inner is not None:
@@ -60,7 +60,7 @@ def told(value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def secrets_of(site: Served) -> list[bytes]:
-    """Words that no browser may ever get: names of stimuli and files, keys, the folder."""
+    """Return texts that no browser may ever receive: names of stimuli and files, keys, paths."""
     words = [str(site.study.folder), site.secrets.link_key.hex(), site.secrets.hash_key.hex()]
     for stimulus in site.study.stimuli:
         files = (stimulus.movie, stimulus.map, stimulus.full)
@@ -69,14 +69,14 @@ def secrets_of(site: Served) -> list[bytes]:
 
 
 def assert_silent(site: Served, answer: Any) -> None:
-    """Neither body nor headers have any such word."""
+    """Check that neither body nor headers contain any of these texts."""
     everything = answer.content + str(dict(answer.headers)).encode()
     for word in secrets_of(site):
         assert word not in everything, word
 
 
 def watch(site: Served, person: Person, phase: str, trial: int) -> None:
-    """Fetch the media of a trial; they show the observed frames and no other."""
+    """Fetch the media of a trial and check that they show only the observed frames."""
     listed = person.ask("GET", f"/api/trials/{phase}")["trials"][trial]
     movie, picture = site.client.get(listed["movie"]), site.client.get(listed["map"])
     person.heard += [("movie", movie), ("map", picture)]
@@ -168,7 +168,7 @@ def test_trials_differ_by_nothing_that_follows_from_their_ends(site: Served) -> 
 
 
 def test_nothing_tells_the_seed_of_the_order(site: Served) -> None:
-    """With a public list of stimuli, and this program, the seed would tell every end."""
+    """With a public list of stimuli and this package, the seed would reveal every outcome."""
     person = site.person(id="seed").walk("test")
     person.ask("GET", "/api/session")
     for phase in PHASES:
@@ -181,7 +181,7 @@ def test_nothing_tells_the_seed_of_the_order(site: Served) -> None:
         seed = kept.scalar_one()
     said = "".join(answer.text for _, answer in person.heard)
     assert "/media/t-" in said and "/media/f-" in said
-    order = [one.stimulus for one in order_of(site.study, "collide", seed)["test"]]
+    order = [one.stimulus for one in trial_order(site.study, "collide", seed)["test"]]
     for written in (str(seed), f"{seed:x}", f"{seed:016x}"):
         assert written not in said
     numbers_said = {int(word) for word in re.findall(r"\d+", said)}
@@ -206,7 +206,7 @@ def test_media_have_no_headers_of_their_files(site: Served) -> None:
 
 
 class TestWholeMovies:
-    """The movie with the end is for the feedback alone."""
+    """The full movie is available only with the feedback."""
 
     @pytest.fixture
     def listed(self, site: Served) -> dict[str, list[Any]]:
@@ -254,7 +254,7 @@ class TestWholeMovies:
         assert numbers(movie) == list(range(FULL))
 
     def test_movies_of_another_person_are_the_same_pictures_only(self, site: Served) -> None:
-        """A path passed on shows observed frames; it tells nothing of a session."""
+        """A shared path shows only observed frames and reveals nothing about a session."""
         person = site.person().walk("test")
         movie = person.ask("GET", "/api/trials/test")["trials"][0]["movie"]
         stranger = site.client.get(movie, headers={"authorization": "Bearer nobody"})
@@ -288,7 +288,7 @@ def test_the_experimenters_pages_need_the_password(site: Served, page: str) -> N
 
 
 def test_the_search_itself_finds_what_it_looks_for(site: Served) -> None:
-    """The tests above would fail if something leaked."""
+    """Check that the search itself would find a leak."""
     name = site.study.stimuli[0].stimulus
     answer = site.client.get("/api/health")
     answer._content = json.dumps({"trials": [{"x": name, "label": False}]}).encode()

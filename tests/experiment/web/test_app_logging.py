@@ -1,4 +1,4 @@
-"""What the server writes to its log: each thing once, what an operator needs, and nobody's data."""
+"""The server's log: each event once, what an operator needs, and no personal data."""
 
 from __future__ import annotations
 

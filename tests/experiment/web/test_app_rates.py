@@ -1,4 +1,4 @@
-"""Limits of rate on the whole application: nobody avoids them, and nobody is kept out by them."""
+"""Rate limits of the whole application: nobody can evade them or be locked out by them."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_a_class_behind_one_address_enters_at_once() -> None:
     limits = RateLimits(Limits())
 
     def enter(now: float) -> float:
-        return limits.before("POST", "/api/enter", "", "192.0.2.1", now)
+        return limits.wait_time("POST", "/api/enter", "", "192.0.2.1", now)
 
     assert [enter(0.0) for _ in range(200)] == [0.0] * 200
     assert enter(0.0) == 1.0

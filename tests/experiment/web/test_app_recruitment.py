@@ -1,4 +1,4 @@
-"""Links to hand out, and how people get their credit."""
+"""Entry links of recruiters, and completion credit."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from physion.experiment.study.recruitment import (
     MTURK_HOSTS,
     RECRUITERS,
     completion,
-    kind_of_pass,
     links,
-    pass_word,
+    make_pass,
+    read_pass,
     session_code,
 )
 from physion.experiment.study.study import Recruitment, Study
@@ -112,13 +112,13 @@ class TestLinks:
 class TestPasses:
     def test_a_word_stands_for_its_kind_alone(self, secrets: Secrets) -> None:
         for kind in ("preview", "simulated"):
-            word = pass_word(secrets, kind)  # type: ignore[arg-type]
-            assert kind_of_pass(secrets, word) == kind
-        signature = pass_word(secrets, "preview").partition("-")[2]
+            word = make_pass(secrets, kind)  # type: ignore[arg-type]
+            assert read_pass(secrets, word) == kind
+        signature = make_pass(secrets, "preview").partition("-")[2]
         others = (f"simulated-{signature}", f"person-{signature}", signature, "é-é")
         longer = (f"preview-{signature}0", f"preview-{signature[:-1]}")
         for word in ("", "preview", "preview-", *others, *longer):
-            assert kind_of_pass(secrets, word) is None, word
+            assert read_pass(secrets, word) is None, word
 
     def test_links_open_sessions_of_their_kinds(self, tmp_path: Path) -> None:
         with served(tmp_path / "s", familiarization=1, test=1) as site:

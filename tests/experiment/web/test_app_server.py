@@ -1,4 +1,4 @@
-"""The server process: starts, says where it is, stops without losing anything, fails in a line."""
+"""The server process: start, printed address, shutdown without data loss, one-line errors."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Study:
 
 @pytest.fixture(scope="module")
 def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A certificate for localhost that signs itself, and its key."""
+    """A self-signed certificate for localhost, and its key."""
     openssl = find_program("openssl")
     folder = tmp_path_factory.mktemp("https")
     certificate, key = folder / "cert.pem", folder / "key.pem"
@@ -53,7 +53,7 @@ def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 @dataclass
 class Process:
-    """A server of its own with the address that it said."""
+    """A server process and the address that it printed."""
 
     process: subprocess.Popen[str]
     said: dict[str, str]
@@ -63,7 +63,7 @@ class Process:
         return int(self.said["address"].rpartition(":")[2])
 
     def end(self, number: signal.Signals) -> tuple[int, str]:
-        """Exit code after a signal, and what went to standard error."""
+        """Send a signal and return the exit code and standard error."""
         self.process.send_signal(number)
         _, errors = self.process.communicate(timeout=30)
         return self.process.returncode, errors
@@ -170,7 +170,7 @@ def test_a_proxys_word_counts_only_where_it_is_named(tmp_path: Path, trusted: bo
 
 
 class TestFaults:
-    """One line on standard error, exit code 2."""
+    """Faults give one line on standard error and exit code 2."""
 
     def fail(self, capsys: pytest.CaptureFixture[str], *words: str) -> str:
         assert main(["experiment", "serve", *words]) == 2
@@ -248,7 +248,7 @@ def test_a_folder_without_a_study_is_none(
 ) -> None:
     assert main(["experiment", "serve", str(tmp_path)]) == 2
     said = capsys.readouterr().err
-    assert "this is no study folder; make one with physion experiment init" in said
+    assert "this is no study folder; create one with physion experiment init" in said
     assert said.count("\n") == 1
 
 

@@ -1,4 +1,4 @@
-"""Files of the participants' pages: shipped code of others, words, what may not be in them."""
+"""Static files of the participants' pages: vendored code, texts, and forbidden content."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_shipped_files_are_those_of_the_lock() -> None:
 
 
 def test_the_page_asks_no_other_host_and_has_nothing_inline() -> None:
-    """What the content security policy would refuse is not there in the first place."""
+    """The pages contain nothing that the content security policy would block."""
     page = Tags((PACKAGE / "pages" / "index.html").read_text(encoding="utf-8"))
     addresses = [
         value for _, attributes in page.tags for name, value in attributes.items()
@@ -106,14 +106,14 @@ def test_every_text_is_there_and_used() -> None:
 
 @pytest.mark.parametrize("language", sorted(TEXTS))
 def test_words_that_the_page_itself_holds(language: str) -> None:
-    """Browsers without script or modules load no texts: the page has these two in all languages."""
+    """The page itself has two texts in all languages, for browsers without script or modules."""
     page = " ".join((PACKAGE / "pages" / "index.html").read_text(encoding="utf-8").split())
     for key in ("refusal.no_script", "refusal.browser"):
         assert TEXTS[language][key] in page
 
 
 def test_contrast_of_the_colours() -> None:
-    """Text on what it stands on: at least 4.5 to 1, as WCAG 2 counts it."""
+    """The contrast of text and background is at least 4.5 to 1 (WCAG 2)."""
     css = (STATIC / "pages.css").read_text(encoding="utf-8")
     colours = dict(re.findall(r"--(\w+): (#[0-9a-f]{6});", css))
     for paper in ("ground", "paper"):
@@ -134,7 +134,7 @@ def luminance(colour: str) -> float:
 
 
 class Tags(HTMLParser):
-    """Tags of a page with their attributes."""
+    """Parser that collects the tags of a page with their attributes."""
 
     def __init__(self, page: str) -> None:
         super().__init__()

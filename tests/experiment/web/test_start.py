@@ -1,4 +1,4 @@
-"""The server is there soon: what takes seconds to import is imported where it is used."""
+"""The server starts quickly: slow modules are imported only where they are used."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 import httpx2
 
 from physion.analysis.people.exclusions import RULE_SETS
-from physion.experiment.simulated.server_process import OwnServer
+from physion.experiment.simulated.server_process import ServerProcess
 from physion.experiment.study.study_checks import EXCLUSIONS
 from support.experiment.tiny_study import make_tiny_study
 
@@ -42,10 +42,10 @@ def test_serving_imports_nothing_slow() -> None:
 
 def test_requests_are_logged_without_what_tells_who_comes(tmp_path: Path) -> None:
     folder = make_tiny_study(tmp_path / "study", test=2, familiarization=1).folder
-    with OwnServer(folder, options=["--log-requests"]) as server:
+    with ServerProcess(folder, options=["--log-requests"]) as server:
         asked = httpx2.get(f"{server.url}/?PROLIFIC_PID=SECRET", trust_env=False)
         httpx2.get(f"{server.url}/no%0Asuch", trust_env=False)
-        lines = server.last_words().splitlines()
+        lines = server.last_output().splitlines()
     assert asked.status_code == 200
     for request in ("GET / 200", "GET /no%0Asuch 404"):
         assert sum(line.endswith(request) for line in lines) == 1

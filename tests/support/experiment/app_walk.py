@@ -1,4 +1,4 @@
-"""A participant over HTTP, who keeps everything that the server ever said."""
+"""Test participant over HTTP, who records all responses of the server."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FAST = Limits(
 
 @dataclass
 class Served:
-    """A study that is served in this process."""
+    """A study served in this process, with its test client."""
 
     study: Study
     secrets: Secrets
@@ -32,7 +32,7 @@ class Served:
     client: TestClient
 
     def person(self, **enter: Any) -> Person:
-        """Someone who has entered."""
+        """Return a person who has entered."""
         person = Person(self.client)
         person.ask("POST", "/api/enter", enter)
         person.token = person.last["token"]
@@ -41,7 +41,7 @@ class Served:
 
 @contextlib.contextmanager
 def served(folder: Path, **settings: Any) -> Iterator[Served]:
-    """Serve a tiny study from ``folder``."""
+    """Create a tiny study in ``folder`` and serve it."""
     study = make_tiny_study(folder, **{"size": 64, "limits": FAST, **settings})
     secrets = Secrets.load(folder)
     store = Store.open(study, secrets)
@@ -54,7 +54,7 @@ def served(folder: Path, **settings: Any) -> Iterator[Served]:
 
 @dataclass
 class Person:
-    """One browser: what it asks and hears. ``heard`` has all answers with what was asked."""
+    """Client of one participant. ``heard`` has all requests with their responses."""
 
     client: TestClient
     token: str = ""
@@ -62,11 +62,11 @@ class Person:
 
     @property
     def last(self) -> Any:
-        """The last answer's message."""
+        """The JSON body of the last response."""
         return self.heard[-1][1].json()
 
     def ask(self, method: str, path: str, body: Any = None, status: int = 200) -> Any:
-        """The message in answer; fails where the status is another one."""
+        """Send a request, assert its status, and return the JSON body (else the response)."""
         headers = {"authorization": f"Bearer {self.token}"} if self.token else {}
         answer = self.client.request(method, path, json=body, headers=headers)
         self.heard.append((f"{method} {path}", answer))
@@ -84,7 +84,7 @@ class Person:
         return self.ask("POST", "/api/answers", answer_body(trial, phase, **more), status)
 
     def walk(self, stage: str) -> Person:
-        """Go on until a stage is reached."""
+        """Submit pages and answers until a stage is reached."""
         while (state := self.state())["stage"] != stage:
             assert STAGES.index(state["stage"]) < STAGES.index(stage)
             if state["trial"] is None:
@@ -95,7 +95,7 @@ class Person:
 
 
 def answer_body(trial: int, phase: str = "test", **more: Any) -> dict[str, Any]:
-    """The body of an answer as the pages send it."""
+    """Return the body of an answer as the pages send it."""
     details = {"cue_changes": [0.0, 250.1, 500.2], "frames": [[0, 0.0], [1, 33.4]]}
     return {
         "key": f"{phase}-{trial:04d}", "phase": phase, "trial": trial, "response": "yes",

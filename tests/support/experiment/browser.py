@@ -1,7 +1,7 @@
-"""A real browser that takes part in a study on a real server, and what tests ask of both.
+"""Helpers of browser tests: take part in a study with a real browser on a real server.
 
-Chromium is the one named by $PHYSION_BROWSER, else that of the system. With $PHYSION_SCREENSHOTS
-every page is also written there as a picture, to be looked at.
+Chromium is the one named by $PHYSION_BROWSER, else that of the system. With $PHYSION_SCREENSHOTS a
+screenshot of every page is written to that folder.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from urllib.parse import urlsplit
 import pytest
 import sqlalchemy as sa
 
-from physion.experiment.simulated.server_process import OwnServer
+from physion.experiment.simulated.server_process import ServerProcess
 from physion.experiment.store.database import open_database, sqlite_url
 from physion.experiment.store.tables import ANSWERS, EVENTS, SESSIONS
 from physion.experiment.study.identity import Secrets, participant_hash
@@ -29,13 +29,13 @@ from support.programs import absent, find_chromium
 SIZE = {"width": 1280, "height": 800}
 SHORT = Timing(fixation_ms=(60, 120), cue_ms=500, flash_hz=2.0)
 OFFLINE = re.compile(r"ERR_(INTERNET_DISCONNECTED|CONNECTION_REFUSED)|status of (409|503)")
-"""What browsers say of requests that a test lets fail."""
+"""Console messages of browsers about requests that a test lets fail."""
 
 
-# As long as it lives, its event loop runs in this thread, and others could not start theirs.
+# One per module: while it runs, its event loop blocks this thread for other event loops.
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Any]:
-    """A running browser for one file of tests; they are skipped where there is none."""
+    """A running browser for one test module; skips the tests if there is no browser."""
     if importlib.util.find_spec("playwright") is None:
         absent("playwright is absent: install the extra 'dev'")
     driver = importlib.import_module("playwright.sync_api")
@@ -47,8 +47,8 @@ def chromium() -> Iterator[Any]:
 
 
 @contextlib.contextmanager
-def served(folder: Path, **settings: Any) -> Iterator[tuple[Study, OwnServer]]:
-    """A tiny study on a server of its own."""
+def served(folder: Path, **settings: Any) -> Iterator[tuple[Study, ServerProcess]]:
+    """Serve a tiny study by its own server process."""
     given: dict[str, Any] = {
         "test": 3,
         "familiarization": 2,
@@ -56,12 +56,12 @@ def served(folder: Path, **settings: Any) -> Iterator[tuple[Study, OwnServer]]:
         "recruitment": Recruitment(link_code="TINY-CODE", link_address="https://lab.example/done"),
     }
     study = make_tiny_study(folder, **{**given, **settings})
-    with OwnServer(study.folder) as server:
+    with ServerProcess(study.folder) as server:
         yield study, server
 
 
 class Visit:
-    """One participant's browser: takes the steps of a session and notes what goes wrong."""
+    """One participant's browser: performs the steps of a session and records console errors."""
 
     def __init__(self, chromium: Any, url: str, name: str = "", **context: Any) -> None:
         self.url, self.name = url, name
@@ -73,16 +73,16 @@ class Visit:
         self._pictures = 0
 
     def open_tab(self) -> Any:
-        """Another tab of the same browser."""
+        """Open another tab of the same browser."""
         page = self.context.new_page()
-        page.on("console", lambda said: self._console(said))
+        page.on("console", lambda message: self._console(message))
         page.on("pageerror", lambda error: self.complaints.append(f"error: {error}"))
         page.on("request", lambda request: self.requests.append(request.url))
         return page
 
-    def _console(self, said: Any) -> None:
-        if said.type in ("error", "warning"):
-            self.complaints.append(f"{said.type}: {said.text}")
+    def _console(self, message: Any) -> None:
+        if message.type in ("error", "warning"):
+            self.complaints.append(f"{message.type}: {message.text}")
 
     def __enter__(self) -> Visit:
         return self
@@ -93,15 +93,15 @@ class Visit:
         self.context.close()
 
     def hosts(self) -> set[str]:
-        """Hosts that anything was asked of; blobs have none."""
+        """Return the hosts of all requests, without blob URLs."""
         return {urlsplit(url).netloc for url in self.requests if not url.startswith("blob:")}
 
     def unexpected(self) -> list[str]:
-        """Complaints that have nothing to do with a connection that a test took away."""
+        """Return the console errors that are not due to a connection cut by the test."""
         return [line for line in self.complaints if not OFFLINE.search(line)]
 
     def picture(self, what: str) -> None:
-        """A picture of the page, where they are wanted."""
+        """Write a screenshot if $PHYSION_SCREENSHOTS is set."""
         folder = os.environ.get("PHYSION_SCREENSHOTS")
         if folder and self.name:
             self._pictures += 1
@@ -109,50 +109,50 @@ class Visit:
             self.page.screenshot(path=f"{folder}/{self.name}-{self._pictures:02d}-{what}.png")
 
     def go(self, query: str = "") -> None:
-        """Open the study by an address with these parameters."""
+        """Open the study with this query string."""
         self.page.goto(f"{self.url}/{query}")
 
     def heading(self, wanted: str | None = None) -> str:
-        """The heading of the page, once there is one (and it is the one that is wanted)."""
-        at = self.page.locator("h1", has_text=wanted) if wanted else self.page.locator("h1")
-        at.wait_for()
-        return str(at.inner_text())
+        """Wait for a heading (containing ``wanted`` if given) and return its text."""
+        locator = self.page.locator("h1", has_text=wanted) if wanted else self.page.locator("h1")
+        locator.wait_for()
+        return str(locator.inner_text())
 
     def press(self, *keys: str) -> None:
         for key in keys:
             self.page.keyboard.press(key)
 
     def main_button(self) -> Any:
-        """The button by which a page goes on."""
+        """Return the locator of the button that continues to the next page."""
         return self.page.locator("main .button:not(.quiet):enabled")
 
     def wait_for_answer(self) -> None:
-        """Until the buttons of a trial can be pressed."""
+        """Wait until the buttons of a trial are enabled."""
         self.page.locator(".answer:enabled").first.wait_for()
 
     def left(self) -> str:
-        """The response whose button stands left."""
+        """Return the response of the left button."""
         return str(self.page.locator(".answer").first.get_attribute("data-response"))
 
     def answer(self, response: str, by: str = "mouse") -> None:
-        """Answer the trial as soon as that is possible."""
+        """Answer the trial as soon as the buttons are enabled."""
         self.wait_for_answer()
         if by == "keyboard":
             self.press("f" if self.left() == response else "j")
         else:
             self.page.click(f".answer[data-response={response}]")
-        # Until the next page is there, so that nothing is pressed on this one again.
+        # Wait for the next page, so that nothing is pressed on this one again.
         self.page.locator(".answer:enabled").first.wait_for(state="detached")
 
     def see_feedback(self) -> str:
-        """See the whole movie and go on; what was said of the answer."""
+        """Watch the full movie, continue, and return the verdict on the answer."""
         self.main_button().wait_for()
         verdict = str(self.page.locator(".verdict").inner_text())
         self.main_button().click()
         return verdict
 
     def begin(self, query: str = "") -> None:
-        """From the consent to the first trial."""
+        """Go from the consent page to the first trial."""
         self.go(query)
         self.heading()
         self.main_button().click()
@@ -171,7 +171,7 @@ class Visit:
         self.main_button().click()
 
     def finish(self) -> None:
-        """Demographics and feedback, until the result is shown."""
+        """Fill in demographics and feedback and wait for the result page."""
         self.page.fill("#age", "33")
         self.page.select_option("#gender", "female")
         self.page.select_option("#education", "master")
@@ -184,7 +184,7 @@ class Visit:
 
 
 def rows_of(study: Study, raw_id: str) -> tuple[Any, list[Any], list[Any]]:
-    """Session, answers in their order, and events of who came by ``?participant=``."""
+    """Return session, ordered answers and events of the person with this ``?participant=`` id."""
     participant = participant_hash(Secrets.load(study.folder), "link", raw_id)
     engine = open_database(sqlite_url(study.folder), must_exist=True)
     try:

@@ -1,4 +1,4 @@
-"""A browser without a screen for the experimenter's pages."""
+"""Test client of the experimenter's pages, and a study that is served to it."""
 
 from __future__ import annotations
 
@@ -21,35 +21,35 @@ TWO = ("collide", "drop")
 
 
 class Visitor(TestClient):
-    """Sends forms as a browser would, with the token of the page that was seen last."""
+    """Test client that submits forms as a browser would, with the page's form token."""
 
     def token(self, page: str = "/login") -> str:
-        """The token in the forms of a page."""
-        found = re.search(r'name="form_token" value="([0-9a-f]{64})"', self.see(page).text)
-        assert found is not None
-        return found[1]
+        """Return the token in the forms of a page."""
+        match = re.search(r'name="form_token" value="([0-9a-f]{64})"', self.see(page).text)
+        assert match is not None
+        return match[1]
 
-    def see(self, place: str = "") -> Any:
-        """A page; what it says where one is sent elsewhere, not the other page."""
-        return self.get(f"{BASE}{place}", follow_redirects=False)
+    def see(self, path: str = "") -> Any:
+        """Get a page without following redirects."""
+        return self.get(f"{BASE}{path}", follow_redirects=False)
 
-    def submit(self, place: str, form_token: str | None = None, **fields: str) -> Any:
-        """A form, without a token where none is given."""
+    def submit(self, path: str, form_token: str | None = None, **fields: str) -> Any:
+        """Submit a form, without a token if ``form_token`` is None."""
         data = fields | ({} if form_token is None else {"form_token": form_token})
-        return self.post(f"{BASE}{place}", data=data, follow_redirects=False)
+        return self.post(f"{BASE}{path}", data=data, follow_redirects=False)
 
     def log_in(self, password: str = PASSWORD) -> Any:
-        """The password, as on the login page."""
+        """Submit the password on the login page."""
         return self.submit("/login", self.token(), password=password)
 
     def open_payments(self) -> Any:
-        """The password once more, then the page of payments."""
+        """Submit the password once more and return the payments page."""
         assert self.submit("/payments", self.token("/export"), password=PASSWORD).status_code == 303
         return self.see("/payments")
 
 
 class Lab:
-    """A study that is served to visitors."""
+    """A tiny study, its store and its application."""
 
     def __init__(self, folder: Path, url: str | None = None, **settings: Any) -> None:
         settings = {"test": 6, "scenarios": TWO, "size": 64, "languages": ("en",)} | settings
@@ -60,28 +60,28 @@ class Lab:
         self._visitors = contextlib.ExitStack()
 
     def visitor(self, base_url: str = "http://testserver", address: str = "192.0.2.1") -> Visitor:
-        """A new browser, not logged in."""
+        """Return a new client that is not logged in."""
         return self._visitors.enter_context(
             Visitor(self.app, base_url=base_url, client=(address, 5000))
         )
 
     def experimenter(self, **settings: Any) -> Visitor:
-        """A new browser that is logged in."""
+        """Return a new client that is logged in."""
         visitor = self.visitor(**settings)
         assert visitor.log_in().status_code == 303
         return visitor
 
     def close(self) -> None:
-        """Ends the server and its processes."""
+        """Close the clients and the store."""
         self._visitors.close()
         self.store.close()
 
 
 @contextlib.contextmanager
 def lab(folder: Path, url: str | None = None, **settings: Any) -> Iterator[Lab]:
-    """A `Lab` for a while."""
-    found = Lab(folder, url, **settings)
+    """Create a `Lab` and close it at the end."""
+    opened = Lab(folder, url, **settings)
     try:
-        yield found
+        yield opened
     finally:
-        found.close()
+        opened.close()

@@ -1,4 +1,4 @@
-"""Sessions put straight into the tables, for what only reads them."""
+"""Insert generated sessions directly into the tables, for tests of code that reads them."""
 
 from __future__ import annotations
 
@@ -41,10 +41,27 @@ def insert_sessions(
     now: float | None = None,
     **facts: Any,
 ) -> list[str]:
-    """``count`` sessions of new participants, their names; ``facts`` are columns of SESSIONS.
+    """Insert ``count`` sessions of new participants and return their names.
 
-    People are right in 70 % of the trials, press the same button always where their number is a
-    multiple of 17, and begin one every three minutes up to ``now``.
+    Answers are correct in 70 % of the trials; every 17th person always presses the same button. One
+    session begins every three minutes until an hour before ``now``.
+
+    Parameters
+    ----------
+    engine, study, secrets
+        Database, study and its keys.
+    count
+        Number of sessions.
+    kind
+        Kind of all sessions.
+    ends
+        Outcomes to draw from.
+    seed
+        Seed of the random draws.
+    now
+        Time of the latest activity in seconds since 1970; the current time if None.
+    facts
+        Columns of SESSIONS that override the generated values.
     """
     generator = np.random.default_rng([seed, count])
     now = time.time() if now is None else now

@@ -1,4 +1,4 @@
-"""An application on a real server in a thread, and raw connections to it."""
+"""Run an application on a real server in a thread, and send raw bytes to it."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from typing import Any
 
 import uvicorn
 
-from physion.experiment.web.connections import CarefulProtocol
+from physion.experiment.web.connections import LimitedHeadProtocol
 
 HOST = "127.0.0.1"
 
 
 @contextlib.contextmanager
 def running(app: Any, **settings: Any) -> Iterator[int]:
-    """Serve ``app`` as the package's server does, on a free port, which is given."""
-    given = {"http": CarefulProtocol, "ws": "none", "lifespan": "off", "log_config": None,
+    """Serve ``app`` with the package's server settings on a free port, and yield the port."""
+    given = {"http": LimitedHeadProtocol, "ws": "none", "lifespan": "off", "log_config": None,
              "access_log": False, "server_header": False, "proxy_headers": False}  # fmt: skip
     server = uvicorn.Server(uvicorn.Config(app, **{**given, **settings}))
     with socket.create_server((HOST, 0)) as listening:
@@ -35,7 +35,7 @@ def running(app: Any, **settings: Any) -> Iterator[int]:
 
 
 def exchange(port: int, *parts: bytes, patience: float = 10.0) -> bytes:
-    """Send bytes as they are; what the server says until it closes or falls silent."""
+    """Send raw bytes and return the response until the server closes or is silent."""
     with socket.create_connection((HOST, port), timeout=patience) as connection:
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             for part in parts:
@@ -44,14 +44,14 @@ def exchange(port: int, *parts: bytes, patience: float = 10.0) -> bytes:
 
 
 def read_all(connection: socket.socket, silence: float = 0.4) -> bytes:
-    """All that comes until the other side closes or is silent."""
-    heard = b""
+    """Read until the other side closes or sends nothing for ``silence`` seconds."""
+    received = b""
     while True:
-        connection.settimeout(silence if heard else 30.0)
+        connection.settimeout(silence if received else 30.0)
         try:
             more = connection.recv(65536)
         except (TimeoutError, ConnectionResetError):
-            return heard
+            return received
         if not more:
-            return heard
-        heard += more
+            return received
+        received += more

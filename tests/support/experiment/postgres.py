@@ -1,7 +1,8 @@
-"""A PostgreSQL server for tests: the one of $PHYSION_POSTGRES, or one of our own.
+"""PostgreSQL server for tests: the one of $PHYSION_POSTGRES, or a temporary one.
 
-Our own lies in a temporary folder, listens on this machine alone and ends with the tests. It is
-durable as a real one (fsync on). Without PostgreSQL's programs the tests that need it are skipped.
+The temporary server has its data in a temporary folder, listens on the loopback interface only and
+ends with the tests. It is as durable as a real one (fsync on). Without PostgreSQL's programs the
+tests that need it are skipped.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ USER = "postgres"
 
 
 class Cluster:
-    """A server that can be stopped and started again, as tests of lost connections need."""
+    """A temporary server that tests of lost connections can stop and start again."""
 
     def __init__(self, folder: Path, programs: Path) -> None:
         self._folder, self._programs = folder, programs
@@ -39,12 +40,12 @@ class Cluster:
             settings.write("fsync = on\nsynchronous_commit = on\nmax_connections = 50\n")
 
     def start(self) -> None:
-        """Start the server; returns once it takes connections."""
+        """Start the server and wait until it accepts connections."""
         options = f"-p {self.port} -c listen_addresses=127.0.0.1 -k {self._folder}"
         self._run("pg_ctl", "start", "-w", "-l", str(self._folder / "log"), "-o", options)
 
     def stop(self, mode: str = "fast") -> None:
-        """Stop it; ``immediate`` is a crash."""
+        """Stop the server; mode ``immediate`` acts like a crash."""
         self._run("pg_ctl", "stop", "-w", "-m", mode)
 
     def _run(self, program: str, *words: str) -> None:
@@ -77,13 +78,13 @@ def _has_user() -> bool:
 
 @pytest.fixture(scope="session")
 def postgres_cluster() -> Iterator[Cluster]:
-    """A running server of our own."""
+    """A running temporary server."""
     programs = _programs()
     if programs is None:
         absent("PostgreSQL is absent: install it, or set PHYSION_POSTGRES to a server's URL")
     if os.geteuid() == 0 and not _has_user():
         absent("PostgreSQL does not run as root, and there is no user postgres")
-    # Not below pytest's own folder, which the user postgres may not enter. initdb makes data.
+    # Not below pytest's folder, which the user postgres cannot enter. initdb creates `data`.
     folder = Path(tempfile.mkdtemp(prefix="physion-postgres-"))
     try:
         if os.geteuid() == 0:
@@ -100,7 +101,7 @@ def postgres_cluster() -> Iterator[Cluster]:
 
 @pytest.fixture(scope="session")
 def postgres_url(request: pytest.FixtureRequest) -> str:
-    """URL of a server on which tests may make databases."""
+    """URL of a server on which tests can create databases."""
     named = os.environ.get("PHYSION_POSTGRES")
     if named:
         return named
@@ -118,7 +119,7 @@ def _fresh(server: str) -> Iterator[str]:
     try:
         yield make_url(server).set(database=name).render_as_string(hide_password=False)
     finally:
-        # Dropping takes half a second; a server of our own is deleted as a whole.
+        # Dropping takes half a second; a temporary server is deleted as a whole.
         if os.environ.get("PHYSION_POSTGRES"):
             with admin.connect() as connection:
                 connection.execute(text(f"DROP DATABASE {name} WITH (FORCE)"))
@@ -133,7 +134,7 @@ def fresh_postgres(postgres_url: str) -> Iterator[str]:
 
 @pytest.fixture(params=["sqlite", "postgresql"])
 def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    """URL of an empty database, once of each kind."""
+    """URL of an empty database, parametrised over both kinds."""
     if request.param == "sqlite":
         (tmp_path / "database").mkdir()
         return f"sqlite:///{tmp_path / 'database' / 'responses.sqlite'}"

@@ -1,4 +1,4 @@
-"""Servers that start quickly, to be killed often, and the rows that they leave in the database."""
+"""Servers that start quickly, for crash tests, and the rows that they leave in the database."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from physion.experiment.simulated.server_process import OwnServer
+from physion.experiment.simulated.server_process import ServerProcess
 from physion.experiment.store.database import open_database, sqlite_url
 from physion.experiment.store.tables import ANSWERS, SESSIONS
 from physion.experiment.study.study import Study
@@ -29,20 +29,20 @@ while os.read(0, 1):
     os.write(1, b"%d\\n" % child)
     os.write(1, b"%d\\n" % os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 """
-"""Imports all that a server needs, and forks one for each byte that it reads."""
+"""Program that imports the server's modules and forks a server for each byte on its stdin."""
 
 
 class Forked:
-    """A child of the mother process, with what `OwnServer` asks of a process."""
+    """A forked server, with the methods of `subprocess.Popen` that `ServerProcess` uses."""
 
     def __init__(self, mother: subprocess.Popen[bytes]) -> None:
-        self._told, self._code = mother.stdout, None
+        self._reports, self._code = mother.stdout, None
         os.write(mother.stdin.fileno(), b"1")
-        self.pid = int(self._told.readline())
+        self.pid = int(self._reports.readline())
 
     def poll(self, timeout: float = 0.0) -> int | None:
-        if self._code is None and select.select([self._told], [], [], timeout)[0]:
-            self._code = int(self._told.readline())
+        if self._code is None and select.select([self._reports], [], [], timeout)[0]:
+            self._code = int(self._reports.readline())
         return self._code
 
     def wait(self, timeout: float = 60.0) -> int:
@@ -62,8 +62,8 @@ class Forked:
             os.kill(self.pid, number)
 
 
-class QuickServer(OwnServer):
-    """`physion experiment serve` in a process that was forked after all imports."""
+class QuickServer(ServerProcess):
+    """`physion experiment serve` in a process forked after all imports."""
 
     _mother: subprocess.Popen[bytes] | None = None
 
@@ -71,7 +71,7 @@ class QuickServer(OwnServer):
         if self._mother is None:
             words = [sys.executable, "-c", MOTHER, *self._command[3:]]
             self._mother = subprocess.Popen(
-                words, bufsize=0, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._said
+                words, bufsize=0, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._output
             )
         return Forked(self._mother)
 
@@ -84,17 +84,17 @@ class QuickServer(OwnServer):
 
 
 def stored_sessions(study: Study, url: str | None = None) -> dict[str, Any]:
-    """Rows of SESSIONS by the reference that the participant was given."""
+    """Return the rows of SESSIONS by the participant's reference."""
     return {row.reference: row for row in _rows(study, url, sa.select(SESSIONS))}
 
 
 def stored_answers(study: Study, url: str | None = None) -> dict[tuple[str, str, int], Any]:
-    """Rows of ANSWERS by reference, phase and trial."""
-    found = sa.select(ANSWERS, SESSIONS.c.reference).join(SESSIONS)
-    rows = _rows(study, url, found)
-    by_place = {(row.reference, row.phase, row.trial): row for row in rows}
-    assert len(by_place) == len(rows)
-    return by_place
+    """Return the rows of ANSWERS by reference, phase and trial."""
+    query = sa.select(ANSWERS, SESSIONS.c.reference).join(SESSIONS)
+    rows = _rows(study, url, query)
+    by_trial = {(row.reference, row.phase, row.trial): row for row in rows}
+    assert len(by_trial) == len(rows)
+    return by_trial
 
 
 def _rows(study: Study, url: str | None, query: sa.Select[Any]) -> list[Any]:

@@ -1,4 +1,4 @@
-"""Walking sessions through the store without HTTP, for tests; and stores to walk in."""
+"""Helpers that run sessions through the store without HTTP, and store fixtures."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import pytest
 from sqlalchemy import select
 
-from physion.experiment.protocol.messages import Answer, AnswerStored, Enter, PageDone, State
+from physion.experiment.protocol.messages import Answer, AnswerStored, Enter, PageDone, SessionState
 from physion.experiment.store.store import Refused, Store
 from physion.experiment.store.tables import ANSWERS
 from physion.experiment.study.identity import Secrets
@@ -46,12 +46,12 @@ def give(store: Store, token: str, trial: int, phase: Any = "test", **more: Any)
     return run(store.answer(token, answer(trial, phase, **more)))
 
 
-def page(store: Store, token: str, name: Any, **data: Any) -> State:
+def page(store: Store, token: str, name: Any, **data: Any) -> SessionState:
     return run(store.page(token, PageDone(page=name, data=data or PAGES.get(name, {}))))
 
 
 def walk(store: Store, token: str, stage: str) -> str:
-    """Go on until a stage is reached, answering yes; the token again."""
+    """Submit pages and "yes" answers until a stage is reached, and return the token."""
     while True:
         state = run(store.state(token))
         if state.stage == stage:
@@ -76,7 +76,7 @@ def rows(store: Store, table: Any = ANSWERS) -> list[Any]:
 
 @pytest.fixture(scope="session")
 def small_study(tmp_path_factory: pytest.TempPathFactory) -> Study:
-    """Two scenarios of 3 familiarization and 4 test trials."""
+    """A study with two scenarios of 3 familiarization and 4 test trials each."""
     folder: Path = tmp_path_factory.mktemp("small") / "study"
     return make_tiny_study(
         folder, test=4, familiarization=3, scenarios=("collide", "drop"), size=64,
@@ -91,7 +91,7 @@ def small_secrets(small_study: Study) -> Secrets:
 
 @pytest.fixture
 def store(small_study: Study, small_secrets: Secrets, database_url: str) -> Iterator[Store]:
-    """A store on an empty database, once of each kind."""
+    """A store on an empty database, parametrised over both kinds."""
     opened = Store.open(small_study, small_secrets, database_url)
     yield opened
     opened.close()
@@ -99,7 +99,7 @@ def store(small_study: Study, small_secrets: Secrets, database_url: str) -> Iter
 
 @pytest.fixture
 def sqlite_store(small_study: Study, small_secrets: Secrets, tmp_path: Path) -> Iterator[Store]:
-    """A store on an empty SQLite database, for what no database has a say in."""
+    """A store on an empty SQLite database, for tests that do not depend on the database."""
     opened = Store.open(small_study, small_secrets, f"sqlite:///{tmp_path / 'a.sqlite'}")
     yield opened
     opened.close()

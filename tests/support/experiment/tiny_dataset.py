@@ -1,4 +1,4 @@
-"""A dataset of ours in a second: movies of `tiny_study` with maps, free and marked colours."""
+"""A small generated dataset: movies of `tiny_study` with maps, in free and in marked colours."""
 
 from __future__ import annotations
 
@@ -26,10 +26,25 @@ def make_tiny_dataset(
     rate: int = 30,
     free: bool = True,
 ) -> Dataset:
-    """So many trials of each split and scenario; every other one has contact, or ``all`` have.
+    """Write a dataset with the given numbers of trials per split and scenario.
 
-    The own look is ``redyellow``, as generated testing trials have it; with ``free`` there are
-    movies in free colours beside it.
+    Parameters
+    ----------
+    folder
+        Folder of the dataset.
+    test, familiarization
+        Trials per scenario in the splits testing and familiarization.
+    scenarios
+        Names of the scenarios.
+    size
+        Width and height of the movies in pixels.
+    contacts
+        ``alternating``: every second trial has contact; ``all``: every trial.
+    rate
+        Frames per second.
+    free
+        Also write movies in free colours. The default look is ``redyellow``, as in generated
+        testing trials.
     """
     rows, number = [], 0
     for scenario in scenarios:
@@ -60,7 +75,7 @@ def _make(
     )
     frames = draw(number, contact, size)
     marked = frames.copy()
-    # Red where the agent is blue: enough to tell the looks apart.
+    # Make the blue agent red, which is enough to distinguish the looks.
     marked[frames[..., 2] > 180] = (200, 30, 30)
     files = {
         "movie": encode_movie(marked, rate=rate),
@@ -81,7 +96,7 @@ def _make(
 
 
 def is_marked(frame: np.ndarray) -> bool:
-    """Is a picture (H, W, 3) of the red and yellow look?"""
+    """Return whether an image (H, W, 3) has the red and yellow look."""
     red, _, blue = (frame[..., channel].astype(int) for channel in range(3))
-    # White digits aside, only one of the two disks is this far from grey.
+    # Apart from the white digits, only the red or the blue disk is this far from grey.
     return bool((red - blue > 80).sum() > (blue - red > 80).sum())

@@ -1,10 +1,10 @@
-"""A real study folder in a second: tiny movies whose frame number can be read off the pixels.
+"""A small but complete study folder, with movies whose pixels encode the frame number.
 
-Each movie shows a blue disk (agent) and a green square (patient) on grey. Along the lower edge, an
-eighth of the picture high, are six blocks of equal width: white for 1, black for 0, the highest
-digit left; together the number of the frame, from 0. `read_number` reads it from a picture; a
-browser test does the same with the pixels of a canvas, at ``((i + 0.5) / 6, 15 / 16)`` of width and
-height. Whole movies go on to frame 59 and end with the agent at the patient, or away from it.
+Each movie shows a blue disk (agent) and a green square (patient) on grey. Six blocks of equal width
+along the lower edge, an eighth of the image high, encode the frame index (from 0) in binary: white
+is 1, black is 0, the highest digit is left. `read_number` decodes it from an image; a browser test
+does the same with the pixels of a canvas, at ``((i + 0.5) / 6, 15 / 16)`` of width and height. Full
+movies continue to frame 59 and end with the agent at the patient, or away from it.
 """
 
 from __future__ import annotations
@@ -41,9 +41,22 @@ def make_tiny_study(
     password: str = PASSWORD,
     **settings: Any,
 ) -> Study:
-    """A study with so many trials a scenario, labels alternating (the first with contact).
+    """Write and load a study with alternating labels (the first trial has contact).
 
-    ``settings`` are fields of `Study` (``participants=3``, ``timing=Timing(cue_ms=100)``, ...).
+    Parameters
+    ----------
+    folder
+        The study folder to create.
+    test, familiarization
+        Number of trials per scenario in each phase.
+    scenarios
+        Names of the scenarios.
+    size
+        Width and height of the movies in pixels.
+    password
+        The experimenter's password.
+    settings
+        Fields of `Study` (``participants=3``, ``timing=Timing(cue_ms=100)``, ...).
     """
     (folder / "media").mkdir(parents=True, exist_ok=True)
     stimuli, number = [], 0
@@ -74,12 +87,12 @@ def make_tiny_study(
 
 @cache
 def _hash(password: str) -> str:
-    """As `Secrets.create` hashes it, but for the 0.2 s that this takes on purpose."""
+    """Hash a password as `Secrets.create` does, but with cheap parameters."""
     return PasswordHasher(time_cost=1, memory_cost=8, parallelism=1).hash(password)
 
 
 def read_number(frame: NDArray[np.uint8]) -> int:
-    """The number of the frame that a picture (H, W, 3) shows."""
+    """Decode the frame index from an image (H, W, 3)."""
     height, width = frame.shape[:2]
     row = frame[height * 15 // 16]
     digits = [int(row[int((i + 0.5) * width / BLOCKS)].mean() > 127) for i in range(BLOCKS)]
@@ -91,7 +104,7 @@ def _stimulus(
 ) -> Stimulus:
     practice, contact = phase == "familiarization", place % 2 == 0
     observed, whole, picture = _media(number, contact, size)
-    # Names that tell neither label nor phase.
+    # File names that reveal neither label nor phase.
     name = f"media/{number * 7919 % 10007:05d}"
     (folder / f"{name}.mp4").write_bytes(observed)
     (folder / f"{name}.png").write_bytes(picture)
@@ -117,13 +130,13 @@ def _stimulus(
 
 @cache
 def _media(number: int, contact: bool, size: int) -> tuple[bytes, bytes, bytes]:
-    """Observed movie, whole movie and map of one stimulus."""
+    """Return observed movie, full movie and map of one stimulus."""
     frames = draw(number, contact, size)
     return encode_movie(frames[:OBSERVED]), encode_movie(frames), draw_map(number, size)
 
 
 def draw(number: int, contact: bool, size: int) -> NDArray[np.uint8]:
-    """The frames (60, size, size, 3) of one stimulus."""
+    """Draw the frames (60, size, size, 3) of one stimulus."""
     frames = np.full((FULL, size, size, 3), 128, np.uint8)
     disk, square = _shapes(number, size)
     for frame in range(FULL):
@@ -140,7 +153,7 @@ def draw(number: int, contact: bool, size: int) -> NDArray[np.uint8]:
 
 def _shapes(number: int, size: int) -> tuple[Any, NDArray[np.bool_]]:
     rows, columns = np.mgrid[0:size, 0:size] / size
-    # Both grow a little with the number, so that no two stimuli are alike.
+    # Both grow a little with the number, so that all stimuli differ.
     radius = 0.06 + 0.0007 * (number % 60)
     square = (abs(columns - 0.8) < radius + 0.04) & (abs(rows - 0.5) < 0.08)
     square &= (rows - 0.4) * size >= number // 60 % 8
@@ -152,7 +165,7 @@ def _shapes(number: int, size: int) -> tuple[Any, NDArray[np.bool_]]:
 
 
 def draw_map(number: int, size: int) -> bytes:
-    """The PNG with the agent in red and the patient in yellow, else transparent."""
+    """Return a PNG with the agent in red and the patient in yellow on a transparent background."""
     disk, square = _shapes(number, size)
     picture = np.zeros((size, size, 4), np.uint8)
     picture[square] = (255, 255, 0, 255)

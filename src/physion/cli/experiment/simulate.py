@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 if TYPE_CHECKING:
-    from physion.experiment.simulated.participants import Plan, Visit
+    from physion.experiment.simulated.participants import SimulationPlan, Visit
     from physion.experiment.study.study import Study
 
 
@@ -56,7 +56,7 @@ def main(options: Options) -> int:
     from physion.cli.experiment.experiment import require_extra
 
     require_extra()
-    from physion.experiment.simulated.participants import Plan, simulate
+    from physion.experiment.simulated.participants import SimulationPlan, simulate
     from physion.experiment.study.identity import Secrets
     from physion.experiment.study.study import load_study
 
@@ -64,7 +64,7 @@ def main(options: Options) -> int:
     study = load_study(options.study)
     secrets = Secrets.load(options.study)
     with _server(options) as url, _progress(options) as visited:
-        plan = Plan(
+        plan = SimulationPlan(
             url=url,
             participants=options.participants,
             scenario=options.scenario,
@@ -78,7 +78,7 @@ def main(options: Options) -> int:
     return 1 if any(visit.outcome in ("refused", "failed") for visit in visits) else 0
 
 
-def summary(study: Study, plan: Plan, visits: list[Visit]) -> dict[str, Any]:
+def summary(study: Study, plan: SimulationPlan, visits: list[Visit]) -> dict[str, Any]:
     """What is printed: outcomes, answers, repeated requests, accuracy, reasons of failures."""
     right = [visit.result.accuracy for visit in visits if visit.result is not None]
     return {
@@ -111,9 +111,9 @@ def _server(options: Options) -> Iterator[str]:
     if options.url is not None:
         yield options.url.rstrip("/")
         return
-    from physion.experiment.simulated.server_process import OwnServer
+    from physion.experiment.simulated.server_process import ServerProcess
 
-    with OwnServer(options.study, options.database) as server:
+    with ServerProcess(options.study, options.database) as server:
         yield server.url
 
 

@@ -1,1 +1,1 @@
-"""Messages between browser and server, and the reasons for a refusal."""
+"""Protocol between browser and server: message types and refusal codes."""

@@ -1,28 +1,31 @@
-"""What browser and server say to each other, as types: one model a message, each bounded.
+"""Types of the messages between browser and server: one bounded pydantic model per message.
 
 All bodies are JSON, at most 64 KiB. A participant's requests carry ``Authorization: Bearer TOKEN``
-with the token of `Entered`; who may see what follows from the token alone, so that no request names
-a session. Times of the client are milliseconds of its own monotonic clock.
+with the token of `Entered`; the token alone identifies the session, so no request names one. Client
+times are milliseconds of the browser's monotonic clock.
 
 ============================  =========================  ==========================================
 request                       body, answer               meaning
 ============================  =========================  ==========================================
-``GET /api/study``            `PublicStudy`              what the page needs before anyone enters
-``GET /api/texts/{language}`` flat object of texts       words of the pages
-``POST /api/enter``           `Enter`, `Entered`         begin, or go on with, a session
-``GET /api/session``          `State`                    where the session stands; ``?load=true``
+``GET /api/study``            `PublicStudy`              settings that the page needs before a
+                                                         session begins
+``GET /api/texts/{language}`` flat object of texts       texts of the pages
+``POST /api/enter``           `Enter`, `Entered`         begin or continue a session
+``GET /api/session``          `SessionState`             current stage and trial; ``?load=true``
                                                          once for each time that the page is loaded
-``GET /api/trials/{phase}``   `TrialList`                what to show; no name, no outcome
-``GET /media/...``            bytes                      paths of `TrialMedia`, signed, no token
-``POST /api/page``            `PageDone`, `State`        a page between the trials was sent
-``POST /api/answers``         `Answer`, `AnswerStored`   stored before it is acknowledged
-``POST /api/events``          `Events`, `Stored`         what else happened in the browser
-``GET /api/result``           `Result`                   accuracy, percentile, completion; at the
-                                                         end alone
-``GET /api/health``           `Health`                   for load balancers: the database answers
+``GET /api/trials/{phase}``   `TrialList`                media of the trials, without stimulus names
+                                                         and outcomes
+``GET /media/...``            bytes                      signed paths of `TrialMedia`, no token
+``POST /api/page``            `PageDone`, `SessionState` submit a page between the trials
+``POST /api/answers``         `Answer`, `AnswerStored`   store an answer; acknowledged after commit
+``POST /api/events``          `Events`, `Stored`         store other events in the browser
+``GET /api/result``           `Result`                   accuracy, percentile and completion of a
+                                                         finished session
+``GET /api/health``           `Health`                   health check for load balancers, including
+                                                         the database
 ============================  =========================  ==========================================
 
-Refusals are `Refusal` bodies with a status of 4xx; see `REFUSALS`.
+A refused request is answered with a `Refusal`; codes and HTTP statuses are in `REFUSALS`.
 """
 
 from __future__ import annotations
@@ -43,7 +46,7 @@ Stage = Literal[
     "done",
     "withdrawn",
 ]
-"""Stages of a session, in this order; ``withdrawn`` ends it at any time."""
+"""Stages of a session, in this order; ``withdrawn`` can follow any stage but ``done``."""
 Kind = Literal["person", "simulated", "preview"]
 Source = Literal["link", "prolific", "sona", "mturk"]
 
@@ -65,15 +68,16 @@ REFUSALS = {
     "unavailable": 503,
     "server_error": 500,
 }
-"""Codes of refusals and their HTTP status. ``out_of_order``, ``already_answered`` and
-``wrong_stage`` carry the state, from which the client goes on."""
+"""Refusal codes and their HTTP status. ``out_of_order``, ``already_answered`` and ``wrong_stage``
+carry the state of the session, with which the client continues."""
 
 MAX_BODY = 64 * 1024
+"""Bytes of a request body."""
 DAY_MS = 86_400_000.0
 Name = Annotated[str, StringConstraints(min_length=1, max_length=200)]
 RawId = Annotated[str, StringConstraints(min_length=1, max_length=200, strip_whitespace=True)]
 Key = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9-]{8,64}$")]
-VisitWord = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9-]{16,64}$")]
+VisitKey = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9-]{16,64}$")]
 Text = Annotated[str, StringConstraints(max_length=5000)]
 Milliseconds = Annotated[float, Field(ge=0, le=DAY_MS, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=0, le=1_000_000)]
@@ -81,13 +85,13 @@ Pixels = Annotated[int, Field(ge=0, le=100_000)]
 
 
 class Message(BaseModel):
-    """A body that is refused where it holds what it should not."""
+    """Base class of all messages: immutable, and unknown fields are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class Device(Message):
-    """Browser and screen, measured once when the page is loaded."""
+    """Properties of browser and screen, measured once when the page is loaded."""
 
     user_agent: Annotated[str, StringConstraints(max_length=1000)] = ""
     refresh_hz: Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)] | None = None
@@ -98,20 +102,35 @@ class Device(Message):
 
 
 class Enter(Message):
-    """Who comes, from where. ``id`` is the recruiter's; without one, ``link`` gives a new person.
+    """Request to begin or continue a session.
 
-    ``visit`` is a random word that the page makes once, before it asks for the first time, and
-    keeps in its storage. Where there is no ``id`` it tells who comes, so that asking again gives
-    the same session; where ``id`` is needed it is no id. Without both everybody is a new person.
-    ``recruiter`` holds the further parameters of the address (study id, visit id, ...), kept beside
-    the raw id alone. ``pass_`` (sent as ``pass``) is the signed word of a preview or pilot link.
+    Parameters
+    ----------
+    source
+        Recruiter, or ``link`` for a plain link.
+    id
+        The participant's id at the recruiter.
+    visit
+        Random key that the page makes once, before its first request, and keeps in the browser's
+        storage. Without an ``id`` it identifies the participant, so that a repeated request gives
+        the same session. It does not replace a required ``id``. Without both, every request is a
+        new participant.
+    recruiter
+        Further URL parameters of the recruiter (study id, visit id, ...), stored only together with
+        the raw id.
+    scenario, language
+        Wanted scenario and language; the server chooses if they are absent.
+    pass_
+        Sent as ``pass``: signed key of a preview or pilot link.
+    device
+        Browser and screen.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
 
     source: Source = "link"
     id: RawId | None = None
-    visit: VisitWord | None = None
+    visit: VisitKey | None = None
     recruiter: Annotated[dict[Name, Annotated[str, StringConstraints(max_length=500)]],
                          Field(max_length=10)] = {}  # fmt: skip
     scenario: Name | None = None
@@ -122,8 +141,8 @@ class Enter(Message):
     device: Device = Device()
 
 
-class State(Message):
-    """Where a session stands. ``trial`` is the next one of the phase; None outside phases."""
+class SessionState(Message):
+    """SessionState of a session. ``trial`` is the next trial of the phase, None outside a phase."""
 
     stage: Stage
     trial: int | None
@@ -133,18 +152,18 @@ class State(Message):
     kind: Kind
     buttons: Literal["yes-no", "no-yes"]
     reference: str
-    """Short code that a participant can name to the experimenter; tells nothing else."""
+    """Short random code by which a participant can refer to the session when contacting us."""
 
 
 class Entered(Message):
-    """The token is shown once here and never stored but as a hash."""
+    """A new token for the session, which the server stores only as a hash, and the state."""
 
     token: str
-    state: State
+    state: SessionState
 
 
 class TrialMedia(Message):
-    """One trial as it is shown. Paths begin with ``/media/``."""
+    """Media and timing of one trial. ``movie`` and ``map`` are paths below ``/media/``."""
 
     trial: int
     movie: str
@@ -157,17 +176,18 @@ class TrialMedia(Message):
 
 
 class TrialList(Message):
-    """The trials of a phase in the participant's own order."""
+    """The trials of a phase in the order of this session."""
 
     phase: Phase
     trials: list[TrialMedia]
 
 
 class PageDone(Message):
-    """A page was sent: ``consent`` {agreed: bool, language: what it was read in, optional},
-    ``instructions`` {}, ``ready`` {},
-    ``demographics`` {age, gender, education}, ``feedback`` {difficulty, technical_problems, text},
-    ``withdraw`` {}. Sending a page twice changes nothing and gives the state.
+    """Submission of a page between the trials; sending it twice changes nothing.
+
+    Fields of ``data`` by page: ``consent`` {agreed: bool, language: optional, in which it was
+    read}; ``demographics`` {age, gender, education}; ``feedback`` {difficulty, technical_problems,
+    text}; ``instructions``, ``ready`` and ``withdraw`` {}.
     """
 
     page: Literal["consent", "instructions", "ready", "demographics", "feedback", "withdraw"]
@@ -175,7 +195,7 @@ class PageDone(Message):
 
 
 class Answer(Message):
-    """One prediction. ``key`` is made once by the client for each answer and kept over retries."""
+    """One prediction. ``key`` is drawn by the client per answer and stays the same over retries."""
 
     key: Key
     phase: Phase
@@ -192,11 +212,11 @@ class Answer(Message):
     window_width: Pixels | None = None
     window_height: Pixels | None = None
     details: Annotated[dict[Name, Any], Field(max_length=30)] = {}
-    """Moments of cue changes and frames, and what else there is; at most 16 KiB as JSON."""
+    """Times of cue changes and frames and further measurements; at most 16 KiB as JSON."""
 
 
 class Feedback(Message):
-    """After a familiarization answer alone: what happens, and the whole movie."""
+    """Feedback on a familiarization answer: the outcome and the full movie."""
 
     contact: bool
     correct: bool
@@ -205,15 +225,15 @@ class Feedback(Message):
 
 
 class AnswerStored(Message):
-    """The answer is on the disk. ``duplicate``: it was there already, under the same key."""
+    """Acknowledgement of a committed answer. ``duplicate``: it was stored before, same key."""
 
     duplicate: bool
     feedback: Feedback | None
-    state: State
+    state: SessionState
 
 
 class Event(Message):
-    """Something that happened in the browser: ``hidden``, ``offline``, ``error``, ``resized``..."""
+    """An event in the browser, such as ``hidden``, ``offline``, ``error`` or ``resized``."""
 
     kind: Annotated[str, StringConstraints(pattern=r"^[a-z_]{1,40}$")]
     at_ms: Milliseconds
@@ -221,8 +241,10 @@ class Event(Message):
 
 
 class Events(Message):
-    """Events of one load of the page. ``key`` is made once for each batch and kept over retries:
-    a batch that is there already is not stored twice (``stored`` is 0).
+    """Events of one page load.
+
+    ``key`` is drawn by the client per batch and stays the same over retries: a batch with a known
+    key is not stored again, and ``stored`` is then 0.
     """
 
     key: Key | None = None
@@ -230,15 +252,15 @@ class Events(Message):
 
 
 class Stored(Message):
-    """So many were stored."""
+    """Number of events that were stored."""
 
     stored: int
 
 
 class Completion(Message):
-    """How the participant gets the credit: a code to copy, an address to go to, or both.
+    """How the participant gets the credit: a completion code, a URL to go to, or both.
 
-    ``post``: the address takes a form by POST with these fields (MTurk), not a visit.
+    ``post``: form fields to send to the URL by POST (MTurk); None for a plain link.
     """
 
     code: str | None
@@ -247,10 +269,11 @@ class Completion(Message):
 
 
 class Result(Message):
-    """What a participant is told at the end. ``percentile``: the share of the other finished people
-    of the scenario with fewer correct, plus half of those with as many, in %: alone at the top 100,
-    alone at the bottom 0. None while fewer than the study's ``percentile_from`` others have
-    finished.
+    """Result that a participant sees at the end.
+
+    ``percentile``: percentage of the other participants who finished this scenario with fewer
+    correct answers, plus half of the percentage with equally many; 100 for the single best, 0 for
+    the single worst. None while fewer than the study's ``percentile_from`` others have finished.
     """
 
     correct: int
@@ -261,12 +284,13 @@ class Result(Message):
 
 
 class Recruiter(Message):
-    """How the address of the page tells who comes: names of one recruiter's parameters.
+    """Names of the URL parameters by which one recruiter identifies participants.
 
-    An address belongs to the first recruiter whose ``id`` or one of whose ``preview`` parameters it
-    has, else it is a plain link. ``others`` go into ``Enter.recruiter`` where present. ``preview``:
-    an address with one of these values shows only information and no session may begin (MTurk).
-    Any address may have ``scenario``, ``language`` and ``pass``, which go into `Enter` as they are.
+    A URL belongs to the first recruiter whose ``id`` parameter or one of whose ``preview``
+    parameters it has, else it is a plain link. Parameters named in ``others`` go into
+    ``Enter.recruiter`` if present. ``preview``: a URL with one of these values only shows
+    information, and no session may begin (MTurk). Any URL may have ``scenario``, ``language`` and
+    ``pass``, which are copied into `Enter`.
     """
 
     source: Source
@@ -276,7 +300,7 @@ class Recruiter(Message):
 
 
 class PublicStudy(Message):
-    """What anyone may know who opens the page."""
+    """Settings of the study that anyone who opens the page may see."""
 
     title: str
     contact: str
@@ -289,22 +313,22 @@ class PublicStudy(Message):
     cue_ms: int
     flash_hz: float
     preload: int
-    """So many trials ahead are loaded before they are shown."""
+    """Number of trials whose media are loaded ahead."""
     example: dict[str, TrialMedia]
-    """Media of the instructions' animated example, by scenario."""
+    """Media of the animated example in the instructions, by scenario."""
     recruiters: list[Recruiter]
-    """In the order in which they are tried."""
+    """In the order in which they are matched against the URL."""
 
 
 class Health(Message):
-    """The server answers, and so does its database."""
+    """Health of the server and its database."""
 
     ok: bool
 
 
 class Refusal(Message):
-    """Why not, in a word for programs and a sentence for people."""
+    """Refusal: ``error`` is a code of `REFUSALS`, ``message`` a sentence for people."""
 
     error: str
     message: str
-    state: State | None = None
+    state: SessionState | None = None

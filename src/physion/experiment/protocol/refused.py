@@ -1,19 +1,25 @@
-"""Why a participant's request is refused, as an exception of the store."""
+"""Exception by which the store refuses a participant's request."""
 
 from __future__ import annotations
 
 from physion.errors import PhysionError
-from physion.experiment.protocol.messages import REFUSALS, State
+from physion.experiment.protocol.messages import REFUSALS, SessionState
 
 
 class Refused(PhysionError):
-    """A request that is not granted, and has changed nothing.
+    """Refusal of a request, which then has changed nothing.
 
-    ``code`` is a key of `REFUSALS`; ``message`` a sentence for people; ``state`` where the session
-    stands, for the codes from which a client goes on.
+    Parameters
+    ----------
+    code
+        A key of `REFUSALS`.
+    message
+        A sentence for people.
+    state
+        Current state of the session, for the codes after which a client can continue.
     """
 
-    def __init__(self, code: str, message: str, state: State | None = None) -> None:
+    def __init__(self, code: str, message: str, state: SessionState | None = None) -> None:
         assert code in REFUSALS
         super().__init__(message)
         self.code, self.message, self.state = code, message, state

@@ -1,1 +1,1 @@
-"""Simulated participants, who test a study before people do."""
+"""Simulated participants, for testing a served study before people take part."""

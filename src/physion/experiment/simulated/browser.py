@@ -1,4 +1,4 @@
-"""Requests of a simulated participant, sent again until the server answers, as the pages do."""
+"""HTTP client of a simulated participant, with the same retries as the browser pages."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from physion.errors import PhysionError
 from physion.experiment.protocol import messages as wire
 
 GO_ON = ("out_of_order", "already_answered", "wrong_stage")
-"""Refusals that carry the state from which a session goes on."""
+"""Refusals that carry the session's state, with which the participant continues."""
 
 
 class RefusedError(PhysionError):
-    """The server said no: a ``code`` of `wire.REFUSALS`, and where the session stands, if told."""
+    """Refusal by the server: a ``code`` of `wire.REFUSALS` and the session's state, if sent."""
 
     def __init__(self, refusal: wire.Refusal) -> None:
         super().__init__(refusal.message)
@@ -23,10 +23,16 @@ class RefusedError(PhysionError):
 
 
 class SimulatedBrowser:
-    """One visitor's requests, sent again until the server answers.
+    """Client of one visitor that retries each request until the server answers.
 
-    The pauses before a request is sent again double from the first of ``waits_s`` to the second;
-    ``patience_s``: how long a request is tried.
+    Parameters
+    ----------
+    client
+        The shared HTTP client.
+    waits_s
+        First and longest pause between retries in seconds; the pause doubles in between.
+    patience_s
+        Seconds after which a request is given up.
     """
 
     def __init__(
@@ -37,7 +43,15 @@ class SimulatedBrowser:
         self.retries = 0
 
     async def ask(self, method: str, path: str, body: wire.Message | None = None) -> bytes:
-        """The body of the answer. `RefusedError` for a no, `PhysionError` when out of patience."""
+        """Send a request and return the body of the response.
+
+        Raises
+        ------
+        RefusedError
+            The server refused the request.
+        PhysionError
+            The server did not answer within ``patience_s``.
+        """
         content = None if body is None else body.model_dump_json(by_alias=True, exclude_none=True)
         headers = {"Authorization": f"Bearer {self.token}"} if self.token else {}
         if content is not None:
@@ -69,8 +83,8 @@ def _refusal(answer: httpx2.Response) -> wire.Refusal:
         return wire.Refusal(error="bad_request", message=f"status {answer.status_code}")
 
 
-def state_after(refused: RefusedError) -> wire.State:
-    """The state from which a session goes on after a refusal; raises it again without one."""
+def state_after(refused: RefusedError) -> wire.SessionState:
+    """Return the state with which to continue after a refusal; raise the refusal if it has none."""
     if refused.code in GO_ON and refused.state is not None:
         return refused.state
     raise refused

@@ -1,10 +1,10 @@
-"""Simulated participants, who go through a served study by HTTP as a browser does.
+"""Simulated participants who complete a served study over HTTP, as a browser would.
 
-They enter with the signed word of the pilot link, which marks their sessions as simulated for good,
-load the pages' data and media, answer every trial with a key that is kept over retries, and fill in
-the pages, each with a `SimulatedBrowser`. What they answer is `SimulatedPerson`'s: the outcomes
-come from the study folder, never from the server. Nothing is waited for but ``pace``; the times of
-cue, movie and frames that they report are the wanted ones.
+They enter with the signed key of the pilot link, which marks their sessions as simulated for good.
+Each uses a `SimulatedBrowser` to load the pages' data and media, answer every trial (with a key
+that stays the same over retries) and submit the pages. The answers come from `SimulatedPerson`,
+which reads the outcomes from the study folder, never from the server. The only waiting time is
+``pace``; the reported times of cue, movie and frames are the nominal ones.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from physion.experiment.protocol import messages as wire
 from physion.experiment.simulated.browser import RefusedError, SimulatedBrowser, state_after
 from physion.experiment.simulated.person import SimulatedPerson
 from physion.experiment.study.identity import Secrets
-from physion.experiment.study.recruitment import pass_word
+from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.stimuli import Stimulus
 from physion.experiment.study.study import Study
 from physion.experiment.web.media_links import read_media_path
@@ -40,7 +40,7 @@ WINDOW = (1280, 720)
 
 @dataclass(frozen=True)
 class Acknowledged:
-    """An answer of which the server said that it is stored."""
+    """An answer that the server acknowledged as stored."""
 
     phase: wire.Phase
     trial: int
@@ -52,7 +52,7 @@ class Acknowledged:
 
 @dataclass
 class Visit:
-    """What became of one simulated participant."""
+    """Record of one simulated participant: what happened and what was answered."""
 
     number: int
     scenario: str
@@ -65,11 +65,31 @@ class Visit:
 
 
 @dataclass(frozen=True)
-class Plan:
-    """How a simulation goes. ``pace``: seconds before each answer. ``dropouts``: share of people
-    who close the page before a random test trial. ``at_once``: so many people at the same time.
-    ``waits_s``: the pauses before a request is sent again double from the first to the second.
-    ``patience_s``: how long a request is tried. ``media``: fetch movies and maps, too.
+class SimulationPlan:
+    """Settings of a simulation.
+
+    Parameters
+    ----------
+    url
+        URL of the served study.
+    participants
+        Number of participants.
+    seed
+        Seed of all random draws.
+    scenario
+        The scenario of everybody; all scenarios in rotation if None.
+    at_once
+        Number of participants at the same time.
+    pace
+        Seconds before each answer.
+    dropouts
+        Fraction of people who close the page before a random test trial.
+    media
+        Also fetch movies and maps.
+    waits_s
+        First and longest pause between retries of a request in seconds.
+    patience_s
+        Seconds after which a request is given up.
     """
 
     url: str
@@ -85,17 +105,17 @@ class Plan:
 
 
 class Participation:
-    """One simulated person's way through the study, from wherever the session stands."""
+    """A simulated person's session, from its current state to its end."""
 
-    def __init__(self, study: Study, secrets: Secrets, plan: Plan, visit: Visit) -> None:
+    def __init__(self, study: Study, secrets: Secrets, plan: SimulationPlan, visit: Visit) -> None:
         self._study, self._secrets, self._plan, self._visit = study, secrets, plan, visit
         self._person = SimulatedPerson(plan.seed, visit.number)
 
-    async def go(self, client: httpx2.AsyncClient) -> None:
-        """Go through; what came of it is in the visit."""
+    async def run(self, client: httpx2.AsyncClient) -> None:
+        """Run the session and record its outcome in the visit."""
         self._browser = SimulatedBrowser(client, self._plan.waits_s, self._plan.patience_s)
         try:
-            await self._walk()
+            await self._run_stages()
         except RefusedError as refused:
             before = refused.code == "already_took_part"
             self._visit.outcome = "done before" if before else "refused"
@@ -105,45 +125,45 @@ class Participation:
         finally:
             self._visit.retries = self._browser.retries
 
-    async def _walk(self) -> None:
+    async def _run_stages(self) -> None:
         public = wire.PublicStudy.model_validate_json(await self._browser.ask("GET", "/api/study"))
         await self._browser.ask("GET", f"/api/texts/{public.languages[0]}")
         state = await self._enter(public.languages[0])
         if state.stage == "done":
             self._visit.outcome = "done before"
             return
-        leaves = self._person.leaves_before(state.trials["test"], self._plan.dropouts)
+        dropout = self._person.dropout_trial(state.trials["test"], self._plan.dropouts)
         while state.stage not in ("done", "withdrawn"):
             if state.stage in ("familiarization", "test"):
-                state = await self._phase(state, leaves)
-                if state.stage == "test" and state.trial == leaves:
+                state = await self._run_phase(state, dropout)
+                if state.stage == "test" and state.trial == dropout:
                     self._visit.outcome = "left"
                     return
             else:
-                state = await self._page(state)
+                state = await self._submit_page(state)
         answer = await self._browser.ask("GET", "/api/result")
         self._visit.result = wire.Result.model_validate_json(answer)
         self._visit.outcome = "done"
 
-    async def _enter(self, language: str) -> wire.State:
+    async def _enter(self, language: str) -> wire.SessionState:
         who = {
             "id": f"simulated-{self._plan.seed}-{self._visit.number}",
             "scenario": self._visit.scenario,
             "language": language,
-            "pass": pass_word(self._secrets, "simulated"),
+            "pass": make_pass(self._secrets, "simulated"),
             "device": DEVICE,
         }
         enter = wire.Enter.model_validate(who)
         answer = await self._browser.ask("POST", "/api/enter", enter)
         entered = wire.Entered.model_validate_json(answer)
         if entered.state.kind != "simulated":
-            raise PhysionError("the server does not mark this session as simulated; stopped")
+            raise PhysionError("stopped: the server does not mark this session as simulated")
         self._browser.token = entered.token
         self._visit.reference = entered.state.reference
         answer = await self._browser.ask("GET", "/api/session?load=true")
-        return wire.State.model_validate_json(answer)
+        return wire.SessionState.model_validate_json(answer)
 
-    async def _page(self, state: wire.State) -> wire.State:
+    async def _submit_page(self, state: wire.SessionState) -> wire.SessionState:
         filled: dict[str, Any] = {
             "consent": {"agreed": True},
             "demographics": self._person.demographics(),
@@ -155,23 +175,23 @@ class Participation:
             answer = await self._browser.ask("POST", "/api/page", done)
         except RefusedError as refused:
             return state_after(refused)
-        return wire.State.model_validate_json(answer)
+        return wire.SessionState.model_validate_json(answer)
 
-    async def _phase(self, state: wire.State, leaves: int | None) -> wire.State:
+    async def _run_phase(self, state: wire.SessionState, dropout: int | None) -> wire.SessionState:
         phase = state.stage
         assert phase == "familiarization" or phase == "test"
         answer = await self._browser.ask("GET", f"/api/trials/{phase}")
         trials = wire.TrialList.model_validate_json(answer).trials
         while state.stage == phase and state.trial is not None:
-            if phase == "test" and state.trial == leaves:
+            if phase == "test" and state.trial == dropout:
                 break
-            state = await self._trial(phase, trials[state.trial])
+            state = await self._run_trial(phase, trials[state.trial])
         return state
 
-    async def _trial(self, phase: wire.Phase, media: wire.TrialMedia) -> wire.State:
+    async def _run_trial(self, phase: wire.Phase, media: wire.TrialMedia) -> wire.SessionState:
         await self._fetch(media.movie, media.map)
-        stimulus = self._shown(phase, media.movie)
-        body = answer_to(self._study, media, phase, self._person, stimulus)
+        stimulus = self._find_stimulus(phase, media.movie)
+        body = build_answer(self._study, media, phase, self._person, stimulus)
         await asyncio.sleep(self._plan.pace)
         try:
             answer = await self._browser.ask("POST", "/api/answers", body)
@@ -185,13 +205,15 @@ class Participation:
             await self._fetch(stored.feedback.movie)
         return stored.state
 
-    def _shown(self, phase: wire.Phase, movie: str) -> Stimulus:
-        """What a movie's path stands for; the server's keys can tell, a browser cannot."""
+    def _find_stimulus(self, phase: wire.Phase, movie: str) -> Stimulus:
+        """Return the stimulus of a movie path, which only the server's keys can decode."""
         path = read_media_path(self._study, self._secrets, movie)
         for stimulus in self._study.phase(self._visit.scenario, phase):
             if self._study.folder / stimulus.movie == path:
                 return stimulus
-        raise PhysionError(f"{movie} is no movie of {self._study.folder}: is it another study's?")
+        raise PhysionError(
+            f"{movie} is not a movie of {self._study.folder}; does the server serve another study?"
+        )
 
     async def _fetch(self, *paths: str) -> None:
         for path in paths if self._plan.media else ():
@@ -199,17 +221,35 @@ class Participation:
                 raise PhysionError(f"{path}: the server sent an empty file")
 
 
-def answer_to(
+def build_answer(
     study: Study,
     media: wire.TrialMedia,
     phase: wire.Phase,
     person: SimulatedPerson,
     stimulus: Stimulus,
 ) -> wire.Answer:
-    """What the pages would post for this trial, with a new key."""
+    """Return the message with a person's answer to a trial, as the pages would send it.
+
+    Parameters
+    ----------
+    study
+        The study, for the timing of the trial.
+    media
+        The trial as the server listed it.
+    phase
+        Phase of the trial.
+    person
+        Who answers.
+    stimulus
+        The stimulus that the trial shows.
+
+    Returns
+    -------
+    The answer, with a new key.
+    """
     prediction = person.predict(stimulus)
     frame_ms = 1000 / media.rate
-    moments = [round(frame * frame_ms, 1) for frame in range(media.frames)]
+    frame_times = [round(frame * frame_ms, 1) for frame in range(media.frames)]
     return wire.Answer(
         key=str(uuid.uuid4()),
         phase=phase,
@@ -221,40 +261,57 @@ def answer_to(
         cue_ms=study.timing.cue_ms,
         frames_shown=media.frames,
         frames_dropped=0,
-        movie_ms=moments[-1],
+        movie_ms=frame_times[-1],
         visibility_changes=0,
         window_width=WINDOW[0],
         window_height=WINDOW[1],
-        details={"simulated": True, "frames_ms": moments},
+        details={"simulated": True, "frames_ms": frame_times},
     )
 
 
 async def simulate(
     study: Study,
     secrets: Secrets,
-    plan: Plan,
+    plan: SimulationPlan,
     visited: Callable[[Visit], None] = lambda visit: None,
 ) -> list[Visit]:
-    """Send the participants through; each finished visit is passed to ``visited``.
+    """Run the simulated participants and return what happened to each.
 
-    The same seed sends the same people: those who finished are left as they are, the others go on.
+    The same seed gives the same people: on a second run, those who had finished are left as they
+    are and the others continue.
+
+    Parameters
+    ----------
+    study
+        The study that is served.
+    secrets
+        Its keys, for the pilot link and for decoding movie paths.
+    plan
+        Settings of the simulation.
+    visited
+        Called with each visit as it ends.
+
+    Raises
+    ------
+    UnknownNameError
+        The study has no such scenario.
     """
     if plan.scenario is not None and plan.scenario not in study.scenarios:
         raise UnknownNameError("scenario", plan.scenario, study.scenarios)
     scenarios = study.scenarios if plan.scenario is None else (plan.scenario,)
     visits = [Visit(n, scenarios[n % len(scenarios)]) for n in range(plan.participants)]
-    seats = asyncio.Semaphore(plan.at_once)
+    slots = asyncio.Semaphore(plan.at_once)
     limits = httpx2.Limits(max_connections=plan.at_once, max_keepalive_connections=plan.at_once)
     async with httpx2.AsyncClient(
         base_url=plan.url, timeout=30.0, limits=limits, trust_env=False
     ) as client:
 
-        async def one(visit: Visit) -> None:
-            async with seats:
-                await Participation(study, secrets, plan, visit).go(client)
+        async def run_one(visit: Visit) -> None:
+            async with slots:
+                await Participation(study, secrets, plan, visit).run(client)
             visited(visit)
 
-        async with asyncio.TaskGroup() as people:
+        async with asyncio.TaskGroup() as tasks:
             for visit in visits:
-                people.create_task(one(visit))
+                tasks.create_task(run_one(visit))
     return visits

@@ -1,10 +1,10 @@
-"""A simple model of a person who takes part: how often right, how fast, with which leaning.
+"""Simple response model of a simulated participant: accuracy, response bias and response time.
 
-A person is right with probability logistic(``ability`` + ``easiness`` of the stimulus), leans
-towards yes by ``lean`` on the same scale, and takes a log-normal time that is longer for hard
-stimuli. It is told the outcome of each stimulus in order to be right that often: it stands for
-people's answers, it does not look at movies. All draws follow from the seed, the person's number
-and the stimulus, so that whoever comes back gives the answer that was on its way.
+An answer is correct with probability logistic(``ability`` + ``easiness`` of the stimulus), as in
+the Rasch model; ``bias`` towards "yes" is added on the same scale. Response times are log-normal
+and longer for hard stimuli. The model does not look at movies: it is given the outcome of each
+stimulus. All draws follow from the seed, the person's number and the stimulus, so a participant who
+comes back gives the same answer again.
 """
 
 from __future__ import annotations
@@ -20,21 +20,22 @@ from physion.seeds import generator
 ABILITY = (1.2, 0.35)
 """Mean and standard deviation over people, in log odds of a correct answer."""
 EASINESS_SD = 1.3
-"""Over stimuli, in log odds; the same stimuli are hard for everybody, in every simulation."""
-LEAN_SD = 0.2
+"""Standard deviation over stimuli, in log odds; the same for all people and simulations."""
+BIAS_SD = 0.2
+"""Standard deviation over people of the bias towards yes, in log odds."""
 LOG_RT = 6.6
-"""Mean logarithm of the response time in milliseconds where one is sure."""
+"""Mean logarithm of the response time in milliseconds when a correct answer is certain."""
 LOG_RT_HARD = 0.4
-"""What is added times the probability of being wrong."""
+"""Added to the mean logarithm, times the probability of a wrong answer."""
 LOG_RT_SD = (0.2, 0.35)
-"""Over people, and over the trials of one."""
+"""Standard deviations over people, and over the trials of one person."""
 GENDERS = ("female", "male", "")
 EDUCATIONS = ("secondary", "bachelor", "")
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """An answer: ``rt_ms`` from the moment the buttons are enabled."""
+    """A simulated answer. ``rt_ms`` counts from the moment the buttons are enabled."""
 
     response: Literal["yes", "no"]
     rt_ms: float
@@ -42,49 +43,49 @@ class Prediction:
 
 @dataclass(frozen=True)
 class SimulatedPerson:
-    """Person ``number`` of the simulation ``seed``."""
+    """Person ``number`` of the simulation with this ``seed``."""
 
     seed: int
     number: int
 
-    def _draws(self, *what: str | int) -> np.random.Generator:
-        return generator("simulated", self.seed, self.number, *what)
+    def _rng(self, *names: str | int) -> np.random.Generator:
+        return generator("simulated", self.seed, self.number, *names)
 
-    def chance(self, stimulus: Stimulus) -> float:
-        """Probability of a correct answer, before any leaning."""
-        ability = self._draws("ability").normal(*ABILITY)
-        hard = generator("easiness", stimulus.stimulus)
-        return float(_logistic(ability + hard.normal(0, EASINESS_SD)))
+    def probability_correct(self, stimulus: Stimulus) -> float:
+        """Return the probability of a correct answer, without response bias."""
+        ability = self._rng("ability").normal(*ABILITY)
+        easiness = generator("easiness", stimulus.stimulus).normal(0, EASINESS_SD)
+        return float(_logistic(ability + easiness))
 
     def predict(self, stimulus: Stimulus) -> Prediction:
-        """The answer to a stimulus, the same each time that it is asked for."""
-        right = self.chance(stimulus)
-        log_odds = np.log(right / (1 - right)) * (1 if stimulus.label else -1)
-        draws = self._draws("answer", stimulus.phase, stimulus.stimulus)
-        lean = self._draws("lean").normal(0, LEAN_SD)
-        yes = draws.random() < _logistic(log_odds + lean)
-        slow = self._draws("slow").normal(0, LOG_RT_SD[0])
-        log_rt = LOG_RT + LOG_RT_HARD * (1 - right) + slow + draws.normal(0, LOG_RT_SD[1])
+        """Return the answer to a stimulus; the same one on every call."""
+        correct = self.probability_correct(stimulus)
+        log_odds = np.log(correct / (1 - correct)) * (1 if stimulus.label else -1)
+        rng = self._rng("answer", stimulus.phase, stimulus.stimulus)
+        bias = self._rng("lean").normal(0, BIAS_SD)
+        yes = rng.random() < _logistic(log_odds + bias)
+        slowness = self._rng("slow").normal(0, LOG_RT_SD[0])
+        log_rt = LOG_RT + LOG_RT_HARD * (1 - correct) + slowness + rng.normal(0, LOG_RT_SD[1])
         return Prediction("yes" if yes else "no", round(float(np.exp(log_rt)), 1))
 
-    def leaves_before(self, trials: int, dropouts: float) -> int | None:
-        """The test trial before which the person closes the page for good; None: stays."""
-        draws = self._draws("leaves")
-        leaves = draws.random() < dropouts
-        return int(draws.integers(trials)) if leaves and trials else None
+    def dropout_trial(self, trials: int, dropouts: float) -> int | None:
+        """Return the test trial before which the person leaves for good, or None if never."""
+        rng = self._rng("leaves")
+        leaves = rng.random() < dropouts
+        return int(rng.integers(trials)) if leaves and trials else None
 
     def demographics(self) -> dict[str, bool | int | float | str | None]:
-        """What the page of demographics asks for."""
-        draws = self._draws("demographics")
+        """Return the fields of the demographics page."""
+        rng = self._rng("demographics")
         return {
-            "age": int(draws.integers(18, 70)),
-            "gender": GENDERS[draws.integers(len(GENDERS))],
-            "education": EDUCATIONS[draws.integers(len(EDUCATIONS))],
+            "age": int(rng.integers(18, 70)),
+            "gender": GENDERS[rng.integers(len(GENDERS))],
+            "education": EDUCATIONS[rng.integers(len(EDUCATIONS))],
         }
 
     def feedback(self) -> dict[str, bool | int | float | str | None]:
-        """What the last page asks for; the text says who wrote it."""
-        difficulty = int(self._draws("difficulty").integers(1, 6))
+        """Return the fields of the feedback page, whose text is marked as simulated."""
+        difficulty = int(self._rng("difficulty").integers(1, 6))
         return {"difficulty": difficulty, "technical_problems": False, "text": "simulated"}
 
 

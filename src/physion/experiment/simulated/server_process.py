@@ -1,4 +1,4 @@
-"""A server process of one's own for a while: for simulations, load tests and crash tests."""
+"""A temporary server process, for simulations, load tests and crash tests."""
 
 from __future__ import annotations
 
@@ -19,12 +19,21 @@ HOST = "127.0.0.1"
 POLL_S = 0.02
 
 
-class OwnServer:
-    """``physion experiment serve`` in a process of its own, on a free port of this machine alone.
+class ServerProcess:
+    """``physion experiment serve`` in its own process, on a free port of the loopback interface.
 
-    As a context manager it starts, waits until the server answers, and stops it in the end.
-    ``database``: its URL; the study's SQLite file where none is given. ``options``: more words of
-    ``serve``. ``command``: other words in place of ``python -m physion.cli.main``, for profilers.
+    As a context manager it starts the server, waits until it answers, and stops it at the end.
+
+    Parameters
+    ----------
+    folder
+        The study folder.
+    database
+        URL of the database; the study's SQLite file if None.
+    options
+        Further command line options of ``serve``.
+    command
+        Replacement for ``python -m physion.cli.main``, e.g. to run it under a profiler.
     """
 
     def __init__(
@@ -36,27 +45,30 @@ class OwnServer:
     ) -> None:
         self.port = _free_port()
         self.url = f"http://{HOST}:{self.port}"
-        words = ["experiment", "serve", str(folder), "--host", HOST, "--port", str(self.port)]
-        words += [] if database is None else ["--database", database]
-        self._command = [*command, *words, *options]
+        arguments = ["experiment", "serve", str(folder), "--host", HOST, "--port", str(self.port)]
+        arguments += [] if database is None else ["--database", database]
+        self._command = [*command, *arguments, *options]
         self._process: subprocess.Popen[bytes] | None = None
-        self._said = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as this object
+        self._output = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as this object
 
     @property
     def pid(self) -> int:
-        """Process number of the running server."""
+        """Process id of the running server."""
         assert self._process is not None, "the server was not started"
         return self._process.pid
 
     @property
     def is_running(self) -> bool:
-        """Is the process alive?"""
+        """Whether the process is alive."""
         return self._process is not None and self._process.poll() is None
 
     def start(self, patience_s: float = 60.0) -> float:
-        """Start, wait until the server answers; returns the seconds that it took.
+        """Start the server, wait until it answers, and return the seconds that this took.
 
-        Raises `PhysionError` with the server's last words where it ends or stays silent.
+        Raises
+        ------
+        PhysionError
+            The server ended, or did not answer within ``patience_s``; with the end of its output.
         """
         begin = time.monotonic()
         self.launch()
@@ -64,7 +76,7 @@ class OwnServer:
         with httpx2.Client(base_url=self.url, trust_env=False, timeout=5.0) as client:
             while time.monotonic() - begin < patience_s:
                 if self._process.poll() is not None:
-                    raise PhysionError(f"the server ended at once: {self.last_words()}")
+                    raise PhysionError(f"the server ended at once: {self.last_output()}")
                 try:
                     if client.get("/api/health").is_success:
                         return time.monotonic() - begin
@@ -72,19 +84,21 @@ class OwnServer:
                     pass
                 time.sleep(POLL_S)
         self.kill()
-        raise PhysionError(f"the server did not answer in {patience_s:g} s: {self.last_words()}")
+        raise PhysionError(
+            f"the server did not answer within {patience_s:g} s: {self.last_output()}"
+        )
 
     def launch(self) -> None:
-        """Start the process and wait for nothing."""
+        """Start the process without waiting for it."""
         self._process = self._new_process()
 
     def _new_process(self) -> subprocess.Popen[bytes]:
         return subprocess.Popen(
-            self._command, stdin=subprocess.DEVNULL, stdout=self._said, stderr=self._said
+            self._command, stdin=subprocess.DEVNULL, stdout=self._output, stderr=self._output
         )
 
     def stop(self, patience_s: float = 30.0) -> int:
-        """Ask the server to finish and wait; killed where it does not. Returns its exit code."""
+        """Ask the server to stop, kill it after ``patience_s``, and return its exit code."""
         if self._process is None:
             return 0
         self._process.terminate()
@@ -94,19 +108,19 @@ class OwnServer:
             return self.kill()
 
     def kill(self) -> int:
-        """End the server at once, as by kill -9. Returns its exit code."""
+        """Kill the server (SIGKILL) and return its exit code."""
         if self._process is None:
             return 0
         self._process.kill()
         return self._process.wait()
 
-    def last_words(self) -> str:
-        """The end of what the server printed."""
-        self._said.seek(0)
-        lines = self._said.read().decode(errors="replace").strip().splitlines()
-        return "\n".join(lines[-20:]) or "it said nothing"
+    def last_output(self) -> str:
+        """Return the last 20 lines that the server printed."""
+        self._output.seek(0)
+        lines = self._output.read().decode(errors="replace").strip().splitlines()
+        return "\n".join(lines[-20:]) or "it printed nothing"
 
-    def __enter__(self) -> OwnServer:
+    def __enter__(self) -> ServerProcess:
         self.start()
         return self
 
@@ -117,10 +131,10 @@ class OwnServer:
         at: TracebackType | None,
     ) -> None:
         self.stop()
-        self._said.close()
+        self._output.close()
 
 
 def _free_port() -> int:
-    with socket.socket() as found:
-        found.bind((HOST, 0))
-        return int(found.getsockname()[1])
+    with socket.socket() as probe:
+        probe.bind((HOST, 0))
+        return int(probe.getsockname()[1])

@@ -1,1 +1,1 @@
-"""The database of sessions and answers."""
+"""Database of sessions and answers."""

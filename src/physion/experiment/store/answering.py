@@ -1,4 +1,4 @@
-"""Storing answers: only the next trial, each once, and the feedback of familiarization."""
+"""Store answers: only to the next trial and each once; give feedback in familiarization."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from sqlalchemy import Connection, bindparam, select, update
 
 from physion.experiment.protocol.messages import Answer, AnswerStored, Feedback
 from physion.experiment.protocol.refused import Refused
-from physion.experiment.store.sessions import Session, answered, insert_new, stage_of, state_of
+from physion.experiment.store.sessions import Session, answered, insert_or_skip, stage_of, state_of
 from physion.experiment.store.tables import ANSWERS, SESSIONS
 from physion.experiment.study.identity import Secrets
-from physion.experiment.study.orders import order_of
+from physion.experiment.study.orders import trial_order
 from physion.experiment.study.stimuli import PHASES, Stimulus
 from physion.experiment.study.study import Study
 from physion.experiment.web.media_links import sign_media
@@ -33,11 +33,17 @@ _COUNT = {
 
 
 def write_details(answer: Answer) -> str:
-    """Further measures as JSON text; `Refused` where they are too long or no JSON."""
+    """Return the further measurements of an answer as JSON text.
+
+    Raises
+    ------
+    Refused
+        They are not plain JSON values, or longer than `MAX_DETAILS` characters.
+    """
     try:
         text = json.dumps(answer.details, allow_nan=False, separators=(",", ":"))
     except (ValueError, TypeError, RecursionError):
-        raise Refused("bad_request", "details: plain JSON values alone") from None
+        raise Refused("bad_request", "details: only plain JSON values") from None
     if len(text) > MAX_DETAILS:
         raise Refused("bad_request", f"details: at most {MAX_DETAILS} characters as JSON")
     return text
@@ -53,17 +59,40 @@ def store_answer(
     details: str,
     now: float,
 ) -> AnswerStored:
-    """Store the answer to the next trial, or find that this very answer is stored already."""
+    """Store the answer to the next trial, unless the same answer is stored already.
+
+    Parameters
+    ----------
+    connection
+        Connection of the writer, in a transaction.
+    study, secrets
+        The study and its keys.
+    trials
+        Number of trials in each phase of the session's scenario.
+    session
+        The session; its count of answers is increased.
+    answer
+        The answer as sent by the client.
+    details
+        `write_details` of the answer.
+    now
+        Time of the server in seconds since 1970.
+
+    Raises
+    ------
+    Refused
+        Another trial is next, or the trial or the key has another answer.
+    """
     known = answered(session, answer.phase)
     if answer.trial < known:
         response = _stored_before(connection, trials, session, answer)
         duplicate = True
     else:
-        _check_turn(trials, session, answer, known)
+        _check_next(trials, session, answer, known)
         response = answer.response
         duplicate = False
-    # A trial that is over was one of this study: stimuli do not change while there are sessions.
-    stimulus = order_of(study, session.scenario, session.order_seed)[answer.phase][answer.trial]
+    # Stimuli cannot change while there are sessions, so an answered trial has this stimulus too.
+    stimulus = trial_order(study, session.scenario, session.order_seed)[answer.phase][answer.trial]
     if not duplicate:
         _store(connection, trials, session, stimulus, answer, details, now)
     feedback = None
@@ -75,22 +104,24 @@ def store_answer(
 def _stored_before(
     connection: Connection, trials: Mapping[str, int], session: Session, answer: Answer
 ) -> str:
-    """The response that is stored under the same key."""
+    """Return the stored response of a trial if it has the same key; else raise `Refused`."""
     row = connection.execute(
         _STORED,
         {"of_session": session.session, "of_phase": answer.phase, "of_trial": answer.trial},
     ).one()
     if row.key != answer.key:
-        raise Refused("already_answered", "This trial has its answer.", state_of(session, trials))
+        raise Refused(
+            "already_answered", "This trial is already answered.", state_of(session, trials)
+        )
     return str(row.response)
 
 
-def _check_turn(trials: Mapping[str, int], session: Session, answer: Answer, known: int) -> None:
+def _check_next(trials: Mapping[str, int], session: Session, answer: Answer, known: int) -> None:
     stage = stage_of(session, trials)
     if stage not in PHASES:
-        raise Refused("wrong_stage", "No trial comes now.", state_of(session, trials))
+        raise Refused("wrong_stage", "No trial is next.", state_of(session, trials))
     if stage != answer.phase or answer.trial != known:
-        raise Refused("out_of_order", "Another trial comes now.", state_of(session, trials))
+        raise Refused("out_of_order", "Another trial is next.", state_of(session, trials))
 
 
 def _store(
@@ -112,8 +143,8 @@ def _store(
         "answered_at": now,
         "details": details,
     }
-    # A key of another trial is the one thing that can be in the way, and then nothing is written.
-    if connection.execute(insert_new(connection, ANSWERS), values).rowcount != 1:
+    # Only a key that another trial has can conflict; then nothing is written.
+    if connection.execute(insert_or_skip(connection, ANSWERS), values).rowcount != 1:
         raise Refused(
             "already_answered", "This key belongs to another trial.", state_of(session, trials)
         )

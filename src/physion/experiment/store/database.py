@@ -1,7 +1,7 @@
-"""Opening a study's database: SQLite in the study folder or PostgreSQL, safe against crashes.
+"""Open a study's database: SQLite in the study folder, or PostgreSQL.
 
-Both are opened so that a commit that returned is on the disk: SQLite with its write-ahead log and
-``synchronous=FULL``, PostgreSQL with ``synchronous_commit=on``. One server at a time writes.
+Both are configured so that a commit is on disk when it returns: SQLite with its write-ahead log and
+``synchronous=FULL``, PostgreSQL with ``synchronous_commit=on``. Only one server at a time writes.
 """
 
 from __future__ import annotations
@@ -22,23 +22,27 @@ from physion.seeds import stable_hash
 
 DATABASE_FILE = "responses.sqlite"
 BUSY_MS = 10_000
-"""How long SQLite waits for another process's write, such as a copy being made."""
+"""Time in milliseconds that SQLite waits for a lock of another process, such as a backup."""
 MIGRATIONS = Path(__file__).parent / "migrations"
 _LOCK = stable_hash("physion experiment: one server") >> 65
 _WRITES = "physion_writes"
 
 
 def sqlite_url(folder: Path) -> str:
-    """The database that a study has where no other is given."""
+    """Return the URL of the default database of a study folder."""
     return f"sqlite:///{folder.resolve() / DATABASE_FILE}"
 
 
 def open_database(url: str, *, must_exist: bool = False) -> Engine:
-    """An engine for ``sqlite:///FILE`` or ``postgresql://...``; nothing is asked of it yet.
+    """Return an engine for ``sqlite:///FILE`` or ``postgresql://...``, without connecting yet.
 
-    Errors tell statements without their values, for ids of people must reach no log. A new SQLite
-    file is readable by its owner alone. With ``must_exist`` a missing one is refused with
-    `BadInputError`, as is any other kind of address.
+    Error messages contain statements without their values, so that no participant's id reaches a
+    log. A new SQLite file is readable by its owner only.
+
+    Raises
+    ------
+    BadInputError
+        The URL is of another kind, or with ``must_exist`` the SQLite file does not exist.
     """
     address = _address(url)
     if address.get_backend_name() == "postgresql":
@@ -46,7 +50,7 @@ def open_database(url: str, *, must_exist: bool = False) -> Engine:
     assert address.database is not None
     path = Path(address.database)
     if must_exist and not path.exists():
-        raise BadInputError(f"there is no database {path}; was the study served yet?")
+        raise BadInputError(f"there is no database {path}; has the study been served yet?")
     return _open_sqlite(address, path)
 
 
@@ -55,24 +59,24 @@ def _address(url: str) -> URL:
         address = make_url(url)
         backend = address.get_backend_name()
     except (ArgumentError, ValueError) as error:
-        raise BadInputError("a database is sqlite:///FILE or postgresql://...") from error
+        raise BadInputError("a database URL is sqlite:///FILE or postgresql://...") from error
     if backend in ("postgresql", "postgres"):
         return address.set(drivername="postgresql+psycopg")
     if backend != "sqlite" or address.database in (None, "", ":memory:"):
-        raise BadInputError("a database is sqlite:///FILE or postgresql://...")
+        raise BadInputError("a database URL is sqlite:///FILE or postgresql://...")
     return address.set(drivername="sqlite+pysqlite")
 
 
 def _open_sqlite(address: URL, path: Path) -> Engine:
     if not path.parent.is_dir():
         raise BadInputError(f"there is no folder {path.parent} for the database")
-    # SQLite gives its log files the mode of the database.
+    # SQLite creates its log files with the permissions of the database file.
     os.close(os.open(path, os.O_CREAT | os.O_RDWR | getattr(os, "O_NOFOLLOW", 0), 0o600))
     engine = create_engine(address, hide_parameters=True, connect_args={"timeout": BUSY_MS / 1000})
 
     @event.listens_for(engine, "connect")
     def prepare(connection: Any, _: Any) -> None:
-        # Transactions are begun by us: the driver would begin them too late, and not for reading.
+        # We begin transactions ourselves: the driver begins them late, and none for reading.
         connection.isolation_level = None
         for pragma in ("journal_mode=WAL", "synchronous=FULL", "fullfsync=ON", "foreign_keys=ON",
                        "secure_delete=ON", f"busy_timeout={BUSY_MS}"):  # fmt: skip
@@ -87,7 +91,7 @@ def _open_sqlite(address: URL, path: Path) -> Engine:
 
 
 def _open_postgresql(address: URL) -> Engine:
-    # A pooled connection may have died with a restart of the database: look before use.
+    # Test pooled connections before use: a restart of the database closes them.
     engine = create_engine(
         address,
         hide_parameters=True,
@@ -105,7 +109,7 @@ def _open_postgresql(address: URL) -> Engine:
 
     @event.listens_for(engine, "handle_error")
     def shorten(context: ExceptionContext) -> None:
-        # PostgreSQL's further lines hold whole rows.
+        # Lines after the first contain the values of whole rows.
         for error in (context.original_exception, context.sqlalchemy_exception):
             if error is not None and error.args:
                 error.args = (str(error.args[0]).partition("\n")[0], *error.args[1:])
@@ -114,9 +118,12 @@ def _open_postgresql(address: URL) -> Engine:
 
 
 def connect_writer(engine: Engine) -> Connection:
-    """The one connection that writes. On PostgreSQL it also keeps other servers away.
+    """Open the single writing connection; on PostgreSQL it also holds the server lock.
 
-    Raises `PhysionError` where another server has the database.
+    Raises
+    ------
+    PhysionError
+        Another server uses the database.
     """
     connection = engine.connect().execution_options(**{_WRITES: True})
     if engine.dialect.name != "postgresql":
@@ -130,22 +137,27 @@ def connect_writer(engine: Engine) -> Connection:
         raise
     if not free:
         connection.close()
-        raise PhysionError("another server writes into this database; stop it first")
+        raise PhysionError("another server uses this database; stop it first")
     return connection
 
 
 def close_writer(connection: Connection) -> None:
-    """Close the connection for good: a lock of PostgreSQL ends with it."""
+    """Close the connection without returning it to the pool, which releases its server lock."""
     with contextlib.suppress(SQLAlchemyError):
         connection.invalidate()
     connection.close()
 
 
 @contextlib.contextmanager
-def one_server(engine: Engine) -> Iterator[None]:
-    """Have the database to oneself among servers; `PhysionError` where another has it.
+def server_lock(engine: Engine) -> Iterator[None]:
+    """Hold the lock that keeps other servers from the database.
 
-    On PostgreSQL the lock lies on the connection of `connect_writer`, and nothing is done here.
+    On PostgreSQL this does nothing, since the connection of `connect_writer` holds the lock.
+
+    Raises
+    ------
+    PhysionError
+        Another process holds the lock.
     """
     if engine.dialect.name == "postgresql":
         yield
@@ -157,13 +169,14 @@ def one_server(engine: Engine) -> Iterator[None]:
             held.enter_context(folder_lock(folder))
         except PhysionError as error:
             raise PhysionError(
-                f"another process writes into {folder}: stop the server that serves this study "
-                "first, or wait for what else is at work there"
+                f"another process writes into {folder}; stop the server of this study first, or "
+                "wait until the other process has finished"
             ) from error
         yield
 
 
-def _script() -> tuple[Any, Any]:
+def _load_migrations() -> tuple[Any, Any]:
+    """Return Alembic's configuration and directory of migration scripts."""
     from alembic.config import Config
     from alembic.script import ScriptDirectory
 
@@ -172,25 +185,30 @@ def _script() -> tuple[Any, Any]:
     return config, ScriptDirectory.from_config(config)
 
 
-def _version(connection: Connection) -> str | None:
+def _read_version(connection: Connection) -> str | None:
+    """Return the schema version of the database, None if it is empty."""
     from alembic.runtime.migration import MigrationContext
 
     return MigrationContext.configure(connection).get_current_revision()
 
 
 def upgrade(engine: Engine) -> None:
-    """Bring the tables to the present version, all or nothing; an empty database gets them all.
+    """Migrate the tables to the current version, in one transaction; create missing tables.
 
-    Raises `BadInputError` for a database of a newer version of this package, and `PhysionError`
-    where the database does not answer.
+    Raises
+    ------
+    BadInputError
+        A newer version of this package wrote the database.
+    PhysionError
+        The database does not answer.
     """
     from alembic import command
 
-    config, script = _script()
+    config, script = _load_migrations()
     try:
         options = {_WRITES: True}
         with engine.execution_options(**options).begin() as connection:
-            version = _version(connection)
+            version = _read_version(connection)
             if version == script.get_current_head():
                 return
             _refuse_unknown(engine, script, version)
@@ -201,33 +219,35 @@ def upgrade(engine: Engine) -> None:
 
 
 def check_version(engine: Engine) -> None:
-    """`BadInputError` unless the tables have the present version; nothing is changed."""
-    _, script = _script()
+    """Raise `BadInputError` unless the tables have the current version; change nothing."""
+    _, script = _load_migrations()
     try:
         with engine.connect() as connection:
-            version = _version(connection)
+            version = _read_version(connection)
     except SQLAlchemyError as error:
         raise _no_answer(engine, error) from error
     _refuse_unknown(engine, script, version)
     if version != script.get_current_head():
         raise BadInputError(
-            f"{_shown(engine)} has no tables of the present version; serve the study once, "
-            "which brings them"
+            f"{_display_url(engine)} lacks the tables of the current version; serve the study once "
+            "to create them"
         )
 
 
 def _refuse_unknown(engine: Engine, script: Any, version: str | None) -> None:
     if version is not None and version not in {each.revision for each in script.walk_revisions()}:
         raise BadInputError(
-            f"{_shown(engine)} was written by a newer version of this package "
+            f"{_display_url(engine)} was written by a newer version of this package "
             f"(tables {version[:40]}); install that version"
         )
 
 
 def _no_answer(engine: Engine, error: SQLAlchemyError) -> PhysionError:
     reason = str(getattr(error, "orig", error)).splitlines()
-    return PhysionError(f"{_shown(engine)} does not answer: {reason[0] if reason else 'no reason'}")
+    return PhysionError(
+        f"{_display_url(engine)} does not answer: {reason[0] if reason else 'no reason given'}"
+    )
 
 
-def _shown(engine: Engine) -> str:
+def _display_url(engine: Engine) -> str:
     return engine.url.render_as_string(hide_password=True)

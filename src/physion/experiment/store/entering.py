@@ -1,4 +1,4 @@
-"""Who may begin a session, in which scenario and order; who goes on with one."""
+"""Begin or continue a session: identify the visitor, assign scenario, trial order and buttons."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from physion.experiment.store.sessions import (
     ENTERED_AGAIN,
     SESSION_COLUMNS,
     Session,
-    Trials,
+    TrialCounts,
     change_session,
-    insert_new,
+    insert_or_skip,
     mark_loaded,
-    plain,
-    plain_values,
-    served_session,
+    session_from_row,
     state_of,
+    storable,
+    storable_values,
 )
 from physion.experiment.store.tables import EVENTS, PARTICIPANTS, RAW_IDS, SESSIONS, TOKENS
 from physion.experiment.study.identity import (
@@ -36,14 +36,14 @@ from physion.experiment.study.identity import (
     new_token,
     participant_hash,
 )
-from physion.experiment.study.orders import draw_buttons, own_order_seed, prepared_order_seed
-from physion.experiment.study.recruitment import is_unfilled, kind_of_pass
+from physion.experiment.study.orders import draw_buttons, individual_order_seed, prepared_order_seed
+from physion.experiment.study.recruitment import is_unfilled, read_pass
 from physion.experiment.study.study import Study
 
 
 @dataclass(frozen=True)
 class Visitor:
-    """Who comes, with all that is drawn: the same visitor may be let in twice with one effect."""
+    """An identified visitor, with all random names drawn, so that entering can be repeated."""
 
     enter: Enter
     kind: Kind
@@ -55,111 +55,136 @@ class Visitor:
     now: float = field(default_factory=time.time)
 
 
-def receive(study: Study, secrets: Secrets, enter: Enter) -> Visitor:
-    """Who comes, from link and id, else from the visit's word; without both a new person.
+def identify_visitor(study: Study, secrets: Secrets, enter: Enter) -> Visitor:
+    """Identify the visitor by link and id, else by the visit key, else as a new participant.
 
-    `Refused` for a word of a link that we never gave, an id that the recruiter did not fill in, or
-    a missing one.
+    Raises
+    ------
+    Refused
+        The link has an invalid key, an unknown scenario or an unfilled placeholder for the id, or
+        lacks a required id.
     """
     kind: Kind | None = "person"
     if enter.pass_ is not None:
-        kind = kind_of_pass(secrets, enter.pass_)
+        kind = read_pass(secrets, enter.pass_)
     if kind is None:
         raise Refused("bad_link", "This link is not complete; copy all of it and try again.")
     if is_unfilled(enter):
         raise Refused(
             "bad_link",
-            "The recruiter did not fill in your id: this link has only the placeholder for it. "
+            "The recruiter did not fill in your id: this link contains only its placeholder. "
             "Open the study from the recruiter's own page.",
         )
-    raw_id = plain(enter.id or "").strip() or None
+    raw_id = storable(enter.id or "").strip() or None
     needed = study.recruitment.id_needed or enter.source != "link"
     if raw_id is None and kind == "person" and needed:
         raise Refused("id_needed", "This link lacks your id; open the link that you were given.")
     if enter.scenario is not None and enter.scenario not in study.scenarios:
-        raise Refused("bad_link", "This link names a part that the study does not have.")
-    # Sessions of programs and previews must not stand in the way of a person with the same id.
+        raise Refused("bad_link", "This link names a scenario that the study does not have.")
+    # A simulated or preview session must not block a person with the same id.
     source = enter.source if kind == "person" else f"{kind} {enter.source}"
     if raw_id is not None:
         participant = participant_hash(secrets, source, raw_id)
     else:
-        # A visit's word is as secret as a token: nobody but its browser knows it.
+        # A visit key is as secret as a token: only its browser knows it.
         participant = participant_hash(secrets, f"{source} visit", enter.visit or token_hex(16))
     return Visitor(enter, kind, participant, raw_id if kind == "person" else None)
 
 
-def let_in(
-    connection: Connection, study: Study, secrets: Secrets, trials: Trials, visitor: Visitor
+def enter_session(
+    connection: Connection, study: Study, secrets: Secrets, trials: TrialCounts, visitor: Visitor
 ) -> Entered:
-    """Begin a session, or give a further token for the one that the visitor has begun."""
-    own = [
-        served_session(study, row)
+    """Begin a session, or issue another token for the session that the visitor has begun.
+
+    Parameters
+    ----------
+    connection
+        Connection of the writer, in a transaction.
+    study, secrets
+        The study and its keys.
+    trials
+        Numbers of trials of its scenarios.
+    visitor
+        Who enters.
+
+    Raises
+    ------
+    Refused
+        The visitor has taken part already, or the study is full.
+    """
+    sessions = [
+        session_from_row(study, row)
         for row in connection.execute(
             select(*SESSION_COLUMNS).where(SESSIONS.c.participant == visitor.participant)
         )
     ]
-    session = _unfinished(own, visitor.enter.scenario)
+    session = _find_unfinished(sessions, visitor.enter.scenario)
     if session is not None:
-        _go_on(connection, trials, session, visitor)
+        _continue(connection, trials, session, visitor)
     else:
-        done = {each.scenario for each in own}
-        scenario = _choose(connection, study, visitor, done)
+        done = {each.scenario for each in sessions}
+        scenario = _choose_scenario(connection, study, visitor, done)
         session = _begin(connection, study, secrets, scenario, visitor)
     connection.execute(
-        insert_new(connection, TOKENS),
+        insert_or_skip(connection, TOKENS),
         {"token_hash": hash_token(visitor.token), "session": session.session, "made": visitor.now},
     )
     _keep_raw_id(connection, visitor)
     return Entered(token=visitor.token, state=state_of(session, trials.of(session.scenario)))
 
 
-def _unfinished(own: list[Session], scenario: str | None) -> Session | None:
-    """The session to go on with: of the scenario asked for, else the latest."""
-    found = [
+def _find_unfinished(sessions: list[Session], scenario: str | None) -> Session | None:
+    """Return the latest unfinished session, of ``scenario`` if it is given, or None."""
+    unfinished = [
         session
-        for session in own
+        for session in sessions
         if session.finished_at is None
         and session.withdrawn_at is None
         and scenario in (None, session.scenario)
     ]
-    return max(found, key=lambda session: session.started_at, default=None)
+    return max(unfinished, key=lambda session: session.started_at, default=None)
 
 
-def _choose(connection: Connection, study: Study, visitor: Visitor, done: set[str]) -> str:
-    """The scenario of a new session: the one asked for, else the least filled with room left."""
-    asked = visitor.enter.scenario
-    open_to = [
+def _choose_scenario(connection: Connection, study: Study, visitor: Visitor, done: set[str]) -> str:
+    """Return the scenario of a new session: the requested one, else the one with fewest sessions.
+
+    Scenarios in ``done`` are excluded, and for people also those that have enough participants.
+    """
+    requested = visitor.enter.scenario
+    available = [
         scenario
         for scenario in study.scenarios
-        if scenario not in done and asked in (None, scenario)
+        if scenario not in done and requested in (None, scenario)
     ]
-    if not open_to:
+    if not available:
         raise Refused("already_took_part", "You have taken part already. Thank you!")
-    filled = _filled(connection, visitor)
+    counts = _count_sessions(connection, visitor)
     if visitor.kind == "person":
-        open_to = [each for each in open_to if filled[each].taken < study.participants]
-    if not open_to:
+        available = [each for each in available if counts[each].taken < study.participants]
+    if not available:
         raise Refused("study_full", "The study has all the participants that it needs. Thank you!")
-    return min(open_to, key=lambda scenario: filled[scenario].begun)
+    return min(available, key=lambda scenario: counts[scenario].begun)
 
 
-class _Filled(NamedTuple):
-    """Sessions of a scenario: ``taken`` are finished, or agreed to and going on; ``begun`` are
-    these and those that are at the consent just now.
+class _SessionCounts(NamedTuple):
+    """Numbers of sessions of a scenario.
+
+    ``taken``: finished, or active with consent given. ``begun``: these and the active ones that are
+    still at the consent page.
     """
 
     taken: int = 0
     begun: int = 0
 
 
-def _filled(connection: Connection, visitor: Visitor) -> Mapping[str, _Filled]:
-    """How full each scenario is of sessions of the visitor's kind."""
-    found: dict[str, _Filled] = defaultdict(_Filled)
+def _count_sessions(connection: Connection, visitor: Visitor) -> Mapping[str, _SessionCounts]:
+    """Count the sessions of the visitor's kind in each scenario."""
+    counts_by_scenario: dict[str, _SessionCounts] = defaultdict(_SessionCounts)
     if visitor.kind != "person" and visitor.enter.scenario is not None:
-        return found  # nobody asks
+        return counts_by_scenario  # the counts would not be used
     columns = SESSIONS.c
     finished = columns.finished_at.is_not(None)
-    # Whoever only opened the page may never agree, and must not keep others away.
+    # Somebody who only opened the page may never consent, and must not take a place.
     taken = case((or_(finished, columns.consented_at.is_not(None)), 1), else_=0)
     statement = (
         select(columns.scenario, func.sum(taken), func.count())
@@ -171,8 +196,8 @@ def _filled(connection: Connection, visitor: Visitor) -> Mapping[str, _Filled]:
         .group_by(columns.scenario)
     )
     for scenario, *counts in connection.execute(statement):
-        found[scenario] = _Filled(*counts)
-    return found
+        counts_by_scenario[scenario] = _SessionCounts(*counts)
+    return counts_by_scenario
 
 
 def _begin(
@@ -180,7 +205,7 @@ def _begin(
 ) -> Session:
     number = _least_used(connection, study, scenario, visitor.kind) if study.orders else 0
     connection.execute(
-        insert_new(connection, PARTICIPANTS),
+        insert_or_skip(connection, PARTICIPANTS),
         {"participant": visitor.participant, "first_seen": visitor.now},
     )
     values = {
@@ -193,23 +218,23 @@ def _begin(
         "reference": visitor.reference,
         "order_seed": prepared_order_seed(study, secrets, scenario, number)
         if number
-        else own_order_seed(study, scenario, visitor.participant),
+        else individual_order_seed(study, scenario, visitor.participant),
         "order_number": number,
         "buttons": draw_buttons(study, visitor.participant),
         "language": _language(study, visitor.enter.language),
         "started_at": visitor.now,
         "last_seen": visitor.now,
-        "device": plain_values(visitor.enter.device.model_dump()),
+        "device": storable_values(visitor.enter.device.model_dump()),
     }
     connection.execute(insert(SESSIONS), values)
     row = connection.execute(
         select(*SESSION_COLUMNS).where(SESSIONS.c.session == visitor.session)
     ).one()
-    return served_session(study, row)
+    return session_from_row(study, row)
 
 
 def _least_used(connection: Connection, study: Study, scenario: str, kind: str) -> int:
-    """The prepared order, from 1, that fewest sessions of the scenario and kind have."""
+    """Return the number (from 1) of the prepared order with the fewest sessions so far."""
     columns = SESSIONS.c
     statement = (
         select(columns.order_number, func.count())
@@ -221,13 +246,16 @@ def _least_used(connection: Connection, study: Study, scenario: str, kind: str) 
 
 
 def _language(study: Study, wanted: str) -> str:
-    """The study's language that is meant; ``de-AT`` means ``de`` where there is no closer one."""
+    """Return the best matching language of the study; ``de-AT`` falls back to ``de``."""
     known = {language.lower(): language for language in study.languages}
     wanted = wanted.lower()
     return known.get(wanted) or known.get(wanted.partition("-")[0]) or study.languages[0]
 
 
-def _go_on(connection: Connection, trials: Trials, session: Session, visitor: Visitor) -> None:
+def _continue(
+    connection: Connection, trials: TrialCounts, session: Session, visitor: Visitor
+) -> None:
+    """Record that the visitor entered an unfinished session again."""
     marks = mark_loaded(session, trials.of(session.scenario))
     change_session(connection, session, last_seen=visitor.now, **marks)
     event = {
@@ -235,19 +263,19 @@ def _go_on(connection: Connection, trials: Trials, session: Session, visitor: Vi
         "kind": ENTERED_AGAIN,
         "at_ms": 0.0,
         "stored_at": visitor.now,
-        "data": plain_values(visitor.enter.device.model_dump()),
+        "data": storable_values(visitor.enter.device.model_dump()),
     }
     connection.execute(insert(EVENTS), event)
 
 
 def _keep_raw_id(connection: Connection, visitor: Visitor) -> None:
-    """For payment; the recruiter's parameters are those of the last visit."""
+    """Store the raw id for payment, with the recruiter's parameters of the latest visit."""
     if visitor.raw_id is None:
         return
     values = {
         "source": visitor.enter.source,
         "raw_id": visitor.raw_id,
-        "recruiter": plain_values(visitor.enter.recruiter),
+        "recruiter": storable_values(visitor.enter.recruiter),
         "seen": visitor.now,
     }
     statement = RAW_IDS.update().where(RAW_IDS.c.participant == visitor.participant)

@@ -1,6 +1,7 @@
-"""Deleting the ids that recruiters gave, or all of a session, so that no byte of them stays.
+"""Delete recruiters' ids, or all data of a session, so that the bytes cannot be recovered.
 
-What is left tells who a participant is only to who has the study's key and tries the id itself.
+The remaining keyed hash identifies a participant only to someone who has the study's key and the
+id itself.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from physion.experiment.store.database import (
     check_version,
     close_writer,
     connect_writer,
-    one_server,
     open_database,
+    server_lock,
 )
 from physion.experiment.store.tables import ANSWERS, EVENTS, RAW_IDS, SESSIONS, TOKENS
 
@@ -30,31 +31,42 @@ _EMPTIED = dict.fromkeys((
     "instructed_at", "ready_at", "demographics_at", "finished_at", "loaded_at_phase",
     "loaded_at_trial", "age", "gender", "education", "difficulty", "technical_problems", "feedback",
 )) | {"answered_familiarization": 0, "answered_test": 0, "loads": 0, "device": {}}  # fmt: skip
-"""What a forgotten session has in place of what its participant did and said."""
+"""Column values that replace the data of a forgotten session."""
 
 
 def forget(url: str, participants: Sequence[str] | None) -> int:
-    """Delete the raw ids of these participants (hashes), or of all for None; how many there were.
+    """Delete the raw ids of these participants (hashes; None for all) and return their number.
 
     In SQLite the deleted bytes are overwritten in the file and its log. PostgreSQL rewrites the
-    table; its own log and backups keep old bytes for as long as they are kept.
+    table; its write-ahead log and backups keep the old bytes for as long as they exist.
 
-    Raises:
-        BadInputError: a name that is no hash, or a participant without an id here; then nothing is
-            deleted.
-        PhysionError: the study is being served, or another program reads the file: stop it first.
+    Raises
+    ------
+    BadInputError
+        A name is not a participant hash, or a participant has no id; then nothing is deleted.
+    PhysionError
+        The study is being served, or another program reads the database.
     """
     _check(participants)
-    return _alone(url, lambda connection: _delete(connection, participants), (RAW_IDS,))
+    return _run_exclusively(
+        url, lambda connection: _delete_raw_ids(connection, participants), (RAW_IDS,)
+    )
 
 
 def forget_sessions(url: str, references: Sequence[str]) -> int:
-    """Delete all that the participants of these sessions did and said; how many sessions it was.
+    """Delete all data of the sessions with these references and return the number of sessions.
 
-    Answers, events, tokens, demographics, free text and device go, and the raw id where no other
-    session of the person is left. The row stays as one of somebody who withdrew, so that the same
-    id cannot take part again; one that was finished gives its place back. The bytes go as in
-    `forget`, whose errors these are, too; a reference that no session has is a `BadInputError`.
+    Deleted are answers, events, tokens, demographics, free text and device, and the raw id if the
+    person has no other session. The row of the session stays, marked as withdrawn, so that the same
+    id cannot take part again; a finished session no longer counts as a participant. Bytes are
+    overwritten as in `forget`.
+
+    Raises
+    ------
+    BadInputError
+        No session has one of the references; then nothing is deleted.
+    PhysionError
+        The study is being served, or another program reads the database.
     """
     wanted = list(dict.fromkeys(reference.strip().upper() for reference in references))
 
@@ -63,52 +75,57 @@ def forget_sessions(url: str, references: Sequence[str]) -> int:
             _forget_session(connection, reference)
         return len(wanted)
 
-    return _alone(url, work, (RAW_IDS, ANSWERS, EVENTS, TOKENS, SESSIONS))
+    return _run_exclusively(url, work, (RAW_IDS, ANSWERS, EVENTS, TOKENS, SESSIONS))
 
 
-def _alone(url: str, work: Callable[[Connection], int], tables: Sequence[Table]) -> int:
-    """Do something in one transaction while nobody serves, and overwrite what it deleted."""
+def _run_exclusively(url: str, work: Callable[[Connection], int], tables: Sequence[Table]) -> int:
+    """Run ``work`` in one transaction while no server runs, then vacuum ``tables``.
+
+    Vacuuming overwrites the deleted rows, so that they cannot be recovered from the file.
+    """
     engine = open_database(url, must_exist=True)
     try:
         check_version(engine)
-        with one_server(engine):
+        with server_lock(engine):
             connection = connect_writer(engine)
             try:
                 with connection.begin():
                     count = work(connection)
             finally:
                 close_writer(connection)
-            _overwrite(engine, tables, compact=True)
+            _erase_deleted_bytes(engine, tables, compact=True)
     finally:
         engine.dispose()
     return count
 
 
 async def forget_raw_ids(store: Store, participants: Sequence[str] | None = None) -> int:
-    """The same while the study is served; participants who come again leave their ids again.
+    """Delete raw ids as `forget` does, while the study is served.
 
-    The file is not made anew, which would keep answers waiting: SQLite is set to overwrite what it
-    deletes (``secure_delete``).
+    The file is not vacuumed, which would delay answers: SQLite overwrites deleted rows by itself
+    (``secure_delete``). Participants who enter again leave their ids again.
     """
     _check(participants)
-    count = await store.write(lambda connection: _delete(connection, participants))
-    await asyncio.to_thread(_overwrite, store.engine, (RAW_IDS,), compact=False)
+    count = await store.write(lambda connection: _delete_raw_ids(connection, participants))
+    await asyncio.to_thread(_erase_deleted_bytes, store.engine, (RAW_IDS,), compact=False)
     return count
 
 
 def _check(participants: Sequence[str] | None) -> None:
     for name in participants or ():
         if not re.fullmatch(r"[0-9a-f]{32}", name):
-            raise BadInputError(f"{name[:40]!r} is no participant: give the 32 digits of an export")
+            raise BadInputError(
+                f"{name[:40]!r} is not a participant; give the 32 hexadecimal digits of the export"
+            )
 
 
-def _delete(connection: Connection, participants: Sequence[str] | None) -> int:
+def _delete_raw_ids(connection: Connection, participants: Sequence[str] | None) -> int:
     if participants is None:
         return connection.execute(delete(RAW_IDS)).rowcount
     names = list(dict.fromkeys(participants))
     for name in names:
-        found = select(RAW_IDS.c.participant).where(RAW_IDS.c.participant == name)
-        if connection.execute(found).first() is None:
+        known = select(RAW_IDS.c.participant).where(RAW_IDS.c.participant == name)
+        if connection.execute(known).first() is None:
             raise BadInputError(f"there is no id of participant {name}; nothing was deleted")
     for name in names:
         connection.execute(delete(RAW_IDS).where(RAW_IDS.c.participant == name))
@@ -117,26 +134,26 @@ def _delete(connection: Connection, participants: Sequence[str] | None) -> int:
 
 def _forget_session(connection: Connection, reference: str) -> None:
     columns = SESSIONS.c
-    named = select(columns.session, columns.participant, columns.withdrawn_at)
-    found = connection.execute(named.where(columns.reference == reference)).all()
-    if len(found) != 1:
+    query = select(columns.session, columns.participant, columns.withdrawn_at)
+    rows = connection.execute(query.where(columns.reference == reference)).all()
+    if len(rows) != 1:
         raise BadInputError(
-            f"{len(found) or 'no'} sessions have the reference {reference[:40]!r}; nothing was "
+            f"{len(rows) or 'no'} sessions have the reference {reference[:40]!r}; nothing was "
             "deleted"
         )
-    session, participant, withdrawn_at = found[0]
+    session, participant, withdrawn_at = rows[0]
     for table in (ANSWERS, EVENTS, TOKENS):
         connection.execute(delete(table).where(table.c.session == session))
     values = _EMPTIED | {"withdrawn_at": withdrawn_at or time.time()}
     connection.execute(update(SESSIONS).where(columns.session == session).values(**values))
-    # Who declined, or was forgotten, has no device: nothing is left there for which an id is kept.
+    # Declined and forgotten sessions have no device; if all are such, the id is not needed.
     devices = select(columns.device).where(columns.participant == participant)
     if not any(connection.execute(devices).scalars()):
         connection.execute(delete(RAW_IDS).where(RAW_IDS.c.participant == participant))
 
 
-def _overwrite(engine: Engine, tables: Sequence[Table], *, compact: bool) -> None:
-    """Have the deleted bytes gone: an empty log, and with ``compact`` a file made anew."""
+def _erase_deleted_bytes(engine: Engine, tables: Sequence[Table], *, compact: bool) -> None:
+    """Remove deleted bytes from disk: empty the log and, with ``compact``, vacuum the file."""
     connection = engine.raw_connection()
     try:
         driver: Any = connection.driver_connection
@@ -157,6 +174,6 @@ def _empty_log(driver: Any) -> None:
     busy = driver.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()[0]
     if busy:
         raise PhysionError(
-            "all is deleted, but another program reads the database and keeps the bytes: "
-            "close it, and say physion experiment forget again"
+            "the data are deleted, but another program reads the database and keeps the old bytes; "
+            "close that program and run physion experiment forget again"
         )

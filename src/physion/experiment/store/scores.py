@@ -1,4 +1,4 @@
-"""How many test trials a person got right, and how that compares with others who finished."""
+"""Numbers of correct test answers, and their percentiles among the finished sessions."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _FINISHED = (
         SESSIONS.c.kind == bindparam("of_kind"),
         SESSIONS.c.finished_at.is_not(None),
         SESSIONS.c.withdrawn_at.is_(None),
-        # Previews may be of other stimuli, whose ends nobody knows any more.
+        # Previews may have used other stimuli, whose labels are no longer known.
         STUDIES.c.stimuli_digest == bindparam("of_stimuli"),
     )
 )
@@ -31,7 +31,7 @@ _TEST = select(ANSWERS.c.session, ANSWERS.c.stimulus, ANSWERS.c.response).where(
 
 
 class Scores:
-    """Correct test answers of finished sessions. They change no more, so each is counted once."""
+    """Cache of the numbers of correct test answers of finished sessions, which are final."""
 
     def __init__(self, study: Study) -> None:
         self._labels = {
@@ -44,8 +44,9 @@ class Scores:
         self._lock = threading.Lock()
 
     def of(self, connection: Connection, scenario: str, kind: str) -> dict[str, int]:
-        """Correct answers by session, of the finished sessions of one scenario and kind that were
-        made with the present stimuli.
+        """Return the number of correct answers of each finished session of a scenario and kind.
+
+        Sessions with other than the current stimuli are left out.
         """
         values = {"of_scenario": scenario, "of_kind": kind, "of_stimuli": self._stimuli}
         rows = connection.execute(_FINISHED, values)
@@ -64,7 +65,7 @@ class Scores:
 
 
 def percentile(correct: int, others: Sequence[int]) -> float:
-    """The share (%) of the ``others`` with fewer correct, plus half of those with as many."""
+    """Return the percentage of ``others`` below ``correct``, plus half of those equal to it."""
     fewer = sum(other < correct for other in others)
-    as_many = sum(other == correct for other in others)
-    return 100 * (fewer + as_many / 2) / len(others)
+    equal = sum(other == correct for other in others)
+    return 100 * (fewer + equal / 2) / len(others)

@@ -1,4 +1,4 @@
-"""Pages between the trials: what each may hold, and what it changes."""
+"""Submitted pages between the trials: validate their fields and write them to the session."""
 
 from __future__ import annotations
 
@@ -7,22 +7,23 @@ from typing import Any
 
 from sqlalchemy import Connection, delete, select, update
 
-from physion.experiment.protocol.messages import PageDone, State
+from physion.experiment.protocol.messages import PageDone, SessionState
 from physion.experiment.protocol.refused import Refused
 from physion.experiment.store.sessions import (
     ENTERED_AGAIN,
     STAGES,
     Session,
     change_session,
-    plain,
     stage_of,
     state_of,
+    storable,
 )
 from physion.experiment.store.tables import EVENTS, RAW_IDS, SESSIONS
 from physion.experiment.study.study import Study
 
 MIN_AGE, MAX_AGE = 18, 130
-MAX_WORDS = 200
+MAX_LABEL = 200
+"""Characters of a short text such as gender."""
 
 
 def _yes_or_no(value: Any) -> bool:
@@ -41,12 +42,12 @@ def _age(value: Any) -> int | None:
     return int(value)
 
 
-def _words(value: Any) -> str | None:
+def _label(value: Any) -> str | None:
     if value is None:
         return None
-    if not isinstance(value, str) or len(value) > MAX_WORDS:
-        raise ValueError(f"text of at most {MAX_WORDS} characters, or null")
-    return plain(value).strip() or None
+    if not isinstance(value, str) or len(value) > MAX_LABEL:
+        raise ValueError(f"text of at most {MAX_LABEL} characters, or null")
+    return storable(value).strip() or None
 
 
 def _difficulty(value: Any) -> int:
@@ -58,14 +59,14 @@ def _difficulty(value: Any) -> int:
 def _free_text(value: Any) -> str:
     if not isinstance(value, str):
         raise ValueError("text, which may be empty")
-    return plain(value).strip()
+    return storable(value).strip()
 
 
 FIELDS: Mapping[str, Mapping[str, Callable[[Any], Any]]] = {
     "consent": {"agreed": _yes_or_no},
     "instructions": {},
     "ready": {},
-    "demographics": {"age": _age, "gender": _words, "education": _words},
+    "demographics": {"age": _age, "gender": _label, "education": _label},
     "feedback": {
         "difficulty": _difficulty,
         "technical_problems": _yes_or_no,
@@ -73,13 +74,19 @@ FIELDS: Mapping[str, Mapping[str, Callable[[Any], Any]]] = {
     },
     "withdraw": {},
 }
-"""Fields of each page, all of them needed; null where a person prefers not to say."""
-OPTIONAL: Mapping[str, Mapping[str, Callable[[Any], Any]]] = {"consent": {"language": _words}}
-"""Fields that a page may have besides."""
+"""Required fields of each page with their validators; null means "prefer not to say"."""
+OPTIONAL: Mapping[str, Mapping[str, Callable[[Any], Any]]] = {"consent": {"language": _label}}
+"""Optional fields of each page."""
 
 
 def check_page(done: PageDone) -> dict[str, Any]:
-    """The values of a page; `Refused` names the first field that is missing, wrong or unknown."""
+    """Return the validated values of a page.
+
+    Raises
+    ------
+    Refused
+        A field is missing, invalid or unknown; the message names the first one.
+    """
     optional = OPTIONAL.get(done.page, {})
     expected = {**FIELDS[done.page], **{k: v for k, v in optional.items() if k in done.data}}
     unknown = sorted(set(done.data) - set(expected))
@@ -97,7 +104,7 @@ def check_page(done: PageDone) -> dict[str, Any]:
     return values
 
 
-def turn_page(
+def submit_page(
     connection: Connection,
     study: Study,
     trials: Mapping[str, int],
@@ -105,8 +112,29 @@ def turn_page(
     page: str,
     values: Mapping[str, Any],
     now: float,
-) -> State:
-    """Take a page that was sent. One that is over already changes nothing."""
+) -> SessionState:
+    """Apply a submitted page to the session; a page that was submitted before changes nothing.
+
+    Parameters
+    ----------
+    connection
+        Connection of the writer, in a transaction.
+    study
+        The study.
+    trials
+        Number of trials in each phase of the session's scenario.
+    session
+        The session; it is updated.
+    page, values
+        Name of the page and its values from `check_page`.
+    now
+        Time of the server in seconds since 1970.
+
+    Raises
+    ------
+    Refused
+        The page is not the next one.
+    """
     stage = stage_of(session, trials)
     if page == "withdraw" or values.get("agreed") is False:
         if stage == "done":
@@ -114,18 +142,18 @@ def turn_page(
         if stage != "withdrawn":
             change_session(connection, session, withdrawn_at=now, last_seen=now)
             if session.consented_at is None:
-                _forget(connection, session)
+                _forget_declined(connection, session)
         return state_of(session, trials)
     if stage == "withdrawn" or STAGES.index(stage) < STAGES.index(page):  # type: ignore[arg-type]
-        raise Refused("wrong_stage", "This page does not come now.", state_of(session, trials))
+        raise Refused("wrong_stage", "This page is not next.", state_of(session, trials))
     if stage == page:
         change_session(connection, session, last_seen=now, **_columns(study, page, values, now))
     return state_of(session, trials)
 
 
-def _forget(connection: Connection, session: Session) -> None:
-    """Delete what came with who did not agree: browser and screen, and the recruiter's id where it
-    belongs to no other session.
+def _forget_declined(connection: Connection, session: Session) -> None:
+    """Delete the data of a person who declined: the device, and the raw id if no other session
+    needs it.
     """
     change_session(connection, session, device={})
     again = (EVENTS.c.session == session.session) & (EVENTS.c.kind == ENTERED_AGAIN)
@@ -138,9 +166,10 @@ def _forget(connection: Connection, session: Session) -> None:
 
 
 def _columns(study: Study, page: str, values: Mapping[str, Any], now: float) -> dict[str, Any]:
+    """Return the columns of SESSIONS that a page sets."""
     match page:
         case "consent":
-            # The consent is given in the language in which it was read.
+            # Store the language in which the consent was read.
             known = values.get("language") in study.languages
             language = {"language": values["language"]} if known else {}
             return {"consented_at": now, "consent_version": study.consent_version, **language}

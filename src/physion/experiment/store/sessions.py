@@ -1,4 +1,4 @@
-"""A session as it stands: read by its token, with its stage and the state that a client is told."""
+"""Read and change sessions: find one by its token, derive its stage and its public state."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from typing import Any, cast
 from sqlalchemy import Connection, Table, bindparam, select, update
 from sqlalchemy.dialects import postgresql, sqlite
 
-from physion.experiment.protocol.messages import Stage, State
+from physion.experiment.protocol.messages import SessionState, Stage
 from physion.experiment.protocol.refused import Refused
 from physion.experiment.store.tables import SESSIONS, TOKENS
 from physion.experiment.study.stimuli import PHASES
 from physion.experiment.study.study import Study
 
 ACTIVE_WITHIN = 15 * 60.0
-"""Seconds since a session was last heard of within which it counts as going on."""
+"""A session counts as active for this many seconds after its last request."""
 ENTERED_AGAIN = "entered_again"
-"""The event of someone who goes on with a session; its data are the device."""
+"""Kind of the event stored when a session is entered again; its data are the device."""
 STAGES: tuple[Stage, ...] = (
     "consent", "instructions", "familiarization", "ready", "test", "demographics", "feedback",
     "done", "withdrawn",
@@ -28,7 +28,7 @@ STAGES: tuple[Stage, ...] = (
 
 @dataclass(slots=True)
 class Session:
-    """What decides how a session goes on: these columns of SESSIONS."""
+    """The columns of SESSIONS that determine how a session continues."""
 
     session: str
     participant: str
@@ -60,8 +60,8 @@ _BY_TOKEN = (
 )
 
 
-class Trials:
-    """How many trials each phase of each scenario has."""
+class TrialCounts:
+    """Number of trials in each phase of each scenario."""
 
     def __init__(self, study: Study) -> None:
         self._counts: dict[str, dict[str, int]] = {
@@ -70,23 +70,30 @@ class Trials:
         }
 
     def of(self, scenario: str) -> Mapping[str, int]:
-        """Counts by phase; `Refused` for a scenario that the study has no more.
+        """Return the numbers of trials by phase.
 
-        Only previews can be of one (`study_record.register`).
+        Raises
+        ------
+        Refused
+            The study no longer has the scenario, which can only happen to previews
+            (`study_record.register`).
         """
         if scenario not in self._counts:
-            raise Refused("unknown_token", "The study has this part no more; open your link again.")
+            raise Refused(
+                "unknown_token",
+                "The study no longer has this scenario; open your link again.",
+            )
         return self._counts[scenario]
 
     def has(self, scenario: str) -> bool:
-        """Is this a scenario of the study as it is now?"""
+        """Return whether the study currently has this scenario."""
         return scenario in self._counts
 
 
-def served_session(study: Study, row: Sequence[Any]) -> Session:
-    """A session from its `SESSION_COLUMNS`, in a language that the study has, as it is served now.
+def session_from_row(study: Study, row: Sequence[Any]) -> Session:
+    """Return the session of a row of `SESSION_COLUMNS`, in a language that the study has now.
 
-    The row keeps the language in which the session began.
+    The database keeps the language in which the session began.
     """
     session = Session(*row)
     if session.language not in study.languages:
@@ -95,20 +102,20 @@ def served_session(study: Study, row: Sequence[Any]) -> Session:
 
 
 def read_session(connection: Connection, study: Study, token_hash: str) -> Session:
-    """The session that a token opens; `Refused` where it opens none."""
+    """Return the session of a token; raise `Refused` if there is none."""
     row = connection.execute(_BY_TOKEN, {"token_hash": token_hash}).first()
     if row is None:
-        raise Refused("unknown_token", "This session is not known here; open your link again.")
-    return served_session(study, row)
+        raise Refused("unknown_token", "This session is unknown; open your link again.")
+    return session_from_row(study, row)
 
 
 def stage_of(session: Session, trials: Mapping[str, int]) -> Stage:
-    """The stage that a session is in: the first that is not over."""
+    """Return the current stage of a session: the first one that is not complete."""
     if session.withdrawn_at is not None:
         return "withdrawn"
     if session.finished_at is not None:
         return "done"
-    over = (
+    complete = (
         session.consented_at is not None,
         session.instructed_at is not None,
         session.answered_familiarization >= trials["familiarization"],
@@ -116,18 +123,18 @@ def stage_of(session: Session, trials: Mapping[str, int]) -> Stage:
         session.answered_test >= trials["test"],
         session.demographics_at is not None,
     )
-    return STAGES[over.index(False)] if False in over else "feedback"
+    return STAGES[complete.index(False)] if False in complete else "feedback"
 
 
 def answered(session: Session, phase: str) -> int:
-    """How many trials of a phase are answered; the number of the next one."""
+    """Return the number of answered trials of a phase, which is the index of the next trial."""
     return session.answered_test if phase == "test" else session.answered_familiarization
 
 
-def state_of(session: Session, trials: Mapping[str, int]) -> State:
-    """What the client is told of a session."""
+def state_of(session: Session, trials: Mapping[str, int]) -> SessionState:
+    """Return the state of a session as sent to the client."""
     stage = stage_of(session, trials)
-    return State(
+    return SessionState(
         stage=stage,
         trial=answered(session, stage) if stage in PHASES else None,
         trials=cast(Any, dict(trials)),
@@ -140,8 +147,8 @@ def state_of(session: Session, trials: Mapping[str, int]) -> State:
 
 
 def change_session(connection: Connection, session: Session, **values: Any) -> None:
-    """Write some columns of a session, and have them in ``session`` too."""
-    assert "kind" not in values, "what a session is stays as it began"
+    """Write columns of a session to the database and to ``session``."""
+    assert "kind" not in values, "the kind of a session never changes"
     statement = update(SESSIONS).where(SESSIONS.c.session == session.session).values(**values)
     connection.execute(statement)
     for name, value in values.items():
@@ -150,9 +157,9 @@ def change_session(connection: Connection, session: Session, **values: Any) -> N
 
 
 def mark_loaded(session: Session, trials: Mapping[str, int]) -> dict[str, Any]:
-    """The columns that say at which trial the page was loaded; none where no trial is next.
+    """Return the columns that record a reload of the page at the next trial, if a trial is next.
 
-    A page must have been loaded before, for the consent: so this was again.
+    The page was loaded before for the consent, so a load at a trial is always a reload.
     """
     stage = stage_of(session, trials)
     if stage not in PHASES:
@@ -160,26 +167,26 @@ def mark_loaded(session: Session, trials: Mapping[str, int]) -> dict[str, Any]:
     return {"loaded_at_phase": stage, "loaded_at_trial": answered(session, stage)}
 
 
-def insert_new(connection: Connection, table: Table) -> Any:
-    """An INSERT that leaves out what would break a UNIQUE constraint; ``rowcount`` tells."""
-    return _insert_new(connection.dialect.name, table)
+def insert_or_skip(connection: Connection, table: Table) -> Any:
+    """Return an INSERT that skips rows which violate a UNIQUE constraint; see ``rowcount``."""
+    return _insert_or_skip(connection.dialect.name, table)
 
 
 @cache
-def _insert_new(dialect: str, table: Table) -> Any:
+def _insert_or_skip(dialect: str, table: Table) -> Any:
     insert = postgresql.insert if dialect == "postgresql" else sqlite.insert
-    # Without the option an INSERT's count of rows is not to be relied on.
+    # Without the option the rowcount of an INSERT is unreliable.
     return insert(table).on_conflict_do_nothing().execution_options(preserve_rowcount=True)
 
 
-def plain(text: str) -> str:
-    """A text without what PostgreSQL cannot store: NUL, and halves of characters."""
+def storable(text: str) -> str:
+    """Return a text without NUL and unpaired surrogates, which PostgreSQL cannot store."""
     return text.replace("\0", "").encode("utf-8", "replace").decode("utf-8")
 
 
-def plain_values(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The same for names and texts of a flat object."""
+def storable_values(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Apply `storable` to the names and texts of a flat object."""
     return {
-        plain(name): plain(value) if isinstance(value, str) else value
+        storable(name): storable(value) if isinstance(value, str) else value
         for name, value in values.items()
     }

@@ -1,4 +1,4 @@
-"""All that a participant's session reads and writes; what is acknowledged is on the disk."""
+"""Interface of the server to the database: one method per request of a participant."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from physion.experiment.protocol.messages import (
     PageDone,
     Phase,
     Result,
-    State,
+    SessionState,
     Stored,
     TrialList,
     TrialMedia,
@@ -30,28 +30,28 @@ from physion.experiment.protocol.refused import Refused
 from physion.experiment.store.answering import store_answer, write_details
 from physion.experiment.store.database import (
     connect_writer,
-    one_server,
     open_database,
+    server_lock,
     sqlite_url,
     upgrade,
 )
-from physion.experiment.store.entering import let_in, receive
+from physion.experiment.store.entering import enter_session, identify_visitor
 from physion.experiment.store.scores import Scores, percentile
-from physion.experiment.store.sent_pages import check_page, turn_page
+from physion.experiment.store.sent_pages import check_page, submit_page
 from physion.experiment.store.sessions import (
     Session,
-    Trials,
+    TrialCounts,
     change_session,
     mark_loaded,
-    plain_values,
     read_session,
     stage_of,
     state_of,
+    storable_values,
 )
 from physion.experiment.store.tables import EVENTS, RAW_IDS, SESSIONS
 from physion.experiment.store.writer import Writer
 from physion.experiment.study.identity import Secrets, hash_token
-from physion.experiment.study.orders import fixations, order_of
+from physion.experiment.study.orders import fixations, trial_order
 from physion.experiment.study.recruitment import completion
 from physion.experiment.study.study import Study
 from physion.experiment.study.study_record import register
@@ -60,34 +60,40 @@ from physion.experiment.web.media_links import sign_media
 __all__ = ["Refused", "Store"]
 T = TypeVar("T")
 MAX_EVENTS = 2000
-"""Events of a session that are kept; more would only fill the disk."""
+"""Number of events kept per session, so that nobody can fill the disk."""
 MAX_EVENT = 16 * 1024
+"""Characters of the JSON data of one event."""
 
 
 class Store:
     """The sessions of one study. Coroutines write and return after the commit; the rest reads.
 
-    Every method raises `Refused` where a request is not granted, and then nothing has changed.
+    Every method for a participant's request raises `Refused` if the request is refused; then
+    nothing has changed.
     """
 
     def __init__(self, study: Study, secrets: Secrets, engine: Engine, writer: Writer) -> None:
         self.study, self.secrets, self.engine = study, secrets, engine
         self._writer = writer
-        self._trials = Trials(study)
+        self._trials = TrialCounts(study)
         self._scores = Scores(study)
         self._held = contextlib.ExitStack()
 
     @classmethod
     def open(cls, study: Study, secrets: Secrets, url: str | None = None) -> Store:
-        """Open the study's database for writing; without ``url`` SQLite in the study folder.
+        """Open the study's database for writing; SQLite in the study folder if ``url`` is None.
 
-        Raises `PhysionError` where another server has it, and `BadInputError` where it was made by
-        a newer version of this package, or with other stimuli.
+        Raises
+        ------
+        PhysionError
+            Another server uses the database.
+        BadInputError
+            A newer version of this package wrote it, or it has sessions with other stimuli.
         """
         with contextlib.ExitStack() as held:
             engine = open_database(url or sqlite_url(study.folder))
             held.callback(engine.dispose)
-            held.enter_context(one_server(engine))
+            held.enter_context(server_lock(engine))
             upgrade(engine)
             writer = Writer(lambda: connect_writer(engine))
             held.callback(writer.close)
@@ -97,23 +103,25 @@ class Store:
         return store
 
     def close(self) -> None:
-        """Write what waits, then let go of the database."""
+        """Write all waiting commands, then close the database."""
         self._held.close()
 
     async def enter(self, enter: Enter) -> Entered:
-        """Begin a session or go on with one."""
-        visitor = receive(self.study, self.secrets, enter)
+        """Begin or continue a session."""
+        visitor = identify_visitor(self.study, self.secrets, enter)
         return await self._writer.run(
-            lambda connection: let_in(connection, self.study, self.secrets, self._trials, visitor)
+            lambda connection: enter_session(
+                connection, self.study, self.secrets, self._trials, visitor
+            )
         )
 
-    async def state(self, token: str, load: bool = False) -> State:
-        """Where the session stands; ``load``: the page was loaded just now."""
+    async def state(self, token: str, load: bool = False) -> SessionState:
+        """Return the state of a session; with ``load``, also count a load of the page."""
         if not load:
             return await asyncio.to_thread(self._read, lambda c: self._state(c, token))
         now = time.time()
 
-        def count(connection: Connection) -> State:
+        def count(connection: Connection) -> SessionState:
             session = read_session(connection, self.study, hash_token(token))
             trials = self._trials.of(session.scenario)
             if stage_of(session, trials) != "withdrawn":
@@ -125,9 +133,10 @@ class Store:
         return await self._writer.run(count)
 
     def trials(self, token: str, phase: Phase) -> TrialList:
-        """What is shown in a phase, in the session's own order; once the phase is near.
+        """Return the media of the trials of a phase, in the session's order.
 
-        Both lists may be had as soon as the consent is given, so that media are loaded ahead.
+        The lists of both phases are available once consent is given, so that media can be loaded
+        ahead.
         """
         session, trials = self._read(lambda c: self._session(c, token))
         stage = stage_of(session, trials)
@@ -137,18 +146,18 @@ class Store:
             raise Refused("not_yet", "Trials come after the consent.", state_of(session, trials))
         return TrialList(phase=phase, trials=self._media(session, phase))
 
-    async def page(self, token: str, done: PageDone) -> State:
-        """A page between the trials was sent."""
+    async def page(self, token: str, done: PageDone) -> SessionState:
+        """Store a submitted page and return the new state."""
         values, now = check_page(done), time.time()
 
-        def turn(connection: Connection) -> State:
+        def turn(connection: Connection) -> SessionState:
             session, trials = self._session(connection, token)
-            return turn_page(connection, self.study, trials, session, done.page, values, now)
+            return submit_page(connection, self.study, trials, session, done.page, values, now)
 
         return await self._writer.run(turn)
 
     async def answer(self, token: str, answer: Answer) -> AnswerStored:
-        """Store one answer; the same one again is found and not stored twice."""
+        """Store one answer; repeating the request does not store it twice."""
         details, token_hash, now = write_details(answer), hash_token(token), time.time()
 
         def store(connection: Connection) -> AnswerStored:
@@ -161,9 +170,7 @@ class Store:
         return await self._writer.run(store)
 
     async def events(self, token: str, events: Events) -> Stored:
-        """Store what happened in the browser, up to MAX_EVENTS a session; a batch under the same
-        key is not stored again.
-        """
+        """Store events, up to MAX_EVENTS per session, unless the key of the batch is known."""
         now = time.time()
         rows = [
             {"batch": events.key, "kind": event.kind, "at_ms": event.at_ms, "stored_at": now,
@@ -192,15 +199,15 @@ class Store:
         return await self._writer.run(store)
 
     def result(self, token: str) -> Result:
-        """Accuracy, percentile and completion of a session that is done."""
+        """Return accuracy, percentile and completion of a finished session."""
         return self._read(lambda connection: self._result(connection, token))
 
     async def write(self, command: Callable[[Connection], T]) -> T:
-        """Have the writer run a command of someone else's; see `Writer` for what it must keep."""
+        """Run any command in the writer; see `Writer` for the rules that it must follow."""
         return await self._writer.run(command)
 
     def healthy(self) -> bool:
-        """Does the database answer?"""
+        """Return whether the database answers."""
         try:
             return bool(self._read(lambda connection: connection.scalar(text("SELECT 1"))))
         except Refused:
@@ -217,7 +224,7 @@ class Store:
         session = read_session(connection, self.study, hash_token(token))
         return session, self._trials.of(session.scenario)
 
-    def _state(self, connection: Connection, token: str) -> State:
+    def _state(self, connection: Connection, token: str) -> SessionState:
         return state_of(*self._session(connection, token))
 
     def _media(self, session: Session, phase: Phase) -> list[TrialMedia]:
@@ -234,7 +241,7 @@ class Store:
                 height=stimulus.height,
                 fixation_ms=crosses[trial],
             )
-            for trial, stimulus in enumerate(order_of(study, scenario, seed)[phase])
+            for trial, stimulus in enumerate(trial_order(study, scenario, seed)[phase])
         ]
 
     def _result(self, connection: Connection, token: str) -> Result:
@@ -245,7 +252,7 @@ class Store:
             raise Refused(code, "The result comes at the end.", state_of(session, trials))
         scores = dict(self._scores.of(connection, session.scenario, session.kind))
         correct = scores.pop(session.session, None)
-        if correct is None:  # a preview of other stimuli: nobody knows any more what was right
+        if correct is None:  # a preview of other stimuli, whose labels are no longer known
             raise Refused("unknown_token", "The stimuli have changed since; open your link again.")
         others = list(scores.values())
         enough = len(others) >= self.study.percentile_from
@@ -268,7 +275,7 @@ def _event_data(data: dict[str, Any], index: int) -> dict[str, Any]:
     try:
         size = len(json.dumps(data, allow_nan=False))
     except ValueError:
-        raise Refused("bad_request", f"events.{index}.data: plain JSON values alone") from None
+        raise Refused("bad_request", f"events.{index}.data: only plain JSON values") from None
     if size > MAX_EVENT:
         raise Refused("bad_request", f"events.{index}.data: at most {MAX_EVENT} characters")
-    return plain_values(data)
+    return storable_values(data)

@@ -1,7 +1,7 @@
-"""The tables of a study's database, the same on SQLite and PostgreSQL.
+"""Tables of a study's database, the same for SQLite and PostgreSQL.
 
-Times are seconds since 1970 in UTC, of the server's clock. What can be computed (order of trials,
-correct or not) is not stored twice; labels are in the study folder alone.
+Times are seconds since 1970 (UTC) of the server's clock. Values that can be computed (order of
+trials, correctness) are not stored; labels are in the study folder only.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ STUDIES = Table(
     Column("settings", JSON, nullable=False),
     Column("first_served", Float, nullable=False),
 )
-"""Every state of the study folder under which sessions ran; ``settings`` is all of it but media."""
+"""Each version of the study folder that was served; ``settings`` is the folder without media."""
 
 PARTICIPANTS = Table(
     "participants",
@@ -51,7 +51,7 @@ PARTICIPANTS = Table(
     Column("participant", String(32), primary_key=True),
     Column("first_seen", Float, nullable=False),
 )
-"""``participant`` is the keyed hash of source and id."""
+"""Participants; ``participant`` is the keyed hash of source and id."""
 
 RAW_IDS = Table(
     "raw_ids",
@@ -62,7 +62,7 @@ RAW_IDS = Table(
     Column("recruiter", JSON, nullable=False),
     Column("seen", Float, nullable=False),
 )
-"""For payment alone; no other table refers to it, so it can be emptied at any time."""
+"""Recruiters' ids, for payment only; no table refers to it, so it can be emptied at any time."""
 
 SESSIONS = Table(
     "sessions",
@@ -104,9 +104,9 @@ SESSIONS = Table(
     CheckConstraint("buttons IN ('yes-no', 'no-yes')", name="buttons"),
     Index("ix_sessions_scenario_kind", "scenario", "kind"),
 )
-"""``kind`` is written once, when the session begins, and by no other statement. ``order_number`` is
-the prepared order where the study has some, else 0; ``order_seed`` with the stimuli gives the order
-of the trials. ``loaded_at_*``: the trial that was next when the page was loaded again."""
+"""Sessions. ``kind`` is written when the session begins and never changed. ``order_number`` is the
+number of the prepared order, 0 if the study has none; ``order_seed`` and the stimuli determine the
+order of the trials. ``loaded_at_*``: the trial that was next when the page was last reloaded."""
 
 TOKENS = Table(
     "tokens",
@@ -115,7 +115,7 @@ TOKENS = Table(
     Column("session", ForeignKey("sessions.session"), nullable=False, index=True),
     Column("made", Float, nullable=False),
 )
-"""SHA-256 of each token; a token opens one session."""
+"""SHA-256 hashes of tokens; each token gives access to one session."""
 
 ANSWERS = Table(
     "answers",
@@ -144,7 +144,7 @@ ANSWERS = Table(
     UniqueConstraint("session", "phase", "stimulus"),
     CheckConstraint("response IN ('yes', 'no')", name="response"),
 )
-"""One row a session and trial; ``details`` is JSON text."""
+"""Answers, one row per session and trial; ``details`` is JSON text."""
 
 EVENTS = Table(
     "events",
@@ -157,5 +157,5 @@ EVENTS = Table(
     Column("stored_at", Float, nullable=False),
     Column("data", JSON, nullable=False),
 )
-"""What happened in the browser or to the session besides answers. ``batch`` is the key under which
-the browser sent some events together."""
+"""Other events in the browser or of the session. ``batch`` is the key under which the browser sent
+several events together."""

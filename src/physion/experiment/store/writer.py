@@ -1,7 +1,7 @@
-"""The one thread that writes: many commands in one transaction, acknowledged after its commit.
+"""Writer thread with group commit: many commands per transaction, acknowledged after its commit.
 
-A commit waits for the disk. While it does, more commands come in; the next transaction takes all of
-them. So each answer costs little, and none is acknowledged before it is safe.
+A commit waits for the disk. Commands that arrive meanwhile share the next transaction, so an answer
+costs little, and none is acknowledged before it is on disk.
 """
 
 from __future__ import annotations
@@ -26,11 +26,14 @@ from physion.experiment.store.database import close_writer
 
 T = TypeVar("T")
 Command = Callable[[Connection], T]
-GROUP = 256
-WAITING = 10_000
+MAX_GROUP = 256
+"""Commands in one transaction."""
+MAX_WAITING = 10_000
+"""Commands in the queue; more are refused."""
 PATIENCE_S = 20.0
-"""How long commands wait for a database that went away, such as one that is restarted."""
+"""Time that commands wait for an unreachable database, such as one that is restarting."""
 PAUSE_S = 0.1
+"""Pause between attempts to reach the database."""
 _log = logging.getLogger(__name__)
 
 
@@ -48,20 +51,31 @@ class _Outcome:
 
 
 class Writer:
-    """Runs commands one after the other in a thread of its own, in groups of one transaction.
+    """Thread that runs commands one after the other, in groups of one transaction each.
 
-    A command takes the connection, and returns or raises. It is run again where a group failed, so
-    it draws nothing itself (names, tokens, times come from outside) and can meet its own effect: a
-    connection may be lost after the database committed and before it said so. `Refused` must be
-    raised before anything is written; what else it raises undoes all that it wrote.
+    A command is a function of the connection. It is run again if its group failed, so it must not
+    draw random names or read the clock, and it must be idempotent: the connection may be lost after
+    the database committed but before it confirmed. A command must raise `Refused` before it writes
+    anything; any other exception rolls back all that it wrote.
+
+    Parameters
+    ----------
+    connect
+        Opens the writing connection; called again after the connection was lost.
+    group
+        Largest number of commands in one transaction.
+    waiting
+        Largest number of commands in the queue.
+    patience_s
+        Seconds that commands wait for an unreachable database.
     """
 
     def __init__(
         self,
         connect: Callable[[], Connection],
         *,
-        group: int = GROUP,
-        waiting: int = WAITING,
+        group: int = MAX_GROUP,
+        waiting: int = MAX_WAITING,
         patience_s: float = PATIENCE_S,
     ) -> None:
         self._connect, self._group, self._waiting = connect, group, waiting
@@ -75,20 +89,20 @@ class Writer:
         self._thread.start()
 
     def submit(self, command: Command[T]) -> Future[T]:
-        """Have a command run; the future is done once its effects are on the disk."""
+        """Queue a command; the returned future is done once its effects are committed."""
         future: Future[T] = Future()
         self._put(_Item(command, future, None))
         return future
 
     async def run(self, command: Command[T]) -> T:
-        """The same for a coroutine: one wake-up of the event loop for a whole group."""
+        """Run a command and await its result; a whole group wakes the event loop only once."""
         loop = asyncio.get_running_loop()
         future: asyncio.Future[T] = loop.create_future()
         self._put(_Item(command, future, loop))
         return await future
 
     def close(self) -> None:
-        """Run what waits, then stop. Later commands are refused."""
+        """Run all waiting commands, then stop the thread. Later commands are refused."""
         with self._lock:
             if not self._closing:
                 self._closing = True
@@ -97,8 +111,8 @@ class Writer:
 
     def _put(self, item: _Item) -> None:
         if self._queue.qsize() >= self._waiting:
-            raise Refused("unavailable", "The server has too much to do; try again soon.")
-        with self._lock:  # nothing may come after the end mark
+            raise Refused("unavailable", "The server is overloaded; try again soon.")
+        with self._lock:  # no command may be queued after the end mark
             if self._closing:
                 raise Refused("unavailable", "The server is stopping; try again soon.")
             self._queue.put(item)
@@ -112,7 +126,7 @@ class Writer:
         self._drop()
 
     def _take(self) -> tuple[list[_Item], bool]:
-        """All that waits, up to one group; waits for the first."""
+        """Wait for a command; return it with the other waiting ones, and whether to stop then."""
         first = self._queue.get()
         if first is None:
             return [], True
@@ -128,7 +142,7 @@ class Writer:
         return group, False
 
     def _perform(self, group: list[_Item]) -> None:
-        """Run a group and acknowledge it; where it fails, wait for the database or split it."""
+        """Run and acknowledge a group; on failure wait for the database or run items one by one."""
         while True:
             try:
                 connection = self._begin()
@@ -155,14 +169,14 @@ class Writer:
             return
 
     def _begin(self) -> Connection:
-        """A connection with a transaction begun."""
+        """Return the connection, with a transaction begun."""
         if self._connection is None:
             self._connection = self._connect()
         self._connection.begin()
         return self._connection
 
     def _undo(self, error: Exception) -> bool:
-        """Take back what a group wrote. Was it the connection, and not what was asked of it?"""
+        """Roll back a group; return whether it failed because the connection was lost."""
         connection = self._connection
         lost = isinstance(error, DBAPIError) and error.connection_invalidated
         try:
@@ -175,7 +189,7 @@ class Writer:
         return lost
 
     def _wait(self, group: list[_Item], error: Exception) -> bool:
-        """Wait a moment for the database; False, and the group is refused, where it took long."""
+        """Pause until the next attempt; after ``patience_s`` refuse the group and return False."""
         now = time.monotonic()
         if self._down_since is None:
             self._down_since = now
@@ -201,7 +215,7 @@ def _run(command: Command[Any], connection: Connection) -> _Outcome:
 
 
 def _settle(group: Sequence[_Item], outcomes: Sequence[_Outcome]) -> None:
-    """Hand the outcomes over, with one wake-up for each event loop."""
+    """Set the futures of a group, with one wake-up of each event loop."""
     by_loop: dict[asyncio.AbstractEventLoop | None, list[tuple[Any, _Outcome]]] = {}
     for item, outcome in zip(group, outcomes, strict=True):
         by_loop.setdefault(item.loop, []).append((item.future, outcome))
@@ -209,15 +223,15 @@ def _settle(group: Sequence[_Item], outcomes: Sequence[_Outcome]) -> None:
         if loop is None:
             _resolve(pairs)
             continue
-        with contextlib.suppress(RuntimeError):  # the loop has ended, nobody waits
+        with contextlib.suppress(RuntimeError):  # the loop has ended
             loop.call_soon_threadsafe(_resolve, pairs)
 
 
 def _resolve(pairs: Sequence[tuple[Any, _Outcome]]) -> None:
     for future, outcome in pairs:
-        if future.done():  # whoever asked has gone away
+        if future.done():  # cancelled
             continue
-        with contextlib.suppress(InvalidStateError):  # gone away this very moment
+        with contextlib.suppress(InvalidStateError):  # cancelled just now
             if outcome.error is not None:
                 future.set_exception(outcome.error)
             else:

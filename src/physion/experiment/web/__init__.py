@@ -1,1 +1,1 @@
-"""The web server: endpoints, limits, headers, files."""
+"""HTTP layer of the server: API endpoints, request limits, headers, pages and media."""

@@ -1,4 +1,4 @@
-"""The endpoints: a request body in, one call of the store, a response message out."""
+"""API endpoints: parse the request, call the store once, return its message."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from physion.experiment.protocol.messages import (
     PublicStudy,
     TrialMedia,
 )
-from physion.experiment.study.recruitment import RECRUITERS, begins_nothing
+from physion.experiment.study.recruitment import RECRUITERS, is_mturk_preview
 from physion.experiment.study.stimuli import PHASES
 from physion.experiment.web.bearer import read_token
 from physion.experiment.web.bodies import read_message
-from physion.experiment.web.guards import GIVEN_TOKEN
+from physion.experiment.web.guards import ISSUED_TOKEN
 from physion.experiment.web.media_links import sign_media
 from physion.experiment.web.refusals import Reply, refuse
 
@@ -36,7 +36,7 @@ SHOWN: tuple[Literal["movie"], Literal["map"]] = ("movie", "map")
 
 
 def public_study(study: Study, secrets: Secrets) -> PublicStudy:
-    """What anyone may know."""
+    """Return the settings of the study that anyone may see."""
     return PublicStudy(
         title=study.title,
         contact=study.contact,
@@ -55,8 +55,9 @@ def public_study(study: Study, secrets: Secrets) -> PublicStudy:
 
 
 def _example(study: Study, secrets: Secrets, scenario: str) -> TrialMedia:
-    """The last trial of familiarization, observed part alone: the one whose memory fades longest
-    until it comes, and no trial of the test.
+    """Return the example trial of the instructions: the last familiarization trial, observed part.
+
+    It is not a test trial, and of the familiarization trials it is shown again latest.
     """
     trial = len(study.phase(scenario, "familiarization")) - 1
     shown = study.phase(scenario, "familiarization")[trial]
@@ -76,12 +77,12 @@ def _example(study: Study, secrets: Secrets, scenario: str) -> TrialMedia:
 
 
 def token_of(request: Request) -> str:
-    """The token that a request carries; empty where there is none."""
+    """Return the bearer token of a request, or an empty string if there is none."""
     return read_token(request.scope["headers"])
 
 
 def build_api(study: Study, secrets: Secrets, store: Store) -> APIRouter:
-    """The router of ``/api``."""
+    """Return the router of all endpoints below ``/api``."""
     router = APIRouter(prefix="/api")
     about = public_study(study, secrets).model_dump_json().encode()
     texts = {
@@ -89,7 +90,7 @@ def build_api(study: Study, secrets: Secrets, store: Store) -> APIRouter:
         for language, words in study.texts.items()
     }
 
-    # First, since routes are tried in order, and this one is asked for most.
+    # First, because routes are matched in order and this one gets most requests.
     @router.post("/answers")
     async def post_answer(request: Request) -> Response:
         answer = await read_message(request, Answer)
@@ -101,18 +102,18 @@ def build_api(study: Study, secrets: Secrets, store: Store) -> APIRouter:
 
     @router.get("/texts/{language}")
     async def get_texts(request: Request) -> Response:
-        words = texts.get(request.path_params["language"])
+        body = texts.get(request.path_params["language"])
         return (
-            refuse("not_found") if words is None else Response(words, media_type="application/json")
+            refuse("not_found") if body is None else Response(body, media_type="application/json")
         )
 
     @router.post("/enter")
     async def post_enter(request: Request) -> Response:
         enter = await read_message(request, Enter)
-        if begins_nothing(enter):
+        if is_mturk_preview(enter):
             return refuse("not_yet", "Accept the task first.")
         entered = await store.enter(enter)
-        request.scope["state"][GIVEN_TOKEN] = entered.token
+        request.scope["state"][ISSUED_TOKEN] = entered.token
         return Reply(entered)
 
     @router.get("/session")

@@ -1,4 +1,4 @@
-"""The token that a request carries, read in one way by who counts requests and who answers them."""
+"""Read the bearer token of a request, in the same way for rate limits and for the endpoints."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import re
 from collections.abc import Iterable
 
 _BEARER = re.compile(rb"bearer ([A-Za-z0-9_-]{1,200})", re.IGNORECASE)
-"""What `identity.new_token` makes, and nothing around it: one token is written in one way."""
+"""A token of `identity.new_token`, without anything around it."""
 
 
 def read_token(headers: Iterable[tuple[bytes, bytes]]) -> str:
-    """The token of ``Authorization: Bearer TOKEN`` in the headers of an ASGI request.
+    """Return the token of ``Authorization: Bearer TOKEN`` in the headers of an ASGI request.
 
-    Empty where there is none, more than one such header, or anything else in it: a token that
-    could be written in two ways would be counted as two.
+    Returns an empty string if there is no or more than one such header, or another value: if a
+    token could be written in two ways, the rate limits would count it as two tokens.
     """
-    given = [value for name, value in headers if name == b"authorization"]
-    found = _BEARER.fullmatch(given[0]) if len(given) == 1 else None
-    return found[1].decode("ascii") if found else ""
+    values = [value for name, value in headers if name == b"authorization"]
+    match = _BEARER.fullmatch(values[0]) if len(values) == 1 else None
+    return match[1].decode("ascii") if match else ""

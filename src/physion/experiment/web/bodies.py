@@ -1,8 +1,8 @@
 """Parse untrusted request bodies into messages of `physion.experiment.protocol.messages`.
 
-Besides what the types of the messages say, a body must be plain JSON: one value a key, no NaN, no
-number beyond what JSON readers agree on, no NUL and no half character (no database takes them), not
-nested more than `MAX_DEPTH` deep.
+Apart from the types of the message, a body must be plain JSON: unique keys, no NaN or infinity, no
+integer beyond 2**53, no NUL and no unpaired surrogate (databases cannot store them), and at most
+`MAX_DEPTH` levels of nesting.
 """
 
 from __future__ import annotations
@@ -16,23 +16,25 @@ from starlette.requests import Request
 
 from physion.errors import BadInputError
 from physion.experiment.protocol.messages import Message
-from physion.experiment.web.refusals import explain
+from physion.experiment.web.refusals import describe_faults
 
 MAX_DEPTH = 8
 EXACT = 2**53
-"""Whole numbers up to here are the same in every reader of JSON."""
+"""Integers up to here are exact in every JSON parser."""
 M = TypeVar("M", bound=Message)
 
 
 class BadBodyError(BadInputError):
-    """A body that is no such message; the text says why without repeating it."""
+    """Error for an invalid body; the message gives the reason without repeating the value."""
 
 
 async def read_message(request: Request, message: type[M]) -> M:
-    """The body of a request as a message.
+    """Read and validate the body of a request.
 
-    Raises:
-        BadBodyError: it is not JSON, or not this message.
+    Raises
+    ------
+    BadBodyError
+        The body is not JSON, or not this message.
     """
     kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if kind != "application/json":
@@ -41,9 +43,9 @@ async def read_message(request: Request, message: type[M]) -> M:
 
 
 def parse_message(body: bytes, message: type[M]) -> M:
-    """As `read_message`, from the bytes."""
+    """Validate the bytes of a body, as `read_message` does."""
     try:
-        _check(json.loads(body, object_pairs_hook=_once, parse_constant=_no_constant), 0)
+        _check(json.loads(body, object_pairs_hook=_unique_keys, parse_constant=_no_constant), 0)
     except BadBodyError:
         raise
     except (ValueError, RecursionError) as error:
@@ -51,14 +53,14 @@ def parse_message(body: bytes, message: type[M]) -> M:
     try:
         return message.model_validate_json(body, strict=True)
     except ValidationError as error:
-        raise BadBodyError(explain(error)) from error
+        raise BadBodyError(describe_faults(error)) from error
 
 
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) != len(pairs):
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    unique = dict(pairs)
+    if len(unique) != len(pairs):
         raise BadBodyError("the body has the same key twice")
-    return found
+    return unique
 
 
 def _no_constant(word: str) -> NoReturn:
@@ -77,7 +79,7 @@ def _check(value: Any, depth: int) -> None:
             raise BadBodyError("the body has a number that is too large")
     elif kind is dict or kind is list:
         if depth >= MAX_DEPTH:
-            raise BadBodyError("the body is nested too deep")
+            raise BadBodyError("the body is nested too deeply")
         if kind is dict:
             for key in value:
                 _check_text(key)
@@ -87,9 +89,9 @@ def _check(value: Any, depth: int) -> None:
 
 def _check_text(text: str) -> None:
     if "\x00" in text:
-        raise BadBodyError("the body has a character that no text has")
+        raise BadBodyError("the body has a NUL character")
     if not text.isascii():
         try:
             text.encode()
         except UnicodeEncodeError as error:
-            raise BadBodyError("the body has half a character") from error
+            raise BadBodyError("the body has an unpaired surrogate") from error

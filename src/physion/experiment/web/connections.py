@@ -1,7 +1,7 @@
-"""Connections that may not cost too much before a request has even begun.
+"""HTTP/1.1 protocol with limits on the size and duration of request headers.
 
-Uvicorn's protocol keeps the headers of a request in memory however many come, and waits for them
-for ever; ours gives up where they are too large or too slow.
+Uvicorn's protocol buffers headers of any size and waits for them without limit; this one closes a
+connection whose headers are too large or too slow.
 """
 
 from __future__ import annotations
@@ -13,15 +13,17 @@ from typing import Any
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 HEAD_BYTES = 64 * 1024
+"""Bytes of request line and headers received while they are incomplete."""
 HEAD_SECONDS = 20.0
+"""Time until request line and headers must be complete."""
 REFUSAL = (
     b"HTTP/1.1 431 Request Header Fields Too Large\r\n"
     b"content-length: 0\r\nconnection: close\r\n\r\n"
 )
 
 
-class CarefulProtocol(HttpToolsProtocol):
-    """HTTP/1.1 as uvicorn speaks it, with bounds on the head of a request."""
+class LimitedHeadProtocol(HttpToolsProtocol):
+    """Uvicorn's HTTP/1.1 protocol with limits on the head (request line and headers)."""
 
     def __init__(self, *arguments: Any, **named: Any) -> None:
         super().__init__(*arguments, **named)
@@ -30,17 +32,17 @@ class CarefulProtocol(HttpToolsProtocol):
         self._head_timer: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """The first head is awaited from now on."""
+        """Start the timer of the first head."""
         super().connection_made(transport)
         self._head_timer = self.loop.call_later(HEAD_SECONDS, self._give_up)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Nothing is awaited any more."""
+        """Stop the timer."""
         self._stop_timer()
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Counts what comes while a head is not complete."""
+        """Count the bytes that arrive while a head is incomplete."""
         begun = self._in_head
         super().data_received(data)
         if not self._in_head or self.transport.is_closing():
@@ -53,12 +55,12 @@ class CarefulProtocol(HttpToolsProtocol):
             self._head_timer = self.loop.call_later(HEAD_SECONDS, self._give_up)
 
     def on_message_begin(self) -> None:
-        """The head begins."""
+        """Start counting the bytes of a head."""
         self._in_head, self._head_bytes = True, 0
         super().on_message_begin()
 
     def on_headers_complete(self) -> None:
-        """The head is here."""
+        """Stop the timer of the head."""
         self._in_head = False
         self._stop_timer()
         super().on_headers_complete()
@@ -71,5 +73,5 @@ class CarefulProtocol(HttpToolsProtocol):
     def _give_up(self) -> None:
         self._head_timer = None
         if not self.transport.is_closing():
-            logging.getLogger("physion.experiment").debug("a connection sent no request")
+            logging.getLogger("physion.experiment").debug("closed a connection without a request")
             self.transport.close()

@@ -1,6 +1,6 @@
-"""What stands before the application: limits of size and rate, headers, errors that say nothing.
+"""ASGI middleware: limits on size and rate, security headers, errors that reveal nothing.
 
-Pure ASGI: a request passes through two small wrappers and no extra task.
+It wraps only `receive` and `send` and starts no task of its own.
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ if TYPE_CHECKING:
 log = logging.getLogger("physion.experiment")
 
 MAX_TARGET = 4096
-"""Bytes of path and query together."""
+"""Bytes of path and query."""
 MAX_HEADERS, MAX_HEADER_BYTES = 64, 16 * 1024
-GIVEN_TOKEN = "given_token"
-"""State of a request under which the application says which new token its answer holds."""
+ISSUED_TOKEN = "given_token"
+"""Key of the request's state under which the application stores a token that it issues."""
 BODY_SECONDS = 20.0
-"""A body that takes longer is given up."""
+"""Time in which a body must arrive."""
 LINGER_BYTES, LINGER_SECONDS = 256 * 1024, 1.0
-"""So much of a refused body is still taken, else the client would not read why it was refused."""
+"""Part of a refused body that is still read, since clients read the response only afterwards."""
 
 
 class _BodyRefused(Exception):
-    """Ends an application whose request's body is too large or too slow."""
+    """Raised in the application to end a request whose body is too large or too slow."""
 
 
 class Guards:
-    """ASGI middleware around everything that is served."""
+    """ASGI middleware around the whole application."""
 
     def __init__(self, app: ASGIApp, study: Study) -> None:
         self._app = app
@@ -88,7 +88,7 @@ class _Exchange:
         except ClientDisconnect:
             return
         except Exception:
-            # Path and trace alone: query, headers and body may tell who takes part.
+            # Only path and traceback: query, headers and body may identify the participant.
             log.exception("%s %s failed", self._scope["method"], quote(self._path))
             if self._started:
                 raise
@@ -97,7 +97,7 @@ class _Exchange:
             await self._refuse(self._refusal)
 
     def _read_headers(self) -> Reply | None:
-        """Take what is needed of the headers; refuse what is out of measure."""
+        """Read the declared body length; refuse a URL, headers or body that are too long."""
         scope = self._scope
         headers = scope["headers"]
         target = len(scope.get("raw_path") or b"") + len(scope["query_string"])
@@ -116,7 +116,7 @@ class _Exchange:
         return refuse("too_large") if self._declared > MAX_BODY else None
 
     def _check_rate(self) -> Reply | None:
-        wait = self._limits.before(
+        wait = self._limits.wait_time(
             self._scope["method"], self._path, self._token, self._address, time.monotonic()
         )
         if wait <= 0:
@@ -124,7 +124,7 @@ class _Exchange:
         return refuse("too_many", headers={"retry-after": str(math.ceil(wait))})
 
     async def receive(self) -> Message:
-        """The next part of the body, as long as body and time allow."""
+        """Receive the next part of the body, within the limits on size and time."""
         if self._body_ended:
             return await self._receive()
         now = asyncio.get_running_loop().time()
@@ -143,31 +143,31 @@ class _Exchange:
         return message
 
     async def send(self, message: Message) -> None:
-        """Pass a response on with our headers; drop it where the body was refused meanwhile."""
+        """Send a response with the additional headers; drop it if the body was refused."""
         if self._refusal is not None and not self._started:
             return
         if message["type"] == "http.response.start":
             self._started = True
-            self._learn(message["status"])
+            self._update_limits(message["status"])
             message = self._with_headers(message)
         await self._send(message)
 
-    def _learn(self, status: int) -> None:
+    def _update_limits(self, status: int) -> None:
         now = time.monotonic()
-        self._limits.after(status, self._path, self._token, self._address, now)
-        given = self._scope["state"].get(GIVEN_TOKEN)
-        if given is not None:
-            self._limits.gave_out(given, now)
+        self._limits.record_status(status, self._path, self._token, self._address, now)
+        issued = self._scope["state"].get(ISSUED_TOKEN)
+        if issued is not None:
+            self._limits.add_token(issued, now)
 
     def _with_headers(self, message: Message) -> Message:
         if log.isEnabledFor(logging.INFO):
-            # Without the query, which may tell who comes; quoted: nobody writes lines of their own.
+            # No query, which may identify the participant; quoted, so it cannot forge log lines.
             path = quote(self._path[:200])
             log.info("%s %s %d", self._scope["method"], path, message["status"])
         headers = list(message.get("headers", ()))
-        given = {name for name, _ in headers}
-        headers += [pair for pair in self._extra if pair[0] not in given]
-        if b"cache-control" not in given:
+        present = {name for name, _ in headers}
+        headers += [pair for pair in self._extra if pair[0] not in present]
+        if b"cache-control" not in present:
             headers.append((b"cache-control", b"no-store"))
         if self._scope["scheme"] == "https":
             headers.append(HTTPS_ONLY)
@@ -176,9 +176,9 @@ class _Exchange:
         return {**message, "headers": headers}
 
     async def _refuse(self, reply: Reply) -> None:
-        """Answer at once, then take a bounded rest of the body so that the answer arrives."""
+        """Send a refusal and read a limited rest of the body, so that the client can receive it."""
         if not self._body_ended and self._declared <= MAX_BODY and self._taken <= MAX_BODY:
-            await self._linger()
+            await self._drain_body()
         start = {"type": "http.response.start", "status": reply.status_code,
                  "headers": reply.raw_headers}  # fmt: skip
         self._started = True
@@ -186,10 +186,10 @@ class _Exchange:
         body = b"" if self._scope["method"] == "HEAD" else reply.body
         await self._send({"type": "http.response.body", "body": body, "more_body": True})
         if not self._body_ended:
-            await self._linger()
+            await self._drain_body()
         await self._send({"type": "http.response.body", "body": b""})
 
-    async def _linger(self) -> None:
+    async def _drain_body(self) -> None:
         taken = 0
         try:
             async with asyncio.timeout(LINGER_SECONDS):

@@ -1,12 +1,12 @@
-"""Addresses of movies and maps: signed, and with nothing in them that tells a stimulus or an end.
+"""Signed media URLs that reveal neither the stimulus nor its outcome.
 
-``/media/<phase>-<trial>-<kind>-<hidden seed>-<signature>``: first letter of the phase, number of
-the trial in its phase, ``movie``, ``map`` or ``full``; then the seed of the session's order, which
-with a public list of stimuli would tell every stimulus, encrypted under a word that the signature
-itself gives (synthetic IV: P. Rogaway and T. Shrimpton, EUROCRYPT 2006). Signed are also the name
-of the scenario and the digest of the stimuli, so that no address ever comes to mean another movie.
-Without the key nobody makes or reads an address: the full movie is to be had only by the address
-that comes with the feedback. An address needs no database to be read.
+A URL path is ``/media/<phase>-<trial>-<kind>-<encrypted seed>-<signature>``: the first letter of
+the phase, the index of the trial in its phase, and ``movie``, ``map`` or ``full``. The seed of the
+session's trial order is encrypted, since with a public list of stimuli it would reveal every
+stimulus. The encryption pad is derived from the signature (synthetic IV: P. Rogaway and
+T. Shrimpton, EUROCRYPT 2006). The signature also covers the scenario and the digest of the stimuli,
+so a URL can never refer to another movie. Without the key nobody can make or decode a URL; the full
+movie is available only by the URL that is sent with the feedback. Decoding needs no database.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Literal
 
 from physion.errors import BadInputError
 from physion.experiment.study.identity import Secrets, check_signature, sign
-from physion.experiment.study.orders import order_of
+from physion.experiment.study.orders import trial_order
 from physion.experiment.study.stimuli import PHASES
 from physion.experiment.study.study import Study
 
@@ -38,37 +38,49 @@ def sign_media(
     trial: int,
     kind: MediaKind,
 ) -> str:
-    """The address of one file of one trial; only familiarization has a ``full`` movie."""
+    """Return the signed path of one file of one trial.
+
+    Parameters
+    ----------
+    study, secrets
+        The study and its keys.
+    scenario, order_seed
+        Scenario and trial order of the session.
+    phase, trial
+        Phase, and index of the trial in it.
+    kind
+        The observed movie, the map, or the full movie (familiarization only).
+    """
     if kind == "full" and phase != PHASES[0]:
-        raise ValueError("there is no address for the full movie of a test trial")
-    place = f"{phase[0]}-{trial}-{kind}"
-    signature = sign(secrets, *_signed(study, scenario, order_seed, place))
-    return f"{PREFIX}{place}-{order_seed ^ _pad(secrets, signature):016x}-{signature}"
+        raise ValueError("there is no URL for the full movie of a test trial")
+    item = f"{phase[0]}-{trial}-{kind}"
+    signature = sign(secrets, *_signed_parts(study, scenario, order_seed, item))
+    return f"{PREFIX}{item}-{order_seed ^ _pad(secrets, signature):016x}-{signature}"
 
 
 def read_media_path(study: Study, secrets: Secrets, path: str) -> Path:
-    """The file that an address stands for; `BadInputError` for any that we did not sign."""
+    """Return the file of a signed path; raise `BadInputError` if the path is not validly signed."""
     match = _PATH.fullmatch(path)
     if match is None:
         raise BadInputError("no such movie or picture")
-    place, letter, trial, kind, hidden, signature = match.groups()
-    order_seed = int(hidden, 16) ^ _pad(secrets, signature)
+    item, letter, trial, kind, encrypted, signature = match.groups()
+    order_seed = int(encrypted, 16) ^ _pad(secrets, signature)
     for scenario in study.scenarios:
-        if check_signature(secrets, signature, *_signed(study, scenario, order_seed, place)):
+        if check_signature(secrets, signature, *_signed_parts(study, scenario, order_seed, item)):
             break
     else:
         raise BadInputError("no such movie or picture")
-    stimuli = order_of(study, scenario, order_seed)[_PHASES[letter]]
+    stimuli = trial_order(study, scenario, order_seed)[_PHASES[letter]]
     name: str = getattr(stimuli[int(trial)], kind) if int(trial) < len(stimuli) else ""
     if not name:
         raise BadInputError("no such movie or picture")
     return study.folder / name
 
 
-def _signed(study: Study, scenario: str, order_seed: int, place: str) -> tuple[str, ...]:
-    return "media", study.stimuli_digest, scenario, str(order_seed), place
+def _signed_parts(study: Study, scenario: str, order_seed: int, item: str) -> tuple[str, ...]:
+    return "media", study.stimuli_digest, scenario, str(order_seed), item
 
 
 def _pad(secrets: Secrets, signature: str) -> int:
-    """64 bits that hide the seed of one address: no two seeds ever share a signature."""
+    """Return the 64-bit pad that encrypts the seed; different seeds have different signatures."""
     return int(sign(secrets, "hidden seed", signature)[:16], 16)

@@ -1,7 +1,6 @@
-"""Movies and maps by signed path: the bytes, their type, and nothing that tells more than they do.
+"""Serve movies and maps without metadata that could reveal the stimulus.
 
-The store signs the paths; which file a path means follows from study and session alone. No ETag, no
-date of a file, no range, no name of a file: two movies differ by their bytes only.
+Responses have no ETag, file date, file name or ranges, so two movies differ only in their bytes.
 """
 
 from __future__ import annotations
@@ -14,16 +13,17 @@ from starlette.responses import Response
 
 from physion.experiment.study.plain_files import read_plain
 
-MOST_BYTES = 64 * 2**20
-"""No movie or map of a study is larger."""
+MAX_MEDIA_BYTES = 64 * 2**20
+"""Size limit of one movie or map."""
 CACHE_BYTES = 256 * 2**20
+"""Size of the cache in memory."""
 TYPES = {".mp4": "video/mp4", ".png": "image/png"}
 
 
 class MediaFiles:
-    """Files of a study, kept in memory up to `CACHE_BYTES`; the least recently sent goes first.
+    """In-memory LRU cache of media files.
 
-    Their names are made of their content, so what is kept can never be out of date.
+    File names are derived from the content, so a cached file is never out of date.
     """
 
     def __init__(self, most: int = CACHE_BYTES) -> None:
@@ -32,14 +32,16 @@ class MediaFiles:
         self._kept: OrderedDict[Path, bytes] = OrderedDict()
 
     async def response(self, path: Path) -> Response:
-        """The file as a response that the browser of one person may keep.
+        """Return a response with the file, which the participant's browser may cache.
 
-        Raises:
-            BadInputError: it is missing, a link, or too large.
+        Raises
+        ------
+        BadInputError
+            The file is missing, a symbolic link, or too large.
         """
         content = self._kept.get(path)
         if content is None:
-            content = await run_in_threadpool(read_plain, path, MOST_BYTES)
+            content = await run_in_threadpool(read_plain, path, MAX_MEDIA_BYTES)
             self._keep(path, content)
         else:
             self._kept.move_to_end(path)
@@ -56,5 +58,5 @@ class MediaFiles:
         self._kept[path] = content
         self._size += len(content)
         while self._size > self._most:
-            _, gone = self._kept.popitem(last=False)
-            self._size -= len(gone)
+            _, evicted = self._kept.popitem(last=False)
+            self._size -= len(evicted)

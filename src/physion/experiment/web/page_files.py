@@ -1,7 +1,7 @@
-"""The files of the pages: read once from the package, served from memory by exact name.
+"""Static files of the pages: read once from the package, then served from memory by exact name.
 
-A request can only name what was found in the package at the start, so no path of a client ever
-reaches the file system.
+Requests are looked up among the files found at startup, so no path of a client reaches the file
+system.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ MEDIA_TYPES = {
     ".woff2": "font/woff2",
     ".mp4": "video/mp4",
 }
-"""What is served at all; anything else in the folders stays unserved."""
+"""Media types by suffix; files with other suffixes are not served."""
 COMPRESSED = (".html", ".js", ".css", ".json", ".svg", ".txt")
 
 
 @dataclass(frozen=True)
 class PageFile:
-    """One file. ``packed``: as gzip, None where that would not help."""
+    """One static file. ``packed`` is the gzipped content, None if compression saves too little."""
 
     content: bytes
     packed: bytes | None
@@ -41,7 +41,7 @@ class PageFile:
     etag: str
 
     def response(self, request: Request) -> Response:
-        """The file, or 304 where the browser has it; it asks each time, so updates arrive."""
+        """Return the file, or 304 if the browser's copy is current; it revalidates every time."""
         headers = {"etag": self.etag, "cache-control": "no-cache", "vary": "accept-encoding"}
         if request.headers.get("if-none-match") == self.etag:
             return Response(status_code=304, headers=headers)
@@ -54,7 +54,7 @@ class PageFile:
 
 
 def read_page_file(path: Path) -> PageFile:
-    """Read one file of a kind that is served."""
+    """Read one file, whose suffix must be one of `MEDIA_TYPES`."""
     content = path.read_bytes()
     packed = gzip.compress(content, 9, mtime=0) if path.suffix in COMPRESSED else content
     return PageFile(
@@ -66,7 +66,7 @@ def read_page_file(path: Path) -> PageFile:
 
 
 def read_page_files(folder: Path) -> dict[str, PageFile]:
-    """Every served file below a folder by its path there, with slashes."""
+    """Read all servable files below a folder; keys are relative paths with slashes."""
     return {
         path.relative_to(folder).as_posix(): read_page_file(path)
         for path in sorted(folder.rglob("*"))

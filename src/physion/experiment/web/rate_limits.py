@@ -1,4 +1,4 @@
-"""How many requests are let through: buckets that fill at a steady rate, in bounded memory."""
+"""Rate limits of requests: token buckets in bounded memory."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ if TYPE_CHECKING:
     from physion.experiment.study.study import Limits
 
 MAX_BUCKETS = 20_000
-"""So many addresses or tokens are remembered; the one not seen for longest is forgotten first."""
+"""Number of addresses or tokens remembered; the least recently used are dropped first."""
 WRONG_TOKENS_PER_SECOND, WRONG_TOKENS_BURST = 2.0, 60.0
 WRONG = (401, 422)
-"""Answers to a token that opens nothing: it may be refused for what else is wrong before that."""
+"""Statuses of responses to unknown tokens; 422 since an invalid body is refused first."""
 WITH_TOKEN = frozenset(
     f"/api/{name}"
     for name in ("session", "trials/familiarization", "trials/test", "page", "answers", "events",
@@ -22,7 +22,7 @@ WITH_TOKEN = frozenset(
 
 
 class Buckets:
-    """One bucket a key: ``burst`` requests at once, then ``rate`` a second."""
+    """Token buckets by key: ``burst`` requests at once, then ``rate`` per second."""
 
     def __init__(self, rate: float, burst: float, most: int = MAX_BUCKETS) -> None:
         self._rate, self._burst, self._most = rate, burst, most
@@ -35,13 +35,13 @@ class Buckets:
         return len(self._left)
 
     def wait(self, key: str, now: float) -> float:
-        """Seconds until one more is let through; 0 for at once. Takes nothing."""
+        """Return the seconds until the next request is allowed, without counting one."""
         left, since = self._left.get(key, (self._burst, now))
         missing = 1.0 - min(self._burst, left + (now - since) * self._rate)
         return max(0.0, missing / self._rate)
 
     def take(self, key: str, now: float) -> float:
-        """As `wait`, and where that is 0, takes one."""
+        """Return the seconds as `wait`; if they are 0, count one request."""
         left, since = self._left.get(key, (self._burst, now))
         left = min(self._burst, left + (now - since) * self._rate)
         missing = 1.0 - left
@@ -53,11 +53,11 @@ class Buckets:
 
 
 class RateLimits:
-    """The limits of one server: by token, and by address for entering.
+    """Rate limits of one server: per token, and per client address for entering.
 
-    A token is known, and has a bucket of its own, once the server has given it out or it has opened
-    a session: invented ones fill no memory. They spend from the bucket of unknown tokens of their
-    address, which keeps out nobody who is known. The experimenter's login has waits of its own.
+    A token is known, and gets its own bucket, once the server has issued it or it has been accepted
+    for a session; invented tokens use no memory. Requests with unknown tokens share one bucket per
+    address, which does not limit known tokens. The experimenter's login has its own limits.
     """
 
     def __init__(self, limits: Limits) -> None:
@@ -66,8 +66,20 @@ class RateLimits:
         self._entering = Buckets(per_second, float(limits.sessions_at_once))
         self._wrong = Buckets(WRONG_TOKENS_PER_SECOND, WRONG_TOKENS_BURST)
 
-    def before(self, method: str, path: str, token: str, address: str, now: float) -> float:
-        """Seconds that this request has to wait; 0 lets it through."""
+    def wait_time(self, method: str, path: str, token: str, address: str, now: float) -> float:
+        """Return the seconds that a request has to wait; 0 if it is allowed now.
+
+        Parameters
+        ----------
+        method, path
+            HTTP method and path of the request.
+        token
+            Its bearer token, or an empty string.
+        address
+            IP address of the client.
+        now
+            Time of a monotonic clock in seconds.
+        """
         if method == "POST" and path == "/api/enter":
             return self._entering.take(network_of(address), now)
         if path not in WITH_TOKEN:
@@ -76,8 +88,8 @@ class RateLimits:
             return self._tokens.take(token, now)
         return self._wrong.wait(network_of(address), now)
 
-    def after(self, status: int, path: str, token: str, address: str, now: float) -> None:
-        """Learn from the status of the answer whether the token opens anything."""
+    def record_status(self, status: int, path: str, token: str, address: str, now: float) -> None:
+        """Update the buckets with the status of a response, which shows if the token is known."""
         if path not in WITH_TOKEN:
             return
         if token in self._tokens:
@@ -87,13 +99,13 @@ class RateLimits:
         elif status in WRONG:
             self._wrong.take(network_of(address), now)
 
-    def gave_out(self, token: str, now: float) -> None:
-        """A token is known from the moment that it is given to somebody who entered."""
+    def add_token(self, token: str, now: float) -> None:
+        """Make a newly issued token known."""
         self._tokens.take(token, now)
 
 
 def network_of(address: str) -> str:
-    """The address; of IPv6 its first 64 bits, all of which one household may use."""
+    """Return the address, or its /64 network for IPv6, since one household has all of that."""
     if ":" not in address:
         return address
     try:

@@ -1,4 +1,4 @@
-"""Headers of every response: what a browser may do with our pages, and who may show them."""
+"""Security headers of every response, such as the content security policy."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ NOT_NEEDED = ("accelerometer", "camera", "display-capture", "geolocation", "gyro
 
 
 def content_policy(study: Study) -> str:
-    """Content security policy: our own files, and movies as blobs, which trials are preloaded as.
+    """Return the content security policy: files of this server only, and media as blobs.
 
-    Forms go to ourselves, and to MTurk where the study may be shown in its frame, since that is how
-    a task there is handed in.
+    Blobs are needed because trials are preloaded. Forms may be sent to this server, and to MTurk if
+    the study may be embedded there, since tasks on MTurk are submitted by a form.
     """
     frames = " ".join(study.embed_from) or "'none'"
     forms = " ".join(("'self'", *(MTURK_HOSTS if study.embed_from else ())))
@@ -36,10 +36,10 @@ def content_policy(study: Study) -> str:
 
 
 def security_headers(study: Study) -> list[tuple[bytes, bytes]]:
-    """Raw headers, names in small letters, for whatever is served.
+    """Return the raw headers of every response, with lower-case names.
 
-    The addresses of the pages hold recruiters' ids: no referrer ever. Isolated from other origins
-    the page also gets the browser's finer clock.
+    No referrer is sent, since page URLs contain recruiters' ids. Cross-origin isolation also gives
+    the page the browser's high-resolution clock.
     """
     headers = {
         "content-security-policy": content_policy(study),
@@ -57,4 +57,4 @@ def security_headers(study: Study) -> list[tuple[bytes, bytes]]:
 
 
 HTTPS_ONLY = (b"strict-transport-security", b"max-age=31536000")
-"""Added where the request came by https."""
+"""Header added to responses over HTTPS."""

@@ -13,7 +13,7 @@ from physion.experiment.store.sessions import (
     ACTIVE_WITHIN,
     SESSION_COLUMNS,
     Session,
-    Trials,
+    TrialCounts,
     stage_of,
 )
 from physion.experiment.store.tables import ANSWERS, SESSIONS
@@ -135,7 +135,7 @@ class Summaries:
     def __init__(self, study: Study, engine: Engine) -> None:
         self._engine = engine
         self._labels = labels_of(study)
-        self._trials = Trials(study)
+        self._trials = TrialCounts(study)
         self._answered: dict[str, Answered] = {}
 
     def refresh(self, now: float) -> list[Summary]:

@@ -1,1 +1,1 @@
-"""Versions of the tables, one file each, applied in order when a study is served."""
+"""Alembic migrations of the tables, one file per version, applied when a study is served."""

@@ -1,4 +1,4 @@
-"""Run by Alembic: applies the versions on the connection that `database.upgrade` hands over."""
+"""Alembic environment: apply the migrations on the connection given by `database.upgrade`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from physion.experiment.store.tables import METADATA
 context.configure(
     connection=context.config.attributes["connection"],
     target_metadata=METADATA,
-    # SQLite cannot alter a column: later versions copy the table.
+    # SQLite cannot alter a column; batch mode copies the table instead.
     render_as_batch=True,
 )
 with context.begin_transaction():

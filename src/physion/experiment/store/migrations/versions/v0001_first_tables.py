@@ -1,4 +1,4 @@
-"""The first tables. Written out, since `tables.py` goes on changing and this version does not."""
+"""Version 1: the first tables. Does not import `tables.py`, which describes the newest version."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ down_revision = None
 
 
 def upgrade() -> None:
-    """Make all tables."""
+    """Create all tables."""
     op.create_table(
         "participants",
         sa.Column("participant", sa.String(length=32), nullable=False),
