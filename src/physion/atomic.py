@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all."""
+"""Atomic writing of files, and locks on folders."""
 
 from __future__ import annotations
 
@@ -16,18 +16,31 @@ except ImportError:  # pragma: no cover - Windows
     fcntl = None  # type: ignore[assignment]
 
 PART_SUFFIX = ".part"
-"""How the name of a file that is still being written ends."""
+"""Suffix of files that are still being written."""
 
 
 def write_atomic(path: Path, data: bytes, mode: int = 0o644) -> None:
-    """Write ``data`` to ``path`` so that no reader ever sees a part of it, not even after a crash.
+    """Write ``data`` to ``path`` such that no reader sees a partial file, even after a crash.
 
-    The bytes go to a temporary name in the same folder, to the disk, and only then take the
-    place of ``path``. The temporary name belongs to this call alone, so that two writers of one
-    path do not meet. ``mode`` holds from the first byte on (less the process's umask): 0o600 for
-    secrets. Raises ``OSError`` (disk full, no permission, ...) with nothing left behind.
+    The bytes are written to a temporary file in the same folder and synced to disk; then the
+    temporary file is renamed to ``path``. Its name is unique, so concurrent writers of one path do
+    not interfere.
+
+    Parameters
+    ----------
+    path
+        File to write or replace.
+    data
+        Content.
+    mode
+        Permissions from creation on, reduced by the umask; 0o600 for secrets.
+
+    Raises
+    ------
+    OSError
+        If writing fails (disk full, no permission, ...); the temporary file is removed.
     """
-    # A short name of its own: adding to a long file name could pass the system's limit.
+    # Short and independent of `path`: extending a long file name could exceed the system's limit.
     part = path.with_name(f".{os.getpid()}-{secrets.token_hex(8)}{PART_SUFFIX}")
     try:
         descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
@@ -46,10 +59,10 @@ def write_atomic(path: Path, data: bytes, mode: int = 0o644) -> None:
 
 
 def remove_leftovers(folder: Path) -> int:
-    """Delete what killed writers left under ``folder``; the count of deleted files.
+    """Delete temporary files of interrupted writers under ``folder``; return their number.
 
-    Only for the one process that has the folder to itself: it would take away the temporary
-    files of writers that are still alive.
+    The caller must hold the lock of the folder: temporary files of running writers would be
+    deleted too.
     """
     leftovers = list(folder.rglob(f".*{PART_SUFFIX}"))
     for part in leftovers:
@@ -58,7 +71,7 @@ def remove_leftovers(folder: Path) -> int:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make the renaming itself survive a power cut, where the system can sync a folder."""
+    """Sync a folder to disk so that a renaming survives a power failure; only on POSIX systems."""
     if os.name != "posix":
         return
     descriptor = os.open(folder, os.O_RDONLY)
@@ -70,10 +83,10 @@ def sync_folder(folder: Path) -> None:
 
 @contextlib.contextmanager
 def folder_lock(folder: Path) -> Iterator[None]:
-    """Have ``folder`` to oneself among the processes of this machine that ask for it too.
+    """Hold an exclusive lock on ``folder`` among the processes of this machine.
 
-    Raises `PhysionError` at once where another one has it. The system gives the lock back when
-    its holder dies, so a killed process leaves nothing to clean up.
+    Raises `PhysionError` at once if another process holds it. The operating system releases the
+    lock when its holder ends, so a killed process needs no cleaning up.
     """
     if fcntl is None:  # pragma: no cover - no such locks on this system
         yield
@@ -88,8 +101,8 @@ def folder_lock(folder: Path) -> Iterator[None]:
             raise PhysionError(
                 f"another process is writing into {folder}; wait for it, or choose another folder"
             ) from None
-        # The holder before may have deleted the file between our opening and our locking it.
-        if _same(path, descriptor):
+        # The previous holder may have deleted the file after it was opened here.
+        if _is_same_file(path, descriptor):
             break
         os.close(descriptor)
     try:
@@ -99,7 +112,8 @@ def folder_lock(folder: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-def _same(path: Path, descriptor: int) -> bool:
+def _is_same_file(path: Path, descriptor: int) -> bool:
+    """Return whether ``path`` is the open file with this descriptor."""
     try:
         return os.path.samestat(path.stat(), os.fstat(descriptor))
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""The kinds of error that this package raises, each with what to do next."""
+"""Exceptions that this package raises; each message says what to do next."""
 
 from __future__ import annotations
 
@@ -7,16 +7,27 @@ from collections.abc import Iterable
 
 
 class PhysionError(Exception):
-    """What went wrong, where, and what to do next.
+    """Base class of all errors of this package.
 
-    The command line prints ``str(error)`` as one line and leaves with ``exit_code``.
+    The message says what went wrong, where, and what to do next. The command line prints it as one
+    line and exits with ``exit_code``.
     """
 
     exit_code = 2
 
 
 class UnknownNameError(PhysionError):
-    """A name that no registry, preset or file holds; the message gives the closest ones."""
+    """Error for a name that is not known; the message lists the closest known names.
+
+    Parameters
+    ----------
+    kind
+        What the name should denote, for example ``scenario``.
+    name
+        The unknown name.
+    known
+        All known names.
+    """
 
     def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
         names = sorted(known)
@@ -27,15 +38,15 @@ class UnknownNameError(PhysionError):
 
 
 class BadInputError(PhysionError):
-    """A file, folder or value from outside that is not what it should be."""
+    """Error for a file, folder or value of the user that is missing, damaged or out of range."""
 
 
 class BadSceneError(BadInputError):
-    """A scene that breaks its own rules: two bodies of one name, a role without a body, ..."""
+    """Error for an inconsistent scene, for example two bodies of one name or an unfilled role."""
 
 
 class MissingExtraError(PhysionError):
-    """A part of the package whose optional dependencies are not installed."""
+    """Error for a feature whose optional dependencies are not installed."""
 
     def __init__(self, what: str, extra: str) -> None:
         super().__init__(

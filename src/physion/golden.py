@@ -1,9 +1,8 @@
-"""Digests that a known trial of each scenario must have, on every machine.
+"""Golden digests: hashes that one known trial of each scenario must have on every machine.
 
-`physion.trials.making.reproduce` computes them; the file beside this module holds those of this
-version.
-They are part of the names of engine and renderer: whoever reads a trial can tell whether the
-software that made it would make the same bytes as their own.
+`physion.trials.making.reproduce` computes them; `golden_digests.json` in this folder stores those
+of this version. A short hash of them is part of the version strings of engine and renderer, which
+every trial stores: equal version strings mean equal bytes.
 """
 
 from __future__ import annotations
@@ -18,16 +17,16 @@ FILE = "golden_digests.json"
 
 @cache
 def golden_digests() -> dict[str, dict[str, str]]:
-    """Return the digests of this version by scenario and part of a trial."""
+    """Return the digests of this version, by scenario and then by part of the trial."""
     text = (files("physion") / FILE).read_text()
     return {scenario: dict(parts) for scenario, parts in json.loads(text).items()}
 
 
 @cache
 def version_digest(*parts: str) -> str:
-    """Return 8 hexadecimal digits that change whenever one of these parts of a golden trial does.
+    """Return 8 hexadecimal digits that change if one of ``parts`` of any golden trial changes.
 
-    ``parts`` are keys of `golden_digests`, for example ``motion``.
+    ``parts`` are parts of a trial as in `golden_digests`, for example ``motion``.
     """
     golden = golden_digests()
     known = [golden[scenario].get(part, "") for scenario in sorted(golden) for part in parts]

@@ -1,4 +1,4 @@
-"""Names for things: scenarios, shapes, models, encoders, engines, rooms."""
+"""Registries, which map names to scenarios, shapes, models, encoders, engines and rooms."""
 
 from __future__ import annotations
 
@@ -13,11 +13,16 @@ T = TypeVar("T")
 
 
 class Registry(Generic[T]):
-    """Holds one kind of thing under names.
+    """Mapping from names to objects of one kind, which can be imported when they are first used.
 
-    A value is added by ``register`` (a decorator or a call), by a lazy ``"module:attribute"``
-    string, or by another package through the entry-point group ``physion.<kind>s``. Looking up
-    an unknown name raises `UnknownNameError` with the three closest names.
+    Other packages add objects through the entry-point group ``physion.<kind>s``.
+
+    Parameters
+    ----------
+    kind
+        What is registered, in the singular; used in messages and in the entry-point group.
+    lazy
+        ``"module:attribute"`` by name, for objects that `get` imports when they are asked for.
     """
 
     def __init__(self, kind: str, lazy: dict[str, str] | None = None) -> None:
@@ -27,7 +32,7 @@ class Registry(Generic[T]):
         self._plugins_read = False
 
     def register(self, name: str) -> Callable[[T], T]:
-        """Register the decorated value as ``name``; a second value of that name is an error."""
+        """Return a decorator that registers a value as ``name``; `PhysionError` if the name is used."""
 
         def add(value: T) -> T:
             if name in self._values and self._values[name] is not value:
@@ -38,7 +43,7 @@ class Registry(Generic[T]):
         return add
 
     def get(self, name: str) -> T:
-        """Return the value called ``name``, importing it if it is lazy."""
+        """Return the value called ``name``, importing it if needed; `UnknownNameError` if unknown."""
         if name not in self._values:
             self._read_plugins()
             if name not in self._lazy:
@@ -51,7 +56,7 @@ class Registry(Generic[T]):
         return self._values[name]
 
     def names(self) -> list[str]:
-        """All names in alphabetical order, without importing anything."""
+        """Return all names in alphabetical order, without importing any value."""
         self._read_plugins()
         return sorted(self._values.keys() | self._lazy.keys())
 

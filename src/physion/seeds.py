@@ -1,4 +1,5 @@
-"""Random numbers that depend on what is made, never on when or where it is made."""
+"""Seeds and random generators, derived from names only, so that results do not depend on the order
+or the machine of a computation."""
 
 from __future__ import annotations
 
@@ -10,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def stable_hash(*parts: str | int) -> int:
-    """A 128-bit number of the parts that is the same in every process and Python version."""
+    """Return a 128-bit hash of ``parts``, the same in every process and Python version."""
     text = "\x1f".join(f"{type(part).__name__}:{part}" for part in parts)
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=16).digest(), "little")
 
@@ -18,26 +19,31 @@ def stable_hash(*parts: str | int) -> int:
 def trial_seed(
     dataset: str | int, scenario: str, split: str, index: int, attempt: int = 0
 ) -> np.random.SeedSequence:
-    """The seed of one trial, a function of what names it and nothing else.
+    """Return the seed of one trial, a function of the trial's name alone.
 
-    ``attempt`` counts the draws that were refused before: each has a seed of its own.
+    Parameters
+    ----------
+    dataset, scenario, split, index
+        Name of the trial.
+    attempt
+        Number of scenes sampled for this trial and rejected before; each has a different seed.
     """
     parts = (dataset, scenario, split, index)
     return named_seed(*parts, attempt) if attempt else named_seed(*parts)
 
 
 def named_seed(*parts: str | int) -> np.random.SeedSequence:
-    """Return the seed that these parts name, for `child_generator`."""
-    import numpy as np  # here, since `stable_hash` alone serves programs that should start quickly
+    """Return the seed that is derived from ``parts``, for use with `child_generator`."""
+    import numpy as np  # imported late: `stable_hash` is used by programs that must start fast
 
     return np.random.SeedSequence(stable_hash(*parts))
 
 
 def child_generator(seed: np.random.SeedSequence, name: str) -> np.random.Generator:
-    """The named random stream of a trial (``placement``, ``looks``, ``distractors``, ...).
+    """Return the random stream called ``name`` (``placement``, ``looks``, ...) of a trial.
 
-    Streams are independent of each other, so that drawing one number more for a distractor does
-    not move the agent.
+    Streams of different names are independent: drawing one more number in one of them, for
+    example for a distractor, does not change what the others draw.
     """
     import numpy as np
 
@@ -47,7 +53,7 @@ def child_generator(seed: np.random.SeedSequence, name: str) -> np.random.Genera
 
 
 def generator(*parts: str | int) -> np.random.Generator:
-    """Return the random stream that these parts name."""
+    """Return the random stream whose seed is derived from ``parts``."""
     import numpy as np
 
     return np.random.default_rng(stable_hash(*parts))

@@ -113,7 +113,7 @@ def test_exit_code_of_a_worker_is_told() -> None:
 def test_a_hanging_task_is_ended_and_the_others_go_on() -> None:
     executor = LocalExecutor(1, tries=1, timeout=1.0)
     outcomes = {o.key: o for o in executor.map(hang, numbers(1, 2, 3))}
-    assert "still at work" in str(outcomes["task 1"].error)
+    assert "still running" in str(outcomes["task 1"].error)
     assert [outcomes[f"task {n}"].value for n in (2, 3)] == [2, 3]
 
 

@@ -1,1 +1,1 @@
-"""Run many independent tasks."""
+"""Execution of many independent tasks, in one process or several."""

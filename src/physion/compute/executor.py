@@ -1,7 +1,7 @@
-"""What an executor is: something that runs one function on many tasks, wherever it likes.
+"""Interface of executors, which run one function on many tasks, and the outcome of a task.
 
-Durability is not its business: a task is a pure function of its description and writes its own
-files atomically, so whatever dies can be run again. An executor only promises that every task
+A task is a pure function of its description and writes its files atomically, so an interrupted
+task can simply be run again. An executor therefore stores nothing; it guarantees that every task
 ends in exactly one outcome.
 """
 
@@ -20,12 +20,22 @@ R = TypeVar("R")
 
 @dataclass(frozen=True)
 class TaskOutcome(Generic[R]):
-    """How one task ended.
+    """Result or error of one task.
 
-    - ``key``: the task's name. ``error``: one line, None where the task succeeded.
-    - ``traceback``: the worker's own, empty where it succeeded or died without a word.
-    - ``errno``: the system's error number where an ``OSError`` ended the task, else None.
-    - ``tries``: how often the task was started; more than 1 where a worker died.
+    Parameters
+    ----------
+    key
+        Name of the task.
+    result
+        Return value of the function; None if the task failed.
+    error
+        One line about the failure; None if the task succeeded.
+    traceback
+        Traceback of the exception; empty if the task succeeded or the worker process died.
+    errno
+        Error number of the operating system if an ``OSError`` ended the task, else None.
+    tries
+        How often the task was started; more than 1 if a worker process died.
     """
 
     key: str
@@ -37,21 +47,21 @@ class TaskOutcome(Generic[R]):
 
     @property
     def value(self) -> R:
-        """What the function returned; `PhysionError` where the task failed."""
+        """Return value of the function; `PhysionError` if the task failed."""
         if self.error is not None:
             raise PhysionError(f"{self.key}: {self.error}")
         return cast(R, self.result)
 
 
 class Executor(Protocol):
-    """Runs tasks. Implementations: this machine's processes, Ray, Slurm."""
+    """Runner of tasks; see `physion.compute.local` for the implementations."""
 
     def map(self, function: Callable[[T], R], tasks: Mapping[str, T]) -> Iterator[TaskOutcome[R]]:
         """Run ``function`` on every task and yield outcomes as they come, in any order.
 
-        An exception of the function becomes a failed outcome and is not tried again: the same
-        task would fail the same way. A worker that dies is replaced and its task is tried
-        again, a few times at most. Closing the iterator stops what still runs.
+        An exception of the function becomes a failed outcome and is not retried: the same task
+        would fail in the same way. If a worker process dies, its task is retried a limited number
+        of times. Closing the iterator stops all running tasks.
         """
         ...
 

@@ -1,4 +1,4 @@
-"""Executors on this machine: in this process, or in a few processes that may die."""
+"""Executors on this machine: one in the calling process, and one with a pool of processes."""
 
 from __future__ import annotations
 
@@ -23,29 +23,37 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 TRIES = 3
-"""Workers that one task may kill before it is put aside."""
+"""How often a task is started before it counts as failed because its worker process died."""
 _THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _READY = "ready"
-_PATIENCE = 5.0
-"""Seconds that an idle or dying process has to end by itself."""
+_EXIT_SECONDS = 5.0
+"""Seconds to wait for a process to end by itself before it is killed."""
 
 
 class SerialExecutor:
-    """Runs the tasks one after the other in this process: for a debugger, and for tiny sets."""
+    """Executor that runs the tasks one after the other in the calling process."""
 
     def map(self, function: Callable[[T], R], tasks: Mapping[str, T]) -> Iterator[TaskOutcome[R]]:
-        """See `physion.compute.executor.Executor`; outcomes come in the order of the tasks."""
+        """Yield outcomes in the order of the tasks; see `physion.compute.executor.Executor`."""
         for key, task in tasks.items():
-            yield _attempt(key, function, task)
+            yield _run_task(key, function, task)
 
 
 class LocalExecutor:
-    """Runs tasks in ``workers`` fresh processes of this machine, one core each.
+    """Executor that runs tasks in several processes of this machine, with one thread each.
 
-    Processes are spawned, not forked, so that compiled code and engines start clean. A worker
-    that dies (killed, out of memory, a crash in C) is replaced, and its task is tried again up
-    to ``tries`` times; the other tasks never notice. ``timeout`` in seconds ends a task that
-    hangs, which counts as a death. By default one worker a core.
+    Processes are spawned, not forked, so that no state of compiled code or engines is inherited.
+    A worker process that dies (killed, out of memory, crash in C) is replaced, and its task is
+    started again; other tasks are not affected.
+
+    Parameters
+    ----------
+    workers
+        Number of processes; by default one per available core.
+    tries
+        How often a task is started before it counts as failed because its process died.
+    timeout
+        Seconds after which the process of a task is killed, which counts as a death.
     """
 
     def __init__(
@@ -57,65 +65,65 @@ class LocalExecutor:
         self.tries, self.timeout = tries, timeout
 
     def map(self, function: Callable[[T], R], tasks: Mapping[str, T]) -> Iterator[TaskOutcome[R]]:
-        """See `physion.compute.executor.Executor`."""
-        waiting = deque(_Job(key, task) for key, task in tasks.items())
-        team = [_Worker(function) for _ in range(min(self.workers, len(tasks)))]
-        stillborn = 0
+        """Yield outcomes as they come; see `physion.compute.executor.Executor`."""
+        waiting = deque(_QueuedTask(key, task) for key, task in tasks.items())
+        workers = [_Worker(function) for _ in range(min(self.workers, len(tasks)))]
+        failed_starts = 0
         try:
-            while team:
+            while workers:
                 done: list[TaskOutcome[R]] = []
-                for worker in self._woken(team):
+                for worker in self._wait(workers):
                     outcome = worker.listen(self.timeout)
                     if outcome is not None:
                         done.append(outcome)
-                    stillborn = 0 if worker.ready else stillborn + worker.lost
+                    failed_starts = 0 if worker.ready else failed_starts + worker.lost
                     if worker.lost:
-                        team.remove(worker)
-                        done += self._bury(worker, waiting)
-                        if stillborn >= self.tries:
-                            raise _stillborn(worker)
+                        workers.remove(worker)
+                        done += self._take_back(worker, waiting)
+                        if failed_starts >= self.tries:
+                            raise _startup_error(worker)
                         if waiting:
-                            team.append(_Worker(function))
-                # New work first, so that nobody idles while the caller looks at the outcomes.
-                team = _hand_out(team, waiting)
+                            workers.append(_Worker(function))
+                # Before yielding, so that workers are busy while the caller handles the outcomes.
+                workers = _assign(workers, waiting)
                 yield from done
         finally:
-            for worker in team:
+            for worker in workers:
                 worker.stop()
 
-    def _woken(self, team: list[_Worker]) -> list[_Worker]:
-        """Wait until a worker says something, dies, or has taken too long."""
-        things: list[Any] = [worker.pipe for worker in team]
-        things += [worker.process.sentinel for worker in team]
+    def _wait(self, workers: list[_Worker]) -> list[_Worker]:
+        """Wait until a worker sends a message, dies, or exceeds the timeout; return such workers."""
+        things: list[Any] = [worker.pipe for worker in workers]
+        things += [worker.process.sentinel for worker in workers]
         pause = None
         if self.timeout is not None:
-            ages = [time.monotonic() - worker.since for worker in team if worker.job]
+            ages = [time.monotonic() - worker.since for worker in workers if worker.job]
             pause = max(self.timeout - max(ages), 0) if ages else None
         ready = wait(things, pause)
         return [
             worker
-            for worker in team
+            for worker in workers
             if worker.pipe in ready
             or worker.process.sentinel in ready
             or worker.overdue(self.timeout)
         ]
 
-    def _bury(self, worker: _Worker, waiting: deque[_Job]) -> list[TaskOutcome[Any]]:
-        """Take back the task of a dead worker, or give it up if it has killed enough of them."""
+    def _take_back(self, worker: _Worker, waiting: deque[_QueuedTask]) -> list[TaskOutcome[Any]]:
+        """Queue the task of a dead worker again, or return a failed outcome after the last try."""
         job = worker.job
         worker.stop()
         if job is None:
             return []
         if job.tries >= self.tries:
-            return [TaskOutcome(job.key, error=worker.last_words(), tries=job.tries)]
-        # At the end, so that a poison task does not hold up the others.
-        waiting.append(_Job(job.key, job.task, job.tries + 1))
+            return [TaskOutcome(job.key, error=worker.reason(), tries=job.tries)]
+        # At the end of the queue, so that a task that kills workers does not delay the others.
+        waiting.append(_QueuedTask(job.key, job.task, job.tries + 1))
         return []
 
 
 @dataclass(frozen=True)
-class _Job:
-    """A task under its name, and which try this is."""
+class _QueuedTask:
+    """A task with its name and the number of this try."""
 
     key: str
     task: Any
@@ -123,7 +131,7 @@ class _Job:
 
 
 class _Worker:
-    """The parent's side of one process: at most one task at a time, so blame is certain."""
+    """Parent's handle of one worker process, which has at most one task at a time."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         context = multiprocessing.get_context("spawn")
@@ -133,27 +141,27 @@ class _Worker:
         )
         with _one_thread():
             self.process.start()
-        # Only the child holds the far end now, so that its death is the end of the pipe.
+        # Only the child holds the far end now, so its death closes the pipe.
         far.close()
-        self.job: _Job | None = None
+        self.job: _QueuedTask | None = None
         self.ready, self.lost, self.since = False, False, time.monotonic()
         self._late = False
 
-    def start(self, job: _Job) -> None:
-        """Hand over a task."""
+    def start(self, job: _QueuedTask) -> None:
+        """Send a task to the process."""
         self.job, self.since = job, time.monotonic()
-        # A worker that died just now is noticed at the next wait, and the task comes back.
+        # A worker that has just died is noticed at the next wait, and its task is queued again.
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             self.pipe.send((job.key, job.task))
 
     def overdue(self, timeout: float | None) -> bool:
-        """The task has run longer than ``timeout`` seconds."""
+        """Return whether the task has run longer than ``timeout`` seconds."""
         if timeout is None or self.job is None:
             return False
         return time.monotonic() - self.since >= timeout
 
     def listen(self, timeout: float | None) -> TaskOutcome[Any] | None:
-        """The outcome that the worker sent, or None; sets ``lost`` where it will send no more."""
+        """Return the outcome that the worker sent, or None; set ``lost`` if the worker is gone."""
         try:
             if self.pipe.poll():
                 message: Any = self.pipe.recv()
@@ -161,7 +169,9 @@ class _Worker:
                     self.ready = True
                     return None
                 job, self.job = self.job, None
-                assert job is not None and message.key == job.key, "answers follow questions"
+                assert job is not None and message.key == job.key, (
+                    "a worker answers the task that it was given"
+                )
                 outcome: TaskOutcome[Any] = dataclasses.replace(message, tries=job.tries)
                 return outcome
         except (EOFError, ConnectionResetError):
@@ -171,55 +181,55 @@ class _Worker:
         self.lost = self._late or not self.process.is_alive()
         return None
 
-    def last_words(self) -> str:
-        """Why a stopped process is gone, in one line."""
+    def reason(self) -> str:
+        """Return one line that says why a stopped process ended."""
         if self._late:
-            return f"still at work after {time.monotonic() - self.since:.0f} s, so it was ended"
+            return f"still running after {time.monotonic() - self.since:.0f} s, so it was stopped"
         code = self.process.exitcode
         if code is not None and code < 0:
             return f"the worker process was ended by signal {signal.Signals(-code).name}"
         return f"the worker process ended with exit code {code}"
 
     def stop(self) -> None:
-        """End the process: politely where it is idle, at once where it is at work."""
+        """End the process: let it finish if it is idle, kill it if it runs a task."""
         self.pipe.close()
         idle = self.ready and self.job is None
-        # A lost process is ending by itself, and its own exit code says more than a kill.
-        self.process.join(_PATIENCE if idle or (self.lost and not self._late) else 0)
+        # A lost process is ending by itself; its exit code says why, that of a kill would not.
+        self.process.join(_EXIT_SECONDS if idle or (self.lost and not self._late) else 0)
         if self.process.is_alive():
             self.process.kill()
             self.process.join()
 
 
-def _hand_out(team: list[_Worker], waiting: deque[_Job]) -> list[_Worker]:
-    """Give every idle worker a task; the team without those for whom there is none."""
-    staying = []
-    for worker in team:
+def _assign(workers: list[_Worker], waiting: deque[_QueuedTask]) -> list[_Worker]:
+    """Give a task to every idle worker, stop those that have none, and return the others."""
+    kept = []
+    for worker in workers:
         if worker.job is None and worker.ready and waiting:
             worker.start(waiting.popleft())
         if worker.job is not None or waiting:
-            staying.append(worker)
+            kept.append(worker)
         else:
             worker.stop()
-    return staying
+    return kept
 
 
-def _stillborn(worker: _Worker) -> PhysionError:
+def _startup_error(worker: _Worker) -> PhysionError:
     return PhysionError(
-        f"worker processes end before they begin ({worker.last_words()}); a script that starts "
-        "them needs: if __name__ == '__main__':"
+        f"worker processes end before they start working ({worker.reason()}); a script that "
+        "starts them needs: if __name__ == '__main__':"
     )
 
 
 def _serve(pipe: Connection, function: Callable[..., Any]) -> None:
-    """The worker's side: run what comes through the pipe until the parent hangs up or dies."""
-    # Ctrl-C goes to the whole group of processes; the parent decides what it means.
+    """Run the tasks that come through the pipe, in the worker process, until it is closed."""
+    # Ctrl-C is sent to all processes of the group; only the parent reacts to it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         pipe.send(_READY)
         while True:
             key, task = pipe.recv()
-            outcome = _attempt(key, function, task)
+            outcome = _run_task(key, function, task)
             try:
                 pipe.send(outcome)
             except (BrokenPipeError, ConnectionResetError):
@@ -230,8 +240,8 @@ def _serve(pipe: Connection, function: Callable[..., Any]) -> None:
         return
 
 
-def _attempt(key: str, function: Callable[[T], R], task: T) -> TaskOutcome[R]:
-    """Run the function and turn an exception into a failed outcome."""
+def _run_task(key: str, function: Callable[[T], R], task: T) -> TaskOutcome[R]:
+    """Run the function; return its result, or its exception as a failed outcome."""
     try:
         return TaskOutcome(key, function(task))
     except Exception as error:
@@ -243,7 +253,7 @@ def _attempt(key: str, function: Callable[[T], R], task: T) -> TaskOutcome[R]:
 
 @contextlib.contextmanager
 def _one_thread() -> Iterator[None]:
-    """Children inherit one thread for their linear algebra: the cores are shared by processes."""
+    """Limit child processes to one thread of linear algebra each: there is one process per core."""
     missing = [name for name in _THREAD_LIMITS if name not in os.environ]
     os.environ.update(dict.fromkeys(missing, "1"))
     try:
@@ -254,7 +264,7 @@ def _one_thread() -> Iterator[None]:
 
 
 def _cores() -> int:
-    """Cores that this process may use, which on shared machines are fewer than there are."""
+    """Return the number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
