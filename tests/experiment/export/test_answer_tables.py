@@ -20,7 +20,7 @@ from physion.experiment.export.session_rows import (
     NO_CONSENT,
     PREVIEW,
     WITHDRAWN,
-    Wanted,
+    SessionSelection,
     read_sessions,
 )
 from physion.experiment.export.trial_rows import read_trials
@@ -194,7 +194,7 @@ def test_what_is_written_meanwhile_is_not_seen(
     before, _ = read_tables(engine, study)
     seen = 0
     with snapshot(engine) as connection:
-        sessions = read_sessions(connection, study, Wanted())
+        sessions = read_sessions(connection, study, SessionSelection())
         for number, part in enumerate(read_trials(connection, study, sessions.table)):
             seen += part.table.num_rows
             if number == 0:
@@ -215,7 +215,7 @@ def test_answers_to_stimuli_that_are_gone_are_named(engine: sa.Engine, study: St
     with pytest.raises(PhysionError, match="the first to gone"):
         read_tables(engine, study)
     with snapshot(engine) as connection:
-        sessions = read_sessions(connection, study, Wanted())
+        sessions = read_sessions(connection, study, SessionSelection())
         parts = list(read_trials(connection, study, sessions.table))
     assert {name for part in parts for name in part.unknown} == {"gone"}
     assert sum(len(part.unknown) for part in parts) > 20
@@ -230,7 +230,9 @@ def test_both_databases_give_the_same(
         engine = open_database(url)
         upgrade(engine)
         names = iter(f"{number:032x}" for number in range(100))
-        monkeypatch.setattr("support.experiment.experimenter_rows.new_session", lambda names=names: next(names))
+        monkeypatch.setattr(
+            "support.experiment.experimenter_rows.new_session", lambda names=names: next(names)
+        )
         insert_sessions(engine, study, Secrets.load(study.folder), 12, now=NOW + 1 / 3)
         tables.append(read_tables(engine, study))
     for one, other in zip(*tables, strict=True):

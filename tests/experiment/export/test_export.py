@@ -19,7 +19,7 @@ from physion.cli.experiment import export as experiment_export
 from physion.cli.main import main
 from physion.errors import BadInputError, PhysionError
 from physion.experiment.export import export_study as export
-from physion.experiment.export import large_tables as export_tables
+from physion.experiment.export import write_tables as export_tables
 from physion.experiment.export.answer_tables import read_tables
 from physion.experiment.export.export_study import GONE, NO_FILE, TABLES, export_study
 from physion.experiment.export.spreadsheet import restore_cell
@@ -253,7 +253,7 @@ def test_people_alone_and_one_scenario(small: sa.Engine, study: Study, tmp_path:
     trials = pd.read_csv(tmp_path / "out" / "trials.csv")
     assert set(trials["scenario"]) == {"drop"} and not trials["simulated"].any()
     reasons = {entry["reason"] for entry in report.left_out}
-    assert "simulated, which was not asked for" in reasons
+    assert "simulated, which was not requested" in reasons
     assert not (tmp_path / "out" / "bids").exists() and (tmp_path / "out" / "psych-ds").is_dir()
 
 
@@ -299,7 +299,7 @@ def test_a_failure_while_writing_behind_is_not_lost(
     def fails(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(export.BidsFolder, "write", fails)
+    monkeypatch.setattr(export.BidsWriter, "write", fails)
     with pytest.raises(OSError, match="No space"):
         export_study(small, study, tmp_path / "out")
     assert not (tmp_path / "out").exists()
@@ -429,5 +429,5 @@ def test_the_verb_exports_and_says_what(
         engine.dispose()
         for path in study.folder.glob("responses.sqlite*"):
             path.unlink()
-    with pytest.raises(BadInputError, match="was the study served"):
+    with pytest.raises(BadInputError, match="has the study been served"):
         experiment_export.main(experiment_export.Options(study.folder))

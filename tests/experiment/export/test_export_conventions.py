@@ -13,7 +13,7 @@ import pytest
 
 from physion.experiment.export.answer_tables import read_tables
 from physion.experiment.export.bids import BEH_COLUMNS
-from physion.experiment.export.column_words import labels_of
+from physion.experiment.export.column_labels import unique_file_labels
 from physion.experiment.export.export_study import export_study
 from physion.experiment.export.spreadsheet import restore_cell
 from physion.experiment.store.database import open_database, upgrade
@@ -84,7 +84,7 @@ def test_psych_ds_has_the_files_and_metadata_that_it_asks_for(exported: Exported
 def test_bids_holds_every_answer_in_its_own_file(exported: Exported) -> None:
     out, trials, sessions = exported
     folder, several = out / "bids", sessions["scenario"].nunique() > 1
-    labels = labels_of(sorted(sessions["scenario"].unique()))
+    labels = unique_file_labels(sorted(sessions["scenario"].unique()))
     files = {path.relative_to(folder).as_posix() for path in folder.rglob("*_beh.tsv")}
     for _, session in sessions.iterrows():
         subject, label = f"sub-{session['participant']}", labels[session["scenario"]]
@@ -155,7 +155,7 @@ def read_text(cell: str) -> str:
 
 
 def test_labels_are_never_alike() -> None:
-    assert labels_of(["a-b", "a.b", "AB", "--", "drop"]) == {
+    assert unique_file_labels(["a-b", "a.b", "AB", "--", "drop"]) == {
         "a-b": "ab", "a.b": "ab2", "AB": "AB3", "--": "x", "drop": "drop",
     }  # fmt: skip
 

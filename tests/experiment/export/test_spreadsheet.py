@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from physion.analysis.people.response_schema import Column
 from physion.analysis.tables.csv_table import read_csv
 from physion.experiment.export.spreadsheet import guard_cell, restore_cell
-from physion.experiment.export.table_files import TableFiles
+from physion.experiment.export.table_writer import TableWriter
 from physion.experiment.study.stimuli import LOOKS, NAME
 
 FORMULA = tuple("=+-@＝＋－＠")
@@ -77,7 +77,7 @@ def test_files_are_safe_whatever_divides_cells(
     folder = tmp_path_factory.mktemp("files")
     names = [f"{number:032x}" for number in range(len(texts))]
     table = pa.table({"session": names, "feedback": texts})
-    with TableFiles(folder, "sessions", COLUMNS) as files:
+    with TableWriter(folder, "sessions", COLUMNS) as files:
         files.write(table)
     content = files.csv.read_bytes().decode()
     rows = list(csv.reader(io.StringIO(content, newline=""), strict=True))
@@ -94,7 +94,7 @@ def test_files_are_safe_whatever_divides_cells(
 
 def test_the_analysis_reads_texts_with_line_ends_and_quotes(tmp_path: Path) -> None:
     texts = ['one\ntwo\r\nthree\rfour, "five"', "", "ümlaut 🙂 \u2028"]
-    with TableFiles(tmp_path, "sessions", COLUMNS) as files:
+    with TableWriter(tmp_path, "sessions", COLUMNS) as files:
         files.write(pa.table({"session": ["a", "b", "c"], "feedback": texts}))
     table = read_csv(files.csv, ("session", "feedback"))
     assert list(table["feedback"]) == texts

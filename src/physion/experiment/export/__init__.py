@@ -1,1 +1,1 @@
-"""The collected data as tables and in the layouts of other conventions."""
+"""Export of the collected data: tables for the analysis, and the layouts Psych-DS and BIDS."""

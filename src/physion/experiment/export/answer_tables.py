@@ -1,9 +1,9 @@
-"""The data of a study as two tables: one row a session, one row a session and trial.
+"""The data of a study as two data frames: one row per session, one row per trial.
 
-Columns, types and order are those of `physion.analysis.people.response_schema`. Sessions
-stand in the order in which they began; trials by session, familiarization first, in the order in
-which they were shown. Labels come from the study folder. Which sessions are never in any table, and
-why, is counted (`session_rows.Sessions.left_out`).
+Columns, types and order are those of `physion.analysis.people.response_schema`. Sessions are sorted
+by start time; trials by session, then familiarization before test, in the order in which they were
+shown. Labels are read from the study folder. Sessions that are left out are counted by reason
+(`session_rows.SessionTable.left_out`).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from sqlalchemy import Connection, Engine
 from physion.analysis.people.response_schema import SESSION_COLUMNS, TRIAL_COLUMNS
 from physion.errors import PhysionError
 from physion.experiment.export.arrow_types import arrow_schema, as_frame
-from physion.experiment.export.session_rows import EXPORTED_KINDS, Wanted, read_sessions
+from physion.experiment.export.session_rows import EXPORTED_KINDS, SessionSelection, read_sessions
 from physion.experiment.export.trial_rows import read_trials
 from physion.experiment.study.study import Study
 
@@ -31,19 +31,43 @@ def read_tables(
     scenario: str | None = None,
     finished_only: bool = False,
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Trials and sessions as they are at one moment, as `response_schema.check_table` types them.
+    """Read trials and sessions from one consistent snapshot of the database.
 
-    Sessions without consent and of participants who withdrew are left out. Raises `PhysionError`
-    for answers to stimuli that the study folder has no more.
+    Sessions without consent and of participants who withdrew are left out.
+
+    Parameters
+    ----------
+    engine
+        The database.
+    study
+        The study, for the labels of its stimuli.
+    kinds
+        Kinds of sessions to include: ``person``, ``simulated`` or both.
+    scenario
+        Include only this scenario.
+    finished_only
+        Include only finished sessions.
+
+    Returns
+    -------
+    tuple of DataFrame
+        Trials and sessions, with the types of `response_schema.check_table`.
+
+    Raises
+    ------
+    PhysionError
+        There are answers to stimuli that the study folder no longer has.
     """
     with snapshot(engine) as connection:
-        sessions = read_sessions(connection, study, Wanted(kinds, scenario, finished_only))
+        sessions = read_sessions(
+            connection, study, SessionSelection(kinds, scenario, finished_only)
+        )
         parts = list(read_trials(connection, study, sessions.table))
     unknown = [name for part in parts for name in part.unknown]
     if unknown:
         raise PhysionError(
-            f"{len(unknown)} answers are to stimuli that {study.folder} has no more, the first to "
-            f"{unknown[0]}; bring them back into stimuli.csv"
+            f"{len(unknown)} answers are to stimuli that {study.folder} no longer has, the first "
+            f"to {unknown[0]}; restore them in stimuli.csv"
         )
     empty = arrow_schema(TRIAL_COLUMNS).empty_table()
     trials = pa.concat_tables([empty, *(part.table for part in parts)])
@@ -52,7 +76,7 @@ def read_tables(
 
 @contextlib.contextmanager
 def snapshot(engine: Engine) -> Iterator[Connection]:
-    """A connection that sees the database as it is at its first question, whoever writes."""
+    """Open a read connection that sees the database as of its first query, despite later writes."""
     with engine.connect() as connection:
         if engine.dialect.name == "postgresql":
             connection.execution_options(
@@ -60,6 +84,7 @@ def snapshot(engine: Engine) -> Iterator[Connection]:
             )
         with connection.begin():
             if engine.dialect.name == "postgresql":
-                # Else it reads all answers for each few sessions where it has no statistics yet.
+                # Without table statistics, the planner would otherwise scan all answers for each
+                # batch of sessions.
                 connection.exec_driver_sql("SET LOCAL enable_seqscan = off")
             yield connection

@@ -1,4 +1,4 @@
-"""The columns of `response_schema` in Arrow and parquet, and back in the analysis' types."""
+"""Conversion of the columns of `response_schema` to Arrow types and to data frames."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ ARROW_TYPES = {
 
 
 def arrow_schema(columns: Sequence[Column]) -> pa.Schema:
-    """The columns with the types that they have in Arrow and parquet."""
+    """Return the Arrow (and parquet) schema of the columns."""
     return pa.schema([pa.field(column.name, ARROW_TYPES[column.kind]) for column in columns])
 
 
 def as_frame(table: pa.Table, columns: Sequence[Column]) -> pd.DataFrame:
-    """A table of Arrow with the types of `response_schema.check_table`."""
+    """Convert an Arrow table to a data frame with the types of `response_schema.check_table`."""
     nullable = {pa.int64(): pd.Int64Dtype(), pa.bool_(): pd.BooleanDtype()}
     frame = table.to_pandas(types_mapper=nullable.get)
     typed = {}

@@ -1,14 +1,14 @@
-"""A study's answers in BIDS: behaviour without recordings, one file a participant and scenario.
+"""Export of a study in BIDS: behaviour without recordings, one file per participant and scenario.
 
 ::
 
     dataset_description.json   README.md   participants.tsv   participants.json
-    task-<scenario>_beh.json                          what the columns mean, for all files of a task
+    task-<scenario>_beh.json                          descriptions of the columns of a task's files
     sub-<participant>/beh/sub-<participant>_task-<scenario>_beh.tsv
 
-Where a study has several scenarios, each is a session of its own: ``ses-<scenario>`` in folders and
-names, and ``sub-<participant>_sessions.tsv`` (with ``sessions.json``) holds what is known of each.
-Empty cells are ``n/a``. See bids-specification.readthedocs.io, behavioral experiments.
+If a study has several scenarios, each is a BIDS session: folders and names contain
+``ses-<scenario>``, and ``sub-<participant>_sessions.tsv`` (with ``sessions.json``) describes the
+sessions. Empty cells are ``n/a``. See bids-specification.readthedocs.io, behavioral experiments.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ import pyarrow.compute as pc
 from pyarrow import csv
 
 from physion.analysis.people.response_schema import SESSION_COLUMNS, TRIAL_COLUMNS, Column
-from physion.experiment.export.column_words import labels_of, levels_of
+from physion.experiment.export.column_labels import column_levels, unique_file_labels
 from physion.experiment.export.spreadsheet import guard_cell
-from physion.experiment.export.trial_rows import Trials
+from physion.experiment.export.trial_rows import TrialBatch
 from physion.experiment.study.study import Study
 
 VERSION = "1.10.0"
@@ -36,9 +36,7 @@ TASK = (
     "A movie of objects is stopped after its first part. Will the object that was shown in red "
     "touch the one that was shown in yellow?"
 )
-TEXT_RULE = (
-    'Text is written as within quotes in JSON (line ends as \\n, tabs as \\t, quotes as \\")'
-)
+TEXT_RULE = 'Text is written as a JSON string without its quotes (newline \\n, tab \\t, quote \\")'
 TRIAL_TYPE = Column(
     "trial_type", "choice", "With feedback (familiarization) or without (test)",
     choices=("familiarization", "test"),
@@ -61,21 +59,24 @@ _PARTICIPANT = {"Description": "sub- and the keyed hash of the participant's id"
 _SESSION = {"Description": "ses- and the scenario"}
 
 
-class BidsFolder:
-    """Writes a dataset: `write` for some sessions after the other, then `close`."""
+class BidsWriter:
+    """Writer of a BIDS dataset: call `write` for each batch of sessions, then `close`.
+
+    ``sessions`` is the table of all sessions, in the order of the batches.
+    """
 
     def __init__(self, folder: Path, study: Study, sessions: pa.Table) -> None:
         folder.mkdir(parents=True)
         self._folder, self._sessions = str(folder), sessions
         self._several = len(study.scenarios) > 1
-        self._labels = labels_of(study.scenarios)
+        self._labels = unique_file_labels(study.scenarios)
         self._participants = sessions.column("participant").to_pylist()
         self._scenarios = sessions.column("scenario").to_pylist()
         self._made: set[str] = set()
         self._answered: list[int] = []
 
-    def write(self, trials: Trials) -> None:
-        """The files of some sessions; one without answers has none."""
+    def write(self, trials: TrialBatch) -> None:
+        """Write the files of a batch of sessions; sessions without answers get no file."""
         header = "\t".join(column.name for column in BEH_COLUMNS).encode() + b"\n"
         rows = _tsv(_beh_table(trials.table))
         ends = np.flatnonzero(np.frombuffer(rows, np.uint8) == ord("\n")) + 1
@@ -85,14 +86,24 @@ class BidsFolder:
                 continue
             row += count
             end = int(ends[row - 1])
-            with open(self._path(at), "wb") as file:  # noqa: PTH123 - 10,000 times
+            with open(self._path(at), "wb") as file:  # noqa: PTH123 - faster, for 10,000 files
                 file.write(header)
                 file.write(rows[begin:end])
             begin = end
             self._answered.append(at)
 
     def close(self, *, name: str, readme: str, version: str) -> int:
-        """Write what belongs to all files; how many sessions have no file for want of answers."""
+        """Write the files of the whole dataset; return how many sessions had no answers.
+
+        Parameters
+        ----------
+        name
+            Title of the dataset.
+        readme
+            Text of README.md.
+        version
+            Version of this package.
+        """
         folder = Path(self._folder)
         answered = self._sessions.take(pa.array(self._answered, pa.int64()))
         _write_json(folder / "dataset_description.json", {
@@ -110,7 +121,7 @@ class BidsFolder:
         return int(self._sessions.num_rows) - len(self._answered)
 
     def _path(self, at: int) -> str:
-        """Where the answers of a session go, in folders that are made."""
+        """Return the path of the answers of session ``at``; create its folders."""
         subject = f"sub-{self._participants[at]}"
         label = self._labels[self._scenarios[at]]
         folders = [subject, *([f"ses-{label}"] if self._several else []), "beh"]
@@ -123,19 +134,22 @@ class BidsFolder:
         return f"{path}/{'_'.join(folders[:-1])}_task-{label}_beh.tsv"
 
     def _write_people(self, folder: Path, sessions: pa.Table) -> None:
-        """``participants.tsv`` and, where there are several scenarios, the files of sessions."""
+        """Write ``participants.tsv`` and, if there are several scenarios, the session files."""
         rows = sessions.to_pylist()
         people: dict[str, list[dict[str, Any]]] = {}
         for row in rows:
             people.setdefault(row["participant"], []).append(row)
         columns = PERSON_COLUMNS if self._several else SESSION_COLUMNS[1:]
         lines = [_line(["participant_id", *(column.name for column in columns)])]
-        for participant, own in people.items():
-            # What was told once holds for a person's other sessions.
-            told = {c.name: next(filter(_is_told, (r[c.name] for r in own)), None) for c in columns}
-            lines.append(_line([f"sub-{participant}", *(_cell(v) for v in told.values())]))
+        for participant, own_rows in people.items():
+            # The first known value of a column holds for all sessions of a person.
+            values = [
+                next((row[column.name] for row in own_rows if row[column.name] is not None), None)
+                for column in columns
+            ]
+            lines.append(_line([f"sub-{participant}", *map(_cell, values)]))
             if self._several:
-                self._write_sessions(folder, participant, own)
+                self._write_sessions(folder, participant, own_rows)
         (folder / "participants.tsv").write_bytes("".join(lines).encode())
         _write_json(
             folder / "participants.json", {"participant_id": _PARTICIPANT} | describe(columns)
@@ -147,6 +161,7 @@ class BidsFolder:
     def _write_sessions(
         self, folder: Path, participant: str, rows: Sequence[Mapping[str, Any]]
     ) -> None:
+        """Write the ``sessions.tsv`` of one participant."""
         names = [column.name for column in SESSION_COLUMNS[1:]]
         lines = [_line(["session_id", *names])]
         for row in rows:
@@ -158,8 +173,8 @@ class BidsFolder:
 
 
 def describe(columns: Sequence[Column]) -> dict[str, dict[str, Any]]:
-    """The columns as BIDS describes them: Description, Units, Levels."""
-    found = {}
+    """Return the columns as BIDS describes them: Description, Units, Levels."""
+    entries = {}
     for column in columns:
         about = column.about
         if column.kind == "text" and column.name in _TEXTS:
@@ -167,10 +182,10 @@ def describe(columns: Sequence[Column]) -> dict[str, dict[str, Any]]:
         entry: dict[str, Any] = {"Description": about}
         if column.unit:
             entry["Units"] = column.unit
-        if levels_of(column):
-            entry["Levels"] = {level: level for level in levels_of(column)}
-        found[column.name] = entry
-    return found
+        if column_levels(column):
+            entry["Levels"] = {level: level for level in column_levels(column)}
+        entries[column.name] = entry
+    return entries
 
 
 _TEXTS = frozenset(
@@ -181,7 +196,7 @@ _TEXTS = frozenset(
 
 
 def _beh_table(trials: pa.Table) -> pa.Table:
-    """Answers with BIDS's names, and ``n/a`` for what is not known."""
+    """Return the answers with BIDS column names, and ``n/a`` in empty cells."""
     columns = []
     for column in BEH_COLUMNS:
         if column is TRIAL_TYPE:
@@ -197,19 +212,18 @@ def _beh_table(trials: pa.Table) -> pa.Table:
 
 
 def _tsv(table: pa.Table) -> bytes:
-    """Rows without a header. Names of stimuli hold no tabs: ArrowInvalid if one did."""
+    """Return the rows as TSV without a header.
+
+    Nothing is quoted: the cells have no tabs or quotes (else Arrow raises ArrowInvalid).
+    """
     buffer = io.BytesIO()
     options = csv.WriteOptions(include_header=False, delimiter="\t", quoting_style="none")
     csv.write_csv(table, buffer, options)
     return buffer.getvalue()
 
 
-def _is_told(value: Any) -> bool:
-    return value is not None
-
-
 def _cell(value: Any) -> str:
-    """One cell of a small table, safe in a spreadsheet."""
+    """Return a value as a TSV cell that is safe in a spreadsheet."""
     if value is None or value == "":
         return EMPTY
     if isinstance(value, bool):
@@ -217,7 +231,7 @@ def _cell(value: Any) -> str:
     if not isinstance(value, str):
         return str(value)
     text = json.dumps(value, ensure_ascii=False)[1:-1]
-    # A text that reads "n/a" is no empty cell; JSON allows the stroke to be escaped.
+    # The text "n/a" must differ from an empty cell; JSON allows the slash to be escaped.
     return guard_cell("n\\/a" if text == EMPTY else text)
 
 

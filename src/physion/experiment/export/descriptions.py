@@ -1,4 +1,4 @@
-"""What an export says of itself to people: its README, and columns that only it has."""
+"""The README files of an export, and the columns of its table of stimuli."""
 
 from __future__ import annotations
 
@@ -15,55 +15,55 @@ from physion.experiment.study.study import Study
 STIMULI_COLUMNS: tuple[Column, ...] = (
     Column("stimulus", "text", "Name, as in the trials"),
     Column("scenario", "text", "Scenario, as in the trials"),
-    Column("phase", "choice", "Where it is shown", choices=PHASES),
-    Column("place", "integer", "Place in familiarization, from 0; no order in the test", low=0),
-    Column("label", "flag", "Does the agent touch the patient?"),
-    Column("frames", "integer", "Frames of the observed movie", low=1),
-    Column("rate", "number", "Frames a second", unit="Hz", low=0),
+    Column("phase", "choice", "Phase in which it is shown", choices=PHASES),
+    Column("place", "integer", "Position in familiarization, from 0; no order in the test", low=0),
+    Column("label", "flag", "Whether the agent touches the patient"),
+    Column("frames", "integer", "Number of frames of the observed movie", low=1),
+    Column("rate", "number", "Frames per second", unit="Hz", low=0),
     Column("width", "integer", "Width of the movie", unit="px", low=1),
     Column("height", "integer", "Height of the movie", unit="px", low=1),
     Column("look", "choice", "Colours of the stimulus", choices=LOOKS),
 )
 
 _TASK = """\
-Participants saw the first part of a movie, after agent and patient had been marked in red and
-yellow, and said whether the one would touch the other. One session is one participant in one
-scenario: familiarization with feedback, then the test without."""
+Participants saw the first part of a movie, in whose first frame the agent was marked in red and the
+patient in yellow, and predicted whether the agent would touch the patient. A session is one
+participant in one scenario: familiarization with feedback, then the test without feedback."""
 
 _PEOPLE = """\
 `participant` is a keyed hash: the same for all sessions of a person in this study, and of no use
-without the study's key. No recruiter's id is in here. Free text and rare combinations of age,
-gender and education may still tell who somebody is: look through them before you share the data.
-Sessions that `simulated` marks were made by a program."""
+without the study's key. Recruiters' ids are not exported. Free text and rare combinations of age,
+gender and education may still identify a person: check them before you share the data.
+Sessions with `simulated` = true are of simulated participants."""
 
 _FILES = """\
-- `trials.csv`, `trials.parquet`: one row a session and trial.
-- `sessions.csv`, `sessions.parquet`: one row a session.
-- `events.csv`, `events.parquet`: what else happened in the browser.
-- `trial_details.parquet`: moments of frames and cues within each trial.
-- `stimuli.csv`: what was shown and how it ends. `expected.csv`: the test of each scenario.
-- `data_dictionary.json`: every column of every table.
-- `study.json`: what the study decided and said, in each state in which sessions ran.
-- `psych-ds/`, `bids/`: trials and sessions in these two conventions, where asked for.
+- `trials.csv`, `trials.parquet`: one row per trial.
+- `sessions.csv`, `sessions.parquet`: one row per session.
+- `events.csv`, `events.parquet`: other events in the browser.
+- `trial_details.parquet`: times of frames and cues within each trial.
+- `stimuli.csv`: the stimuli and their outcomes. `expected.csv`: the test stimuli by scenario.
+- `data_dictionary.json`: description of every column of every table.
+- `study.json`: settings and texts of each version of the study under which sessions ran.
+- `psych-ds/`, `bids/`: trials and sessions in these two conventions, if requested.
 - `export.json`: counts, and what was left out.
 
-The rows of `trials` are told apart by `session`, `phase` and `trial`. To compare them with models:
+A row of `trials` is identified by `session`, `phase` and `trial`. To compare them with models:
 
     physion compare PREDICTIONS --responses trials.csv --sessions sessions.csv \\
         --expected expected.csv
 
-Sessions that were not finished are in the tables; the analysis flags them. Sessions of people who
-withdrew or did not agree, and previews, are not."""
+Unfinished sessions are included; the analysis flags them. Previews and sessions of people who
+withdrew or did not consent are not included."""
 
 _PSYCH_DS = """\
-A Psych-DS dataset (psych-ds.github.io). The rows of `..._description-trials_data.csv` are told
-apart by `session`, `phase` and `trial`, those of `..._description-sessions_data.csv` by `session`,
-those of `..._description-events_data.csv` by `session` and `number`."""
+A Psych-DS dataset (psych-ds.github.io). A row of `..._description-trials_data.csv` is identified by
+`session`, `phase` and `trial`, a row of `..._description-sessions_data.csv` by `session`, a row of
+`..._description-events_data.csv` by `session` and `number`."""
 
 _BIDS = """\
-A BIDS dataset of behaviour without recordings (bids.neuroimaging.io): one file a participant and
-scenario. Practice trials come first, `trial_type` tells them from the test. Participants without
-any answer have no file and are not listed."""
+A BIDS dataset of behaviour without recordings (bids.neuroimaging.io): one file per participant and
+scenario. Familiarization trials come first; `trial_type` distinguishes them from the test.
+Participants without any answer have no file and are not listed."""
 
 
 def readme(
@@ -71,7 +71,10 @@ def readme(
     place: Literal["export", "psych-ds", "bids"],
     facts: Mapping[str, Any] | None = None,
 ) -> str:
-    """README.md of the export or of one of the two conventions' folders."""
+    """Return the README.md of the export, or of its Psych-DS or BIDS folder.
+
+    ``facts``, if given, are the counts of `ExportReport.facts`, which are appended.
+    """
     special = {"export": _FILES, "psych-ds": _PSYCH_DS, "bids": _BIDS}[place]
     rule = RULE if place != "bids" else f"{TEXT_RULE}. {RULE}"
     parts = [
@@ -88,7 +91,7 @@ def readme(
 
 
 def count_lines(facts: Mapping[str, Any], bullet: str = "") -> list[str]:
-    """Counts of a report, a line each."""
+    """Return the counts of `ExportReport.facts` as lines of text."""
     lines = []
     for kind, states in facts["sessions"].items():
         total = sum(states.values())

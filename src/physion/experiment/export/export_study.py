@@ -1,20 +1,20 @@
-"""The data of a study as a folder of files: what the analysis reads, and what conventions ask for.
+"""Export of the data of a study as a folder of tables, also in the conventions Psych-DS and BIDS.
 
 ::
 
     OUT/
-      README.md              what is what
-      trials.csv, .parquet   one row a session and trial: physion compare --responses
-      sessions.csv, .parquet one row a session: physion compare --sessions
-      events.csv, .parquet   what else happened
-      trial_details.parquet  moments within each trial
-      stimuli.csv, expected.csv   what was shown; what the test of each scenario consists of
-      data_dictionary.json   every column of every table
-      study.json             what the study decided, without codes and keys
-      psych-ds/, bids/       the same in two conventions
+      README.md              description of the files
+      trials.csv, .parquet   one row per trial: physion compare --responses
+      sessions.csv, .parquet one row per session: physion compare --sessions
+      events.csv, .parquet   other events in the browser
+      trial_details.parquet  times of frames and cues within each trial
+      stimuli.csv, expected.csv   the stimuli; the test stimuli of each scenario
+      data_dictionary.json   description of every column of every table
+      study.json             settings and texts of the study, without codes and keys
+      psych-ds/, bids/       the same data in two conventions
       export.json            counts, and what was left out; written last
 
-The same data and version of this package give the same bytes.
+The same data and package version give byte-identical files, whatever the database.
 """
 
 from __future__ import annotations
@@ -34,29 +34,44 @@ from sqlalchemy import Connection, Engine, select
 import physion
 from physion.analysis.people.response_schema import data_dictionary
 from physion.experiment.export.answer_tables import snapshot
-from physion.experiment.export.bids import BidsFolder
+from physion.experiment.export.bids import BidsWriter
 from physion.experiment.export.descriptions import STIMULI_COLUMNS, readme
-from physion.experiment.export.folder import whole_folder, write_manifest
+from physion.experiment.export.export_folder import atomic_folder, write_manifest
 from physion.experiment.export.iso_times import iso_times
-from physion.experiment.export.large_tables import TABLES, Written, write_tables
 from physion.experiment.export.psych_ds import write_psych_ds
-from physion.experiment.export.session_rows import EXPORTED_KINDS, Sessions, Wanted, read_sessions
+from physion.experiment.export.session_rows import (
+    EXPORTED_KINDS,
+    SessionSelection,
+    SessionTable,
+    read_sessions,
+)
 from physion.experiment.export.spreadsheet import RULE
+from physion.experiment.export.write_tables import TABLES, WrittenTables, write_tables
 from physion.experiment.store.tables import STUDIES
 from physion.experiment.study.study import Study
 
 Layout = Literal["both", "psych-ds", "bids"]
-GONE = "answer to a stimulus that the study folder has no more"
-NO_FILE = "no answer yet, and so no file in bids/"
+GONE = "its stimulus is no longer in the study folder"
+NO_FILE = "no answer yet, so no file in bids/"
 _SECRET_SETTINGS = ("recruitment", "folder", "stimuli")
 
 
 @dataclass(frozen=True)
-class Report:
-    """What was exported to ``out``.
+class ExportReport:
+    """Counts of an export.
 
-    ``sessions``: by kind and ``finished`` or ``unfinished``. ``rows``: by table. ``left_out``: what
-    (session or answer), kind, reason and count. ``until``: the last moment in the data.
+    Attributes
+    ----------
+    out
+        The exported folder.
+    sessions
+        Number of sessions by kind, and by ``finished`` or ``unfinished``.
+    rows
+        Number of rows by table.
+    left_out
+        What (session or answer) was left out, with kind, reason and count.
+    until
+        Latest time in the data (ISO 8601); None if there are no data.
     """
 
     out: Path
@@ -66,7 +81,7 @@ class Report:
     until: str | None
 
     def facts(self) -> dict[str, Any]:
-        """The counts, as plain values; no path."""
+        """Return the counts as JSON values, without the path."""
         return {
             "sessions": self.sessions,
             "rows": self.rows,
@@ -83,19 +98,38 @@ def export_study(
     simulated: bool = True,
     scenario: str | None = None,
     layout: Layout = "both",
-) -> Report:
-    """Export all data at one moment into the folder ``out``, whole or not at all.
+) -> ExportReport:
+    """Export one consistent snapshot of the data into the folder ``out``, completely or not at all.
 
-    A server may run meanwhile. An ``out`` that is there is replaced where it is an export that
-    nobody added anything to; `BadInputError` otherwise. Without ``simulated``, people alone.
+    A server may be running.
+
+    Parameters
+    ----------
+    engine
+        The database.
+    study
+        The study.
+    out
+        Folder to write. An existing export without added files is replaced.
+    simulated
+        Whether to include simulated participants.
+    scenario
+        Export only this scenario.
+    layout
+        Conventions to write besides the tables.
+
+    Raises
+    ------
+    BadInputError
+        ``out`` exists and is anything but an unchanged export or an empty folder.
     """
     kinds = EXPORTED_KINDS if simulated else ("person",)
-    with whole_folder(out) as folder:
+    with atomic_folder(out) as folder:
         with snapshot(engine) as connection:
-            sessions = read_sessions(connection, study, Wanted(kinds, scenario))
+            sessions = read_sessions(connection, study, SessionSelection(kinds, scenario))
             bids = None
             if layout != "psych-ds":
-                bids = BidsFolder(folder / "bids", study, sessions.table)
+                bids = BidsWriter(folder / "bids", study, sessions.table)
             written = write_tables(folder, connection, study, sessions, bids)
             states = _states(connection, sessions)
         report = _report(out, sessions, written)
@@ -118,43 +152,48 @@ def export_study(
     return report
 
 
-def _report(out: Path, sessions: Sessions, written: Written) -> Report:
+def _report(out: Path, sessions: SessionTable, written: WrittenTables) -> ExportReport:
+    """Return the report of the tables, before Psych-DS and BIDS."""
     kinds: dict[str, dict[str, int]] = {}
     for kind in EXPORTED_KINDS:
         states = {state: sessions.states[kind, state] for state in ("finished", "unfinished")}
         if any(states.values()):
             kinds[kind] = states
-    report = Report(out, kinds, written.rows, (), written.until)
+    report = ExportReport(out, kinds, written.rows, (), written.until)
     for (kind, reason), count in sorted(sessions.left_out.items()):
         report = _with_left_out(report, "session", kind, reason, count)
     return _with_left_out(report, "answer", "any", GONE, written.gone)
 
 
-def _with_left_out(report: Report, what: str, kind: str, reason: str, count: int) -> Report:
+def _with_left_out(
+    report: ExportReport, what: str, kind: str, reason: str, count: int
+) -> ExportReport:
+    """Return the report with one more entry in ``left_out``, unless ``count`` is 0."""
     if not count:
         return report
     entry = {"what": what, "kind": kind, "reason": reason, "count": count}
     left_out = (*report.left_out, entry)
-    return Report(report.out, report.sessions, report.rows, left_out, report.until)
+    return ExportReport(report.out, report.sessions, report.rows, left_out, report.until)
 
 
-def _states(connection: Connection, sessions: Sessions) -> list[dict[str, Any]]:
-    """The states of the study under which the sessions ran, without codes and links."""
+def _states(connection: Connection, sessions: SessionTable) -> list[dict[str, Any]]:
+    """Return the versions of the study under which the sessions ran, without secret settings."""
     rows = connection.execute(select(STUDIES)).fetchall()
-    found = []
+    states = []
     for row in sorted(rows, key=lambda row: (row.first_served, row.digest)):
         if row.digest in sessions.studies:
             kept = {k: v for k, v in row.settings.items() if k not in _SECRET_SETTINGS}
-            found.append({
+            states.append({
                 "digest": row.digest, "name": row.name, "version": row.version,
                 "stimuli_digest": row.stimuli_digest,
                 "first_served": iso_times(np.array([row.first_served]))[0].as_py(),
                 "settings": kept,
             })  # fmt: skip
-    return found
+    return states
 
 
 def _write_stimuli(folder: Path, study: Study) -> None:
+    """Write ``stimuli.csv`` and ``expected.csv``."""
     names = [column.name for column in STIMULI_COLUMNS]
     shown = [[getattr(stimulus, name) for name in names] for stimulus in study.stimuli]
     _write_csv(folder / "stimuli.csv", names, shown)
@@ -169,7 +208,7 @@ def _write_csv(path: Path, header: Sequence[str], rows: Sequence[Sequence[Any]])
     path.write_bytes(lines.getvalue().encode())
 
 
-def _write_psych_ds(folder: Path, study: Study, sessions: Sessions, until: str | None) -> None:
+def _write_psych_ds(folder: Path, study: Study, sessions: SessionTable, until: str | None) -> None:
     began = pc.min(sessions.table.column("started_at")).as_py()
     write_psych_ds(
         folder / "psych-ds",

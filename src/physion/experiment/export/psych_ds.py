@@ -1,7 +1,7 @@
-"""A study's tables as a Psych-DS dataset: CSV files under ``data/`` and schema.org metadata.
+"""Export of a study as a Psych-DS dataset: CSV files in ``data/`` and schema.org metadata.
 
 Psych-DS (psych-ds.github.io): ``dataset_description.json`` is a schema.org ``Dataset`` whose
-``variableMeasured`` names every column of every file; data files are called
+``variableMeasured`` describes every column of every file; data files are called
 ``keyword-value[_keyword-value...]_data.csv``.
 """
 
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from physion.analysis.people.response_schema import Column
-from physion.experiment.export.column_words import KIND_WORDS, label_of, levels_of
+from physion.experiment.export.column_labels import KIND_NAMES, column_levels, file_label
 
 VERSION = "Psych-DS 0.4.0"
 
@@ -28,21 +28,31 @@ def write_psych_ds(
     readme: str,
     covers: tuple[str, str] | None,
 ) -> list[Path]:
-    """Write a dataset into the new ``folder``; the data files.
+    """Write a dataset into a new folder; return the paths of its data files.
 
-    ``tables``: by a word of letters, a CSV file (copied) and its columns. ``name`` and
-    ``description``: of the study. ``covers``: first and last moment of the data, in ISO 8601.
+    Parameters
+    ----------
+    folder
+        Folder to create.
+    tables
+        CSV file (which is copied) and columns of each table, by table name.
+    name, description
+        Name and title of the study.
+    readme
+        Text of README.md.
+    covers
+        First and last time in the data (ISO 8601), if known.
     """
     data = folder / "data"
     data.mkdir(parents=True)
     paths = []
-    for word, (source, _) in tables.items():
-        paths.append(data / f"study-{label_of(name)}_description-{label_of(word)}_data.csv")
+    for table, (source, _) in tables.items():
+        paths.append(data / f"study-{file_label(name)}_description-{file_label(table)}_data.csv")
         shutil.copyfile(source, paths[-1])
     columns: dict[str, Column] = {}
     for _, listed in tables.values():
         for column in listed:
-            columns.setdefault(column.name, column)  # the first table says it in full
+            columns.setdefault(column.name, column)  # the first table has the full description
     metadata: dict[str, Any] = {
         "@context": "https://schema.org/",
         "@type": "Dataset",
@@ -61,19 +71,19 @@ def write_psych_ds(
 
 
 def variable(column: Column) -> dict[str, Any]:
-    """A column as a schema.org ``PropertyValue``."""
-    about = f"{column.about} ({KIND_WORDS[column.kind]})"
-    found: dict[str, Any] = {
+    """Return the description of a column as a schema.org ``PropertyValue``."""
+    about = f"{column.about} ({KIND_NAMES[column.kind]})"
+    value: dict[str, Any] = {
         "@type": "PropertyValue",
         "name": column.name,
         "description": about,
     }
     if column.unit:
-        found["unitText"] = column.unit
+        value["unitText"] = column.unit
     if column.low is not None:
-        found["minValue"] = column.low
+        value["minValue"] = column.low
     if column.high is not None:
-        found["maxValue"] = column.high
-    if levels_of(column):
-        found["valueReference"] = list(levels_of(column))
-    return found
+        value["maxValue"] = column.high
+    if column_levels(column):
+        value["valueReference"] = list(column_levels(column))
+    return value

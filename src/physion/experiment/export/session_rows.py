@@ -1,4 +1,4 @@
-"""The table of sessions: which are in it, and which are left out for which reason."""
+"""The exported table of sessions, and counts of the sessions left out, by reason."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from physion.experiment.store.tables import SESSIONS, STUDIES
 from physion.experiment.study.study import Study
 
 EXPORTED_KINDS = ("person", "simulated")
-"""Kinds of sessions that can be asked for; previews cannot."""
+"""Kinds of sessions that can be exported; previews cannot."""
 PREVIEW = "preview by the experimenter"
 NO_CONSENT = "no consent was given"
 WITHDRAWN = "the participant withdrew"
-UNFINISHED = "not finished, and only finished ones were asked for"
-OTHER_KIND = "{kind}, which was not asked for"
-GONE_SCENARIO = "of {scenario}, which study.toml has no more: put it back to export them"
-OTHER_SCENARIO = "of a scenario that was not asked for"
+UNFINISHED = "not finished, and only finished ones were requested"
+OTHER_KIND = "{kind}, which was not requested"
+GONE_SCENARIO = "of {scenario}, which study.toml no longer has: add it again to export them"
+OTHER_SCENARIO = "of a scenario that was not requested"
 _Row = Any
-"""A row of sessions with the study's name and version: the library's type lists all columns."""
+"""A row of sessions with name and version of the study (its exact type would list all columns)."""
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """Which sessions: of these ``kinds``, of one scenario (None: all), finished ones alone?"""
+class SessionSelection:
+    """Which sessions to export: kinds, one scenario (None: all), only finished ones or all."""
 
     kinds: Sequence[str] = EXPORTED_KINDS
     scenario: str | None = None
@@ -41,12 +41,19 @@ class Wanted:
 
 
 @dataclass(frozen=True)
-class Sessions:
-    """The ``table`` of sessions (empty cells are null), and what is not in it.
+class SessionTable:
+    """The exported sessions, and counts of those left out.
 
-    ``states``: sessions of the table by kind and ``finished`` or ``unfinished``. ``left_out``:
-    sessions by kind and reason. ``studies``: digests of the states of the study folder under which
-    the table's sessions ran.
+    Attributes
+    ----------
+    table
+        One row per session; empty cells are null.
+    states
+        Number of sessions in the table by kind and ``finished`` or ``unfinished``.
+    left_out
+        Number of sessions left out, by kind and reason.
+    studies
+        Digests of the versions of the study under which the sessions of the table ran.
     """
 
     table: pa.Table
@@ -55,8 +62,10 @@ class Sessions:
     studies: tuple[str, ...]
 
 
-def read_sessions(connection: Connection, study: Study, wanted: Wanted = Wanted()) -> Sessions:
-    """The table of sessions, and what is left out of it, for which reason."""
+def read_sessions(
+    connection: Connection, study: Study, wanted: SessionSelection = SessionSelection()
+) -> SessionTable:
+    """Read the selected sessions, sorted by start time; count the others by reason."""
     for kind in wanted.kinds:
         if kind not in EXPORTED_KINDS:
             raise UnknownNameError("kind of session", kind, EXPORTED_KINDS)
@@ -75,14 +84,14 @@ def read_sessions(connection: Connection, study: Study, wanted: Wanted = Wanted(
             continue
         kept.append(row)
         states[row.kind, "unfinished" if row.finished_at is None else "finished"] += 1
-    # Sorted here: databases differ in how they order text.
+    # Sorted here because databases differ in how they order text.
     kept.sort(key=lambda row: (row.started_at, row.session))
     digests = tuple(dict.fromkeys(row.study for row in kept))
-    return Sessions(_session_table(kept), states, left_out, digests)
+    return SessionTable(_session_table(kept), states, left_out, digests)
 
 
-def _why_not(row: _Row, wanted: Wanted, study: Study) -> str | None:
-    """Why a session is in no table; None: it is in it."""
+def _why_not(row: _Row, wanted: SessionSelection, study: Study) -> str | None:
+    """Return the reason why a session is left out, or None if it is exported."""
     if row.kind not in EXPORTED_KINDS:
         return PREVIEW
     if row.kind not in wanted.kinds:
@@ -112,6 +121,7 @@ def _session_table(rows: Sequence[_Row]) -> pa.Table:
 
 
 def _session_value(row: _Row, name: str) -> Any:
+    """Return the value of one exported column; None for an empty cell."""
     match name:
         case "simulated":
             return row.kind == "simulated"

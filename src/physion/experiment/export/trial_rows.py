@@ -1,4 +1,4 @@
-"""The table of answers, some sessions at a time, so that memory stays bounded."""
+"""The exported table of answers, read in batches of sessions to bound the memory."""
 
 from __future__ import annotations
 
@@ -21,16 +21,25 @@ from physion.experiment.study.stimuli import LOOKS, PHASES, Stimulus
 from physion.experiment.study.study import Study
 
 AT_ONCE = 200
-"""Sessions whose answers are fetched together."""
+"""Number of sessions whose answers are fetched in one query."""
 
 
 @dataclass(frozen=True)
-class Trials:
-    """Answers of some consecutive sessions.
+class TrialBatch:
+    """Answers of consecutive sessions.
 
-    ``sessions``: their rows in the table of sessions. ``counts``: rows of ``table`` by session.
-    ``details``: JSON text by row, where it was asked for. ``unknown``: names of stimuli that the
-    study folder has no more, by row that is left out for this.
+    Attributes
+    ----------
+    sessions
+        Row numbers of these sessions in the table of sessions.
+    table
+        One row per answer.
+    counts
+        Number of rows of ``table`` for each session.
+    details
+        JSON text of each row, if requested.
+    unknown
+        Stimulus of each answer that was left out because the study folder no longer has it.
     """
 
     sessions: range
@@ -43,24 +52,26 @@ class Trials:
 _INPUTS = ("mouse", "touch", "keyboard")
 _RESPONSES = ("no", "yes")
 _ABSENT = -1.0
-"""Stands for empty cells while numbers are fetched: none of them is ever below 0."""
+"""Value of empty cells while numbers are fetched; real values are never negative."""
 
 
-def _place(column: Any, words: Sequence[str]) -> ColumnElement[int]:
-    return case({word: place for place, word in enumerate(words)}, value=column, else_=-1)
+def _index(column: Any, values: Sequence[str]) -> ColumnElement[int]:
+    """Return the SQL expression of the index of a cell in ``values``, -1 if it is not in them."""
+    return case({value: index for index, value in enumerate(values)}, value=column, else_=-1)
 
 
 def _or_absent(column: Any) -> ColumnElement[Any]:
-    # Of the column's own type: PostgreSQL would make decimals of both, which are slow.
+    """Return the SQL expression of a column with `_ABSENT` in place of NULL."""
+    # Of the column's own type, else PostgreSQL would convert both to slow decimals.
     return func.coalesce(column, _ABSENT if isinstance(column.type, Float) else int(_ABSENT))
 
 
 _NUMBERS: dict[str, Any] = {
-    "phase": _place(ANSWERS.c.phase, PHASES),
+    "phase": _index(ANSWERS.c.phase, PHASES),
     "trial": ANSWERS.c.trial,
-    "response": _place(ANSWERS.c.response, _RESPONSES),
+    "response": _index(ANSWERS.c.response, _RESPONSES),
     "rt_ms": ANSWERS.c.rt_ms,
-    "input": _place(ANSWERS.c.input, _INPUTS),
+    "input": _index(ANSWERS.c.input, _INPUTS),
     "fixation_ms": _or_absent(ANSWERS.c.fixation_ms),
     "cue_ms": _or_absent(ANSWERS.c.cue_ms),
     "frames_expected": ANSWERS.c.frames_expected,
@@ -73,29 +84,41 @@ _NUMBERS: dict[str, Any] = {
     "resumed": cast(ANSWERS.c.resumed, Integer),
     "answered_at": ANSWERS.c.answered_at,
 }
-"""All of an answer but names: fetched as numbers, which is several times as fast as text."""
-_WORDS = {"phase": PHASES, "response": _RESPONSES, "input": _INPUTS}
+"""Columns of an answer that are fetched as numbers, several times faster than as text."""
+_CHOICES = {"phase": PHASES, "response": _RESPONSES, "input": _INPUTS}
 
 
 def read_trials(
     connection: Connection, study: Study, sessions: pa.Table, *, details: bool = False
-) -> Iterator[Trials]:
-    """The answers of all ``sessions`` of a table of `read_sessions`, some sessions at a time."""
+) -> Iterator[TrialBatch]:
+    """Yield the answers of a batch of sessions at a time, in the order of ``sessions``.
+
+    Parameters
+    ----------
+    connection
+        Connection of `snapshot`.
+    study
+        The study, for the labels of its stimuli.
+    sessions
+        Table of `read_sessions`.
+    details
+        Whether to read the measured details of each trial too.
+    """
     known = _Stimuli(study.stimuli)
     names = sessions.column("session").to_pylist()
     for first in range(0, len(names), AT_ONCE):
         chosen = range(first, min(first + AT_ONCE, len(names)))
         rows = _fetch(connection, [names[at] for at in chosen], details)
-        own = sessions.slice(first, len(chosen)).combine_chunks()
-        yield _trials(chosen, own, rows, known, details)
+        batch = sessions.slice(first, len(chosen)).combine_chunks()
+        yield _trials(chosen, batch, rows, known, details)
 
 
 def _fetch(connection: Connection, names: Sequence[str], details: bool) -> list[tuple[Any, ...]]:
-    """Rows of session, stimulus, details if asked for, and `_NUMBERS`."""
+    """Fetch rows of session, stimulus, details (if requested) and `_NUMBERS`."""
     texts = [ANSWERS.c.session, ANSWERS.c.stimulus, *([ANSWERS.c.details] if details else [])]
     query = select(*texts, *_NUMBERS.values()).where(ANSWERS.c.session.in_(names))
     text = query.compile(dialect=connection.dialect, compile_kwargs={"literal_binds": True})
-    # The driver's own rows: a row object of the library for each answer would double the time.
+    # Plain rows of the driver: SQLAlchemy's row objects would double the time.
     binary = {"binary": True} if connection.dialect.name == "postgresql" else {}
     cursor = connection.connection.cursor(**binary)
     try:
@@ -106,10 +129,10 @@ def _fetch(connection: Connection, names: Sequence[str], details: bool) -> list[
 
 
 class _Stimuli:
-    """What the study folder knows of each stimulus of each scenario, as arrays."""
+    """Names, labels and looks of all stimuli as arrays, and their indices by name."""
 
     def __init__(self, stimuli: Sequence[Stimulus]) -> None:
-        self.places = {(s.scenario, s.stimulus): place for place, s in enumerate(stimuli)}
+        self.indices = {(s.scenario, s.stimulus): index for index, s in enumerate(stimuli)}
         self.names = pa.array([s.stimulus for s in stimuli], pa.string())
         self.labels = np.array([s.label for s in stimuli], dtype=bool)
         self.looks = np.array([LOOKS.index(s.look) for s in stimuli], dtype=np.int64)
@@ -121,29 +144,29 @@ def _trials(
     rows: list[tuple[Any, ...]],
     known: _Stimuli,
     details: bool,
-) -> Trials:
+) -> TrialBatch:
+    """Convert fetched rows to a sorted table; answers to unknown stimuli are left out."""
     texts = 3 if details else 2
     ranks = {name: rank for rank, name in enumerate(sessions.column("session").to_pylist())}
     scenarios = sessions.column("scenario").to_pylist()
     rank = np.array([ranks[row[0]] for row in rows], dtype=np.int64)
-    place = np.array(
-        [known.places.get((scenarios[ranks[row[0]]], row[1]), -1) for row in rows], dtype=np.int64
+    stimulus = np.array(
+        [known.indices.get((scenarios[ranks[row[0]]], row[1]), -1) for row in rows], dtype=np.int64
     )
-    unknown = tuple(rows[at][1] for at in np.flatnonzero(place < 0))
+    unknown = tuple(rows[at][1] for at in np.flatnonzero(stimulus < 0))
     flat = chain.from_iterable(row[texts:] for row in rows)
     width = len(_NUMBERS)
     numbers = np.fromiter(flat, np.float64, len(rows) * width).reshape(-1, width).T
-    found = dict(zip(_NUMBERS, numbers, strict=True))
-    order = np.lexsort((found["trial"], found["phase"], rank))
-    order = order[place[order] >= 0]
-    found = {name: values[order] for name, values in found.items()}
-    rank, place = rank[order], place[order]
-    words = pa.array([rows[at][2] for at in order], pa.string()) if details else None
-    return Trials(
+    values = dict(zip(_NUMBERS, numbers, strict=True))
+    order = np.lexsort((values["trial"], values["phase"], rank))
+    order = order[stimulus[order] >= 0]
+    values = {name: column[order] for name, column in values.items()}
+    rank, stimulus = rank[order], stimulus[order]
+    return TrialBatch(
         sessions=chosen,
-        table=_trial_table(sessions, rank, known, place, found),
+        table=_trial_table(sessions, rank, known, stimulus, values),
         counts=np.bincount(rank, minlength=len(chosen)).astype(np.int64),
-        details=words,
+        details=pa.array([rows[at][2] for at in order], pa.string()) if details else None,
         unknown=unknown,
     )
 
@@ -152,29 +175,44 @@ def _trial_table(
     sessions: pa.Table,
     rank: npt.NDArray[np.int64],
     known: _Stimuli,
-    place: npt.NDArray[np.int64],
-    found: dict[str, npt.NDArray[np.float64]],
+    stimulus: npt.NDArray[np.int64],
+    values: dict[str, npt.NDArray[np.float64]],
 ) -> pa.Table:
+    """Return the table of trials from fetched numbers.
+
+    Parameters
+    ----------
+    sessions
+        Rows of the sessions of this batch.
+    rank
+        Index of the session of each answer.
+    known
+        The stimuli of the study.
+    stimulus
+        Index of the stimulus of each answer.
+    values
+        Columns of `_NUMBERS`.
+    """
     of_session = sessions.select(["participant", "session", "scenario", "simulated", "buttons"])
     of_session = of_session.take(pa.array(rank))
-    label = known.labels[place]
+    label = known.labels[stimulus]
     columns: dict[str, Any] = {name: of_session.column(name) for name in of_session.column_names}
     columns |= {
-        "stimulus": known.names.take(pa.array(place)),
+        "stimulus": known.names.take(pa.array(stimulus)),
         "label": pa.array(label),
-        "correct": pa.array((found["response"] == _RESPONSES.index("yes")) == label),
-        "look": pa.array(LOOKS).take(pa.array(known.looks[place])),
-        "answered_at": iso_times(found["answered_at"]),
-        "resumed": pa.array(found["resumed"] != 0),
+        "correct": pa.array((values["response"] == _RESPONSES.index("yes")) == label),
+        "look": pa.array(LOOKS).take(pa.array(known.looks[stimulus])),
+        "answered_at": iso_times(values["answered_at"]),
+        "resumed": pa.array(values["resumed"] != 0),
     }
-    for name, words in _WORDS.items():
-        places = found[name].astype(np.int64)
-        columns[name] = pa.array(words).take(pa.array(places, mask=places < 0))
+    for name, choices in _CHOICES.items():
+        indices = values[name].astype(np.int64)
+        columns[name] = pa.array(choices).take(pa.array(indices, mask=indices < 0))
     for column in TRIAL_COLUMNS:
         if column.name not in columns:
-            values = found[column.name]
-            absent = None if column.name == "rt_ms" else values == _ABSENT
-            whole = values.astype(np.int64) if column.kind == "integer" else values
-            columns[column.name] = pa.array(whole, mask=absent)
+            cells = values[column.name]
+            absent = None if column.name == "rt_ms" else cells == _ABSENT
+            typed = cells.astype(np.int64) if column.kind == "integer" else cells
+            columns[column.name] = pa.array(typed, mask=absent)
     ordered = {column.name: columns[column.name] for column in TRIAL_COLUMNS}
     return pa.table(ordered, arrow_schema(TRIAL_COLUMNS))

@@ -1,4 +1,4 @@
-"""One table as CSV and as parquet, written part by part; the same rows give the same bytes."""
+"""Writer of one table as CSV and parquet, in batches; the same rows give the same bytes."""
 
 from __future__ import annotations
 
@@ -16,15 +16,26 @@ from physion.experiment.export.arrow_types import arrow_schema
 from physion.experiment.export.spreadsheet import guard_cell
 
 NAMES = frozenset({"participant", "session", "scenario", "stimulus", "kind"})
-"""Text columns whose values are hashes or made of letters, digits and ._+-, so that they are never
-taken for formulas: they stay as they are."""
+"""Text columns that need no protection against formulas: their values are hashes or consist of
+letters, digits and ._+- and start with a letter or digit."""
 
 
-class TableFiles:
-    """Writes ``NAME.csv`` and ``NAME.parquet`` in a folder; a context manager.
+class TableWriter:
+    """Context manager that writes ``NAME.csv`` and ``NAME.parquet`` in a folder.
 
-    CSV: UTF-8, a header, lines that end in LF; text is guarded (`guard_cell`), and quoted wherever
-    the table has free text at all. Empty cells are empty. Parquet: Zstandard, empty cells null.
+    CSV: UTF-8 with a header and LF line ends; free text is protected by `guard_cell` and quoted
+    where needed. Parquet: Zstandard compression; empty cells are null.
+
+    Parameters
+    ----------
+    folder, name
+        Folder, and name of the files without ending.
+    columns
+        Columns of the table.
+    with_csv
+        Whether to write the CSV file too.
+    level
+        Compression level of the parquet file.
     """
 
     def __init__(
@@ -48,7 +59,7 @@ class TableFiles:
                     schema,
                     compression="zstd",
                     compression_level=level,
-                    # A dictionary of texts that are all different only costs.
+                    # No dictionary for free texts, which hardly ever repeat.
                     use_dictionary=[c.name for c in columns if c.name not in self._texts],
                 )
             )
@@ -63,21 +74,22 @@ class TableFiles:
             self._stack = opened.pop_all()
 
     def write(self, table: pa.Table) -> None:
-        """Add rows."""
+        """Append rows."""
         self.rows += table.num_rows
         self._parquet.write_table(table)
         if self._csv is not None:
             self._csv.write_table(self._guarded(table))
 
     def _guarded(self, table: pa.Table) -> pa.Table:
+        """Return the table with its free texts protected by `guard_cell`."""
         for name in self._texts:
             cells = table.column(name).to_pylist()
             guarded = [None if cell is None else guard_cell(cell) for cell in cells]
-            place = table.schema.get_field_index(name)
-            table = table.set_column(place, name, pa.array(guarded, pa.string()))
+            index = table.schema.get_field_index(name)
+            table = table.set_column(index, name, pa.array(guarded, pa.string()))
         return table
 
-    def __enter__(self) -> TableFiles:
+    def __enter__(self) -> TableWriter:
         return self
 
     def __exit__(

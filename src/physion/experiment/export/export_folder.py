@@ -1,4 +1,4 @@
-"""A folder of exported files that is there whole or not at all, and replaces only its own kind."""
+"""Atomic creation of an export folder, which replaces an older export but nothing else."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from physion.errors import BadInputError
 MANIFEST = "export.json"
 FORMAT = "physion experiment export"
 _SECRET = 0o700
-"""Others on the machine do not read what people answered."""
+"""Mode of the folder: other users of the machine must not read the answers."""
 
 
 @contextlib.contextmanager
-def whole_folder(out: Path) -> Iterator[Path]:
-    """A folder to write into, which becomes ``out`` once all is on the disk.
+def atomic_folder(out: Path) -> Iterator[Path]:
+    """Yield a temporary folder, which is renamed to ``out`` when everything is on disk.
 
-    What is written must hold `MANIFEST` by `write_manifest`. An ``out`` that is there is replaced
-    where it is an export that nobody added anything to, or empty; `BadInputError` otherwise.
+    The caller must finish with `write_manifest`. An existing ``out`` is replaced if it is empty or
+    an unchanged export; otherwise `BadInputError` is raised.
     """
     out = Path(os.path.abspath(out))  # noqa: PTH100 - resolve() would follow a link
     out.parent.mkdir(parents=True, exist_ok=True)
     part, old = (out.with_name(f".{out.name}.{ending}") for ending in ("part", "old"))
     for path in (part, old):
         if path.is_symlink() or (path.exists() and not path.is_dir()):
-            raise BadInputError(f"{path} is in the way; take it away")
+            raise BadInputError(f"{path} is a link or not a folder; remove it")
     part.mkdir(mode=_SECRET, exist_ok=True)
     with folder_lock(part):
         _tidy(out, old)
@@ -48,14 +48,14 @@ def whole_folder(out: Path) -> Iterator[Path]:
 
 
 def write_manifest(folder: Path, facts: dict[str, Any]) -> None:
-    """Write `MANIFEST`: ``facts`` and which files there are. It is written last."""
+    """Write `MANIFEST` with ``facts`` and a summary of the files; must be called last."""
     manifest = {"format": FORMAT, **facts, **_contents(folder)}
     text = json.dumps(manifest, indent=2, ensure_ascii=False)
     (folder / MANIFEST).write_text(text + "\n", encoding="utf-8")
 
 
 def _contents(folder: Path) -> dict[str, Any]:
-    """How many files and folders there are but the manifest, and a hash of their names."""
+    """Return the number of files and folders besides the manifest, and a hash of their names."""
     names = []
     for at, folders, files in os.walk(folder):
         inside = Path(at).relative_to(folder)
@@ -66,11 +66,11 @@ def _contents(folder: Path) -> dict[str, Any]:
 
 
 def _refuse_others(out: Path) -> None:
-    """`BadInputError` where replacing ``out`` would delete what is not ours."""
+    """Raise `BadInputError` if replacing ``out`` would delete anything but an export."""
     if not out.is_symlink() and not out.exists():
         return
     if out.is_symlink() or not out.is_dir():
-        raise BadInputError(f"{out} is no folder; choose another one with --out")
+        raise BadInputError(f"{out} is not a folder; choose another one with --out")
     if not any(out.iterdir()):
         return
     try:
@@ -79,17 +79,16 @@ def _refuse_others(out: Path) -> None:
     except (OSError, ValueError, RecursionError):
         ours = False
     if not ours:
-        raise BadInputError(f"{out} holds something else; choose another folder with --out")
-    found = _contents(out)
-    if any(manifest.get(name) != value for name, value in found.items()):
+        raise BadInputError(f"{out} contains something else; choose another folder with --out")
+    if any(manifest.get(name) != value for name, value in _contents(out).items()):
         raise BadInputError(
             f"{out} is an export to which files were added, or of which some are missing; move "
-            "your own away, or choose another folder with --out"
+            "your files elsewhere, or choose another folder with --out"
         )
 
 
 def _tidy(out: Path, old: Path) -> None:
-    """Undo what an export that was killed while it swapped folders has left."""
+    """Restore or remove the old folder that an export left when killed during the swap."""
     if not old.exists():
         return
     if out.exists():
@@ -99,6 +98,7 @@ def _tidy(out: Path, old: Path) -> None:
 
 
 def _empty(folder: Path) -> None:
+    """Delete the content of a folder except its lock."""
     for entry in folder.iterdir():
         if entry.name == ".lock":
             continue
@@ -109,7 +109,7 @@ def _empty(folder: Path) -> None:
 
 
 def _sync_all(folder: Path) -> None:
-    """Bring everything to the disk: at once, since a call for each of 10,000 files takes long."""
+    """Flush all files to disk, with one system call, since 10,000 single ones would be slow."""
     if hasattr(os, "sync"):
         os.sync()
         return
@@ -120,16 +120,17 @@ def _sync_all(folder: Path) -> None:
 
 
 def _swap(part: Path, out: Path, old: Path) -> None:
+    """Rename ``part`` to ``out``; an existing ``out`` is moved to ``old`` and then deleted."""
     (part / ".lock").unlink(missing_ok=True)
-    there = out.exists()
-    if there:
+    replaces = out.exists()
+    if replaces:
         out.rename(old)
     try:
         part.rename(out)
     except BaseException:
-        if there:
+        if replaces:
             old.rename(out)
         raise
     sync_folder(out.parent)
-    if there:
+    if replaces:
         shutil.rmtree(old)

@@ -1,4 +1,4 @@
-"""The large tables of an export, written part by part while the next part is read."""
+"""Writing of the large tables of an export, in batches, while the next batch is being read."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ import pyarrow.compute as pc
 from sqlalchemy import Connection
 
 from physion.analysis.people.response_schema import SESSION_COLUMNS, TRIAL_COLUMNS
-from physion.experiment.export.bids import BidsFolder
+from physion.experiment.export.bids import BidsWriter
 from physion.experiment.export.descriptions import STIMULI_COLUMNS
-from physion.experiment.export.further_tables import (
+from physion.experiment.export.event_tables import (
     DETAIL_COLUMNS,
     EVENT_COLUMNS,
     detail_table,
     read_events,
 )
-from physion.experiment.export.session_rows import Sessions
-from physion.experiment.export.table_files import TableFiles
-from physion.experiment.export.trial_rows import Trials, read_trials
+from physion.experiment.export.session_rows import SessionTable
+from physion.experiment.export.table_writer import TableWriter
+from physion.experiment.export.trial_rows import TrialBatch, read_trials
 from physion.experiment.study.study import Study
 
 WAITING = 2
-"""Parts that may wait for being written, so that memory stays bounded."""
+"""Maximum number of batches waiting to be written, which bounds the memory."""
 TABLES = {
     "trials": TRIAL_COLUMNS,
     "sessions": SESSION_COLUMNS,
@@ -39,8 +39,8 @@ TABLES = {
 
 
 @dataclass(frozen=True)
-class Written:
-    """Rows by table, answers to stimuli that are gone, and the last moment in the data."""
+class WrittenTables:
+    """Rows by table, answers whose stimuli no longer exist, and the latest time in the data."""
 
     rows: dict[str, int]
     gone: int
@@ -51,22 +51,36 @@ def write_tables(
     folder: Path,
     connection: Connection,
     study: Study,
-    sessions: Sessions,
-    bids: BidsFolder | None,
-) -> Written:
-    """Writes trials, sessions, events and details, in one go through the answers."""
+    sessions: SessionTable,
+    bids: BidsWriter | None,
+) -> WrittenTables:
+    """Write trials, sessions, events and details in one pass over the answers.
+
+    Parameters
+    ----------
+    folder
+        Folder of the tables.
+    connection
+        Connection of `snapshot`.
+    study
+        The study.
+    sessions
+        The sessions to export.
+    bids
+        Writer of the BIDS dataset, if there is to be one.
+    """
     gone = 0
     latest = [_latest(sessions.table, column) for column in ("started_at", "finished_at")]
     with ExitStack() as stack:
         files = {
-            name: stack.enter_context(TableFiles(folder, name, TABLES[name]))
+            name: stack.enter_context(TableWriter(folder, name, TABLES[name]))
             for name in ("trials", "sessions", "events")
         }
         details = stack.enter_context(
-            TableFiles(folder, "trial_details", DETAIL_COLUMNS, with_csv=False, level=1)
+            TableWriter(folder, "trial_details", DETAIL_COLUMNS, with_csv=False, level=1)
         )
 
-        def write(part: Trials) -> None:
+        def write(part: TrialBatch) -> None:
             files["trials"].write(part.table)
             details.write(detail_table(part))
             if bids is not None:
@@ -75,34 +89,34 @@ def write_tables(
         files["sessions"].write(sessions.table)
         for events in read_events(connection, sessions.table):
             files["events"].write(events)
-        with _Behind(write) as behind:
+        with _BackgroundWriter(write) as behind:
             for part in read_trials(connection, study, sessions.table, details=True):
                 gone += len(part.unknown)
                 latest.append(_latest(part.table, "answered_at"))
                 behind(part)
         rows = {name: file.rows for name, file in (*files.items(), ("trial_details", details))}
-    return Written(rows, gone, max(latest) or None)
+    return WrittenTables(rows, gone, max(latest) or None)
 
 
 def _latest(table: pa.Table, column: str) -> str:
-    """The last moment of a column; empty where it has none."""
+    """Return the latest time in a column, or an empty text."""
     return str(pc.max(table.column(column)).as_py() or "")
 
 
-class _Behind:
-    """Calls a function in one other thread, in order, while this one fetches what comes next."""
+class _BackgroundWriter:
+    """Calls a function in order in a background thread, while this thread reads the next batch."""
 
-    def __init__(self, function: Callable[[Trials], None]) -> None:
+    def __init__(self, function: Callable[[TrialBatch], None]) -> None:
         self._function = function
         self._pool = ThreadPoolExecutor(1)
         self._waiting: deque[Future[None]] = deque()
 
-    def __call__(self, part: Trials) -> None:
+    def __call__(self, part: TrialBatch) -> None:
         self._waiting.append(self._pool.submit(self._function, part))
         while len(self._waiting) > WAITING:
             self._waiting.popleft().result()
 
-    def __enter__(self) -> _Behind:
+    def __enter__(self) -> _BackgroundWriter:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
