@@ -21,7 +21,7 @@ from physion.analysis.tables.stimuli import MEAN
 from physion.report.figures import by_scenario as figures
 from physion.report.figures import by_stimulus as figures_stimuli
 from physion.report.figures import figure_tables, theme
-from physion.report.figures.plots import plots
+from physion.report.figures.registry import make_plots
 from physion.report.inputs import ReportInputs
 from physion.report.mixed_fits import fits_of_models
 from physion.report.page import blocks
@@ -176,7 +176,7 @@ def test_one_condition_alone_makes_no_figure(make_comparison: Maker) -> None:
     comparison, predictions = trained(make_comparison, ["all", "all"])
     assert figure_tables.effects_table(comparison, predictions).empty
     assert figure_tables.generalization_table(comparison, predictions).empty
-    names = {plot.name for plot in plots(ReportInputs(comparison, predictions=predictions))}
+    names = {plot.name for plot in make_plots(ReportInputs(comparison, predictions=predictions))}
     assert names == {"accuracy", "r", "scatter", "thirds", "calibration", "difficulty"}
 
 
@@ -230,7 +230,7 @@ def test_panels_inside_have_neither_ticks_nor_numbers(make_comparison: Maker) ->
 
 def pictures(inputs: ReportInputs) -> list[Picture]:
     blank = {"svg": b"<svg/>", "png": b""}
-    return [Picture(plot.name, blank, blank, plot.words) for plot in plots(inputs)]
+    return [Picture(plot.name, blank, blank, plot.words) for plot in make_plots(inputs)]
 
 
 def test_page_and_figures_call_a_model_by_one_name(make_comparison: Maker) -> None:
@@ -306,7 +306,7 @@ def test_marks_stand_out_from_the_paper(look: theme.Theme) -> None:
 
 @pytest.mark.parametrize("with_people", [True, False])
 def test_figures_are_sound_files(make_comparison: Maker, with_people: bool) -> None:
-    for plot in plots(ReportInputs(make_comparison(with_people=with_people))):
+    for plot in make_plots(ReportInputs(make_comparison(with_people=with_people))):
         figure = plot.draw(plot.table, theme.LIGHT)
         assert ElementTree.fromstring(theme.figure_bytes(figure, "svg")).tag.endswith("svg")
         image = Image.open(io.BytesIO(theme.figure_bytes(figure, "png")))
@@ -315,7 +315,7 @@ def test_figures_are_sound_files(make_comparison: Maker, with_people: bool) -> N
 
 def test_bytes_repeat(make_comparison: Maker) -> None:
     def draw(kind: str) -> list[bytes]:
-        found = plots(ReportInputs(make_comparison()))
+        found = make_plots(ReportInputs(make_comparison()))
         return [theme.figure_bytes(plot.draw(plot.table, theme.DARK), kind) for plot in found[:2]]
 
     assert draw("svg") == draw("svg")

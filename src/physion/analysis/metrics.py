@@ -225,7 +225,8 @@ class Metric:
 
     - ``name``: its column and its value of ``measure``;
     - ``compute``: from a `Sample` to values (b, m); undefined is NaN;
-    - ``label``: its name in tables of the report, ``heading`` in the report's table of scores;
+    - ``label``: its name in tables of the report (empty: the report leaves it out), ``heading`` in
+      the report's table of scores;
     - ``definition``: one sentence for the report;
     - ``better``: which values are better; ``zero``: those nearest to 0; empty: none is;
     - ``needs``: ``outcome`` (of the trials), ``people`` (their averages by stimulus) or
@@ -430,7 +431,7 @@ def rmsd(sample: Sample) -> Array:
 
 @register_metric(
     "euclid_over_n",
-    label="RMSD / √stimuli",
+    label="",
     definition="RMSD divided by the square root of the number of stimuli: the “RMSE” of the "
     "released notebooks",
     better="lower",

@@ -31,7 +31,7 @@ from physion.report.assembly import (
     people_in_words,
     with_participants,
 )
-from physion.report.figures.plots import plots
+from physion.report.figures.registry import make_plots
 from physion.report.inputs import ReportInputs
 from physion.report.page.movies import check_movies
 from physion.report.page.page import render_page
@@ -61,7 +61,7 @@ def build_report(inputs: ReportInputs, folder: Path) -> Path:
     pictures = prepare_folder(folder)
     for name, table in inputs.tables().items():
         write_csv(folder / "tables" / f"{name}.csv", table)
-    shown = [write_plot(plot, pictures) for plot in plots(inputs)]
+    shown = [write_plot(plot, pictures) for plot in make_plots(inputs)]
     text = json.dumps(report_numbers(inputs), indent=1, ensure_ascii=False, allow_nan=False)
     write_atomic(folder / "report.json", f"{text}\n".encode())
     page = folder / "report.html"

@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     from physion.analysis.tables.leaderboard import Leaderboard
 
 SHOWN = ("rank", "model", "readout", "training", "scenarios", "stimuli")
-SCORES = ("accuracy", "r", "kappa", "rmsd")
-"""Columns on the console, then the versions and the file; those without a value are left out."""
+"""Columns on the console before the metrics, the versions and the file."""
 
 
 @dataclass(frozen=True)
@@ -131,10 +130,13 @@ def _write(board: Leaderboard, record: dict[str, Any], folder: Path) -> None:
 
 
 def _print(table: pd.DataFrame) -> None:
+    from physion.analysis.metrics import leaderboard_metrics
     from physion.cli.output import console
     from physion.cli.text_table import text_table
 
-    shown = table[[*SHOWN, *SCORES, "versions", "file"]].copy()
+    # To keep lines short: the difference is accuracy less that of people.
+    metrics = [one.name for one in leaderboard_metrics() if one.name != "difference"]
+    shown = table[[*SHOWN, *metrics, "versions", "file"]].copy()
     for name in ("scenarios", "stimuli"):
         shown[name] = [
             f"{row[name]}"
@@ -142,7 +144,7 @@ def _print(table: pd.DataFrame) -> None:
             else f"{row[name]} of {row[f'of_{name}']}"
             for row in table.to_dict("records")
         ]
-    for name in SCORES:
+    for name in metrics:
         shown[name] = [_interval(row, name) for row in table.to_dict("records")]
     empty = [name for name in shown.columns if shown[name].isin(["", None]).all()]
     text = text_table(shown.drop(columns=empty))

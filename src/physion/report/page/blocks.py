@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 import pandas as pd
 
+from physion.analysis.metrics import Metric, score_metrics
 from physion.analysis.models.comparison import Comparison
 from physion.analysis.tables.stimuli import MEAN, POOLED, in_order
 from physion.report.words import number, plural
@@ -121,26 +122,38 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]], caption: str = "
     )
 
 
+def shown_metrics(comparison: Comparison) -> list[Metric]:
+    """Return the metrics of the table of scores that say something about this comparison.
+
+    Without people those that need them are left out, and those about simulated outcomes if all
+    simulated outcomes are the official ones.
+    """
+    simulated = ("accuracy_simulated", "r_same")
+    return [
+        metric
+        for metric in score_metrics()
+        if (comparison.has_people or metric.needs == "outcome")
+        and not (comparison.changed.empty and metric.name in simulated)
+    ]
+
+
 def overall_table(comparison: Comparison, which: str, caption: str = "") -> str:
     """A row a model: accuracy against both outcomes, beside people; r with its ceiling; RMSD.
 
     What is about simulated outcomes is absent where they all are the official ones.
     """
     rows = comparison.scores[comparison.scores["scenario"] == which]
-    shown = {"accuracy": "accuracy", "accuracy_simulated": "against simulated outcome"}
-    if comparison.has_people:
-        shown |= {"human_accuracy": "people", "difference": "difference", "r": "Pearson r",
-                  "r_same": "r, same outcome"}  # fmt: skip
-    if comparison.changed.empty:
-        shown = {k: v for k, v in shown.items() if k not in ("accuracy_simulated", "r_same")}
-    header = ["model", "readout", "stimuli", *shown.values()]
-    header += ["ceiling of r", "RMSD"] if comparison.has_people else []
+    shown = shown_metrics(comparison)
+    header = ["model", "readout", "stimuli", *(metric.heading for metric in shown)]
+    ceiling = header.index("RMSD") if comparison.has_people else None
+    if ceiling is not None:
+        header.insert(ceiling, "ceiling of r")
     cells = []
     for _, row in rows.iterrows():
         line = [escape(_model_words(row)), escape(row["readout"]), str(row["stimuli"])]
-        line += [interval(row, key) for key in shown]
-        if comparison.has_people:
-            line += [number(row["ceiling"]), interval(row, "rmsd")]
+        line += [interval(row, metric.name) for metric in shown]
+        if ceiling is not None:
+            line.insert(ceiling, number(row["ceiling"]))
         cells.append(line)
     reasons = [
         f"<li>{escape(row['agent'])}: {escape(row['reason'])}</li>"
@@ -212,22 +225,12 @@ def people(comparison: Comparison) -> str:
 
 def definitions(comparison: Comparison) -> str:
     """What the columns mean; those that are hidden, see `overall_table`, are not explained."""
-    meaning = {
-        "accuracy": "share of the model's answers that equal the official outcome; people: mean "
-        "over stimuli of the share who are right, on the same stimuli",
-        "against simulated outcome": "the same answers against the outcome of the trial as it was "
-        "simulated for the model",
-        "Pearson r": "correlation over stimuli of P(contact) with the share of people who say yes, "
-        "that is, with the average person; “same outcome”: without the stimuli whose simulated "
-        "outcome is not the official one, as there people and model saw different events",
-        "RMSD": "root of the mean squared difference of these two",
-        "NaN": "undefined; the reason stands below the table or shows on hovering",
+    meaning = {metric.heading: metric.definition for metric in shown_metrics(comparison)}
+    meaning |= {
+        "NaN": "undefined; the reason is below the table or shown on hovering",
         "all, all-but, only": "a model's training: on all scenarios, on all but the tested one, on "
         "the tested one alone; in the files the last two are “all but this” and “same”",
     }
-    if comparison.changed.empty:
-        del meaning["against simulated outcome"]
-        meaning["Pearson r"] = meaning["Pearson r"].partition(";")[0]
     return f"<h3>What the numbers mean</h3>{words_list(meaning)}"
 
 

@@ -8,6 +8,7 @@ from html import escape
 from pathlib import Path
 
 from physion.analysis.tables.stimuli import MEAN, POOLED, in_order
+from physion.report.figures.registry import BY_SCENARIO, BY_STIMULUS, TRAINING, all_figures
 from physion.report.inputs import EXPECTED_METHODS, ReportInputs
 from physion.report.page import blocks, people_blocks, session_blocks, tests_of_models
 from physion.report.page.document import Picture, Section, figure, render_document
@@ -27,9 +28,9 @@ def render_page(
     links = _links(inputs, folder)
     sections = [
         Section("Scores", _scores(inputs)),
-        Section("By scenario", _by_scenario(inputs, shown)),
-        Section("Readout and training", _training(inputs, shown)),
-        Section("Stimulus by stimulus", _stimuli(inputs, shown, links)),
+        Section(BY_SCENARIO, _by_scenario(inputs, shown)),
+        Section(TRAINING, _figures(TRAINING, shown, {})),
+        Section(BY_STIMULUS, _stimuli(inputs, shown, links)),
         Section("Where model and people differ most", _gaps(inputs)),
         Section("People", people_blocks.people(inputs, shown)),
         Section("Sessions left out", session_blocks.sessions(inputs)),
@@ -90,42 +91,34 @@ def _scores(inputs: ReportInputs) -> str:
     )
 
 
+def _figures(section: str, shown: Mapping[str, str], below: Mapping[str, str]) -> str:
+    """Return the figures of a section with their headings; ``below``: HTML below a figure."""
+    parts = []
+    for entry in all_figures():
+        if entry.section == section and entry.name in shown:
+            parts += [f"<h3>{escape(entry.heading)}</h3>"] if entry.heading else []
+            parts += [shown[entry.name], below.get(entry.name, "")]
+    return "\n".join(part for part in parts if part)
+
+
 def _by_scenario(inputs: ReportInputs, shown: Mapping[str, str]) -> str:
     comparison = inputs.comparison
-    parts = ["<h3>Accuracy</h3>", shown["accuracy"]]
-    parts.append(blocks.details("Accuracy as a table", blocks.matrix(comparison, "accuracy")))
-    if "r" in shown:
-        parts += ["<h3>Correlation with the average person</h3>", shown["r"]]
-        parts.append(
-            blocks.details("Pearson r by scenario, as a table", blocks.matrix(comparison, "r"))
+    below = {
+        "accuracy": blocks.details("Accuracy as a table", blocks.matrix(comparison, "accuracy")),
+        "kappa": people_blocks.measures(inputs),
+    }
+    if comparison.has_people:
+        below["r"] = blocks.details(
+            "Pearson r by scenario, as a table", blocks.matrix(comparison, "r")
         )
-    if "kappa" in shown:
-        parts += ["<h3>Agreement with single participants</h3>", shown["kappa"]]
-        parts.append(people_blocks.measures(inputs))
-    return "\n".join(parts)
-
-
-def _training(inputs: ReportInputs, shown: Mapping[str, str]) -> str:
-    parts = [shown[name] for name in ("effects", "generalization") if name in shown]
-    return "\n".join(parts)
+    return _figures(BY_SCENARIO, shown, below)
 
 
 def _stimuli(inputs: ReportInputs, shown: Mapping[str, str], links: Mapping[str, str]) -> str:
-    parts = []
-    for name, heading in (
-        ("scatter", "Models against people"),
-        ("thirds", "Hard, chance and easy stimuli"),
-        ("calibration", "Calibration of P(contact)"),
-    ):
-        if name in shown:
-            parts += [f"<h3>{heading}</h3>", shown[name]]
-    parts.append(tests_of_models.calibration(inputs))
-    if "difficulty" in shown:
-        parts += ["<h3>Stimuli that fool people</h3>", shown["difficulty"]]
-        parts.append(people_blocks.fooled(inputs, links))
-    if "response_time" in shown:
-        parts += ["<h3>Response times</h3>", shown["response_time"]]
-    return "\n".join(parts)
+    below = {"calibration": tests_of_models.calibration(inputs)}
+    if inputs.comparison.has_people:
+        below["difficulty"] = people_blocks.fooled(inputs, links)
+    return _figures(BY_STIMULUS, shown, below)
 
 
 def _gaps(inputs: ReportInputs) -> str:

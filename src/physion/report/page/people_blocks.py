@@ -8,6 +8,7 @@ from html import escape
 import numpy as np
 import pandas as pd
 
+from physion.analysis.metrics import measure_metrics
 from physion.analysis.people.difficulty import below_chance
 from physion.analysis.people.hypotheses import HYPOTHESES
 from physion.analysis.tables.stimuli import MEAN, in_order
@@ -17,16 +18,6 @@ from physion.report.page.blocks import people as averages
 from physion.report.words import number
 
 MORE = "every scenario, and why an interval is missing, is in tables/measures.csv"
-
-_MEASURES = {
-    "accuracy": "accuracy",
-    "difference": "accuracy less people's",
-    "r": "r",
-    "rmsd": "RMSD",
-    "kappa": "kappa",
-    "kappa_gap": "kappa less people's",
-    "error_consistency": "error consistency",
-}
 
 
 def people(inputs: ReportInputs, shown: Mapping[str, str]) -> str:
@@ -177,8 +168,9 @@ def measures(inputs: ReportInputs) -> str:
     if inputs.beside is None:
         return ""
     scores = inputs.beside.scores
-    rows = scores[scores["measure"].isin(_MEASURES)]
-    rows = rows.assign(measure=rows["measure"].map(_MEASURES))
+    labels = {metric.name: metric.label for metric in measure_metrics()}
+    rows = scores.assign(measure=scores["measure"].map(labels))
+    rows = rows[rows["measure"] != ""]
     columns = [
         Column("model", "model", "text"), Column("scenario", "scenario", "text"),
         Column("measure", "measure", "text"), Column("stimuli", "stimuli", "count"),
