@@ -1,1 +1,1 @@
-"""One file per verb of the command line."""
+"""Command line: one module per verb."""

@@ -1,4 +1,4 @@
-"""Check this machine: versions, cores, memory, GPU, codecs, write access; say what to install."""
+"""Check this machine: versions, cores, memory, GPU, codecs, write access; print what to install."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ CORE = (
 
 @dataclass(frozen=True)
 class Options:
-    """What to check."""
+    """Options of ``physion doctor``."""
 
     folder: Path = Path()
-    """Where trials would be written."""
+    """Folder whose write access is checked."""
     reproduce: bool = False
-    """Also make a known trial of each scenario and compare its bytes with those of this version."""
+    """Also generate a known trial of each scenario and compare it with its known digests."""
     json: bool = False
     """Print one JSON object instead of lines."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """One line of the answer. ``remedy`` is the line that mends it, empty when all is well."""
+    """Result of one check; ``remedy`` is a command or advice, empty where nothing is wrong."""
 
     name: str
     value: str
@@ -52,7 +52,7 @@ class Check:
 
 
 def main(options: Options) -> int:
-    """Print the checks; 1 if something that the core needs is missing."""
+    """Print the checks; return 1 if a requirement of the core is missing."""
     checks = [*machine(), *core(), *extras(), gpu(), codec(), writable(options.folder)]
     if options.reproduce:
         checks += reproduction()
@@ -69,7 +69,7 @@ def main(options: Options) -> int:
 
 
 def machine() -> list[Check]:
-    """Python, processor cores and memory."""
+    """Check Python, processor cores and memory."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     pages = os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 0
     gigabytes = pages * os.sysconf("SC_PAGE_SIZE") / 2**30 if pages else float("nan")
@@ -92,8 +92,8 @@ def _version(package: str) -> str | None:
 
 
 def core() -> list[Check]:
-    """Every package that generation and analysis need."""
-    found = {package: _version(package) for package in CORE}
+    """Check the packages that generation and analysis need."""
+    versions = {package: _version(package) for package in CORE}
     return [
         Check(
             package,
@@ -101,24 +101,24 @@ def core() -> list[Check]:
             version is not None,
             remedy="" if version else f"pip install {package}",
         )
-        for package, version in found.items()
+        for package, version in versions.items()
     ]
 
 
 def extras() -> list[Check]:
-    """Which optional parts are there; each missing one with the line that installs it."""
+    """Check the optional dependencies; the remedy of a missing one is its install command."""
     checks = []
     for extra, packages in EXTRAS.items():
         missing = [package for package in packages if _version(package) is None]
-        there = [f"{package} {_version(package)}" for package in packages if _version(package)]
-        value = ", ".join(there) if not missing else f"without {', '.join(missing)}"
+        installed = [f"{package} {_version(package)}" for package in packages if _version(package)]
+        value = ", ".join(installed) if not missing else f"without {', '.join(missing)}"
         remedy = f"pip install -e '.[{extra}]'" if missing else ""
         checks.append(Check(f"extra {extra}", value, not missing, needed=False, remedy=remedy))
     return checks
 
 
 def gpu() -> Check:
-    """The accelerator that torch sees."""
+    """Check which accelerator torch finds."""
     if _version("torch") is None:
         return Check("gpu", "unknown without torch", False, needed=False)
     import torch
@@ -129,33 +129,33 @@ def gpu() -> Check:
 
 
 def codec() -> Check:
-    """Whether movies can be written and read here."""
+    """Check whether movies can be written and read."""
     try:
         import av
 
         av.codec.Codec("libx264", "w")
         av.codec.Codec("h264", "r")
-    except Exception as error:  # PyAV raises its own kinds, and ImportError without its library
+    except Exception as error:  # PyAV has exceptions of its own, and ImportError without FFmpeg
         return Check("codec", f"H.264: {error}", False, remedy="pip install --force-reinstall av")
     return Check("codec", f"H.264 through PyAV {av.__version__}")
 
 
 def reproduction() -> list[Check]:
-    """Whether trials made on this machine have the bytes that this version promises."""
+    """Check whether trials generated here have the digests of this version."""
     from physion.golden import golden_digests
     from physion.trials.making.reproduce import differences
 
     checks = []
     for scenario in sorted(golden_digests()):
         parts = differences(scenario)
-        value = f"other bytes: {', '.join(parts)}" if parts else "the same bytes"
+        value = f"different: {', '.join(parts)}" if parts else "as expected"
         remedy = "pip install -c requirements.lock -e ." if parts else ""
         checks.append(Check(f"bytes of {scenario}", value, not parts, remedy=remedy))
     return checks
 
 
 def writable(folder: Path) -> Check:
-    """Whether trials can be written to ``folder``, and how much room is left."""
+    """Check whether ``folder`` can be written to, and its free space."""
     try:
         with tempfile.NamedTemporaryFile(dir=folder):
             pass

@@ -1,4 +1,4 @@
-"""Train a model's dynamics and readouts on a dataset and write its predictions."""
+"""Train the dynamics and readouts of a model on a dataset and write its predictions."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ from physion.trials.dataset import Dataset
 
 @dataclass(frozen=True)
 class Options:
-    """Which model on which trials."""
+    """Options of ``physion evaluate``."""
 
     dataset: Annotated[Path, tyro.conf.Positional]
     """Folder of a dataset."""
     model: Annotated[str, tyro.conf.Positional]
     """Name of a model; physion ls models lists them."""
     out: Path = Path("runs/models")
-    """Folder for predictions, and for what makes a second run quick."""
+    """Folder for predictions and caches."""
     option: tuple[str, ...] = ()
     """Fields of the model's config as NAME=VALUE, such as encoder=resnet50 weights=imagenet."""
     config: Annotated[EvaluationConfig, tyro.conf.arg(name="")] = field(
         default_factory=EvaluationConfig
     )
-    """Readouts, training protocol and solver."""
+    """Readouts, training protocol, optimiser and cross-validation."""
     workers: int = os.cpu_count() or 1
-    """Processes that simulate."""
+    """Number of processes for simulations."""
     json: bool = False
     """Print one JSON object."""
 
 
 def main(options: Options) -> int:
-    """Write the table of predictions; 1 if some trials have none."""
+    """Write the table of predictions; return 1 if some trials have none."""
     with Stages() as stages:
         result = evaluate(
             Dataset(options.dataset),
@@ -62,13 +62,13 @@ def main(options: Options) -> int:
     return 1 if result.problems else 0
 
 
-def parse_options(words: tuple[str, ...]) -> dict[str, Any]:
-    """NAME=VALUE pairs; a value that is JSON is taken as such, anything else as text."""
+def parse_options(pairs: tuple[str, ...]) -> dict[str, Any]:
+    """Parse NAME=VALUE pairs; a value that is not JSON is taken as text."""
     values: dict[str, Any] = {}
-    for word in words:
-        name, sign, text = word.partition("=")
+    for pair in pairs:
+        name, sign, text = pair.partition("=")
         if not sign or not name:
-            raise BadInputError(f"--option takes NAME=VALUE, not {word!r}")
+            raise BadInputError(f"--option takes NAME=VALUE, not {pair!r}")
         try:
             values[name] = json_module.loads(text)
         except json_module.JSONDecodeError:

@@ -1,4 +1,4 @@
-"""Write a dataset in the layouts of others: the original study's, webdataset, or a dataset card."""
+"""Export a dataset to the official layout, to webdataset shards, or to a dataset card."""
 
 from __future__ import annotations
 
@@ -18,47 +18,48 @@ from physion.errors import BadInputError
 
 @dataclass(frozen=True)
 class Options:
-    """What to export, and how."""
+    """Options of ``physion export``."""
 
     folder: Annotated[Path, tyro.conf.Positional]
     """Folder of a dataset."""
     out: Annotated[Path | None, tyro.conf.Positional] = None
-    """Folder to write into; a card goes by default beside the index."""
+    """Output folder; the default for a card is the dataset's folder."""
     layout: Literal["official", "webdataset", "card"] = "official"
-    """HDF5 files and PhysionTest-Core folders; tar shards; or a card with Croissant metadata."""
+    """official: HDF5 files and PhysionTest-Core folders; webdataset: tar shards; card: README with
+    Croissant metadata."""
     split: Literal["training", "readout", "testing", "familiarization"] | None = None
-    """Only this part of the dataset."""
+    """Export this split alone."""
     scenario: str | None = None
-    """Only this scenario."""
+    """Export this scenario alone."""
     parts: Literal["all", "seen"] = "all"
-    """For webdataset: all parts of a sample, or those alone that tell nothing of what happens."""
+    """For webdataset: all parts of a sample, or only those that do not reveal the outcome."""
     license: str | None = None
-    """For a card: an identifier of spdx.org, like CC-BY-4.0; by default MIT."""
+    """For a card: SPDX identifier of the licence, such as CC-BY-4.0; default: MIT."""
     creator: str | None = None
-    """For a card: who made the dataset."""
+    """For a card: author of the dataset."""
     version: str | None = None
-    """For a card: three numbers with dots; by default 1.0.0."""
+    """For a card: version with three numbers; default: 1.0.0."""
     url: str | None = None
-    """For a card: the page of the dataset."""
+    """For a card: URL of the dataset."""
     published: str | None = None
-    """For a card: the day, like 2026-01-31; by default today."""
+    """For a card: date of publication, such as 2026-01-31; default: today."""
     workers: int = os.cpu_count() or 1
-    """Processes."""
+    """Number of processes."""
     json: bool = False
     """Print one JSON object."""
 
 
 CARD_TERMS = ("license", "creator", "version", "url", "published")
-"""Options that only a card has."""
+"""Options that apply to a card alone."""
 
 
 def main(options: Options) -> int:
-    """Export what is missing; 1 if a trial failed."""
+    """Export what is missing; return 1 if a trial failed."""
     terms = [name for name in CARD_TERMS if getattr(options, name) is not None]
     if terms and options.layout != "card":
-        raise BadInputError(f"--{terms[0]} is for a card: use it with --layout card")
+        raise BadInputError(f"--{terms[0]} applies to a card alone: use it with --layout card")
     if options.parts != "all" and options.layout != "webdataset":
-        raise BadInputError("--parts is for shards: use it with --layout webdataset")
+        raise BadInputError("--parts applies to shards alone: use it with --layout webdataset")
     if options.layout == "card":
         return _card(options)
     if options.out is None:

@@ -1,4 +1,4 @@
-"""Sample scenes, simulate, render, and write trials. What is there already is kept."""
+"""Sample scenes, simulate and render them, and write trials; existing trials are kept."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ from physion.trials.making.plan import FULL_COUNTS, SPLITS, GenerateSettings, pl
 
 @dataclass(frozen=True)
 class Options:
-    """What to make, and where."""
+    """Options of ``physion generate``."""
 
     folder: Annotated[Path, tyro.conf.Positional]
-    """Folder of the dataset; new, empty, or one to go on with."""
+    """Folder of the dataset: new, empty, or one to resume."""
     scenario: str = "all"
-    """A scenario, or all."""
+    """Name of a scenario, or all."""
     split: Literal["training", "readout", "testing", "familiarization", "all"] = "testing"
-    """Which part of the dataset; all with --full makes everything."""
+    """Split to generate; all with --full generates the sets of the study."""
     count: int = 10
-    """Trials a scenario."""
+    """Trials per scenario."""
     full: bool = False
-    """The sizes of the study in place of --count: training 2000, readout 1000, testing 150,
-    familiarization 10 a scenario."""
+    """Use the sizes of the study instead of --count: training 2000, readout 1000, testing 150,
+    familiarization 10 per scenario."""
     presets: tuple[str, ...] = ()
-    """Presets that the trials take in turn (physion ls presets), or FILE.toml:NAME; by default the
-    published configurations. Needs one --scenario."""
+    """Presets that are used in turn (see physion ls presets), or FILE.toml:NAME; default: the
+    published configurations. Requires a --scenario."""
     name: str = "physion"
-    """Name of the dataset: another name draws other trials."""
+    """Name of the dataset, part of the seed of every trial."""
     settings: Annotated[GenerateSettings, tyro.conf.arg(name="")] = field(
         default_factory=GenerateSettings
     )

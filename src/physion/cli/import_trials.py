@@ -1,4 +1,4 @@
-"""Bring official HDF5 files and movies into a dataset of ours."""
+"""Convert official HDF5 files and movies to a dataset of this package."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from physion.trials.official.import_folder import import_official
 
 @dataclass(frozen=True)
 class Options:
-    """What to import, and where to."""
+    """Options of ``physion import``."""
 
     folder: Annotated[Path, tyro.conf.Positional]
     """Folder with official files, at any depth."""
     out: Annotated[Path, tyro.conf.Positional]
-    """Folder of the dataset to make or to go on with."""
+    """Folder of the dataset: new, or one to resume."""
     name: str | None = None
-    """Name of the dataset; by default that of our own files, and "imported" for others."""
+    """Name of the dataset; default: the name in files of this package, else "imported"."""
     split: Literal["training", "readout", "testing", "familiarization"] | None = None
-    """Which part of the dataset the trials are; by default that of our own files, else testing."""
+    """Split of the trials; default: the split in files of this package, else testing."""
     scenario: str | None = None
-    """The scenario of all files; by default the one that their names say."""
+    """Scenario of all files; default: inferred from their names."""
     workers: int = os.cpu_count() or 1
-    """Processes."""
+    """Number of processes."""
     json: bool = False
     """Print one JSON object."""
 
 
 def main(options: Options) -> int:
-    """Import what is missing; 1 if a file failed."""
+    """Import what is missing; return 1 if a file failed."""
     report = import_official(
         options.folder,
         options.out,

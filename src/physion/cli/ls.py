@@ -1,4 +1,4 @@
-"""List what can be named: scenarios, presets, shapes, props, materials, models, engines."""
+"""List the available scenarios, presets, shapes, props, materials, models and engines."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ LISTS: Mapping[str, Callable[[], Names]] = {
 
 @dataclass(frozen=True)
 class Options:
-    """Which list."""
+    """Options of ``physion ls``."""
 
     what: Annotated[
         Literal[
@@ -52,18 +52,17 @@ class Options:
         ],
         tyro.conf.Positional,
     ] = "all"
-    """One list, or all."""
+    """Name of a list, or all."""
     scenario: Annotated[str | None, tyro.conf.Positional] = None
-    """With presets: a scenario, whose presets are described."""
+    """With presets: the scenario whose presets are described."""
     preset: Annotated[str | None, tyro.conf.Positional] = None
-    """With presets and a scenario: a preset, all values of which are printed with what each may
-    be."""
+    """With presets and a scenario: the preset whose values are printed with their limits."""
     json: bool = False
     """Print one JSON object."""
 
 
 def main(options: Options) -> int:
-    """Print names, one list a line, or the presets of a scenario, or the values of a preset."""
+    """Print lists of names, the presets of a scenario, or the values of a preset."""
     if options.scenario is not None:
         if options.what != "presets":
             raise BadInputError("a scenario can be named after 'presets' only")
@@ -75,14 +74,14 @@ def main(options: Options) -> int:
     if options.json:
         print(json_module.dumps(names))
         return 0
-    for kind, found in names.items():
-        if isinstance(found, list):
-            print(f"{kind}: {', '.join(found)}")
+    for kind, members in names.items():
+        if isinstance(members, list):
+            print(f"{kind}: {', '.join(members)}")
         elif options.what == "all":
-            print(f"{kind}: {sum(map(len, found.values()))} (physion ls {kind})")
+            print(f"{kind}: {sum(map(len, members.values()))} (physion ls {kind})")
         else:
-            for group, members in found.items():
-                print(f"{group} ({len(members)}): {', '.join(members)}")
+            for group, entries in members.items():
+                print(f"{group} ({len(entries)}): {', '.join(entries)}")
     return 0
 
 
@@ -92,10 +91,10 @@ def _print_presets(scenario: str, as_json: bool) -> int:
         print(json_module.dumps([_facts(preset) for preset in presets]))
         return 0
     for preset in presets:
-        told = preset.about or preset.official or ""
+        text = preset.about or preset.official or ""
         if preset.published:
-            told += f" (published: {preset.published.contact} of {preset.published.trials} contact)"
-        console.print(f"{preset.name}: {told}", markup=False, soft_wrap=True)
+            text += f" (published: {preset.published.contact} of {preset.published.trials} contact)"
+        console.print(f"{preset.name}: {text}", markup=False, soft_wrap=True)
     return 0
 
 
@@ -105,8 +104,8 @@ def _print_preset(preset: Preset, as_json: bool) -> int:
         return 0
     limits = drawn_limits(preset.params)
     for key, value in _flat(as_record(preset.params)).items():
-        told = f"{key} = {json_module.dumps(value)}   # {limits.get(key, '')}"
-        console.print(told, markup=False, soft_wrap=True)
+        line = f"{key} = {json_module.dumps(value)}   # {limits.get(key, '')}"
+        console.print(line, markup=False, soft_wrap=True)
     return 0
 
 
@@ -124,7 +123,7 @@ def _facts(preset: Preset) -> dict[str, Any]:
 
 
 def _flat(record: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested keys joined by dots, as preset files may write them."""
+    """Flatten nested keys to dotted ones, as preset files may have them."""
     flat: dict[str, Any] = {}
     for key, value in record.items():
         if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""What export to and import from the official layout print at their end."""
+"""Summary of an export to, or import from, the official layout."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SHOWN_NOTES = 5
 
 
 def print_report(report: RunReport, as_json: bool) -> int:
-    """Print what was done, as one JSON object or as lines for people; the exit code."""
+    """Print the report as one JSON object or as text, and return the exit code."""
     if as_json:
         values = {"made": report.made, "kept": report.kept, "failed": dict(report.failed)}
         values |= {"notes": dict(report.notes), "index": str(report.index)}
@@ -22,7 +22,7 @@ def print_report(report: RunReport, as_json: bool) -> int:
         return report.exit_code
     for name, reason in report.failed.items():
         console.print(f"failed: {name}: {reason}", markup=False, soft_wrap=True)
-    notes = [f"{name}: {note}" for name, found in report.notes.items() for note in found]
+    notes = [f"{name}: {note}" for name, texts in report.notes.items() for note in texts]
     for note in notes[:SHOWN_NOTES]:
         console.print(f"note: {note}", markup=False, soft_wrap=True)
     if len(notes) > SHOWN_NOTES:

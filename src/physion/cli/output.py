@@ -1,4 +1,4 @@
-"""What verbs print and write: progress with time left, and files that are whole or absent."""
+"""Output of the verbs: results, progress bars, and files that are written atomically."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from physion.atomic import write_atomic
 T = TypeVar("T")
 
 console = Console(highlight=False)
-"""Results. Progress goes to the error stream, so that output can be piped."""
+"""Console for results; progress goes to standard error, so that output can be piped."""
 
 
 def _columns() -> tuple[ProgressColumn, ...]:
@@ -39,7 +39,7 @@ def _columns() -> tuple[ProgressColumn, ...]:
 
 
 def track(items: Iterable[T], what: str, total: int) -> Iterator[T]:
-    """Pass ``items`` on while showing how many are done and how long the rest will take."""
+    """Yield ``items`` while showing their number and the remaining time."""
     with Progress(*_columns(), console=Console(file=sys.stderr), transient=True) as progress:
         task = progress.add_task(what, total=total)
         for item in items:
@@ -48,7 +48,7 @@ def track(items: Iterable[T], what: str, total: int) -> Iterator[T]:
 
 
 class Stages:
-    """Shows the progress of work that reports itself as (what, done, total)."""
+    """Progress display of work that reports (stage, done, total)."""
 
     def __enter__(self) -> Stages:
         self._progress = Progress(*_columns(), console=Console(file=sys.stderr), transient=True)
@@ -60,13 +60,13 @@ class Stages:
         self._progress.stop()
 
     def __call__(self, what: str, done: int, total: int) -> None:
-        """Show that ``done`` of ``total`` are through."""
+        """Show that ``done`` of ``total`` items of a stage are finished."""
         if what not in self._tasks:
             self._tasks[what] = self._progress.add_task(what, total=total)
         self._progress.update(self._tasks[what], completed=done, total=total)
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file whole or not at all, making its folder."""
+    """Write a text file atomically and create its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(path, text.encode())

@@ -1,4 +1,4 @@
-"""Simulate official command logs and compare with the outcomes that were recorded."""
+"""Simulate official command logs and compare the outcomes with the recorded ones."""
 
 from __future__ import annotations
 
@@ -24,37 +24,37 @@ SHOWN_FAILURES = 5
 
 @dataclass(frozen=True)
 class Options:
-    """How to replay."""
+    """Options of ``physion replay``."""
 
     folder: Annotated[Path, tyro.conf.Positional]
     """Folder with official command logs, at any depth."""
     json: Path | None = None
-    """Write the table, every trial and every failure to this file."""
+    """Write the table, all trials and all failures to this file."""
     scenario: str | None = None
-    """Only this scenario."""
+    """Replay this scenario alone."""
     limit: int | None = None
-    """Only the first so many trials of each scenario."""
+    """Replay only the first trials of each scenario, this many."""
     jitter: float = 1.0
-    """Sideways noise of the repeats: standard deviation in millimetres."""
+    """Standard deviation, in millimetres, of the horizontal noise of the repeats."""
     repeats: int = 0
-    """Jittered runs of each trial, for the agreement of a scene with itself."""
+    """Jittered simulations of each trial, which measure the robustness of its outcome."""
     workers: int = os.cpu_count() or 1
-    """Processes."""
+    """Number of processes."""
 
 
 def main(options: Options) -> int:
-    """Replay, print the table; 1 if a trial could not be imported or simulated."""
+    """Replay and print the table; return 1 if a trial could not be imported or simulated."""
     if options.repeats < 0 or options.jitter < 0:
-        raise BadInputError("--repeats and --jitter must not be below 0")
+        raise BadInputError("--repeats and --jitter must not be negative")
     if options.json is not None and options.json.is_dir():
         raise BadInputError(f"--json {options.json} is a folder; give a file")
-    found = read_scenes(options.folder, options.scenario, options.limit)
-    found.require_trials()
-    trials, copies = found.unique()
+    logs = read_scenes(options.folder, options.scenario, options.limit)
+    logs.require_trials()
+    trials, copies = logs.unique()
     tasks = [ReplayTask(trial, options.jitter / 1000, options.repeats) for trial in trials]
     executor = LocalExecutor(workers=options.workers)
     replays: list[Replay] = []
-    failures = [str(failure) for failure in found.failures]
+    failures = [str(failure) for failure in logs.failures]
     results = executor.map(replay_trial, {task.trial.scene.name: task for task in tasks})
     for outcome in track(results, "replaying", len(tasks)):
         if outcome.error is None:
@@ -64,15 +64,15 @@ def main(options: Options) -> int:
     order = {task.trial.scene.name: position for position, task in enumerate(tasks)}
     replays.sort(key=lambda replay: order[replay.name])
     rows = summarise(replays)
-    _print(rows, copies, found, failures)
+    _print(rows, copies, logs, failures)
     if options.json:
-        write_text(options.json, _as_json(rows, replays, copies, found, failures))
+        write_text(options.json, _as_json(rows, replays, copies, logs, failures))
         print(options.json)
     return 1 if failures else 0
 
 
-def _print(rows: Sequence[ReplayRow], copies: int, found: TrialSet, failures: list[str]) -> None:
-    table = Table(title="Simulated outcome against the recorded one")
+def _print(rows: Sequence[ReplayRow], copies: int, logs: TrialSet, failures: list[str]) -> None:
+    table = Table(title="Simulated outcomes compared with the recorded ones")
     for column in (
         "scenario",
         "trials",
@@ -99,12 +99,12 @@ def _print(rows: Sequence[ReplayRow], copies: int, found: TrialSet, failures: li
         )
     console.print(table)
     console.print(
-        "base: share of the commoner outcome; frames: median difference of first contact; "
-        "ms: processor time a trial; speed: times real time"
+        "base: frequency of the more frequent outcome; frames: median difference of first contact; "
+        "ms: processor time per trial; speed: times real time"
     )
-    unknown = ", ".join(f"{name} x{count}" for name, count in found.unknown.items()) or "none"
+    unknown = ", ".join(f"{name} x{count}" for name, count in logs.unknown.items()) or "none"
     console.print(f"duplicates left out: {copies}; unknown commands: {unknown}")
-    notes = sum(len(trial.notes) for trial in found.trials)
+    notes = sum(len(trial.notes) for trial in logs.trials)
     console.print(f"notes on imported trials: {notes}; failures: {len(failures)}")
     for failure in failures[:SHOWN_FAILURES]:
         console.print(f"  {failure}", markup=False, soft_wrap=True)
@@ -120,19 +120,19 @@ def _as_json(
     rows: Sequence[ReplayRow],
     replays: Sequence[Replay],
     copies: int,
-    found: TrialSet,
+    logs: TrialSet,
     failures: list[str],
 ) -> str:
-    def plain(thing: Replay | ReplayRow) -> dict[str, object]:
+    def as_dict(thing: Replay | ReplayRow) -> dict[str, object]:
         values = dataclasses.asdict(thing)
         return {key: None if value != value else value for key, value in values.items()}
 
     content = {
-        "scenarios": [plain(row) for row in rows],
-        "trials": [plain(replay) for replay in replays],
+        "scenarios": [as_dict(row) for row in rows],
+        "trials": [as_dict(replay) for replay in replays],
         "duplicates": copies,
-        "unknown_commands": dict(found.unknown),
+        "unknown_commands": dict(logs.unknown),
         "failures": failures,
-        "notes": {t.scene.name: list(t.notes) for t in found.trials if t.notes},
+        "notes": {t.scene.name: list(t.notes) for t in logs.trials if t.notes},
     }
     return json.dumps(content, indent=1) + "\n"

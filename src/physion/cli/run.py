@@ -1,7 +1,7 @@
-"""The whole road: scenes, physics, pictures, trials, models, readout, comparison, one report.
+"""Run the whole pipeline: scenes, physics, rendering, trials, models, readouts, report.
 
-Without --scenes, scenes of Dominoes, Collide and Drop are sampled. With --scenes the official
-command logs are simulated, and with --humans the models are compared with the people who saw them.
+Without --scenes, scenes of Dominoes, Collide and Drop are sampled. With --scenes, official command
+logs are simulated instead, and with --humans the models are compared with people's responses.
 """
 
 from __future__ import annotations
@@ -26,39 +26,39 @@ SAMPLED_SCENARIOS = ("dominoes", "collide", "drop")
 
 @dataclass(frozen=True)
 class Options:
-    """Where scenes and people come from, and how much of everything."""
+    """Options of ``physion run``."""
 
     scenes: Path | None = None
-    """Folder with official command logs; without it scenes are sampled."""
+    """Folder with official command logs; by default scenes are sampled."""
     humans: Path | None = None
-    """Folder with human_accuracy-*.csv: people's answers to those scenes."""
+    """Folder with human_accuracy-*.csv, people's responses to these scenes."""
     out: Path | None = None
-    """Folder for trials, predictions and the report; runs/sampled or runs/official by default.
-    A second run goes on from what is there."""
+    """Folder for trials, predictions and the report; default: runs/sampled or runs/official.
+    A second run resumes."""
     limit: int | None = None
-    """Testing trials a scenario. Official scenes: all by default, and as many for the readout;
+    """Testing trials per scenario. Official scenes: all by default, and as many for the readout;
     sampled ones: 12 by default, and twice as many for the readout."""
     size: int = 128
-    """Pixels a side of the movies."""
+    """Pixels per side of the movies."""
     encoder: str = "resnet18"
     """Frozen image encoder, any timm name."""
     weights: str = "random"
-    """Its weights: imagenet (downloaded by timm), a file, or random."""
+    """Weights of the encoder: imagenet (downloaded by timm), a file, or random."""
     dynamics: str = "mlp"
-    """What predicts the next feature: mlp or lstm."""
+    """Dynamics that predict the next feature: mlp or lstm."""
     steps: int = 300
     """Training steps of the dynamics."""
     samples: int = 20
-    """Simulations a trial of noisy-simulation."""
+    """Simulations per trial of noisy-simulation."""
     workers: int = os.cpu_count() or 1
-    """Processes."""
+    """Number of processes."""
     json: bool = False
     """Print one JSON object instead of lines."""
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What is to be made, the recorded outcomes by stimulus, and what could not be imported."""
+class RunPlan:
+    """Trials to generate, recorded outcomes by stimulus, and failures of the import."""
 
     tasks: list[TrialTask]
     recorded: Mapping[str, bool]
@@ -66,18 +66,18 @@ class Plan:
 
 
 def main(options: Options) -> int:
-    """Go the road; 1 if some trials failed on the way."""
+    """Run the whole pipeline; return 1 if some trials failed."""
     if options.out is None:
         name = "sampled" if options.scenes is None else "official"
         options = replace(options, out=Path("runs") / name)
     if options.humans is not None and options.scenes is None:
-        raise BadInputError("--humans needs --scenes: people saw the official scenes only")
+        raise BadInputError("--humans requires --scenes: people saw only the official scenes")
     if options.limit is not None and options.limit < 1:
-        raise BadInputError(f"--limit must be 1 or more, not {options.limit}")
+        raise BadInputError(f"--limit must be at least 1, not {options.limit}")
     check_models(options)
     plan = plan_sampled(options) if options.scenes is None else plan_official(options)
-    failures = [*plan.failures, *make_trials(options, plan.tasks)]
-    predictions, problems = ask_models(options)
+    failures = [*plan.failures, *generate_trials(options, plan.tasks)]
+    predictions, problems = predict(options)
     page, scores = write_report(options, plan, predictions)
     failures += problems
     if options.json:
@@ -90,23 +90,23 @@ def main(options: Options) -> int:
     return 1 if failures else 0
 
 
-def folder(options: Options) -> Path:
-    """Where everything of this run goes."""
-    assert options.out is not None, "main chooses a folder"
+def out_folder(options: Options) -> Path:
+    """Return the output folder."""
+    assert options.out is not None, "main sets the folder"
     return options.out
 
 
-def plan_sampled(options: Options) -> Plan:
-    """A small set of sampled trials: testing, and as many again for the readout."""
+def plan_sampled(options: Options) -> RunPlan:
+    """Plan a small set of sampled trials: testing, and twice as many for the readout."""
     from physion.trials.making.plan import plan_dataset
 
     count = 12 if options.limit is None else options.limit
     tasks = plan_dataset("sampled", SAMPLED_SCENARIOS, {"readout": 2 * count, "testing": count})
-    return Plan(tasks, {}, [])
+    return RunPlan(tasks, {}, [])
 
 
-def plan_official(options: Options) -> Plan:
-    """The official scenes: those that people saw for testing, the others for the readout."""
+def plan_official(options: Options) -> RunPlan:
+    """Plan the official scenes: those that people saw are tested, the others fit the readout."""
     from physion.analysis.tables.responses import read_humans
     from physion.scenes.tdw.read_logs import read_scenes
     from physion.stimulus_names import canonical_name
@@ -114,32 +114,32 @@ def plan_official(options: Options) -> Plan:
 
     assert options.scenes is not None
     seen = set(read_humans(options.humans)["stimulus"]) if options.humans is not None else None
-    found = read_scenes(options.scenes)
-    found.require_trials()
-    recorded = {trial.scene.name: trial.outcome.contact for trial in found.trials}
+    logs = read_scenes(options.scenes)
+    logs.require_trials()
+    recorded = {trial.scene.name: trial.outcome.contact for trial in logs.trials}
     parts: dict[str, list[ImportedTrial]] = {"testing": [], "readout": []}
-    for trial in found.trials:
-        # What people practised on is nobody's test and nobody's readout.
+    for trial in logs.trials:
+        # Familiarization trials are neither tested nor fitted.
         if "familiarization" not in trial.scene.name:
             tested = seen is None or canonical_name(trial.scene.name) in seen
             parts["testing" if tested else "readout"].append(trial)
-    # A scene that only looks different is no new scene to fit on.
+    # Scenes with the physics of a tested one are not fitted.
     known = {trial.scene.physics_digest() for trial in parts["testing"]}
     parts["readout"] = [t for t in parts["readout"] if t.scene.physics_digest() not in known]
     tasks: list[TrialTask] = []
     for split, trials in parts.items():
-        scenes = [trial.scene for trial in few(trials, options.limit)]
+        scenes = [trial.scene for trial in limit_trials(trials, options.limit)]
         tasks += plan_scenes("official", scenes, split, recorded)
     if not any(task.split == "testing" for task in tasks):
         raise BadInputError(f"none of the scenes in {options.scenes} is in {options.humans}")
     check_names(tasks)
-    return Plan(tasks, recorded, [str(failure) for failure in found.failures])
+    return RunPlan(tasks, recorded, [str(failure) for failure in logs.failures])
 
 
-def few(trials: Iterable[ImportedTrial], limit: int | None) -> list[ImportedTrial]:
-    """At most ``limit`` trials a scenario, spread over its configurations.
+def limit_trials(trials: Iterable[ImportedTrial], limit: int | None) -> list[ImportedTrial]:
+    """Return at most ``limit`` trials per scenario, spread over its configurations.
 
-    Which ones depends on their names alone, and a larger limit keeps all that a smaller one had.
+    The choice depends on the names alone; a larger limit includes the trials of a smaller one.
     """
     from physion.seeds import stable_hash
 
@@ -149,14 +149,14 @@ def few(trials: Iterable[ImportedTrial], limit: int | None) -> list[ImportedTria
     return [trial for group in groups.values() for trial in group[:limit]]
 
 
-def make_trials(options: Options, tasks: list[TrialTask]) -> list[str]:
-    """Simulate, label, render and store what is missing; why some trials failed."""
+def generate_trials(options: Options, tasks: list[TrialTask]) -> list[str]:
+    """Simulate, label, render and store missing trials; return the failures."""
     from physion.compute.local import LocalExecutor
     from physion.trials.making.generate import generate
     from physion.trials.making.plan import GenerateSettings
 
     report = generate(
-        folder(options) / "trials",
+        out_folder(options) / "trials",
         tasks,
         GenerateSettings(width=options.size, height=options.size, look="redyellow", jitters=0),
         executor=LocalExecutor(workers=options.workers),
@@ -166,7 +166,7 @@ def make_trials(options: Options, tasks: list[TrialTask]) -> list[str]:
 
 
 def chosen_models(options: Options) -> dict[str, dict[str, Any]]:
-    """The models of this run with the fields of their configs."""
+    """Return the models of this run and the options of each."""
     return {
         "frozen-encoder": {
             "encoder": options.encoder,
@@ -178,20 +178,20 @@ def chosen_models(options: Options) -> dict[str, dict[str, Any]]:
 
 
 def check_models(options: Options) -> None:
-    """Build every model once: a wrong name or a missing extra is said before hours of work."""
+    """Build every model once, so that a wrong name or a missing extra fails early."""
     from physion.models.interface import build_model
 
     for model, settings in chosen_models(options).items():
         build_model(model, **settings)
 
 
-def ask_models(options: Options) -> tuple[list[Path], list[str]]:
-    """Predictions of a frozen encoder and of noisy simulation; why some trials have none."""
+def predict(options: Options) -> tuple[list[Path], list[str]]:
+    """Write predictions of a frozen encoder and of noisy simulation; return paths and failures."""
     from physion.compute.local import LocalExecutor
     from physion.readout.evaluate import EvaluationConfig, evaluate
     from physion.trials.dataset import Dataset
 
-    dataset = Dataset(folder(options) / "trials")
+    dataset = Dataset(out_folder(options) / "trials")
     paths: list[Path] = []
     problems: list[str] = []
     for model, settings in chosen_models(options).items():
@@ -199,7 +199,7 @@ def ask_models(options: Options) -> tuple[list[Path], list[str]]:
             evaluation = evaluate(
                 dataset,
                 model,
-                folder(options) / "models",
+                out_folder(options) / "models",
                 options=settings,
                 config=EvaluationConfig(steps=options.steps),
                 executor=LocalExecutor(workers=options.workers),
@@ -211,9 +211,9 @@ def ask_models(options: Options) -> tuple[list[Path], list[str]]:
 
 
 def write_report(
-    options: Options, plan: Plan, predictions: list[Path]
+    options: Options, plan: RunPlan, predictions: list[Path]
 ) -> tuple[Path, list[dict[str, Any]]]:
-    """The report's page and its table of scores."""
+    """Write the report; return its page and the table of scores."""
     import pandas as pd
 
     from physion.report.build import compare_files
@@ -221,12 +221,12 @@ def write_report(
     from physion.stimulus_names import canonical_name
     from physion.trials.dataset import Dataset
 
-    dataset = Dataset(folder(options) / "trials")
+    dataset = Dataset(out_folder(options) / "trials")
     page = compare_files(
         predictions,
         options.humans,
         {canonical_name(name): contact for name, contact in plan.recorded.items()} or None,
-        folder(options) / "report",
+        out_folder(options) / "report",
         methods=methods(options, dataset.index),
         movies=movies_of(dataset.folder),
     )
@@ -235,18 +235,18 @@ def write_report(
 
 
 def methods(options: Options, index: Any) -> dict[str, str]:
-    """The choices of this run in words, for the report."""
+    """Return the settings of this run as texts for the report."""
     splits = index.groupby("split").size()
     counts = ", ".join(f"{count} {split}" for split, count in splits.items())
     source = "sampled by this package" if options.scenes is None else "official command logs"
     return {
         "Scenes": f"{source}; trials: {counts}; movies of {options.size} x {options.size} pixels",
-        "Readout": "one L2 logistic regression a scenario on standardised features, C from 17 "
+        "Readout": "one L2 logistic regression per scenario on standardised features, C from 17 "
         "values in 1e-8 to 1e8 by stratified 5-fold cross-validation on readout trials",
         "Encoder weights": f"{options.encoder}: {options.weights}, frozen; {options.dynamics} "
         f"dynamics of 1024 hidden units, {options.steps} steps of Adam",
-        "Noise of the simulation": f"{options.samples} simulations a trial from the true state at "
-        "the end of the observed part; the noise scale is fitted on readout trials alone",
+        "Noise of the simulation": f"{options.samples} simulations per trial from the true state "
+        "at the end of the observed part; the noise scale is fitted on readout trials alone",
         "Engine": ", ".join(sorted(set(index["engine"]))),
         "Renderer": ", ".join(sorted(set(index["renderer"]))),
     }

@@ -1,4 +1,4 @@
-"""Tables as lines of text that no terminal width cuts, so that they can be searched and piped."""
+"""Text tables that are not cut to the terminal's width, so that they can be searched and piped."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ if TYPE_CHECKING:
 
 
 def text_table(table: pd.DataFrame, title: str = "") -> str:
-    """A header and one line a row, two spaces between columns; numbers to three decimals, to the
-    right; nothing where a value is NaN."""
+    """Return a table as text: a header and one line per row, columns separated by two spaces.
+
+    Numbers have three decimals and are aligned to the right; NaN is an empty cell.
+    """
     import pandas as pd
 
     columns = [[str(name), *map(_cell, table[name])] for name in table.columns]

@@ -1,4 +1,4 @@
-"""Check a dataset: every byte, every label, every motion; say which file and field is wrong."""
+"""Check all files, labels and motions of a dataset, and name the files and fields with faults."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from physion.trials.making.verify import SAMPLE, verify_dataset
 
 @dataclass(frozen=True)
 class Options:
-    """Which dataset, and how thoroughly."""
+    """Options of ``physion verify``."""
 
     folder: Annotated[Path, tyro.conf.Positional]
     """Folder of a dataset."""
     again: int = SAMPLE
-    """Trials to simulate and render again and compare to the bit; -1 takes all."""
+    """Number of trials to simulate and render again for a bitwise comparison; -1: all."""
     json: bool = False
     """Print one JSON object: faults, and differences from trials of another version."""
 

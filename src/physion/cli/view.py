@@ -1,4 +1,4 @@
-"""Write one self-contained page that shows a dataset: movies, passes, motion in 3D, parameters."""
+"""Write a self-contained page that shows a dataset: movies, passes, motion in 3D, parameters."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from physion.report.viewer.write_viewer import ViewerOptions, build_viewer
 
 @dataclass(frozen=True)
 class Options:
-    """Which dataset, and how much of it."""
+    """Options of ``physion view``."""
 
     folder: Annotated[Path, tyro.conf.Positional]
     """Folder of a dataset."""
     out: Path | None = None
-    """The page to write; by default view.html in the dataset's folder."""
+    """Output file; default: view.html in the dataset's folder."""
     trials: int = ViewerOptions.trials
-    """Trials of each scenario at most; the page says how many are left out."""
+    """Maximal number of trials per scenario; the page states how many are left out."""
     details: int = ViewerOptions.details
-    """So many of them with all passes and the scene in 3D."""
+    """Number of these trials that have all passes and the scene in 3D."""
     scenario: str | None = None
-    """Only this scenario."""
+    """Show this scenario alone."""
     split: str | None = None
-    """Only this split."""
+    """Show this split alone."""
     open: bool = False
     """Open the page in the browser."""
     json: bool = False
@@ -45,8 +45,8 @@ def main(options: Options) -> int:
         values = {"page": str(report.page), "bytes": report.size}
         print(json_module.dumps(values | {"shown": report.shown, "left_out": report.left_out}))
     else:
-        words = f"{report.shown} trials, {report.left_out} left out, {report.size / 1e6:.1f} MB"
-        console.print(f"{words}: {report.page}", markup=False, soft_wrap=True)
+        summary = f"{report.shown} trials, {report.left_out} left out, {report.size / 1e6:.1f} MB"
+        console.print(f"{summary}: {report.page}", markup=False, soft_wrap=True)
     if options.open:
         webbrowser.open(report.page.resolve().as_uri())
     return 0

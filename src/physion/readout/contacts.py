@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
+from physion.compute.progress import Progress
 from physion.errors import BadInputError
 from physion.models.interface import PredictsContact
 from physion.models.observed import cut_to_observed
@@ -26,7 +26,7 @@ class ContactReadout:
 
     dataset: Dataset
     model: PredictsContact
-    progress: Callable[[str, int, int], None] | None = None
+    progress: Progress | None = None
 
     def __post_init__(self) -> None:
         self.problems: dict[str, str] = {}

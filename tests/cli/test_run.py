@@ -1,4 +1,4 @@
-"""The whole road by its verb: sampled scenes, and the official ones against real people."""
+"""The verb run: sampled scenes, and the official ones compared with real people."""
 
 from __future__ import annotations
 
