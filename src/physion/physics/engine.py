@@ -35,9 +35,7 @@ class Engine(Protocol):
         ...
 
 
-engines: Registry[type] = Registry(
-    "engine", {"mujoco": "physion.physics.rigid.engine:MujocoEngine"}
-)
+engines: Registry[type] = Registry("engine", {"mujoco": "physion.physics.rigid.engine:RigidEngine"})
 
 
 def simulate(

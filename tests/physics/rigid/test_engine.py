@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from physion.errors import BadInputError, BadSceneError
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
-from physion.physics.rigid.engine import MujocoEngine, RigidRun
-from physion.physics.rigid.settings import Settings
+from physion.physics.rigid.engine import RigidEngine, RigidRun
+from physion.physics.rigid.settings import RigidSettings
 from physion.physics.trajectory import ENVIRONMENT, Trajectory
 from physion.scenes.sampling.registry import sample_scene
 from physion.scenes.scene import Body, Camera, Ending, Joint, Push, Roles, Scene, SurfaceMaterial
@@ -42,7 +42,7 @@ def scene_of(*bodies: Body, pushes: tuple[Push, ...] = (), joints: tuple[Joint, 
 
 def run(scene: Scene, frames: int | None = None, **changes: object) -> Trajectory:
     """Simulate with some settings changed."""
-    return MujocoEngine(replace(Settings(), **changes)).simulate(scene, frames=frames)  # type: ignore[arg-type]
+    return RigidEngine(replace(RigidSettings(), **changes)).simulate(scene, frames=frames)  # type: ignore[arg-type]
 
 
 def test_free_fall_is_a_parabola_of_whole_steps() -> None:
@@ -157,7 +157,7 @@ def test_joined_bodies_move_as_one_and_keep_their_materials() -> None:
     gap = np.linalg.norm(path.positions[:, 0] - path.positions[:, 1], axis=1)
     assert np.abs(gap - 0.2).max() < 1e-5
     assert np.allclose(path.rotations[:, 0], path.rotations[:, 1], atol=1e-6)
-    run_ = RigidRun(held, Settings())
+    run_ = RigidRun(held, RigidSettings())
     assert run_.model.actors == 1
     assert run_.model.inv_mass[0] == pytest.approx(1 / 4.0)
     assert run_.model.material[0].tolist() == [0.5, 0.5, 0.0]
@@ -172,7 +172,7 @@ def test_joined_bodies_move_as_one_and_keep_their_materials() -> None:
 def test_a_joint_to_something_fixed_is_refused() -> None:
     scene = scene_of(Body("a", "cube", (0, 0, 0)), joints=(Joint("zone", "a"),))
     with pytest.raises(BadSceneError, match="make both kinematic or neither"):
-        MujocoEngine().simulate(scene)
+        RigidEngine().simulate(scene)
 
 
 def test_kinematic_bodies_stay_and_are_touched() -> None:
@@ -207,13 +207,13 @@ def test_scenery_touches_nothing() -> None:
 def test_a_trial_ends_when_all_sleep_but_not_before_its_least_frames() -> None:
     block = Body("a", "cube", (0, 0, 0), (0.2, 0.2, 0.2))
     scene = replace(scene_of(block), ending=Ending(80, 200))
-    resting = MujocoEngine().simulate(scene)
+    resting = RigidEngine().simulate(scene)
     assert (len(resting), resting.completed) == (80, True)
     falling = replace(scene, bodies=(replace(block, position=(0, 0, 50.0)), ZONE))
-    path = MujocoEngine().simulate(falling)
+    path = RigidEngine().simulate(falling)
     assert (len(path), path.completed) == (200, False)
     late = replace(scene, pushes=(Push("a", (1.0, 0, 0), frame=79),))
-    assert MujocoEngine().simulate(late, frames=100).positions[-1, 0, 0] > 0.02
+    assert RigidEngine().simulate(late, frames=100).positions[-1, 0, 0] > 0.02
 
 
 def test_a_sleeping_body_is_hit_with_its_whole_mass() -> None:
@@ -256,7 +256,7 @@ def test_going_on_from_a_state_follows_the_same_path() -> None:
         a, pushes=(Push("a", (1, 0.2, 0), (0.1, 0, 3.3)), Push("a", (0, 1, 0), None, 30))
     )
     whole = run(scene, frames=60)
-    rest = MujocoEngine().simulate(scene, start=whole.state(20), frames=40)
+    rest = RigidEngine().simulate(scene, start=whole.state(20), frames=40)
     assert np.abs(rest.positions - whole.positions[20:]).max() < 1e-4
     assert np.abs(rest.velocities - whole.velocities[20:]).max() < 1e-4
     assert np.abs(rest.rotations - whole.rotations[20:]).max() < 1e-4
@@ -267,11 +267,11 @@ def test_same_bytes_in_every_process() -> None:
         Body("a", "torus", (0, 0, 0.4), (0.3, 0.3, 0.3), (0.9, 0.3, 0.3, 0.1)),
         Body("b", "cone", (0.05, 0, 0), (0.3, 0.3, 0.3)),
     )
-    here = [MujocoEngine().simulate(scene, frames=90).digest() for _ in range(2)]
+    here = [RigidEngine().simulate(scene, frames=90).digest() for _ in range(2)]
     code = (
         "import sys; from physion.scenes.scene import Scene; "
-        "from physion.physics.rigid.engine import MujocoEngine; "
-        "print(MujocoEngine().simulate(Scene.from_json(sys.stdin.read()), frames=90).digest())"
+        "from physion.physics.rigid.engine import RigidEngine; "
+        "print(RigidEngine().simulate(Scene.from_json(sys.stdin.read()), frames=90).digest())"
     )
     there = subprocess.run(
         [sys.executable, "-c", code],
@@ -284,9 +284,9 @@ def test_same_bytes_in_every_process() -> None:
 
 
 def test_settings_change_the_name_and_frames_must_be_positive() -> None:
-    assert MujocoEngine().name != MujocoEngine(Settings(gravity=1.0)).name
+    assert RigidEngine().name != RigidEngine(RigidSettings(gravity=1.0)).name
     with pytest.raises(BadInputError, match="at least 1"):
-        MujocoEngine().simulate(scene_of(Body("a", "cube", (0, 0, 0))), frames=0)
+        RigidEngine().simulate(scene_of(Body("a", "cube", (0, 0, 0))), frames=0)
 
 
 def test_higher_floor_carries_bodies() -> None:

@@ -1,4 +1,4 @@
-"""What touched what, collected frame by frame."""
+"""Collect the contacts of a simulation frame by frame, and sum them up pair by pair."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from physion.physics.rigid.solver import ContactSet
 from physion.physics.trajectory import Contacts
 
 TOUCH_GAP = 0.0
+"""Metres of separation up to which a contact without impulse counts as a touch."""
 
 
 class ContactRecord:
-    """Collects the contacts of every frame and sums them up, pair by pair."""
+    """Contacts of all frames so far."""
 
     def __init__(self) -> None:
         self._frames: list[NDArray[np.int64]] = []
@@ -24,20 +25,22 @@ class ContactRecord:
         frame: int,
         contacts: ContactSet,
         pairs: NDArray[np.int64],
-        load: NDArray[np.float64],
+        normal_impulse: NDArray[np.float64],
     ) -> None:
-        """Keep the contacts of the step that led to ``frame``; ``load`` are their impulses."""
-        touch = (load > 0.0) | (contacts.separation <= TOUCH_GAP)
+        """Add the contacts of the step that led to ``frame``; those that do not touch are left out.
+
+        ``pairs`` (C, 2) are their scene bodies, ``normal_impulse`` (C,) their impulses in N s.
+        """
+        touch = (normal_impulse > 0.0) | (contacts.separation <= TOUCH_GAP)
         if not touch.any():
             return
         self._frames.append(np.full(np.count_nonzero(touch), frame))
         self._pairs.append(pairs[touch])
-        self._rows.append(
-            np.column_stack([contacts.point, contacts.normal, load, contacts.separation])[touch]
-        )
+        columns = [contacts.point, contacts.normal, normal_impulse, contacts.separation]
+        self._rows.append(np.column_stack(columns)[touch])
 
     def touches(self, pair: set[int]) -> bool:
-        """Whether the two bodies of ``pair`` touch in the last frame that had a contact."""
+        """Return whether the two bodies touch in the last frame that had a contact."""
         if not self._pairs:
             return False
         low, high = min(pair), max(pair)
@@ -45,7 +48,7 @@ class ContactRecord:
         return bool(((last[:, 0] == low) & (last[:, 1] == high)).any())
 
     def contacts(self) -> Contacts:
-        """One row for each touching pair and frame, at its deepest point."""
+        """Return one row for each touching pair and frame: its deepest point, its whole impulse."""
         if not self._frames:
             return Contacts.empty()
         frame = np.concatenate(self._frames)
@@ -65,12 +68,12 @@ class ContactRecord:
             bodies=pair[first].astype(np.int32),
             point=row[first, 0:3].astype(np.float32),
             normal=row[first, 3:6].astype(np.float32),
-            impulse=_sums(row[:, 6], first).astype(np.float32),
+            impulse=_sum_groups(row[:, 6], first).astype(np.float32),
         )
 
 
-def _sums(values: NDArray[np.float64], starts: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Sums of the values from each start to the next, added in order."""
+def _sum_groups(values: NDArray[np.float64], starts: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the sums of the values from each start to the next, added in order."""
     total = np.zeros(len(starts))
     group = np.cumsum(np.isin(np.arange(len(values)), starts)) - 1
     np.add.at(total, group, values)

@@ -1,9 +1,14 @@
-"""The rigid-body engine: MuJoCo's geometry and collisions, the official simulator's contact law.
+"""The rigid-body engine: MuJoCo finds contacts, a solver written after PhysX 4 moves the bodies.
 
-A step of 0.01 s, one a frame: contacts at the present poses; pushes, gravity, drag and the cap of
-the angular velocity; contact forces (`contact_solver`); poses move; then the velocities lose the
-speed that only corrected penetration. The same scene gives the same bytes: nothing here is random,
-parallel or dependent on time.
+MuJoCo is used for collision detection alone; its dynamics is not. One step of 0.01 s is one frame:
+
+1. contacts at the present poses (`find_contacts`, `manifold`);
+2. pushes, gravity, drag, cap of the angular velocity (`solver.move_freely`);
+3. contact impulses (`solver.solve_step`);
+4. poses move (`solver.move_poses`);
+5. bodies at rest fall asleep (`sleeping`).
+
+The same scene gives the same bytes: nothing here is random, parallel or dependent on time.
 """
 
 from __future__ import annotations
@@ -20,10 +25,18 @@ from physion.physics.cloth.simulate import ClothSettings, add_cloth, settle_soli
 from physion.physics.rigid.contact_record import ContactRecord
 from physion.physics.rigid.find_contacts import ContactFinder
 from physion.physics.rigid.model import build_model
-from physion.physics.rigid.settings import Settings
-from physion.physics.rigid.sleeping import find_islands, update_sleep, wake_touched
+from physion.physics.rigid.settings import RigidSettings
+from physion.physics.rigid.sleeping import (
+    SleepOptions,
+    SleepState,
+    find_islands,
+    update_sleep,
+    wake_touched,
+)
 from physion.physics.rigid.solver import (
     AnchorMemory,
+    Bodies,
+    SolverOptions,
     move_freely,
     move_poses,
     no_anchors,
@@ -32,26 +45,30 @@ from physion.physics.rigid.solver import (
 from physion.physics.trajectory import State, Trajectory
 from physion.scenes.scene import Scene
 
-Array = NDArray[np.float64]
+F64 = NDArray[np.float64]
 
 VERSION = 2
-"""Raised whenever a scene may move differently, together with the golden digests."""
+"""Version of the motion: to be raised, with the golden digests, when scenes move differently."""
 
 
-class MujocoEngine:
-    """Simulates rigid bodies, then what `physion.physics.cloth.simulate` lays over them."""
+class RigidEngine:
+    """Simulator of rigid bodies, and of cloth that falls on them.
+
+    Rigid bodies are moved first, by `RigidRun`; cloths then follow in
+    `physion.physics.cloth.simulate`, without acting back on them.
+    """
 
     def __init__(
-        self, settings: Settings | None = None, cloth: ClothSettings | None = None
+        self, settings: RigidSettings | None = None, cloth: ClothSettings | None = None
     ) -> None:
-        self.settings = settings if settings is not None else Settings()
+        self.settings = settings if settings is not None else RigidSettings()
         self.cloth = cloth if cloth is not None else ClothSettings()
 
     @property
     def name(self) -> str:
         """``physion-<version>.<digest>+mujoco-<version>.<settings>.<cloth settings>``.
 
-        The digest is that of the golden motions: engines of one name move scenes alike.
+        The digest is that of the golden motions: engines of the same name move scenes alike.
         """
         engine = f"physion-{VERSION}.{version_digest('motion')}"
         tags = f"{self.settings.tag()}.{self.cloth.tag()}"
@@ -65,7 +82,7 @@ class MujocoEngine:
         frames: int | None = None,
         until_contact: bool = False,
     ) -> Trajectory:
-        """Move ``scene`` until it ends; see `physion.physics.engine.Engine.simulate`."""
+        """Simulate ``scene`` until it ends; see `physion.physics.engine.Engine.simulate`."""
         if frames is not None and frames < 1:
             raise BadInputError(f"frames must be at least 1, not {frames}")
         scene = settle_solids(scene, self.cloth)
@@ -83,70 +100,78 @@ class MujocoEngine:
 
 
 class RigidRun:
-    """A scene while it moves: state, memory of the contacts, and what was recorded so far."""
+    """One simulation in progress: state of the actors, friction anchors, and the record so far."""
 
-    def __init__(self, scene: Scene, settings: Settings, start: State | None = None) -> None:
+    def __init__(self, scene: Scene, settings: RigidSettings, start: State | None = None) -> None:
         self.scene, self.settings = scene, settings
         self.model = build_model(scene, settings)
         self.finder = ContactFinder(self.model, settings, scene.floor)
         actors = self.model.actors
-        self.x, self.q = self.model.start_x.copy(), self.model.start_q.copy()
-        self.v, self.w = np.zeros((actors + 1, 3)), np.zeros((actors + 1, 3))
+        model = self.model
+        actors = model.actors
+        self.bodies = Bodies(
+            model.start_x.copy(),
+            model.start_q.copy(),
+            np.zeros((actors + 1, 3)),
+            np.zeros((actors + 1, 3)),
+            model.inv_mass,
+            model.inv_inertia,
+        )
         self.frame = 0
         if start is not None:
-            self._take(start)
+            self._restore(start)
         self.anchors: AnchorMemory = no_anchors()
-        self.counter = np.full(actors, settings.wake_time)
-        self.still_v, self.still_w = np.zeros((actors, 3)), np.zeros((actors, 3))
-        self.asleep = np.zeros(actors, np.bool_)
-        self.history: list[Array] = [self._actors()]
+        self.sleep = SleepState(
+            np.full(actors, settings.wake_time),
+            np.zeros((actors, 3)),
+            np.zeros((actors, 3)),
+            np.zeros(actors, np.bool_),
+        )
+        self.solver_options = _solver_options(settings)
+        self.sleep_options = SleepOptions(settings.sleep_threshold, settings.wake_time, settings.dt)
+        self.history: list[F64] = [self._state()]
         self.record = ContactRecord()
 
     def step(self) -> None:
         """Move by one frame."""
-        s, model = self.settings, self.model
-        if self.asleep.all() and all(push.frame != self.frame for push in self.scene.pushes):
+        settings, model, bodies, sleep = self.settings, self.model, self.bodies, self.sleep
+        if sleep.asleep.all() and all(push.frame != self.frame for push in self.scene.pushes):
             self.frame += 1
             self.history.append(self.history[-1])
             return
-        contacts, pairs = self.finder.find(self.x, self.q)
+        contacts, pairs = self.finder.find(bodies.x, bodies.q)
         self._push()
         island = find_islands(contacts.bodies, model.actors)
-        wake_touched(island, self.asleep, self.counter, s.wake_time)
-        awake = ~self.asleep
-        self._free_motion(awake)
-        move_v, move_w, load, *memory = solve_step(
-            contacts, self.anchors, self.x, self.q, self.v, self.w,
-            np.where(np.append(awake, True), model.inv_mass, 0.0),
-            np.where(np.append(awake, True)[:, None, None], model.inv_inertia, 0.0),
-            s.dt, s.position_iterations, s.velocity_iterations, s.friction_sweeps,
-            not s.friction_doubling, s.bias, s.max_depenetration_speed, s.bounce_threshold,
-            s.friction_gain, s.patch_cosine, s.anchor_distance, s.anchor_gap,
-        )  # fmt: skip
-        self.anchors = AnchorMemory(*memory)
-        move_poses(self.x, self.q, move_v, move_w, s.dt)
-        update_sleep(
-            contacts.bodies, island, move_v, move_w, self.q, model.inv_inertia, model.inv_mass,
-            self.counter, self.still_v, self.still_w, self.asleep,
-            s.sleep_threshold, s.wake_time, s.dt,
-        )  # fmt: skip
-        self.v[:-1][self.asleep] = 0.0
-        self.w[:-1][self.asleep] = 0.0
+        wake_touched(island, sleep, settings.wake_time)
+        awake = ~sleep.asleep
+        gravity, cap, dt = settings.gravity, settings.max_angular_velocity, settings.dt
+        move_freely(bodies.v, bodies.w, awake, model.drag, gravity, cap, dt)
+        solid = bodies if awake.all() else self._with_sleepers_fixed(awake)
+        result = solve_step(solid, contacts, self.anchors, self.solver_options)
+        self.anchors = result.anchors
+        move_v, move_w = result.move_v, result.move_w
+        move_poses(bodies.x, bodies.q, move_v, move_w, dt)
+        moved = bodies._replace(v=move_v, w=move_w)
+        update_sleep(contacts.bodies, island, moved, sleep, self.sleep_options)
+        bodies.v[:-1][sleep.asleep] = 0.0
+        bodies.w[:-1][sleep.asleep] = 0.0
         self.frame += 1
-        self.record.add(len(self.history), contacts, pairs, load)
-        self.history.append(self._actors())
+        self.record.add(len(self.history), contacts, pairs, result.normal_impulse)
+        self.history.append(self._state())
 
     def all_asleep(self) -> bool:
-        """Every body sleeps that has not fallen below the floor of the ending."""
-        if self.asleep.all():
+        """Return whether every body sleeps that has not fallen below the floor of the ending."""
+        asleep = self.sleep.asleep
+        if asleep.all():
             return True
-        own = self.model.actor_of
-        height = (self.x[own] + rotate_vectors(self.q[own], self.model.pivot))[:, 2]
-        counted = np.unique(own[height >= self.scene.ending.floor])
-        return bool(np.append(self.asleep, True)[counted].all())
+        actor = self.model.actor_of
+        rotated = rotate_vectors(self.bodies.q[actor], self.model.pivot)
+        height = (self.bodies.x[actor] + rotated)[:, 2]
+        counted = np.unique(actor[height >= self.scene.ending.floor])
+        return bool(np.append(asleep, True)[counted].all())
 
     def trajectory(self, engine: str) -> Trajectory:
-        """All frames so far."""
+        """Return all frames so far; ``engine`` is the name that is stored with them."""
         model = self.model
         frames = len(self.history)
         of_body = np.asarray(self.history)[:, model.actor_of]
@@ -154,7 +179,7 @@ class RigidRun:
         arm = rotate_vectors(q, model.center)
         return Trajectory(
             positions=(x + rotate_vectors(q, model.pivot)).astype(np.float32),
-            rotations=multiply_quaternions(q, model.turn).astype(np.float32),
+            rotations=multiply_quaternions(q, model.rotation).astype(np.float32),
             velocities=(v + np.cross(w, arm)).astype(np.float32),
             angular_velocities=w.astype(np.float32),
             cloth_vertices=np.zeros((frames, 0, 3), np.float32),
@@ -164,41 +189,66 @@ class RigidRun:
             engine=engine,
         )
 
-    def _actors(self) -> Array:
-        return np.concatenate([self.x, self.q, self.v, self.w], axis=1)
+    def _state(self) -> F64:
+        """Return position, orientation and velocities of all actors, (A + 1, 13)."""
+        bodies = self.bodies
+        return np.concatenate([bodies.x, bodies.q, bodies.v, bodies.w], axis=1)
+
+    def _with_sleepers_fixed(self, awake: NDArray[np.bool_]) -> Bodies:
+        """Return the bodies with infinite mass where they sleep, so that they do not give way."""
+        gives_way = np.append(awake, True)
+        return self.bodies._replace(
+            inv_mass=np.where(gives_way, self.model.inv_mass, 0.0),
+            inv_inertia=np.where(gives_way[:, None, None], self.model.inv_inertia, 0.0),
+        )
 
     def _push(self) -> None:
+        """Apply the pushes of this frame, J: v += J / m, w += I^-1 (r x J); wake what is pushed."""
+        bodies, model = self.bodies, self.model
         for push in self.scene.pushes:
             if push.frame != self.frame:
                 continue
-            actor = self.model.actor_of[self.scene.index(push.body)]
-            if actor == self.model.actors:
+            actor = model.actor_of[self.scene.index(push.body)]
+            if actor == model.actors:
                 continue
             impulse = np.asarray(push.impulse)
-            self.v[actor] += impulse * self.model.inv_mass[actor]
+            bodies.v[actor] += impulse * model.inv_mass[actor]
             if push.point is not None:
-                turning = np.cross(np.asarray(push.point) - self.x[actor], impulse)
-                local = rotate_vectors(conjugate(self.q[actor]), turning)
-                spin = apply(self.model.inv_inertia[actor], local)
-                self.w[actor] += rotate_vectors(self.q[actor], spin)
-            self.asleep[actor] = False
-            self.counter[actor] = self.settings.wake_time
+                angular = np.cross(np.asarray(push.point) - bodies.x[actor], impulse)
+                local = rotate_vectors(conjugate(bodies.q[actor]), angular)
+                spin = apply(model.inv_inertia[actor], local)
+                bodies.w[actor] += rotate_vectors(bodies.q[actor], spin)
+            self.sleep.asleep[actor] = False
+            self.sleep.counter[actor] = self.settings.wake_time
 
-    def _free_motion(self, awake: NDArray[np.bool_]) -> None:
-        """Gravity, drag, and the cap of the angular velocity, for everything awake."""
-        s, drag = self.settings, self.model.drag
-        move_freely(self.v, self.w, awake, drag, s.gravity, s.max_angular_velocity, s.dt)
-
-    def _take(self, start: State) -> None:
+    def _restore(self, start: State) -> None:
         """Set the actors from the state of the first body of each."""
-        model = self.model
+        bodies, model = self.bodies, self.model
         for actor in range(model.actors):
             i = int(np.flatnonzero(model.actor_of == actor)[0])
-            turn = np.asarray(start.rotations[i], np.float64)
-            q = multiply_quaternions(unit(turn), conjugate(model.turn[i]))
-            self.q[actor] = q
-            self.x[actor] = start.positions[i] - rotate_vectors(q, model.pivot[i])
-            self.w[actor] = start.angular_velocities[i]
+            rotation = np.asarray(start.rotations[i], np.float64)
+            q = multiply_quaternions(unit(rotation), conjugate(model.rotation[i]))
+            bodies.q[actor] = q
+            bodies.x[actor] = start.positions[i] - rotate_vectors(q, model.pivot[i])
+            bodies.w[actor] = start.angular_velocities[i]
             arm = rotate_vectors(q, model.center[i])
-            self.v[actor] = start.velocities[i] - np.cross(self.w[actor], arm)
+            bodies.v[actor] = start.velocities[i] - np.cross(bodies.w[actor], arm)
         self.frame = start.frame
+
+
+def _solver_options(settings: RigidSettings) -> SolverOptions:
+    """Return the settings that the contact solver needs."""
+    return SolverOptions(
+        dt=settings.dt,
+        position_iterations=settings.position_iterations,
+        velocity_iterations=settings.velocity_iterations,
+        friction_sweeps=settings.friction_sweeps,
+        divide_friction=not settings.friction_doubling,
+        bias=settings.bias,
+        max_depenetration_speed=settings.max_depenetration_speed,
+        bounce_threshold=settings.bounce_threshold,
+        friction_gain=settings.friction_gain,
+        patch_cosine=settings.patch_cosine,
+        anchor_distance=settings.anchor_distance,
+        anchor_gap=settings.anchor_gap,
+    )

@@ -1,4 +1,4 @@
-"""The physical constants of the rigid-body engine, all in one place and all documented."""
+"""Constants of the rigid-body engine: time step, solver, friction, sleep."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ FLOOR_MATERIAL = SurfaceMaterial(static_friction=0.6, dynamic_friction=0.6, rest
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
-    """How the engine moves bodies. The defaults are those of the official simulator.
+class RigidSettings:
+    """Constants of the rigid-body engine. The defaults are those of the official simulator.
 
     "Unity" means a default of Unity 2019's physics (PhysX 4), "official" a value that the official
     command logs set, "PhysX" a constant of its patch-friction Gauss-Seidel solver.
@@ -23,15 +23,16 @@ class Settings:
     - ``gravity``: metres per second squared, downwards (official).
     - ``position_iterations``: Gauss-Seidel sweeps with penetration bias (official: 32).
     - ``velocity_iterations``: sweeps without bias, after the poses have moved (Unity: 1).
-    - ``friction_sweeps``: how many of the last position sweeps rub; 0 means all (Unity: all).
-    - ``friction_doubling``: every one of a patch's two anchors may carry the whole friction force,
-      so that flat contacts rub twice as strongly as Coulomb's law says. That is how the official
-      simulator behaves (Unity's "improved patch friction" is off); False shares the force out.
+    - ``friction_sweeps``: number of the last position sweeps that solve friction; 0 means all
+      (Unity: all).
+    - ``friction_doubling``: each of a patch's two anchors may bear the whole friction force, so
+      that flat contacts have twice the friction of Coulomb's law. The official simulator behaves
+      so (Unity's "improved patch friction" is off); with False the anchors divide the force.
     - ``contact_offset``: metres around every surface in which contacts are found (Unity: .01).
-    - ``bias``: share of a penetration or gap that one step closes (PhysX: .8).
+    - ``bias``: fraction of a penetration or gap that one step closes (PhysX: .8).
     - ``max_depenetration_speed``: metres per second (Unity: 10).
     - ``bounce_threshold``: approach speed in m/s above which restitution acts (Unity: 2).
-    - ``friction_gain``: share of the tangential velocity that one sweep removes (PhysX: .8).
+    - ``friction_gain``: fraction of the tangential velocity that one sweep removes (PhysX: .8).
     - ``patch_cosine``: contacts whose normals agree by this cosine form one patch (PhysX: .999).
     - ``anchor_distance``: metres; a second friction anchor must be this far from the first, and
       anchors this far apart along the normal are forgotten (PhysX: .025).
@@ -39,7 +40,7 @@ class Settings:
     - ``max_angular_velocity``: radians per second, about the centre of mass (Unity: 7).
     - ``sleep_threshold``: kinetic energy by mass in m²/s² (official: .01).
     - ``wake_time``: seconds of stillness before a body may sleep (PhysX: .4).
-    - ``floor``: how the floor rubs and bounces (Unity's default material).
+    - ``floor``: friction and restitution of the floor (Unity's default material).
     """
 
     dt: float = FRAME_TIME
@@ -62,6 +63,6 @@ class Settings:
     floor: SurfaceMaterial = FLOOR_MATERIAL
 
     def tag(self) -> str:
-        """Eight hexadecimal digits that change whenever a setting does."""
+        """Return eight hexadecimal digits that change whenever a setting does."""
         text = json.dumps(asdict(self), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:8]

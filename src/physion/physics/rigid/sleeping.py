@@ -1,26 +1,64 @@
-"""When resting bodies fall asleep, as PhysX decides it."""
+"""Sleep: when resting bodies stop being simulated, and what wakes them, after PhysX 4.
+
+Bodies that touch form an island. An island falls asleep as a whole when the wake counter of each of
+its bodies has run down, and wakes as a whole when one of them is awake.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from physion.numerics.kernel import kernel
 from physion.numerics.linear_algebra import inverse
 from physion.numerics.rotations import rotate_vector
+from physion.physics.rigid.solver import Bodies
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+COUNTING_FRACTION = 0.5
+"""Part of the wake time, its last, in which the motion of a body is added up (PhysX)."""
+MAX_RESET = 2.0
+"""Most halves of the wake time that a motion above the limit sets the counter to (PhysX)."""
+
+
+class SleepState(NamedTuple):
+    """Wake counters of A actors; all arrays are changed in place.
+
+    - ``counter`` (A,): seconds until an actor may sleep.
+    - ``sum_v``, ``sum_w`` (A, 3): velocities in m/s (world axes) and angular velocities in rad/s
+      (body axes), summed over the steps of the counter's last part.
+    - ``asleep`` (A,): actors that are not simulated.
+    """
+
+    counter: F64
+    sum_v: F64
+    sum_w: F64
+    asleep: Flags
+
+
+class SleepOptions(NamedTuple):
+    """``threshold``: energy by mass in m^2/s^2. ``wake_time``, ``dt``: seconds."""
+
+    threshold: float
+    wake_time: float
+    dt: float
 
 
 @kernel
-def find_islands(bodies: Any, actors: int) -> Any:
-    """(A,) for every actor the lowest actor that it touches, directly or through others.
+def find_islands(pairs: I64, actors: int) -> I64:
+    """Return (A,) for every actor the lowest actor that it touches, directly or through others.
 
-    ``bodies`` (C, 2) are the actors of the contacts of a step; numbers from ``actors`` on stand
-    for things that do not move and join nothing.
+    ``pairs`` (C, 2) are the actors of the contacts of a step; numbers from ``actors`` on stand for
+    what does not move, and join nothing.
     """
     island = np.arange(actors)
-    for c in range(len(bodies)):
-        a, b = bodies[c, 0], bodies[c, 1]
+    for c in range(len(pairs)):
+        a, b = pairs[c, 0], pairs[c, 1]
         if a < actors and b < actors and island[a] != island[b]:
             low, high = min(island[a], island[b]), max(island[a], island[b])
             for i in range(actors):
@@ -30,46 +68,57 @@ def find_islands(bodies: Any, actors: int) -> Any:
 
 
 @kernel
-def wake_touched(island: Any, asleep: Any, counter: Any, wake_time: float) -> None:
-    """Wake every sleeping actor whose island holds one that is awake."""
+def wake_touched(island: I64, state: SleepState, wake_time: float) -> None:
+    """Wake every sleeping actor whose ``island`` (A,) holds an actor that is awake.
+
+    Its counter is set to ``wake_time`` seconds.
+    """
     for i in range(len(island)):
-        if asleep[i]:
+        if state.asleep[i]:
             continue
         for j in range(len(island)):
-            if asleep[j] and island[j] == island[i]:
-                asleep[j] = False
-                counter[j] = wake_time
+            if state.asleep[j] and island[j] == island[i]:
+                state.asleep[j] = False
+                state.counter[j] = wake_time
+
+
+# The wake counter runs down from wake_time. In its last half, velocities are summed up, so that a
+# shake to and fro cancels and a drift does not: with sums V and W over those steps,
+#     E = (V . V + (W . I W) / m) / 2                (m^2/s^2, energy by mass of the summed motion)
+# is compared with L = (1 + neighbours) threshold. Where E >= L, the sums are cleared and the
+# counter becomes min(E / L, 2) wake_time / 2 + neighbours dt; otherwise it loses dt. W is summed in
+# body axes, so that a steady roll is not taken for rest.
+# PhysX: `updateWakeCounter` (``lowleveldynamics``), whose cluster factor is 1 + neighbours, and the
+# island manager's deactivation. No deviation is known.
 
 
 @kernel
 def update_sleep(
-    bodies: Any,
-    island: Any,
-    v: Any,
-    w: Any,
-    q: Any,
-    inv_inertia: Any,
-    inv_mass: Any,
-    counter: Any,
-    still_v: Any,
-    still_w: Any,
-    asleep: Any,
-    threshold: float,
-    wake_time: float,
-    dt: float,
+    pairs: I64, island: I64, bodies: Bodies, state: SleepState, options: SleepOptions
 ) -> None:
-    """Advance the sleep clocks of all actors by a step.
+    """Advance the wake counters of all actors by a step, and let islands at rest fall asleep.
 
-    ``v``, ``w`` are the velocities that moved the poses. ``counter`` (A,) counts down from
-    ``wake_time``; in its second half the velocities add up in ``still_v``, ``still_w`` (A, 3), and
-    a sum with more energy than ``threshold`` times one plus the number of touching neighbours
-    starts it anew. An island falls asleep when all its clocks are down.
+    Parameters
+    ----------
+    pairs : (C, 2)
+        Actors of the contacts of the step; A stands for what does not move.
+    island : (A,)
+        From `find_islands`.
+    bodies : Bodies
+        With the velocities that moved the poses, and the masses of bodies that are awake.
+    state : SleepState
+        Is changed.
+    options : SleepOptions
+        Threshold, wake time, length of a step.
     """
+    counter, sum_v, sum_w, asleep = state.counter, state.sum_v, state.sum_w, state.asleep
+    v, w, q = bodies.v, bodies.w, bodies.q
+    threshold, wake_time, dt = options.threshold, options.wake_time, options.dt
     actors = len(counter)
     touching = np.zeros((actors, actors + 1), np.bool_)
     opposite = np.zeros(4)
-    for c in range(len(bodies)):
-        a, b = bodies[c, 0], bodies[c, 1]
+    for c in range(len(pairs)):
+        a, b = pairs[c, 0], pairs[c, 1]
         if a < actors:
             touching[a, b] = True
         if b < actors:
@@ -77,32 +126,31 @@ def update_sleep(
     for i in range(actors):
         if asleep[i]:
             continue
-        if counter[i] < 0.5 * wake_time or counter[i] < dt:
+        if counter[i] < COUNTING_FRACTION * wake_time or counter[i] < dt:
             energy = 0.0
             for j in range(3):
-                still_v[i, j] += v[i, j]
-                energy += still_v[i, j] ** 2
-            # Spins add up in the body's own axes, so that a steady roll is not taken for rest.
+                sum_v[i, j] += v[i, j]
+                energy += sum_v[i, j] ** 2
             opposite[:] = -q[i]
             opposite[0] = q[i, 0]
             local = rotate_vector(opposite, w[i])
             for j in range(3):
-                still_w[i, j] += local[j]
-            inertia = inverse(inv_inertia[i])
+                sum_w[i, j] += local[j]
+            inertia = inverse(bodies.inv_inertia[i])
             spin = 0.0
             for j in range(3):
                 for k in range(3):
-                    spin += still_w[i, j] * inertia[j, k] * still_w[i, k]
-            energy += inv_mass[i] * spin
+                    spin += sum_w[i, j] * inertia[j, k] * sum_w[i, k]
+            energy += bodies.inv_mass[i] * spin
             neighbours = 0
             for j in range(actors + 1):
                 neighbours += touching[i, j]
             limit = (1.0 + neighbours) * threshold
             if 0.5 * energy >= limit:
-                still_v[i] = 0.0
-                still_w[i] = 0.0
-                factor = min(0.5 * energy / limit, 2.0) if limit > 0 else 2.0
-                counter[i] = factor * 0.5 * wake_time + dt * neighbours
+                sum_v[i] = 0.0
+                sum_w[i] = 0.0
+                factor = min(0.5 * energy / limit, MAX_RESET) if limit > 0 else MAX_RESET
+                counter[i] = factor * COUNTING_FRACTION * wake_time + dt * neighbours
                 continue
         counter[i] = max(counter[i] - dt, 0.0)
     for i in range(actors):
@@ -117,5 +165,5 @@ def update_sleep(
         for j in range(actors):
             if island[j] == i and not asleep[j]:
                 asleep[j] = True
-                still_v[j] = 0.0
-                still_w[j] = 0.0
+                sum_v[j] = 0.0
+                sum_w[j] = 0.0
