@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from physion.physics.trajectory import Contacts, Trajectory
-from physion.rendering.renderer import PASSES, Renderer, Settings
+from physion.rendering.renderer import PASSES, Renderer, RenderSettings
 from physion.scenes.scene import Body, Camera, Cloth, Look, Roles, Scene
 
 RESULTS = Path(__file__).parent / "results"
@@ -95,7 +95,7 @@ def milliseconds(size: int, passes: tuple[str, ...], still_layer: bool = True) -
     """CPU milliseconds a frame: of the first (with set-up), and mean and worst of the others."""
     scene, trajectory = reference_scene()
     start = time.process_time()
-    renderer = Renderer(scene, trajectory, size, size, Settings(still_layer=still_layer))
+    renderer = Renderer(scene, trajectory, size, size, RenderSettings(keep_static=still_layer))
     renderer.render(0, passes)
     first = time.process_time() - start
     times = []

@@ -10,7 +10,14 @@ from numpy.typing import NDArray
 
 from physion.numerics.rotations import rotation_matrix
 from physion.rendering.camera import View
-from physion.rendering.rasterizer import NOTHING, SAMPLES, rasterize
+from physion.rendering.rasterizer import (
+    NOTHING,
+    SAMPLES,
+    DepthRange,
+    Triangles,
+    VisibilityBuffer,
+    rasterize,
+)
 from physion.rendering.renderer import Frame, Renderer
 from physion.scenes.scene import Camera, Cloth, Scene
 from physion.scenes.shapes.primitives import shape, shapes
@@ -218,7 +225,9 @@ def test_every_shape_is_closed_to_the_eye(name: str) -> None:
         ids = np.full((128, 128, len(SAMPLES)), NOTHING, np.int32)
         inverse = np.zeros(ids.shape, np.float32)
         sides = np.full(len(faces), two_sided)
-        rasterize(homogeneous, faces, sides, 0, 0.1, 100.0, np.zeros((len(faces), 9)), ids, inverse)
+        triangles = Triangles(faces, sides, np.zeros((len(faces), 3, 3)))
+        buffer = VisibilityBuffer(ids, inverse)
+        rasterize(homogeneous, triangles, 0, DepthRange(0.1, 100.0), buffer)
         pictures.append(inverse)
     assert (pictures[0] > 0).sum() > 2000
     np.testing.assert_allclose(pictures[0], pictures[1], atol=1e-6)
@@ -236,9 +245,9 @@ def test_a_triangle_through_the_camera_plane_hides_what_is_behind_it() -> None:
     homogeneous = corners @ view.to_pixels[:, :3].T + view.to_pixels[:, 3]
     ids = np.full((64, 64, 1), NOTHING, np.int32)
     inverse = np.zeros(ids.shape, np.float32)
-    edges = np.zeros((1, 9))
     faces = np.array([[0, 1, 2]], np.int32)
-    rasterize(homogeneous, faces, np.ones(1, bool), 0, 0.1, 100.0, edges, ids, inverse)
+    triangles = Triangles(faces, np.ones(1, bool), np.zeros((1, 3, 3)))
+    rasterize(homogeneous, triangles, 0, DepthRange(0.1, 100.0), VisibilityBuffer(ids, inverse))
     eye = np.array([0.0, 0.0, 1.0])
     ray = view.unproject(pixel_centers(64, 64), np.ones((64, 64))) - eye
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -16,7 +16,7 @@ from physion.rendering.renderer import (
     PASSES,
     Frame,
     Renderer,
-    Settings,
+    RenderSettings,
     render_frames,
     role_map,
 )
@@ -80,10 +80,10 @@ def test_a_frame_does_not_depend_on_the_frames_after_the_next() -> None:
     assert digest(whole.render(0, ALL)) == digest(part.render(0, ALL))
 
 
-def test_drawing_still_things_once_changes_no_byte() -> None:
+def test_shading_static_surfaces_once_changes_no_byte() -> None:
     scene, trajectory = tumbling()
     once = Renderer(scene, trajectory).render(1, ALL)
-    always = Renderer(scene, trajectory, settings=Settings(still_layer=False)).render(1, ALL)
+    always = Renderer(scene, trajectory, settings=RenderSettings(keep_static=False)).render(1, ALL)
     assert digest(once) == digest(always)
 
 
@@ -102,9 +102,9 @@ def test_a_fresh_process_gives_the_same_bytes() -> None:
 
 
 @pytest.mark.parametrize("room", ["box", "bright"])
-@pytest.mark.parametrize("turn", range(8))
-def test_rooms_have_no_holes_and_are_not_over_exposed(room: str, turn: int) -> None:
-    angle = turn * np.pi / 4
+@pytest.mark.parametrize("step", range(8))
+def test_rooms_have_no_holes_and_are_not_over_exposed(room: str, step: int) -> None:
+    angle = step * np.pi / 4
     camera = Camera((2.5 * np.cos(angle), 2.5 * np.sin(angle), 1.2), (0.0, 0.0, 1.0))
     scene = scene_of(
         body("box", at=(0.0, 0.0, 0.0), scale=(0.2, 0.2, 0.2)), camera=camera, room=room
@@ -138,7 +138,7 @@ def test_things_throw_soft_shadows_and_darken_the_ground_they_stand_on() -> None
     plain = Renderer(empty, resting(empty)).render(0)
     high = scene_of(far, body("lid", at=(0.0, 0.0, 1.0), scale=(0.8, 0.8, 0.02)), camera=camera)
     shaded = Renderer(high, resting(high)).render(0)
-    direction = np.asarray(rooms.get("empty").lamp_direction)
+    direction = np.asarray(rooms.get("empty").light_direction)
     under = (-direction[0] / direction[2], -direction[1] / direction[2], 0.0)
     assert floor_color(shaded, view, under) < 0.95 * floor_color(plain, view, under)
     # Inside the edge, on it, and outside of it.
@@ -147,7 +147,7 @@ def test_things_throw_soft_shadows_and_darken_the_ground_they_stand_on() -> None
     assert steps[0] < steps[1] < steps[2]
     low = scene_of(far, body("box", at=(0.0, 0.0, 0.0), scale=(0.4, 0.4, 0.4)), camera=camera)
     beside = Renderer(low, resting(low)).render(0)
-    spot = (0.27, 0.0, 0.0)  # towards the lamp, where no shadow falls
+    spot = (0.27, 0.0, 0.0)  # towards the light, where no shadow falls
     assert floor_color(beside, view, spot) < 0.98 * floor_color(plain, view, spot)
 
 

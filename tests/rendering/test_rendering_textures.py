@@ -55,7 +55,7 @@ def test_texture_repeats_without_a_seam(name: str, axis: int) -> None:
 def test_every_look_has_a_finish(name: str) -> None:
     kind = finish(name)
     assert kind.texture in PAINTERS
-    assert 0 <= kind.mirror < 1 and 0 <= kind.metal <= 1 and kind.gloss >= 0
+    assert 0 <= kind.reflectance < 1 and 0 <= kind.metalness <= 1 and kind.specular >= 0
 
 
 def test_materials_differ_in_texture_or_in_shine() -> None:
@@ -126,13 +126,13 @@ def test_parts_of_props_have_their_own_colours_unless_they_play_a_role() -> None
     prop = shape("prop:lamp")
     assert isinstance(prop, PropShape)
     free, role = (assemble(scene, rooms.get("empty")) for scene in map(lamp_scene, (False, True)))
-    painted = free.material[free.objects == 2]
+    painted = free.material[free.object_ids == 2]
     assert len(set(painted)) == 1 + len(prop.own_looks)
     # Triangles of two colours are two surfaces.
-    surfaces = free.surface[free.objects == 2]
+    surfaces = free.groups[free.object_ids == 2]
     pairs = set(zip(surfaces.tolist(), painted.tolist(), strict=True))
     assert len(pairs) == len(set(surfaces.tolist()))
-    assert len(set(role.material[role.objects == 1])) == 1
+    assert len(set(role.material[role.object_ids == 1])) == 1
 
 
 def test_paint_follows_the_mesh_of_every_prop() -> None:
@@ -145,7 +145,7 @@ def test_paint_follows_the_mesh_of_every_prop() -> None:
     for i, name in enumerate(PROPS):
         prop = shape(PREFIX + name)
         assert isinstance(prop, PropShape)
-        rows = made.material[made.objects == i + 2]
+        rows = made.material[made.object_ids == i + 2]
         assert len(rows) == len(prop.paint)
         for slot in set(prop.paint.tolist()):
             assert len(set(rows[prop.paint == slot])) == 1

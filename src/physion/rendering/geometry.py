@@ -1,4 +1,4 @@
-"""Triangles ready to be drawn: corner normals, texture coordinates, surfaces."""
+"""Meshes ready to be drawn: corner normals, texture coordinates, smooth surfaces."""
 
 from __future__ import annotations
 
@@ -15,20 +15,25 @@ F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 
 FLAT = np.radians(1.0)
-"""Triangles that meet at a smaller angle than this lie in one face, in radians."""
+"""Angle in radians below which triangles that meet at an edge lie in one flat face."""
+UV_MARGIN = 0.002
+"""Distance in texture coordinates that a bounding box keeps from the seam of its texture."""
+UV_SPAN = 0.996
+"""Part of the texture that it therefore spans: 1 - 2 `UV_MARGIN`."""
 
 
 @dataclass(frozen=True)
-class Part:
+class MeshPart:
     """One mesh in the axes of its body. V vertices, T triangles.
 
     - ``vertices`` (V, 3): metres. ``faces`` (T, 3): counter-clockwise seen from outside.
-    - ``normals`` (T, 9): unit normals of the three corners.
-    - ``uv`` (T, 6): texture coordinates of the three corners; the texture repeats each unit.
-    - ``tangents`` (T, 6): world directions of growing u and v, zero where no relief is drawn.
-    - ``surfaces`` (T,): triangles with one number make one smooth surface, so that a pixel that
-      shows several of them is shaded once.
-    - ``materials`` (T,): row in the table of materials.
+    - ``normals`` (T, 3, 3): unit normal of each corner.
+    - ``uv`` (T, 3, 2): texture coordinates of each corner; the texture repeats every unit.
+    - ``tangents`` (T, 2, 3): world directions of growing u and v; zero without a normal map.
+    - ``groups`` (T,): triangles of one number make one smooth surface, so that a pixel that shows
+      several of them is shaded once.
+    - ``materials`` (T,): index of the material.
+    - ``two_sided``: whether the back of the triangles is drawn too.
     """
 
     vertices: F64
@@ -36,7 +41,7 @@ class Part:
     normals: F32
     uv: F32
     tangents: F32
-    surfaces: I32
+    groups: I32
     materials: I32
     two_sided: bool = False
 
@@ -49,41 +54,61 @@ def face_normals(vertices: F64, faces: I32) -> F64:
     return np.asarray(np.divide(cross, length, out=np.zeros_like(cross), where=length > 0))
 
 
-def solid(vertices: F64, faces: I32, scale: F64, crease: float, material: int) -> Part:
-    """A body's mesh at unit scale as a `Part` in metres.
+def solid(vertices: F64, faces: I32, scale: F64, crease: float, material: int) -> MeshPart:
+    """Return the mesh of a body in metres.
 
-    Triangles that meet at an angle below ``crease`` (radians, at unit scale) are shaded round.
-    Texture coordinates are taken before scaling, from the side of the unit box that a triangle
-    faces: a texture stretches with its body, as it does in the original stimuli.
+    Parameters
+    ----------
+    vertices, faces
+        (V, 3) at unit scale and (T, 3).
+    scale
+        (3,) factors along the axes of the body.
+    crease
+        Angle in radians, at unit scale, below which triangles that meet at an edge form one smooth
+        surface.
+    material
+        Index of the material of all triangles.
+
+    Notes
+    -----
+    The normal of a corner is the mean of the normals of the triangles of its surface that meet
+    there, weighted by their angles (Thurmer and Wuthrich 1998). Texture coordinates are taken
+    before scaling, from the side of the unit box that a triangle faces. A texture therefore
+    stretches with its body, as in the original stimuli.
+
+    References
+    ----------
+    Thurmer, G. and Wuthrich, C. (1998). Computing vertex normals from polygonal facets. Journal of
+        Graphics Tools 3(1).
     """
     unit, faces = _merge(np.asarray(vertices, np.float64), np.asarray(faces, np.int32))
     scaled = unit * scale
-    surfaces = _surfaces(faces, face_normals(unit, faces), cos(max(crease, FLAT)))
+    groups = _smooth_groups(faces, face_normals(unit, faces), cos(max(crease, FLAT)))
     normals = face_normals(scaled, faces)
-    key = faces.astype(np.int64) + len(unit) * surfaces[:, None].astype(np.int64)
-    _, group = np.unique(key.ravel(), return_inverse=True)
+    key = faces.astype(np.int64) + len(unit) * groups[:, None].astype(np.int64)
+    _, corner_index = np.unique(key.ravel(), return_inverse=True)
     angles = _corner_angles(scaled, faces).reshape(-1, 1)
     weighted = np.repeat(normals, 3, axis=0) * angles
-    total = np.zeros((int(group.max()) + 1, 3))
-    np.add.at(total, group, weighted)
-    corner = total[group]
+    total = np.zeros((int(corner_index.max()) + 1, 3))
+    np.add.at(total, corner_index, weighted)
+    corner = total[corner_index]
     length = norm(corner)[:, None]
     flat = np.repeat(normals, 3, axis=0)
     corner = np.where(length > 1e-12, corner / np.maximum(length, 1e-12), flat)
     count = len(faces)
-    return Part(
+    return MeshPart(
         vertices=scaled,
         faces=faces,
-        normals=corner.reshape(count, 9).astype(np.float32),
-        uv=_box_uv(unit, faces).reshape(count, 6),
-        tangents=np.zeros((count, 6), np.float32),
-        surfaces=surfaces,
+        normals=corner.reshape(count, 3, 3).astype(np.float32),
+        uv=_box_uv(unit, faces),
+        tangents=np.zeros((count, 2, 3), np.float32),
+        groups=groups,
         materials=np.full(count, material, np.int32),
     )
 
 
-def sheet(resolution: int, material: int) -> Part:
-    """A cloth: a grid of ``resolution`` x ``resolution`` vertices that come with each frame."""
+def sheet(resolution: int, material: int) -> MeshPart:
+    """Return a cloth of ``resolution`` x ``resolution`` vertices, which each frame fills in."""
     index = np.arange(resolution * resolution, dtype=np.int32).reshape(resolution, resolution)
     a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
     faces = np.concatenate(
@@ -91,20 +116,20 @@ def sheet(resolution: int, material: int) -> Part:
     )
     u, v = np.divmod(faces, resolution)
     count = len(faces)
-    return Part(
+    return MeshPart(
         vertices=np.zeros((resolution * resolution, 3)),
         faces=faces,
-        normals=np.zeros((count, 9), np.float32),
-        uv=(np.stack([u, v], -1) / (resolution - 1)).reshape(count, 6).astype(np.float32),
-        tangents=np.zeros((count, 6), np.float32),
-        surfaces=np.zeros(count, np.int32),
+        normals=np.zeros((count, 3, 3), np.float32),
+        uv=(np.stack([u, v], -1) / (resolution - 1)).astype(np.float32),
+        tangents=np.zeros((count, 2, 3), np.float32),
+        groups=np.zeros(count, np.int32),
         materials=np.full(count, material, np.int32),
         two_sided=True,
     )
 
 
 def _merge(vertices: F64, faces: I32) -> tuple[F64, I32]:
-    """Make vertices at one place (to a micrometre) one vertex, and drop triangles that vanish."""
+    """Join vertices at the same position (to a micrometre); drop triangles that become lines."""
     _, first, inverse = np.unique(
         np.round(vertices, 6), axis=0, return_index=True, return_inverse=True
     )
@@ -117,8 +142,12 @@ def _merge(vertices: F64, faces: I32) -> tuple[F64, I32]:
     return vertices[first], np.ascontiguousarray(merged[kept])
 
 
-def _surfaces(faces: I32, normals: F64, threshold: float) -> I32:
-    """Number the groups of triangles that meet at edges less sharp than ``threshold`` (cosine)."""
+def _smooth_groups(faces: I32, normals: F64, threshold: float) -> I32:
+    """Return the smooth surface (T,) of each triangle.
+
+    Two triangles with a common edge belong together if the cosine of the angle between their
+    ``normals`` exceeds ``threshold``.
+    """
     count = len(faces)
     edges = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], -1).reshape(-1, 2), axis=1)
     owner = np.repeat(np.arange(count), 3)
@@ -131,7 +160,7 @@ def _surfaces(faces: I32, normals: F64, threshold: float) -> I32:
 
 
 def _components(count: int, a: NDArray[np.intp], b: NDArray[np.intp]) -> I32:
-    """Number the connected groups of ``count`` nodes that the pairs (a, b) join.
+    """Return the connected component of each of ``count`` nodes joined by the pairs (a, b).
 
     Every node takes the smallest label among its neighbours, then its label's label, until
     nothing changes.
@@ -158,12 +187,12 @@ def _corner_angles(vertices: F64, faces: I32) -> F64:
 
 
 def _box_uv(unit: F64, faces: I32) -> F32:
-    """Texture coordinates (T, 3, 2) in 0..1 from the side of the bounding box that is faced."""
+    """Return texture coordinates (T, 3, 2) in 0..1 on the side of the bounding box they face."""
     low, size = unit.min(axis=0), np.ptp(unit, axis=0)
-    at = (unit - low) / np.where(size > 0, size, 1.0)
-    at = 0.002 + 0.996 * at  # keep off the seam of the texture
+    relative = (unit - low) / np.where(size > 0, size, 1.0)
+    relative = UV_MARGIN + UV_SPAN * relative
     axis = np.abs(face_normals(unit, faces)).argmax(axis=1)
-    # Grain runs along z on the sides and along x on top, as on a plank that stands.
+    # v, the direction of the grain, is z on the sides and x on top, as on an upright plank.
     pairs = np.array([[1, 2], [0, 2], [1, 0]])[axis]
-    corners = at[faces]
+    corners = relative[faces]
     return np.take_along_axis(corners, pairs[:, None, :].repeat(3, 1), axis=2).astype(np.float32)

@@ -1,16 +1,23 @@
-"""Which triangle is seen at each sample of each pixel, and the depth maps for shadows.
+"""Visibility: which triangle each sample of each pixel shows; depth maps; the G-buffer.
 
-Triangles are drawn in homogeneous pixel coordinates (x w, y w, w), so a triangle that crosses the
-plane of the camera needs no clipping (Olano and Greer 1997, "Triangle scan conversion using 2D
-homogeneous coordinates"). With v0, v1, v2 the corners, the three edge functions are the cross
-products of two of them; divided by the determinant, each is linear in the picture and equals
-barycentric coordinate / depth. Their sum is 1 / depth.
+Triangles are drawn in homogeneous pixel coordinates (x w, y w, w), where w is the depth in metres,
+so a triangle that crosses the plane of the camera needs no clipping (Olano and Greer 1997). The
+colour pass takes five samples for each pixel, the other passes the one at its centre.
 
-An edge that two triangles share has, in both, exactly opposite coefficients; samples on it count
-for both, and the nearer one stays: no cracks.
+Letters in the kernels: T triangles, V vertices, H rows, W columns, S samples for each pixel.
+
+References
+----------
+Pineda, J. (1988). A parallel algorithm for polygon rasterization. SIGGRAPH.
+Olano, M. and Greer, T. (1997). Triangle scan conversion using 2D homogeneous coordinates.
+    Graphics Hardware.
+Burns, C. and Hunt, W. (2013). The visibility buffer: a cache-friendly approach to deferred
+    shading. Journal of Computer Graphics Techniques 2(2).
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,20 +26,87 @@ from physion.numerics.kernel import kernel
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
+I16 = NDArray[np.int16]
 I32 = NDArray[np.int32]
+Bools = NDArray[np.bool_]
 
 SAMPLES = np.array([[0.0, 0.0], [-0.125, -0.375], [0.375, -0.125], [-0.375, 0.125], [0.125, 0.375]])
-"""Offsets of the samples from the centre of a pixel. The first one alone makes the exact passes;
-colour is the mean of all five."""
-
-REACH = 0.375
+"""Offsets (S, 2) of the samples from the centre of a pixel: the centre, then a rotated grid."""
+SAMPLE_REACH = 0.375
+"""Largest offset of a sample along x or y."""
 NOTHING = -1
-"""Triangle index of a sample where nothing is seen."""
+"""Triangle id of a sample that no triangle covers."""
+SHORTEST_NORMAL = 1e-12
+"""Length below which an interpolated normal is not scaled up to one."""
+
+
+class Triangles(NamedTuple):
+    """Triangles to be drawn.
+
+    - ``faces`` (T, 3) int32: vertex indices, counter-clockwise seen from outside.
+    - ``two_sided`` (T,) bool: triangles whose back is drawn too.
+    - ``edges`` (T, 3, 3) float64, written by `rasterize`: coefficients (of x, y, 1) of the three
+      edge functions, see there; zero for a triangle that is not drawn.
+    """
+
+    faces: I32
+    two_sided: Bools
+    edges: F64
+
+
+class DepthRange(NamedTuple):
+    """Depths in metres between which surfaces are drawn: 0 < ``near`` < ``far``."""
+
+    near: float
+    far: float
+
+
+class VisibilityBuffer(NamedTuple):
+    """Nearest triangle of each sample (Burns and Hunt 2013).
+
+    - ``triangle_ids`` (H, W, S) int32: index of the triangle, or `NOTHING`.
+    - ``inverse_depth`` (H, W, S) float32: 1 / depth in 1/m; 0 where there is nothing.
+    """
+
+    triangle_ids: I32
+    inverse_depth: F32
+
+
+class GeometryBuffers(NamedTuple):
+    """The G-buffer: what the pixel centres show, apart from colour.
+
+    - ``depth`` (H, W) float32: metres along the optical axis.
+    - ``normals`` (H, W, 3) float32: unit vectors in the world.
+    - ``object_ids`` (H, W) int16.
+    - ``flow`` (H, W, 2) float32: pixels to the next frame.
+    """
+
+    depth: F32
+    normals: F32
+    object_ids: I16
+    flow: F32
+
+
+class SurfaceMotion(NamedTuple):
+    """What `fill_geometry_buffers` reads besides the triangles.
+
+    - ``normals`` (T, 3, 3) float32: normal of each corner in the world.
+    - ``object_ids`` (T,) int32.
+    - ``next_points`` (V, 3) float64: homogeneous pixels of the vertices in the next frame.
+    """
+
+    normals: F32
+    object_ids: I32
+    next_points: F64
 
 
 @kernel
 def _bounds(points: F64, face: I32, near: float) -> tuple[float, float, float, float]:
-    """Smallest box of pixels around the part of a triangle that lies beyond ``near``."""
+    """Return left, right, top and bottom in pixels of the part of a triangle beyond ``near``.
+
+    That part is a polygon whose corners are the triangle's corners beyond ``near`` and the points
+    where its edges cross the plane w = near; the box around them is exact.
+    """
     left, right, top, bottom = np.inf, -np.inf, np.inf, -np.inf
     for k in range(3):
         a, b = face[k], face[(k + 1) % 3]
@@ -43,72 +117,100 @@ def _bounds(points: F64, face: I32, near: float) -> tuple[float, float, float, f
             left, right = min(left, x), max(right, x)
             top, bottom = min(top, y), max(bottom, y)
         if (aw >= near) != (bw >= near):
-            share = (near - aw) / (bw - aw)
-            x = (ax + share * (points[b, 0] - ax)) / near
-            y = (ay + share * (points[b, 1] - ay)) / near
+            fraction = (near - aw) / (bw - aw)
+            x = (ax + fraction * (points[b, 0] - ax)) / near
+            y = (ay + fraction * (points[b, 1] - ay)) / near
             left, right = min(left, x), max(right, x)
             top, bottom = min(top, y), max(bottom, y)
     return left, right, top, bottom
 
 
 @kernel
-def rasterize(
-    points: F64,
-    faces: I32,
-    two_sided: NDArray[np.bool_],
-    first: int,
-    near: float,
-    far: float,
-    edges: F64,
-    ids: I32,
-    inverse_depth: F32,
-) -> None:
-    """Draw the triangles from index ``first`` on into ``ids`` and ``inverse_depth``.
+def _covered_pixels(low: float, high: float, size: int) -> tuple[int, int]:
+    """Return the first and last pixel of ``size`` that may have a sample between two coordinates.
 
-    - ``points`` (V, 3): homogeneous pixels. ``faces`` (T, 3), counter-clockwise seen from outside;
-      the others are culled unless ``two_sided`` (T,).
-    - ``edges`` (T, 9), written: for each corner the coefficients (of x, y, 1) of its barycentric
-      coordinate / depth. Zeros for a triangle that is not seen.
-    - ``ids`` (H, W, S), ``inverse_depth`` (H, W, S): updated where a triangle is nearer than what
-      is there. Equal depths keep the one drawn first.
+    A sample lies at most `SAMPLE_REACH` from the centre of its pixel, which is at index + 0.5.
     """
-    height, width, samples = ids.shape
-    most, least = 1.0 / near, 1.0 / far
-    for t in range(first, faces.shape[0]):
-        for c in range(9):
-            edges[t, c] = 0.0
-        i, j, k = faces[t, 0], faces[t, 1], faces[t, 2]
+    first = int(max(0.0, np.ceil(max(low, -1.0) - 0.5 - SAMPLE_REACH)))
+    last = int(min(size - 1.0, np.floor(min(high, size + 1.0) - 0.5 + SAMPLE_REACH)))
+    return first, last
+
+
+@kernel
+def rasterize(
+    points: F64, triangles: Triangles, first: int, depths: DepthRange, buffer: VisibilityBuffer
+) -> None:
+    """Draw the triangles from index ``first`` on into a visibility buffer.
+
+    Parameters
+    ----------
+    points
+        (V, 3) homogeneous pixels (x w, y w, w).
+    triangles
+        ``faces`` and ``two_sided`` are read, ``edges`` of the triangles drawn are written.
+    first
+        Index of the first triangle to draw.
+    depths
+        Surfaces nearer or farther than this are left out, sample by sample.
+    buffer
+        Updated where a triangle is nearer than what is there. Of equal depths the one drawn first
+        stays.
+
+    Notes
+    -----
+    With the corners v0, v1, v2 in homogeneous pixels, the edge functions (Pineda 1988) are
+
+        E0(x, y) = (v1 x v2) . (x, y, 1) / det,   det = v0 . (v1 x v2),
+
+    and E1, E2 with the indices rotated. A pixel lies in the triangle where all three are >= 0. The
+    functions are linear in the picture, Ek = bk / w with the barycentric coordinate bk of the
+    surface point, and their sum is 1 / w since the bk add up to 1 (Olano and Greer 1997).
+
+    det < 0 for a triangle seen from its front, because y points down in the picture.
+
+    The edge that two triangles share has exactly opposite coefficients in both, so that no sample
+    on it is missed by both. A sample exactly on it belongs to both, and the depth test keeps one.
+    """
+    height, width, samples = buffer.triangle_ids.shape
+    nearest, farthest = 1.0 / depths.near, 1.0 / depths.far
+    for t in range(first, triangles.faces.shape[0]):
+        for corner in range(3):
+            for column in range(3):
+                triangles.edges[t, corner, column] = 0.0
+        i, j, k = triangles.faces[t, 0], triangles.faces[t, 1], triangles.faces[t, 2]
         x0, y0, w0 = points[i, 0], points[i, 1], points[i, 2]
         x1, y1, w1 = points[j, 0], points[j, 1], points[j, 2]
         x2, y2, w2 = points[k, 0], points[k, 1], points[k, 2]
-        if w0 < near and w1 < near and w2 < near:
+        if w0 < depths.near and w1 < depths.near and w2 < depths.near:
             continue
+        # Cross products: the coefficients (a, b, c) of the edge function opposite each corner.
         a0, b0, c0 = y1 * w2 - w1 * y2, w1 * x2 - x1 * w2, x1 * y2 - y1 * x2
         a1, b1, c1 = y2 * w0 - w2 * y0, w2 * x0 - x2 * w0, x2 * y0 - y2 * x0
         a2, b2, c2 = y0 * w1 - w0 * y1, w0 * x1 - x0 * w1, x0 * y1 - y0 * x1
         determinant = x0 * a0 + y0 * b0 + w0 * c0
-        if determinant == 0.0 or (determinant > 0.0 and not two_sided[t]):
+        if determinant == 0.0 or (determinant > 0.0 and not triangles.two_sided[t]):
             continue
-        left, right, top, bottom = _bounds(points, faces[t], near)
-        # A sample lies at most REACH from the centre of its pixel, which is at j + 0.5.
-        j0 = int(max(0.0, np.ceil(max(left, -1.0) - 0.5 - REACH)))
-        j1 = int(min(width - 1.0, np.floor(min(right, width + 1.0) - 0.5 + REACH)))
-        i0 = int(max(0.0, np.ceil(max(top, -1.0) - 0.5 - REACH)))
-        i1 = int(min(height - 1.0, np.floor(min(bottom, height + 1.0) - 0.5 + REACH)))
+        left, right, top, bottom = _bounds(points, triangles.faces[t], depths.near)
+        j0, j1 = _covered_pixels(left, right, width)
+        i0, i1 = _covered_pixels(top, bottom, height)
         if j0 > j1 or i0 > i1:
             continue
         inverse = 1.0 / determinant
-        edges[t, 0], edges[t, 1], edges[t, 2] = a0 * inverse, b0 * inverse, c0 * inverse
-        edges[t, 3], edges[t, 4], edges[t, 5] = a1 * inverse, b1 * inverse, c1 * inverse
-        edges[t, 6], edges[t, 7], edges[t, 8] = a2 * inverse, b2 * inverse, c2 * inverse
+        edges = triangles.edges
+        edges[t, 0, 0], edges[t, 0, 1], edges[t, 0, 2] = a0 * inverse, b0 * inverse, c0 * inverse
+        edges[t, 1, 0], edges[t, 1, 1], edges[t, 1, 2] = a1 * inverse, b1 * inverse, c1 * inverse
+        edges[t, 2, 0], edges[t, 2, 1], edges[t, 2, 2] = a2 * inverse, b2 * inverse, c2 * inverse
+        # 1 / depth is the sum of the edge functions.
         da = (a0 + a1 + a2) * inverse
         db = (b0 + b1 + b2) * inverse
         dc = (c0 + c1 + c2) * inverse
+        # Inside is where the functions have the sign of 1 / det; the factor itself is left out.
         if determinant < 0.0:
             a0, b0, c0, a1, b1, c1, a2, b2, c2 = -a0, -b0, -c0, -a1, -b1, -c1, -a2, -b2, -c2
-        m0 = REACH * (abs(a0) + abs(b0))
-        m1 = REACH * (abs(a1) + abs(b1))
-        m2 = REACH * (abs(a2) + abs(b2))
+        # Most that each function can gain from the centre of a pixel to one of its samples.
+        m0 = SAMPLE_REACH * (abs(a0) + abs(b0))
+        m1 = SAMPLE_REACH * (abs(a1) + abs(b1))
+        m2 = SAMPLE_REACH * (abs(a2) + abs(b2))
         for row in range(i0, i1 + 1):
             yc = row + 0.5
             r0, r1, r2 = b0 * yc + c0, b1 * yc + c1, b2 * yc + c2
@@ -124,17 +226,31 @@ def rasterize(
                         and a2 * x + (b2 * y + c2) >= 0.0
                     ):
                         d = np.float32(da * x + db * y + dc)
-                        if d > inverse_depth[row, column, s] and least <= d <= most:
-                            inverse_depth[row, column, s] = d
-                            ids[row, column, s] = t
+                        if d > buffer.inverse_depth[row, column, s] and farthest <= d <= nearest:
+                            buffer.inverse_depth[row, column, s] = d
+                            buffer.triangle_ids[row, column, s] = t
 
 
 @kernel
 def rasterize_depth(points: F64, faces: I32, first: int, last: int, depth: F32) -> None:
-    """Lower ``depth`` (H, W) to the smallest third coordinate of the triangles ``first:last``.
+    """Lower a depth map to the smallest depth of the triangles ``first:last``.
 
-    ``points`` (V, 3) are (x in texels, y in texels, depth), without perspective. Every side of a
-    triangle counts. Texel centres are at j + 0.5.
+    Parameters
+    ----------
+    points
+        (V, 3): x and y in texels, depth in metres; a parallel projection.
+    faces
+        (T, 3) vertex indices; both sides of a triangle are drawn.
+    first, last
+        Range of triangles.
+    depth
+        (H, W) in metres, updated at texel centres (index + 0.5).
+
+    Notes
+    -----
+    Without perspective the barycentric coordinates are ratios of signed areas,
+    b1 = area(v0, p, v2) / area(v0, v1, v2), and the depth is z0 + b1 (z1 - z0) + b2 (z2 - z0)
+    (Pineda 1988).
     """
     height, width = depth.shape
     for t in range(first, last):
@@ -164,70 +280,88 @@ def rasterize_depth(points: F64, faces: I32, first: int, last: int, depth: F32) 
 
 
 @kernel
-def measure(
-    ids: I32,
-    edges: F64,
-    faces: I32,
-    objects: I32,
-    normals: F32,
-    two_sided: NDArray[np.bool_],
-    next_points: F64,
-    first: int,
-    depth: F32,
-    normal: F32,
-    identity: NDArray[np.int16],
-    flow: F32,
-) -> None:
-    """Fill the exact passes at pixel centres that show triangle ``first`` or a later one.
+def barycentric(edges: F64, t: int, x: float, y: float) -> tuple[float, float, float, float]:
+    """Return depth and barycentric coordinates of the point of triangle ``t`` seen at a pixel.
 
-    ``objects`` (T,) is what is written to ``identity``; ``normals`` (T, 9) are the corner normals
-    in the world; ``next_points`` (V, 3) are the homogeneous pixels of the next frame. The surface
-    point at a pixel is the same weighted mean of its corners in both frames, so the flow is exact
-    for whatever moves its corners: rigid bodies and cloth alike.
+    ``edges`` (T, 3, 3) as `rasterize` writes them; x and y are in pixels. With Ek = bk / w and
+    b0 + b1 + b2 = 1: w = 1 / (E0 + E1 + E2) and bk = w Ek. The mean of the corners' values with
+    the weights bk is perspective-correct interpolation (Olano and Greer 1997).
     """
-    height, width, _ = ids.shape
-    for row in range(height):
-        for column in range(width):
-            t = ids[row, column, 0]
-            if t < first:
-                continue
-            x, y = column + 0.5, row + 0.5
-            e0 = edges[t, 0] * x + edges[t, 1] * y + edges[t, 2]
-            e1 = edges[t, 3] * x + edges[t, 4] * y + edges[t, 5]
-            e2 = edges[t, 6] * x + edges[t, 7] * y + edges[t, 8]
-            w = 1.0 / (e0 + e1 + e2)
-            e0, e1, e2 = e0 * w, e1 * w, e2 * w
-            depth[row, column] = w
-            identity[row, column] = objects[t]
-            n0 = e0 * normals[t, 0] + e1 * normals[t, 3] + e2 * normals[t, 6]
-            n1 = e0 * normals[t, 1] + e1 * normals[t, 4] + e2 * normals[t, 7]
-            n2 = e0 * normals[t, 2] + e1 * normals[t, 5] + e2 * normals[t, 8]
-            length = max(np.sqrt(n0 * n0 + n1 * n1 + n2 * n2), 1e-12)
-            if two_sided[t] and _is_back(edges, t):
-                length = -length
-            normal[row, column, 0] = n0 / length
-            normal[row, column, 1] = n1 / length
-            normal[row, column, 2] = n2 / length
-            i, j, k = faces[t, 0], faces[t, 1], faces[t, 2]
-            nx = e0 * next_points[i, 0] + e1 * next_points[j, 0] + e2 * next_points[k, 0]
-            ny = e0 * next_points[i, 1] + e1 * next_points[j, 1] + e2 * next_points[k, 1]
-            nw = e0 * next_points[i, 2] + e1 * next_points[j, 2] + e2 * next_points[k, 2]
-            if nw > 0.0:
-                flow[row, column, 0] = nx / nw - x
-                flow[row, column, 1] = ny / nw - y
-            else:
-                flow[row, column, 0] = np.nan
-                flow[row, column, 1] = np.nan
+    e0 = edges[t, 0, 0] * x + edges[t, 0, 1] * y + edges[t, 0, 2]
+    e1 = edges[t, 1, 0] * x + edges[t, 1, 1] * y + edges[t, 1, 2]
+    e2 = edges[t, 2, 0] * x + edges[t, 2, 1] * y + edges[t, 2, 2]
+    w = 1.0 / (e0 + e1 + e2)
+    return w, e0 * w, e1 * w, e2 * w
 
 
 @kernel
-def _is_back(edges: F64, t: int) -> bool:
-    """Whether the triangle shows its back: its corners run clockwise (y points down).
+def fill_geometry_buffers(
+    triangle_ids: I32, triangles: Triangles, motion: SurfaceMotion, first: int, out: GeometryBuffers
+) -> None:
+    """Fill the G-buffer at pixel centres that show triangle ``first`` or a later one.
 
-    The determinant of the nine coefficients has the sign of that of the corners.
+    Parameters
+    ----------
+    triangle_ids
+        (H, W, S) triangles of a visibility buffer; the first sample is the pixel centre.
+    triangles
+        ``edges`` as `rasterize` wrote them for these ids.
+    motion
+        Corner normals, object ids, and the vertices in the next frame.
+    first
+        Index of the first triangle that is written; the other pixels stay as they are.
+    out
+        The buffers.
+
+    Notes
+    -----
+    The point with barycentric coordinates b of a triangle keeps them while its corners move, so
+    its next position in homogeneous pixels is b0 v0' + b1 v1' + b2 v2'. The flow is therefore
+    exact for whatever moves its corners, rigid bodies and cloth alike. It is NaN for a point that
+    passes behind the camera (w' <= 0).
     """
-    a0, b0, c0 = edges[t, 0], edges[t, 1], edges[t, 2]
-    a1, b1, c1 = edges[t, 3], edges[t, 4], edges[t, 5]
-    a2, b2, c2 = edges[t, 6], edges[t, 7], edges[t, 8]
-    turn = a0 * (b1 * c2 - b2 * c1) - b0 * (a1 * c2 - a2 * c1) + c0 * (a1 * b2 - a2 * b1)
-    return bool(turn > 0.0)
+    height, width, _ = triangle_ids.shape
+    for row in range(height):
+        for column in range(width):
+            t = triangle_ids[row, column, 0]
+            if t < first:
+                continue
+            x, y = column + 0.5, row + 0.5
+            w, b0, b1, b2 = barycentric(triangles.edges, t, x, y)
+            out.depth[row, column] = w
+            out.object_ids[row, column] = motion.object_ids[t]
+            normals = motion.normals
+            n0 = b0 * normals[t, 0, 0] + b1 * normals[t, 1, 0] + b2 * normals[t, 2, 0]
+            n1 = b0 * normals[t, 0, 1] + b1 * normals[t, 1, 1] + b2 * normals[t, 2, 1]
+            n2 = b0 * normals[t, 0, 2] + b1 * normals[t, 1, 2] + b2 * normals[t, 2, 2]
+            length = max(np.sqrt(n0 * n0 + n1 * n1 + n2 * n2), SHORTEST_NORMAL)
+            if triangles.two_sided[t] and shows_back(triangles.edges, t):
+                length = -length
+            out.normals[row, column, 0] = n0 / length
+            out.normals[row, column, 1] = n1 / length
+            out.normals[row, column, 2] = n2 / length
+            i, j, k = triangles.faces[t, 0], triangles.faces[t, 1], triangles.faces[t, 2]
+            following = motion.next_points
+            nx = b0 * following[i, 0] + b1 * following[j, 0] + b2 * following[k, 0]
+            ny = b0 * following[i, 1] + b1 * following[j, 1] + b2 * following[k, 1]
+            nw = b0 * following[i, 2] + b1 * following[j, 2] + b2 * following[k, 2]
+            if nw > 0.0:
+                out.flow[row, column, 0] = nx / nw - x
+                out.flow[row, column, 1] = ny / nw - y
+            else:
+                out.flow[row, column, 0] = np.nan
+                out.flow[row, column, 1] = np.nan
+
+
+@kernel
+def shows_back(edges: F64, t: int) -> bool:
+    """Whether the camera sees the back of triangle ``t``; ``edges`` as `rasterize` writes them.
+
+    The edge functions are the inverse of the matrix of corners, so their determinant has its sign:
+    positive where the corners run clockwise in the picture (y points down).
+    """
+    a0, b0, c0 = edges[t, 0, 0], edges[t, 0, 1], edges[t, 0, 2]
+    a1, b1, c1 = edges[t, 1, 0], edges[t, 1, 1], edges[t, 1, 2]
+    a2, b2, c2 = edges[t, 2, 0], edges[t, 2, 1], edges[t, 2, 2]
+    determinant = a0 * (b1 * c2 - b2 * c1) - b0 * (a1 * c2 - a2 * c1) + c0 * (a1 * b2 - a2 * b1)
+    return bool(determinant > 0.0)

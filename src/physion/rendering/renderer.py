@@ -1,4 +1,4 @@
-"""Frames of a trial: colour, depth, normals, ids and flow from its scene and trajectory.
+"""Renderer of a trial: colour, depth, normals, ids and optical flow from scene and trajectory.
 
 A frame depends on the scene and on one instant of the trajectory (two for the flow), never on the
 frames that were rendered before it.
@@ -16,26 +16,44 @@ from physion.errors import BadInputError, UnknownNameError
 from physion.numerics.linear_algebra import apply
 from physion.physics.trajectory import Trajectory
 from physion.rendering.camera import View
-from physion.rendering.light import ShadeMap, StillMap, pack_light, still_maps, tone_table
+from physion.rendering.depth_maps import DepthMap
+from physion.rendering.light import StaticDepthMap, empty_maps, pack_light, tone_table
 from physion.rendering.rasterizer import (
     NOTHING,
     SAMPLES,
-    measure,
+    DepthRange,
+    GeometryBuffers,
+    SurfaceMotion,
+    Triangles,
+    VisibilityBuffer,
+    fill_geometry_buffers,
     rasterize,
     rasterize_depth,
 )
 from physion.rendering.rooms import Room, rooms
-from physion.rendering.shading import POINT, pack_corners, shade
-from physion.rendering.triangles import assemble, place
+from physion.rendering.shading import (
+    CAMERA,
+    POINT,
+    SURFACE,
+    LightMaps,
+    Records,
+    ShadingInputs,
+    shade,
+    shade_static_points,
+)
+from physion.rendering.triangles import Assembly, assemble, pose_meshes
 from physion.scenes.scene import Scene
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
+U8 = NDArray[np.uint8]
 
 VERSION = 2
 """Raised whenever a frame may look different, together with the golden digests."""
 PASSES = ("color", "depth", "normals", "ids", "flow")
+AGENT_COLOR, PATIENT_COLOR = (255, 0, 0, 255), (255, 255, 0, 255)
+"""Colours of `role_map`: red, green, blue, alpha."""
 
 
 @dataclass(frozen=True)
@@ -45,18 +63,18 @@ class Frame:
     Colour is anti-aliased; the other passes are one exact sample at each pixel centre.
 
     - ``color`` (H, W, 3) uint8: sRGB.
-    - ``depth`` (H, W) float32: metres along the optical axis (planar z, not along the ray);
+    - ``depth`` (H, W) float32: metres along the optical axis (planar depth, not along the ray);
       infinity where nothing is seen.
-    - ``normals`` (H, W, 3) float32: unit, world axes, of the smooth surface without relief;
-      towards the camera on cloth; zero where nothing is seen.
+    - ``normals`` (H, W, 3) float32: unit vectors in the world, interpolated, without normal
+      mapping; towards the camera on cloth; zero where nothing is seen.
     - ``ids`` (H, W) int16: 0 is the room, i + 1 is the i-th of `Scene.names`.
-    - ``flow`` (H, W, 2) float32: forward, in pixels (x right, y down): the surface point at the
-      centre of a pixel in this frame is, in the next one, at that centre plus the flow, whether or
-      not it can be seen there. Zero in the last frame and for the room. NaN for a point that
+    - ``flow`` (H, W, 2) float32: forward optical flow in pixels (x right, y down). The surface
+      point at the centre of a pixel is, in the next frame, at that centre plus the flow, whether
+      or not it is visible there. Zero in the last frame and for the room. NaN for a point that
       passes behind the camera.
     """
 
-    color: NDArray[np.uint8] | None = None
+    color: U8 | None = None
     depth: F32 | None = None
     normals: F32 | None = None
     ids: NDArray[np.int16] | None = None
@@ -64,17 +82,20 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Settings:
-    """``still_layer``: draw and shade what never moves once, not in every frame. The frames are
-    the same either way, to the byte."""
+class RenderSettings:
+    """Settings of a `Renderer`.
 
-    still_layer: bool = True
+    ``keep_static``: shade what never moves once, not in every frame. The frames are the same
+    either way, to the byte.
+    """
+
+    keep_static: bool = True
 
 
 class Renderer:
-    """Renders any frame of one trial at ``width`` x ``height`` pixels.
+    """Renderer of the frames of one trial at ``width`` x ``height`` pixels.
 
-    It keeps arrays to work in: use one renderer for each thread.
+    It keeps working arrays: use one renderer for each thread.
     """
 
     def __init__(
@@ -83,55 +104,63 @@ class Renderer:
         trajectory: Trajectory,
         width: int = 256,
         height: int = 256,
-        settings: Settings = Settings(),
+        settings: RenderSettings = RenderSettings(),
     ) -> None:
         if width < 1 or height < 1:
             raise BadInputError(f"a picture of {width} x {height} pixels cannot be rendered")
         self.scene, self.trajectory = scene, trajectory
         self.width, self.height = width, height
-        self._check()
+        self._check_trajectory()
         self.room: Room = rooms.get(scene.room)
         view = View(scene.camera, width, height)
         self._projection = view.to_pixels
-        self._assembly = assembly = assemble(scene, self.room)
-        self._first = assembly.first_triangle if settings.still_layer else 0
-        self._tones = tone_table(self.room.exposure)
-        self._sight, self._light, self._settings = pack_light(self.room, view)
-        self._still_vertices, self._still_normals = place(assembly, scene, trajectory, 0, False)
-        self._corners = pack_corners(
-            self._still_normals, assembly.uv, assembly.tangents, assembly.material
+        self._assembly = a = assemble(scene, self.room)
+        self._kept_triangles = a.first_triangle if settings.keep_static else 0
+        self._static_vertices, self._static_normals = pose_meshes(a, scene, trajectory, 0, False)
+        edges = np.zeros((len(a.faces), 3, 3))
+        self._triangles = Triangles(a.faces, a.two_sided, edges)
+        self._inputs = ShadingInputs(
+            camera=_pack_camera(view),
+            edges=edges,
+            surfaces=_pack_surfaces(a, self._static_normals),
+            groups=a.groups,
+            materials=a.materials,
+            atlas=a.atlas,
+            lights=pack_light(self.room),
+            tones=tone_table(self.room.exposure),
         )
-        self._edges = np.zeros((len(assembly.faces), 9))
-        self._shadow, self._contact = self._still_maps()
-        self._ids, self._inverse, self._points = self._still_picture()
-        self._still_shading: F32 | None = None
-        self._still_passes: tuple[F32, F32, NDArray[np.int16], F32] | None = None
+        self._shadow, self._occlusion = self._draw_static_maps()
+        self._static_points = self._to_pixels(self._static_vertices)
+        self._static_buffer = self._draw_static()
+        self._shaded: Records | None = None
+        self._static_geometry: GeometryBuffers | None = None
 
     @property
     def triangles(self) -> int:
-        """How many triangles there are, the room's among them."""
+        """Number of triangles, including those of the room."""
         return len(self._assembly.faces)
 
-    def _check(self) -> None:
+    def _check_trajectory(self) -> None:
+        """Raise `BadInputError` if the trajectory is not one of the scene."""
         scene, trajectory = self.scene, self.trajectory
         cloth = sum(c.resolution**2 for c in scene.cloths)
         bodies = trajectory.positions.shape[1]
         if bodies != len(scene.bodies) or trajectory.cloth_vertices.shape[1] != cloth:
             raise BadInputError(
-                f"trajectory of {bodies} bodies and {trajectory.cloth_vertices.shape[1]} cloth "
-                f"vertices is not one of scene {scene.name!r} with {len(scene.bodies)} bodies and "
-                f"{cloth} cloth vertices"
+                f"the trajectory of {bodies} bodies and {trajectory.cloth_vertices.shape[1]} cloth "
+                f"vertices does not belong to scene {scene.name!r}, which has "
+                f"{len(scene.bodies)} bodies and {cloth} cloth vertices"
             )
 
-    def _still_maps(self) -> tuple[StillMap, StillMap]:
-        """Shadow and contact map with what never moves."""
-        maps = still_maps(self.scene, self.room)
-        for still in maps:
-            self._draw_map(still.depth, still.matrix, self._still_vertices, False)
+    def _draw_static_maps(self) -> tuple[StaticDepthMap, StaticDepthMap]:
+        """Return shadow and occlusion map with what never moves."""
+        maps = empty_maps(self.scene, self.room)
+        for static in maps:
+            self._draw_map(static.depth, static.matrix, self._static_vertices, False)
         return maps
 
     def _draw_map(self, depth: F32, matrix: F64, vertices: F64, moving: bool) -> None:
-        """Add the moving bodies, or the others without the room, to a depth map."""
+        """Draw the moving bodies, or the static ones without the room, into a depth map."""
         assembly = self._assembly
         points = apply(matrix[:, :3], vertices) + matrix[:, 3]
         first, last = assembly.room_triangles, assembly.first_triangle
@@ -139,27 +168,41 @@ class Renderer:
             first, last = assembly.first_triangle, len(assembly.faces)
         rasterize_depth(points, assembly.faces, first, last, depth)
 
-    def _still_picture(self) -> tuple[I32, F32, F64]:
-        """What never moves, drawn: triangle ids, inverse depths, homogeneous pixels."""
-        assembly = self._assembly
-        ids = np.full((self.height, self.width, len(SAMPLES)), NOTHING, np.int32)
-        inverse = np.zeros(ids.shape, np.float32)
-        points = self._to_pixels(self._still_vertices)
-        still = assembly.faces[: assembly.first_triangle]
-        self._draw(points, still, 0, ids, inverse)
-        return ids, inverse, points
+    def _draw_static(self) -> VisibilityBuffer:
+        """Return the visibility buffer of what never moves."""
+        shape = (self.height, self.width, len(SAMPLES))
+        triangle_ids = np.full(shape, NOTHING, np.int32)
+        buffer = VisibilityBuffer(triangle_ids, np.zeros(shape, np.float32))
+        last = self._assembly.first_triangle
+        static = self._triangles._replace(faces=self._triangles.faces[:last])
+        rasterize(self._static_points, static, 0, self._depths, buffer)
+        return buffer
+
+    @property
+    def _depths(self) -> DepthRange:
+        return DepthRange(self.scene.camera.near, self.scene.camera.far)
 
     def _to_pixels(self, vertices: F64) -> F64:
+        """Return the homogeneous pixels (V, 3) of world points (V, 3)."""
         return apply(self._projection[:, :3], vertices) + self._projection[:, 3]
 
-    def _draw(self, points: F64, faces: I32, first: int, ids: I32, inverse: F32) -> None:
-        camera, two_sided = self.scene.camera, self._assembly.two_sided
-        rasterize(
-            points, faces, two_sided, first, camera.near, camera.far, self._edges, ids, inverse
-        )
+    def _moved_points(self, vertices: F64) -> F64:
+        """Return the homogeneous pixels of all vertices, of which only the moving ones moved."""
+        points = self._static_points.copy()
+        first = self._assembly.first_vertex
+        points[first:] = self._to_pixels(vertices[first:])
+        return points
 
     def render(self, frame: int, passes: Sequence[str] = ("color",)) -> Frame:
-        """Render the passes named, of `PASSES`, of frame ``frame`` (-1 is the last)."""
+        """Render some passes of one frame.
+
+        Parameters
+        ----------
+        frame
+            Index of the frame; negative ones count from the end.
+        passes
+            Names of `PASSES`.
+        """
         for name in passes:
             if name not in PASSES:
                 raise UnknownNameError("pass", name, PASSES)
@@ -168,24 +211,24 @@ class Renderer:
             raise BadInputError(f"frame {frame} of a trajectory of {count} frames does not exist")
         frame %= count
         assembly = self._assembly
-        vertices, normals = place(assembly, self.scene, self.trajectory, frame, True)
-        vertices += self._still_vertices
-        normals += self._still_normals
-        points = self._points.copy()
-        first = assembly.first_vertex
-        points[first:] = self._to_pixels(vertices[first:])
-        ids, inverse = self._ids.copy(), self._inverse.copy()
-        self._draw(points, assembly.faces, assembly.first_triangle, ids, inverse)
-        color = self._color(ids, vertices, normals) if "color" in passes else None
+        vertices, normals = pose_meshes(assembly, self.scene, self.trajectory, frame, True)
+        vertices += self._static_vertices
+        normals += self._static_normals
+        points = self._moved_points(vertices)
+        static = self._static_buffer
+        buffer = VisibilityBuffer(static.triangle_ids.copy(), static.inverse_depth.copy())
+        rasterize(points, self._triangles, assembly.first_triangle, self._depths, buffer)
+        ids = buffer.triangle_ids
+        color = self._shade(ids, vertices, normals) if "color" in passes else None
         if not set(passes) - {"color"}:
             return Frame(color=color)
-        depth, normal, identity, flow = self._measure(ids, points, normals, frame, "flow" in passes)
+        geometry = self._fill_geometry(ids, points, normals, frame, "flow" in passes)
         return Frame(
             color=color,
-            depth=depth if "depth" in passes else None,
-            normals=normal if "normals" in passes else None,
-            ids=identity if "ids" in passes else None,
-            flow=flow if "flow" in passes else None,
+            depth=geometry.depth if "depth" in passes else None,
+            normals=geometry.normals if "normals" in passes else None,
+            ids=geometry.object_ids if "ids" in passes else None,
+            flow=geometry.flow if "flow" in passes else None,
         )
 
     def frames(self, passes: Sequence[str] = ("color",)) -> Iterator[Frame]:
@@ -193,70 +236,90 @@ class Renderer:
         for frame in range(len(self.trajectory)):
             yield self.render(frame, passes)
 
-    def _color(self, ids: I32, vertices: F64, normals: F32) -> NDArray[np.uint8]:
-        assembly, first = self._assembly, self._assembly.first_triangle
-        corners = self._corners
-        corners[first:, :9] = normals[first:]
-        surfaces = (self._edges, corners, assembly.surface, assembly.materials)
-        light = (self._sight, self._light, *self._map(self._shadow, vertices))
-        rest = (*self._map(self._contact, vertices), self._settings, self._tones)
-        out = np.empty((self.height, self.width, 3), np.uint8)
-        arrays = (*surfaces, *assembly.atlas, *light, *rest)
-        if self._still_shading is None:
-            still = np.zeros((self.height * self.width + 1, POINT), np.float32)
-            if self._first:
-                shade(self._ids, self._first, True, *arrays, still, out)
-            self._still_shading = still
-        shade(ids, self._first, False, *arrays, self._still_shading, out)
-        return out
-
-    def _map(self, still: StillMap, vertices: F64) -> ShadeMap:
-        """The map of one instant: what never moves, and the moving bodies on top."""
-        depth = still.depth.copy()
-        self._draw_map(depth, still.matrix, vertices, True)
-        return still.with_moving(depth)
-
-    def _measure(
-        self, ids: I32, points: F64, normals: F32, frame: int, flow: bool
-    ) -> tuple[F32, F32, NDArray[np.int16], F32]:
-        if self._still_passes is None:
-            blank = (
-                np.full((self.height, self.width), np.inf, np.float32),
-                np.zeros((self.height, self.width, 3), np.float32),
-                np.zeros((self.height, self.width), np.int16),
-                np.zeros((self.height, self.width, 2), np.float32),
-            )
-            self._measure_into(self._ids, normals, points, 0, blank)
-            blank[3][...] = 0.0
-            self._still_passes = blank
-        later = points
-        following = frame + 1
-        if flow and following < len(self.trajectory):
-            later = points.copy()
-            vertices, _ = place(self._assembly, self.scene, self.trajectory, following, True)
-            first = self._assembly.first_vertex
-            later[first:] = self._to_pixels(vertices[first:])
-        out = (
-            self._still_passes[0].copy(),
-            self._still_passes[1].copy(),
-            self._still_passes[2].copy(),
-            self._still_passes[3].copy(),
+    def _shade(self, triangle_ids: I32, vertices: F64, normals: F32) -> U8:
+        """Return the colour pass (H, W, 3) of a frame."""
+        inputs, first = self._inputs, self._assembly.first_triangle
+        inputs.surfaces["normals"][first:] = normals[first:]
+        if self._shaded is None:
+            self._shaded = np.zeros(self.height * self.width + 1, POINT)
+            static_ids = self._static_buffer.triangle_ids
+            shade_static_points(static_ids, self._kept_triangles, inputs, self._shaded)
+        maps = LightMaps(
+            self._with_moving(self._shadow, vertices), self._with_moving(self._occlusion, vertices)
         )
-        self._measure_into(ids, normals, later, self._assembly.first_triangle, out)
-        if later is points:
-            out[3][...] = 0.0
+        colors = np.empty((self.height, self.width, 3), np.uint8)
+        shade(triangle_ids, self._kept_triangles, inputs, maps, self._shaded, colors)
+        return colors
+
+    def _with_moving(self, static: StaticDepthMap, vertices: F64) -> DepthMap:
+        """Return a depth map of one frame: what never moves, and the moving bodies."""
+        depth = static.depth.copy()
+        self._draw_map(depth, static.matrix, vertices, True)
+        return static.with_moving(depth)
+
+    def _fill_geometry(
+        self, triangle_ids: I32, points: F64, normals: F32, frame: int, flow: bool
+    ) -> GeometryBuffers:
+        """Return the passes other than colour; ``flow`` only if asked for, otherwise zero.
+
+        Parameters
+        ----------
+        triangle_ids, points, normals
+            Visible triangles, homogeneous pixels and corner normals of this frame.
+        frame
+            Index of the frame.
+        flow
+            Whether the flow is asked for.
+        """
+        assembly = self._assembly
+        motion = SurfaceMotion(normals, assembly.object_ids, points)
+        if self._static_geometry is None:
+            self._static_geometry = _empty_geometry(self.height, self.width)
+            ids = self._static_buffer.triangle_ids
+            fill_geometry_buffers(ids, self._triangles, motion, 0, self._static_geometry)
+            self._static_geometry.flow[...] = 0.0
+        following = frame + 1
+        flow = flow and following < len(self.trajectory)
+        if flow:
+            vertices, _ = pose_meshes(assembly, self.scene, self.trajectory, following, True)
+            motion = motion._replace(next_points=self._moved_points(vertices))
+        static = self._static_geometry
+        out = GeometryBuffers(
+            static.depth.copy(),
+            static.normals.copy(),
+            static.object_ids.copy(),
+            static.flow.copy(),
+        )
+        first = assembly.first_triangle
+        fill_geometry_buffers(triangle_ids, self._triangles, motion, first, out)
+        if not flow:
+            out.flow[...] = 0.0
         return out
 
-    def _measure_into(
-        self,
-        ids: I32,
-        normals: F32,
-        later: F64,
-        first: int,
-        out: tuple[F32, F32, NDArray[np.int16], F32],
-    ) -> None:
-        a = self._assembly
-        measure(ids, self._edges, a.faces, a.objects, normals, a.two_sided, later, first, *out)
+
+def _pack_camera(view: View) -> Records:
+    """Return the camera as one record of `CAMERA`, (1,)."""
+    camera = np.zeros(1, CAMERA)
+    camera["position"], camera["rays"] = view.camera.position, view.ray_matrix
+    return camera
+
+
+def _pack_surfaces(assembly: Assembly, normals: F32) -> Records:
+    """Return the triangles with these corner normals (T, 3, 3) as (T,) of `SURFACE`."""
+    surfaces = np.zeros(len(assembly.faces), SURFACE)
+    surfaces["normals"], surfaces["uv"] = normals, assembly.uv
+    surfaces["tangents"], surfaces["material"] = assembly.tangents, assembly.material
+    return surfaces
+
+
+def _empty_geometry(height: int, width: int) -> GeometryBuffers:
+    """Return the G-buffer of a picture in which nothing is seen."""
+    return GeometryBuffers(
+        depth=np.full((height, width), np.inf, np.float32),
+        normals=np.zeros((height, width, 3), np.float32),
+        object_ids=np.zeros((height, width), np.int16),
+        flow=np.zeros((height, width, 2), np.float32),
+    )
 
 
 def render_frames(
@@ -267,16 +330,16 @@ def render_frames(
     height: int = 256,
     passes: Sequence[str] = ("color",),
 ) -> Iterator[Frame]:
-    """Render all frames of a trial, lazily."""
+    """Render the passes named of all frames of a trial, one at a time."""
     return Renderer(scene, trajectory, width, height).frames(passes)
 
 
 def role_map(ids: NDArray[np.integer], scene: Scene) -> NDArray[np.uint8]:
-    """Picture (H, W, 4) that points out the agent in red and the patient in yellow, from ids.
+    """Return a picture (H, W, 4) uint8 with the agent in red and the patient in yellow.
 
-    Everything else is transparent: alpha is 0.
+    ``ids`` (H, W) are those of a `Frame`. Everything else is transparent: alpha is 0.
     """
     colors = np.zeros((len(scene.names()) + 1, 4), np.uint8)
-    colors[scene.index(scene.roles.agent) + 1] = (255, 0, 0, 255)
-    colors[scene.index(scene.roles.patient) + 1] = (255, 255, 0, 255)
+    colors[scene.index(scene.roles.agent) + 1] = AGENT_COLOR
+    colors[scene.index(scene.roles.patient) + 1] = PATIENT_COLOR
     return np.asarray(colors[ids])

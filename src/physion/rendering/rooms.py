@@ -1,7 +1,7 @@
 """Rooms in which trials are shown: their surfaces and their light.
 
-A room is a handful of large rectangles that face inwards, its floor at z = 0. It is drawn only:
-nothing collides with its walls.
+A room consists of rectangles that face inwards, with the floor at z = 0. It is only drawn: nothing
+collides with its walls.
 """
 
 from __future__ import annotations
@@ -21,10 +21,11 @@ Rect = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class Panel:
-    """A rectangle from ``corner`` along ``u`` and ``v`` (metres); it faces ``u`` x ``v``.
+    """Rectangle from ``corner`` along ``u`` and ``v`` (metres); its front is at ``u`` x ``v``.
 
-    ``tile`` is how many metres one texture spans; ``glow`` is light of its own, as a multiple of
-    its colour.
+    ``color`` is sRGB; ``texture`` is the name of a finish, repeated every ``tile`` metres;
+    ``emission`` is light of its own, as a multiple of its colour; ``occluded`` tells whether it is
+    darker near the edges of the room.
     """
 
     corner: Vec3
@@ -33,35 +34,54 @@ class Panel:
     color: Vec3
     texture: str = "smooth_plaster"
     tile: float = 2.0
-    glow: float = 0.0
-    shaded: bool = True
+    emission: float = 0.0
+    occluded: bool = True
 
 
 @dataclass(frozen=True)
 class Room:
-    """Panels and light; see `physion.rendering.shading.Light` for the terms of the light."""
+    """Panels and light; colours of light are linear, see `physion.rendering.shading.LightTerms`.
+
+    - ``panels``: the first one is the floor.
+    - ``low``, ``high``: corners of the box that the walls, floor and ceiling make.
+    - ``light_direction``, ``light_color``: the directional light; the vector points towards it.
+    - ``ambient``, ``ambient_slopes``: ambient light, and its change with each component of the
+      normal.
+    - ``environment``: what reflections show at the sides, below and above.
+    - ``exposure``: factor of all light before the tone curve.
+    - ``window``: two corners and colour of a bright rectangle in a plane of one y, which
+      reflections show; by default too far away to be seen.
+    - ``background``: sRGB colour where nothing is seen.
+    - ``shadow_strength``: fraction of the directional light that a full shadow takes.
+    - ``occlusion_strength``: fraction of all light that full occlusion under objects takes.
+    """
 
     panels: tuple[Panel, ...]
     low: Vec3
     high: Vec3
-    lamp_direction: Vec3
-    lamp: Vec3
-    around: tuple[Vec3, Vec3, Vec3, Vec3]
-    mirrored: tuple[Vec3, Vec3, Vec3]
+    light_direction: Vec3
+    light_color: Vec3
+    ambient: Vec3
+    ambient_slopes: tuple[Vec3, Vec3, Vec3]
+    environment: tuple[Vec3, Vec3, Vec3]
     exposure: float
     window: tuple[Vec3, Vec3, Vec3] = ((0.0, 1e6, 0.0), (0.0, 1e6, 0.0), (0.0, 0.0, 0.0))
     background: Vec3 = (0.8, 0.85, 0.9)
-    shadow: float = 0.8
-    contact: float = 0.6
+    shadow_strength: float = 0.8
+    occlusion_strength: float = 0.6
 
 
 rooms: Registry[Room] = Registry("room")
 
 
 def _wall(
-    corner: Vec3, u: Vec3, v: Vec3, openings: Sequence[Rect], **look: object
+    corner: Vec3, u: Vec3, v: Vec3, openings: Sequence[Rect], **surface: object
 ) -> Iterator[Panel]:
-    """A wall with rectangular openings (u from, u to, v from, v to), in metres along u and v."""
+    """Yield the panels of a wall with rectangular openings.
+
+    An opening is (u from, u to, v from, v to) in metres. The wall is cut along the sides of all
+    openings into a grid; ``surface`` are the other fields of `Panel`.
+    """
     start, du, dv = (np.asarray(x, np.float64) for x in (corner, u, v))
     width, height = norm(du), norm(dv)
     du, dv = du / width, dv / height
@@ -75,18 +95,19 @@ def _wall(
                 _vec(start + a * du + c * dv),
                 _vec((b - a) * du),
                 _vec((d - c) * dv),
-                **look,  # type: ignore[arg-type]
+                **surface,  # type: ignore[arg-type]
             )
 
 
 def _vec(value: np.ndarray) -> Vec3:
+    """Return an array (3,) as a tuple of floats."""
     return (float(value[0]), float(value[1]), float(value[2]))
 
 
 def _reveal(
-    corner: Vec3, u: Vec3, v: Vec3, opening: Rect, depth: float, **look: object
+    corner: Vec3, u: Vec3, v: Vec3, opening: Rect, depth: float, **surface: object
 ) -> Iterator[Panel]:
-    """The four sides of an opening through a wall ``depth`` metres thick."""
+    """Yield the four sides of an opening through a wall ``depth`` metres thick."""
     start, du, dv = (np.asarray(x, np.float64) for x in (corner, u, v))
     du, dv = unit(du), unit(dv)
     back = -depth * np.cross(du, dv)
@@ -94,21 +115,21 @@ def _reveal(
     p = [start + x * du + y * dv for x, y in ((a, c), (b, c), (b, d), (a, d))]
     for i in range(4):
         side = p[(i + 1) % 4] - p[i]
-        yield Panel(_vec(p[i]), _vec(side), _vec(back), **look)  # type: ignore[arg-type]
+        yield Panel(_vec(p[i]), _vec(side), _vec(back), **surface)  # type: ignore[arg-type]
 
 
-def _slab(low: Vec3, high: Vec3, **look: object) -> Iterator[Panel]:
-    """A box that faces outwards: a beam, a post, a step."""
+def _slab(low: Vec3, high: Vec3, **surface: object) -> Iterator[Panel]:
+    """Yield the sides of a box that is seen from outside: a beam, a post, a step."""
     a, b = np.asarray(low, np.float64), np.asarray(high, np.float64)
     x, y, z = np.diag(b - a)
     for corner, u, v in (
         (a, y, x), (a, x, z), (a, z, y), (b, -x, -y), (b, -z, -x), (b, -y, -z),
     ):  # fmt: skip
-        yield Panel(_vec(corner), _vec(u), _vec(v), **look)  # type: ignore[arg-type]
+        yield Panel(_vec(corner), _vec(u), _vec(v), **surface)  # type: ignore[arg-type]
 
 
 def _four_walls(half_x: float, half_y: float, height: float) -> list[tuple[Vec3, Vec3, Vec3]]:
-    """Corner, u and v of the walls at -x, +x, -y and +y; u x v points into the room."""
+    """Return corner, u and v of the walls at -x, +x, -y and +y; u x v points into the room."""
     x, y, h = half_x, half_y, (0.0, 0.0, height)
     return [
         ((-x, -y, 0.0), (0.0, 2 * y, 0.0), h),
@@ -119,7 +140,7 @@ def _four_walls(half_x: float, half_y: float, height: float) -> list[tuple[Vec3,
 
 
 def _box_room() -> Room:
-    """Grey plaster, dark blue carpet, small high windows; a coffered ceiling."""
+    """Return a room with grey plaster, a dark blue carpet, small windows and a coffered ceiling."""
     half, height = 6.5, 4.6
     floor = Panel(
         (-half, -half, 0), (2 * half, 0, 0), (0, 2 * half, 0), (0.25, 0.33, 0.445), "carpet", 1.1
@@ -142,13 +163,14 @@ def _box_room() -> Room:
         panels=tuple(panels),
         low=(-half, -half, 0.0),
         high=(half, half, height),
-        lamp_direction=(0.30, 0.25, 0.92),
-        lamp=(0.27, 0.27, 0.27),
-        around=((0.36, 0.36, 0.365), (0.03, 0.03, 0.03), (-0.03, -0.03, -0.03), (0.20, 0.20, 0.20)),
-        mirrored=((0.26, 0.27, 0.32), (0.03, 0.04, 0.06), (0.40, 0.40, 0.42)),
+        light_direction=(0.30, 0.25, 0.92),
+        light_color=(0.27, 0.27, 0.27),
+        ambient=(0.36, 0.36, 0.365),
+        ambient_slopes=((0.03, 0.03, 0.03), (-0.03, -0.03, -0.03), (0.20, 0.20, 0.20)),
+        environment=((0.26, 0.27, 0.32), (0.03, 0.04, 0.06), (0.40, 0.40, 0.42)),
         exposure=1.0,
-        shadow=0.85,
-        contact=0.6,
+        shadow_strength=0.85,
+        occlusion_strength=0.6,
     )
 
 
@@ -157,9 +179,9 @@ WHITE = {"color": (0.955, 0.96, 0.985), "texture": "smooth_plaster", "tile": 3.0
 
 
 def _coffers(half: float, height: float) -> list[Panel]:
-    """A ceiling of pale fields between dark beams."""
-    beam = {"color": (0.36, 0.35, 0.33), "texture": "smooth_plaster", "glow": 0.14}
-    pale = {"color": (0.80, 0.80, 0.79), "texture": "smooth_plaster", "glow": 0.22}
+    """Return a ceiling of pale fields between dark beams."""
+    beam = {"color": (0.36, 0.35, 0.33), "texture": "smooth_plaster", "emission": 0.14}
+    pale = {"color": (0.80, 0.80, 0.79), "texture": "smooth_plaster", "emission": 0.22}
     inner, rise = half - 0.8, 0.30
     across, back = (2 * inner, 0.0, 0.0), (0.0, -2 * inner, 0.0)
     panels = [Panel((-inner, inner, height + rise), across, back, **pale)]  # type: ignore[arg-type]
@@ -174,21 +196,25 @@ def _coffers(half: float, height: float) -> list[Panel]:
 
 
 def _pane(
-    corner: Vec3, u: Vec3, v: Vec3, opening: Rect, depth: float, color: Vec3, glow: float
+    corner: Vec3, u: Vec3, v: Vec3, opening: Rect, depth: float, color: Vec3, emission: float
 ) -> Panel:
-    """What is seen through an opening: a plane of light behind it."""
+    """Return what is seen through an opening: a plane of light behind it."""
     start, du, dv = (np.asarray(x, np.float64) for x in (corner, u, v))
     du, dv = unit(du), unit(dv)
     a, b, c, d = opening
     at = start + a * du + c * dv - depth * np.cross(du, dv)
-    return Panel(_vec(at), _vec((b - a) * du), _vec((d - c) * dv), color, "glow", 2.0, glow, False)
+    return Panel(
+        _vec(at), _vec((b - a) * du), _vec((d - c) * dv), color, "glow", 2.0, emission, False
+    )
 
 
 def _bright_room() -> Room:
-    """Reddish stone tiles, white walls, glass doors on a yard at -y."""
+    """Return a room with reddish stone tiles, white walls, and glass doors to a yard at -y."""
     x, y, height = 6.5, 5.0, 3.4
     floor = Panel((-x, -y, 0), (2 * x, 0, 0), (0, 2 * y, 0), (1, 1, 1), "tiles", 1.8)
-    ceiling = Panel((-x, y, height), (2 * x, 0, 0), (0, -2 * y, 0), (0.90, 0.90, 0.91), glow=0.20)
+    ceiling = Panel(
+        (-x, y, height), (2 * x, 0, 0), (0, -2 * y, 0), (0.90, 0.90, 0.91), emission=0.20
+    )
     panels: list[Panel] = [floor, ceiling]
     doors: dict[int, list[Rect]] = {
         0: [(2.0, 3.0, 0.0, 2.15), (6.0, 7.6, 0.9, 2.1)],
@@ -219,25 +245,21 @@ def _bright_room() -> Room:
         panels=tuple(panels),
         low=(-x, -y, 0.0),
         high=(x, y, height),
-        lamp_direction=(-0.25, -0.42, 0.87),
-        lamp=(0.30, 0.295, 0.285),
-        around=(
-            (0.53, 0.54, 0.56),
-            (-0.02, -0.02, -0.02),
-            (-0.06, -0.06, -0.06),
-            (0.18, 0.18, 0.18),
-        ),
-        mirrored=((0.40, 0.40, 0.41), (0.05, 0.03, 0.025), (0.5, 0.5, 0.51)),
+        light_direction=(-0.25, -0.42, 0.87),
+        light_color=(0.30, 0.295, 0.285),
+        ambient=(0.53, 0.54, 0.56),
+        ambient_slopes=((-0.02, -0.02, -0.02), (-0.06, -0.06, -0.06), (0.18, 0.18, 0.18)),
+        environment=((0.40, 0.40, 0.41), (0.05, 0.03, 0.025), (0.5, 0.5, 0.51)),
         exposure=1.0,
         window=((-2.8, -y, 0.0), (2.8, -y, 2.3), (7.0, 6.5, 5.8)),
-        shadow=0.8,
-        contact=0.6,
+        shadow_strength=0.8,
+        occlusion_strength=0.6,
     )
 
 
 def _door_frames(y: float) -> list[Panel]:
-    """White posts and rails of the sliding doors and of the windows beside them."""
-    frame = {"color": (0.93, 0.94, 0.95), "texture": "smooth_plaster", "shaded": False}
+    """Return the white posts and rails of the sliding doors and of the windows next to them."""
+    frame = {"color": (0.93, 0.94, 0.95), "texture": "smooth_plaster", "occluded": False}
     bars: list[Rect] = [(a - 0.035, a + 0.035, 0.0, 2.3) for a in (-2.8, -1.4, 0.0, 1.4, 2.8)]
     bars += [(-2.8, 2.8, 2.22, 2.3), (-2.8, 2.8, 0.0, 0.06)]
     for a, b in ((-4.4, -3.5), (3.5, 4.4)):
@@ -249,8 +271,8 @@ def _door_frames(y: float) -> list[Panel]:
 
 
 def _yard(y: float) -> list[Panel]:
-    """A wooden terrace, paving, a low brick wall, houses and an overcast sky beyond the doors."""
-    out = {"shaded": False}
+    """Return a terrace, paving, a low brick wall, houses and an overcast sky behind the doors."""
+    out = {"occluded": False}
     wood, stone, brick = (0.80, 0.66, 0.54), (0.62, 0.62, 0.63), (0.60, 0.52, 0.45)
     panels = [
         Panel((-12, y - 1.2, -0.02), (24, 0, 0), (0, 1.25, 0), wood, "planks", 3.0, **out),  # type: ignore[arg-type]
@@ -264,12 +286,12 @@ def _yard(y: float) -> list[Panel]:
         ((-7.5, y - 13, 0.0), (-4.5, y - 10.5, 2.9), (0.80, 0.76, 0.42)),
         ((0.5, y - 14, 0.0), (8.5, y - 11, 2.3), (0.52, 0.51, 0.50)),
     ):
-        panels += _slab(low, high, color=color, texture="plaster", tile=3.0, shaded=False)
+        panels += _slab(low, high, color=color, texture="plaster", tile=3.0, occluded=False)
     return panels
 
 
 def _empty_room() -> Room:
-    """A plain grey floor and nothing else, under even light."""
+    """Return a room that is a plain grey floor under even light."""
     floor = Panel(
         (-50, -50, 0), (100, 0, 0), (0, 100, 0), (0.62, 0.62, 0.62), "plaster", 3.0, 0.0, False
     )
@@ -277,10 +299,11 @@ def _empty_room() -> Room:
         panels=(floor,),
         low=(-50.0, -50.0, 0.0),
         high=(50.0, 50.0, 100.0),
-        lamp_direction=(0.35, 0.25, 0.9),
-        lamp=(0.45, 0.45, 0.45),
-        around=((0.6, 0.6, 0.6), (0.05, 0.05, 0.05), (-0.05, -0.05, -0.05), (0.15, 0.15, 0.15)),
-        mirrored=((0.5, 0.5, 0.5), (0.2, 0.2, 0.2), (0.6, 0.6, 0.6)),
+        light_direction=(0.35, 0.25, 0.9),
+        light_color=(0.45, 0.45, 0.45),
+        ambient=(0.6, 0.6, 0.6),
+        ambient_slopes=((0.05, 0.05, 0.05), (-0.05, -0.05, -0.05), (0.15, 0.15, 0.15)),
+        environment=((0.5, 0.5, 0.5), (0.2, 0.2, 0.2), (0.6, 0.6, 0.6)),
         exposure=0.85,
         background=(0.62, 0.66, 0.72),
     )

@@ -1,321 +1,485 @@
-"""The colour of a surface under a room's light: textures, shadows, tone.
+"""Colour pass: textures, light, shadows and tone curve for every pixel of a visibility buffer.
 
-Light is linear. A surface gets light from all around (``around``: a constant and a slope along
-each axis, so that walls differ), and from one soft lamp that throws shadows. Colour is shaded once
-for each surface that a pixel shows, at the first sample that shows it, and weighted by the number
-of samples. What never moves is shaded once: only the shadows on it change.
+Light is linear until the tone curve. Each surface that a pixel shows is shaded once, at the first
+sample that shows it, and weighted by its number of samples. The light that a surface point sends
+to the camera is
+
+    room (ambient + environment) + emission + lit room (Lambert + specular)
+
+with the terms of `_shade_point`; ``lit`` is the fraction of the directional light that shadows
+leave, and ``room`` the ambient occlusion near the room's walls. Everything but ``lit`` and the
+occlusion under objects depends on the point alone. It is therefore kept for surfaces that never
+move.
+
+References
+----------
+Blinn, J. (1977). Models of light reflection for computer synthesized pictures. SIGGRAPH.
+Schlick, C. (1994). An inexpensive BRDF model for physically-based rendering. Computer Graphics
+    Forum 13(3).
+Heckbert, P. (1989). Fundamentals of texture mapping and image warping. MSc thesis, UC Berkeley.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from physion.numerics.elementary import coarse_log2_of, exp_of
 from physion.numerics.kernel import kernel
-from physion.rendering.rasterizer import SAMPLES
+from physion.rendering.depth_maps import DepthMap, lit_fraction, occluded_fraction
+from physion.rendering.rasterizer import SAMPLES, barycentric
+from physion.rendering.textures.lookup import Atlas, mip_level, sample_texture
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 U8 = NDArray[np.uint8]
+Records = NDArray[np.void]
+Vector = tuple[float, float, float]
 
-TONES = 16384
-POINT = 13
-"""Numbers kept of a shaded point, see `_shade_point`."""
-BLOCK = 8
-MATERIAL = 21
-CORNERS = 22
-"""Numbers of a triangle: corner normals 0..8, texture coordinates 9..14, tangents 15..20, and the
-row of its material."""
-SHARPEN = 0.64
-"""Share of the area of a pixel over which textures are averaged: below 1 is crisper."""
 LN2 = 0.6931471805599453
+TONES = 16384
+"""Entries of the tone table."""
 WHITEST = 4.0
-"""Linear light beyond which the tone table is white."""
+"""Linear light of the last entry of the tone table; brighter light has the same tone."""
+FOOTPRINT = 0.64
+"""Fraction of a pixel's area over which textures are averaged: below 1 is sharper."""
+HIGHLIGHT_CUTOFF = 0.5
+"""Cosine between normal and half vector up to which the highlight is taken as 0."""
+GRAZING_GAIN = 3.0
+"""A dielectric seen edge-on reflects (1 + this) times what it reflects seen straight on."""
+GRAZING_GAIN_LOST = 2.0
+"""How much smaller the gain is for a metal, which reflects much from every side."""
+METAL_DIFFUSE_LOST = 0.8
+"""Fraction of the diffuse reflection that a metal lacks."""
+ENVIRONMENT_SLOPE = 2.0
+"""Reflections with a vertical component of 1 / this or more show the ceiling or the floor alone."""
+SIDES, BELOW, ABOVE = 0, 1, 2
+"""Rows of the environment in `LIGHT`."""
+WINDOW_BLUR = 0.25
+"""Width in metres of the window's soft edge in a reflection right next to it."""
+WINDOW_BLUR_GROWTH = 0.12
+"""Metres by which that width grows for each metre between surface and window."""
+PARALLEL = 1e-9
+"""Distance times slope up to which a reflected ray is taken never to reach the window."""
+CORNER_OCCLUSION = 0.22
+"""Fraction of the light that a surface loses in the edge between it and one wall."""
+CORNER_RANGE = 0.6
+"""Metres from that edge at which the loss has fallen to 1/e."""
+SHADOW_OFFSET = 0.03
+"""Metres along the normal from a point to where it is looked up in the shadow map, so that a
+surface does not shadow itself."""
+LEVEL_COSINE = 0.5
+"""Vertical component of the normal below which things under it or near it do not occlude."""
 
 
-@kernel
-def _texel(
-    texels: U8, start: int, side: int, u: float, v: float
-) -> tuple[float, float, float, float, float]:
-    """One level of a texture between its four nearest texels, repeating."""
-    x, y = u * side - 0.5, v * side - 0.5
-    fx, fy = np.floor(x), np.floor(y)
-    ax, ay = x - fx, y - fy
-    mask = side - 1
-    x0, y0 = int(fx) & mask, int(fy) & mask
-    x1, y1 = (x0 + 1) & mask, (y0 + 1) & mask
-    i, j = start + y0 * side + x0, start + y0 * side + x1
-    k, m = start + y1 * side + x0, start + y1 * side + x1
-    wi, wj, wk, wm = (1 - ax) * (1 - ay), ax * (1 - ay), (1 - ax) * ay, ax * ay
-    r = wi * texels[i, 0] + wj * texels[j, 0] + wk * texels[k, 0] + wm * texels[m, 0]
-    g = wi * texels[i, 1] + wj * texels[j, 1] + wk * texels[k, 1] + wm * texels[m, 1]
-    b = wi * texels[i, 2] + wj * texels[j, 2] + wk * texels[k, 2] + wm * texels[m, 2]
-    p = wi * texels[i, 3] + wj * texels[j, 3] + wk * texels[k, 3] + wm * texels[m, 3]
-    q = wi * texels[i, 4] + wj * texels[j, 4] + wk * texels[k, 4] + wm * texels[m, 4]
-    return r, g, b, p, q
+CAMERA = np.dtype([("position", "f8", 3), ("rays", "f8", (3, 3))], align=True)
+"""The camera: its position in metres; the matrix from a pixel (x, y, 1) to the world vector from
+the camera to depth 1 m."""
+SURFACE = np.dtype(
+    [
+        ("normals", "f4", (3, 3)),
+        ("uv", "f4", (3, 2)),
+        ("tangents", "f4", (2, 3)),
+        ("material", "i4"),
+    ],
+    align=True,
+)
+"""A triangle.
+
+- ``normals``: normal of each corner in the world. ``uv``: texture coordinates of each corner.
+- ``tangents``: world directions of growing u and v.
+- ``material``: index of its `MATERIAL`.
+"""
+MATERIAL = np.dtype(
+    [
+        *(("color", "f8", 3), ("texture", "i8"), ("specular", "f8"), ("exponent", "f8")),
+        *(("reflectance", "f8"), ("metalness", "f8"), ("normal_scale", "f8")),
+        *(("emission", "f8"), ("occluded", "?")),
+    ],
+    align=True,
+)
+"""A surface material.
+
+- ``color``: linear colour; the albedo is its product with the texture. ``texture``: index into the
+  atlas.
+- ``specular``, ``exponent``: strength and exponent of the highlight.
+- ``reflectance``: fraction of the environment that is reflected seen straight on.
+- ``metalness``: 0 dielectric .. 1 metal, whose reflections have the colour of its albedo.
+- ``normal_scale``: factor of the texture's slopes in the normal map; 0 is without.
+- ``emission``: light of its own, as a multiple of the albedo.
+- ``occluded``: whether the room's walls darken it near the edges between them.
+"""
+LIGHT = np.dtype(
+    [
+        *(("direction", "f8", 3), ("color", "f8", 3)),
+        *(("ambient", "f8", 3), ("ambient_slopes", "f8", (3, 3)), ("environment", "f8", (3, 3))),
+        *(("window_low", "f8", 3), ("window_high", "f8", 3), ("window_color", "f8", 3)),
+        *(("room_low", "f8", 3), ("room_high", "f8", 3), ("background", "f8", 3)),
+        *(("shadow_strength", "f8"), ("occlusion_strength", "f8")),
+    ],
+    align=True,
+)
+"""Light of a room; colours are linear.
+
+- ``direction``: unit vector towards the directional light. ``color``: its colour.
+- ``ambient``, ``ambient_slopes``: the ambient light of a normal n is
+  ``ambient + n @ ambient_slopes``, so that walls differ.
+- ``environment``: what reflections show at the sides, below and above (rows).
+- ``window_low``, ``window_high``, ``window_color``: corners of a bright rectangle in a plane of one
+  y, which reflections show too, and its colour.
+- ``room_low``, ``room_high``: corners of the room, for ambient occlusion near its edges.
+- ``background``: colour where nothing is seen.
+- ``shadow_strength``: fraction of the directional light that a full shadow takes.
+- ``occlusion_strength``: fraction of all light that full occlusion under objects takes.
+"""
+POINT = np.dtype(
+    [
+        *(("position", "f4", 3), ("normal", "f4", 3)),
+        *(("ambient", "f4", 3), ("direct", "f4", 3), ("levelness", "f4")),
+    ],
+    align=True,
+)
+"""A surface point with its light before shadows.
+
+- ``position``: metres in the world. ``normal``: unit, before normal mapping.
+- ``ambient``: ambient light, environment and emission that the point sends.
+- ``direct``: the directional light that it sends if lit.
+- ``levelness``: 1 for a horizontal surface that faces up, 0 from 60 degrees on; the weight of the
+  occlusion under objects.
+"""
 
 
-@kernel
-def _texture(
-    texels: U8, starts: NDArray[np.int64], row: int, u: float, v: float, level: float
-) -> tuple[float, float, float, float, float]:
-    """Linear albedo and slopes of a texture between two of its levels."""
-    low = min(int(level), starts.shape[1] - 1)
-    share = level - low
-    side = 1 << (starts.shape[1] - 1)
-    r, g, b, p, q = _texel(texels, starts[row, low], side >> low, u, v)
-    if share > 0.02 and low + 1 < starts.shape[1]:
-        r1, g1, b1, p1, q1 = _texel(texels, starts[row, low + 1], side >> (low + 1), u, v)
-        r, g, b = r + share * (r1 - r), g + share * (g1 - g), b + share * (b1 - b)
-        p, q = p + share * (p1 - p), q + share * (q1 - q)
-    unit = 1.0 / (255.0 * 255.0)
-    return r * r * unit, g * g * unit, b * b * unit, (p - 128.0) / 64.0, (q - 128.0) / 64.0
+class ShadingInputs(NamedTuple):
+    """Everything about a scene that is the same for all its pixels.
 
+    Numba counts references to each array that a kernel takes apart from a tuple, so the fields of
+    one kind stand side by side in an array of records.
 
-@kernel
-def _shade_point(
-    t: int,
-    x: float,
-    y: float,
-    edges: F64,
-    corners: F32,
-    materials: F64,
-    texels: U8,
-    starts: NDArray[np.int64],
-    view: F64,
-    light: F64,
-    out: F32,
-    at: int,
-) -> None:
-    """Shade triangle ``t`` at pixel coordinates into row ``at`` of ``out`` (P, POINT).
-
-    In order: the world point, the light from around, the lamp's light, how much the surface faces
-    up (0..1), which is where things standing near darken it, and the normal without relief.
+    - ``camera`` (1,) of `CAMERA`; ``lights`` (1,) of `LIGHT`; ``materials`` (M,) of `MATERIAL`.
+    - ``edges`` (T, 3, 3): edge functions of the triangles, written by `rasterize`.
+    - ``surfaces`` (T,) of `SURFACE`; ``groups`` (T,): triangles of one number make one smooth
+      surface and are shaded as one.
+    - ``atlas``: the textures.
+    - ``tones`` (TONES,) uint8: the sRGB bytes of linear light 0..`WHITEST`.
     """
-    a0, a1, a2 = edges[t, 0], edges[t, 3], edges[t, 6]
-    b0, b1, b2 = edges[t, 1], edges[t, 4], edges[t, 7]
-    e0 = a0 * x + b0 * y + edges[t, 2]
-    e1 = a1 * x + b1 * y + edges[t, 5]
-    e2 = a2 * x + b2 * y + edges[t, 8]
-    w = 1.0 / (e0 + e1 + e2)
-    e0, e1, e2 = e0 * w, e1 * w, e2 * w
-    vx = view[1, 0] * x + view[1, 1] * y + view[1, 2]
-    vy = view[2, 0] * x + view[2, 1] * y + view[2, 2]
-    vz = view[3, 0] * x + view[3, 1] * y + view[3, 2]
-    px, py, pz = view[0, 0] + w * vx, view[0, 1] + w * vy, view[0, 2] + w * vz
-    scale = -1.0 / np.sqrt(vx * vx + vy * vy + vz * vz)
-    vx, vy, vz = vx * scale, vy * scale, vz * scale
 
-    m = int(corners[t, MATERIAL])
-    u0, u1, u2 = corners[t, 9], corners[t, 11], corners[t, 13]
-    v0, v1, v2 = corners[t, 10], corners[t, 12], corners[t, 14]
-    u = e0 * u0 + e1 * u1 + e2 * u2
-    v = e0 * v0 + e1 * v1 + e2 * v2
+    camera: Records
+    edges: F64
+    surfaces: Records
+    groups: I32
+    materials: Records
+    atlas: Atlas
+    lights: Records
+    tones: U8
+
+
+class LightMaps(NamedTuple):
+    """Depth maps of one frame: of the directional light, and of what hangs low over the ground."""
+
+    shadow: DepthMap
+    occlusion: DepthMap
+
+
+@kernel
+def _dot(a: Vector, b: Vector) -> float:
+    """Return the scalar product of two vectors."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@kernel
+def _scaled(a: Vector, factor: float) -> Vector:
+    """Return ``factor`` times a vector."""
+    return a[0] * factor, a[1] * factor, a[2] * factor
+
+
+@kernel
+def texture_footprint(
+    edges: F64, surfaces: Records, t: int, weights: Vector, depth: float
+) -> tuple[float, float, float]:
+    """Return u, v, and the area that a pixel covers in the texture, as a fraction of it.
+
+    Parameters
+    ----------
+    edges, surfaces, t
+        The triangles as in `ShadingInputs`, and the index of one.
+    weights, depth
+        Barycentric coordinates and depth of the point, see `barycentric`.
+
+    Notes
+    -----
+    With Ek = ak x + bk y + ck the edge functions and w = 1 / sum Ek the depth,
+    u = w sum Ek uk and du/dx = w (sum ak uk - u sum ak); likewise for v and y. The area is the
+    product of the lengths of (du, dv)/dx and (du, dv)/dy. The area, rather than the longer side
+    (Williams 1983), makes surfaces seen edge-on sharper: a compromise between blur and flicker
+    (Heckbert 1989).
+    """
+    uv = surfaces[t].uv
+    a0, a1, a2 = edges[t, 0, 0], edges[t, 1, 0], edges[t, 2, 0]
+    b0, b1, b2 = edges[t, 0, 1], edges[t, 1, 1], edges[t, 2, 1]
+    u0, u1, u2 = uv[0, 0], uv[1, 0], uv[2, 0]
+    v0, v1, v2 = uv[0, 1], uv[1, 1], uv[2, 1]
+    u = weights[0] * u0 + weights[1] * u1 + weights[2] * u2
+    v = weights[0] * v0 + weights[1] * v1 + weights[2] * v2
     da, db = a0 + a1 + a2, b0 + b1 + b2
     du_dx = a0 * u0 + a1 * u1 + a2 * u2 - u * da
     du_dy = b0 * u0 + b1 * u1 + b2 * u2 - u * db
     dv_dx = a0 * v0 + a1 * v1 + a2 * v2 - v * da
     dv_dy = b0 * v0 + b1 * v1 + b2 * v2 - v * db
-    # The square of the mean of both sides' lengths (geometric: between blur and flicker).
-    square = np.sqrt((du_dx * du_dx + dv_dx * dv_dx) * (du_dy * du_dy + dv_dy * dv_dy))
-    side = 1 << (starts.shape[1] - 1)
-    level = 0.5 * coarse_log2_of(max(SHARPEN * side * side * w * w * square, 1.0))
-    ar, ag, ab, slope_u, slope_v = _texture(texels, starts, int(materials[m, 3]), u, v, level)
-    ar, ag, ab = ar * materials[m, 0], ag * materials[m, 1], ab * materials[m, 2]
-
-    nx = e0 * corners[t, 0] + e1 * corners[t, 3] + e2 * corners[t, 6]
-    ny = e0 * corners[t, 1] + e1 * corners[t, 4] + e2 * corners[t, 7]
-    nz = e0 * corners[t, 2] + e1 * corners[t, 5] + e2 * corners[t, 8]
-    scale = 1.0 / np.sqrt(nx * nx + ny * ny + nz * nz)
-    if nx * vx + ny * vy + nz * vz < 0.0:
-        scale = -scale
-    nx, ny, nz = nx * scale, ny * scale, nz * scale
-    out[at, 9] = min(max(2.0 * nz - 1.0, 0.0), 1.0)
-    out[at, 10], out[at, 11], out[at, 12] = nx, ny, nz
-    if materials[m, 8] > 0.0:
-        slope_u, slope_v = slope_u * materials[m, 8], slope_v * materials[m, 8]
-        nx -= slope_u * corners[t, 15] + slope_v * corners[t, 18]
-        ny -= slope_u * corners[t, 16] + slope_v * corners[t, 19]
-        nz -= slope_u * corners[t, 17] + slope_v * corners[t, 20]
-        scale = 1.0 / np.sqrt(nx * nx + ny * ny + nz * nz)
-        nx, ny, nz = nx * scale, ny * scale, nz * scale
-
-    lx, ly, lz = light[0, 0], light[0, 1], light[0, 2]
-    direct = max(nx * lx + ny * ly + nz * lz, 0.0)
-    toward = max(nx * vx + ny * vy + nz * vz, 0.0)
-    shine = 0.0
-    if direct > 0.0 and materials[m, 4] > 0.0:
-        hx, hy, hz = lx + vx, ly + vy, lz + vz
-        half = (nx * hx + ny * hy + nz * hz) / np.sqrt(hx * hx + hy * hy + hz * hz)
-        if half > 0.5:
-            # half ** sharpness, to 3e-4.
-            shine = materials[m, 4] * exp_of(LN2 * materials[m, 5] * coarse_log2_of(half))
-    metal = materials[m, 7]
-    graze = (1.0 - toward) * (1.0 - toward)
-    mirror = materials[m, 6] * (1.0 + (3.0 - 2.0 * metal) * graze * graze)
-    window, high = 0.0, 0.0
-    if mirror > 0.0:
-        rx, ry, rz = 2.0 * toward * nx - vx, 2.0 * toward * ny - vy, 2.0 * toward * nz - vz
-        window = _window_share(px, py, pz, rx, ry, rz, light)
-        high = min(max(2.0 * rz, -1.0), 1.0)
-    room = 1.0
-    if materials[m, 10] > 0.0:
-        room = _room_shade(px, py, pz, nx, ny, nz, light)
-    out[at, 0], out[at, 1], out[at, 2] = px, py, pz
-    end = 8 if high > 0.0 else 7
-    for k in range(3):
-        albedo = ar if k == 0 else (ag if k == 1 else ab)
-        ambient = light[2, k] + nx * light[3, k] + ny * light[4, k] + nz * light[5, k]
-        seen = light[6, k] + abs(high) * (light[end, k] - light[6, k])
-        seen += window * (light[11, k] - seen)
-        tint = 1.0 + metal * (albedo - 1.0)
-        matte = albedo * (1.0 - 0.8 * metal)
-        out[at, 3 + k] = room * (matte * ambient + mirror * tint * seen) + materials[m, 9] * albedo
-        out[at, 6 + k] = room * light[1, k] * (matte * direct + tint * shine)
+    area = np.sqrt((du_dx * du_dx + dv_dx * dv_dx) * (du_dy * du_dy + dv_dy * dv_dy))
+    return u, v, FOOTPRINT * depth * depth * area
 
 
 @kernel
-def _window_share(
-    px: float, py: float, pz: float, rx: float, ry: float, rz: float, light: F64
-) -> float:
-    """How much of the window a rough reflection along (rx, ry, rz) sees, 0..1."""
-    gap = light[9, 1] - py
-    if gap * ry <= 1e-9:
+def _smooth_normal(surfaces: Records, t: int, weights: Vector, to_eye: Vector) -> Vector:
+    """Return the interpolated unit normal of triangle ``t``, on the side that the camera sees."""
+    normals = surfaces[t].normals
+    b0, b1, b2 = weights
+    nx = b0 * normals[0, 0] + b1 * normals[1, 0] + b2 * normals[2, 0]
+    ny = b0 * normals[0, 1] + b1 * normals[1, 1] + b2 * normals[2, 1]
+    nz = b0 * normals[0, 2] + b1 * normals[1, 2] + b2 * normals[2, 2]
+    scale = 1.0 / np.sqrt(nx * nx + ny * ny + nz * nz)
+    if _dot((nx, ny, nz), to_eye) < 0.0:
+        scale = -scale
+    return nx * scale, ny * scale, nz * scale
+
+
+@kernel
+def _mapped_normal(
+    normal: Vector, surfaces: Records, t: int, slope_u: float, slope_v: float
+) -> Vector:
+    """Tilt a normal by the slopes of a normal map: n' = n - su tu - sv tv, scaled to length 1.
+
+    That is the normal of the height field h(u, v) with slopes su = dh/du and sv = dh/dv.
+    """
+    tangents = surfaces[t].tangents
+    nx = normal[0] - (slope_u * tangents[0, 0] + slope_v * tangents[1, 0])
+    ny = normal[1] - (slope_u * tangents[0, 1] + slope_v * tangents[1, 1])
+    nz = normal[2] - (slope_u * tangents[0, 2] + slope_v * tangents[1, 2])
+    return _scaled((nx, ny, nz), 1.0 / np.sqrt(nx * nx + ny * ny + nz * nz))
+
+
+@kernel
+def lambert(normal: Vector, to_light: Vector) -> float:
+    """Return Lambert's cosine, max(n . l, 0): what a matte surface receives by its tilt."""
+    return max(_dot(normal, to_light), 0.0)
+
+
+@kernel
+def highlight(normal: Vector, to_light: Vector, to_eye: Vector, exponent: float) -> float:
+    """Return the specular highlight (n . h)^exponent, h = (l + v) / |l + v| (Blinn 1977).
+
+    It is 1 where the normal is the half vector h. The power is computed as
+    2^(exponent log2(n . h)) with a logarithm that is exact to 2e-5.
+    """
+    half = to_light[0] + to_eye[0], to_light[1] + to_eye[1], to_light[2] + to_eye[2]
+    cosine = _dot(normal, half) / np.sqrt(_dot(half, half))
+    if cosine > HIGHLIGHT_CUTOFF:
+        return exp_of(LN2 * exponent * coarse_log2_of(cosine))
+    return 0.0
+
+
+@kernel
+def fresnel(reflectance: float, metalness: float, cosine: float) -> float:
+    """Return the fraction of the environment that a surface reflects at an angle to its normal.
+
+    F = F0 (1 + g (1 - cos)^4), with the gain g = 3 for dielectrics and 1 for metals. It has the
+    form of Schlick's (1994) approximation F0 + (1 - F0) (1 - cos)^5, but stays proportional to
+    F0, so that rough surfaces do not turn into mirrors when seen edge-on.
+    """
+    grazing = (1.0 - cosine) * (1.0 - cosine)
+    return reflectance * (1.0 + (GRAZING_GAIN - GRAZING_GAIN_LOST * metalness) * grazing * grazing)
+
+
+@kernel
+def window_fraction(position: Vector, ray: Vector, low: F64, high: F64) -> float:
+    """Return how much of the window a rough reflection along ``ray`` shows, 0..1.
+
+    The ray meets the window's plane y = low[1] at a distance d. Along x and z, the distance to the
+    nearer edge divided by a blur that grows with d goes through a smooth step 3 s^2 - 2 s^3.
+    """
+    gap = low[1] - position[1]
+    if gap * ray[1] <= PARALLEL:
         return 0.0
-    along = gap / ry
-    x, z = px + along * rx, pz + along * rz
-    blur = 0.25 + 0.12 * along
-    u = min(x - light[9, 0], light[10, 0] - x) / blur + 0.5
-    v = min(z - light[9, 2], light[10, 2] - z) / blur + 0.5
+    along = gap / ray[1]
+    x, z = position[0] + along * ray[0], position[2] + along * ray[2]
+    blur = WINDOW_BLUR + WINDOW_BLUR_GROWTH * along
+    u = min(x - low[0], high[0] - x) / blur + 0.5
+    v = min(z - low[2], high[2] - z) / blur + 0.5
     u, v = min(max(u, 0.0), 1.0), min(max(v, 0.0), 1.0)
     return float(u * u * (3.0 - 2.0 * u) * v * v * (3.0 - 2.0 * v))
 
 
 @kernel
-def _room_shade(
-    px: float, py: float, pz: float, nx: float, ny: float, nz: float, light: F64
-) -> float:
-    """Light that is left near the edges where walls, floor and ceiling meet, 0..1."""
+def corner_occlusion(position: Vector, normal: Vector, low: F64, high: F64) -> float:
+    """Return the fraction of light left near the edges where walls, floor and ceiling meet.
+
+    Each of the room's six planes takes c (1 - |n_k|) exp(-d / r) of the light of a surface at
+    distance d from it: the factor 1 - |n_k| leaves out the plane that the surface lies in.
+    """
     left = 1.0
     for k in range(3):
-        p = px if k == 0 else (py if k == 1 else pz)
-        n = nx if k == 0 else (ny if k == 1 else nz)
-        flat = 1.0 - abs(n)
-        low, high = max(p - light[12, k], 0.0), max(light[13, k] - p, 0.0)
-        left *= 1.0 - 0.22 * flat * exp_of(-low / 0.6)
-        left *= 1.0 - 0.22 * flat * exp_of(-high / 0.6)
+        p = position[0] if k == 0 else (position[1] if k == 1 else position[2])
+        n = normal[0] if k == 0 else (normal[1] if k == 1 else normal[2])
+        across = 1.0 - abs(n)
+        to_low, to_high = max(p - low[k], 0.0), max(high[k] - p, 0.0)
+        left *= 1.0 - CORNER_OCCLUSION * across * exp_of(-to_low / CORNER_RANGE)
+        left *= 1.0 - CORNER_OCCLUSION * across * exp_of(-to_high / CORNER_RANGE)
     return float(left)
 
 
 @kernel
-def _lit(px: float, py: float, pz: float, m: F64, shadow: F32, busy: NDArray[np.bool_]) -> float:
-    """Share of the lamp that reaches a world point: a soft-edged look into the shadow map."""
-    x = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3] - 0.5
-    y = m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3] - 0.5
-    height, width = shadow.shape
-    if x < 2.0 or y < 2.0 or x >= width - 3.0 or y >= height - 3.0:
-        return 1.0
-    j, i = int(x), int(y)
-    if not busy[i // BLOCK, j // BLOCK]:
-        return 1.0
-    z = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3]
-    ax, ay = x - j, y - i
-    total = 0.0
-    for row in range(-2, 4):
-        line = 0.0
-        for column in range(-1, 3):
-            if shadow[i + row, j + column] >= z:
-                line += 1.0
-        if shadow[i + row, j - 2] >= z:
-            line += 1.0 - ax
-        if shadow[i + row, j + 3] >= z:
-            line += ax
-        total += line * (1.0 - ay if row == -2 else (ay if row == 3 else 1.0))
-    return float(total / 25.0)
+def _shade_point(
+    t: int, x: float, y: float, inputs: ShadingInputs, points: Records, row: int
+) -> None:
+    """Shade triangle ``t`` at a point of the picture.
 
+    Parameters
+    ----------
+    t
+        Index of the triangle.
+    x, y
+        Point of the picture in pixels.
+    inputs
+        The scene.
+    points, row
+        Where the result is written.
 
-@kernel
-def _crowded(
-    px: float, py: float, pz: float, m: F64, contact: F32, busy: NDArray[np.bool_], reach: float
-) -> float:
-    """How much of the surroundings of a point is taken by things that stand low over it, 0..1."""
-    x = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3] - 0.5
-    y = m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3] - 0.5
-    height, width = contact.shape
-    if x < 3.0 or y < 3.0 or x >= width - 4.0 or y >= height - 4.0:
-        return 0.0
-    j, i = int(x), int(y)
-    if not busy[i // BLOCK, j // BLOCK]:
-        return 0.0
-    ax, ay = x - j, y - i
-    total = 0.0
-    for row in range(-3, 5):
-        line = 0.0
-        for column in range(-3, 5):
-            gap = contact[i + row, j + column] - pz
-            if -0.004 < gap < reach:
-                share = 1.0 - gap / reach
-                line += share * (1.0 - ax if column == -3 else (ax if column == 4 else 1.0))
-        total += line * (1.0 - ay if row == -3 else (ay if row == 4 else 1.0))
-    return float(total / 49.0)
+    Notes
+    -----
+    With albedo a, metalness m, tint = 1 + m (a - 1), diffuse colour d = a (1 - 0.8 m), normal n
+    and reflected ray r:
+
+        ambient light   room (d (A + n . slopes) + F tint environment(r)) + emission a
+        direct light    room color (d max(n . l, 0) + tint specular (n . h)^exponent)
+    """
+    edges, surfaces = inputs.edges, inputs.surfaces
+    camera, light = inputs.camera[0], inputs.lights[0]
+    material, point = inputs.materials[surfaces[t].material], points[row]
+    # The point: camera + depth * ray, and the direction back to the camera.
+    depth, b0, b1, b2 = barycentric(edges, t, x, y)
+    weights = (b0, b1, b2)
+    rays, eye = camera.rays, camera.position
+    vx = rays[0, 0] * x + rays[0, 1] * y + rays[0, 2]
+    vy = rays[1, 0] * x + rays[1, 1] * y + rays[1, 2]
+    vz = rays[2, 0] * x + rays[2, 1] * y + rays[2, 2]
+    position = (eye[0] + depth * vx, eye[1] + depth * vy, eye[2] + depth * vz)
+    to_eye = _scaled((vx, vy, vz), -1.0 / np.sqrt(vx * vx + vy * vy + vz * vz))
+
+    # Albedo: colour times texture at the level of the pixel's footprint.
+    u, v, footprint = texture_footprint(edges, surfaces, t, weights, depth)
+    atlas = inputs.atlas
+    level = mip_level(footprint, 1 << (atlas.starts.shape[1] - 1))
+    red, green, blue, slope_u, slope_v = sample_texture(atlas, material.texture, u, v, level)
+    color = material.color
+    albedo = (red * color[0], green * color[1], blue * color[2])
+
+    # Normals: the smooth one for shadows and occlusion, the mapped one for light.
+    normal = _smooth_normal(surfaces, t, weights, to_eye)
+    for k in range(3):
+        point.position[k] = position[k]
+        point.normal[k] = normal[k]
+    levelness = (normal[2] - LEVEL_COSINE) / (1.0 - LEVEL_COSINE)
+    point.levelness = min(max(levelness, 0.0), 1.0)
+    scale = material.normal_scale
+    if scale > 0.0:
+        normal = _mapped_normal(normal, surfaces, t, slope_u * scale, slope_v * scale)
+
+    # Directional light: Lambert and Blinn-Phong.
+    to_light = (light.direction[0], light.direction[1], light.direction[2])
+    diffuse = lambert(normal, to_light)
+    shine = 0.0
+    if diffuse > 0.0 and material.specular > 0.0:
+        shine = material.specular * highlight(normal, to_light, to_eye, material.exponent)
+
+    # Environment: seen along the mirrored ray r = 2 (n . v) n - v, as far as Fresnel reflects it.
+    metal = material.metalness
+    cosine = max(_dot(normal, to_eye), 0.0)
+    mirror = fresnel(material.reflectance, metal, cosine)
+    window, height = 0.0, 0.0
+    if mirror > 0.0:
+        twice = 2.0 * cosine
+        rx, ry = twice * normal[0] - to_eye[0], twice * normal[1] - to_eye[1]
+        rz = twice * normal[2] - to_eye[2]
+        window = window_fraction(position, (rx, ry, rz), light.window_low, light.window_high)
+        height = min(max(ENVIRONMENT_SLOPE * rz, -1.0), 1.0)
+    room = 1.0
+    if material.occluded:
+        room = corner_occlusion(position, normal, light.room_low, light.room_high)
+
+    # Sum of the terms, for red, green and blue.
+    pole = ABOVE if height > 0.0 else BELOW
+    slopes, environment = light.ambient_slopes, light.environment
+    for k in range(3):
+        a = albedo[0] if k == 0 else (albedo[1] if k == 1 else albedo[2])
+        ambient = light.ambient[k] + normal[0] * slopes[0, k]
+        ambient = ambient + normal[1] * slopes[1, k] + normal[2] * slopes[2, k]
+        seen = environment[SIDES, k] + abs(height) * (environment[pole, k] - environment[SIDES, k])
+        seen += window * (light.window_color[k] - seen)
+        tint = 1.0 + metal * (a - 1.0)
+        matte = a * (1.0 - METAL_DIFFUSE_LOST * metal)
+        sent = room * (matte * ambient + mirror * tint * seen)
+        point.ambient[k] = sent + material.emission * a
+        point.direct[k] = room * light.color[k] * (matte * diffuse + tint * shine)
 
 
 @kernel
 def _tone(tones: U8, light: float) -> int:
-    """The byte of a linear light; black for what is no number (a normal of no length)."""
-    at = light * ((TONES - 1) / WHITEST)
-    if not at > 0.0:
+    """Return the byte of a linear light; black for NaN (from a normal without length)."""
+    index = light * ((TONES - 1) / WHITEST)
+    if not index > 0.0:
         return int(tones[0])
-    return int(tones[int(min(at, TONES - 1.0))])
+    return int(tones[int(min(index, TONES - 1.0))])
+
+
+@kernel
+def shade_static_points(
+    triangle_ids: I32, static: int, inputs: ShadingInputs, points: Records
+) -> None:
+    """Shade the centres of all pixels that show one of the first ``static`` triangles.
+
+    Entry i * W + j of ``points``, of `POINT`, is the pixel in row i and column j of
+    ``triangle_ids`` (H, W, S); the entries of other pixels stay as they are.
+    """
+    height, width, _ = triangle_ids.shape
+    for row in range(height):
+        for column in range(width):
+            t = triangle_ids[row, column, 0]
+            if 0 <= t < static:
+                x, y = column + 0.5 + SAMPLES[0, 0], row + 0.5 + SAMPLES[0, 1]
+                _shade_point(t, x, y, inputs, points, row * width + column)
 
 
 @kernel
 def shade(
-    ids: I32,
-    first: int,
-    fill: bool,
-    edges: F64,
-    corners: F32,
-    surface: I32,
-    materials: F64,
-    texels: U8,
-    starts: NDArray[np.int64],
-    view: F64,
-    light: F64,
-    to_shadow: F64,
-    shadow: F32,
-    shadow_busy: NDArray[np.bool_],
-    to_contact: F64,
-    contact: F32,
-    contact_busy: NDArray[np.bool_],
-    settings: F64,
-    tones: U8,
-    still: F32,
-    out: U8,
+    triangle_ids: I32,
+    static: int,
+    inputs: ShadingInputs,
+    maps: LightMaps,
+    points: Records,
+    colors: U8,
 ) -> None:
-    """Shade every pixel of ``ids`` (H, W, S) into ``out`` (H, W, 3), sRGB.
+    """Shade every pixel of a visibility buffer.
 
-    Triangles before ``first`` never move: where the centre of a pixel shows one of them, its
-    shading is read from ``still`` (H * W + 1, POINT), the same numbers that shading it again
-    gives. With ``fill`` it is the other way round: ``still`` is written at every centre and
-    ``out`` is not. The last row of ``still`` is room to work in.
-
-    - ``edges`` (T, 9) as `rasterize` writes; ``corners`` (T, CORNERS) as `pack_corners` gives;
-      ``surface`` (T,): triangles of one number are shaded as one.
-    - ``materials`` (M, 12): linear colour, texture row, gloss, sharpness, mirror, metal, relief,
-      glow, whether the room's edges darken it, unused.
-    - ``texels``, ``starts``: an `Atlas`. ``view`` (4, 3): the camera's place; then the rows that
-      take (x, y, 1) in pixels to a world vector. ``light`` (15, 3): a `Light`, row by row, then
-      the linear colour where nothing is seen.
-    - ``to_shadow``, ``shadow``, ``shadow_busy``: the `ShadeMap` of the lamp; ``to_contact``, ...:
-      that of what hangs low over the ground.
-    - ``settings`` (4,): how far a point is lifted off its surface before it is looked up, share of
-      the lamp that shadows take, strength and reach in metres of the darkness under things.
+    Parameters
+    ----------
+    triangle_ids
+        (H, W, S) triangle of each sample, or `NOTHING`.
+    static
+        Triangles before this index never move. Where the centre of a pixel shows one of them, its
+        shading is read from ``points``; that gives the same numbers as shading it again.
+    inputs
+        The scene. ``maps``: its depth maps in this frame.
+    points
+        (H * W + 1,) of `POINT`, filled by `shade_static_points`. The last one is overwritten.
+    colors
+        (H, W, 3) uint8, written: sRGB.
     """
-    height, width, samples = ids.shape
-    lift, dark, strength, reach = settings[0], settings[1], settings[2], settings[3]
+    height, width, samples = triangle_ids.shape
+    light, groups, tones = inputs.lights[0], inputs.groups, inputs.tones
+    shadow, occlusion = maps.shadow, maps.occlusion
     for row in range(height):
         for column in range(width):
             red, green, blue = 0.0, 0.0, 0.0
@@ -323,48 +487,40 @@ def shade(
             for s in range(samples):
                 if not todo >> s & 1:
                     continue
-                t = ids[row, column, s]
+                t = triangle_ids[row, column, s]
                 count = 1
                 for other in range(s + 1, samples):
-                    o = ids[row, column, other]
-                    if o == t or (o >= 0 and t >= 0 and surface[o] == surface[t]):
+                    o = triangle_ids[row, column, other]
+                    if o == t or (o >= 0 and t >= 0 and groups[o] == groups[t]):
                         todo &= ~(1 << other)
                         count += 1
                 weight = count / samples
                 if t < 0:
-                    red += weight * light[14, 0]
-                    green += weight * light[14, 1]
-                    blue += weight * light[14, 2]
+                    red += weight * light.background[0]
+                    green += weight * light.background[1]
+                    blue += weight * light.background[2]
                     continue
-                kept = s == 0 and t < first
-                p = row * width + column if kept else height * width
-                if fill or not kept:
+                p = row * width + column
+                if s > 0 or t >= static:
+                    p = height * width
                     x, y = column + 0.5 + SAMPLES[s, 0], row + 0.5 + SAMPLES[s, 1]
-                    _shade_point(
-                        t, x, y, edges, corners, materials, texels, starts, view, light, still, p
-                    )
-                if fill:
-                    break
-                px, py, pz = still[p, 0], still[p, 1], still[p, 2]
-                lx, ly, lz = (
-                    px + lift * still[p, 10],
-                    py + lift * still[p, 11],
-                    pz + lift * still[p, 12],
+                    _shade_point(t, x, y, inputs, points, p)
+                point = points[p]
+                px, py, pz = point.position[0], point.position[1], point.position[2]
+                lit = lit_fraction(
+                    shadow,
+                    px + SHADOW_OFFSET * point.normal[0],
+                    py + SHADOW_OFFSET * point.normal[1],
+                    pz + SHADOW_OFFSET * point.normal[2],
                 )
-                lit = _lit(lx, ly, lz, to_shadow, shadow, shadow_busy)
-                lit = 1.0 - dark * (1.0 - lit)
-                if still[p, 9] > 0.0:
-                    crowd = _crowded(px, py, pz, to_contact, contact, contact_busy, reach)
-                    weight *= 1.0 - still[p, 9] * strength * crowd
-                red += weight * (still[p, 3] + lit * still[p, 6])
-                green += weight * (still[p, 4] + lit * still[p, 7])
-                blue += weight * (still[p, 5] + lit * still[p, 8])
-            if not fill:
-                out[row, column, 0] = _tone(tones, red)
-                out[row, column, 1] = _tone(tones, green)
-                out[row, column, 2] = _tone(tones, blue)
-
-
-def pack_corners(normals: F32, uv: F32, tangents: F32, material: I32) -> F32:
-    """What the shading loop reads of each triangle, side by side: (T, CORNERS)."""
-    return np.concatenate([normals, uv, tangents, material[:, None].astype(np.float32)], axis=1)
+                lit = 1.0 - light.shadow_strength * (1.0 - lit)
+                levelness = point.levelness
+                if levelness > 0.0:
+                    occluded = occluded_fraction(occlusion, px, py, pz)
+                    weight *= 1.0 - levelness * light.occlusion_strength * occluded
+                red += weight * (point.ambient[0] + lit * point.direct[0])
+                green += weight * (point.ambient[1] + lit * point.direct[1])
+                blue += weight * (point.ambient[2] + lit * point.direct[2])
+            colors[row, column, 0] = _tone(tones, red)
+            colors[row, column, 1] = _tone(tones, green)
+            colors[row, column, 2] = _tone(tones, blue)

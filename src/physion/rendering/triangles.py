@@ -1,6 +1,6 @@
-"""A scene as triangles: the room, what never moves, what moves, in this order.
+"""A scene as triangles in this order: the room, the bodies that never move, those that move.
 
-The order lets the renderer draw and shade the first two once.
+The order lets the renderer draw and shade the first two once for all frames.
 """
 
 from __future__ import annotations
@@ -14,39 +14,57 @@ from numpy.typing import NDArray
 from physion.numerics.linear_algebra import apply, dot, norm, unit
 from physion.numerics.rotations import rotation_matrices
 from physion.physics.trajectory import Trajectory
-from physion.rendering.geometry import F32, F64, I32, Part, sheet, solid
+from physion.rendering.geometry import F32, F64, I32, MeshPart, sheet, solid
 from physion.rendering.light import to_linear
 from physion.rendering.paint import painted
 from physion.rendering.rooms import Panel, Room
-from physion.rendering.textures.atlas import Atlas, build_atlas, finish
+from physion.rendering.shading import MATERIAL, Records
+from physion.rendering.textures.atlas import Finish, build_atlas, finish
+from physion.rendering.textures.lookup import Atlas
 from physion.scenes.scene import Look, Scene
 from physion.scenes.shapes.primitives import shape
 
+ROOM = -1
+"""Object index of the room."""
+
 
 @dataclass(frozen=True)
-class Piece:
-    """Where one body or cloth lies in the arrays: vertices and triangles from..to."""
+class MeshInstance:
+    """One body, one cloth or the room in the arrays of an `Assembly`.
 
-    part: Part
+    ``vertices`` and ``triangles`` are its ranges; ``index`` is its index in `Scene.names`, or
+    `ROOM`.
+    """
+
+    part: MeshPart
     vertices: slice
     triangles: slice
     index: int
-    """Index in `Scene.names`; -1 for the room."""
 
 
 @dataclass(frozen=True)
 class Assembly:
-    """All triangles of a scene. ``first_*`` is where the moving ones begin."""
+    """All triangles of a scene. T triangles.
 
-    pieces: tuple[Piece, ...]
+    - ``instances``: the meshes, in the order of the arrays.
+    - ``faces`` (T, 3), ``two_sided`` (T,), ``uv`` (T, 3, 2), ``tangents`` (T, 2, 3), ``groups``
+      (T,), ``material`` (T,): as in `MeshPart`, with indices into all vertices, all surfaces and
+      ``materials``.
+    - ``object_ids`` (T,): 0 is the room, i + 1 the i-th of `Scene.names`.
+    - ``materials``, ``atlas``: surface materials and their textures.
+    - ``first_vertex``, ``first_triangle``: where the moving ones begin.
+    - ``vertex_count``: all vertices. ``room_triangles``: triangles of the room, the first ones.
+    """
+
+    instances: tuple[MeshInstance, ...]
     faces: I32
     two_sided: NDArray[np.bool_]
-    objects: I32
-    surface: I32
+    object_ids: I32
+    groups: I32
     uv: F32
     tangents: F32
     material: I32
-    materials: F64
+    materials: Records
     atlas: Atlas
     first_vertex: int
     first_triangle: int
@@ -54,36 +72,46 @@ class Assembly:
     room_triangles: int
 
 
-class _Materials:
-    """Rows of the material table, and which textures they use."""
+class _MaterialTable:
+    """Surface materials in the order in which they were added, and the textures they use."""
 
     def __init__(self) -> None:
-        self._rows: list[list[float]] = []
+        self._colors: list[tuple[float, float, float]] = []
+        self._finishes: list[Finish] = []
+        self._emission: list[float] = []
+        self._occluded: list[bool] = []
         self.textures: list[str] = []
 
-    def add(self, look: Look, glow: float = 0.0, room: bool = False) -> int:
-        """Add a row for ``look`` and return its index."""
+    def add(self, look: Look, emission: float = 0.0, occluded: bool = False) -> int:
+        """Add the material of a look and return its index."""
         kind = finish(look.texture)
         if kind.texture not in self.textures:
             self.textures.append(kind.texture)
-        row = [*look.color, self.textures.index(kind.texture), kind.gloss, kind.sharpness]
-        self._rows.append([*row, kind.mirror, kind.metal, kind.relief, glow, float(room), 0.0])
-        return len(self._rows) - 1
+        self._colors.append(look.color)
+        self._finishes.append(kind)
+        self._emission.append(emission)
+        self._occluded.append(occluded)
+        return len(self._colors) - 1
 
-    def table(self) -> F64:
-        """Return the rows as `physion.rendering.shading.shade` reads them: (M, 12)."""
-        table = np.array(self._rows, np.float64)
-        table[:, :3] = to_linear(table[:, :3])
+    def materials(self) -> Records:
+        """Return all materials (M,) of `physion.rendering.shading.MATERIAL`."""
+        table = np.zeros(len(self._colors), MATERIAL)
+        table["color"] = to_linear(self._colors)
+        table["emission"], table["occluded"] = self._emission, self._occluded
+        for row, kind in enumerate(self._finishes):
+            table["texture"][row] = self.textures.index(kind.texture)
+            for name in ("specular", "exponent", "reflectance", "metalness", "normal_scale"):
+                table[name][row] = getattr(kind, name)
         return table
 
 
 def assemble(scene: Scene, room: Room) -> Assembly:
-    """Collect the triangles of ``scene`` in ``room``."""
-    materials = _Materials()
-    parts: list[tuple[Part, int]] = [(_panels(room.panels, materials), -1)]
-    still = [i for i, body in enumerate(scene.bodies) if body.kinematic or body.scenery]
-    moving = [i for i in range(len(scene.bodies)) if i not in set(still)]
-    for i in still + moving:
+    """Return the triangles of a scene in a room."""
+    table = _MaterialTable()
+    parts: list[tuple[MeshPart, int]] = [(_room_part(room.panels, table), ROOM)]
+    static = [i for i, body in enumerate(scene.bodies) if body.kinematic or body.scenery]
+    moving = [i for i in range(len(scene.bodies)) if i not in set(static)]
+    for i in static + moving:
         body = scene.bodies[i]
         form = shape(body.shape)
         mesh = form.mesh
@@ -92,102 +120,120 @@ def assemble(scene: Scene, room: Room) -> Assembly:
             np.asarray(mesh.faces, np.int32),
             np.asarray(body.scale),
             mesh.smooth,
-            materials.add(body.look),
+            table.add(body.look),
         )
         if body.name not in (scene.roles.agent, scene.roles.patient):
-            part = painted(part, form, materials.add)
+            part = painted(part, form, table.add)
         parts.append((part, i))
     for i, cloth in enumerate(scene.cloths):
-        parts.append((sheet(cloth.resolution, materials.add(cloth.look)), len(scene.bodies) + i))
-    return _concatenate(parts, 1 + len(still), materials)
+        parts.append((sheet(cloth.resolution, table.add(cloth.look)), len(scene.bodies) + i))
+    return _concatenate(parts, 1 + len(static), table)
 
 
-def _concatenate(parts: list[tuple[Part, int]], first: int, materials: _Materials) -> Assembly:
-    pieces, vertex, triangle, surface = [], 0, 0, 0
-    surfaces = []
+def _concatenate(
+    parts: list[tuple[MeshPart, int]], first_moving: int, table: _MaterialTable
+) -> Assembly:
+    """Return the parts (mesh, object index) as one assembly; those from ``first_moving`` move."""
+    instances, vertex, triangle, group = [], 0, 0, 0
+    groups = []
     for part, index in parts:
-        v, t = len(part.vertices), len(part.faces)
-        pieces.append(Piece(part, slice(vertex, vertex + v), slice(triangle, triangle + t), index))
-        surfaces.append(part.surfaces + surface)
-        surface += int(part.surfaces.max(initial=-1)) + 1
-        vertex, triangle = vertex + v, triangle + t
+        vertices = slice(vertex, vertex + len(part.vertices))
+        triangles = slice(triangle, triangle + len(part.faces))
+        instances.append(MeshInstance(part, vertices, triangles, index))
+        groups.append(part.groups + group)
+        group += int(part.groups.max(initial=-1)) + 1
+        vertex, triangle = vertices.stop, triangles.stop
     counts = [len(part.faces) for part, _ in parts]
-    end = pieces[first - 1]
+    last_static = instances[first_moving - 1]
     return Assembly(
-        pieces=tuple(pieces),
-        faces=np.concatenate([p.part.faces + np.int32(p.vertices.start) for p in pieces]),
+        instances=tuple(instances),
+        faces=np.concatenate([i.part.faces + np.int32(i.vertices.start) for i in instances]),
         two_sided=np.repeat([part.two_sided for part, _ in parts], counts),
-        objects=np.repeat(np.array([i + 1 for _, i in parts], np.int32), counts),
-        surface=np.concatenate(surfaces).astype(np.int32),
+        object_ids=np.repeat(np.array([i + 1 for _, i in parts], np.int32), counts),
+        groups=np.concatenate(groups).astype(np.int32),
         uv=np.concatenate([part.uv for part, _ in parts]),
         tangents=np.concatenate([part.tangents for part, _ in parts]),
         material=np.concatenate([part.materials for part, _ in parts]),
-        materials=materials.table(),
-        atlas=build_atlas(tuple(materials.textures)),
-        first_vertex=end.vertices.stop,
-        first_triangle=end.triangles.stop,
+        materials=table.materials(),
+        atlas=build_atlas(tuple(table.textures)),
+        first_vertex=last_static.vertices.stop,
+        first_triangle=last_static.triangles.stop,
         vertex_count=vertex,
         room_triangles=len(parts[0][0].faces),
     )
 
 
-def _panels(panels: tuple[Panel, ...], materials: _Materials) -> Part:
-    """The room as one part in world coordinates, two triangles for each panel."""
+def _room_part(panels: tuple[Panel, ...], table: _MaterialTable) -> MeshPart:
+    """Return the room as one mesh in the world, two triangles for each panel."""
     corner, u, v = (np.array([getattr(p, name) for p in panels]) for name in ("corner", "u", "v"))
     count = len(panels)
     quad = np.stack([corner, corner + u, corner + u + v, corner + v], axis=1)
-    along = np.stack([unit(u), unit(v)], axis=1)
+    axes = np.stack([unit(u), unit(v)], axis=1)
     tile = np.array([p.tile for p in panels])
-    at = dot(quad[:, :, None], along[:, None]) / tile[:, None, None]
+    uv = dot(quad[:, :, None], axes[:, None]) / tile[:, None, None]
     index = np.array([0, 1, 2, 0, 2, 3])
-    normal = np.cross(along[:, 0], along[:, 1])
-    rows = [materials.add(Look(p.color, p.texture), p.glow, p.shaded) for p in panels]
-    return Part(
+    normal = np.cross(axes[:, 0], axes[:, 1]).astype(np.float32)
+    materials = [table.add(Look(p.color, p.texture), p.emission, p.occluded) for p in panels]
+    return MeshPart(
         vertices=quad.reshape(-1, 3),
         faces=(4 * np.arange(count)[:, None] + index).reshape(-1, 3).astype(np.int32),
-        normals=np.repeat(np.tile(normal, (1, 3)), 2, axis=0).astype(np.float32),
-        uv=at[:, index].reshape(2 * count, 6).astype(np.float32),
-        tangents=np.repeat(along.reshape(count, 6), 2, axis=0).astype(np.float32),
-        surfaces=np.repeat(np.arange(count, dtype=np.int32), 2),
-        materials=np.repeat(np.array(rows, np.int32), 2),
+        normals=np.broadcast_to(np.repeat(normal, 2, axis=0)[:, None], (2 * count, 3, 3)),
+        uv=uv[:, index].reshape(2 * count, 3, 2).astype(np.float32),
+        tangents=np.repeat(axes, 2, axis=0).astype(np.float32),
+        groups=np.repeat(np.arange(count, dtype=np.int32), 2),
+        materials=np.repeat(np.array(materials, np.int32), 2),
     )
 
 
-def place(
+def pose_meshes(
     assembly: Assembly, scene: Scene, trajectory: Trajectory, frame: int, moving: bool
 ) -> tuple[F64, F32]:
-    """Return world vertices (V, 3) and corner normals (T, 9) of one frame.
+    """Return the vertices and normals in the world in one frame.
 
-    Only the moving pieces, or only the others; the rest of the arrays is zero.
+    Parameters
+    ----------
+    assembly, scene, trajectory
+        The triangles, the scene they are made from, and its motion.
+    frame
+        Index of the frame.
+    moving
+        Whether the moving meshes are posed, or the others.
+
+    Returns
+    -------
+    vertices, normals
+        (V, 3) metres and (T, 3, 3) of each corner; zero for the meshes that are not posed.
     """
     vertices = np.zeros((assembly.vertex_count, 3))
-    normals = np.zeros((len(assembly.faces), 9), np.float32)
+    normals = np.zeros((len(assembly.faces), 3, 3), np.float32)
     bodies, offset = len(scene.bodies), 0
-    turns = rotation_matrices(trajectory.rotations[frame])
-    for piece in assembly.pieces:
-        part, index = piece.part, piece.index
-        is_moving = piece.vertices.start >= assembly.first_vertex
-        size = len(part.vertices)
-        if is_moving == moving and index < 0:
-            vertices[piece.vertices], normals[piece.triangles] = part.vertices, part.normals
-        elif is_moving == moving and index < bodies:
-            at = trajectory.positions[frame, index].astype(np.float64)
-            vertices[piece.vertices] = apply(turns[index], part.vertices) + at
-            turned = apply(turns[index], part.normals.reshape(-1, 3))
-            normals[piece.triangles] = turned.reshape(-1, 9)
-        elif is_moving == moving:
-            cloth = trajectory.cloth_vertices[frame, offset : offset + size].astype(np.float64)
-            vertices[piece.vertices] = cloth
-            normals[piece.triangles] = _sheet_normals(cloth)
+    rotations = rotation_matrices(trajectory.rotations[frame])
+    for instance in assembly.instances:
+        part, index = instance.part, instance.index
+        wanted = (instance.vertices.start >= assembly.first_vertex) == moving
+        count = len(part.vertices)
+        if wanted and index == ROOM:
+            vertices[instance.vertices] = part.vertices
+            normals[instance.triangles] = part.normals
+        elif wanted and index < bodies:
+            position = trajectory.positions[frame, index].astype(np.float64)
+            vertices[instance.vertices] = apply(rotations[index], part.vertices) + position
+            normals[instance.triangles] = apply(rotations[index], part.normals)
+        elif wanted:
+            cloth = trajectory.cloth_vertices[frame, offset : offset + count].astype(np.float64)
+            vertices[instance.vertices] = cloth
+            normals[instance.triangles] = _sheet_normals(cloth)
         if index >= bodies:
-            offset += size
+            offset += count
     return vertices, normals
 
 
 def _sheet_normals(vertices: F64) -> F32:
-    """Return corner normals (T, 9) of a square sheet: means by area over the triangles there.
+    """Return the corner normals (T, 3, 3) of a square sheet with these vertices (V, 3).
 
-    The triangles are those of `sheet`: all that lie left of the diagonals, then all others.
+    The normal of a vertex is the mean of its triangles' normals, weighted by area: the sum of
+    their cross products. The triangles are those of `sheet`: all to the left of the diagonals,
+    then all others.
     """
     side = math.isqrt(len(vertices))
     p = vertices.reshape(side, side, 3)
@@ -201,5 +247,5 @@ def _sheet_normals(vertices: F64) -> F32:
     length = norm(total)[..., None]
     n = np.where(length > 0, total / np.where(length > 0, length, 1.0), (0.0, 0.0, 1.0))
     a, b, c, d = n[:-1, :-1], n[1:, :-1], n[1:, 1:], n[:-1, 1:]
-    corners = [np.concatenate([a, b, c], -1), np.concatenate([a, c, d], -1)]
-    return np.concatenate([x.reshape(-1, 9) for x in corners]).astype(np.float32)
+    corners = [np.stack([a, b, c], axis=-2), np.stack([a, c, d], axis=-2)]
+    return np.concatenate([x.reshape(-1, 3, 3) for x in corners]).astype(np.float32)
