@@ -1,4 +1,4 @@
-"""Colours and textures: free random ones, and red agent with yellow patient."""
+"""Colours and textures of bodies: random ones, or red agent and yellow patient."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ MATERIALS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "fabric": ("fabric_canvas", "fabric_denim", "fabric_linen", "fabric_wool"),
     }
 )
-"""Names of materials by family; the official library has the same families."""
+"""Names of materials by family. The official material library has the same families."""
 TEXTURES = (
     *(name for names in MATERIALS.values() for name in names),
     *("plain", "cloth", "carpet", "plaster", "tiles", "wicker", "fur", "moon"),
 )
-"""Names that a renderer knows; it tints them by the look's colour."""
+"""All texture names that the renderer knows; a texture is multiplied by the colour of the look."""
 RED: Vec3 = (1.0, 0.0, 0.0)
 YELLOW: Vec3 = (1.0, 1.0, 0.0)
 MARGIN = 0.25
-"""Two colours are too near if no channel differs by more (official-system.md, section 2.3)."""
+"""Two colours are too similar if no channel differs by more than this (official-system.md, 2.3)."""
 ROLE_MARGIN = 0.33
-"""The middle one of the official margins, for what may pass for red or yellow."""
+"""The same for colours that may be mistaken for red or yellow: the middle official margin."""
 ROLE_HUES: dict[Vec3, tuple[float, float]] = {
     RED: (-35 / 360, 15 / 360),
     YELLOW: (45 / 360, 80 / 360),
 }
-"""Beyond the official rule: a strong colour between these hues passes for the role's, however dark
-it is: crimson for red, lime for yellow. The browns of furniture and dogs lie between the two."""
+"""Ranges of hue (0..1) in which a saturated colour is mistaken for red or yellow, for example
+crimson or lime. An addition to the official rule. Browns of furniture and dogs lie in between."""
 STRONG_SATURATION, STRONG_VALUE = 0.6, 0.3
 
 _PALETTES: dict[str, tuple[Vec3, ...]] = {
@@ -81,35 +81,35 @@ _STYLE_OF = {prop: style for style, props in _PROP_STYLES.items() for prop in pr
 
 
 def expand_materials(names: Sequence[str]) -> tuple[str, ...]:
-    """Names of materials for names of materials and of families, in the order given, each once.
+    """Replace families of materials by their members; return each name once, in order.
 
-    `UnknownNameError` with the closest names for any other.
+    Raises `UnknownNameError`, with the closest names, for a name that is neither.
     """
-    found: list[str] = []
+    expanded: list[str] = []
     for name in names:
-        # A family wins over a material of its name: "metal" is any metal.
+        # A family takes precedence over a material of the same name: "metal" is any metal.
         family = MATERIALS.get(name.lower())
         if family is None and name not in TEXTURES:
             raise UnknownNameError("material or family of materials", name, (*TEXTURES, *MATERIALS))
-        found += family or (name,)
-    return tuple(dict.fromkeys(found))
+        expanded += family or (name,)
+    return tuple(dict.fromkeys(expanded))
 
 
 def pick_material(rng: np.random.Generator, names: Sequence[str]) -> str:
-    """One of the materials that ``names`` of materials and families stand for, evenly drawn."""
+    """Draw one of the materials that ``names`` (materials and families) include, uniformly."""
     choice = expand_materials(names)
     if not choice:
-        raise BadInputError("no material to pick from: name a material or a family of them")
+        raise BadInputError("no material to pick from: name at least one material or family")
     return choice[int(rng.integers(len(choice)))]
 
 
 def too_near(color: Vec3, other: Vec3, margin: float = MARGIN) -> bool:
-    """Whether every channel of two colours is within ``margin``."""
+    """Return whether no channel of two colours differs by more than ``margin``."""
     return all(abs(a - b) <= margin for a, b in zip(color, other, strict=True))
 
 
 def mistakable(color: Vec3, role: Vec3) -> bool:
-    """Whether people may take ``color`` for the colour of a role."""
+    """Return whether people may take ``color`` for the colour of a role (red or yellow)."""
     hue, saturation, value = colorsys.rgb_to_hsv(*color)
     low, high = ROLE_HUES[role]
     same_hue = low <= hue <= high or low <= hue - 1 <= high
@@ -120,9 +120,9 @@ def mistakable(color: Vec3, role: Vec3) -> bool:
 def random_color(
     rng: np.random.Generator, avoid: Sequence[Vec3] = (), margin: float = MARGIN
 ) -> Vec3:
-    """An even random colour that is not too near any of ``avoid``.
+    """Draw a uniform random colour that is not too similar to any of ``avoid``.
 
-    The margin must leave some colour over: with a few colours to avoid it is at most 0.5.
+    ``margin`` must leave some colours allowed: 0.5 at most if there are colours to avoid.
     """
     while True:
         red, green, blue = (float(channel) for channel in rng.random(3))
@@ -131,7 +131,7 @@ def random_color(
 
 
 def prop_look(rng: np.random.Generator, shape: str) -> Look:
-    """A natural, dull colour and texture for a prop (``prop:vase``)."""
+    """Draw a natural, muted colour and a texture for a prop, given its shape (``prop:vase``)."""
     palette, textures = _STYLE_OF.get(shape.removeprefix("prop:"), ("grey", ("plain",)))
     colors = _PALETTES[palette]
     color, texture = int(rng.integers(len(colors))), int(rng.integers(len(textures)))
@@ -139,10 +139,10 @@ def prop_look(rng: np.random.Generator, shape: str) -> Look:
 
 
 def with_role_colors(scene: Scene) -> Scene:
-    """The scene with a red agent and a yellow patient; all that looked like them is recoloured.
+    """Return the scene with a red agent and a yellow patient; similar colours are replaced.
 
-    Nothing but colours changes. New colours depend on the physics of the scene alone, so that
-    the same trial always looks the same.
+    Only colours change. The random replacements are seeded by the physics digest, so that the same
+    trial always looks the same.
     """
     rng = child_generator(named_seed(scene.physics_digest()), "role colors")
 

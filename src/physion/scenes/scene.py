@@ -1,8 +1,9 @@
-"""What is in a trial, before any engine or pixel: bodies, cloth, pushes, joints, camera, roles.
+"""Description of a trial, independent of engine and renderer: bodies, cloth, pushes, camera, roles.
 
 Units are metres, kilograms, seconds and radians; z is up, axes are right-handed, quaternions are
-(w, x, y, z) of unit length. A body's position is its pivot: for every primitive the centre of its
-bottom face. Everything is frozen and serialises to JSON and back without loss.
+(w, x, y, z) of unit length. A body's position is that of its pivot: for every primitive the centre
+of its bottom face. All classes are frozen dataclasses; a `Scene` is written to JSON and read back
+without loss.
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ Vec3: TypeAlias = tuple[float, float, float]
 Quat: TypeAlias = tuple[float, float, float, float]
 
 FRAME_TIME = 0.01
-"""Seconds of physics in one frame (reference/official-system.md, section 1)."""
+"""Seconds of physics per frame (docs/official-system.md, section 1)."""
 PLAYBACK_RATE = 30
-"""Frames a second of the official movies, so that they play 3.33 times slower than the physics."""
+"""Frames per second of the official movies, which play 3.33 times slower than the physics."""
 OBSERVED_FRAMES = 45
-"""Frames that people and models see: 1.5 s of movie, 0.45 s of physics."""
+"""Number of frames that people and models see: 1.5 s of movie, 0.45 s of physics."""
 GRAVITY = 9.81
 """Metres per second squared, downwards."""
 
@@ -43,7 +44,7 @@ class SurfaceMaterial:
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """Colour (red, green, blue in 0..1, as a person names it: sRGB) and a texture by name."""
+    """Appearance of a body: sRGB colour (red, green, blue in 0..1) and the name of a texture."""
 
     color: Vec3 = (0.8, 0.8, 0.8)
     texture: str = "plain"
@@ -51,11 +52,14 @@ class Look:
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """A rigid body: a shape by name, scaled along its own axes, at a pose.
+    """Rigid body: a named shape, scaled along its own axes, at a pose.
 
-    ``shape`` names a primitive (``cube``, ``bowl``, ...), or a prop. ``kinematic`` bodies never
-    move but are touched; ``scenery`` bodies are drawn only. ``angular_drag`` and ``drag`` are
-    Unity's: a share of the velocity lost each second.
+    - ``shape``: name of a primitive (``cube``, ``bowl``, ...) or of a prop (``prop:vase``).
+    - ``position``: of the pivot, metres. ``scale``: factors of the unit shape. ``mass``: kg.
+    - ``contact``: the surface material.
+    - ``kinematic``: the body never moves, but others collide with it.
+    - ``scenery``: the body is drawn, but takes no part in the physics.
+    - ``drag``, ``angular_drag``: as in Unity, the fraction of the velocity lost per second.
     """
 
     name: str
@@ -76,11 +80,12 @@ class Body:
 
 @dataclass(frozen=True, slots=True)
 class Cloth:
-    """A square sheet, ``size`` metres a side, flat at ``position`` (its centre) when released.
+    """Square sheet of cloth, released flat with its centre at ``position``.
 
-    ``stretch``, ``bend`` and ``tether`` are stiffnesses in 0..1, as NVIDIA Flex takes them.
-    ``resolution`` counts the vertices along a side; the solver's finer sheets stretch more. Of 41
-    to 61 vertices, 51 tell the outcomes of the official trials apart best (2 m a side).
+    - ``size``: metres along each side.
+    - ``stretch``, ``bend``, ``tether``: stiffnesses in 0..1, as in NVIDIA Flex.
+    - ``resolution``: number of vertices along a side. A finer sheet stretches more. Among 41 to 61
+      vertices for 2 m, 51 reproduces the outcomes of the official trials best.
     """
 
     name: str
@@ -97,9 +102,9 @@ class Cloth:
 
 @dataclass(frozen=True, slots=True)
 class Push:
-    """An impulse (newton seconds) at a point of the world, just before the step after ``frame``.
+    """Impulse (newton seconds) on a body, applied just before the step that follows ``frame``.
 
-    Without a ``point`` it acts on the centre of mass and gives no spin.
+    ``point`` is in world coordinates, metres; None is the centre of mass, which causes no rotation.
     """
 
     body: str
@@ -110,7 +115,7 @@ class Push:
 
 @dataclass(frozen=True, slots=True)
 class Joint:
-    """Two bodies held together rigidly from frame 0."""
+    """Rigid connection of two bodies from frame 0 on."""
 
     parent: str
     child: str
@@ -118,9 +123,10 @@ class Joint:
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """A pinhole that looks from ``position`` to ``target`` with z upright in the picture.
+    """Pinhole camera at ``position`` that looks at ``target``, with z upwards in the image.
 
-    ``fov`` is the vertical field of view in radians; ``near`` and ``far`` are metres.
+    ``fov`` is the vertical field of view in radians; ``near`` and ``far`` are the distances of the
+    clipping planes in metres.
     """
 
     position: Vec3
@@ -132,9 +138,9 @@ class Camera:
 
 @dataclass(frozen=True, slots=True)
 class Ending:
-    """A trial ends once every body sleeps, after ``min_frames``, or at ``max_frames`` anyway.
+    """When a trial ends: all bodies at rest and ``min_frames`` reached, or ``max_frames`` reached.
 
-    Counts include frame 0. A body below ``floor`` metres is ignored when asking who sleeps.
+    Counts include frame 0. Bodies below the height ``floor`` (metres) need not be at rest.
     """
 
     min_frames: int = 151
@@ -144,7 +150,7 @@ class Ending:
 
 @dataclass(frozen=True, slots=True)
 class Roles:
-    """Who is asked about: will the ``agent`` touch the ``patient``? ``probe`` gets the push."""
+    """Bodies of the question: will ``agent`` touch ``patient``? ``probe`` is the body pushed."""
 
     agent: str
     patient: str
@@ -153,12 +159,14 @@ class Roles:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Everything that decides a trial. ``name`` is the stimulus name, unique in its set.
+    """Complete description of a trial.
 
-    ``floor`` is the height of the room's floor in metres.
-    ``settle_frames`` is how long bodies come to rest before frame 0, with the cloth held still
-    (the official cloth trials let every solid settle for 100 steps).
-    ``parameters`` keeps what the sampler or the importer drew, for the record: JSON values only.
+    - ``name``: stimulus name, unique in its data set.
+    - ``floor``: height of the room's floor, metres.
+    - ``settle_frames``: frames simulated before frame 0 while the cloth is held still, so that
+      bodies come to rest (100 in the official cloth trials).
+    - ``parameters``: the parameters that the scene was sampled or imported with, as JSON values;
+      kept as a record, without effect.
     """
 
     name: str
@@ -201,18 +209,18 @@ class Scene:
                 )
 
     def names(self) -> list[str]:
-        """Names of all bodies, then of all cloths: the order of every per-body array."""
+        """Return the names of all bodies, then of all cloths: the order of every per-body array."""
         return [body.name for body in self.bodies] + [cloth.name for cloth in self.cloths]
 
     def index(self, name: str) -> int:
-        """Position of a body or cloth in per-body arrays; `BadSceneError` if there is none."""
+        """Return the index of a body or cloth in per-body arrays; `BadSceneError` if unknown."""
         try:
             return self.names().index(name)
         except ValueError:
-            raise BadSceneError(f"scene {self.name!r} holds no {name!r}") from None
+            raise BadSceneError(f"scene {self.name!r} has no body or cloth {name!r}") from None
 
     def physics_digest(self) -> str:
-        """SHA-256 of all that decides the motion: equal for two scenes that only look different."""
+        """Return the SHA-256 of all that affects the motion; appearance and names do not count."""
         plain = dataclasses.replace(
             self,
             name="",
@@ -227,10 +235,10 @@ class Scene:
         return hashlib.sha256(plain.to_json().encode()).hexdigest()
 
     def to_json(self) -> str:
-        """One line of JSON that `Scene.from_json` turns back into an equal scene."""
+        """Return the scene as one line of JSON, from which `from_json` builds an equal scene."""
         return json.dumps(dataclasses.asdict(self), separators=(",", ":"), sort_keys=True)
 
     @classmethod
     def from_json(cls, text: str) -> Scene:
-        """Read what `to_json` wrote; `BadSceneError` says which field is missing or unknown."""
+        """Read what `to_json` wrote; `BadSceneError` names the field that is wrong."""
         return read_dataclass(cls, parse_json(text, "scene", BadSceneError), "scene", BadSceneError)

@@ -186,7 +186,7 @@ def test_a_file_of_ones_own(tmp_path: Path) -> None:
     assert other.target.scale == ((0.2, 0.2), (0.2, 0.2), (0.4, 0.5))
     assert other.length == 2.0 and other.push.height == 0.8
     assert tuple(read_preset_file(file)) == ("mine", "other")
-    with pytest.raises(BadInputError, match=r"\['mine', 'other'\]; say which as .*own\.toml:NAME"):
+    with pytest.raises(BadInputError, match=r"\['mine', 'other'\]; choose one as .*own\.toml:NAME"):
         get_preset("collide", str(file))
     with pytest.raises(UnknownNameError, match="closest: other"):
         get_preset("collide", f"{file}:othr")

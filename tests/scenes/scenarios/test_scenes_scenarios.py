@@ -237,7 +237,7 @@ def test_dominoes_rows() -> None:
 
 def test_dominoes_say_what_does_not_fit() -> None:
     seed = trial_seed("test", "dominoes", "train", 0)
-    with pytest.raises(BadSceneError, match=r"2 m long .*100 tries: no room left for all 30 in"):
+    with pytest.raises(BadSceneError, match=r"2 m long .*100 tries: no room for 30 dominoes"):
         sample_scene("dominoes", seed, still_row(middles=30))
     with pytest.raises(BadSceneError, match="probe and target would start inside"):
         sample_scene("dominoes", seed, still_row(middles=0, length=0.05))

@@ -1,4 +1,4 @@
-"""What every scenario does the same way: colours, camera, scenery, and the scene around them."""
+"""Steps shared by all scenarios: colours, camera, scenery, and assembly of the scene."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from physion.scenes.scene import Body, Cloth, Ending, Joint, Look, Push, Roles, 
 from physion.seeds import child_generator
 
 AIM_HEIGHT = 0.5
-"""Metres above the floor at which the camera looks, where a scenario does not say otherwise."""
+"""Default height of the camera's target above the floor, metres."""
 FLOORS = {"box": 0.0, "bright": 0.0043, "empty": 0.0}
-"""Height of each room's floor in metres. In the official ``tdw_room``, our ``bright``, everything
-that was put at 0 ends .004 or .005 higher than in ``box_room_2018``."""
+"""Height of each room's floor, metres. In the official ``tdw_room`` (here ``bright``) bodies placed
+at 0 come to rest 4 to 5 mm higher than in ``box_room_2018`` (here ``box``)."""
 
 
 class SceneParams(Protocol):
-    """What the parameters of every scenario have in common."""
+    """Parameters that every scenario has."""
 
     @property
     def room(self) -> str:
@@ -31,18 +31,21 @@ class SceneParams(Protocol):
 
     @property
     def camera(self) -> CameraRule:
-        """Where the camera stands."""
+        """How the camera is drawn."""
         ...
 
     @property
     def scenery(self) -> SceneryRule:
-        """What stands behind and before the scene."""
+        """How distractors and occluders are drawn."""
         ...
 
 
 @dataclass
 class Palette:
-    """Draws looks that nobody takes for the agent's; ``shared`` is the colour of all others."""
+    """Source of random looks that differ from the agent's colour.
+
+    ``shared`` is the single colour of the other bodies of a monochrome scene.
+    """
 
     rng: np.random.Generator
     agent: Vec3
@@ -50,17 +53,17 @@ class Palette:
 
     @classmethod
     def of(cls, seed: np.random.SeedSequence) -> Palette:
-        """The colours of the trial with this seed."""
+        """Return the colours of the trial with this seed."""
         rng = child_generator(seed, "looks")
         agent = random_color(rng)
         return cls(rng, agent, random_color(rng, (agent,)))
 
     def agent_look(self, textures: Sequence[str]) -> Look:
-        """The look of the agent."""
+        """Draw the look of the agent."""
         return Look(self.agent, pick_material(self.rng, textures))
 
     def look(self, textures: Sequence[str], monochrome: bool = False) -> Look:
-        """The look of another body: a new colour, or the one that ``monochrome`` bodies share."""
+        """Draw the look of another body: a new colour, or with ``monochrome`` the shared one."""
         color = random_color(self.rng, (self.agent,))
         return Look(self.shared if monochrome else color, pick_material(self.rng, textures))
 
@@ -82,11 +85,31 @@ def build_scene(
     around: Sequence[Body] | None = None,
     settle_frames: int = 0,
 ) -> Scene:
-    """The scene of ``bodies``, with the camera and the scenery that ``params`` draw around them.
+    """Build the scene of ``bodies``; draw camera and scenery, and move all onto the room's floor.
 
-    ``seen`` are the bodies that the camera must show: agent and patient, where they are bodies.
-    Scenery keeps clear of the bodies ``around`` which it stands: all, but for those without end.
-    ``camera`` replaces the rule of ``params``. Everything stands on the floor of its room.
+    Parameters
+    ----------
+    scenario, seed, params
+        Name, seed and parameters of the scene; camera and scenery use streams of their own.
+    bodies, cloths, pushes, joints, roles
+        Content of the scene, for a floor at height 0.
+    max_frames
+        Longest trial; it ends earlier if all bodies are at rest.
+    aim_height
+        Height of the camera's target above the floor, metres.
+    camera
+        Rule used in place of ``params.camera``.
+    seen
+        Bodies that the camera must show, by default agent and patient.
+    around
+        Bodies that scenery keeps a distance from, by default all.
+    settle_frames
+        See `Scene`.
+
+    Raises
+    ------
+    BadSceneError
+        If no camera shows ``seen``, or there is no space for the scenery.
     """
     by_name = {body.name: body for body in bodies}
     wanted = [by_name[name] for name in (roles.agent, roles.patient) if name in by_name]
@@ -119,7 +142,7 @@ def build_scene(
 
 
 def raised(thing: Any, height: float) -> Any:
-    """A body or cloth that much higher, in metres."""
+    """Return a body or cloth moved up by ``height`` metres."""
     x, y, z = thing.position
     return replace(thing, position=(x, y, z + height))
 

@@ -1,8 +1,8 @@
-"""The numbers that a scenario draws from: their units, what is allowed, and how they are drawn.
+"""Types of scenario parameters with unit and limits, functions that read them and draw from them.
 
-Every field of a scenario's parameters has one of the types below, so that a preset file can be
-checked before anything is made. In a file a range may be a single number (always that one), and a
-size or a turn a single number, a range, or one of either for each axis.
+Every field of a scenario's ``Params`` has one of the types below, so that a preset file can be
+checked before any scene is sampled. In a file a range may be a single number (which is then the
+value), and a size or a rotation may be a number, a range, or one of either for each axis.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from physion.scenes.scene import Ending, Quat, Vec3
 ROOMS = ("box", "bright", "empty")
 
 Range: TypeAlias = tuple[float, float]
-"""Smallest and largest value of an even random draw."""
+"""Smallest and largest value of a uniform random draw."""
 Axes: TypeAlias = Range | tuple[Range, Range, Range]
-"""One draw for all axes, or a draw for each of x, y, z."""
+"""One range for all axes, or a range for each of x, y and z."""
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """Unit of a parameter, and the smallest and largest value that makes sense for it."""
+    """Unit of a parameter and the smallest and largest value allowed."""
 
     unit: str
     low: float
@@ -45,9 +45,9 @@ class Quantity:
 
 @dataclass(frozen=True)
 class NamesOf:
-    """What the names in a parameter name: shapes, materials (or their families), props, rooms.
+    """Kind of name that a parameter holds: shape, material (or family), prop, or room.
 
-    ``names`` are those to choose from where they belong to one scenario.
+    ``names`` are the allowed names if they are particular to one scenario.
     """
 
     kind: str
@@ -57,69 +57,69 @@ class NamesOf:
 Length = Annotated[float, Quantity("m", 0.0, 50.0)]
 Lengths = Annotated[Range, Quantity("m", 0.0, 50.0)]
 SMALLEST_SIDE = 0.005
-"""Metres: no body is thinner, so that none vanishes."""
+"""Smallest side of a body, metres."""
 Sides = Annotated[Range, Quantity("m", SMALLEST_SIDE, 50.0)]
-"""Lengths of a thing's sides."""
+"""Range of the length of a side."""
 Distances = Annotated[Range, Quantity("m", 0.1, 50.0)]
-"""Lengths between things that may not be at the same place."""
+"""Range of a distance that must not be zero."""
 Offsets = Annotated[Range, Quantity("m", -50.0, 50.0)]
 FloorPosition = Annotated[tuple[float, float], Quantity("m as [x, y]", -50.0, 50.0)]
 Sizes = Annotated[Axes, Quantity("m", SMALLEST_SIDE, 200.0)]
-"""Scale of a shape whose unit size is about a metre."""
+"""Scale of a shape whose unit size is about one metre."""
 Slope = Annotated[float, Quantity("m", -1.0, 1.0)]
 LEAST_MASS = 0.001
-"""Kilogrammes: no body is lighter."""
+"""Smallest mass of a body, kg."""
 Masses = Annotated[Range, Quantity("kg", LEAST_MASS, 10000.0)]
 Angles = Annotated[Range, Quantity("degrees", -360.0, 360.0)]
 Angle = Annotated[float, Quantity("degrees", -360.0, 360.0)]
 Rotations = Annotated[Axes, Quantity("degrees", -360.0, 360.0)]
-"""A turn about the upright, or about x, y and z (of Unity's x, z and y)."""
+"""Rotation about z, or about x, y and z (Unity's x, z and y)."""
 Fraction = Annotated[float, Quantity("", 0.0, 1.0)]
 Fractions = Annotated[Range, Quantity("", 0.0, 1.0)]
 Multiples = Annotated[Range, Quantity("times", 0.0, 100.0)]
 SizeFactors = Annotated[Range, Quantity("times", 0.01, 100.0)]
-"""Multiples of a size, which leave something of it."""
+"""Range of a factor of a size, above zero."""
 Multiple = Annotated[float, Quantity("times", -100.0, 100.0)]
 Speeds = Annotated[Range, Quantity("m/s", 0.0, 100.0)]
 Frictions = Annotated[Range, Quantity("", 0.0, 10.0)]
 EarlyFrames = Annotated[Range, Quantity("frames", 0.0, Ending().min_frames - 1.0)]
-"""Frames that every trial has: one whose bodies are all at rest ends after them."""
+"""Range of frames that every trial has: none ends earlier, even if all bodies are at rest."""
 Count = Annotated[int, Quantity("", 0, 50)]
 Counts = Annotated[tuple[int, int], Quantity("", 0, 50)]
-"""Fewest and most, both possible."""
+"""Smallest and largest count, both included."""
 CountsFromOne = Annotated[tuple[int, int], Quantity("", 1, 50)]
-"""`Counts` of what there must be at least one of."""
+"""`Counts` of at least one."""
 Shapes = Annotated[tuple[str, ...], NamesOf("shape")]
-"""One of these is chosen, each as likely; so with materials and props."""
+"""Names of which one is drawn, all equally likely; the same for materials and props."""
 Materials = Annotated[tuple[str, ...], NamesOf("material")]
 Props = Annotated[tuple[str, ...], NamesOf("prop")]
 Room = Annotated[str, NamesOf("room")]
 
 
 def uniform(rng: np.random.Generator, interval: Range) -> float:
-    """An even draw from ``interval``; always one number of the stream, also if it is a point."""
+    """Draw uniformly from ``interval``; always takes one number from ``rng``."""
     low, high = interval
-    # Not `Generator.uniform`: compilers for some processors fuse its product and sum.
+    # Not `Generator.uniform`: on some processors its product and sum are fused and differ in bits.
     return low + (high - low) * rng.random()
 
 
 def draw_count(rng: np.random.Generator, counts: tuple[int, int]) -> int:
-    """A whole number of the range, both ends possible."""
+    """Draw a whole number of the range, both ends included."""
     return int(rng.integers(counts[0], counts[1] + 1))
 
 
 def draw_frame(rng: np.random.Generator, frames: Range) -> int:
-    """A frame of the range, its last one left out as officially (int of an even draw)."""
+    """Draw a frame of the range, rounded down, so that the last is never drawn (as officially)."""
     return int(uniform(rng, frames))
 
 
 def pick(rng: np.random.Generator, names: Sequence[str]) -> str:
-    """One of ``names``, each as likely."""
+    """Draw one of ``names``, all equally likely."""
     return names[int(rng.integers(len(names)))]
 
 
 def draw_axes(rng: np.random.Generator, axes: Axes) -> Vec3:
-    """Three values: the same draw for all axes, or one draw each."""
+    """Draw three values: one draw used for all axes, or one for each axis."""
     if is_range(axes):
         value = uniform(rng, typing.cast(Range, axes))
         return (value, value, value)
@@ -128,22 +128,22 @@ def draw_axes(rng: np.random.Generator, axes: Axes) -> Vec3:
 
 
 def is_range(axes: Axes) -> bool:
-    """Whether one draw serves all axes."""
+    """Return whether ``axes`` is a single range, used for all axes."""
     return not isinstance(axes[0], tuple)
 
 
 def draw_rotation(rng: np.random.Generator, angles_deg: Axes) -> Quat:
-    """A rotation: by one angle about z, or as Unity turns by three (about z, then x, then y).
-
-    The three angles are about our x, y, z; Unity calls our y its z, and turns the other way.
-    """
+    """Draw a rotation about z, or one about three axes (see `euler_rotation`); in degrees."""
     if is_range(angles_deg):
         return yaw(math.radians(uniform(rng, typing.cast(Range, angles_deg))))
     return euler_rotation(*draw_axes(rng, angles_deg))
 
 
 def euler_rotation(x_deg: float, y_deg: float, z_deg: float) -> Quat:
-    """The rotation by degrees about y, then about x, then about z: Unity's order."""
+    """Return the rotation by these angles about y, then x, then z, the order that Unity uses.
+
+    Unity calls our y axis z (and reversely), and its rotations have the opposite sense.
+    """
     about_x, about_y, about_z = (
         axis_angle_quaternion(axis, math.radians(angle))
         for axis, angle in zip(np.eye(3), (x_deg, y_deg, z_deg), strict=True)
@@ -153,21 +153,34 @@ def euler_rotation(x_deg: float, y_deg: float, z_deg: float) -> Quat:
 
 
 def yaw(angle: float) -> Quat:
-    """The rotation by ``angle`` radians about z."""
+    """Return the rotation by ``angle`` radians about z."""
     return as_quaternion(axis_angle_quaternion((0.0, 0.0, 1.0), angle))
 
 
 def as_quaternion(values: NDArray[np.float64]) -> Quat:
-    """Turn an array (4,) into the tuple of floats that scenes hold and JSON can keep."""
+    """Convert an array (4,) to the tuple of floats that a scene holds and JSON can store."""
     w, x, y, z = values.tolist()
     return (w, x, y, z)
 
 
 def read_params(kind: type[Any], table: Mapping[str, Any], where: str, base: Any = None) -> Any:
-    """The parameters ``kind`` with the values of ``table`` in place of those of ``base``.
+    """Return ``base`` with the values that a table gives in place of its own.
 
-    Nested tables change the nested parameters that they name and leave the others. ``base`` is by
-    default ``kind()``. `BadInputError` names the key, ``where`` it stands, and what is allowed.
+    Parameters
+    ----------
+    kind
+        Dataclass of the parameters.
+    table
+        New values by key; a nested table changes some values of a nested dataclass.
+    where
+        File and preset, for errors.
+    base
+        Parameters to change, by default ``kind()``.
+
+    Raises
+    ------
+    BadInputError
+        With ``where``, the key and what is allowed.
     """
     base = kind() if base is None else base
     hints = field_types(kind)
@@ -180,7 +193,7 @@ def read_params(kind: type[Any], table: Mapping[str, Any], where: str, base: Any
 
 
 def check_params(params: Any, where: str) -> None:
-    """Raise `BadInputError` where a value of ``params`` is not one that a file could give."""
+    """Raise `BadInputError` if a value of ``params`` would be refused in a preset file."""
     _check_each(params, where)
     check_together(params, where)
 
@@ -198,50 +211,50 @@ def _check_each(params: Any, where: str) -> None:
 
 
 def check_together(params: Any, where: str) -> None:
-    """Raise `BadInputError` where values are good one by one, but not with one another.
+    """Raise `BadInputError` if values contradict each other, in ``params`` or in nested parameters.
 
-    Parameters, and those nested in them, say so by a method ``check_values``: it returns what is
-    wrong, beginning with the key, or None.
+    Parameters may have a method ``check_values`` for this, which returns None, or what is wrong,
+    beginning with the key.
     """
     for key, hint in field_types(type(params)).items():
         if dataclasses.is_dataclass(hint):
             check_together(getattr(params, key), f"{where}: {key}")
     check = getattr(params, "check_values", None)
-    wrong = None if check is None else check()
-    if wrong is not None:
-        raise BadInputError(f"{where}: {wrong}")
+    problem = None if check is None else check()
+    if problem is not None:
+        raise BadInputError(f"{where}: {problem}")
 
 
 def drawn_limits(params: Any) -> dict[str, str]:
-    """What each key of the parameters allows, in words, nested keys joined by dots."""
+    """Return as text what each key of the parameters allows; nested keys are joined by dots."""
     allowed: dict[str, str] = {}
     for key, hint in field_types(type(params)).items():
         value = getattr(params, key)
         if dataclasses.is_dataclass(value):
             allowed |= {f"{key}.{name}": text for name, text in drawn_limits(value).items()}
         else:
-            allowed[key] = _word(hint)
+            allowed[key] = _allowed_text(hint)
     return allowed
 
 
-def _told(value: Any) -> str:
-    """A value as a file would have it, also if it is one of numpy's."""
+def _as_written(value: Any) -> str:
+    """Return a value, also one of numpy, as it would be written in a preset file."""
     if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_told, value))}]"
+        return f"[{', '.join(map(_as_written, value))}]"
     return repr(value.item() if isinstance(value, np.generic) else value)
 
 
-def _note(hint: Any) -> Quantity | NamesOf | None:
-    """What the annotation of a parameter's type says of its values."""
+def _annotation(hint: Any) -> Quantity | NamesOf | None:
+    """Return the unit and limits, or the kind of names, in the annotation of a type."""
     return next(iter(getattr(hint, "__metadata__", ())), None)
 
 
-def _word(hint: Any) -> str:
-    note = _note(hint)
-    if isinstance(note, Quantity):
-        return str(note)
-    if isinstance(note, NamesOf):
-        return f"names of {note.kind}s"
+def _allowed_text(hint: Any) -> str:
+    annotation = _annotation(hint)
+    if isinstance(annotation, Quantity):
+        return str(annotation)
+    if isinstance(annotation, NamesOf):
+        return f"names of {annotation.kind}s"
     return {bool: "true or false"}.get(hint, "a name")
 
 
@@ -250,22 +263,22 @@ def _read(hint: Any, value: Any, where: str, base: Any) -> Any:
         if not isinstance(value, Mapping):
             raise BadInputError(f"{where} must be a table of {', '.join(field_types(hint))}")
         return read_params(hint, value, where, base)  # type: ignore[arg-type]
-    note = _note(hint)
-    if isinstance(note, Quantity):
-        return _read_quantity(typing.get_args(hint)[0], value, where, note)
-    if isinstance(note, NamesOf):
-        return _read_names(typing.get_args(hint)[0] is str, value, where, note)
+    annotation = _annotation(hint)
+    if isinstance(annotation, Quantity):
+        return _read_quantity(typing.get_args(hint)[0], value, where, annotation)
+    if isinstance(annotation, NamesOf):
+        return _read_names(typing.get_args(hint)[0] is str, value, where, annotation)
     if type(value) is not hint:
-        raise BadInputError(f"{where} must be {_word(hint)}, not {_told(value)}")
+        raise BadInputError(f"{where} must be {_allowed_text(hint)}, not {_as_written(value)}")
     return value
 
 
-def _read_names(single: bool, value: Any, where: str, note: NamesOf) -> Any:
-    kind = note.kind
+def _read_names(single: bool, value: Any, where: str, annotation: NamesOf) -> Any:
+    kind = annotation.kind
     names = [value] if isinstance(value, str) else value
     if not isinstance(names, list | tuple) or not names or (single and len(names) > 1):
-        raise BadInputError(f"{where} must name a {kind}, not {_told(value)}")
-    known = note.names or _known_names(kind)
+        raise BadInputError(f"{where} must name a {kind}, not {_as_written(value)}")
+    known = annotation.names or _known_names(kind)
     for name in names:
         if not isinstance(name, str) or name not in known:
             raise BadInputError(f"{where}: {UnknownNameError(kind, str(name), known)}")
@@ -298,9 +311,9 @@ def _read_quantity(kind: Any, value: Any, where: str, quantity: Quantity) -> Any
     if kind == tuple[int, int]:
         low, high = _range(value, where, quantity)
         return (_number(int, low, where, quantity), _number(int, high, where, quantity))
-    if quantity == _note(FloorPosition):
+    if quantity == _annotation(FloorPosition):
         if not isinstance(value, list | tuple) or len(value) != 2:
-            raise BadInputError(f"{where} must be a place [x, y] in m, not {_told(value)}")
+            raise BadInputError(f"{where} must be a position [x, y] in m, not {_as_written(value)}")
         return tuple(_number(float, part, where, quantity) for part in value)
     return _range(value, where, quantity)
 
@@ -310,7 +323,9 @@ def _range(value: Any, where: str, quantity: Quantity) -> Range:
         number = _number(float, value, where, quantity)
         return (number, number)
     if len(value) != 2:
-        raise BadInputError(f"{where} must be a number or [smallest, largest], not {_told(value)}")
+        raise BadInputError(
+            f"{where} must be a number or [smallest, largest], not {_as_written(value)}"
+        )
     low, high = (_number(float, part, where, quantity) for part in value)
     if low > high:
         raise BadInputError(f"{where} must go from smaller to larger, not [{low:g}, {high:g}]")
@@ -320,9 +335,13 @@ def _range(value: Any, where: str, quantity: Quantity) -> Range:
 def _number(kind: type[Any], value: Any, where: str, quantity: Quantity) -> Any:
     unit = f" in {quantity.unit}" if quantity.unit else ""
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise BadInputError(f"{where} must be a number{unit} ({quantity}), not {_told(value)}")
+        raise BadInputError(
+            f"{where} must be a number{unit} ({quantity}), not {_as_written(value)}"
+        )
     if kind is int and isinstance(value, float) and not value.is_integer():
-        raise BadInputError(f"{where} must be a whole number ({quantity}), not {_told(value)}")
+        raise BadInputError(
+            f"{where} must be a whole number ({quantity}), not {_as_written(value)}"
+        )
     if not quantity.low <= value <= quantity.high:  # false for NaN too
         # A whole number may be too large for a float.
         shown = f"{value:g}" if isinstance(value, float) else f"{value!s:.20}"
@@ -331,10 +350,11 @@ def _number(kind: type[Any], value: Any, where: str, quantity: Quantity) -> Any:
 
 
 def retry(tries: int, what: str, attempt: typing.Callable[[], str | None]) -> None:
-    """Call ``attempt`` until it returns None, at most ``tries`` times.
+    """Call ``attempt`` until it returns None (success), at most ``tries`` times.
 
-    It returns what stands in the way otherwise; `BadSceneError` says what did so most often. That
-    is to be free of what was drawn, so that draws which fail for the same reason can be counted.
+    On failure ``attempt`` returns the reason, a constant text without drawn numbers, so that equal
+    reasons can be counted. After the last try `BadSceneError` gives the most frequent reason;
+    ``what`` names what was to be placed.
     """
     reasons: dict[str, int] = {}
     for _ in range(tries):

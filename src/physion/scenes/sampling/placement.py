@@ -1,7 +1,7 @@
-"""Where the camera stands, and what stands behind and before the scene.
+"""Placement of the camera and of scenery: distractors behind and occluders in front of the bodies.
 
-Rules of the official generator (docs/official-system.md, sections 2.4 and 2.5), with one
-addition: a camera that does not see agent and patient is drawn again.
+The rules are those of the official generator (docs/official-system.md, sections 2.4 and 2.5), with
+one addition: a camera that does not see agent and patient is drawn again.
 """
 
 from __future__ import annotations

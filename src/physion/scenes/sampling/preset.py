@@ -1,11 +1,15 @@
-"""Presets: parameters of a scenario under a name, the published configurations among them.
+"""Presets: named parameters of a scenario, among them the published configurations.
 
-A preset file is TOML. ``scenario`` names whose parameters it fills; ``[shared]`` holds what all
-its presets have; each ``[presets.NAME]`` has its own ``params`` and may say what it is ``about``,
-which preset it is ``based_on`` (one before it in the file, or one that comes with the scenario),
-and, for a published configuration, its ``official`` name, its
-``seed`` and what was ``published`` about its trials. Keys and units are those of the scenario's
-``Params``; ``physion ls presets SCENARIO`` prints them.
+A preset file is TOML:
+
+- ``scenario``: the scenario of all presets in the file.
+- ``[shared]``: parameters that all presets of the file have.
+- ``[presets.NAME]``: a preset. ``params`` are its parameters, ``about`` a description, ``based_on``
+  the preset that it changes (an earlier one of the file, or one that comes with the scenario).
+  Published configurations also have ``official`` (name), ``seed`` and ``published`` (results).
+
+Keys and units of parameters are those of the scenario's ``Params``; ``physion ls presets SCENARIO
+PRESET`` prints them.
 """
 
 from __future__ import annotations
@@ -24,7 +28,7 @@ from physion.scenes.sampling.parameters import Quantity, check_together, read_pa
 from physion.scenes.sampling.registry import scenarios
 
 DEFAULT, FAMILIARIZATION, DEBUG = "default", "familiarization", "debug"
-"""Presets that every scenario has besides the published ones."""
+"""Names of presets that every scenario of this package has besides the published ones."""
 Trials = Annotated[int, Quantity("", 0, 1_000_000)]
 _PRESET_KEYS = ("about", "based_on", "official", "seed", "published", "params")
 _FILE_KEYS = ("scenario", "shared", "presets")
@@ -32,11 +36,11 @@ _FILE_KEYS = ("scenario", "shared", "presets")
 
 @dataclass(frozen=True)
 class Published:
-    """What the original study reports of a configuration (docs/official-system.md, section 3).
+    """What the original study reports about a configuration (docs/official-system.md, section 3).
 
-    - ``trials``, ``contact``: of those generated for the test, how many and how many with contact.
-    - ``frames``: mean length. ``tested``: how many are among the published 150.
-    - ``readout_trials``, ``readout_contact``: the same of the readout set.
+    - ``trials``, ``contact``: number of trials generated for testing, and of those with contact.
+    - ``frames``: mean length. ``tested``: number of trials among the published 150.
+    - ``readout_trials``, ``readout_contact``: the same for the readout set.
     """
 
     trials: Trials
@@ -49,9 +53,10 @@ class Published:
 
 @dataclass(frozen=True)
 class Preset:
-    """Parameters of ``scenario`` under a name.
+    """Named parameters of a scenario.
 
-    ``official`` is the published configuration that it is, with the ``seed`` it was made with.
+    ``official`` is the name of the published configuration that the preset reproduces, and ``seed``
+    the seed it was generated with.
     """
 
     name: str
@@ -65,9 +70,9 @@ class Preset:
 
 @cache
 def load_presets(scenario: str) -> Mapping[str, Preset]:
-    """All presets that come with the scenario, in the order of their file.
+    """Return the presets that come with a scenario, in the order of their file.
 
-    A scenario of another package has none, but for ``default``: its parameters as they are.
+    A scenario from outside this package has one preset, ``default``, with its default parameters.
     """
     kind = scenarios.get(scenario).params
     file = resources.files("physion.scenes.scenarios").joinpath("presets", f"{scenario}.toml")
@@ -77,10 +82,10 @@ def load_presets(scenario: str) -> Mapping[str, Preset]:
 
 
 def get_preset(scenario: str, name: str) -> Preset:
-    """The preset ``name`` of ``scenario``; `UnknownNameError` has the closest names.
+    """Return a preset of ``scenario`` by its name, or from a file by ``FILE.toml:NAME``.
 
-    ``FILE.toml`` or ``FILE.toml:NAME`` reads a preset file of one's own; without ``NAME`` it must
-    hold one preset.
+    ``NAME`` may be left out if the file holds one preset. Raises `UnknownNameError` with the
+    closest names, and `BadInputError` for a bad file.
     """
     path, _, chosen = name.partition(".toml")
     if path != name:
@@ -92,11 +97,11 @@ def get_preset(scenario: str, name: str) -> Preset:
 
 
 def default_presets(scenario: str, split: str) -> tuple[str, ...]:
-    """Names of the presets that the trials of a split take in turn.
+    """Return the presets that the trials of a split use one after the other.
 
-    The familiarization split has its own. Every other split takes the published configurations of
-    which trials were in the test, each once: those without are the ones that people practised on,
-    and some repeat another under a second name.
+    The familiarization split has its own preset. Every other split uses the published
+    configurations with trials in the test. (The others were used for practice, or are a copy of
+    another configuration under a second name.)
     """
     known = load_presets(scenario)
     if split == FAMILIARIZATION and FAMILIARIZATION in known:
@@ -109,7 +114,7 @@ def default_presets(scenario: str, split: str) -> tuple[str, ...]:
 
 
 def read_preset_file(path: Path) -> Mapping[str, Preset]:
-    """The presets of a file; `BadInputError` names file, preset, key and what is allowed."""
+    """Read a preset file; `BadInputError` names file, preset, key and what is allowed."""
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -118,9 +123,9 @@ def read_preset_file(path: Path) -> Mapping[str, Preset]:
 
 
 def parse_presets(text: str, where: str, *, own: bool = True) -> Mapping[str, Preset]:
-    """The presets of a file's ``text``; ``where`` names it in errors.
+    """Read the text of a preset file; ``where`` names the file in errors.
 
-    Those of one's ``own`` may be based on presets that come with the scenario.
+    With ``own`` (a file of the user) presets may be based on those that come with the scenario.
     """
     try:
         data = tomllib.loads(text)
@@ -187,19 +192,19 @@ def _published(table: Mapping[str, Any], here: str) -> Published:
 
 
 def _from_file(path: Path, name: str, scenario: str) -> Preset:
-    found = read_preset_file(path)
-    if not name and len(found) != 1:
-        raise BadInputError(f"{path} holds {sorted(found)}; say which as {path}:NAME")
-    preset = found.get(name) if name else next(iter(found.values()))
+    presets = read_preset_file(path)
+    if not name and len(presets) != 1:
+        raise BadInputError(f"{path} holds {sorted(presets)}; choose one as {path}:NAME")
+    preset = presets.get(name) if name else next(iter(presets.values()))
     if preset is None:
-        raise UnknownNameError(f"preset of {path}", name, found)
+        raise UnknownNameError(f"preset of {path}", name, presets)
     if preset.scenario != scenario:
         raise BadInputError(f"{path} has presets of {preset.scenario}, not of {scenario}")
     return preset
 
 
 def _table(data: Mapping[str, Any], key: str, where: str) -> Mapping[str, Any]:
-    found = data.get(key, {})
-    if not isinstance(found, Mapping):
+    table = data.get(key, {})
+    if not isinstance(table, Mapping):
         raise BadInputError(f"{where}: {key} must be a table")
-    return found
+    return table

@@ -1,4 +1,4 @@
-"""The scenarios by name: each draws scenes from its own parameters."""
+"""Registry of scenarios. A scenario samples scenes from its parameters and a seed."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ P = TypeVar("P")
 
 @dataclass(frozen=True)
 class Scenario:
-    """A kind of trial.
+    """Kind of trial.
 
-    ``params`` is a frozen dataclass with a default for each field, not always the official one, and
-    may have a method ``check_values`` (`physion.scenes.sampling.parameters.check_together`).
-    ``sample(params(), seed)`` draws a scene that depends on nothing else.
+    - ``params``: frozen dataclass with a default for each field. It may have a method
+      ``check_values`` (`physion.scenes.sampling.parameters.check_together`).
+    - ``sample``: function of parameters and seed that returns a scene and depends on nothing else.
     """
 
     name: str
@@ -56,7 +56,7 @@ def scenario(
 ) -> Callable[
     [Callable[[P, np.random.SeedSequence], Scene]], Callable[[P, np.random.SeedSequence], Scene]
 ]:
-    """Register the decorated sampler as the scenario ``name``."""
+    """Return a decorator that registers a sampling function as the scenario ``name``."""
 
     def add(
         sample: Callable[[P, np.random.SeedSequence], Scene],
@@ -68,28 +68,30 @@ def scenario(
 
 
 def sample_scene(name: str, seed: np.random.SeedSequence, params: object | None = None) -> Scene:
-    """Draw a scene of the scenario ``name``, with its default parameters unless others are given.
+    """Sample a scene of the scenario ``name``, by default with its default parameters.
 
-    `UnknownNameError` has the closest names.
+    Raises `UnknownNameError` with the closest names for an unknown scenario, `BadInputError` for
+    parameters that are not allowed, and `BadSceneError` if no scene fits them.
     """
-    found = scenarios.get(name)
+    chosen = scenarios.get(name)
     if params is None:
-        params = found.params()
-    elif not isinstance(params, found.params):
+        params = chosen.params()
+    elif not isinstance(params, chosen.params):
         raise BadInputError(
-            f"scenario {name!r} takes {found.params.__module__}.Params, not {type(params).__name__}"
+            f"scenario {name!r} takes {chosen.params.__module__}.{chosen.params.__name__}, "
+            f"not {type(params).__name__}"
         )
     else:
         check_params(params, f"parameters of {name}")
-    return found.sample(params, seed)
+    return chosen.sample(params, seed)
 
 
 def scene_name(scenario: str, seed: np.random.SeedSequence) -> str:
-    """A name for a scene that nobody has named yet: the same seed, the same name."""
+    """Return a name for a sampled scene; it depends on scenario and seed only."""
     return f"{scenario}_{stable_hash(str(seed.entropy)) & 0xFFFFFFFF:08x}"
 
 
 def as_record(params: Any) -> dict[str, Any]:
-    """A dataclass of parameters as plain JSON values, for `Scene.parameters`."""
+    """Convert parameters to plain JSON values, for `Scene.parameters`."""
     record: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(params)))
     return record

@@ -1,4 +1,4 @@
-"""What is drawn for the bodies and pushes of a scenario, said in the same words in all of them."""
+"""Rules by which all scenarios draw bodies, zones and pushes."""
 
 from __future__ import annotations
 
@@ -42,14 +42,15 @@ STATIC_OVER_DYNAMIC = 10.0
 
 @dataclass(frozen=True)
 class BodyRule:
-    """How a body that moves is drawn (defaults: section 2.1 of docs/official-system.md).
+    """How a moving body is drawn (defaults: docs/official-system.md, section 2.1).
 
-    - ``shapes``: one of these, each as likely. ``scale``: metres at unit size.
-    - ``turn_deg``: about the upright, or about three axes. ``mass``: kg. With ``tumbled`` a single
-      range gives one angle for all three axes, as the probes of the official Roll have.
-    - ``static_friction``, ``dynamic_friction``: drawn apart, but static is never below dynamic
-      (officially it may be), so that their ranges must meet. ``restitution``: 0 to 1.
-    - ``textures``: material names or families.
+    - ``shapes``: one of these, all equally likely. ``scale``: factor of the unit shape (metres for
+      shapes of unit size). ``mass``: kg.
+    - ``turn_deg``: rotation about z, or about three axes. With ``tumbled`` a single range gives one
+      angle that is used for all three axes, as for the probes of the official Roll.
+    - ``static_friction``, ``dynamic_friction``: drawn independently, but static is raised to
+      dynamic if it is lower (officially it is not). ``restitution``: 0 to 1.
+    - ``textures``: names of materials or families.
     """
 
     shapes: Shapes = ("cube",)
@@ -63,22 +64,22 @@ class BodyRule:
     textures: Materials = ("wood_cedar",)
 
     def check_values(self) -> str | None:
-        """What is wrong with values that are good one by one, or None."""
+        """Return which values contradict each other, or None."""
         most, least = self.static_friction[1], self.dynamic_friction[0]
         if most >= least:
             return None
         return (
             f"static_friction is at most {most:g} and dynamic_friction at least {least:g}; static "
-            "friction is never below dynamic friction"
+            "friction must be able to reach dynamic friction"
         )
 
 
 @dataclass(frozen=True)
 class ZoneRule:
-    """How the patient, a flat body that never moves, is drawn.
+    """How the zone is drawn: the patient of most scenarios, a flat body that never moves.
 
-    ``center`` is where its middle stands, metres, relative to the place that the scenario gives
-    it. ``friction`` is the dynamic one; static friction is ten times as large.
+    ``center`` is an offset (metres) of its position in the scenario. ``friction`` is the dynamic
+    friction; static friction is ten times as large.
     """
 
     shapes: Shapes = ("cube",)
@@ -93,12 +94,13 @@ class ZoneRule:
 class PushRule:
     """How the probe is pushed.
 
-    - ``speed``: metres per second that the push would give a free body: impulse over mass.
-    - ``heading_deg``: away from +x, towards +y. ``rise``: vertical over horizontal part.
-    - ``height``: where it acts, as a share of the probe's scale above its pivot.
-    - ``point_jitter``: metres by which that point is off in each direction, at most. Officially
-      it may lie outside the body, which gives it a spin that nobody controls.
-    - ``frame``: when; the last is left out.
+    - ``speed``: impulse over mass, the change of velocity of a free body, m/s.
+    - ``heading_deg``: direction, from +x towards +y. ``rise``: ratio of the vertical to the
+      horizontal part.
+    - ``height``: height of the point of action above the pivot, as a fraction of the scale.
+    - ``point_jitter``: largest displacement of this point along each axis, metres. Officially the
+      point may lie outside the body, which then spins in an uncontrolled way.
+    - ``frame``: the frame after which it acts; the last of the range is never drawn.
     """
 
     speed: Speeds = (1.0, 1.0)
@@ -118,7 +120,7 @@ def draw_body(
     *,
     angular_drag: float = 0.05,
 ) -> Body:
-    """A body of ``rule`` with its pivot at ``position``."""
+    """Draw a body by ``rule``, with its pivot at ``position``."""
     kind, scale = pick(rng, rule.shapes), draw_axes(rng, rule.scale)
     if rule.tumbled and is_range(rule.turn_deg):
         rotation = euler_rotation(*draw_axes(rng, rule.turn_deg))
@@ -134,26 +136,26 @@ def draw_body(
 
 
 def raised_to_floor(body: Body) -> Body:
-    """The body, raised if any of it is under the floor: turned ones reach below their pivot."""
+    """Return the body, raised if a part of it is below the floor (rotated bodies may be)."""
     missing = max(0.0, -float(world_bounds(body)[0, 2]))
     x, y, z = body.position
     return replace(body, position=(x, y, z + missing))
 
 
 def require_apart(one: Body, other: Body) -> None:
-    """Raise `BadSceneError` where the boxes round two bodies share room at the start."""
+    """Raise `BadSceneError` if the bounding boxes of two bodies overlap."""
     low, high = np.array([world_bounds(body) for body in (one, other)]).transpose(1, 0, 2)
     if (low.max(axis=0) < high.min(axis=0)).all():
         raise BadSceneError(
-            f"{one.name} and {other.name} would start inside each other: make the scene longer or "
-            "the bodies smaller"
+            f"{one.name} and {other.name} would start inside each other: increase the length of "
+            "the scene or make the bodies smaller"
         )
 
 
 def draw_zone(
     rng: np.random.Generator, rule: ZoneRule, look: Look, position: tuple[float, float] = (0.0, 0.0)
 ) -> Body:
-    """The patient called ``zone``, on the floor at ``place`` plus the rule's own centre."""
+    """Draw the patient ``zone``, on the floor at ``position`` plus the rule's ``center``."""
     kind, scale = pick(rng, rule.shapes), draw_axes(rng, rule.scale)
     friction = uniform(rng, rule.friction)
     return Body(
@@ -169,9 +171,9 @@ def draw_zone(
 
 
 def draw_push(rng: np.random.Generator, rule: PushRule, body: Body, rotation: float = 0.0) -> Push:
-    """A push on ``body``; its heading is turned by ``turn`` radians.
+    """Draw a push on ``body``; its heading is rotated by ``rotation`` radians about z.
 
-    The point is at most as high as the body's own top: flat shapes are not pushed in the air.
+    The point of action is at most as high as the top of the body.
     """
     speed, rise = uniform(rng, rule.speed), uniform(rng, rule.rise)
     heading = math.radians(uniform(rng, rule.heading_deg)) + rotation

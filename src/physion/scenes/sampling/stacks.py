@@ -1,4 +1,4 @@
-"""Bodies that stand on one another: stacks, what they stand on, and masses by volume."""
+"""Stacks of bodies, the stands that carry them, and masses proportional to volume."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ from physion.scenes.shapes.primitives import shape
 from physion.scenes.shapes.props import NATURAL_SIZES
 
 UNIT_VOLUME = 0.125
-"""Cubic metres of the cube of 0.5 m a side whose mass the rules give."""
+"""Volume of the cube with sides of 0.5 m whose mass the rules give, cubic metres."""
 SMALLEST = 0.05
-"""Metres: the smallest side that a gradient leaves. Officially blocks shrink to nothing."""
-ATTACHMENT_SHARES = {"cylinder": math.pi / 4, "cone": math.pi / 12}
-"""By how much attachments are lighter than their bounding boxes. In the official command logs no
-other body is, whatever its shape."""
+"""Smallest side of a body in a stack with a gradient, metres. Officially there is no limit."""
+ATTACHMENT_MASS_FACTORS = {"cylinder": math.pi / 4, "cone": math.pi / 12}
+"""Mass of an attachment relative to that of its bounding box. In the official command logs the mass
+of every other body is that of its bounding box, whatever its shape."""
 CONE_RISE = 0.25
-"""What stands on a cone starts higher by this times the cone's diagonal over its height."""
+"""Bodies on a cone start higher by this factor times the cone's diagonal over its height."""
 OPEN_BELOW = ("pipe", "torus")
-"""Bases in which things stand on the floor."""
+"""Shapes of a base that are open below, so that bodies inside stand on the floor."""
 
 
 PLAIN = BodyRule()
@@ -43,12 +43,12 @@ PLAIN = BodyRule()
 
 @dataclass(frozen=True)
 class StackRule:
-    """How bodies that stand on one another are drawn (docs/official-system.md, 3.2).
+    """How a stack of bodies is drawn (docs/official-system.md, 3.2).
 
-    - ``member``: each body; its ``mass`` is that of a cube of 0.5 m a side, and is multiplied with
-      the product of the body's scales over that of the cube's.
-    - ``count``: how many. ``gradient``: metres by which each body is smaller than that below.
-    - ``jitter``: how far aside a body stands along x and y, at most, as a share of its scale.
+    - ``member``: rule of each body. Its ``mass`` is that of a cube with sides of 0.5 m; the mass of
+      the body is proportional to the product of its scales.
+    - ``count``: number of bodies. ``gradient``: metres by which each is smaller than the one below.
+    - ``jitter``: largest displacement along x and y, as a fraction of the scale.
     """
 
     member: BodyRule = PLAIN
@@ -59,21 +59,21 @@ class StackRule:
 
 @dataclass(frozen=True)
 class FilledStackRule(StackRule):
-    """A `StackRule` of at least one body: the agent is one of them."""
+    """`StackRule` of at least one body, since one of them is the agent."""
 
     count: CountsFromOne = (2, 2)
 
 
 @dataclass(frozen=True)
 class StandRule:
-    """What a stack stands on or in (docs/official-system.md, 3.4 and 3.6).
+    """How the stand is drawn on or in which a stack stands (docs/official-system.md, 3.4 and 3.6).
 
-    - ``base``: the lowest body. ``attachment``: one on its top, if ``attached``.
-    - ``joined``: base and attachment are held together, and attachment and cap.
-    - ``capped``: another body of the kind of ``base`` is on top of the attachment.
+    - ``base``: the lowest body. ``attached``: there is an ``attachment`` on its top.
+    - ``joined``: base, attachment and cap are connected rigidly.
+    - ``capped``: a second body drawn by ``base`` is on top of the attachment.
 
-    Masses are those of a cube of 0.5 m a side, as in `StackRule`. The scale of a prop is a multiple
-    of its natural size.
+    Masses are those of a cube with sides of 0.5 m, as in `StackRule`. The scale of a prop is a
+    multiple of its natural size.
     """
 
     base: BodyRule = PLAIN
@@ -85,10 +85,11 @@ class StandRule:
 
 @dataclass(frozen=True)
 class Stand:
-    """A drawn stand.
+    """Bodies of a stand.
 
-    ``holders`` are the base and, where there is one, the attachment. ``top`` is the height in
-    metres at which the base ends, ``start`` that at which a stack officially starts.
+    - ``holders``: the base and, if there is one, the attachment. ``cap``: the body on top.
+    - ``top``: height of the upper end of the base, metres.
+    - ``start``: height at which a stack starts in the official scenes, metres.
     """
 
     holders: tuple[Body, ...]
@@ -99,28 +100,28 @@ class Stand:
 
     @property
     def bodies(self) -> tuple[Body, ...]:
-        """All bodies of the stand."""
+        """Return all bodies of the stand."""
         return self.holders if self.cap is None else (*self.holders, self.cap)
 
 
-def with_mass_by_volume(body: Body, share: float = 1.0) -> Body:
-    """The body with a ``share`` of its mass by volume, ``body.mass`` being that of the unit.
+def with_mass_by_volume(body: Body, factor: float = 1.0) -> Body:
+    """Return the body with a mass proportional to its volume, at least `LEAST_MASS`.
 
-    It keeps the least mass that a body may have.
+    ``body.mass`` is that of a cube of `UNIT_VOLUME`; the result is multiplied by ``factor``.
     """
-    mass = body.mass * math.prod(body.scale) / UNIT_VOLUME * share
+    mass = body.mass * math.prod(body.scale) / UNIT_VOLUME * factor
     return replace(body, mass=max(mass, LEAST_MASS))
 
 
 def top_height(body: Body) -> float:
-    """Height in metres of the top of an upright body."""
+    """Return the height of the top of a body that is not tilted, metres."""
     return body.position[2] + float(shape(body.shape).bounds[1, 2]) * body.scale[2]
 
 
 def draw_looks(
     rng: np.random.Generator, rule: StackRule, palette: Palette, monochrome: bool
 ) -> list[Look]:
-    """The looks of a stack's bodies, and so how many there are."""
+    """Draw the number of bodies of a stack, and a look for each."""
     textures = rule.member.textures
     return [palette.look(textures, monochrome) for _ in range(draw_count(rng, rule.count))]
 
@@ -132,12 +133,26 @@ def draw_stack(
     obstacles: Sequence[Body],
     looks: Sequence[Look],
     name: str,
-    mass_share: float = 1.0,
+    mass_factor: float = 1.0,
 ) -> list[Body]:
-    """One body for each of ``looks``, the lowest at height ``start``.
+    """Draw a stack with one body for each of ``looks``, from below, the lowest at height ``start``.
 
-    They are called ``name`` and a number, from below. A body that would start inside one of the
-    ``obstacles`` is put above it, and what stands on it as much higher.
+    Parameters
+    ----------
+    rng
+        Random stream.
+    rule
+        How the bodies are drawn.
+    start
+        Height of the lowest pivot, metres.
+    obstacles
+        A body that would start inside one of these is raised above it, with all bodies on it.
+    looks
+        Look of each body.
+    name
+        Names of the bodies are this and an index: ``name_0``, ``name_1``, ...
+    mass_factor
+        Factor of the masses (`with_mass_by_volume`).
     """
     bodies: list[Body] = []
     for i, look in enumerate(looks):
@@ -146,7 +161,7 @@ def draw_stack(
         x, y, z = (max(side + grown, SMALLEST) for side in body.scale)
         right, ahead = (side * uniform(rng, (-rule.jitter, rule.jitter)) for side in (x, y))
         body = replace(body, scale=(x, y, z), position=(right, ahead, start))
-        body = raised_clear_of(with_mass_by_volume(body, mass_share), (*obstacles, *bodies))
+        body = raised_clear_of(with_mass_by_volume(body, mass_factor), (*obstacles, *bodies))
         bodies.append(body)
         start = top_height(body)
     return bodies
@@ -155,8 +170,8 @@ def draw_stack(
 def draw_stand(
     rng: np.random.Generator, rule: StandRule, zone: Body, base_look: Look, attachment_look: Look
 ) -> Stand:
-    """A base in the middle of the scene, with what ``rule`` puts on it."""
-    base = with_mass_by_volume(_draw_part(rng, rule.base, "base", 0.0, base_look))
+    """Draw the base in the centre of the scene, with attachment and cap if ``rule`` has them."""
+    base = with_mass_by_volume(_draw_stand_body(rng, rule.base, "base", 0.0, base_look))
     through = base.shape in OPEN_BELOW
     height = 0.0 if through else top_height(base)
     base = raised_clear_of(base, (zone,))
@@ -164,24 +179,24 @@ def draw_stand(
     start = height + zone.scale[2]
     if not rule.attached:
         return Stand((base,), None, (), top, start)
-    pole = _draw_part(rng, rule.attachment, "attachment", top, attachment_look)
+    pole = _draw_stand_body(rng, rule.attachment, "attachment", top, attachment_look)
     pole = raised_clear_of(
-        with_mass_by_volume(pole, ATTACHMENT_SHARES.get(pole.shape, 1.0)), (zone, base)
+        with_mass_by_volume(pole, ATTACHMENT_MASS_FACTORS.get(pole.shape, 1.0)), (zone, base)
     )
     joints = [Joint("base", "attachment")] if rule.joined else []
     if pole.shape == "cone":
         start += CONE_RISE * float(norm(pole.scale[:2])) / pole.scale[2]
     if not rule.capped:
         return Stand((base, pole), None, tuple(joints), top, start)
-    cap = with_mass_by_volume(_draw_part(rng, rule.base, "cap", top_height(pole), base_look))
+    cap = with_mass_by_volume(_draw_stand_body(rng, rule.base, "cap", top_height(pole), base_look))
     joints += [Joint("attachment", "cap")] if rule.joined else []
-    # Officially the cap raises the stack as if it were a second base.
+    # In the official code the cap raises the stack as if it were a second base.
     start += top_height(cap) - cap.position[2]
     return Stand((base, pole), cap, tuple(joints), top, start)
 
 
 def lowered_under_cap(stack: Sequence[Body], stand: Stand) -> list[Body] | None:
-    """The stack, as low as it must be to end below the cap; None if it does not fit there."""
+    """Return the stack, lowered to end below the cap if there is one; None if it does not fit."""
     if stand.cap is None or not stack:
         return list(stack)
     above = max(top_height(stack[-1]) + GAP - stand.cap.position[2], 0.0)
@@ -190,13 +205,13 @@ def lowered_under_cap(stack: Sequence[Body], stand: Stand) -> list[Body] | None:
 
 
 def choose_position(rng: np.random.Generator, count: int, choice: tuple[int, int]) -> int:
-    """One of ``count`` positions, within ``choice`` as far as there are such, else the highest."""
+    """Draw an index below ``count`` in the range ``choice``; the last index if there is none."""
     allowed = range(count)[choice[0] : choice[1] + 1]
-    at = int(rng.integers(max(len(allowed), 1)))
-    return allowed[at] if allowed else count - 1
+    index = int(rng.integers(max(len(allowed), 1)))
+    return allowed[index] if allowed else count - 1
 
 
-def _draw_part(
+def _draw_stand_body(
     rng: np.random.Generator, rule: BodyRule, name: str, height: float, look: Look
 ) -> Body:
     body = draw_body(rng, rule, name, (0.0, 0.0, height), look)

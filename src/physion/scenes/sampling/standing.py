@@ -1,4 +1,4 @@
-"""A ball that hits a stand on which other bodies stand: what contain and link have in common."""
+"""Sampling shared by contain and link: a ball hits a stand that carries a stack of bodies."""
 
 from __future__ import annotations
 
@@ -35,45 +35,45 @@ from physion.seeds import child_generator
 TRIES = 100
 MAX_FRAMES = 452
 STACK_MASS = 0.25
-"""Bodies of the stack have this share of their mass by volume (docs/official-system.md, 3.4)."""
+"""Factor of the masses of the stack's bodies (docs/official-system.md, 3.4)."""
 
 
 class StandParams(SceneParams, Protocol):
-    """Parameters of a scenario with a stand."""
+    """Parameters that a scenario with a stand has."""
 
     @property
     def length(self) -> float:
-        """The probe starts at minus half of this, metres."""
+        """Distance in metres; the probe starts at x = -length / 2."""
         ...
 
     @property
     def stand(self) -> StandRule:
-        """What stands in the middle."""
+        """Rule of the stand in the centre."""
         ...
 
     @property
     def stack(self) -> FilledStackRule:
-        """What stands on or in it."""
+        """Rule of the stack on or in it."""
         ...
 
     @property
     def choice(self) -> tuple[int, int]:
-        """First and last position in the stack at which the agent may be."""
+        """First and last index in the stack at which the agent may be."""
         ...
 
     @property
     def zone(self) -> ZoneRule:
-        """The patient."""
+        """Rule of the patient."""
         ...
 
     @property
     def probe(self) -> BodyRule:
-        """What is pushed."""
+        """Rule of the body that is pushed."""
         ...
 
     @property
     def push(self) -> PushRule:
-        """How it is pushed."""
+        """Rule of the push."""
         ...
 
     @property
@@ -96,9 +96,10 @@ def sample_standing(
     base_color: Vec3 | None,
     attachment_color: Vec3,
 ) -> Scene:
-    """Draw a stand in the middle, a stack in or on it, and a ball at -x pushed at its foot.
+    """Sample a stand in the centre, a stack in or on it, and a ball at -x pushed towards its foot.
 
-    Colours of the stand are fixed ones of the official configurations; None draws one.
+    ``base_color`` and ``attachment_color`` are fixed in the official configurations; None draws
+    the colour.
     """
     rng, palette = child_generator(seed, "placement"), Palette.of(seed)
     member = params.stack.member
@@ -108,15 +109,15 @@ def sample_standing(
     probe_look = palette.look(params.probe.textures)
     zone = draw_zone(rng, params.zone, palette.look(params.zone.textures))
     looks = draw_looks(rng, params.stack, palette, params.monochrome)
-    at = choose_position(rng, len(looks), params.choice)
-    looks[at] = agent_look
+    agent = choose_position(rng, len(looks), params.choice)
+    looks[agent] = agent_look
     push_rng = child_generator(seed, "push")
     drawn: list[_DrawnStand] = []
 
     def attempt() -> str | None:
         stand = draw_stand(rng, params.stand, zone, base_look, attachment_look)
-        around = (zone, *stand.holders)
-        stack = draw_stack(rng, params.stack, stand.start, around, looks, "member", STACK_MASS)
+        obstacles = (zone, *stand.holders)
+        stack = draw_stack(rng, params.stack, stand.start, obstacles, looks, "member", STACK_MASS)
         fitting = lowered_under_cap(stack, stand)
         start = (-params.length / 2, 0.0, 0.0)
         probe = draw_body(push_rng, params.probe, "probe", start, probe_look, angular_drag=0.0)
@@ -129,19 +130,19 @@ def sample_standing(
         return None
 
     retry(TRIES, scenario, attempt)
-    found = drawn[0]
-    target = replace(found.stack[at], name="target")
-    others = [body for i, body in enumerate(found.stack) if i != at]
+    result = drawn[0]
+    target = replace(result.stack[agent], name="target")
+    others = [body for i, body in enumerate(result.stack) if i != agent]
     return build_scene(
         scenario,
         seed,
         params,
-        bodies=(zone, target, found.probe, *found.stand.bodies, *others),
+        bodies=(zone, target, result.probe, *result.stand.bodies, *others),
         roles=Roles("target", "zone", "probe"),
         max_frames=MAX_FRAMES,
-        aim_height=top_height(found.stack[-1]) / 2,
-        pushes=(draw_push(push_rng, params.push, found.probe),),
-        joints=found.stand.joints,
+        aim_height=top_height(result.stack[-1]) / 2,
+        pushes=(draw_push(push_rng, params.push, result.probe),),
+        joints=result.stand.joints,
     )
 
 

@@ -1,4 +1,4 @@
-"""Collide: a ball shoots at an object; is the object knocked onto the zone behind it?"""
+"""Collide: a ball is pushed at an object; does the object reach the zone behind it?"""
 
 from __future__ import annotations
 
@@ -40,15 +40,16 @@ SCENERY = SceneryRule(
 
 @dataclass(frozen=True)
 class Params:
-    """What is drawn for a trial of collide (docs/official-system.md, 2.1, 3.0 and 3.3).
+    """Parameters of the scenario collide (docs/official-system.md, 2.1, 3.0 and 3.3).
 
-    Defaults are the official class defaults, but for the heading of the push: the class has 20
-    degrees, at which most pushes miss, all configurations have 8 or less.
+    Defaults are those of the official class, except the heading of the push: the class has 20
+    degrees, at which most pushes miss; all published configurations have 8 or less.
 
-    - ``length``: metres from probe to target, and from the middle to the zone's centre.
-    - ``zone_jitter``: metres across. ``lift``: metres that the probe starts above the floor.
-    - ``push.point_jitter`` is 0.5 in the published configurations, mostly outside the probe; the
-      default is none.
+    - ``length``: metres from probe to target, and from the scene's centre to that of the zone.
+    - ``zone_jitter``: largest displacement of the zone along y, metres. ``lift``: height of the
+      probe above the floor at the start, metres.
+    - ``push.point_jitter``: 0.5 in the published configurations, which is mostly outside the
+      probe; 0 by default.
     """
 
     length: Length = 2.0
@@ -66,7 +67,7 @@ class Params:
 
 @scenario("collide", Params)
 def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
-    """Draw a ball at -x that is pushed towards a target at +x, with the zone beyond."""
+    """Sample a ball at -x that is pushed at a target at +x, with the zone behind the target."""
     rng, palette = child_generator(seed, "placement"), Palette.of(seed)
     aside = uniform(rng, (-params.zone_jitter, params.zone_jitter))
     zone = draw_zone(rng, params.zone, palette.look(params.zone.textures), (params.length, aside))

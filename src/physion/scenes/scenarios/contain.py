@@ -1,4 +1,4 @@
-"""Contain: a ball hits a container; does the object in it come out onto the plate around it?"""
+"""Contain: a ball hits a container; does an object in it fall onto the plate around it?"""
 
 from __future__ import annotations
 
@@ -48,15 +48,15 @@ SCENERY = SceneryRule()
 
 @dataclass(frozen=True)
 class Params:
-    """What is drawn for a trial of contain (docs/official-system.md, 2.1, 3.0 and 3.4).
+    """Parameters of the scenario contain (docs/official-system.md, 2.1, 3.0 and 3.4).
 
-    - ``length``: the probe starts at minus half of this, metres; the stand is in the middle.
-    - ``stand``: the container, and what stands on it, which may be another container.
-    - ``stack``: the objects in or on it, from below. ``choice``: which of them may be the agent,
-      0 for the lowest; each of those that there are is as likely.
+    - ``length``: metres; the probe starts at x = -length / 2, the container is at the centre.
+    - ``stand``: the container, and a second one on it if ``attached``.
+    - ``stack``: the objects in or on it, from below. ``choice``: indices of those that may be the
+      agent (0 is the lowest), all equally likely.
 
-    Masses of stand and stack are those of a cube of 0.5 m a side (`StackRule`); what is contained
-    has a quarter of it.
+    Masses of stand and stack are those of a cube with sides of 0.5 m (`StackRule`), and a quarter
+    of it for the stack.
     """
 
     length: Length = 2.0
@@ -74,5 +74,5 @@ class Params:
 
 @scenario("contain", Params)
 def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
-    """Draw a container in the middle of a plate or ring, and a ball at -x that hits it."""
+    """Sample a container in the middle of a plate or ring, and a ball at -x pushed towards it."""
     return sample_standing("contain", params, seed, None, ATTACHMENT_COLOR)

@@ -1,4 +1,4 @@
-"""Dominoes: a pushed domino topples a row of others, or not; does the last one reach the zone?"""
+"""Dominoes: a pushed domino may topple a row of others; does the last one reach the zone?"""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from physion.seeds import child_generator
 
 MAX_FRAMES = 302
 ZONE_GAP = 0.1
-"""Metres added between zone and target (docs/official-system.md, section 3.1)."""
+"""Gap between target and zone, metres (docs/official-system.md, section 3.1)."""
 BODY_GAP = 0.01
-"""Metres kept free between neighbours, which officially may start inside each other."""
+"""Smallest gap between neighbours, metres. Officially they may start inside each other."""
 ROW_TRIES = 100
 
 DOMINO = ((0.1, 0.1), (0.25, 0.25), (0.5, 0.5))
@@ -44,17 +44,17 @@ CAMERA, SCENERY = CameraRule(), SceneryRule()
 
 @dataclass(frozen=True)
 class Params:
-    """What is drawn for a trial of dominoes (docs/official-system.md, 2.1, 3.0 and 3.1).
+    """Parameters of the scenario dominoes (docs/official-system.md, 2.1, 3.0 and 3.1).
 
     Defaults are the official configuration `pilot_dominoes_2mid_J025R30`, in which every second
     trial ends in contact; those of the official class are the preset `default_boxroom`.
 
-    - ``length``: metres from probe to target. ``middles``: how many stand between them.
-    - ``spacing_jitter``: share by which each step along the row is longer or shorter; it adds up.
-      ``lateral_jitter``: share of its width by which a middle one stands aside.
-    - ``remove_middle``: one of the middle ones is left out, so that there is a gap.
-    - ``turned_push``: the push turns with the probe, as officially.
-    - ``monochrome``: the middle ones share a colour.
+    - ``length``: metres from probe to target. ``middles``: number of dominoes between them.
+    - ``spacing_jitter``: largest relative change of each distance along the row; changes add up.
+      ``lateral_jitter``: largest displacement across the row, as a fraction of the width.
+    - ``remove_middle``: leave out one of the dominoes between, so that there is a gap.
+    - ``turned_push``: rotate the push with the probe, as officially.
+    - ``monochrome``: the dominoes between have one colour.
     """
 
     length: Length = 1.5
@@ -76,7 +76,7 @@ class Params:
 
 @scenario("dominoes", Params)
 def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
-    """Draw a row of dominoes along x, the probe at its negative end, the zone beyond the target."""
+    """Sample a row of dominoes along x with the probe at -x, and the zone behind the target."""
     rng, palette = child_generator(seed, "placement"), Palette.of(seed)
     half = params.length / 2
     zone = draw_zone(rng, params.zone, palette.look(params.zone.textures), (half + ZONE_GAP, 0.0))
@@ -105,7 +105,7 @@ def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
 
 
 def heading(body: Body) -> float:
-    """Radians from +x, towards +y, of where the body's own x axis points."""
+    """Return the direction of the body's x axis: radians from +x towards +y."""
     x, y, _ = rotate_vectors(body.rotation, (1.0, 0.0, 0.0))
     return arctan2(float(y), float(x))
 
@@ -113,7 +113,7 @@ def heading(body: Body) -> float:
 def _row(
     params: Params, rng: np.random.Generator, palette: Palette, probe: Body, target: Body
 ) -> list[Body]:
-    """The dominoes between probe and target, drawn anew as a whole where they do not fit."""
+    """Draw the dominoes between probe and target, again until all of them fit."""
     removed = int(rng.integers(max(params.middles, 1))) if params.remove_middle else -1
     looks = [palette.look(params.middle.textures, params.monochrome) for _ in range(params.middles)]
     free = float(world_bounds(probe)[1, 0]), float(world_bounds(target)[0, 0])
@@ -122,7 +122,7 @@ def _row(
     def attempt() -> str | None:
         row[:] = _draw_row(params, rng, looks, *free)
         if len(row) < params.middles:
-            return f"no room left for all {params.middles} in the middle"
+            return f"no room for {params.middles} dominoes between probe and target"
         return None
 
     retry(ROW_TRIES, f"a row of dominoes {params.length:g} m long", attempt)
@@ -132,12 +132,12 @@ def _row(
 def _draw_row(
     params: Params, rng: np.random.Generator, looks: list[Look], start: float, end: float
 ) -> list[Body]:
-    """As many as fit between ``start`` and ``end`` (metres along x); their jitter adds up."""
+    """Draw dominoes from ``start`` to ``end`` (x in metres), at most as many as fit."""
     spacing = params.length / (params.middles + 1)
     x, taken, row = -params.length / 2, start, []
     for i, look in enumerate(looks):
-        share = params.spacing_jitter
-        x += spacing * uniform(rng, (1 - share, 1 + share))
+        jitter = params.spacing_jitter
+        x += spacing * uniform(rng, (1 - jitter, 1 + jitter))
         aside = uniform(rng, (-params.lateral_jitter, params.lateral_jitter))
         body = raised_to_floor(draw_body(rng, params.middle, f"middle_{i}", (0.0, 0.0, 0.0), look))
         low, high = (float(bound) for bound in world_bounds(body)[:, 0])

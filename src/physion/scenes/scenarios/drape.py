@@ -1,4 +1,4 @@
-"""Drape: a cloth falls over some objects; does it touch the one in question?"""
+"""Drape: a cloth falls over objects; does it touch the zone between them?"""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ from physion.seeds import child_generator
 MAX_FRAMES = 151
 TRIES = 100
 VERTEX_SPACING = 0.04
-"""Metres between the vertices of a cloth: 51 along the official two metres (`Cloth`)."""
+"""Distance between the vertices of a cloth, metres: 51 vertices for the official 2 m."""
 
 
 class PropPlacement(NamedTuple):
-    """Size of a prop in the world, its place on the floor, metres, and how it is turned."""
+    """Size and position on the floor (metres) of a prop, and its rotation about z."""
 
     size: Vec3
     position: tuple[float, float]
@@ -61,7 +61,7 @@ OFFICIAL_PROPS = {
     "desk_lamp": PropPlacement((0.979, 0.231, 1.177), (0.187, -1.086), angle_deg=-90.0),
     "armchair": PropPlacement((0.915, 0.914, 0.833), (0.0, -1.4)),
 }
-"""The four models that stand behind the official scenes, as measured."""
+"""The four props of the official scenes, with measured sizes and positions."""
 DEFAULT_PROP_POSITION = (0.0, -1.1)
 
 Frames = Annotated[int, Quantity("frames", 0, 10000)]
@@ -74,10 +74,10 @@ SCENERY = SceneryRule(distractor_size=(0.8, 1.2), occluder_size=(0.8, 1.2))
 
 @dataclass(frozen=True)
 class ClothRule:
-    """The cloth, a square sheet that is let go flat and level.
+    """How the cloth is drawn: a square sheet, released flat and horizontal.
 
-    - ``size``: metres a side. ``stretch``, ``bend``, ``tether``: stiffnesses (`Cloth`).
-    - ``x``, ``y``, ``height``: metres, of its centre. ``mass``: kg. ``textures``: materials.
+    - ``size``: length of a side, metres. ``stretch``, ``bend``, ``tether``: stiffnesses (`Cloth`).
+    - ``x``, ``y``, ``height``: position of the centre, metres. ``mass``: kg. ``textures``.
     """
 
     size: Sides = (2.0, 2.0)
@@ -93,15 +93,17 @@ class ClothRule:
 
 @dataclass(frozen=True)
 class AnchorRule:
-    """The objects on both sides that hold the cloth up.
+    """How the anchors are drawn: the objects on both sides that support the cloth.
 
     - ``shapes``; ``width`` along x and ``depth`` along y, metres; ``mass``: kg; ``textures``.
-    - ``height``: metres, more or less by up to ``height_jitter``; the right one is ``taller``.
-    - ``between``: x of the left and of the right one; both are further out by up to ``jitter``.
-    - ``extra``: chance of a third one, ``extra_height`` tall, jittered alike. It stands
-      ``extra_distance`` outside of the left one's place with a chance of ``extra_left``, or of the
-      right one's, by up to ``jitter`` to the left of that. (Height, side and the direction of this
-      jitter are measured on 69 of them.)
+    - ``height``: metres, plus or minus up to ``height_jitter``; the right anchor is higher by
+      ``taller``.
+    - ``between``: x of the left and of the right anchor; each is moved outwards by up to
+      ``jitter``.
+    - ``extra``: probability of a third anchor. It has the height ``extra_height`` (with the same
+      jitter) and stands ``extra_distance`` to the left of the left anchor with the probability
+      ``extra_left``, otherwise to the right of the right anchor; then it is moved to the left by
+      up to ``jitter``. (Measured on 69 official trials.)
     """
 
     shapes: Shapes = ("cone", "cube", "cylinder", "pyramid", "triangular_prism")
@@ -120,22 +122,22 @@ class AnchorRule:
     textures: Materials = FAMILIES
 
     def check_values(self) -> str | None:
-        """What is wrong with values that are good one by one, or None."""
+        """Return which values contradict each other, or None."""
         for key, height in (("height", self.height), ("extra_height", self.extra_height)):
             if height - self.height_jitter < SMALLEST_SIDE:
                 return (
                     f"height_jitter is {self.height_jitter:g} m and {key} {height:g} m; "
-                    f"at least {SMALLEST_SIDE:g} m must be left"
+                    f"their difference must be at least {SMALLEST_SIDE:g} m"
                 )
         return None
 
 
 @dataclass(frozen=True)
 class PropRule:
-    """The large object behind the others.
+    """How the large object behind the others is drawn.
 
-    ``size`` is times the official size (`OFFICIAL_PROPS`) or, of props that the study does
-    not have, times the natural one; ``shift`` is metres from its official place.
+    ``size`` is a factor of the official size (`OFFICIAL_PROPS`), or of the natural size of props
+    that the study did not use; ``shift`` is an offset of the official position, metres.
     """
 
     props: Props = tuple(OFFICIAL_PROPS)
@@ -147,13 +149,13 @@ class PropRule:
 
 @dataclass(frozen=True)
 class Params:
-    """What is drawn for a trial of drape (docs/official-system.md, 2.1, 3.0 and 3.8).
+    """Parameters of the scenario drape (docs/official-system.md, 2.1, 3.0 and 3.8).
 
-    Defaults are the official rules, with middling values of what the configurations differ in.
+    Defaults are the official rules, with average values of what differs between configurations.
 
-    - ``zone_share``: where the zone stands, as a share of the way from the right anchor's place to
-      the left one's. ``zone_y``: metres.
-    - ``settle_frames``: see `Scene`. Bodies never move: cloth does not push them.
+    - ``zone_share``: position of the zone as a fraction of the way from the right anchor to the
+      left one. ``zone_y``: metres.
+    - ``settle_frames``: see `Scene`. Bodies never move, since cloth does not push them.
     """
 
     cloth: ClothRule = ClothRule()
@@ -170,7 +172,7 @@ class Params:
 
 @scenario("drape", Params)
 def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
-    """Draw a cloth above anchors along x, with the zone between them and a prop behind."""
+    """Sample a cloth above anchors along x, with the zone between them and a prop behind."""
     palette = Palette.of(seed)
     cloth = _draw_cloth(params.cloth, child_generator(seed, "cloth"), palette)
     prop = _draw_prop(params.prop, child_generator(seed, "prop"), palette)
@@ -228,7 +230,7 @@ def _draw_prop(rule: PropRule, rng: np.random.Generator, palette: Palette) -> Bo
 def _draw_anchors(
     rule: AnchorRule, rng: np.random.Generator, palette: Palette, prop: Body
 ) -> list[Body]:
-    """The anchors left and right, and perhaps the extra one."""
+    """Draw the left and the right anchor, and possibly the third."""
     left, right = rule.between
     rightwards, leftwards = (0.0, rule.jitter), (-rule.jitter, 0.0)
     wanted = [
@@ -279,9 +281,9 @@ def _draw_zone(
 
 
 def _draw_apart(name: str, others: Sequence[Body], draw: Callable[[], Body]) -> Body:
-    """The first body drawn whose floor plan is apart from those of ``others``.
+    """Draw a body until its footprint overlaps none of those of ``others``.
 
-    Official ones may start inside each other, and are pushed apart while they settle.
+    In the official scenes they may overlap, and are pushed apart while they settle.
     """
     drawn: list[Body] = []
 
@@ -291,7 +293,7 @@ def _draw_apart(name: str, others: Sequence[Body], draw: Callable[[], Body]) -> 
         for other in others:
             other_low, other_high = world_bounds(other)[:, :2]
             if (low < other_high).all() and (other_low < high).all():
-                return f"it meets {other.name}"
+                return f"it overlaps {other.name}"
         return None
 
     retry(TRIES, name, attempt)

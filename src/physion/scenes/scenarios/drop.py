@@ -1,4 +1,4 @@
-"""Drop: an object falls onto another one; does it end up on the zone below, or stay off it?"""
+"""Drop: an object falls onto another one; does it reach the zone below?"""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ PRIMITIVES = (
 )
 MAX_FRAMES = 302
 FALL = 0.1
-"""Least free fall in metres: long objects that hang down start higher than drawn."""
-WHOLE_TURN = ((0.0, 360.0), (0.0, 360.0), (0.0, 360.0))
+"""Smallest height of free fall, metres. Long objects may have to start higher than drawn."""
+ANY_ROTATION = ((0.0, 360.0), (0.0, 360.0), (0.0, 360.0))
 
 DROPPED = BodyRule(
     PRIMITIVES,
     (0.1, 0.4),
-    WHOLE_TURN,
+    ANY_ROTATION,
     mass=(2.0, 7.0),
     static_friction=(0.4, 0.4),
     dynamic_friction=(0.4, 0.4),
@@ -60,23 +60,25 @@ LOWER = BodyRule(
 )
 ZONE = ZoneRule(scale=((2.0, 2.0), (2.0, 2.0), (0.01, 0.01)))
 CAMERA = CameraRule((2.0, 2.0), (45.0, 225.0), (0.25, 4.0))
-"""The official camera may be 2 cm above the floor, where nobody can see the zone."""
+"""The official camera may be 2 cm above the floor, from where the zone cannot be seen."""
 SCENERY = SceneryRule()
 
 
 @dataclass(frozen=True)
 class Params:
-    """What is drawn for a trial of drop (docs/official-system.md, 2.1, 3.0 and 3.5).
+    """Parameters of the scenario drop (docs/official-system.md, 2.1, 3.0 and 3.5).
 
-    Defaults are those of the official `simple` configurations, but for ``even_turn``. Masses are
-    the values in use: the official mass arguments had no effect.
+    Defaults are those of the official `simple` configurations, except ``even_turn``. Masses are the
+    values that had an effect: the official mass arguments had none.
 
-    - ``dropped``: what falls. ``lower``: what stands below, on the zone where that reaches there.
-    - ``even_turn``: every orientation of what falls is as likely; otherwise it is turned by
-      ``dropped.turn_deg``, officially by three even angles, which prefer the poles.
-    - ``height``: metres of the falling pivot above the floor; ``jitter``: metres aside along x
-      and y. What would start in or just above the lower body starts higher.
-    - ``camera_height``: times the height of the fall, within the metres of ``camera.height``.
+    - ``dropped``: the falling object. ``lower``: the object below, on the floor or on the zone.
+    - ``even_turn``: draw the orientation of the falling object uniformly among all rotations.
+      Otherwise it is rotated by ``dropped.turn_deg``, officially by three uniform angles, which
+      is not a uniform orientation.
+    - ``height``: of the falling object's pivot above the floor, metres; ``jitter``: its largest
+      displacement along x and y, metres. It starts higher if it would be inside the lower object
+      or just above it.
+    - ``camera_height``: as a factor of the height of the fall, within ``camera.height`` (metres).
     """
 
     dropped: BodyRule = DROPPED
@@ -94,12 +96,12 @@ class Params:
 
 @scenario("drop", Params)
 def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
-    """Draw an object in the air, turned at random, above one that stands at the origin."""
+    """Sample a randomly rotated object in the air above one that stands at the origin."""
     rng, palette = child_generator(seed, "placement"), Palette.of(seed)
     zone = draw_zone(rng, params.zone, palette.look(params.zone.textures))
     look = palette.look(params.lower.textures)
-    lower = _standing(draw_body(rng, params.lower, "lower", (0.0, 0.0, 0.0), look), zone)
-    target = _hung(params, rng, palette, lower)
+    lower = _put_on_zone(draw_body(rng, params.lower, "lower", (0.0, 0.0, 0.0), look), zone)
+    target = _draw_dropped(params, rng, palette, lower)
     fall = target.position[2]
     lowest, highest = params.camera.height
     low, high = (min(max(times * fall, lowest), highest) for times in params.camera_height)
@@ -115,8 +117,8 @@ def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
     )
 
 
-def _standing(lower: Body, zone: Body) -> Body:
-    """The lower body on the zone, where the official one starts inside it, or on the floor."""
+def _put_on_zone(lower: Body, zone: Body) -> Body:
+    """Return the lower body, on the zone if it is above it, otherwise on the floor."""
     lower = raised_to_floor(lower)
     below, body = world_bounds(zone), world_bounds(lower)
     apart = (below[1, :2] <= body[0, :2]).any() or (body[1, :2] <= below[0, :2]).any()
@@ -124,8 +126,8 @@ def _standing(lower: Body, zone: Body) -> Body:
     return lower if apart else replace(lower, position=(x, y, z + float(below[1, 2])))
 
 
-def _hung(params: Params, rng: np.random.Generator, palette: Palette, lower: Body) -> Body:
-    """What falls, high enough to fall at least `FALL` metres."""
+def _draw_dropped(params: Params, rng: np.random.Generator, palette: Palette, lower: Body) -> Body:
+    """Draw the falling object, high enough to fall at least `FALL` metres."""
     x, y = (uniform(rng, (-params.jitter, params.jitter)) for _ in range(2))
     position = (x, y, uniform(rng, params.height))
     look = palette.agent_look(params.dropped.textures)
@@ -138,5 +140,5 @@ def _hung(params: Params, rng: np.random.Generator, palette: Palette, lower: Bod
 
 
 def random_rotation(rng: np.random.Generator) -> Quat:
-    """Draw a rotation, all orientations as likely."""
+    """Draw a rotation uniformly among all orientations."""
     return as_quaternion(unit(standard_normal(rng, 4)))

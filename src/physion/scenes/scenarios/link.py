@@ -1,4 +1,4 @@
-"""Link: a ball hits a pole with rings on it; does the asked one come off and reach the zone?"""
+"""Link: a ball hits a pole with rings on it; does the agent, one of them, reach the zone?"""
 
 from __future__ import annotations
 
@@ -53,15 +53,16 @@ SCENERY = SceneryRule()
 
 @dataclass(frozen=True)
 class Params:
-    """What is drawn for a trial of link (docs/official-system.md, 2.1, 3.0 and 3.6).
+    """Parameters of the scenario link (docs/official-system.md, 2.1, 3.0 and 3.6).
 
-    - ``length``: the probe starts at minus half of this, metres; the pole is in the middle.
-    - ``stand``: the base and the pole on it, which may have a cap that keeps the links on.
-    - ``stack``: the links, from below. ``choice``: which of them may be the agent, 0 for the
-      lowest; each of those that there are is as likely.
+    - ``length``: metres; the probe starts at x = -length / 2, the pole is at the centre.
+    - ``stand``: the base, the pole on it, and possibly a cap that keeps the rings on the pole.
+    - ``stack``: the rings, from below. ``choice``: indices of those that may be the agent (0 is
+      the lowest), all equally likely.
 
-    Masses of stand and links are those of a cube of 0.5 m a side (`StackRule`); links have a
-    quarter of it. Under a cap the links start lower than officially, where they may be inside it.
+    Masses of stand and rings are those of a cube with sides of 0.5 m (`StackRule`), and a quarter
+    of it for the rings. Below a cap the rings start lower than in the official scenes, where they
+    may start inside it.
     """
 
     length: Length = 2.0
@@ -79,5 +80,5 @@ class Params:
 
 @scenario("link", Params)
 def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
-    """Draw rings on a pole in the middle of a ring or plate, and a ball at -x that hits it."""
+    """Sample rings on a pole in the middle of a ring or plate, and a ball at -x pushed at it."""
     return sample_standing("link", params, seed, STAND_COLOR, STAND_COLOR)

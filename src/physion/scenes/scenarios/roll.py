@@ -1,4 +1,4 @@
-"""Roll: an object slides down a ramp, rolls over a ledge or is knocked; does it reach the zone?"""
+"""Roll: an object slides down a ramp, rolls over a ledge or is hit; does it reach the zone?"""
 
 from __future__ import annotations
 
@@ -41,17 +41,17 @@ from physion.seeds import child_generator
 
 TEMPLATES = ("ramp", "ledge", "collision")
 MAX_FRAMES = 302
-HAIR = 0.001
-"""Metres between the ramp and a target that had to be raised to clear it."""
+GAP = 0.001
+"""Gap between the ramp and a target that had to be raised, metres."""
 
 Templates = Annotated[tuple[str, ...], NamesOf("template", TEMPLATES)]
 
 PRIMITIVES = ("bowl", "cone", "cube", "cylinder", "dumbbell", "pentagon", "pipe", "pyramid")
 ROLLING = ("pipe", "cube", "pentagon", "sphere")
-ANY_TURN = ((0.0, 360.0), (0.0, 360.0), (0.0, 360.0))
+ANY_ROTATION = ((0.0, 360.0), (0.0, 360.0), (0.0, 360.0))
 SMALL, ROUGH, SMOOTH = (0.25, 0.25), (0.4, 0.4), (0.01, 0.01)
 
-RELEASED = BodyRule(ROLLING, SMALL, ANY_TURN, static_friction=ROUGH, dynamic_friction=ROUGH)
+RELEASED = BodyRule(ROLLING, SMALL, ANY_ROTATION, static_friction=ROUGH, dynamic_friction=ROUGH)
 ROLLED = BodyRule(ROLLING, SMALL, static_friction=ROUGH, dynamic_friction=ROUGH)
 KNOCKED = BodyRule((*PRIMITIVES, "sphere"), (SMALL, SMALL, (0.5, 0.5)))
 KNOCKING = BodyRule(
@@ -71,15 +71,16 @@ CAMERA, SCENERY = CameraRule(), SceneryRule()
 
 @dataclass(frozen=True)
 class RampRule:
-    """The target is let go above a slippery ramp that ends before the zone.
+    """Template in which the target is released above a slippery ramp that ends before the zone.
 
-    - ``length``: metres from the middle to the zone's centre; the ramp's pivot is half of it away
-      on the other side.
-    - ``shapes``, ``scale``, ``friction``, ``mass``, ``textures``: of the ramp. ``lift``: metres
-      that it stands above the floor, officially the thickness of the zone.
-    - ``start``: metres up the slope from the ramp's pivot to the target's (measured).
-    - ``drop``: metres of the target's pivot above the ramp's top. A turned target reaches below
-      its pivot: one that would start inside the ramp is raised until it does not.
+    - ``length``: metres from the scene's centre to that of the zone; the pivot of the ramp is at
+      x = -length / 2.
+    - ``shapes``, ``scale``, ``friction``, ``mass``, ``textures``: of the ramp. ``lift``: height of
+      the ramp above the floor, metres; officially the thickness of the zone.
+    - ``start``: horizontal distance from the ramp's pivot to that of the target, up the slope,
+      metres (measured in official scenes).
+    - ``drop``: height of the target's pivot above the ramp's top, metres. A rotated target that
+      would start inside the ramp is raised.
     """
 
     length: Length = 1.25
@@ -97,13 +98,13 @@ class RampRule:
 
 @dataclass(frozen=True)
 class LedgeRule:
-    """The target is pushed at its base towards a low round ledge across its way to the zone.
+    """Template in which the target is pushed at its base over a low round ledge towards the zone.
 
-    - ``length``: metres from the middle to the zone's centre; the target is half of it away on the
-      other side.
+    - ``length``: metres from the scene's centre to that of the zone; the target is at
+      x = -length / 2.
     - ``shapes``, ``scale``, ``center``, ``friction``, ``mass``, ``textures``: of the ledge. The
-      official one is a ball stretched to 100 m and sunk by half into the floor; the half cylinder
-      has the same cross-section and stands on it.
+      official ledge is a sphere scaled to a length of 100 m, half of it below the floor; the half
+      cylinder has the same cross-section and stands on the floor.
     """
 
     length: Length = 1.5
@@ -120,7 +121,7 @@ class LedgeRule:
 
 @dataclass(frozen=True)
 class CollisionRule:
-    """As `collide.Params`, but with probes of any shape that start in the air."""
+    """Template like `collide.Params`, with probes of any shape that start in the air."""
 
     length: Length = 1.7
     target: BodyRule = KNOCKED
@@ -134,11 +135,11 @@ class CollisionRule:
 
 @dataclass(frozen=True)
 class Params:
-    """What is drawn for a trial of roll (docs/official-system.md, 2.1, 3.0 and 3.7).
+    """Parameters of the scenario roll (docs/official-system.md, 2.1, 3.0 and 3.7).
 
-    ``template`` names one of `TEMPLATES` or several, each as likely; only its rule is used.
-    Defaults are the values of the published configurations, but for ``ramp.lift``, which is 0.01
-    there, and ``collision.push.point_jitter``, which is 0.5 there, mostly outside the probe.
+    ``template`` is one of `TEMPLATES`, or several of which one is drawn; only the rule of that name
+    is used. Defaults are those of the published configurations, except ``ramp.lift`` (0.01 there)
+    and ``collision.push.point_jitter`` (0.5 there, mostly outside the probe).
     """
 
     template: Templates = ("ramp",)
@@ -152,7 +153,7 @@ class Params:
 
 @scenario("roll", Params)
 def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
-    """Draw a scene of one template, with the zone at +x; it is recorded which template."""
+    """Sample a scene of one template, with the zone at +x; the scene's parameters name it."""
     template = pick(child_generator(seed, "template"), params.template)
     chosen = replace(params, template=(template,))
     if template == "collision":
@@ -190,10 +191,10 @@ def _sample_ramp(params: Params, seed: np.random.SeedSequence) -> Scene:
 
 
 def _above_ramp(target: Body, ramp: Body) -> Body:
-    """The target, raised if any of it is inside a ramp that leads down towards +x.
+    """Return the target, raised if a part of it is inside a ramp that leads down towards +x.
 
-    It is clear if it lies above some plane through the ridge between slope and platform that is
-    no steeper than the slope.
+    It is outside if it lies above a plane through the ridge between slope and platform that is not
+    steeper than the slope.
     """
     corners = world_corners(ramp)
     top, bottom = corners[:, 2].max(), corners[:, 2].min()
@@ -202,7 +203,7 @@ def _above_ramp(target: Body, ramp: Body) -> Body:
     along, up = world_corners(target)[:, 0] - ridge, world_corners(target)[:, 2] - top
     missing = float((-up - along * grades).max(axis=1).min())
     x, y, z = target.position
-    return replace(target, position=(x, y, z + missing + HAIR)) if missing > 0 else target
+    return replace(target, position=(x, y, z + missing + GAP)) if missing > 0 else target
 
 
 def _sample_ledge(params: Params, seed: np.random.SeedSequence) -> Scene:

@@ -1,4 +1,4 @@
-"""Support: a ball hits a tower; does the object on its top fall onto the plate around it?"""
+"""Support: a ball hits a tower; does the object on top fall onto the plate around the tower?"""
 
 from __future__ import annotations
 
@@ -55,12 +55,12 @@ SCENERY = SceneryRule()
 
 @dataclass(frozen=True)
 class Params:
-    """What is drawn for a trial of support (docs/official-system.md, 2.1, 3.0 and 3.2).
+    """Parameters of the scenario support (docs/official-system.md, 2.1, 3.0 and 3.2).
 
-    - ``length``: the probe starts at minus half of this, metres; the tower stands in the middle.
-    - ``stack``: the blocks of the tower, from below. ``cap``: what is on its top, the agent.
+    - ``length``: metres; the probe starts at x = -length / 2, the tower is at the centre.
+    - ``stack``: the blocks of the tower, from below. ``cap``: the object on top, the agent.
 
-    Masses of blocks and cap are those of a cube of 0.5 m a side (`StackRule`).
+    Masses of blocks and cap are those of a cube with sides of 0.5 m (`StackRule`).
     """
 
     length: Length = 2.0
@@ -77,7 +77,7 @@ class Params:
 
 @scenario("support", Params)
 def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
-    """Draw a tower in the middle of a plate, and a ball at -x that is pushed at its foot."""
+    """Sample a tower in the middle of a plate, and a ball at -x pushed towards its foot."""
     rng, palette = child_generator(seed, "placement"), Palette.of(seed)
     target_look = palette.agent_look(params.cap.textures)
     probe_look = palette.look(params.probe.textures)
