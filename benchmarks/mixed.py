@@ -33,8 +33,8 @@ from mixed_fixtures import CASES, as_csv, ask_r
 from physion.analysis.mixed.linear import fit_linear
 from physion.analysis.mixed.logistic import fit_logistic
 from physion.analysis.mixed.result import MixedFit
-from physion.analysis.mixed.simulation import AnswerDesign, simulate_answers
 from replay import RESULTS, processor
+from support.simulated_answers import AnswerDesign, simulate_answers
 
 GOAL = 15.0
 """Seconds that the logistic model of the study may take."""

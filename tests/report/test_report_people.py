@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from physion.analysis import Bootstrap
-from physion.analysis.statistics.kappa import cohen_kappa
+from physion.analysis.statistics.kappa import cross_kappa
 from physion.errors import BadInputError, UnknownNameError
 from physion.report import compare_files
 from physion.report.inputs import permutations_of
@@ -115,7 +115,7 @@ def test_kappa_of_the_figure_is_the_mean_over_people(report: Path) -> None:
     answers = responses()
     model = predictions().iloc[STIMULI : 2 * STIMULI]["Predicted Outcome"].to_numpy(float)
     people = answers[answers["scenario"] == "drop"].groupby("session")["response"]
-    kappas = [cohen_kappa((own == "yes").to_numpy(float), model) for _, own in people]
+    kappas = [cross_kappa((own == "yes").to_numpy(float), model).item() for _, own in people]
     row = table.loc[("drop", "one · observed")]
     assert row["value"] == pytest.approx(np.mean(kappas))
     assert row["low"] < row["value"] < row["high"] and row["zone_low"] < row["zone_high"]

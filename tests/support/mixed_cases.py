@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from physion.analysis.mixed.simulation import AnswerDesign, simulate_answers
 from support.official import official_folder
+from support.simulated_answers import AnswerDesign, simulate_answers
 
 STORED = Path(__file__).parent / "fixtures" / "mixed_r.csv"
 

@@ -10,8 +10,8 @@ from physion.analysis.mixed.design import build_design
 from physion.analysis.mixed.formula import split_formula
 from physion.analysis.mixed.linear import fit_linear
 from physion.analysis.mixed.logistic import fit_logistic
-from physion.analysis.mixed.simulation import AnswerDesign, simulate_answers
 from physion.errors import BadInputError, UnknownNameError
+from support.simulated_answers import AnswerDesign, simulate_answers
 
 CROSSED = "(1|participant) + (1|stimulus)"
 

@@ -17,7 +17,7 @@ from physion.analysis.mixed.factor import Factor
 from physion.analysis.mixed.groupings import Groupings
 from physion.analysis.mixed.linear import LinearModel, fit_linear
 from physion.analysis.mixed.logistic import LogisticModel, fit_logistic
-from physion.analysis.mixed.simulation import AnswerDesign, simulate_answers
+from support.simulated_answers import AnswerDesign, simulate_answers
 
 CROSSED = "(1|participant) + (1|stimulus)"
 THREE = "(1|participant) + (1|stimulus) + (1|scenario)"

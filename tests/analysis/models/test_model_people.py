@@ -96,7 +96,7 @@ def plain(
              if who[i] != who[j]]  # fmt: skip
     rmsd = agreement.rmsd(p, share)
     return {
-        "accuracy": agreement.accuracy(said == 1, label == 1),
+        "accuracy": float(np.mean(said == label)),
         "difference": float(np.mean(said == label) - np.mean(right)),
         "r": agreement.pearson(p, share),
         "rmsd": rmsd,

@@ -46,13 +46,13 @@ from physion.analysis.statistics.kappa import pair_values, pairwise_kappa
 from physion.analysis.tables.attributes import (
     ATTRIBUTES,
     MISLABELLED,
-    attributes_from_metadata,
     attributes_from_names,
     attributes_from_table,
     better_attributes,
 )
 from physion.analysis.tables.responses import read_humans, read_labels, with_labels
 from physion.errors import BadInputError
+from support.scene_metadata import attributes_from_metadata
 from support.simulated_people import study
 
 Array = npt.NDArray[np.float64]
@@ -354,7 +354,7 @@ def test_names_with_their_correction_say_what_the_metadata_say(
     assert (best[best["configuration"] == "pilot_dominoes_4mid_tdwroom"]["elements"] == 8).all()
 
 
-def test_attributes_from_tables_and_broken_sources(tmp_path: Path) -> None:
+def test_attributes_from_tables_and_bad_names() -> None:
     table = pd.DataFrame({"stimulus": ["a_img", "b"], "scenario": "drop", "occluders": ["1", "x"]})
     found = attributes_from_table(table)
     assert found["stimulus"].tolist() == ["a", "b"] and found["occluders"].iloc[0] == 1
@@ -365,14 +365,6 @@ def test_attributes_from_tables_and_broken_sources(tmp_path: Path) -> None:
         attributes_from_names(["collide_0001"])
     with pytest.raises(BadInputError, match="stands in two rows"):
         attributes_from_names(["test13_0011", "test13_0011_img"])
-    with pytest.raises(BadInputError, match="holds no"):
-        attributes_from_metadata(tmp_path)
-    (tmp_path / "drop" / "x").mkdir(parents=True)
-    path = tmp_path / "drop" / "x" / "metadata.json"
-    for text, words in (("{", "not JSON"), ("{}", "list of trials"), ("[{}]", "stimulus_name")):
-        path.write_text(text)
-        with pytest.raises(BadInputError, match=words):
-            attributes_from_metadata(tmp_path)
 
 
 def stimuli_table(seed: int, effect: float) -> pd.DataFrame:

@@ -44,8 +44,6 @@ def test_every_pair_is_as_scikit_learn_has_it(values: Array) -> None:
         for j in range(len(values)):
             expected = by_scikit_learn(values[i], values[j])
             assert found[i, j] == pytest.approx(expected, abs=1e-12, nan_ok=True)
-            undefined = kappa.why_no_kappa(values[i], values[j])
-            assert bool(undefined) == bool(np.isnan(found[i, j]))
 
 
 @settings(deadline=None)
@@ -60,13 +58,11 @@ def test_kappa_is_symmetric_bounded_and_blind_to_the_names_of_the_answers(values
     assert (own[np.isfinite(own)] == 1).all()
 
 
-def test_kappa_that_is_not_defined_says_why() -> None:
-    assert np.isnan(kappa.cohen_kappa([1, 1, 1], [1, 1, 1]))
-    assert kappa.why_no_kappa([1, 1], [1, 1]) == "kappa: both always give the same one answer"
-    assert kappa.why_no_kappa([1, np.nan], [np.nan, 0]) == "kappa: no stimulus that both answered"
-    # One who always says yes beside one who does not: no agreement beyond chance, and defined.
-    assert kappa.cohen_kappa([1, 1, 1, 1], [1, 0, 1, 0]) == 0.0
-    assert kappa.cohen_kappa([1, 0], [0, 1]) == -1.0
+def test_kappa_without_variation() -> None:
+    assert np.isnan(kappa.cross_kappa([1, 1, 1], [1, 1, 1])).all()
+    # A constant answer and one that varies: no agreement beyond chance, and defined.
+    assert kappa.cross_kappa([1, 1, 1, 1], [1, 0, 1, 0]).item() == 0.0
+    assert kappa.cross_kappa([1, 0], [0, 1]).item() == -1.0
 
 
 @settings(deadline=None)
@@ -86,7 +82,7 @@ def test_correlation_is_that_of_scipy(values: Array) -> None:
 @given(answers, st.integers(0, 9))
 def test_error_consistency_is_the_kappa_of_being_right(values: Array, seed: int) -> None:
     labels = np.random.default_rng(seed).integers(0, 2, values.shape[1]).astype(float)
-    found = kappa.error_consistency(values, labels)
+    found = kappa.pairwise_kappa(kappa.correctness(values, labels))
     right = (values == labels).astype(float)
     expected = by_scikit_learn(right[0], right[1])
     assert found[0, 1] == pytest.approx(expected, abs=1e-12, nan_ok=True)
@@ -97,8 +93,8 @@ def test_errors_of_independent_raters_are_not_consistent_however_accurate_they_a
     labels = generator.integers(0, 2, 20_000).astype(float)
     wrong = generator.random((2, 20_000)) < 0.1
     values = np.where(wrong, 1 - labels, labels)
-    assert kappa.cohen_kappa(*values) > 0.6
-    assert abs(kappa.error_consistency(values, labels)[0, 1]) < 0.03
+    assert kappa.cross_kappa(*values).item() > 0.6
+    assert abs(kappa.pairwise_kappa(kappa.correctness(values, labels))[0, 1]) < 0.03
 
 
 # --- resampling ------------------------------------------------------------------------------

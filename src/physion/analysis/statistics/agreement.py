@@ -18,12 +18,6 @@ FEWEST = 3
 """Stimuli below which r is undefined: any two points lie on a line."""
 
 
-def accuracy(answers: npt.ArrayLike, outcomes: npt.ArrayLike) -> float:
-    """Share of answers (bool) that equal the outcomes (bool); NaN without any."""
-    given, true = np.asarray(answers, dtype=bool), np.asarray(outcomes, dtype=bool)
-    return float(np.mean(given == true)) if len(given) else float("nan")
-
-
 def pearson(x: npt.ArrayLike, y: npt.ArrayLike) -> float:
     """Pearson's r of two arrays of shape (n,); NaN where either is constant or n < 3."""
     a, b = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)

@@ -4,7 +4,7 @@ Answers are arrays of shape (raters, stimuli) that hold 1 (yes), 0 (no) or NaN (
 pair is compared on the stimuli that both answered, and its chance agreement comes from their shares
 of yes on these. Kappa is (observed - chance) / (1 - chance): 1 for equal answers, 0 for what two
 independent raters would have, below 0 for less than that. It is NaN where chance agreement is 1
-(both always give one and the same answer) or where no stimulus is shared; `why_no_kappa` tells.
+(both always give the same one answer) or where no stimulus is shared.
 """
 
 from __future__ import annotations
@@ -37,11 +37,6 @@ def as_answers(answers: npt.ArrayLike, what: str = "answers") -> Array:
     return values
 
 
-def cohen_kappa(first: npt.ArrayLike, second: npt.ArrayLike) -> float:
-    """Cohen's kappa of two answer vectors of shape (stimuli,), for a single pair."""
-    return float(cross_kappa(first, second)[0, 0])
-
-
 def cross_kappa(
     first: npt.ArrayLike, second: npt.ArrayLike, weights: npt.ArrayLike | None = None
 ) -> Array:
@@ -60,16 +55,6 @@ def pairwise_kappa(answers: npt.ArrayLike) -> Array:
     """Kappa of every two raters, shape (n, n), symmetric; 1 (or NaN) on the diagonal."""
     values = as_answers(answers)
     return cross_kappa(values, values)
-
-
-def error_consistency(answers: npt.ArrayLike, labels: npt.ArrayLike) -> Array:
-    """Do two raters err on the same stimuli, beyond what their accuracies make likely? (n, n)
-
-    It is the kappa of right and wrong rather than of yes and no (Geirhos and others, 2020), so it
-    does not grow just because two raters are both accurate. NaN where both are always right.
-    """
-    values = as_answers(answers)
-    return pairwise_kappa(correctness(values, labels))
 
 
 def correctness(answers: npt.ArrayLike, labels: npt.ArrayLike) -> Array:
@@ -94,16 +79,6 @@ def pairwise_correlation(answers: npt.ArrayLike) -> Array:
         spread = (mine / n) * (1 - mine / n)
         r = covariance / np.sqrt(spread * spread.T)
     return np.where((n >= 3) & (spread > 0) & (spread.T > 0), r, np.nan)
-
-
-def why_no_kappa(first: npt.ArrayLike, second: npt.ArrayLike) -> str:
-    """In words why the kappa of two answer vectors is NaN; empty where it is defined."""
-    a, b = as_answers(first)[0], as_answers(second)[0]
-    shared = ~np.isnan(a) & ~np.isnan(b)
-    if not shared.any():
-        return "kappa: no stimulus that both answered"
-    values = {*a[shared], *b[shared]}
-    return "kappa: both always give the same one answer" if len(values) == 1 else ""
 
 
 def pair_values(matrix: Array) -> Array:

@@ -1,18 +1,15 @@
-"""Attributes of stimuli: how many elements, distractors and occluders they hold.
+"""Attributes of stimuli: how many elements, distractors and occluders a scene contains.
 
-Three sources, each named in the column ``source``: the official names, which say what the
-configuration was called; the official ``metadata.json`` files, which say what was generated; any
-table with the columns, such as that of one's own stimuli. Where metadata are given they go before
-names (`better_attributes`); names that are known to be wrong are corrected (`MISLABELLED`). What a
-source does not say is NaN.
+Two sources, each named in the column ``source``: the official names of stimuli, which contain the
+counts, and any table with the columns, such as that of one's own stimuli. A table has precedence
+over names (`better_attributes`); names that are known to be wrong are corrected (`MISLABELLED`).
+What a source does not contain is NaN.
 """
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +17,7 @@ import pandas as pd
 
 from physion.analysis.tables.csv_table import refuse_duplicates, require_columns
 from physion.errors import BadInputError
-from physion.stimulus_names import SCENARIOS, canonical_name, scenario_of
+from physion.stimulus_names import canonical_name, scenario_of
 
 ATTRIBUTES = ("elements", "distractors", "occluders")
 """``elements``: objects that the physics is about beside probe, agent and zone: dominoes between
@@ -85,54 +82,6 @@ def _first(patterns: tuple[re.Pattern[str], ...], text: str) -> float:
         if match := pattern.search(text):
             return float(match[1])
     return float("nan")
-
-
-def attributes_from_metadata(folder: Path) -> pd.DataFrame:
-    """Attributes from all ``<scenario>/<configuration>/metadata.json`` under ``folder``.
-
-    Links and blocks that the metadata do not count are NaN. Raises `BadInputError`.
-    """
-    rows = []
-    for path in sorted(folder.glob("*/*/metadata.json")):
-        try:
-            trials = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-            raise BadInputError(f"{path} is not JSON: {error}") from error
-        if not isinstance(trials, list) or not all(isinstance(trial, dict) for trial in trials):
-            raise BadInputError(f"{path} is not a list of trials")
-        scenario = path.parents[1].name
-        rows += [_from_metadata(trial, scenario, path) for trial in trials]
-    if not rows:
-        raise BadInputError(f"{folder} holds no <scenario>/<configuration>/metadata.json")
-    table = pd.DataFrame(rows, columns=list(COLUMNS))
-    refuse_duplicates(table["stimulus"], str(folder))
-    return table
-
-
-def _from_metadata(trial: dict[str, Any], scenario: str, path: Path) -> dict[str, Any]:
-    name = trial.get("stimulus_name")
-    if not isinstance(name, str):
-        raise BadInputError(f"{path}: a trial has no stimulus_name")
-    middle = _count(trial, "num_middle_objects")
-    removed = str(trial.get("remove_middle")).lower() == "true"
-    # The generator of Drop inherits a count of 0 that means nothing.
-    counted = scenario in ("dominoes", "support")
-    room = re.sub(r"^b?'?([a-z]*)'?$", r"\1", str(trial.get("room", "")))
-    return {
-        "stimulus": canonical_name(name),
-        "scenario": scenario if scenario in SCENARIOS else scenario_of(canonical_name(name)),
-        "configuration": path.parent.name,
-        "elements": middle - removed if counted else np.nan,
-        "distractors": _count(trial, "num_distractors"),
-        "occluders": _count(trial, "num_occluders"),
-        "room": room,
-        "source": "metadata",
-    }
-
-
-def _count(trial: dict[str, Any], key: str) -> float:
-    value = pd.to_numeric(str(trial.get(key)), errors="coerce")
-    return float(value)
 
 
 def attributes_from_table(table: pd.DataFrame, where: str = "table of attributes") -> pd.DataFrame:
