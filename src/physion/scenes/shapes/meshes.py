@@ -1,4 +1,4 @@
-"""Build closed triangle meshes: turned on a lathe, extruded, or as the hull of points."""
+"""Closed triangle meshes: revolved, extruded and convex ones; mass properties."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ Faces = NDArray[np.int32]
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A triangle mesh in a shape's own frame, z up.
+    """Triangle mesh in the coordinates of a shape, z up.
 
     - ``vertices`` (V, 3): metres at unit scale.
     - ``faces`` (F, 3): indices, counter-clockwise as seen from outside.
-    - ``smooth``: crease angle in radians. Faces that meet at less than this angle are shaded as
-      one curved surface; 0 shades every face flat.
+    - ``smooth``: crease angle in radians. Faces that meet at a smaller angle are shaded smoothly; 0
+      shades every face flat.
     """
 
     vertices: Points
@@ -33,20 +33,20 @@ class Mesh:
 
     @property
     def bounds(self) -> Points:
-        """(2, 3): smallest and largest coordinates."""
+        """Return the smallest and largest coordinates (2, 3)."""
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
     def moved(self, scale: ArrayLike = 1.0, offset: ArrayLike = 0.0) -> Mesh:
-        """The mesh scaled (factors above zero) along its axes, then shifted by ``offset``."""
+        """Return the mesh scaled (by factors above zero), then shifted by ``offset``."""
         return Mesh(self.vertices * np.asarray(scale) + np.asarray(offset), self.faces, self.smooth)
 
     def rotated(self, matrix: Points) -> Mesh:
-        """The mesh turned by the rotation ``matrix`` (3, 3)."""
+        """Return the mesh rotated by ``matrix`` (3, 3)."""
         return Mesh(apply(matrix, self.vertices), self.faces, self.smooth)
 
 
 def hull(points: ArrayLike, smooth: float = 0.0) -> Mesh:
-    """The convex hull of ``points`` (K, 3), with outward faces."""
+    """Return the convex hull of ``points`` (K, 3), with faces oriented outwards."""
     cloud = np.asarray(points, np.float64)
     convex = ConvexHull(cloud)
     faces = convex.simplices.astype(np.int32)
@@ -66,11 +66,21 @@ def revolve(
     phase: float = 0.0,
     smooth: float = 0.0,
 ) -> Mesh:
-    """Turn a profile of (radius, height) points about the z axis.
+    """Return the surface of revolution of a profile about the z axis.
 
-    The solid lies to the left of the profile as it is walked, so an outer wall is walked upwards.
-    An open profile starts and ends on the axis (radius 0); a ``closed`` one is a loop off the axis.
-    ``phase`` turns the first of ``segments`` corners away from the x axis (radians).
+    Parameters
+    ----------
+    profile
+        Points (radius, height). The solid lies to the left of the direction of the profile, so that
+        an outer wall is given from the bottom up. An open profile starts and ends at radius 0.
+    segments
+        Number of corners of the circle.
+    closed
+        The profile is a loop that does not touch the axis, as for a torus.
+    phase
+        Angle of the first corner from the x axis, radians.
+    smooth
+        Crease angle of the mesh (`Mesh`).
     """
     angles = phase + 2 * math.pi * np.arange(segments) / segments
     circle = np.stack([cos(angles), sin(angles)], axis=1)
@@ -95,7 +105,7 @@ def revolve(
 
 
 def extrude(polygon: ArrayLike, bottom: float, top: float) -> Mesh:
-    """A convex polygon (K, 2), counter-clockwise, pulled from ``bottom`` to ``top`` along z."""
+    """Return a prism: a convex polygon (K, 2), counter-clockwise, from z ``bottom`` to ``top``."""
     base = np.asarray(polygon, np.float64)
     low = np.column_stack([base, np.full(len(base), bottom)])
     high = np.column_stack([base, np.full(len(base), top)])
@@ -103,13 +113,13 @@ def extrude(polygon: ArrayLike, bottom: float, top: float) -> Mesh:
 
 
 def box(center: ArrayLike, half: ArrayLike) -> Mesh:
-    """An axis-aligned box by its centre and half sizes."""
+    """Return an axis-aligned box with this centre and these half sizes."""
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
     return hull(signs).moved(half, center)
 
 
 def merge(meshes: Iterable[Mesh], smooth: float | None = None) -> Mesh:
-    """Several closed meshes as one; they may overlap. The first one's crease angle is kept."""
+    """Join closed meshes, which may overlap. The crease angle is by default that of the first."""
     parts = list(meshes)
     starts = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
     faces = [part.faces + start for part, start in zip(parts, starts, strict=True)]
@@ -121,10 +131,10 @@ def merge(meshes: Iterable[Mesh], smooth: float | None = None) -> Mesh:
 
 
 def solid_properties(mesh: Mesh) -> tuple[float, Points, Points]:
-    """Volume, centre of mass (3,), and inertia tensor (3, 3) about it for a mass of 1 kg.
+    """Return volume, centre of mass (3,), and inertia tensor (3, 3) about it for a mass of 1 kg.
 
-    The mesh is closed and filled evenly. Sums over the tetrahedra from the origin to every face,
-    so that the result is exact (Tonon, Journal of Mathematics and Statistics 1, 2005).
+    The mesh is closed and has uniform density. The integrals are sums over the tetrahedra from the
+    origin to every face and exact (Tonon, Journal of Mathematics and Statistics 1, 2005).
     """
     a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
     volumes = dot(a, np.cross(b, c)) / 6.0
@@ -139,6 +149,6 @@ def solid_properties(mesh: Mesh) -> tuple[float, Points, Points]:
 
 
 def inertia_from_second_moment(second: Points) -> Points:
-    """Inertia tensor (3, 3) of a unit mass with the second moments ``second`` about its centre."""
+    """Return the inertia tensor (3, 3) of a unit mass from its second moments about the centre."""
     trace = second[0, 0] + second[1, 1] + second[2, 2]
     return np.asarray(trace * np.eye(3) - second)

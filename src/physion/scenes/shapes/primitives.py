@@ -1,4 +1,4 @@
-"""The primitives of every scene by name: how they look, collide, and how heavy they are.
+"""Registry of shapes, and the primitives: their meshes, collision pieces and mass properties.
 
 Sizes are those of the official model records (docs/official-system.md, section 1.2), with
 their (x, y up, z) written as our (x, z, y up): the pivot is the centre of the bottom face, so that
@@ -37,7 +37,7 @@ from physion.scenes.shapes.meshes import (
 from physion.scenes.shapes.prop_names import PREFIX, PROPS
 
 CURVED = math.radians(40.0)
-"""Crease angle of turned shapes: walls are shaded round, rims stay sharp."""
+"""Crease angle of round shapes: walls are shaded smoothly, rims are sharp."""
 ROUND_SEGMENTS = 32
 CONE_SEGMENTS = 22
 """From the record: 0.9898 wide and 1 deep, which is a 22-sided cone with corners on one axis."""
@@ -76,12 +76,13 @@ PIPE_SECTORS, BOWL_SECTORS, BOWL_BANDS = 16, 12, 3
 
 @dataclass(frozen=True, eq=False)
 class ConvexPiece:
-    """A convex part of a shape for contacts.
+    """Convex part of a shape that is used for collisions.
 
-    ``center`` and ``half`` (half sizes; a sphere's radius three times; a cylinder's rx, ry and
-    half height, its axis along z) describe all kinds, as the bounding box for ``convex``, whose
-    corners are ``vertices`` (K, 3) in the shape's frame. The others have no vertices.
-    ``turn`` is the rotation (3, 3) from the piece's own axes to the shape's.
+    - ``center``, ``half``: centre and half sizes in the shape's coordinates. For a sphere ``half``
+      is three times the radius, for a cylinder (axis z) its two radii and half its height, for
+      ``convex`` those of the bounding box.
+    - ``vertices`` (K, 3): corners in the shape's coordinates, for ``convex`` only.
+    - ``rotation`` (3, 3): from the axes of the piece to those of the shape.
     """
 
     kind: Literal["box", "sphere", "cylinder", "convex"]
@@ -92,7 +93,7 @@ class ConvexPiece:
 
     @property
     def mesh(self) -> Mesh:
-        """The piece as a closed mesh; round ones have 32 sides."""
+        """Return the piece as a closed mesh; round pieces have 32 sides."""
         if self.kind == "convex":
             return hull(self.vertices)
         if self.kind == "box":
@@ -107,10 +108,10 @@ class ConvexPiece:
 
 @dataclass(frozen=True, eq=False)
 class MassProperties:
-    """How an evenly filled body resists motion.
+    """Volume, centre of mass and inertia of a body of uniform density.
 
-    ``volume`` in cubic metres; ``center`` of mass (3,) in the shape's frame, metres; ``inertia``
-    (3, 3) about that centre for a mass of 1 kg: multiply it by the body's mass.
+    ``volume`` is in cubic metres, ``center`` (3,) in metres in the shape's coordinates. ``inertia``
+    (3, 3) is about the centre for a mass of 1 kg: multiply it by the body's mass.
     """
 
     volume: float
@@ -120,9 +121,9 @@ class MassProperties:
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A shape at unit scale: its mesh to draw (closed) and its convex pieces to collide.
+    """Shape at unit scale: a closed mesh for rendering and convex pieces for collisions.
 
-    ``volume`` (cubic metres) is that of the mesh. ``hollow`` shapes have a hole or a cavity.
+    ``hollow`` shapes have a hole or a cavity.
     """
 
     name: str
@@ -132,56 +133,58 @@ class Shape:
 
     @property
     def volume(self) -> float:
-        """Volume of the drawn solid, cubic metres at unit scale."""
+        """Return the volume of the mesh, cubic metres at unit scale."""
         return solid_properties(self.mesh)[0]
 
     @property
     def bounds(self) -> Points:
-        """(2, 3): smallest and largest coordinates of the mesh."""
+        """Return the smallest and largest coordinates (2, 3) of the mesh."""
         return self.mesh.bounds
 
     def mass_properties(
         self, scale: Vec3 = (1.0, 1.0, 1.0), of: Literal["solid", "pieces"] = "solid"
     ) -> MassProperties:
-        """Volume, centre and inertia at ``scale``, of the drawn solid or of its pieces.
+        """Return the mass properties at ``scale``, of the mesh or of the collision pieces.
 
-        Unity takes a body's centre and inertia from its colliders: ``of="pieces"``.
+        Unity computes those of a body from its colliders, which corresponds to ``of="pieces"``.
         """
         parts = [self.mesh] if of == "solid" else [piece.mesh for piece in self.pieces]
-        found = [solid_properties(part.moved(scale)) for part in parts]
-        volumes = np.array([volume for volume, _, _ in found])
+        parts_properties = [solid_properties(part.moved(scale)) for part in parts]
+        volumes = np.array([volume for volume, _, _ in parts_properties])
         volume = float(ordered_sum(volumes))
-        shares = volumes / volume
-        centers = np.stack([center for _, center, _ in found])
-        center = ordered_sum(shares[:, None] * centers, axis=0)
+        weights = volumes / volume
+        centers = np.stack([center for _, center, _ in parts_properties])
+        center = ordered_sum(weights[:, None] * centers, axis=0)
         inertia = np.zeros((3, 3))
-        for share, part_center, (_, _, own) in zip(shares, centers, found, strict=True):
+        for weight, part_center, (_, _, part_inertia) in zip(
+            weights, centers, parts_properties, strict=True
+        ):
             arm = part_center - center
-            inertia += share * (own + inertia_from_second_moment(outer(arm, arm)))
+            inertia += weight * (part_inertia + inertia_from_second_moment(outer(arm, arm)))
         return MassProperties(volume, center, inertia)
 
 
 Outline = list[tuple[float, float]]
-Maker = Callable[[], Shape]
-shapes: Registry[Maker] = Registry(
+ShapeBuilder = Callable[[], Shape]
+shapes: Registry[ShapeBuilder] = Registry(
     "shape", {PREFIX + name: "physion.scenes.shapes.props:shapes" for name in PROPS}
 )
-"""Makers of shapes; call `shape` for the shape itself."""
+"""Registry of functions that build shapes; use `shape` to get a shape."""
 
 
 @cache
 def shape(name: str) -> Shape:
-    """The shape called ``name``; `UnknownNameError` with the closest names if there is none."""
+    """Return the shape called ``name``; raise `UnknownNameError` with the closest names."""
     return shapes.get(name)()
 
 
 def primitive(kind: Literal["box", "sphere", "cylinder"], center: Vec3, half: Vec3) -> ConvexPiece:
-    """A piece that engines know by itself, its axes along the shape's."""
+    """Return a collision piece of a kind that engines know, aligned with the axes of the shape."""
     return ConvexPiece(kind, center, half, np.zeros((0, 3)), np.eye(3))
 
 
 def convex(points: NDArray[np.float64]) -> ConvexPiece:
-    """A piece that is the hull of ``points`` (K, 3)."""
+    """Return a collision piece that is the convex hull of ``points`` (K, 3)."""
     corners = hull(points).vertices
     low, high = corners.min(axis=0), corners.max(axis=0)
     center, half = (low + high) / 2, (high - low) / 2
@@ -189,7 +192,7 @@ def convex(points: NDArray[np.float64]) -> ConvexPiece:
 
 
 def ball_mesh(radius: float, segments: int = ROUND_SEGMENTS) -> Mesh:
-    """A sphere about the origin, in ``segments`` meridians and half as many bands."""
+    """Return a sphere about the origin with ``segments`` meridians and half as many bands."""
     bands = segments // 2
     angles = [-math.pi / 2 + math.pi * i / bands for i in range(bands + 1)]
     rings = [(radius * cos(t), radius * sin(t)) for t in angles[1:-1]]
@@ -199,9 +202,16 @@ def ball_mesh(radius: float, segments: int = ROUND_SEGMENTS) -> Mesh:
 def ring_pieces(
     sections: list[NDArray[np.float64]], sectors: int, steps: int
 ) -> tuple[ConvexPiece, ...]:
-    """Convex sectors of a ring: each section (K, 2) of (radius, height), swept over its share.
+    """Divide a ring into convex sectors.
 
-    ``steps`` is how many corners of the drawn circle a sector spans.
+    Parameters
+    ----------
+    sections
+        Convex cross-sections (K, 2) of (radius, height); each is swept around the axis.
+    sectors
+        Number of sectors per section.
+    steps
+        Number of corners of the drawn circle that a sector spans.
     """
     pieces = []
     for section in sections:
@@ -321,9 +331,9 @@ def _pipe() -> Shape:
 
 
 def bowl_outline(radius: float, height: float, flat: float, points: int) -> Outline:
-    """A circular arc of ``points`` corners from (``flat``, 0) up to (``radius``, ``height``).
+    """Return a circular arc of ``points`` corners from (``flat``, 0) to (``radius``, ``height``).
 
-    Of all circles through both ends, that which a round bottom at z = 0 would have.
+    The centre of the circle is on the axis.
     """
     middle = (radius * radius + height * height - flat * flat) / (2 * height)
     size = math.sqrt(flat * flat + middle * middle)
@@ -349,7 +359,7 @@ def _bowl() -> Shape:
 
 
 def _inside_bowl(wall: float, points: int) -> Outline:
-    """The inner side of a bowl's wall, from the bottom up to the rim."""
+    """Return the inner profile of a bowl's wall, from the bottom up to the rim."""
     flat = max(BOWL_FLAT - wall / 2, 0.01)
     arc = bowl_outline(BOWL_RADIUS - wall, BOWL_HEIGHT - wall, flat, points)
     return [(r, z + wall) for r, z in arc]
@@ -366,7 +376,7 @@ def _ramp_60() -> Shape:
 
 
 def _ramp(name: str, grade: float, length: float, height: float) -> Shape:
-    """A slope that rises from its foot towards +x by ``grade``, then a level platform."""
+    """Return a ramp that rises from its foot towards +x by ``grade``, then a level platform."""
     foot, top, end = -RAMP_FOOT, height / grade - RAMP_FOOT, length - RAMP_FOOT
     side = [(foot, 0.0), (top, height), (end, height), (end, 0.0)]
     corners = [(x, y, z) for x, z in side for y in (-RAMP_DEPTH / 2, RAMP_DEPTH / 2)]
@@ -374,7 +384,7 @@ def _ramp(name: str, grade: float, length: float, height: float) -> Shape:
 
 
 def _solid(name: str, mesh: Mesh) -> Shape:
-    """A convex shape, which is its own single piece."""
+    """Return a convex shape, whose mesh is also its only collision piece."""
     return Shape(name, mesh, (convex(mesh.vertices),))
 
 

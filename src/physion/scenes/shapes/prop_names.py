@@ -1,4 +1,4 @@
-"""Which prop stands for which library model of the official scenes, and how large it is."""
+"""Names and categories of props, and the prop that replaces each official library model."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _NAMES = """
     vase_bottle wineglass
 """
 PROPS = tuple(_NAMES.split())
-"""Names of all props; their shapes are called ``prop:`` and the name."""
+"""Names of all props. The shape of a prop is called ``prop:NAME``."""
 
 _STANDS_FOR = {
     "armchair": "armchair sofa",
@@ -72,8 +72,7 @@ _MODELS = {
     "vase_beaker": "vase_02 vase_05 vase_laura_deko_vase_set",
     "vase_bottle": "vase_01 vase_03 vase_06",
 }
-"""Models of the published trials that another prop than that of their category is more like, by
-their names and proportions."""
+"""Models of the published trials that resemble another prop more than that of their category."""
 _PROP_OF_MODEL = {
     model: PREFIX + prop for prop, models in _MODELS.items() for model in models.split()
 }
@@ -106,32 +105,32 @@ PROP_CATEGORIES: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "full": _FULL,
     }
 )
-"""Props by the words of the official scenery: a category in the singular or plural, or ``full``,
-which is all that occur in the published trials (docs/official-system.md, section 1.2)."""
+"""Props by category, in the singular or plural; ``full`` are all that occur in the published trials
+(docs/official-system.md, section 1.2)."""
 
 
 def expand_props(names: Sequence[str]) -> tuple[str, ...]:
-    """Names of props for names of props and of categories, in the order given, each once.
+    """Replace categories of props by their members; return each name once, in order.
 
-    Underscores and spaces are alike. `UnknownNameError` with the closest names for others.
+    Underscores and spaces are equivalent. Raises `UnknownNameError` with the closest names.
     """
-    found: list[str] = []
+    expanded: list[str] = []
     for name in names:
         bare = name.removeprefix(PREFIX)
         spaced, joined = bare.lower().replace("_", " "), bare.lower().replace(" ", "_")
-        # A category wins over a prop of its name: "chair" is any chair, "prop:chair" that one.
+        # A category takes precedence: "chair" is any chair, "prop:chair" the prop of that name.
         if not name.startswith(PREFIX) and spaced in PROP_CATEGORIES:
-            found += PROP_CATEGORIES[spaced]
+            expanded += PROP_CATEGORIES[spaced]
         elif joined in PROPS:
-            found.append(joined)
+            expanded.append(joined)
         else:
             raise UnknownNameError("prop or category of props", name, (*PROPS, *PROP_CATEGORIES))
-    return tuple(dict.fromkeys(found))
+    return tuple(dict.fromkeys(expanded))
 
 
 @dataclass(frozen=True)
 class ModelBounds:
-    """Where a library model lies about its pivot at scale 1, in our axes.
+    """Bounding box of a library model relative to its pivot at scale 1, in our axes.
 
     ``bottom`` is the centre of the bottom face and ``size`` the extent, metres.
     """
@@ -142,7 +141,7 @@ class ModelBounds:
 
 
 def prop_for(category: str, model: str = "") -> str:
-    """The shape that stands for a library ``model`` of ``category``; a crate for unknown ones."""
+    """Return the shape that replaces a library model; a crate for unknown categories."""
     if model in _PROP_OF_MODEL:
         return _PROP_OF_MODEL[model]
     return _PROP_OF.get(category.lower().replace("_", " "), FALLBACK)
@@ -151,18 +150,18 @@ def prop_for(category: str, model: str = "") -> str:
 def read_model_bounds(path: Path) -> dict[str, ModelBounds]:
     """Read ``model_bounds.json`` (official axes, y up) into our axes, by model name.
 
-    The six face centres of each record span its box; records may be turned inside out, and flat
-    ones get a millimetre. `BadInputError` names the model and the field that is missing.
+    A record gives the centres of the six faces, possibly with sides exchanged; flat models get a
+    thickness of 1 mm. `BadInputError` names the model and the missing field.
     """
     try:
         models = json.loads(path.read_text(encoding="utf-8"))["models"]
     except (OSError, UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError) as error:
         raise BadInputError(
-            f"{path} is no record of model bounds ({type(error).__name__}: {error}); "
-            "it needs an object 'models' of name -> bounds"
+            f"{path} cannot be read as model bounds ({type(error).__name__}: {error}); "
+            "it needs an object 'models' with bounds by model name"
         ) from error
     if not isinstance(models, dict):
-        raise BadInputError(f"{path}: 'models' must be an object of name -> bounds")
+        raise BadInputError(f"{path}: 'models' must be an object with bounds by model name")
     return {
         name: _read_bounds(record, f"{path}: model {name!r}") for name, record in models.items()
     }

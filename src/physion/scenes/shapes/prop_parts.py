@@ -1,7 +1,7 @@
-"""What a prop is: parts with looks of their own, fitted to the unit box and registered.
+"""Parts of props with looks of their own; registration of a prop as a shape.
 
-A prop is modelled in metres at its natural size, front towards +y, and then fitted to the box
-[-0.5, 0.5] x [-0.5, 0.5] x [0, 1]: a body's scale is the size of the model that it stands for.
+A prop is modelled in metres at its natural size with its front towards +y, and then scaled to the
+box [-0.5, 0.5] x [-0.5, 0.5] x [0, 1], so that the scale of a body is its size in metres.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from physion.scenes.shapes.primitives import CURVED, Shape, convex, shapes
 from physion.scenes.shapes.prop_names import PREFIX
 
 NATURAL_SIZES: dict[str, Vec3] = {}
-"""Width, depth and height in metres that each prop looks right at, by name without prefix."""
+"""Natural width, depth and height of each prop in metres, by name without prefix."""
 
 
 @dataclass(frozen=True)
 class PropShape(Shape):
-    """A shape whose triangles may have colours of their own.
+    """Shape whose triangles may have looks of their own.
 
-    ``paint`` (triangles of the mesh,) is 0 where the look of the body is seen and i where
-    ``own[i - 1]`` is. ``made`` is the size in metres in which the prop was modelled.
+    - ``paint`` (F,): per triangle 0 for the look of the body, or i for ``own_looks[i - 1]``.
+    - ``modelled_size``: size in metres at which the prop was modelled.
     """
 
     paint: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
@@ -38,10 +38,11 @@ class PropShape(Shape):
 
 @dataclass(frozen=True, eq=False)
 class PropPart:
-    """One closed solid of a prop, and the corners of the convex pieces that stand for it.
+    """One closed solid of a prop.
 
-    ``look`` is its own colour and texture, None for those of the body. ``patches`` are looks of
-    some of its triangles: masks (F,) with their looks, the last one wins.
+    - ``mesh``: its mesh, metres. ``pieces``: corners (K, 3) of its convex collision pieces.
+    - ``look``: its look, None for that of the body.
+    - ``patches``: masks (F,) of triangles with looks of their own; a later one takes precedence.
     """
 
     mesh: Mesh
@@ -50,34 +51,37 @@ class PropPart:
     patches: tuple[tuple[NDArray[np.bool_], Look], ...] = ()
 
     def moved(self, offset: ArrayLike) -> PropPart:
-        """The part shifted by ``offset``, metres."""
+        """Return the part shifted by ``offset``, metres."""
         shift = np.asarray(offset, np.float64)
         pieces = tuple(piece + shift for piece in self.pieces)
         return replace(self, mesh=self.mesh.moved(offset=shift), pieces=pieces)
 
     def rotated(self, axis: ArrayLike, angle: float, about: ArrayLike = (0, 0, 0)) -> PropPart:
-        """The part turned by ``angle`` radians about ``axis`` through the point ``about``."""
+        """Return the part rotated by ``angle`` (radians) about ``axis`` through ``about``."""
         matrix, center = axis_angle_matrix(axis, angle), np.asarray(about, np.float64)
         shift = center - apply(matrix, center)
         pieces = tuple(apply(matrix, piece) + shift for piece in self.pieces)
         return replace(self, mesh=self.mesh.rotated(matrix).moved(offset=shift), pieces=pieces)
 
     def patched(self, where: Callable[[Points, Points], NDArray[np.bool_]], look: Look) -> PropPart:
-        """The part with ``look`` on the triangles whose centres and normals (F, 3) are so."""
+        """Return a copy with ``look`` on the triangles for which ``where(centers, normals)``."""
         corners = self.mesh.vertices[self.mesh.faces]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         mask = np.asarray(where(ordered_mean(corners, axis=1), unit(normals)), np.bool_)
         return replace(self, patches=(*self.patches, (mask, look)))
 
 
-Maker = Callable[[], Iterable[PropPart]]
+PartsBuilder = Callable[[], Iterable[PropPart]]
 
 
-def prop(name: str, size: Vec3) -> Callable[[Maker], Maker]:
-    """Register a builder of parts as the shape ``prop:name``, of a natural ``size`` in metres."""
+def prop(name: str, size: Vec3) -> Callable[[PartsBuilder], PartsBuilder]:
+    """Return a decorator that registers a generator of parts as the shape ``prop:name``.
+
+    ``size`` is the natural width, depth and height in metres.
+    """
     NATURAL_SIZES[name] = size
 
-    def add(parts_of: Maker) -> Maker:
+    def add(parts_of: PartsBuilder) -> PartsBuilder:
         shapes.register(PREFIX + name)(lambda: _fitted(name, list(parts_of())))
         return parts_of
 
@@ -106,8 +110,8 @@ def _fitted(name: str, parts: list[PropPart]) -> PropShape:
 
 
 def _paint(part: PropPart, own_looks: tuple[Look, ...]) -> NDArray[np.int32]:
-    slot = 0 if part.look is None else 1 + own_looks.index(part.look)
-    paint = np.full(len(part.mesh.faces), slot, np.int32)
+    index = 0 if part.look is None else 1 + own_looks.index(part.look)
+    paint = np.full(len(part.mesh.faces), index, np.int32)
     for mask, look in part.patches:
         paint[mask] = 1 + own_looks.index(look)
     return paint

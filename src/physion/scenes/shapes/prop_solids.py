@@ -1,4 +1,4 @@
-"""Solids that props are made of: boxes, cushions, limbs, turned, bent and lofted ones."""
+"""Solids from which props are built: boxes, limbs, surfaces of revolution, tubes and lofts."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from physion.scenes.shapes.primitives import CURVED, ball_mesh
 from physion.scenes.shapes.prop_parts import PropPart
 
 SIDES = 24
-"""Sides of what is turned."""
+"""Number of sides of a surface of revolution."""
 
 
 def solid(mesh: Mesh, look: Look | None = None) -> PropPart:
-    """A convex mesh, which is its own piece."""
+    """Return a part of a convex mesh, which is also its collision piece."""
     return PropPart(mesh, (mesh.vertices,), look)
 
 
 def board(center: ArrayLike, half: ArrayLike, look: Look | None = None) -> PropPart:
-    """A box by its centre and half sizes."""
+    """Return a box with this centre and these half sizes."""
     return solid(box(center, half), look)
 
 
@@ -38,7 +38,7 @@ def block(
     top: float,
     look: Look | None = None,
 ) -> PropPart:
-    """A box that tapers: half sizes ``low`` at height ``bottom``, ``high`` at ``top``."""
+    """Return a tapered box: half sizes ``low`` at height ``bottom``, ``high`` at ``top``."""
     signs = [(x, y) for x in (-1, 1) for y in (-1, 1)]
     points = [(x * low[0], y * low[1], bottom) for x, y in signs]
     return solid(hull(points + [(x * high[0], y * high[1], top) for x, y in signs]), look)
@@ -47,7 +47,7 @@ def block(
 def cushion(
     center: ArrayLike, half: ArrayLike, radius: float, look: Look | None = None
 ) -> PropPart:
-    """A box with edges rounded by ``radius``."""
+    """Return a box with edges rounded by ``radius``."""
     ball = ball_mesh(radius, 12).vertices
     inner = np.asarray(half, np.float64) - radius
     signs = itertools.product((-1, 1), repeat=3)
@@ -62,14 +62,14 @@ def limb(
     thin: float | None = None,
     look: Look | None = None,
 ) -> PropPart:
-    """A rounded limb from ``start`` to ``end``; radii ``thick`` and ``thin`` at the ends."""
+    """Return a rounded cone from ``start`` (radius ``thick``) to ``end`` (radius ``thin``)."""
     first = ball_mesh(thick, 10).moved(offset=start).vertices
     last = ball_mesh(thick if thin is None else thin, 10).moved(offset=end).vertices
     return solid(hull(np.concatenate([first, last]), CURVED), look)
 
 
 def ball(center: ArrayLike, half: ArrayLike, look: Look | None = None, sides: int = 16) -> PropPart:
-    """An ellipsoid by its centre and half sizes."""
+    """Return an ellipsoid with this centre and these half axes."""
     return solid(ball_mesh(1.0, sides).moved(half, center), look)
 
 
@@ -79,9 +79,10 @@ def lathe(
     look: Look | None = None,
     sides: int = SIDES,
 ) -> PropPart:
-    """An ``outline`` of (radius, height) from the bottom up, turned; hollow if it has a ``wall``.
+    """Return the surface of revolution of an ``outline`` of (radius, height) from the bottom up.
 
-    Its pieces are the full slices between neighbouring points.
+    It is hollow and open above if a thickness ``wall`` is given. Its collision pieces are full
+    slices between neighbouring points.
     """
     (_, bottom), (_, top) = outline[0], outline[-1]
     profile = [(0.0, bottom), *outline]
@@ -101,14 +102,14 @@ def lathe(
 def sleeve(
     outline: Sequence[tuple[float, float]], wall: float, look: Look | None = None
 ) -> PropPart:
-    """A turned wall, open above and below, as a lamp shade; its pieces are full slices."""
+    """Return a round wall, open above and below, as a lamp shade; its pieces are full slices."""
     inside = [(r - wall, z) for r, z in reversed(outline)]
     mesh = revolve([*outline, *inside], SIDES, closed=True, smooth=CURVED)
     return replace(lathe(outline, look=look), mesh=mesh)
 
 
 def curve(points: Sequence[Sequence[float]] | Sequence[Points], steps: int = 5) -> Points:
-    """A smooth line (K, D) through ``points`` (Catmull-Rom), ``steps`` to each span."""
+    """Return a Catmull-Rom spline (K, D) through ``points``, with ``steps`` points per span."""
     p = np.asarray(points, np.float64)
     p = np.concatenate([p[:1], p, p[-1:]])
     t = np.linspace(0, 1, steps, endpoint=False)[:, None]
@@ -120,7 +121,7 @@ def curve(points: Sequence[Sequence[float]] | Sequence[Points], steps: int = 5) 
 
 
 def outline(points: Sequence[tuple[float, float]], steps: int = 3) -> list[tuple[float, float]]:
-    """A smooth outline of (radius, height) through ``points``, for `turned`."""
+    """Return a smooth outline of (radius, height) through ``points``, for `lathe`."""
     return [(float(r), float(z)) for r, z in curve(points, steps)]
 
 
@@ -133,19 +134,32 @@ def tube(
     rounded: bool = False,
     closed: bool = False,
 ) -> PropPart:
-    """A tube along ``path`` (K, 3) with elliptic sections: one radius, one a point, or two.
+    """Return a tube along ``path`` with elliptic cross-sections.
 
-    Of two radii the first lies level, across the path, where the path is not upright; ``rounded``
-    adds domes at both ends; a ``closed`` path comes back to its start.
+    Parameters
+    ----------
+    path
+        Points (K, 3).
+    radii
+        One radius, one per point (K,), or two per point (K, 2), of which the first is horizontal
+        unless the path is vertical.
+    look
+        Look of the part.
+    sides
+        Number of sides of the cross-section.
+    rounded
+        Add domes at both ends.
+    closed
+        Connect the end of the path with its start.
     """
     points = np.asarray(path, np.float64)
     given = np.asarray(radii, np.float64)
     if given.ndim < 2:
         given = given.reshape(-1, 1)
     sizes = np.broadcast_to(given, (len(points), 2))
-    across, up, ways = _frames(points, closed)
+    across, up, ahead_axes = _frames(points, closed)
     if rounded:
-        points, sizes, across, up = _domed(points, sizes, across, up, ways)
+        points, sizes, across, up = _domed(points, sizes, across, up, ahead_axes)
     angles = 2 * math.pi * np.arange(sides) / sides
     section = np.stack([cos(angles), sin(angles)], axis=1)
     spokes = np.stack([across * sizes[:, :1], up * sizes[:, 1:]], axis=1)
@@ -160,20 +174,24 @@ def tube(
 
 
 def loft(rings: Points, look: Look | None = None, *, closed: bool = False) -> PropPart:
-    """The skin over rings (K, S, 3) of corners, closed by fans; its pieces lie between rings."""
+    """Return the surface through rings (K, S, 3) of corners, with closed ends.
+
+    A ``closed`` loft connects the last ring with the first instead. The collision pieces are the
+    hulls of neighbouring rings.
+    """
     count, sides = rings.shape[:2]
-    at = np.arange(count * sides).reshape(count, sides)
+    index = np.arange(count * sides).reshape(count, sides)
     if closed:
-        at = np.concatenate([at, at[:1]])
-    low, high = at[:-1], at[1:]
+        index = np.concatenate([index, index[:1]])
+    low, high = index[:-1], index[1:]
     ahead, above = np.roll(low, -1, axis=1), np.roll(high, -1, axis=1)
     faces = [np.stack(x, axis=-1).reshape(-1, 3) for x in ((low, ahead, above), (low, above, high))]
     vertices = rings.reshape(-1, 3)
     if not closed:
         vertices = np.concatenate([vertices, ordered_mean(rings[[0, -1]], axis=1)])
         first, last = count * sides, count * sides + 1
-        faces.append(np.stack([np.full(sides, first), np.roll(at[0], -1), at[0]], axis=1))
-        faces.append(np.stack([np.full(sides, last), at[-1], np.roll(at[-1], -1)], axis=1))
+        faces.append(np.stack([np.full(sides, first), np.roll(index[0], -1), index[0]], axis=1))
+        faces.append(np.stack([np.full(sides, last), index[-1], np.roll(index[-1], -1)], axis=1))
     mesh = Mesh(vertices, np.concatenate(faces).astype(np.int32), CURVED)
     if solid_properties(mesh)[0] < 0:
         mesh = replace(mesh, faces=np.ascontiguousarray(mesh.faces[:, ::-1]))
@@ -185,42 +203,42 @@ def loft(rings: Points, look: Look | None = None, *, closed: bool = False) -> Pr
 def arc(
     center: ArrayLike, right: ArrayLike, up: ArrayLike, first: float, last: float, count: int
 ) -> Points:
-    """``count`` points (K, 3) of an ellipse with these half axes, between two angles in radians."""
+    """Return ``count`` points (K, 3) of an elliptic arc between two angles in radians."""
     angles = np.linspace(first, last, count)[:, None]
     middle, x, y = (np.asarray(v, np.float64) for v in (center, right, up))
     return np.asarray(middle + cos(angles) * x + sin(angles) * y)
 
 
 def ring(x: float, y: float, z: float, sides: int = 12) -> list[Vec3]:
-    """Corners of a level ellipse at height ``z``."""
+    """Return the corners of a horizontal ellipse at height ``z``."""
     angles = 2 * math.pi * np.arange(sides) / sides
     return [(x * cos(t), y * sin(t), z) for t in angles]
 
 
 def _frames(points: Points, closed: bool) -> tuple[Points, Points, Points]:
-    """Axes (K, 3) across and up, and the way ahead, that turn as little as the path bends."""
+    """Return a rotation-minimising frame along a path: axes across, up and ahead, each (K, 3)."""
     ahead = np.roll(points, -1, axis=0) - points
     behind = points - np.roll(points, 1, axis=0)
     if not closed:
         ahead[-1], behind[0] = behind[-1], ahead[0]
-    ways = unit(unit(ahead) + unit(behind))
-    level = np.cross(ways[0], (0.0, 0.0, 1.0))
+    ahead_axes = unit(unit(ahead) + unit(behind))
+    level = np.cross(ahead_axes[0], (0.0, 0.0, 1.0))
     across = level if norm(level) > 0.2 else np.array([1.0, 0.0, 0.0])
-    found = []
-    for way in ways:
+    axes = []
+    for way in ahead_axes:
         across = unit(across - way * dot(across, way))
-        found.append(across)
-    sideways = np.array(found)
-    return sideways, np.cross(sideways, ways), ways
+        axes.append(across)
+    sideways = np.array(axes)
+    return sideways, np.cross(sideways, ahead_axes), ahead_axes
 
 
 def _domed(
-    points: Points, sizes: Points, across: Points, up: Points, ways: Points
+    points: Points, sizes: Points, across: Points, up: Points, ahead_axes: Points
 ) -> tuple[Points, Points, Points, Points]:
-    """The path with three more rings at each end, which close it like half a ball."""
+    """Return the path with three more rings at each end that form a dome."""
     angles = np.radians([84.0, 60.0, 30.0])[:, None]
-    first = points[0] - ways[0] * sin(angles) * sizes[0].min()
-    last = points[-1] + ways[-1] * sin(angles[::-1]) * sizes[-1].min()
+    first = points[0] - ahead_axes[0] * sin(angles) * sizes[0].min()
+    last = points[-1] + ahead_axes[-1] * sin(angles[::-1]) * sizes[-1].min()
     return (
         np.concatenate([first, points, last]),
         np.concatenate([sizes[0] * cos(angles), sizes, sizes[-1] * cos(angles[::-1])]),

@@ -1,9 +1,9 @@
-"""Stand-ins for the library models of the official scenes: vases, chairs, dogs, lamps, ...
+"""Props that replace the library models of the official scenes: vases, chairs, dogs, lamps, ...
 
-The official models may not be shipped, so each prop is built from a few solids, in the modules that
-are imported here. It fills the box [-0.5, 0.5] x [-0.5, 0.5] x [0, 1] exactly: a body's scale is
-the size of the model that it stands for, whatever that is. Front is +y. Props are shapes like any
-other (``prop:vase``): mostly scenery, but their parts are also pieces for contacts.
+The licence of the official models forbids shipping them, so each prop is built from a few solids,
+in the modules imported here. A prop fills the box [-0.5, 0.5] x [-0.5, 0.5] x [0, 1] exactly, so
+that the scale of a body is the size of the model it replaces. Its front is +y. Props are shapes
+like any other (``prop:vase``): mostly scenery, but they have collision pieces as well.
 """
 
 from __future__ import annotations

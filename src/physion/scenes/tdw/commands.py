@@ -1,7 +1,7 @@
-"""What every official command does to the objects of a trial.
+"""Execution of the official simulator's commands: one method of `CommandReader` per command.
 
-`CommandReader` carries commands out, one method each; `read_logs` makes the scene of it.
-Vectors and turns are brought into our axes here: (x, y, z) of Unity is (x, z, y) of ours.
+`read_logs` builds a scene from the result. Vectors and rotations are converted to our axes here:
+(x, y, z) of Unity is (x, z, y) of ours.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
+from physion.dataclass_json import shown
 from physion.errors import BadInputError, PhysionError
 from physion.numerics.rotations import multiply_quaternions
 from physion.scenes.sampling.parameters import as_quaternion, euler_rotation
@@ -51,47 +52,48 @@ IGNORED_COMMANDS = frozenset(
         "unload_asset_bundles",
     }
 )
-"""Commands that change nothing here: output requests, picture settings, and engine settings that
-are the same in every published log and are the defaults of our engine."""
+"""Commands without effect here: requests for output, image settings, and engine settings that are
+equal in all published logs and are the defaults of our engine."""
 
 
 ROOMS = {"box_room_2018": "box", "tdw_room": "bright", "archviz_house": "bright"}
 TEXTURES = {"wood_european_ash": "wood_ash", "parquet_wood_red_cedar": "wood_cedar"}
 VANISHING_SCALE = 1e-4
-"""Bodies scaled below this are placeholders of the official generator (no attachment, an empty
-end of the size gradient); they are left out and noted."""
+"""Bodies with a smaller scale are placeholders of the official generator (a missing attachment, or
+the end of a size gradient). They are left out, with a note."""
 
 UNSET_MATERIAL = SurfaceMaterial(0.6, 0.6, 0.0)
-"""Unity's default material, for objects that were given none."""
+"""Unity's default material, for objects without one."""
 
 
 def vector(value: Any) -> Vec3:
-    """An official vector (x right, y up, z forward) in our axes (z up)."""
+    """Convert an official vector (x right, y up, z forward) to our axes (z up)."""
     try:
         x, y, z = float(value["x"]), float(value["y"]), float(value["z"])
     except (TypeError, KeyError, ValueError):
-        raise BadInputError(f"expected x, y and z numbers, found {value!r}") from None
+        raise BadInputError(f"expected numbers x, y and z, not {shown(value)}") from None
     if not all(map(math.isfinite, (x, y, z))):
-        raise BadInputError(f"expected finite numbers, found {value!r}")
+        raise BadInputError(f"expected finite numbers, not {shown(value)}")
     return (x, z, y)
 
 
 def quaternion_from_euler(degrees: Any) -> Quat:
-    """Unity's Euler angles (turn about z, then x, then y) as a quaternion in our axes."""
-    # Swapping y and z mirrors space, so that turns go the other way; two whole turns are none.
+    """Convert Unity's Euler angles (about z, then x, then y) to a quaternion in our axes."""
+    # Swapping y and z is a reflection, which changes the sign of rotations. 720 degrees are the
+    # identity also for quaternions.
     x, y, z = (-math.fmod(angle, 720.0) for angle in vector(degrees))
     return euler_rotation(x, y, z)
 
 
 def _to_our_axes(unity: Quat) -> Quat:
-    # As in `quaternion_from_euler`, the direction of the turn flips.
+    # The sign of the rotation changes, as in `quaternion_from_euler`.
     w, x, y, z = unity
     return (w, -x, -z, -y)
 
 
 @dataclass
 class LoggedObject:
-    """An object of the log while its commands are read."""
+    """Object of a command log, as changed by the commands read so far."""
 
     id: int
     model: str
@@ -120,7 +122,7 @@ class LoggedObject:
 
 
 class CommandReader:
-    """The state of a trial while its commands are carried out, in our axes."""
+    """State of a trial while its commands are executed, in our axes."""
 
     def __init__(self, unknown: Counter[str]) -> None:
         self.unknown = unknown
@@ -136,18 +138,18 @@ class CommandReader:
         self.notes: list[str] = []
 
     def read(self, setup: list[Command], frames: list[tuple[int, list[Command]]]) -> None:
-        """Carry out the set-up, then (line, commands) of every frame."""
+        """Execute the set-up commands, then those of every frame: (line number, commands)."""
         for command in setup:
-            self._carry_out(command, "the set-up before the first trial")
+            self._execute(command, "the set-up before the first trial")
         for frame, (line, commands) in enumerate(frames):
             self.frame = frame
-            # The last lists only clean up for the next trial.
+            # Lists that only destroy objects clean up for the next trial.
             if frame and commands and all("destroy" in c["$type"] for c in commands):
                 break
             for command in commands:
-                self._carry_out(command, f"line {line}")
+                self._execute(command, f"line {line}")
 
-    def _carry_out(self, command: Command, where: str) -> None:
+    def _execute(self, command: Command, where: str) -> None:
         kind = command["$type"]
         if kind in IGNORED_COMMANDS:
             return
@@ -167,19 +169,21 @@ class CommandReader:
     def _object(self, command: Command, key: str = "id") -> LoggedObject:
         thing = self.objects.get(command[key])
         if thing is None:
-            raise BadInputError(f"object {command[key]} was never created")
+            raise BadInputError(f"object {shown(command[key])} was never created")
         return thing
 
     def _at_start(self) -> None:
         if self.frame:
-            raise BadInputError(f"comes at frame {self.frame}; only pushes may come later than 0")
+            raise BadInputError(
+                f"is at frame {self.frame}, but after frame 0 only pushes are allowed"
+            )
 
-    # Commands, one method each.
+    # One method per command.
 
     def do_add_scene(self, command: Command) -> None:
         name = command["name"]
         if name not in ROOMS:
-            self.notes.append(f"room {name!r} is not modelled; the empty room stands in")
+            self.notes.append(f"room {name!r} is not available; the empty room is used")
         self.room = ROOMS.get(name, "empty")
 
     def do_set_field_of_view(self, command: Command) -> None:

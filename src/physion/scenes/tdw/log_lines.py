@@ -1,4 +1,4 @@
-"""Command logs as text: lines become commands by trial, and every fault gets its place."""
+"""Reading of command logs: lines are grouped by trial, and errors are reported with their line."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from physion.errors import BadInputError
 Command: TypeAlias = dict[str, Any]
 
 MAX_LOG_BYTES = 1 << 30
-"""A log larger than this when unpacked is refused; the largest official one has a few MB."""
+"""Largest size of an uncompressed log; the largest official one has a few MB."""
 
 
 @dataclass(frozen=True)
 class ImportFailure:
-    """A trial that could not be imported: which file, which trial (None: all), and why."""
+    """Trial that could not be imported, with file, trial (None for all of the file) and reason."""
 
     file: str
     trial: str | None
@@ -34,9 +34,11 @@ class ImportFailure:
 
 @dataclass
 class CommandLog:
-    """One log: commands before the first trial, then by trial tag (line number, commands) a frame.
+    """Content of a command log.
 
-    Trials with a broken line are in ``failures`` instead.
+    - ``setup``: commands before the first trial.
+    - ``trials``: by trial tag, the (line number, commands) of every frame.
+    - ``failures``: trials with a broken line; they are not in ``trials``.
     """
 
     setup: list[Command] = field(default_factory=list)
@@ -45,7 +47,7 @@ class CommandLog:
 
 
 def find_logs(root: Path) -> list[Path]:
-    """Every command log under ``root`` in the order of their paths."""
+    """Return all command logs in the folder ``root``, sorted by path."""
     if not root.exists():
         raise BadInputError(f"{root} does not exist; give a folder with official command logs")
     if not root.is_dir():
@@ -57,10 +59,10 @@ def find_logs(root: Path) -> list[Path]:
 
 
 def read_metadata(path: Path) -> dict[str, dict[str, Any]]:
-    """The records of ``metadata.json`` by the number of their trial, as text.
+    """Read the records of ``metadata.json`` by trial number (as text).
 
-    The number ends the stimulus name (``..._0012`` is trial 12); where a record has no such name
-    its place in the file is its number.
+    The number is the end of the stimulus name (``..._0012`` is trial 12), or the index of the
+    record in the file if the name has none.
     """
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
@@ -69,7 +71,7 @@ def read_metadata(path: Path) -> dict[str, dict[str, Any]]:
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise BadInputError(f"{path} cannot be read: {error}") from error
     if not isinstance(data, list) or not all(isinstance(record, dict) for record in data):
-        raise BadInputError(f"{path} is not a list with one object a trial")
+        raise BadInputError(f"{path} must be a list with one object per trial")
     records = {}
     for position, record in enumerate(data):
         match = re.search(r"_(\d{4,})$", str(record.get("stimulus_name")))
@@ -78,7 +80,7 @@ def read_metadata(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def read_command_log(path: Path) -> CommandLog:
-    """Read a log, packed or not; `BadInputError` if it cannot be read to its end."""
+    """Read a log, compressed or not; `BadInputError` if it cannot be read to its end."""
     log, broken, size, last = CommandLog(), set(), 0, ""
     opener: Callable[..., Any] = gzip.open if path.suffix == ".gz" else open
     try:
@@ -86,10 +88,10 @@ def read_command_log(path: Path) -> CommandLog:
             for number, line in enumerate(lines, 1):
                 size += len(line)
                 if size > MAX_LOG_BYTES:
-                    raise BadInputError(f"{path} is larger than {MAX_LOG_BYTES} bytes unpacked")
+                    raise BadInputError(f"{path} has more than {MAX_LOG_BYTES} bytes uncompressed")
                 if not line.strip():
                     continue
-                # A line that lost its end belongs to the trial it stands in.
+                # A line whose end is missing belongs to the same trial as the line before.
                 tag = _tag(line) or last
                 last = tag
                 try:

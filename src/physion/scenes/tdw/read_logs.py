@@ -1,8 +1,8 @@
-"""Official command logs become scenes: the one door through which left-handed, y-up data comes in.
+"""Import of official command logs as scenes. They are left-handed with y up; our scenes are not.
 
 A configuration is a folder with ``tdw_commands.json`` (or ``.json.gz``) and ``metadata.json``.
-The log holds one JSON list of commands a line, followed by ``trial N``; the lists of one trial are
-its frames, ``trial None`` prepares the room (docs/official-system.md, section 8).
+Each line of the log is a JSON list of commands followed by ``trial N``. The lists of a trial are
+its frames; ``trial None`` prepares the room (docs/official-system.md, section 8).
 """
 
 from __future__ import annotations
@@ -45,21 +45,22 @@ SCENARIOS = {controller: scenario for scenario, controller in CONTROLLERS.items(
 Collide controller: a folder whose name contains ``rolling`` is Roll."""
 
 MAX_FRAMES = {"collide": 152, "contain": 452, "link": 452, "support": 602, "drape": 151}
-"""Longest trial by scenario, frame 0 counted; 302 for the others (reference section 2.6)."""
+"""Frames of the longest trial, frame 0 included; 302 for other scenarios (official-system.md, 2.6)."""
 
 FLOORS = {"bright": 0.0043}
-"""Height in metres of a room's floor where it is not 0. In ``tdw_room`` everything that was put
-at 0 ends .004 or .005 higher than in ``box_room_2018`` (recorded displacements of the targets)."""
+"""Height of a room's floor if it is not 0, metres. In ``tdw_room`` bodies placed at 0 come to rest
+4 to 5 mm higher than in ``box_room_2018`` (recorded displacements of the targets)."""
 
 FLEX_SETTLE_FRAMES = 100
 
 
 @dataclass(frozen=True)
 class RecordedOutcome:
-    """What the official simulator recorded for a trial (its ``metadata.json``).
+    """Outcome that the official simulator recorded for a trial in ``metadata.json``.
 
-    Frames are counted from 0. ``displacement`` is the agent's final position minus its reference
-    position, in our axes; ``min_distance`` belongs to cloth trials.
+    - ``first_frame``: first frame with contact, counted from 0.
+    - ``displacement``: final minus initial position of the agent, in our axes, metres.
+    - ``min_distance``: between cloth and zone, for cloth trials only.
     """
 
     contact: bool
@@ -71,7 +72,7 @@ class RecordedOutcome:
 
 @dataclass(frozen=True)
 class ImportedTrial:
-    """A scene with what really happened in it. ``notes`` say what was left out."""
+    """Imported scene with its recorded outcome. ``notes`` tell what was left out of the scene."""
 
     scene: Scene
     outcome: RecordedOutcome
@@ -80,10 +81,10 @@ class ImportedTrial:
 
 @dataclass
 class TrialSet:
-    """Everything found under a folder.
+    """Result of importing a folder.
 
-    ``unknown`` counts commands that the importer does not know, ``unrecorded`` the trials of logs
-    for which ``metadata.json`` holds no outcome.
+    ``unknown`` counts the commands that the importer does not know, ``unrecorded`` the trials
+    without an outcome in ``metadata.json``.
     """
 
     trials: list[ImportedTrial] = field(default_factory=list)
@@ -92,13 +93,13 @@ class TrialSet:
     unrecorded: int = 0
 
     def require_trials(self) -> None:
-        """Raise `BadInputError` with the first failure where nothing could be imported."""
+        """Raise `BadInputError` with the first failure if nothing was imported."""
         if not self.trials:
-            why = str(self.failures[0]) if self.failures else "no trial fits the choice"
+            why = str(self.failures[0]) if self.failures else "no trial of this scenario"
             raise BadInputError(f"no trial could be imported: {why}")
 
     def unique(self) -> tuple[list[ImportedTrial], int]:
-        """Trials with different physics, and how many were left out as copies of another."""
+        """Return the trials with different physics, and the number of duplicates left out."""
         first: dict[str, ImportedTrial] = {}
         for trial in self.trials:
             first.setdefault(trial.scene.physics_digest(), trial)
@@ -106,55 +107,67 @@ class TrialSet:
 
 
 def read_scenes(root: Path, scenario: str | None = None, limit: int | None = None) -> TrialSet:
-    """Import every log under ``root``; ``limit`` keeps the first trials of each scenario.
+    """Import all command logs in the folder ``root``.
 
-    A broken log or trial becomes a failure of the result and the others go on;
-    `BadInputError` only where there is no log at all, `UnknownNameError` for a scenario that no
-    log can have.
+    Parameters
+    ----------
+    root
+        Folder that is searched for logs.
+    scenario
+        Import trials of this scenario only.
+    limit
+        Import at most this many trials of each scenario.
+
+    Raises
+    ------
+    BadInputError
+        If there is no log. A broken log or trial is a failure in the result instead.
+    UnknownNameError
+        For an unknown scenario.
     """
     if scenario is not None and scenario not in SCENARIOS.values():
         raise UnknownNameError("scenario", scenario, SCENARIOS.values())
     if limit is not None and limit < 1:
         raise BadInputError(f"the limit of trials must be 1 or more, not {limit}")
-    found = TrialSet()
-    bounds = _bounds_beside(root)
-    taken: Counter[str] = Counter()
+    result = TrialSet()
+    bounds = _find_model_bounds(root)
+    counts: Counter[str] = Counter()
     for log in find_logs(root):
-        for trial in read_log(log, found, bounds):
+        for trial in read_log(log, result, bounds):
             name = trial.scene.scenario
-            if scenario not in (None, name) or (limit is not None and taken[name] >= limit):
+            if scenario not in (None, name) or (limit is not None and counts[name] >= limit):
                 continue
-            taken[name] += 1
-            found.trials.append(trial)
-    return found
+            counts[name] += 1
+            result.trials.append(trial)
+    return result
 
 
 def read_log(
-    path: Path, found: TrialSet, bounds: Mapping[str, ModelBounds] | None = None
+    path: Path, result: TrialSet, bounds: Mapping[str, ModelBounds] | None = None
 ) -> Iterator[ImportedTrial]:
-    """Yield the trials of one log; failures and unknown commands are added to ``found``."""
+    """Yield the trials of one log; add failures and unknown commands to ``result``."""
     try:
         records = read_metadata(path.parent / "metadata.json")
         log = read_command_log(path)
     except PhysionError as error:
-        found.failures.append(ImportFailure(str(path), None, str(error)))
+        result.failures.append(ImportFailure(str(path), None, str(error)))
         return
-    found.failures += log.failures
+    result.failures += log.failures
     for tag, frames in log.trials.items():
         try:
             if tag not in records:
-                # Familiarization trials were chosen by hand out of the log.
-                found.unrecorded += 1
+                # Logs of familiarization trials contain more trials than were used.
+                result.unrecorded += 1
                 continue
-            commands = CommandReader(found.unknown)
+            commands = CommandReader(result.unknown)
             commands.read(log.setup, frames)
             builder = _SceneBuilder(commands, records[tag], path.parent, bounds or {})
             yield ImportedTrial(builder.scene(), builder.outcome(), tuple(builder.notes))
         except PhysionError as error:
-            found.failures.append(ImportFailure(str(path), tag, str(error)))
+            result.failures.append(ImportFailure(str(path), tag, str(error)))
 
 
-def _bounds_beside(root: Path) -> Mapping[str, ModelBounds]:
+def _find_model_bounds(root: Path) -> Mapping[str, ModelBounds]:
     for folder in (root, *root.resolve().parents[:3]):
         if (folder / "model_bounds.json").is_file():
             return read_model_bounds(folder / "model_bounds.json")
@@ -162,7 +175,7 @@ def _bounds_beside(root: Path) -> Mapping[str, ModelBounds]:
 
 
 class _SceneBuilder:
-    """Makes the scene and the outcome of one trial out of its carried-out commands."""
+    """Builder of the scene and the outcome of one trial from its executed commands."""
 
     def __init__(
         self,
@@ -225,14 +238,14 @@ class _SceneBuilder:
         return MAX_FRAMES["collide"] if by_collision else MAX_FRAMES.get(scenario, 302)
 
     def _roles(self, kept: list[LoggedObject], pushes: tuple[Push, ...]) -> Roles:
-        """Lowest id: the zone. Id 2: the target, or, where it is gone, the last of its colour."""
+        """Find the roles: the lowest id is the zone, 2 the target (or the last of its colour)."""
         by_id = {thing.id: thing for thing in kept}
         if not kept:
             raise BadInputError("no object is left in the trial")
         zone = by_id[min(by_id)]
         first = self.commands.objects.get(2)
         if first is None or zone.id == 2:
-            raise BadInputError("there is no object 2, the target")
+            raise BadInputError("there is no object with id 2, the target")
         agent: LoggedObject | None = first
         if first.gone:
             alike = [t for t in kept if t.id > 2 and t.color == first.color]
@@ -244,7 +257,7 @@ class _SceneBuilder:
 
     def _look(self, thing: LoggedObject) -> Look:
         if thing.color is None and thing.model not in shapes:
-            # Library models bring their own pictures: a model looks the same in every trial.
+            # Library models have their own textures: a model looks the same in every trial.
             rng = generator("library model", thing.model)
             return prop_look(rng, prop_for(thing.category, thing.model))
         return Look(thing.color or (0.8, 0.8, 0.8), thing.texture)
@@ -262,7 +275,7 @@ class _SceneBuilder:
             rotation=thing.rotation,
             mass=1.0 if thing.mass is None else thing.mass,
             contact=thing.contact,
-            # Flex solids carry their weight on the floor and do not move once settled.
+            # Solids of Flex rest on the floor and do not move after settling.
             kinematic=thing.kinematic or thing.mass is None or thing.flex,
             scenery=thing.mass is None,
             drag=thing.drag,
@@ -271,10 +284,10 @@ class _SceneBuilder:
         )
 
     def _prop(self, thing: LoggedObject) -> tuple[str, Vec3, Vec3]:
-        """A stand-in that fills the bounds of a library model: shape, scale, pivot."""
+        """Return shape, scale and position of the prop that fills the bounds of a library model."""
         bounds = self.bounds.get(thing.model)
         if bounds is None:
-            self.notes.append(f"no bounds are known for {thing.model!r}; it is drawn half a metre")
+            self.notes.append(f"no bounds are known for {thing.model!r}; it gets a size of 0.5 m")
             bounds = ModelBounds((0.0, 0.0, 0.0), (0.5, 0.5, 0.5))
         size = tuple(a * b for a, b in zip(bounds.size, thing.scale, strict=True))
         shift = tuple(a * b for a, b in zip(bounds.bottom, thing.scale, strict=True))
@@ -301,7 +314,9 @@ class _SceneBuilder:
         record = self.record
         contact = record.get("does_target_contact_zone")
         if not isinstance(contact, bool):
-            raise BadInputError("metadata.json does not say does_target_contact_zone for it")
+            raise BadInputError(
+                "metadata.json has no does_target_contact_zone (true or false) for it"
+            )
         first = record.get("first_target_contact_zone_frame")
         moved = record.get("final_target_displacement")
         return RecordedOutcome(
