@@ -135,7 +135,8 @@ class RigidRun:
     def step(self) -> None:
         """Move by one frame."""
         settings, model, bodies, sleep = self.settings, self.model, self.bodies, self.sleep
-        if sleep.asleep.all() and all(push.frame != self.frame for push in self.scene.pushes):
+        pushed = any(push.frame == self.frame for push in self.scene.pushes)
+        if not pushed and np.count_nonzero(sleep.asleep) == model.actors:
             self.frame += 1
             self.history.append(self.history[-1])
             return
@@ -146,15 +147,17 @@ class RigidRun:
         awake = ~sleep.asleep
         gravity, cap, dt = settings.gravity, settings.max_angular_velocity, settings.dt
         move_freely(bodies.v, bodies.w, awake, model.drag, gravity, cap, dt)
-        solid = bodies if awake.all() else self._with_sleepers_fixed(awake)
+        all_awake = np.count_nonzero(awake) == model.actors
+        solid = bodies if all_awake else self._with_sleepers_fixed(awake)
         result = solve_step(solid, contacts, self.anchors, self.solver_options)
         self.anchors = result.anchors
         move_v, move_w = result.move_v, result.move_w
         move_poses(bodies.x, bodies.q, move_v, move_w, dt)
         moved = bodies._replace(v=move_v, w=move_w)
         update_sleep(contacts.bodies, island, moved, sleep, self.sleep_options)
-        bodies.v[:-1][sleep.asleep] = 0.0
-        bodies.w[:-1][sleep.asleep] = 0.0
+        if np.count_nonzero(sleep.asleep):
+            bodies.v[:-1][sleep.asleep] = 0.0
+            bodies.w[:-1][sleep.asleep] = 0.0
         self.frame += 1
         self.record.add(len(self.history), contacts, pairs, result.normal_impulse)
         self.history.append(self._state())
