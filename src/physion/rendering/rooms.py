@@ -40,7 +40,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Room:
-    """Panels and light; colours of light are linear, see `physion.rendering.shading.LightTerms`.
+    """Panels and light; colours of light are linear, see `physion.rendering.shading.LIGHT`.
 
     - ``panels``: the first one is the floor.
     - ``low``, ``high``: corners of the box that the walls, floor and ceiling make.

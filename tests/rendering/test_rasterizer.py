@@ -1,0 +1,174 @@
+"""Rasterisation of single triangles against closed forms: depth, interpolation, edges, sides."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike, NDArray
+
+from physion.rendering.rasterizer import (
+    NOTHING,
+    SAMPLES,
+    DepthRange,
+    GeometryBuffers,
+    SurfaceMotion,
+    Triangles,
+    VisibilityBuffer,
+    barycentric,
+    fill_geometry_buffers,
+    rasterize,
+    rasterize_depth,
+    shows_back,
+)
+
+SIZE = 64
+FRONT, BACK = [0, 1, 2], [0, 2, 1]
+"""Counter-clockwise and clockwise in the picture, for the corners below (y points down)."""
+CORNERS = [[0.0, 0.0], [0.0, 64.0], [64.0, 0.0]]
+DEPTHS = [1.0, 4.0, 2.0]
+RANGE = DepthRange(0.1, 100.0)
+
+
+def homogeneous(pixels: ArrayLike, depths: ArrayLike) -> NDArray[np.float64]:
+    w = np.asarray(depths, np.float64)[:, None]
+    return np.concatenate([np.asarray(pixels, np.float64) * w, w], axis=1)
+
+
+def draw(
+    points: NDArray[np.float64],
+    faces: ArrayLike,
+    two_sided: bool = False,
+    depths: DepthRange = RANGE,
+) -> tuple[Triangles, VisibilityBuffer]:
+    faces = np.asarray(faces, np.int32)
+    count = len(faces)
+    triangles = Triangles(faces, np.full(count, two_sided), np.zeros((count, 3, 3)))
+    shape = (SIZE, SIZE, len(SAMPLES))
+    buffer = VisibilityBuffer(np.full(shape, NOTHING, np.int32), np.zeros(shape, np.float32))
+    rasterize(points, triangles, 0, depths, buffer)
+    return triangles, buffer
+
+
+def sample_positions() -> NDArray[np.float64]:
+    """Pixel coordinates (SIZE, SIZE, S, 2) of all samples."""
+    x, y = np.meshgrid(np.arange(SIZE) + 0.5, np.arange(SIZE) + 0.5)
+    return np.asarray(np.stack([x, y], axis=-1)[:, :, None] + SAMPLES)
+
+
+def test_inverse_depth_is_linear_in_the_picture() -> None:
+    _, buffer = draw(homogeneous(CORNERS, DEPTHS), [FRONT])
+    x, y = np.moveaxis(sample_positions(), -1, 0)
+    expected = 1.0 + x / 64 * (1 / 2 - 1) + y / 64 * (1 / 4 - 1)
+    inside = x + y <= 64
+    np.testing.assert_array_equal(buffer.triangle_ids == 0, inside)
+    np.testing.assert_allclose(buffer.inverse_depth[inside], expected[inside], rtol=1e-6)
+
+
+def test_interpolation_is_correct_in_perspective() -> None:
+    """Half-way in the picture between depths 1 and 4 lies 1/5 of the way in space."""
+    triangles, _ = draw(homogeneous(CORNERS, DEPTHS), [FRONT])
+    depth, b0, b1, b2 = barycentric(triangles.edges, 0, 0.0, 32.0)
+    assert (depth, b0, b1, b2) == pytest.approx((1.6, 0.8, 0.2, 0.0))
+
+
+def test_a_triangle_is_culled_from_behind_unless_two_sided() -> None:
+    points = homogeneous(CORNERS, DEPTHS)
+    assert (draw(points, [FRONT])[1].triangle_ids == 0).any()
+    assert (draw(points, [BACK])[1].triangle_ids == NOTHING).all()
+    front, seen = draw(points, [FRONT], two_sided=True)
+    back, also_seen = draw(points, [BACK], two_sided=True)
+    np.testing.assert_array_equal(seen.triangle_ids, also_seen.triangle_ids)
+    assert not shows_back(front.edges, 0)
+    assert shows_back(back.edges, 0)
+
+
+def test_triangles_that_share_an_edge_cover_every_sample_once() -> None:
+    """Samples on the edge itself belong to both; the one drawn first keeps them."""
+    points = homogeneous([[8, 8], [8, 56], [56, 56], [56, 8]], [2.0] * 4)
+    faces = [[0, 1, 2], [0, 2, 3]]
+    one, two = (draw(points, [face])[1].triangle_ids == 0 for face in faces)
+    x, y = np.moveaxis(sample_positions(), -1, 0)
+    square = (x >= 8) & (x <= 56) & (y >= 8) & (y <= 56)
+    np.testing.assert_array_equal(one | two, square)
+    np.testing.assert_array_equal(one & two, square & (x == y))
+    both = draw(points, faces)[1].triangle_ids
+    np.testing.assert_array_equal(both, np.where(one, 0, np.where(two, 1, NOTHING)))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_fan_around_any_point_has_neither_cracks_nor_overlaps(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    angles = np.sort(rng.uniform(0, 2 * np.pi, 9))[::-1] + np.linspace(0, -1e-3, 9)
+    rim = 32 + 200 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    points = homogeneous([rng.uniform(25, 39, 2), *rim], rng.uniform(0.5, 5, 10))
+    faces = [[0, 1 + i, 1 + (i + 1) % 9] for i in range(9)]
+    alone = [draw(points, [face], two_sided=True)[1].triangle_ids == 0 for face in faces]
+    count = np.sum(alone, axis=0)
+    assert count.min() == count.max() == 1
+
+
+def test_surfaces_outside_the_depth_range_are_left_out() -> None:
+    points = homogeneous(CORNERS, [3.0] * 3)
+    assert (draw(points, [FRONT], depths=DepthRange(2.9, 3.1))[1].triangle_ids == 0).any()
+    assert (draw(points, [FRONT], depths=DepthRange(0.1, 2.9))[1].triangle_ids == NOTHING).all()
+    assert (draw(points, [FRONT], depths=DepthRange(3.1, 9.0))[1].triangle_ids == NOTHING).all()
+
+
+def test_the_nearer_triangle_is_seen_whatever_the_order() -> None:
+    points = np.concatenate([homogeneous(CORNERS, [3.0] * 3), homogeneous(CORNERS, [2.0] * 3)])
+    near, far = [3, 4, 5], [0, 1, 2]
+    first, second = draw(points, [far, near])[1], draw(points, [near, far])[1]
+    covered = first.triangle_ids != NOTHING
+    assert (first.triangle_ids[covered] == 1).all()
+    assert (second.triangle_ids[covered] == 0).all()
+    np.testing.assert_array_equal(first.inverse_depth, second.inverse_depth)
+
+
+def geometry(
+    faces: ArrayLike, normals: ArrayLike, following: NDArray[np.float64]
+) -> GeometryBuffers:
+    """The G-buffer of the triangle of this module, two-sided, as object 7."""
+    triangles, buffer = draw(homogeneous(CORNERS, DEPTHS), faces, two_sided=True)
+    out = GeometryBuffers(
+        np.full((SIZE, SIZE), np.inf, np.float32),
+        np.zeros((SIZE, SIZE, 3), np.float32),
+        np.zeros((SIZE, SIZE), np.int16),
+        np.zeros((SIZE, SIZE, 2), np.float32),
+    )
+    corner_normals = np.asarray(normals, np.float32)[None]
+    motion = SurfaceMotion(corner_normals, np.array([7], np.int32), following)
+    fill_geometry_buffers(buffer.triangle_ids, triangles, motion, 0, out)
+    return out
+
+
+def test_g_buffer_holds_depth_id_and_interpolated_normal() -> None:
+    normals = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    still = homogeneous(CORNERS, DEPTHS)
+    out = geometry([FRONT], normals, still)
+    x, y = 10.5, 20.5
+    weights = np.array([1 - (x + y) / 64, y / 64, x / 64]) / DEPTHS
+    assert out.depth[20, 10] == pytest.approx(1 / weights.sum(), rel=1e-6)
+    assert out.object_ids[20, 10] == 7
+    np.testing.assert_allclose(out.normals[20, 10], weights / np.linalg.norm(weights), rtol=1e-6)
+    np.testing.assert_allclose(out.flow[20, 10], 0.0, atol=1e-5)
+    assert np.isinf(out.depth[63, 63]) and out.object_ids[63, 63] == 0
+    back = geometry([BACK], [normals[0], normals[2], normals[1]], still)
+    np.testing.assert_allclose(back.normals[20, 10], -out.normals[20, 10], rtol=1e-6)
+
+
+def test_flow_is_the_shift_in_the_picture_and_nan_behind_the_camera() -> None:
+    normals = np.eye(3)
+    moved = homogeneous(np.add(CORNERS, (3.0, -2.0)), DEPTHS)
+    np.testing.assert_allclose(geometry([FRONT], normals, moved).flow[20, 10], (3, -2), atol=1e-5)
+    behind = homogeneous(CORNERS, [-1.0] * 3)
+    assert np.isnan(geometry([FRONT], normals, behind).flow[20, 10]).all()
+
+
+def test_depth_map_of_a_tilted_plane() -> None:
+    corners = np.array([[0, 0], [64, 0], [64, 64], [0, 64]], float)
+    plane = np.column_stack([corners, 1 + 0.1 * corners[:, 0] + 0.2 * corners[:, 1]])
+    faces = np.array([[0, 1, 2], [0, 3, 2]], np.int32)
+    depth = np.full((SIZE, SIZE), 9.0, np.float32)
+    rasterize_depth(plane, faces, 0, 2, depth)
+    x, y = np.meshgrid(np.arange(SIZE) + 0.5, np.arange(SIZE) + 0.5)
+    np.testing.assert_allclose(depth, np.minimum(1 + 0.1 * x + 0.2 * y, 9.0), rtol=1e-6)
