@@ -8,7 +8,6 @@ value), and a size or a rotation may be a number, a range, or one of either for 
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 import typing
 from collections.abc import Mapping, Sequence
@@ -285,7 +284,6 @@ def _read_names(single: bool, value: Any, where: str, annotation: NamesOf) -> An
     return names[0] if single else tuple(names)
 
 
-@functools.cache
 def _known_names(kind: str) -> frozenset[str]:
     from physion.scenes.looks import MATERIALS, TEXTURES
     from physion.scenes.shapes.primitives import shapes

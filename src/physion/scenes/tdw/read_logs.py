@@ -45,7 +45,7 @@ SCENARIOS = {controller: scenario for scenario, controller in CONTROLLERS.items(
 Collide controller: a folder whose name contains ``rolling`` is Roll."""
 
 MAX_FRAMES = {"collide": 152, "contain": 452, "link": 452, "support": 602, "drape": 151}
-"""Frames of the longest trial, frame 0 included; 302 for other scenarios (official-system.md, 2.6)."""
+"""Frames of the longest trial, frame 0 included; 302 for others (docs/official-system.md, 2.6)."""
 
 FLOORS = {"bright": 0.0043}
 """Height of a room's floor if it is not 0, metres. In ``tdw_room`` bodies placed at 0 come to rest
