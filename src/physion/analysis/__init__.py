@@ -1,4 +1,4 @@
-"""How alike are models and people? Tables in, tables out; no trial is opened."""
+"""Comparison of models with people: tables in, tables out; no trial is opened."""
 
 from physion.analysis.models.comparison import Comparison, compare
 from physion.analysis.statistics.bootstrap import Bootstrap

@@ -1,1 +1,1 @@
-"""Mixed models with crossed random intercepts."""
+"""Linear and logistic mixed models with crossed random intercepts."""

@@ -1,4 +1,4 @@
-"""The arrays of a mixed model, from a formula and a table; what cannot be fitted is refused."""
+"""Arrays of a mixed model from a formula and a table; what cannot be fitted is refused."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ALIASED = 1e-9
 
 @dataclass(frozen=True)
 class Group:
-    """A grouping with random intercepts: ``codes`` (n,) of its ``labels``."""
+    """Grouping with random intercepts: ``codes`` (n,) index its ``labels``."""
 
     name: str
     codes: npt.NDArray[np.int64]
@@ -31,17 +31,16 @@ class Group:
 
     @property
     def levels(self) -> int:
-        """How many levels occur."""
+        """Number of levels."""
         return len(self.labels)
 
 
 @dataclass(frozen=True)
 class Design:
-    """A model's arrays: ``y`` (n,), ``x`` (n, p) of full rank, and the groupings.
+    """Arrays of a model: ``y`` (n,), ``x`` (n, p) of full rank, and the groupings.
 
-    ``terms`` gives the columns of ``x`` that belong to each term of the formula; ``missing`` how
-    many rows were left out for lack of each column (a row can lack several), ``left_out`` how many
-    in all.
+    ``terms`` maps each term of the formula to its columns of ``x``; ``missing`` counts the rows
+    left out for lack of each column (a row can lack several), ``left_out`` all rows left out.
     """
 
     formula: str
@@ -56,11 +55,11 @@ class Design:
 
 
 def build_design(formula: str, data: pd.DataFrame) -> Design:
-    """The arrays of ``formula`` on the rows of ``data`` that lack nothing.
+    """Build the arrays of ``formula`` from the complete rows of ``data``.
 
     Raises `BadInputError` for what cannot be fitted: unknown columns, no random intercept, no rows,
-    a constant or non-numeric response, infinite values, groups of one level, groups that are the
-    same, and fixed effects that depend on each other.
+    a constant or non-numeric response, infinite values, groups of one level, identical groups, and
+    linearly dependent fixed effects.
     """
     response, fixed, random = split_formula(formula)
     used = columns_of(response, fixed, random, list(map(str, data.columns)))
@@ -109,7 +108,7 @@ def _response(column: pd.Series, name: str) -> Array:
 def _fixed_effects(
     fixed: str, rows: pd.DataFrame
 ) -> tuple[Array, tuple[str, ...], dict[str, tuple[int, ...]]]:
-    """The matrix of fixed effects, its column names, and the columns of each term."""
+    """Return the matrix of fixed effects, its column names, and the columns of each term."""
     tidy = rows.copy()
     for name in tidy.columns:
         if isinstance(tidy[name].dtype, pd.CategoricalDtype):
@@ -175,7 +174,7 @@ def _refuse_same(groups: Sequence[Group]) -> None:
 
 
 def _refuse_explained(groups: Sequence[Group], x: Array) -> None:
-    """A group whose levels are fixed effects already: its variance would be anything."""
+    """Refuse a group whose levels are fixed effects already: its variance is not identified."""
     orthonormal = np.linalg.qr(x)[0]
     for group in groups:
         if group.levels > x.shape[1]:

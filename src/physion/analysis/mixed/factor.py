@@ -1,8 +1,8 @@
-"""The equations of random intercepts, solved exactly: no general sparse library is needed.
+"""Exact solution of the equations of random intercepts by blocks, without a sparse solver.
 
-With random effects b = Lambda u, u standard normal, Lambda the diagonal of standard deviations,
-every step needs H = I + Lambda Z'WZ Lambda. Its cost is (wide + narrow) * narrow^2 within each
-block of `Groupings`, which explains the words.
+With random effects b = Lambda u, u standard normal, Lambda the diagonal matrix of standard
+deviations, every step needs H = I + Lambda Z'WZ Lambda. Its cost is (wide + narrow) * narrow^2
+within each block of `Groupings`, which defines wide and narrow.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Inverse:
-    """What is needed of H^-1: its diagonal (q,), and the blocks wide x narrow, narrow x narrow."""
+    """Parts of H^-1: its diagonal (q,), and by block wide x narrow and narrow x narrow."""
 
     diagonal: Array
     cross: list[Array]
@@ -29,7 +29,9 @@ class Inverse:
 
 
 class Factor:
-    """H = I + Lambda Z'WZ Lambda, factorised; ``scale`` is Lambda's diagonal by slot (q,)."""
+    """Factorisation of H = I + Lambda Z'WZ Lambda; ``scale`` is the diagonal of Lambda by slot
+    (q,).
+    """
 
     def __init__(self, groupings: Groupings, counts: Counts, scale: Array) -> None:
         self._groupings, self._counts, self._scale = groupings, counts, scale
@@ -48,7 +50,7 @@ class Factor:
             self._lower.append(lower)
 
     def solve(self, right: Array) -> Array:
-        """H^-1 times ``right``, of shape (q,) or (q, p)."""
+        """Return H^-1 times ``right``, of shape (q,) or (q, p)."""
         found = np.empty_like(right)
         for (wide, narrow), ratio, lower in self._parts():
             below = right[narrow] - ratio.T @ right[wide]
@@ -58,7 +60,7 @@ class Factor:
         return found
 
     def inverse(self) -> Inverse:
-        """The parts of H^-1 that belong to cells that rows can fill."""
+        """Return the parts of H^-1 for the cells that rows can fill."""
         diagonal, cross, square = np.empty(self._groupings.q), [], []
         for (wide, narrow), ratio, lower in self._parts():
             unit = np.eye(len(lower))
@@ -71,9 +73,9 @@ class Factor:
         return Inverse(diagonal, cross, square)
 
     def slopes(self, inverse: Inverse) -> Array:
-        """Half the derivative of log|H| by each grouping's standard deviation: shape (groupings,).
+        """Return half the derivative of log|H| by each grouping's standard deviation, (groupings,).
 
-        It is the trace of that grouping's part of H^-1 Lambda Z'WZ, which stays exact at zero.
+        It is the trace of that grouping's part of H^-1 Lambda Z'WZ, which is exact at zero.
         """
         scale, counts = self._scale, self._counts
         by_slot = np.empty(len(scale))
@@ -89,7 +91,7 @@ class Factor:
         return self._groupings.by_grouping(by_slot)
 
     def at_rows(self, inverse: Inverse) -> Array:
-        """z'Lambda H^-1 Lambda z for each row's indicators z, shape (n,)."""
+        """Return z'Lambda H^-1 Lambda z for each row's indicators z, shape (n,)."""
         scale, groupings = self._scale, self._groupings
         found = groupings.spread(inverse.diagonal * scale**2)
         cross = np.concatenate([block.ravel() for block in inverse.cross])

@@ -1,11 +1,11 @@
-"""Formulas of mixed models: ``y ~ fixed effects + (1|group)``, taken apart and checked.
+"""Parser of formulas of mixed models: ``y ~ fixed effects + (1|group)``.
 
 Fixed effects are read by formulaic (numbers as they are, True as 1; text and categories against the
-first level): ``a + b``, ``a:b``, ``a * b``, ``C(a, Treatment("level"))``, ``C(a, Sum)``,
-``log``, ``sqrt``, ``exp``, ``center``, ``scale``, ``poly``, ``0 +`` for no intercept. Names that
-are not columns or these functions are refused before anything is evaluated. Random intercepts are
-``(1|g)``; ``(1|g:h)`` has a level for each pair, ``(1|g/h)`` stands for ``(1|g) + (1|g:h)``.
-Columns with blanks stand in backticks.
+first level): ``a + b``, ``a:b``, ``a * b``, ``C(a, Treatment("level"))``, ``C(a, Sum)``, ``log``,
+``sqrt``, ``exp``, ``center``, ``scale``, ``poly``, ``0 +`` for no intercept. Names that are not
+columns or these functions are refused before anything is evaluated. Random intercepts are
+``(1|g)``; ``(1|g:h)`` has a level for each pair, ``(1|g/h)`` means ``(1|g) + (1|g:h)``. Column
+names with blanks are quoted with backticks.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _SIGNS = set("+-*:/^(),~=")
 
 
 def split_formula(formula: str) -> tuple[str, str, list[tuple[str, tuple[str, ...]]]]:
-    """Response, fixed part, and the random intercepts as (name, columns of the grouping)."""
+    """Return response, fixed part, and the random intercepts as (name, columns of the grouping)."""
     left, tilde, right = formula.partition("~")
     if not tilde or "~" in right or not left.strip() or not right.strip():
         raise BadInputError(f"{formula!r} is not of the form: response ~ effects + (1|group)")
@@ -84,7 +84,7 @@ def _plain(name: str) -> str:
 def columns_of(
     response: str, fixed: str, random: Sequence[tuple[str, tuple[str, ...]]], known: list[str]
 ) -> list[str]:
-    """All columns that are needed; unknown names and odd characters are refused."""
+    """Return all columns that are needed; refuse unknown names and characters."""
     found = [response]
     tokens = _TOKEN.findall(fixed)
     for token, after in zip(tokens, [*tokens[1:], ""], strict=True):

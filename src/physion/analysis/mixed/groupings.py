@@ -1,10 +1,10 @@
 """Levels of crossed groupings, sorted so that their equations split into small dense blocks.
 
 Z is the matrix of indicators of levels, W the diagonal of weights of rows. Within one grouping Z'WZ
-is diagonal. So the grouping with most levels ("wide") is eliminated by hand, and what remains is a
-dense matrix over the levels of the others ("narrow"), which splits where no row links its levels:
-with participants and stimuli within scenarios, into one of 100 x 100 per scenario. Genuinely
-crossed designs give one larger block and the same answer. `mixed_factor` solves the equations.
+is diagonal. So the grouping with most levels ("wide") is eliminated first, and what remains is a
+dense matrix over the levels of the others ("narrow"), which splits if no row links its levels: with
+participants and stimuli within scenarios, into one of 100 x 100 per scenario. Genuinely crossed
+designs give one larger block and the same result. `factor` solves the equations.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ class Counts:
 
 
 class Groupings:
-    """Where each row sits: levels sorted into blocks, and cells of the cross tables.
+    """Positions of rows in the equations: levels sorted into blocks, and cells of the cross tables.
 
     ``codes``: one array (n,) a grouping with values 0..levels-1, all present. Positions in the
     vectors of random effects ("slots", q in all) are by block, wide levels first;
-    ``slots[k][code]`` finds them and ``rows[k]`` gives that of each row.
+    ``slots[k][code]`` maps a level to its slot and ``rows[k]`` each row.
     """
 
     def __init__(self, codes: Sequence[Codes]) -> None:
@@ -65,7 +65,7 @@ class Groupings:
         self._index_cells()
 
     def _sort_into_blocks(self, codes: Sequence[Codes]) -> list[Codes]:
-        """Slots of each grouping's levels; sets the blocks' bounds among wide and narrow ones."""
+        """Return the slots of each grouping's levels; set the bounds of the blocks."""
         start = np.cumsum([0, *self.levels])
         links = [(start[self.wide] + codes[self.wide], start[k] + codes[k]) for k in self._narrow]
         label = np.zeros(self.q, dtype=np.int64)
@@ -91,7 +91,7 @@ class Groupings:
         return slots
 
     def _index_cells(self) -> None:
-        """For each row and narrow grouping its cell in the flat cross tables."""
+        """Compute the cell in the flat cross tables for each row and narrow grouping."""
         wide, narrow = np.diff(self._wide_bounds), np.diff(self._narrow_bounds)
         self._shapes = list(zip(wide.tolist(), narrow.tolist(), strict=True))
         self._cross_starts = np.cumsum([0, *(wide * narrow)])
@@ -122,7 +122,7 @@ class Groupings:
         ]
 
     def counts(self, weights: Array | None = None) -> Counts:
-        """Z'WZ for weights of shape (n,), or all one."""
+        """Return Z'WZ for weights of shape (n,), or weights of one."""
         wide = np.bincount(self.rows[self.wide], weights, self.q_wide).astype(np.float64)
         cross = np.zeros(self._cross_starts[-1])
         for cells in self.cells.values():
@@ -141,7 +141,7 @@ class Groupings:
         )
 
     def sums(self, values: Array) -> Array:
-        """Z' times ``values`` (n,) or (n, p): sums by slot, shape (q,) or (q, p)."""
+        """Return Z' times ``values`` (n,) or (n, p): sums by slot, shape (q,) or (q, p)."""
         if values.ndim == 2:
             return np.stack([self.sums(column) for column in values.T], axis=1)
         total = np.zeros(self.q)
@@ -150,18 +150,18 @@ class Groupings:
         return total
 
     def spread(self, effects: Array) -> Array:
-        """Z times ``effects`` (q,): by row."""
+        """Return Z times ``effects`` (q,): values by row (n,)."""
         total = effects[self.rows[0]]
         for rows in self.rows[1:]:
             total = total + effects[rows]
         return total
 
     def by_grouping(self, values: Array) -> Array:
-        """Sums of ``values`` (q,) over the levels of each grouping."""
+        """Return the sums of ``values`` (q,) over the levels of each grouping."""
         return np.asarray(np.bincount(self.owner, values, len(self.levels)), dtype=np.float64)
 
     def multiply(self, counts: Counts, effects: Array) -> Array:
-        """Z'WZ times ``effects`` (q,) or (q, p)."""
+        """Return Z'WZ times ``effects`` (q,) or (q, p)."""
         product = np.empty_like(effects)
         for (wide, narrow), cross, square in self.blocks(counts):
             x, y = effects[wide], effects[narrow]
@@ -170,7 +170,7 @@ class Groupings:
         return product
 
     def blocks(self, counts: Counts) -> list[tuple[tuple[slice, slice], Array, Array]]:
-        """For each block its slots (wide, narrow) and its two tables."""
+        """Return for each block its slots (wide, narrow) and its two tables."""
         wide = [slice(a, b) for a, b in _pairs(self._wide_bounds)]
         narrow = [slice(self.q_wide + a, self.q_wide + b) for a, b in _pairs(self._narrow_bounds)]
         places = list(zip(wide, narrow, strict=True))
@@ -178,7 +178,7 @@ class Groupings:
 
 
 def _rank(block: Codes) -> Codes:
-    """The place of each level when levels are sorted by block."""
+    """Return the position of each level when levels are sorted by block."""
     place = np.empty(len(block), dtype=np.int64)
     place[np.argsort(block, kind="stable")] = np.arange(len(block))
     return place

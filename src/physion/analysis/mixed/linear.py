@@ -1,10 +1,10 @@
 """Linear mixed models with crossed random intercepts (restricted maximum likelihood).
 
 As lme4::lmer with lmerTest: variances maximise the restricted likelihood, profiled over the
-residual variance; t tests have Satterthwaite's degrees of freedom. Own code, since statsmodels'
-MixedLM has no degrees of freedom, and for crossed groups of this size does not end in 300 s
-(``python benchmarks/mixed.py --others``), and since the equations are those of logistic models.
-Only sums by level and by pair of levels enter, so that the time hardly depends on the rows.
+residual variance; t tests have Satterthwaite's degrees of freedom. Not statsmodels' MixedLM: it has
+no degrees of freedom, and for crossed groups of this size does not finish in 300 s (``python
+benchmarks/mixed.py --others``). Only sums by level and by pair of levels enter, so that the time
+hardly depends on the number of rows.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ Array = npt.NDArray[np.float64]
 
 
 def fit_linear(formula: str, data: pd.DataFrame, level: float = 0.95) -> MixedFit:
-    """Fit ``log_rt ~ scenario + x + (1|participant) + (1|stimulus)`` and the like.
+    """Fit a linear mixed model such as ``log_rt ~ scenario + x + (1|participant) + (1|stimulus)``.
 
     The response is numeric, or True/False for the linear probability models of the paper
     (``model_correct ~ ...``). The table has t tests with Satterthwaite's degrees of freedom.
     ``level`` is that of the intervals.
 
-    Rows with a missing value are left out, counted in ``missing`` and said in ``warnings``. Raises
+    Rows with a missing value are left out, counted in ``missing`` and named in ``warnings``. Raises
     `BadInputError` for unknown columns, a constant response, a group of one level or with a level
     for each row, and fixed effects that depend on each other or explain everything.
     """
@@ -66,7 +66,7 @@ def fit_linear(formula: str, data: pd.DataFrame, level: float = 0.95) -> MixedFi
 
 
 class Solution:
-    """Everything at given ratios of standard deviations to the residual one."""
+    """Estimates at given ratios of standard deviations to the residual one."""
 
     def __init__(self, model: LinearModel, ratios: Array) -> None:
         groupings = model.groupings
@@ -93,10 +93,10 @@ class Solution:
 
 
 class LinearModel:
-    """The restricted likelihood of one design.
+    """Restricted likelihood of one design.
 
-    Fixed effects are orthonormal (p columns), and their least squares part is taken from y, so
-    that neither large means nor units of columns cost digits.
+    Fixed effects are orthonormal (p columns), and their least-squares part is subtracted from y, so
+    that neither large means nor units of columns cost precision.
     """
 
     def __init__(self, design: Design) -> None:
@@ -114,20 +114,22 @@ class LinearModel:
         self.zy = self.groupings.sums(y)
 
     def solve(self, ratios: Array) -> Solution:
-        """Fixed and random effects at ``ratios`` (groupings,)."""
+        """Solve for fixed and random effects at ``ratios`` (groupings,)."""
         return Solution(self, ratios)
 
     def coefficients(self, solution: Solution) -> Array:
-        """Fixed effects of the columns as given."""
+        """Return the fixed effects of the original columns."""
         return np.asarray(np.linalg.solve(self.triangle, self._least + solution.b))
 
     def backward(self, matrix: npt.ArrayLike) -> Array:
-        """A covariance of the orthonormal columns as one of the columns as given."""
+        """Transform a covariance of the orthonormal columns to the original columns."""
         back = np.linalg.inv(self.triangle)
         return np.asarray(back @ matrix @ back.T)
 
     def profiled(self, ratios: Array) -> tuple[float, Array]:
-        """Negative restricted log-likelihood at its best residual variance, and its gradient."""
+        """Return the negative restricted log-likelihood at the best residual variance, and its
+        gradient.
+        """
         solution = self.solve(ratios)
         spare = self.n - self.p
         determinants = (
@@ -139,7 +141,7 @@ class LinearModel:
         return float(value), self._slope(solution, ratios, solution.sigma2)
 
     def slope(self, ratios: Array, sigma2: float) -> Array:
-        """Gradient by ``ratios`` at a given residual variance."""
+        """Return the gradient by ``ratios`` at a given residual variance."""
         return self._slope(self.solve(ratios), ratios, sigma2)
 
     def _slope(self, solution: Solution, ratios: Array, sigma2: float) -> Array:
@@ -154,9 +156,9 @@ class LinearModel:
 
 
 def _satterthwaite(model: LinearModel, optimum: Optimum) -> Callable[[Array], float]:
-    """Degrees of freedom of a contrast of the fixed effects, as a function of it.
+    """Return a function from a contrast of the fixed effects to its degrees of freedom.
 
-    2 v^2 / var(v) for the contrast's variance v, whose own variance comes from its slopes by the
+    2 v^2 / var(v) for the contrast's variance v. The variance of v comes from its slopes by the
     variance parameters (ratios, and the logarithm of the residual variance) and their covariance,
     the inverse of the observed information. Variances estimated as zero count as known.
     """

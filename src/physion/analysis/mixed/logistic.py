@@ -1,17 +1,17 @@
 """Logistic regression with crossed random intercepts (maximum likelihood, Laplace approximation).
 
-Why own code: of the maintained fitters none is both quick and right at the size of the study (800
-participants, 120 000 answers). ``python benchmarks/mixed.py --r --others`` runs them side by side;
-its last figures are in benchmarks/results/mixed.json. mixedlm and interlace-lme agree with us
-and take one minute and three; GPBoost is quick, but stops early and gives standard errors of the
-fixed effects up to 65 % too small; lme-python's coefficients are 0.2 of a standard error off, as
-those of lme4 with nAGQ = 0 would be; statsmodels has Bayesian approximations only, which do not end
-in 300 s; bambi samples; pymer4 needs R.
+Of the maintained fitters none is both fast and correct at the size of the study (800 participants,
+120 000 answers). ``python benchmarks/mixed.py --r --others`` compares them; its last results are in
+benchmarks/results/mixed.json. mixedlm and interlace-lme agree with this module and take one minute
+and three; GPBoost is fast, but stops early and gives standard errors of the fixed effects up to 65
+% too small; lme-python's coefficients differ by 0.2 of a standard error, as those of lme4 with nAGQ
+= 0 would; statsmodels has Bayesian approximations only, which do not finish in 300 s; bambi
+samples; pymer4 needs R.
 
 The marginal likelihood of the fixed effects and standard deviations is, as in glmmTMB and
 lme4::glmer(nAGQ = 1), that of the normal distribution around the mode of the random effects. Its
-gradient is exact, including how the mode and the curvature move. Standard errors come from the
-whole Hessian, so that they contain the uncertainty of the variances.
+gradient is exact and includes the change of the mode and of the curvature. Standard errors come
+from the whole Hessian, so that they contain the uncertainty of the variances.
 """
 
 from __future__ import annotations
@@ -40,12 +40,13 @@ FAR = 30.0
 
 
 def fit_logistic(formula: str, data: pd.DataFrame, level: float = 0.95) -> MixedFit:
-    """Fit ``correct ~ scenario + x + (1|participant) + (1|stimulus)`` and the like.
+    """Fit a logistic mixed model such as ``correct ~ scenario + x + (1|participant) +
+    (1|stimulus)``.
 
-    The response is a column of True/False or 0/1; what formulas may hold says `mixed_formula`.
+    The response is a column of True/False or 0/1; `mixed.formula` lists what formulas may contain.
     The table has Wald tests: statistic z, df infinite. ``level`` is that of the intervals.
 
-    Rows with a missing value are left out, counted in ``missing`` and said in ``warnings``. Raises
+    Rows with a missing value are left out, counted in ``missing`` and named in ``warnings``. Raises
     `BadInputError` for unknown columns, a response of one class, a group of one level, fixed
     effects that depend on each other, and for separation (a coefficient that would be infinite).
     """
@@ -88,10 +89,10 @@ def _notes(design: Design, optimum: Optimum, p: int) -> list[str]:
 
 
 class LogisticModel:
-    """The negative Laplace log-likelihood of one design, with its gradient.
+    """Negative Laplace log-likelihood of one design, with its gradient.
 
-    Parameters: coefficients of the orthonormal fixed effects (p,), then standard deviations.
-    Random effects are u of unit variance, by slot; the mode found last starts the next search.
+    Parameters: coefficients of the orthonormal fixed effects (p,), then standard deviations. Random
+    effects are u of unit variance, by slot; each search starts at the last mode.
     """
 
     def __init__(self, design: Design) -> None:
@@ -105,7 +106,9 @@ class LogisticModel:
         self.u = np.zeros(self.groupings.q)
 
     def start(self) -> tuple[Array, Array]:
-        """Penalised quasi-likelihood estimates, and steps of one standard error as columns."""
+        """Return penalised quasi-likelihood estimates, and steps of one standard error as
+        columns.
+        """
         groupings = self.groupings
         beta, spread = np.zeros(self.p), np.ones(len(groupings.levels))
         for _ in range(12):

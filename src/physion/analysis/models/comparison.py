@@ -1,4 +1,4 @@
-"""The comparison of models with people: which trials, then every table that a report needs."""
+"""Comparison of models with people: the selection of trials, and every table of results."""
 
 from __future__ import annotations
 
@@ -24,17 +24,18 @@ NO_SCENARIO = "its scenario is not known"
 
 @dataclass(frozen=True)
 class Comparison:
-    """Models beside people, as tables.
+    """Tables that compare models with people.
 
-    - ``scores``: see `tables.score_table`.
-    - ``people``: see `tables.people_table`, on the stimuli that any model predicts; empty when no
-      people were given.
+    - ``scores``: see `score_tables.score_table`.
+    - ``people``: see `score_tables.people_table`, for the stimuli that any model predicts; empty
+      without people.
     - ``stimuli``: one row a model and stimulus that both answered: ``agent``, ``model``,
       ``readout``, ``scenario``, ``stimulus``, ``p_contact``, ``predicted``, ``label`` (official),
       ``simulated``, ``human_accuracy``, ``count``, ``p_yes``, ``gap`` (p_contact - p_yes).
     - ``changed``: the stimuli whose simulated outcome is not the official one, one row each.
-    - ``dropped``: ``agent`` (empty: people's side), ``scenario``, ``reason``, ``stimuli`` (count).
-    - ``settings``: each choice in words, for the report.
+    - ``dropped``: excluded stimuli: ``agent`` (empty: excluded for all), ``scenario``, ``reason``,
+      ``stimuli`` (count).
+    - ``settings``: the settings as text for the report, by name.
     """
 
     scores: pd.DataFrame
@@ -46,12 +47,12 @@ class Comparison:
 
     @property
     def agents(self) -> list[str]:
-        """The models in the order of the predictions."""
+        """Names of the models in the order of the predictions."""
         return [str(name) for name in self.stimuli["agent"].unique()]
 
     @property
     def has_people(self) -> bool:
-        """Were people given at all?"""
+        """Whether answers of people were given."""
         return not self.people.empty
 
 
@@ -69,18 +70,38 @@ def compare(
 ) -> Comparison:
     """Compare models with people on the stimuli that people saw and the model predicts.
 
-    ``predictions``: official column names (`predictions.check_predictions`); *Actual Outcome* is
-    the outcome of the trial that the model was shown. ``humans``: from `responses.read_humans`, or
-    None to have the models' accuracies alone. ``labels``: official outcome by stimulus; where it is
-    silent the column *Recorded Outcome* of the predictions speaks, and without people the simulated
-    outcome. ``zone``: from `responses.read_human_zone` or from single participants' accuracies,
-    with ``scenario``, ``low`` and ``high``; ``zone_origin`` says in words where it comes from.
-    ``participants``: the answers of single participants are known and are drawn for the intervals
-    of other tables, which the settings then say. ``exclude``: stimuli to leave out.
-    ``exclude_ledge``: leave out the Roll stimuli with a ledge, as the study does.
+    Parameters
+    ----------
+    predictions
+        Official column names (`predictions.check_predictions`); *Actual Outcome* is the outcome of
+        the trial that the model was shown.
+    humans
+        Table from `responses.read_humans`, or None for the accuracies of the models alone.
+    labels
+        Official outcome by stimulus. For a stimulus without one the column *Recorded Outcome* of
+        the predictions is used and, without people, the simulated outcome.
+    zone
+        Table from `responses.read_human_zone` or from the accuracies of single participants, with
+        ``scenario``, ``low`` and ``high``.
+    zone_origin
+        Source of the zone as text.
+    participants
+        Whether other tables draw single participants for their intervals, for the settings.
+    exclude
+        Stimuli to exclude.
+    exclude_ledge
+        Whether to exclude the Roll stimuli with a ledge, as the study does.
+    bootstrap
+        Draws for the intervals.
 
-    Everything left out is counted in ``dropped``. Raises `BadInputError` where nothing is left, or
-    where a model or the tables contradict themselves.
+    Returns
+    -------
+    The tables; everything that was excluded is counted in ``dropped``.
+
+    Raises
+    ------
+    BadInputError
+        If no stimulus is left, or a model or the tables contradict themselves.
     """
     draws = bootstrap or Bootstrap()
     rows = predictions if "agent" in predictions else name_models(check_predictions(predictions))
@@ -118,14 +139,14 @@ def compare(
 
 
 def _recorded(rows: pd.DataFrame) -> dict[str, bool]:
-    """The official outcomes that the predictions themselves carry."""
+    """Return the official outcomes that the predictions contain."""
     given = rows[rows["recorded"].notna()].drop_duplicates("stimulus")
     pairs = zip(given["stimulus"], given["recorded"], strict=True)
     return {str(stimulus): bool(value) for stimulus, value in pairs}
 
 
 def _nobody(rows: pd.DataFrame, known: Mapping[str, bool]) -> pd.DataFrame:
-    """The stimuli of the predictions as if people had seen them, with NaN for their answers."""
+    """Return the stimuli of the predictions as a table of people whose answers are NaN."""
     people = rows.drop_duplicates("stimulus")[["stimulus", "scenario", "actual"]]
     label = people["stimulus"].map(known).astype(object)
     people = people.assign(
@@ -140,7 +161,7 @@ def _nobody(rows: pd.DataFrame, known: Mapping[str, bool]) -> pd.DataFrame:
 def _drop(
     people: pd.DataFrame, unwanted: set[str], exclude_ledge: bool
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """``people`` without what is left out on purpose or for want of a label, and the counts."""
+    """Return ``people`` without excluded stimuli and those without a label, and the counts."""
     reason = pd.Series("", index=people.index, dtype=object)
     reason = reason.mask(people["scenario"].isna(), NO_SCENARIO)
     reason = reason.mask(people["label"].isna(), NO_LABEL)
@@ -152,7 +173,7 @@ def _drop(
 
 
 def _purpose(stimulus: pd.Series, unwanted: set[str], exclude_ledge: bool) -> pd.Series:
-    """Why a stimulus is left out on purpose, empty where it is not."""
+    """Return the reason for which a stimulus is excluded on purpose; empty if it is not."""
     reason = pd.Series("", index=stimulus.index, dtype=object)
     reason = reason.mask(stimulus.isin(unwanted), EXCLUDED)
     return reason.mask(stimulus.map(is_ledge).astype(bool) & exclude_ledge, LEDGE)
@@ -172,7 +193,7 @@ def _join(rows: pd.DataFrame, people: pd.DataFrame) -> pd.DataFrame:
 def _unmatched(
     rows: pd.DataFrame, people: pd.DataFrame, unwanted: set[str], exclude_ledge: bool
 ) -> list[pd.DataFrame]:
-    """Counts of predictions that people have no answer to, and the other way round."""
+    """Count predictions without answers of people, and answers of people without a prediction."""
     extra = rows[~rows["stimulus"].isin(people["stimulus"])]
     reason = _purpose(extra["stimulus"], unwanted, exclude_ledge)
     parts = [_count(extra.assign(reason=reason.mask(reason == "", NOT_SEEN)))]
@@ -193,7 +214,7 @@ def _count(rows: pd.DataFrame) -> pd.DataFrame:
 def _whole(
     zone: pd.DataFrame | None, people: pd.DataFrame, stimuli: pd.DataFrame
 ) -> pd.DataFrame | None:
-    """``zone`` of the scenarios that are there in full: it says nothing about a part of them."""
+    """Return ``zone`` for scenarios with all stimuli: it does not hold for a part of them."""
     missing = people[~people["stimulus"].isin(stimuli["stimulus"])]["scenario"]
     return zone if zone is None else zone[~zone["scenario"].isin(missing)]
 

@@ -1,8 +1,8 @@
-"""Models beside single people in one scenario: every measure, its human zone, its intervals.
+"""Models compared with single participants of one scenario: every measure and its intervals.
 
-A *measure* of a model compares it with the people of the scenario; the *zone* of a measure is what
-single people (or pairs, or halves of them) reach, from the 2.5th to the 97.5th percentile.
-Intervals draw people, stimuli, or both; each is named, since they answer different questions.
+A *measure* of a model compares it with the people of the scenario; the *zone* of a measure is the
+range of single people (or pairs, or halves of them) from the 2.5th to the 97.5th percentile.
+Intervals draw people, stimuli, or both; they answer different questions, so each is named.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ TABLE_COLUMNS = (
 
 @dataclass(frozen=True)
 class Models:
-    """What models say about the stimuli of one scenario, in the order of `Answers.stimuli`.
+    """Predictions of models for the stimuli of one scenario, in the order of its answers.
 
-    ``p_contact`` (m, s) in 0..1 and ``predicted`` (m, s) 1 or 0; NaN where a model lacks the
-    stimulus. Raises `BadInputError` for other values or for shapes that do not fit.
+    ``p_contact`` (m, s) in 0..1 and ``predicted`` (m, s) 1 or 0; NaN if a model does not predict
+    the stimulus. Raises `BadInputError` for other values or for shapes that do not fit.
     """
 
     names: tuple[str, ...]
@@ -62,11 +62,22 @@ class Models:
 def models_of(
     rows: pd.DataFrame, answers: Answers, agents: Sequence[str] | None = None
 ) -> tuple[Models, pd.DataFrame]:
-    """The models of a table with ``agent``, ``stimulus``, ``p_contact``, ``predicted``.
+    """Return the models of a table, and a table of what has no counterpart.
 
-    ``agents``: which ones, in this order, be they in ``rows`` or not. Also a table of what finds no
-    counterpart: ``agent``, ``reason``, ``stimuli``. A stimulus that a model answers twice raises
-    `BadInputError`.
+    Parameters
+    ----------
+    rows
+        Table with ``agent``, ``stimulus``, ``p_contact``, ``predicted``.
+    answers
+        Answers of people to the scenario, whose stimuli are used.
+    agents
+        Names of the models in the order to use, whether they occur in ``rows`` or not; None: those
+        that occur.
+
+    Returns
+    -------
+    The models, and the table ``agent``, ``reason``, ``stimuli``. Raises `BadInputError` if a model
+    predicts a stimulus twice.
     """
     twice = rows[rows.duplicated(["agent", "stimulus"])]
     if len(twice):
@@ -94,10 +105,11 @@ def models_of(
 
 @dataclass(frozen=True)
 class Measured:
-    """The measures of models in one scenario with what their intervals are made of.
+    """Measures of models in one scenario, with the resamples for their intervals.
 
-    ``values[measure]`` (m,); ``pairs[measure]`` (people, m), for kappa and error consistency;
-    ``draws[what][measure]`` (resamples, m) for each of `RESAMPLED`, absent where nothing is drawn.
+    ``values[measure]`` (m,); ``pairs[measure]`` (people, m), for measures with a value for each
+    participant; ``draws[what][measure]`` (resamples, m) for each of `metrics.RESAMPLED`, absent if
+    the measure does not depend on the draw.
     """
 
     models: Models
@@ -123,11 +135,11 @@ def measure_models(models: Models, answers: Answers, bootstrap: Bootstrap) -> Me
 
 
 def measure_table(measured: Measured, bootstrap: Bootstrap) -> pd.DataFrame:
-    """One row a model and measure.
+    """Return one row a model and measure.
 
     Columns: ``model``, ``scenario``, ``measure``, ``stimuli``, ``value``; ``low`` and ``high`` with
-    ``_people``, ``_stimuli``, ``_both`` (interval by what is drawn); for kappa and error
-    consistency also ``pair_low``, ``pair_median``, ``pair_high`` (over participants) and
+    ``_people``, ``_stimuli``, ``_both`` (interval by what is drawn); for measures by participant
+    also ``pair_low``, ``pair_median``, ``pair_high`` (percentiles over participants) and
     ``undefined`` (participants for whom it is NaN); ``reason``.
     """
     models, records = measured.models, []
@@ -157,7 +169,9 @@ def measure_table(measured: Measured, bootstrap: Bootstrap) -> pd.DataFrame:
 def interval_columns(
     value: float, draws: Mapping[Resampled, Array | None], bootstrap: Bootstrap
 ) -> tuple[dict[str, Any], list[str]]:
-    """``value`` with ``low_`` and ``high_`` of each of `RESAMPLED`, and reasons for what is NaN."""
+    """Return ``value`` with ``low_`` and ``high_`` by what is drawn, and reasons for what is
+    NaN.
+    """
     record: dict[str, Any] = {"value": value}
     reasons = []
     for what in RESAMPLED:
@@ -237,8 +251,10 @@ def _why(measure: str, k: int, models: Models, answers: Answers) -> str:
 
 
 def model_pairs(models: Models, answers: Answers) -> pd.DataFrame:
-    """Kappa and error consistency of every two models: ``first``, ``second``, ``stimuli``,
-    ``kappa``, ``error_consistency``, NaN where undefined."""
+    """Return kappa and error consistency of every two models.
+
+    Columns: ``first``, ``second``, ``stimuli``, ``kappa``, ``error_consistency``; NaN if undefined.
+    """
     right = correctness(models.predicted, answers.label)
     kappa, errors = (cross_kappa(a, a) for a in (models.predicted, right))
     has = (~np.isnan(models.predicted)).astype(np.float64)

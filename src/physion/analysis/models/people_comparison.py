@@ -1,4 +1,4 @@
-"""All models beside all people: every scenario, their mean, and what was left out."""
+"""All models compared with all participants: every scenario, their mean, and what was excluded."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from physion.analysis.tables.stimuli import MEAN
 
 @dataclass(frozen=True)
 class PeopleComparison:
-    """Models beside single people, as tables.
+    """Tables that compare models with single participants.
 
-    - ``scores``: `model_people.measure_table` of every scenario, then of their mean (each scenario
-      counts the same; NaN where one of them is undefined), with ``zone_low``, ``zone_high`` (of
-      single participants) and ``in_zone`` (yes, no, or empty where either is not defined).
-    - ``zones``: `zones.human_zones` of every scenario, and of several also the paper's band of r
-      (`zones.released_r_zone`), whose scenario is the mean.
+    - ``scores``: `model_people.measure_table` of every scenario, then of their mean with equal
+      weights (NaN if one of them is undefined), with ``zone_low``, ``zone_high`` (of single
+      participants) and ``in_zone`` (yes, no, or empty if either is undefined).
+    - ``zones``: `zones.human_zones` of every scenario, and for several scenarios also the paper's
+      band of r (`zones.released_r_zone`), whose scenario is the mean.
     - ``pairs``: `model_people.model_pairs` of every scenario.
     - ``tests``: `paired.compare_models` on the stimuli of all scenarios together.
     - ``calibration``: `calibration.calibration_table`, likewise.
@@ -61,9 +61,19 @@ def compare_everywhere(
 ) -> PeopleComparison:
     """Compare the models of ``predictions`` with the people of ``test`` in every scenario.
 
-    ``predictions``: one row a model and stimulus with ``agent``, ``stimulus`` (canonical name),
-    ``p_contact``, ``predicted``; ``test``: test rows of `participants.Responses`. Predictions of
-    stimuli that no one saw are counted as dropped.
+    Parameters
+    ----------
+    predictions
+        One row a model and stimulus with ``agent``, ``stimulus`` (canonical name), ``p_contact``,
+        ``predicted``. Predictions of stimuli that nobody saw are counted as dropped.
+    test
+        Test rows of `participants.Responses`.
+    bootstrap
+        Draws for the intervals.
+    halves
+        Number of random splits of the people into halves.
+    permutations
+        Permutations of the test of differences in r.
     """
     columns = ["agent", "stimulus", "p_contact", "predicted"]
     require_columns(predictions, columns, "the predictions")
@@ -103,7 +113,7 @@ def _unseen(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _mean_table(measured: Sequence[Measured], bootstrap: Bootstrap) -> pd.DataFrame:
-    """The mean over scenarios; their people and stimuli are drawn independently."""
+    """Return the mean over scenarios; their people and stimuli are drawn independently."""
     records = []
     for k, name in enumerate(measured[0].models.names):
         for measure in measured[0].values:

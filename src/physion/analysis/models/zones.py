@@ -1,4 +1,4 @@
-"""What people themselves reach: the zones that a model's measures are set beside."""
+"""Human zones: the range of the same measures among people, to compare models with."""
 
 from __future__ import annotations
 
@@ -23,14 +23,17 @@ RELEASED_R = "halves, mean of scenarios (the paper's band)"
 
 
 def human_zones(answers: Answers, halves: Array | None = None) -> pd.DataFrame:
-    """What single people reach in each measure: ``scenario``, ``measure``, ``of``, ``values``,
-    ``mean``, ``low``, ``median``, ``high`` (2.5th, 50th, 97.5th percentile), ``undefined``.
+    """Return the range of each measure among single people.
 
-    ``of`` says whose values they are: ``participants`` (one against the average of the others, or
-    their mean kappa with the others: what a model would have to reach to pass for a participant),
-    ``pairs`` (kappa of two people: beside a model's kappa with single people) and ``halves`` (r of
-    two halves of the people; ``halves`` is from `people.split_halves`). A person says 0 or 1 and
-    no probability, which costs r and rmsd; halves are averages and reach more.
+    Columns: ``scenario``, ``measure``, ``of``, ``values`` (their number), ``mean``, ``low``,
+    ``median``, ``high`` (2.5th, 50th, 97.5th percentile), ``undefined``.
+
+    ``of`` names whose values they are: ``participants`` (each with the average of the others, or
+    the mean kappa with the others: what a model must reach to be indistinguishable from a
+    participant), ``pairs`` (kappa of two people, comparable to a model's kappa with single people)
+    and ``halves`` (r of two halves of the people; ``halves`` is from `people.split_halves`). A
+    person answers 0 or 1 and no probability, which makes r and RMSD worse; halves are averages and
+    reach better values.
     """
     yes, n = answers.yes, len(answers.sessions)
     others = mean_over_people(yes, 1 - np.eye(n))
@@ -61,7 +64,7 @@ def human_zones(answers: Answers, halves: Array | None = None) -> pd.DataFrame:
 
 
 def rmsd_of(own: Array, rest: Array) -> float:
-    """RMSD of two vectors on what both have."""
+    """Return the RMSD of two vectors where both are finite."""
     known = np.isfinite(own) & np.isfinite(rest)
     return rmsd(own[known], rest[known])
 
@@ -78,11 +81,11 @@ def _zone(values: npt.ArrayLike) -> dict[str, float]:
 def released_zone(
     scenario_values: Sequence[float], bootstrap: Bootstrap | None = None
 ) -> tuple[float, float, float]:
-    """The grey band of the published panels for accuracy and kappa: mean, low, high.
+    """Return the grey band of the published panels for accuracy and kappa: mean, low, high.
 
-    It is the bootstrap over the values of the eight scenarios, so it tells how far their mean would
-    move with other scenarios, and nothing about how participants differ: no human zone, though it
-    bears the name. The released code drew without a seed.
+    It is a bootstrap over the values of the eight scenarios. It shows how far their mean would vary
+    with other scenarios, and not how participants differ, so it is no human zone, although the
+    paper names it so. The released code drew without a seed.
     """
     values = np.asarray(scenario_values, dtype=np.float64)
     if not len(values) or not np.isfinite(values).all():
@@ -93,11 +96,12 @@ def released_zone(
 
 
 def released_r_zone(zones: pd.DataFrame) -> pd.DataFrame:
-    """The grey band of the published panel for r, as one row with the columns of `human_zones`.
+    """Return the grey band of the published panel for r, as one row with the columns of
+    `human_zones`.
 
     ``zones`` holds the rows of `human_zones` of several scenarios. The band is the mean over them
     of the 2.5th and of the 97.5th percentile of r between random halves of the people, uncorrected
-    for their halved number; NaN where a scenario has none. ``values`` counts the scenarios.
+    for the halved number of people; NaN if a scenario has none. ``values`` counts the scenarios.
     """
     halves = zones[(zones["measure"] == "r") & (zones["of"] == "halves")]
     bounds = halves[["mean", "low", "median", "high"]].mean(skipna=False)

@@ -1,1 +1,1 @@
-"""Answers of single participants."""
+"""Answers of single participants, and their analysis."""

@@ -1,4 +1,4 @@
-"""Answers of one scenario as arrays: participants by stimuli, for statistics that need no names."""
+"""Answers of one scenario as arrays of participants by stimuli."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Answers:
-    """Who said what in one scenario.
+    """Answers of all participants to one scenario.
 
     - ``sessions`` and ``participants``: names, length n, in the order of the rows of ``yes``;
     - ``stimuli``: names, length s, sorted: the columns;
-    - ``yes`` (n, s): 1, 0, or NaN where that person did not answer;
-    - ``label`` (s,): 1 where agent and patient touch, else 0;
-    - ``log_rt`` (n, s): log response time in log ms, NaN where not known.
+    - ``yes`` (n, s): 1, 0, or NaN if that person did not answer;
+    - ``label`` (s,): 1 if agent and patient touch, else 0;
+    - ``log_rt`` (n, s): natural logarithm of the response time in ms, NaN if unknown.
     """
 
     scenario: str
@@ -34,18 +34,18 @@ class Answers:
 
     @property
     def correct(self) -> Array:
-        """1 where right, 0 where wrong, NaN without an answer; (n, s)."""
+        """Correctness of the answers (n, s): 1 right, 0 wrong, NaN without an answer."""
         return np.where(np.isnan(self.yes), np.nan, self.yes == self.label)
 
     def shares(self) -> Array:
-        """Share of people who said yes, by stimulus, (s,)."""
+        """Return the fraction of people who say yes, by stimulus, (s,)."""
         return mean_over_people(self.yes)
 
 
 def mean_over_people(values: Array, weights: npt.ArrayLike | None = None) -> Array:
-    """Mean over people by stimulus of values (n, s) with gaps; NaN where nobody answered.
+    """Return the mean over people, by stimulus, of values (n, s) with gaps; NaN if nobody answered.
 
-    With ``weights`` (resamples, n), how often each person is drawn: shape (resamples, s).
+    With ``weights`` (resamples, n), how often each person is drawn, the shape is (resamples, s).
     """
     given = ~np.isnan(values)
     drawn = np.ones(len(values)) if weights is None else np.asarray(weights, dtype=np.float64)
@@ -55,9 +55,9 @@ def mean_over_people(values: Array, weights: npt.ArrayLike | None = None) -> Arr
 
 
 def answers_of(test: pd.DataFrame, scenario: str) -> Answers:
-    """The answers to one scenario, from the test rows of `participants.Responses`.
+    """Return the answers to one scenario from the test rows of `participants.Responses`.
 
-    Raises `BadInputError` where the scenario has no answer, or a session two to one stimulus.
+    Raises `BadInputError` if the scenario has no answer, or a session two answers to one stimulus.
     """
     rows = test[test["scenario"] == scenario]
     if rows.empty:

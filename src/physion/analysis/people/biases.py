@@ -1,4 +1,4 @@
-"""What else moves answers: a liking for yes or for one side, practice, who the people are."""
+"""Biases and covariates of answers: response bias, side bias, practice, background."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ BACKGROUND = ("age", "gender", "education", "difficulty", "technical_problems")
 
 
 def yes_bias(test: pd.DataFrame, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
-    """Do people say yes too often? One row a scenario.
+    """Test whether people say yes too often; one row a scenario.
 
-    Columns: ``scenario``, ``people``, ``base_rate`` (share of stimuli with contact, each answer
-    counted), ``yes`` (share of yes), ``bias`` (yes - base_rate) with ``_low``, ``_high``,
-    ``d_prime`` and ``criterion`` (means over people; below 0: inclined to yes) with intervals,
-    ``reason``. Intervals draw people. Hit and false-alarm rates of a person add half an answer to
-    each side (log-linear), so that all-right people have a finite d'.
+    Columns: ``scenario``, ``people``, ``base_rate`` (fraction of stimuli with contact, weighted by
+    answers), ``yes`` (fraction of yes), ``bias`` (yes - base_rate) with ``_low``, ``_high``,
+    ``d_prime`` and ``criterion`` (means over people; below 0: bias towards yes) with intervals,
+    ``reason``. Intervals draw people. Hit and false-alarm rates use the log-linear correction (half
+    an answer added to each side), so that d' is finite for people who are always right.
     """
     draws = bootstrap or Bootstrap()
     records = []
@@ -56,7 +56,7 @@ def yes_bias(test: pd.DataFrame, bootstrap: Bootstrap | None = None) -> pd.DataF
 
 
 def _signal_detection(answers: Answers) -> tuple[Array, Array, str]:
-    """d' and criterion of each person; NaN where the stimuli seen have one outcome only."""
+    """Return d' and criterion of each person; NaN if all stimuli seen have the same outcome."""
     given = ~np.isnan(answers.yes)
     touch = given & (answers.label == 1)
     miss = given & (answers.label == 0)
@@ -86,13 +86,13 @@ def _mean_with_interval(
 
 
 def side_bias(test: pd.DataFrame, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
-    """Do people press the left button too often? One row a scenario.
+    """Test whether people press the left button too often; one row a scenario.
 
-    A person keeps one order of buttons, so that side and answer are mixed up within people; between
-    people they are not. Columns: ``scenario``, ``yes_left``, ``yes_right`` (people of either
-    order), ``left`` (share of left presses, mean of the two groups, so that saying yes often
-    cancels) with ``_low``, ``_high`` (people drawn within each group) and ``p`` (Welch's test of
-    the share of yes in the two groups), ``unknown`` (people whose order is not known), ``reason``.
+    A person keeps one order of buttons, so side and answer are confounded within people but not
+    between people. Columns: ``scenario``, ``yes_left``, ``yes_right`` (people with either order),
+    ``left`` (fraction of left presses, mean of the two groups, so that a bias towards yes cancels)
+    with ``_low``, ``_high`` (people drawn within each group) and ``p`` (Welch's test of the
+    fraction of yes in the two groups), ``unknown`` (people whose order is unknown), ``reason``.
     """
     draws = bootstrap or Bootstrap()
     records = []
@@ -133,12 +133,13 @@ def _side_record(groups: dict[str, Array], scenario: str, draws: Bootstrap) -> d
 
 
 def learning(test: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
-    """Do people get better over the test trials, without feedback? One row a scenario, then all.
+    """Test whether people improve over the test trials, without feedback; one row a scenario, then
+    all.
 
-    Logistic regression of being right on the place in the order, in units of 100 trials, with
+    Logistic regression of correctness on the position in the order, in units of 100 trials, with
     standard errors clustered by participant (`clustered_logit`); for all scenarios together with an
-    intercept each. Columns: ``scenario``, ``b`` (log odds per 100 trials), ``se``, ``z``, ``p``,
-    ``low``, ``high``, ``rows``, ``clusters``, ``reason``, ``first_half`` and ``second_half``
+    intercept for each. Columns: ``scenario``, ``b`` (log odds per 100 trials), ``se``, ``z``,
+    ``p``, ``low``, ``high``, ``rows``, ``clusters``, ``reason``, ``first_half`` and ``second_half``
     (accuracy in either half of the trials). Orders are random, so stimuli need no adjustment.
     """
     table = test.assign(hundred=test["trial"].to_numpy(dtype=np.float64) / 100)
@@ -162,9 +163,10 @@ def learning(test: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
 
 
 def background(sessions: pd.DataFrame) -> pd.DataFrame:
-    """Who took part: one row a question and answer, with ``sessions`` and ``share``.
+    """Count the answers to the questionnaire: one row a question and answer.
 
-    Answers of numeric questions are given as they are; not answered is ``(none)``.
+    Columns: ``question``, ``answer`` (``(none)`` if not answered), ``sessions``, ``share``
+    (fraction).
     """
     parts = []
     for column in BACKGROUND:
@@ -189,7 +191,7 @@ def background(sessions: pd.DataFrame) -> pd.DataFrame:
 
 
 def accuracy_by_background(test: pd.DataFrame, sessions: pd.DataFrame) -> pd.DataFrame:
-    """Does accuracy go with age, gender, education or the difficulty that people report?
+    """Test whether accuracy depends on age, gender, education or reported difficulty.
 
     Accuracies are taken relative to the mean of their scenario, since scenarios differ. One row a
     question: ``question``, ``sessions``, ``test`` (``spearman`` for numbers, ``kruskal-wallis`` for

@@ -1,4 +1,4 @@
-"""Stimuli that fool people, and hard, chance and easy ones."""
+"""Difficulty of stimuli for people: below chance, hard, at chance, easy."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ EDGES = (1 / 3, 2 / 3)
 
 
 def below_chance_released(accuracy: npt.ArrayLike, count: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-    """The study's rule: accuracy + 1.96 standard errors lie below 0.5.
+    """Return whether accuracy + 1.96 standard errors is below 0.5: the study's rule.
 
-    The standard error is that of the normal approximation at the observed share, so that a share
-    of 0 has none; there is no correction for looking at 150 stimuli.
+    The standard error is that of the normal approximation at the observed fraction, which is 0 for
+    a fraction of 0; there is no correction for testing 150 stimuli.
     """
     p, n = _shares(accuracy, count)
     return np.asarray(p + 1.96 * np.sqrt(p * (1 - p) / n) < 0.5)
 
 
 def below_chance_p(accuracy: npt.ArrayLike, count: npt.ArrayLike) -> Array:
-    """Exact binomial p of so few or fewer right answers of ``count``, were people guessing."""
+    """Return the exact binomial p of at most so many right answers of ``count`` by guessing."""
     p, n = _shares(accuracy, count)
     return np.asarray(stats.binom.cdf(np.rint(p * n), n, 0.5), dtype=np.float64)
 
 
 def below_chance(by_stimulus: pd.DataFrame, level: float = 0.05) -> pd.DataFrame:
-    """Which stimuli people get wrong more often than by guessing, by two rules.
+    """Find the stimuli that people get wrong more often than by guessing, by two rules.
 
     ``by_stimulus`` has ``stimulus``, ``scenario``, ``accuracy`` and ``count``, from
-    `people.accuracy_by_stimulus` or `responses.read_humans`. Columns that come: ``released``
+    `people.accuracy_by_stimulus` or `responses.read_humans`. Added columns: ``released``
     (`below_chance_released`), ``p`` (`below_chance_p`), ``p_adjusted`` (Benjamini and Hochberg over
     all rows given), ``exact`` (p_adjusted < ``level``).
     """
@@ -55,7 +55,9 @@ def below_chance(by_stimulus: pd.DataFrame, level: float = 0.05) -> pd.DataFrame
 
 
 def difficulty_third(accuracy: npt.ArrayLike, edges: tuple[float, float] = EDGES) -> pd.Series:
-    """``hard`` up to the first edge, ``easy`` from the second on, ``chance`` between; NaN stays."""
+    """Return ``hard`` up to the first edge, ``easy`` from the second, ``chance`` between; NaN stays
+    NaN.
+    """
     values = np.asarray(accuracy, dtype=np.float64)
     names = np.select([values <= edges[0], values >= edges[1]], ["hard", "easy"], "chance")
     return pd.Series(names, dtype=object).where(np.isfinite(values), np.nan)
@@ -65,14 +67,30 @@ def r_by_third(
     p_contact: npt.ArrayLike, yes: npt.ArrayLike, label: npt.ArrayLike, halves: int = 200,
     seed: int = 0,
 ) -> pd.DataFrame:  # fmt: skip
-    """r of models with the average person within hard, chance and easy stimuli of one scenario.
+    """Return r of models with the average person within hard, chance and easy stimuli of one
+    scenario.
 
-    ``p_contact`` (m, s) with NaN for gaps, ``yes`` (n, s) the answers of people, ``label`` (s,).
-    Columns: ``third``, ``stimuli``, ``model`` (row number; -1: the two halves of the people, whose
-    ``low`` and ``high`` are the 2.5th and 97.5th percentile of r), ``r`` (halves: mean), ``low``,
-    ``high``. Thirds are made by the very answers that r is about: within a third accuracy hardly
-    varies, so r there is mostly whether P(contact) follows the outcome (easy) or its opposite
-    (hard). NaN where r is undefined.
+    Parameters
+    ----------
+    p_contact
+        (m, s), NaN if a model does not predict a stimulus.
+    yes
+        (n, s): answers of people.
+    label
+        (s,): official outcomes.
+    halves, seed
+        Number of random splits of the people, and their seed.
+
+    Returns
+    -------
+    ``third``, ``stimuli``, ``model`` (row index; -1: the two halves of the people, whose ``low``
+    and ``high`` are the 2.5th and 97.5th percentile of r), ``r`` (halves: mean), ``low``, ``high``;
+    NaN if r is undefined.
+
+    Notes
+    -----
+    The thirds depend on the same answers as r: within a third accuracy hardly varies, so r there
+    mostly tells whether P(contact) follows the outcome (easy) or its opposite (hard).
     """
     answers, truth = np.asarray(yes, np.float64), np.asarray(label, np.float64)
     models = np.atleast_2d(np.asarray(p_contact, np.float64))

@@ -1,9 +1,9 @@
-"""Which sessions are flagged, by which rule, and whether it matters.
+"""Exclusion rules: which sessions are flagged, by which rule, and with which effect.
 
-Rules flag, they do not drop: `flag_sessions` gives one row a session and one column a rule, so that
-analyses can be done with and without the flagged ones, as preregistered. Rule sets are values:
-`PREREGISTERED` is the preregistration's text, `OFFICIAL_CODE` what the released code did instead
-(docs/official-system.md, section 7.2).
+Rules flag sessions and do not drop them: `flag_sessions` returns one row a session and one column a
+rule, so that analyses can be done with and without flagged sessions, as preregistered. Rule sets
+are values: `PREREGISTERED` follows the text of the preregistration, `OFFICIAL_CODE` the released
+code, which differs from it.
 """
 
 from __future__ import annotations
@@ -91,11 +91,11 @@ def streak_limit(
     trials: int = 150, percentile: float = 97.5, p_yes: float = 0.5,
     simulations: int = 10_000, seed: int = 0,
 ) -> float:  # fmt: skip
-    """The percentile of the longest streak of independent answers, by seeded simulation.
+    """Return the percentile of the longest streak of independent answers, by seeded simulation.
 
-    The exact 97.5th percentile for 150 fair answers is 12 (which 98.3 % of sequences do not exceed,
-    while 96.6 % do not exceed 11). The thousand simulations of the released code gave 11 or 13 now
-    and then; ten thousand do not.
+    The exact 97.5th percentile for 150 fair answers is 12 (98.3 % of sequences do not exceed it,
+    96.6 % do not exceed 11). The thousand simulations of the released code sometimes gave 11 or 13;
+    ten thousand do not.
     """
     rng = generator("streak", seed, trials, simulations)
     answers = rng.random((simulations, trials)) < p_yes
@@ -106,7 +106,9 @@ def streak_limit(
 
 
 def flag_streak(measures: pd.DataFrame, rules: ExclusionRules, seed: int = 0) -> pd.Series:
-    """A run of one answer that is longer than ``streak_over`` (or than the simulated limit)."""
+    """Flag a streak of one answer that is longer than ``streak_over`` (or than the simulated
+    limit).
+    """
     if rules.streak_percentile is not None:
         lengths = measures["expected"].astype(int)
         limits = {n: streak_limit(n, rules.streak_percentile, seed=seed) for n in set(lengths)}
@@ -116,21 +118,21 @@ def flag_streak(measures: pd.DataFrame, rules: ExclusionRules, seed: int = 0) ->
 
 
 def flag_alternation(measures: pd.DataFrame, rules: ExclusionRules) -> pd.Series:
-    """At least ``alternation`` answers in a row that alternate."""
+    """Flag at least ``alternation`` alternating answers in a row."""
     limit = np.inf if rules.alternation is None else rules.alternation
     which = "longest_alternation" + ("_from_first" if rules.alternation_phase else "")
     return measures[which] >= limit
 
 
 def flag_familiarization(measures: pd.DataFrame, rules: ExclusionRules) -> pd.Series:
-    """Too few practice trials right; not assessed, so not flagged, where none were recorded."""
+    """Flag too few correct practice trials; without recorded practice a session is not flagged."""
     limit = -np.inf if rules.familiarization_share is None else rules.familiarization_share
     share = measures["familiarization_correct"] / measures["familiarization_trials"]
     return share <= limit + 1e-9  # 3 of 10 is 0.3
 
 
 def flag_low_accuracy(measures: pd.DataFrame, rules: ExclusionRules) -> pd.Series:
-    """Accuracy far below that of the scenario's sessions."""
+    """Flag an accuracy far below that of the scenario's sessions."""
     if rules.accuracy_sd is None:
         return pd.Series(False, index=measures.index)
     base = _reference(measures, "accuracy", rules.accuracy_centre, rules.ddof)
@@ -138,7 +140,7 @@ def flag_low_accuracy(measures: pd.DataFrame, rules: ExclusionRules) -> pd.Serie
 
 
 def flag_slow(measures: pd.DataFrame, rules: ExclusionRules) -> pd.Series:
-    """Log response times far above those of the scenario's sessions."""
+    """Flag log response times far above those of the scenario's sessions."""
     if rules.rt_sd is None:
         return pd.Series(False, index=measures.index)
     column = f"{rules.rt_summary}_log_rt"
@@ -147,14 +149,14 @@ def flag_slow(measures: pd.DataFrame, rules: ExclusionRules) -> pd.Series:
 
 
 def flag_incomplete(measures: pd.DataFrame) -> pd.Series:
-    """Fewer test trials answered than the scenario has."""
+    """Flag fewer answered test trials than expected."""
     return measures["trials"] < measures["expected"]
 
 
 def flag_repeated(measures: pd.DataFrame) -> pd.Series:
-    """Every session of a participant in a scenario but the first complete one.
+    """Flag every session of a participant in a scenario except the first complete one.
 
-    Sessions count in the order in which they began. Where none is complete, the first counts.
+    Sessions count in the order in which they began. If none is complete, the first is kept.
     """
     incomplete = flag_incomplete(measures)
     ordered = measures.assign(_incomplete=incomplete).sort_values("_incomplete", kind="stable")
@@ -162,7 +164,7 @@ def flag_repeated(measures: pd.DataFrame) -> pd.Series:
 
 
 def _reference(measures: pd.DataFrame, column: str, centre: str, ddof: int) -> pd.DataFrame:
-    """Centre and standard deviation of the complete sessions of each session's scenario."""
+    """Return centre and standard deviation of the complete sessions of each session's scenario."""
     whole = measures[~flag_incomplete(measures)]
     groups = whole.groupby("scenario")[column]
     table = pd.DataFrame({"centre": groups.agg(centre), "sd": groups.std(ddof=ddof)})
@@ -180,10 +182,12 @@ def flag_sessions(
     expected: Mapping[str, int] | None = None,
     seed: int = 0,
 ) -> pd.DataFrame:
-    """One row a session: the measures, a bool for each of `RULES`, and ``flagged`` (any of them).
+    """Return one row a session: the measures, a bool for each of `RULES`, and ``flagged`` (any of
+    them).
 
     Flag before stimuli are dropped: rules about sequences need all answers. Centres and standard
-    deviations are those of the scenario's complete sessions, flagged by another rule or not.
+    deviations are those of the scenario's complete sessions, whether another rule flags them or
+    not.
     """
     measures = session_measures(responses, expected)
     flags = {
@@ -200,9 +204,9 @@ def flag_sessions(
 
 
 def without_flagged(responses: Responses, flags: pd.DataFrame) -> Responses:
-    """The responses of the main analysis: only sessions that no rule flags.
+    """Return the responses of the sessions that no rule flags, for the main analysis.
 
-    Raises `BadInputError` where none remains.
+    Raises `BadInputError` if none remains.
     """
     unflagged = set(flags.loc[~flags["flagged"], "session"])
     if not unflagged:
@@ -211,11 +215,12 @@ def without_flagged(responses: Responses, flags: pd.DataFrame) -> Responses:
 
 
 def count_flags(flags: pd.DataFrame) -> pd.DataFrame:
-    """Sessions that each rule flags, by scenario: ``scenario``, ``rule``, ``sessions``, ``only``.
+    """Count the sessions that each rule flags, by scenario.
 
-    ``only`` counts those that no other rule flags. The rows ``flagged`` (by any rule), ``kept`` and
-    ``all`` end each scenario; ``familiarization not assessed`` (no practice trial) and ``slow not
-    assessed`` (no response time) stand where they apply.
+    Columns: ``scenario``, ``rule``, ``sessions``, ``only`` (flagged by no other rule). The rows
+    ``flagged`` (by any rule), ``kept`` and ``all`` end each scenario; ``familiarization not
+    assessed`` (no practice trial) and ``slow not assessed`` (no response time) are added if they
+    apply.
     """
     rows = []
     for scenario in in_order(flags["scenario"]):
@@ -244,10 +249,10 @@ def with_and_without(
     flags: pd.DataFrame,
     analyse: Callable[[Responses], pd.DataFrame],
 ) -> pd.DataFrame:
-    """A table of any analysis, once without and once with the flagged sessions.
+    """Apply an analysis once without and once with the flagged sessions.
 
-    ``analyse`` takes `Responses` and gives a table; the column ``sessions`` that is put before it
-    says ``unflagged`` (the main analysis) or ``complete`` (all complete first sessions).
+    ``analyse`` maps `Responses` to a table. The first column of the result, ``sessions``, is
+    ``unflagged`` (the main analysis) or ``complete`` (all complete first sessions).
     """
     whole = set(flags.loc[~flags["incomplete"] & ~flags["repeated"], "session"])
     sets = {"unflagged": set(flags.loc[~flags["flagged"], "session"]), "complete": whole}
@@ -264,13 +269,13 @@ def with_and_without(
 def flag_effect(
     responses: Responses, flags: pd.DataFrame, column: str = "flagged", level: float = 0.95
 ) -> pd.DataFrame:
-    """The modelled effect of a session's flag on being right, over all sessions.
+    """Estimate the effect of a session's flag on correctness, over all sessions.
 
     Logistic regression of every test answer on the flag and the scenario, with standard errors
-    that allow for the answers of one participant being alike (`clustered_logit`). Columns are
-    those of `clustered_logit`, for the term ``column`` alone; NaN with a ``reason`` where all or no
-    sessions are flagged. Low accuracy is itself a rule, so the effects of ``low_accuracy``, and of
-    ``flagged`` where it flags any session, are there by construction, which the ``reason`` says.
+    clustered by participant. Columns are those of `clustered_logit`, for the term ``column`` alone;
+    NaN with a ``reason`` if all or no sessions are flagged. Low accuracy is itself a rule, so the
+    effects of ``low_accuracy``, and of ``flagged`` if it flags any session, hold by construction;
+    the ``reason`` then states it.
     """
     if column not in (*RULES, "flagged"):
         raise BadInputError(f"{column!r} is no rule; choose one of {', '.join(RULES)} or flagged")

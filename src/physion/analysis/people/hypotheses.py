@@ -1,9 +1,9 @@
-"""The four preregistered hypotheses: what makes a stimulus hard, and do people take longer then?
+"""The four preregistered hypotheses: attributes that make stimuli hard, and slower answers to them.
 
 By stimulus, which needs only the table of `people.accuracy_by_stimulus` or of the official files:
 regression of a stimulus' accuracy (or log response time) on the attribute, with an intercept for
-each scenario. The same hypotheses at the level of single answers are `HYPOTHESES[...].formula` on
-`answer_rows`, for the mixed models.
+each scenario. By single answers: ``HYPOTHESES[...].formula`` on `answer_rows`, for the mixed
+models.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """``predictor`` moves ``outcome`` in the direction of ``sign``.
+    """A hypothesis: ``predictor`` changes ``outcome`` in the direction of ``sign``.
 
-    ``formula`` says the same of single answers, with scenario fixed and participants and stimuli
-    random; ``family``: whether that model is ``logistic`` or ``linear``.
+    ``formula`` is its mixed model of single answers, with scenario fixed and participants and
+    stimuli random; ``family``: whether that model is ``logistic`` or ``linear``.
     """
 
     name: str
@@ -72,14 +72,14 @@ COLUMNS = (
 
 
 def with_attributes(by_stimulus: pd.DataFrame, attributes: pd.DataFrame) -> pd.DataFrame:
-    """``by_stimulus`` with the columns of `attributes.ATTRIBUTES`, NaN where they are not known."""
+    """Return ``by_stimulus`` with the columns of `attributes.ATTRIBUTES`, NaN if unknown."""
     require_columns(by_stimulus, ["stimulus", "scenario", "accuracy"], "the table by stimulus")
     columns = ["stimulus", *ATTRIBUTES]
     return by_stimulus.merge(attributes[columns], on="stimulus", how="left", validate="one_to_one")
 
 
 def answer_rows(test: pd.DataFrame, stimuli: pd.DataFrame) -> pd.DataFrame:
-    """Single answers with the attributes of their stimuli: what a mixed model is fitted to.
+    """Return single answers with the attributes of their stimuli, for mixed models.
 
     ``stimuli``: from `with_attributes`. Columns: ``participant``, ``scenario``, ``stimulus``,
     ``correct``, ``log_rt``, ``accuracy`` (of the stimulus, over all people), `ATTRIBUTES`.
@@ -90,15 +90,15 @@ def answer_rows(test: pd.DataFrame, stimuli: pd.DataFrame) -> pd.DataFrame:
 
 
 def regress_hypotheses(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
-    """Each hypothesis in each scenario and, in row ``all``, over all with an intercept for each.
+    """Test each hypothesis in each scenario and, in row ``all``, over all with an intercept for
+    each.
 
     ``stimuli``: from `with_attributes`, with ``mean_log_rt`` for H4. Columns: ``b`` (change of the
-    outcome for one more of the predictor; H4: per unit of accuracy), ``se`` (HC3, which holds for
-    unequal variances), ``t``, ``df``, ``p`` (two-sided), ``low``, ``high``, ``r`` (Pearson's,
-    within scenarios) and ``spearman`` (in ``all`` of values less their scenario's mean),
-    ``as_predicted`` (sign of b), ``left_out`` (stimuli without predictor or outcome), ``reason``.
-    A reason also tells where distractors and occluders always come together: then neither has an
-    effect of its own that these stimuli could show.
+    outcome per unit of the predictor), ``se`` (HC3, valid for unequal variances), ``t``, ``df``,
+    ``p`` (two-sided), ``low``, ``high``, ``r`` (Pearson's, within scenarios) and ``spearman`` (in
+    ``all`` of values less their scenario's mean), ``as_predicted`` (sign of b), ``left_out``
+    (stimuli without predictor or outcome), ``reason``. The reason also reports if distractors and
+    occluders always occur together: then their effects cannot be separated.
     """
     records = []
     for hypothesis in HYPOTHESES.values():
@@ -140,16 +140,18 @@ def _record(hypothesis: Hypothesis, name: str, rows: pd.DataFrame, level: float)
 
 
 def _within(rows: pd.DataFrame, column: str) -> Array:
-    """A column less the mean of its scenario: the same as an intercept for each scenario."""
+    """Subtract the mean of its scenario from a column: equivalent to an intercept for each
+    scenario.
+    """
     values = rows[column].astype(np.float64)
     return np.asarray(values - values.groupby(rows["scenario"]).transform("mean"))
 
 
 def _slope(x: Array, y: Array, of_scenario: Array, level: float) -> dict[str, float]:
-    """Least squares through the origin of centred values, with HC3 standard error.
+    """Fit least squares through the origin of centred values, with the HC3 standard error.
 
-    ``of_scenario``: stimuli of each stimulus' scenario, whose mean was taken off and adds
-    1 / of_scenario to its leverage.
+    ``of_scenario``: number of stimuli of each stimulus' scenario, whose subtracted mean adds 1 /
+    of_scenario to the leverage.
     """
     squares = float(np.sum(x * x))
     b = float(np.sum(x * y)) / squares

@@ -1,8 +1,7 @@
-"""Participant-level answers in the raw columns of the original study, made `Responses`.
+"""Reader of participant-level answers in the raw columns of the original study.
 
 The study's exports are ``human_responses-<study>-<iteration>.csv`` (150 test trials a session) and
-``familiarization_human_responses-...`` (10 trials); docs/official-system.md, section 7.1,
-says what their columns mean. Their ``rt`` starts before the cue.
+``familiarization_human_responses-...`` (10 trials). Their ``rt`` starts before the cue.
 """
 
 from __future__ import annotations
@@ -45,11 +44,11 @@ def read_official_responses(
     unknown: Refuse = "refuse",
     conflicts: Refuse = "refuse",
 ) -> Responses:
-    """Responses from the raw files of the study, test and familiarization together.
+    """Read responses from the raw files of the study, test and familiarization together.
 
-    A file's scenario is, in this order: ``scenario``, what its name says, what its stimuli are
-    called. A session is a ``gameID``; its participant the Prolific id, where there is one.
-    ``rt_offset_ms`` is taken off ``rt``. The rest is as in `participants.read_responses`.
+    The scenario of a file is ``scenario``, else that in its name, else that of its stimuli. A
+    session is a ``gameID``; its participant is the Prolific id if there is one. ``rt_offset_ms`` is
+    subtracted from ``rt``. The other parameters are those of `participants.read_responses`.
     """
     if not files:
         raise BadInputError("no file of responses was given")
@@ -60,7 +59,7 @@ def read_official_responses(
 
 
 def _file(path: Path, scenario: str | None, offset: float) -> pd.DataFrame:
-    """One file in our columns, as text where it was text."""
+    """Read one file into our columns; text stays text."""
     raw = read_csv(path, COLUMNS)
     condition = raw["condition"] if "condition" in raw else pd.Series("prediction", index=raw.index)
     is_practice = condition.str.contains("familiarization")
@@ -120,6 +119,6 @@ def _response_time(rt: pd.Series, offset: float, path: Path) -> pd.Series:
 
 
 def _buttons(choices: str) -> str:
-    """``["YES", "NO"]``, ``['NO' 'YES']``, ``YES,NO``: the order is what counts."""
+    """Return the order of the buttons from ``["YES", "NO"]``, ``['NO' 'YES']`` or ``YES,NO``."""
     words = re.findall(r"yes|no", choices.lower())
     return "-".join(words) if sorted(words) == ["no", "yes"] else ""

@@ -1,8 +1,8 @@
-"""Answers of single participants: read, checked, cleaned, with every drop counted.
+"""Answers of single participants: read, checked and cleaned; everything dropped is counted.
 
-`read_responses` reads what our experiment exports (`response_schema`); `official_responses` reads
-the raw columns of the original study. Both give `Responses`, on which exclusions, the analyses of
-people and the comparison with models build.
+`read_responses` reads the export of our experiment (`response_schema`); `official_responses` reads
+the raw columns of the original study. Both return `Responses`, the input of exclusions, of the
+analyses of people and of the comparison with models.
 """
 
 from __future__ import annotations
@@ -56,19 +56,20 @@ class Responses:
 
     @property
     def test(self) -> pd.DataFrame:
-        """The rows of the test phase."""
+        """Rows of the test phase."""
         return self.trials[self.trials["phase"] == "test"]
 
     def keep_sessions(self, sessions: Collection[str], reason: str) -> Responses:
-        """Only these sessions; the others are counted as dropped for ``reason``."""
+        """Return these sessions only; the others are counted as dropped for ``reason``."""
         gone = ~self.trials["session"].isin(sessions)
         kept = self.sessions[self.sessions["session"].isin(sessions)].reset_index(drop=True)
         return replace(_without(self, gone, "sessions", reason), sessions=kept)
 
     def drop_stimuli(self, exclude: Iterable[str] = (), ledge: bool = True) -> Responses:
-        """Without the stimuli of a list and, as in the study, without Roll's ledges.
+        """Return the responses without the stimuli of a list and, as in the study, without Roll's
+        ledges.
 
-        Flag sessions first: rules about the sequence of answers need all of it.
+        Flag sessions first: rules about the sequence of answers need all answers.
         """
         unwanted = {canonical_name(name) for name in exclude}
         stimuli = self.trials["stimulus"]
@@ -86,11 +87,25 @@ def read_responses(
     conflicts: Refuse = "refuse",
     simulated: bool = False,
 ) -> Responses:
-    """Responses from our experiment's export: CSV or parquet, see `response_schema`.
+    """Read the responses of our experiment's export.
 
-    ``known``: names of the stimuli that may occur. ``unknown``: what to do with others.
-    ``conflicts``: what to do with a second answer of one session to one stimulus (``drop`` keeps
-    the first). ``simulated``: keep the sessions that no person made. Raises `BadInputError`.
+    Parameters
+    ----------
+    trials, sessions
+        CSV or parquet files with the columns of `response_schema`.
+    known
+        Names of the stimuli that may occur; None: any.
+    unknown
+        What to do with other stimuli.
+    conflicts
+        What to do with a second answer of one session to one stimulus (``drop`` keeps the first).
+    simulated
+        Whether to keep the sessions of simulated participants.
+
+    Raises
+    ------
+    BadInputError
+        For files that break the schema or contradict themselves.
     """
     table = check_table(read_table(trials, ()), TRIAL_COLUMNS, str(trials))
     people = None
@@ -116,10 +131,11 @@ def clean(
     unknown: Refuse = "refuse",
     conflicts: Refuse = "refuse",
 ) -> Responses:
-    """Responses from a table that `check_table` has typed; see `read_responses`.
+    """Return the responses of a table that `check_table` has typed; see `read_responses`.
 
-    Raises `BadInputError` for a session of two participants or scenarios, a stimulus with two
-    labels, a ``correct`` that contradicts, a trial that names no session of ``sessions``.
+    Raises `BadInputError` for a session with two participants or scenarios, a stimulus with two
+    labels, a ``correct`` that contradicts response and label, or a trial whose session is not in
+    ``sessions``.
     """
     if trials.empty:
         raise BadInputError(f"{where} has no row")
@@ -139,7 +155,7 @@ def clean(
 
 
 def _scenarios(names: pd.Series) -> pd.Series:
-    """Our spelling of the eight; a scenario of somebody else's keeps its name."""
+    """Return our spelling of the eight scenarios; another scenario keeps its name."""
     return names.map({name: _ours(name) for name in names.unique()})
 
 
@@ -148,7 +164,7 @@ def _ours(name: str) -> str:
 
 
 def _sessions(trials: pd.DataFrame, given: pd.DataFrame | None, where: str) -> pd.DataFrame:
-    """The table of sessions, checked against the trials."""
+    """Return the table of sessions, checked against the trials."""
     keys = ["session", "participant", "scenario"]
     found = trials[keys].drop_duplicates().reset_index(drop=True)
     twice = found[found["session"].duplicated()]
@@ -206,7 +222,7 @@ def _one_answer_each(found: Responses, conflicts: Refuse, where: str) -> Respons
 
 
 def _derived(trials: pd.DataFrame, where: str) -> pd.DataFrame:
-    """Booleans, log response times, order; contradictions are refused."""
+    """Add booleans, log response times and order; refuse contradictions."""
     yes, label = trials["response"] == "yes", trials["label"].astype(bool)
     correct = yes == label
     if "correct" in trials:
@@ -230,13 +246,13 @@ def _derived(trials: pd.DataFrame, where: str) -> pd.DataFrame:
 
 
 def log_ms(rt_ms: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """Natural logarithm of response times in ms; NaN where not above 0 or not known."""
+    """Return the natural logarithm of response times in ms; NaN if not above 0 or unknown."""
     values = np.asarray(rt_ms, dtype=np.float64)
     return np.log(values, out=np.full_like(values, np.nan), where=values > 0)
 
 
 def _without(found: Responses, gone: pd.Series, step: str, reason: str) -> Responses:
-    """``found`` without the rows that are ``gone``, which are counted."""
+    """Return the responses without the rows where ``gone`` is True, and count these."""
     if not gone.any():
         return found
     counts = _counted(found.trials[gone], step, reason)
@@ -249,22 +265,22 @@ def _without(found: Responses, gone: pd.Series, step: str, reason: str) -> Respo
 
 
 def _counted(rows: pd.DataFrame, step: str, reason: str) -> pd.DataFrame:
-    """``rows`` by scenario, with `DROPPED_COLUMNS`."""
+    """Count ``rows`` by scenario, with `DROPPED_COLUMNS`."""
     counts = rows.groupby("scenario", sort=False)["session"].agg(sessions="nunique", rows="size")
     return counts.reset_index().assign(step=step, reason=reason)[list(DROPPED_COLUMNS)]
 
 
 def missing_times(responses: Responses) -> pd.DataFrame:
-    """Test answers that no analysis of response times can use, as rows of ``dropped``.
+    """Count the test answers without a usable response time, as rows of ``dropped``.
 
-    They are not among `Responses.dropped`, since the answers themselves are kept.
+    They are not in `Responses.dropped`, since the answers themselves are kept.
     """
     test = responses.test
     return _counted(test[test["log_rt"].isna()], "response times", NO_TIME)
 
 
 def check_labels(responses: Responses, labels: Mapping[str, bool]) -> None:
-    """Refuse responses whose labels contradict the official ones, naming the first stimulus."""
+    """Raise `BadInputError` with the first stimulus whose label contradicts the official one."""
     own = responses.trials.drop_duplicates("stimulus").set_index("stimulus")["label"]
     official = own.index.map({canonical_name(name): value for name, value in labels.items()})
     wrong = pd.Series(official, index=own.index).notna() & (official != own.to_numpy())

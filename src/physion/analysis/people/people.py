@@ -1,8 +1,8 @@
-"""How well and how alike people answer: by stimulus, by participant, by scenario.
+"""Accuracy of people and agreement among them: by stimulus, by participant, by scenario.
 
-All functions take the test rows of `participants.Responses` (``responses.test``) with what is to be
-left out already left out. Intervals come from drawing participants with replacement (`Bootstrap`,
-1000 draws, seeded), as preregistered; a *zone* is the middle 95 % of single participants or pairs.
+All functions take the test rows of `participants.Responses` (``responses.test``) after exclusions.
+Intervals draw participants with replacement (`Bootstrap`, 1000 draws, seeded), as preregistered; a
+*zone* is the middle 95 % of single participants or pairs.
 """
 
 from __future__ import annotations
@@ -33,24 +33,25 @@ HALVES = 1000
 
 
 def all_answers(test: pd.DataFrame) -> list[Answers]:
-    """The answers to every scenario that occurs, in the order of the paper."""
+    """Return the answers to every scenario that occurs, in the order of the paper."""
     if test.empty:
         raise BadInputError("there is no test answer of people; was every session left out?")
     return [answers_of(test, name) for name in in_order(test["scenario"])]
 
 
 def draws_of_people(answers: Answers, bootstrap: Bootstrap) -> Array:
-    """How often each person is drawn, (resamples, n): the same draws for every statistic."""
+    """Return how often each person is drawn, (resamples, n): the same draws for every statistic."""
     return bootstrap.weights(f"people of {answers.scenario}", len(answers.sessions))
 
 
 def accuracy_by_stimulus(test: pd.DataFrame, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
-    """One row a stimulus: ``scenario``, ``stimulus``, ``label``, ``count`` (people), ``accuracy``
-    with ``_low``, ``_high``, ``p_yes``, ``consistency``, ``mean_log_rt``.
+    """Return one row a stimulus.
 
-    ``consistency`` is the share of people who gave the more frequent answer, be it right or wrong:
-    0.5 to 1. ``mean_log_rt`` is the mean over people of the natural logarithm of the ms. The table
-    has the columns that `responses.with_labels` gives, so that it can take its place.
+    Columns: ``scenario``, ``stimulus``, ``label``, ``count`` (people), ``accuracy`` with ``_low``,
+    ``_high``, ``p_yes``, ``consistency`` (fraction of people who gave the more frequent answer,
+    right or wrong: 0.5 to 1), ``mean_log_rt`` (mean over people of the natural logarithm of the
+    ms). They include the columns of `responses.with_labels`, so that the table can replace that
+    one.
     """
     draws = bootstrap or Bootstrap()
     parts = []
@@ -75,8 +76,11 @@ def accuracy_by_stimulus(test: pd.DataFrame, bootstrap: Bootstrap | None = None)
 
 
 def accuracy_by_participant(test: pd.DataFrame) -> pd.DataFrame:
-    """One row a session: ``scenario``, ``session``, ``participant``, ``trials``, ``accuracy``,
-    ``yes`` (share of yes), ``mean_log_rt``, ``median_rt_ms``."""
+    """Return one row a session.
+
+    Columns: ``scenario``, ``session``, ``participant``, ``trials``, ``accuracy``, ``yes`` (fraction
+    of yes), ``mean_log_rt``, ``median_rt_ms``.
+    """
     groups = test.groupby(["scenario", "session", "participant"], sort=True)
     table = groups.agg(
         trials=("correct", "size"),
@@ -91,13 +95,13 @@ def accuracy_by_participant(test: pd.DataFrame) -> pd.DataFrame:
 
 
 def accuracy_by_scenario(test: pd.DataFrame, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
-    """One row a scenario and, in row `MEAN`, their mean, each scenario counting the same.
+    """Return one row a scenario and, in row `MEAN`, their mean with equal weights.
 
-    Columns: ``scenario``, ``people``, ``stimuli``, ``accuracy`` (mean over people of their share of
-    right answers) with ``_low``, ``_high`` (interval of that mean), ``sd`` over people, ``t``,
-    ``df``, ``p`` (two-sided, of people's accuracies against 0.5), ``zone_low``, ``zone_high``
-    (2.5th and 97.5th percentile of single people), ``consistency`` (mean over stimuli), ``reason``.
-    In row `MEAN` the scenarios' people are drawn independently.
+    Columns: ``scenario``, ``people``, ``stimuli``, ``accuracy`` (mean over people of their
+    accuracy) with ``_low``, ``_high`` (interval of that mean), ``sd`` over people, ``t``, ``df``,
+    ``p`` (two-sided, of people's accuracies against 0.5), ``zone_low``, ``zone_high`` (2.5th and
+    97.5th percentile of single people), ``consistency`` (mean over stimuli), ``reason``. In row
+    `MEAN` the scenarios' people are drawn independently.
     """
     draws = bootstrap or Bootstrap()
     records, resampled = [], []
@@ -153,13 +157,13 @@ def _scenario_record(
 def agreement_by_scenario(
     test: pd.DataFrame, bootstrap: Bootstrap | None = None, halves: int = HALVES
 ) -> pd.DataFrame:
-    """How alike people of one scenario answer, one row a scenario and measure.
+    """Return how much people of one scenario agree, one row a scenario and measure.
 
     ``measure``: ``kappa`` and ``correlation`` of all pairs of participants, ``split_half`` (r of
-    the shares of yes of two random halves) and ``spearman_brown`` (the same, each r corrected to
-    the full number of people). Columns: ``values`` (pairs or halves), ``undefined`` (those of them
-    that are NaN), ``mean``, ``mean_low``, ``mean_high`` (drawing participants; pairs of one person
-    with himself left out; NaN for halves), ``low``, ``median``, ``high`` (2.5th, 50th and 97.5th
+    the fractions of yes of two random halves) and ``spearman_brown`` (the same, each r corrected to
+    the full number of people). Columns: ``values`` (number of pairs or halves), ``undefined`` (NaN
+    among them), ``mean``, ``mean_low``, ``mean_high`` (drawing participants; without pairs of a
+    person with themselves; NaN for halves), ``low``, ``median``, ``high`` (2.5th, 50th and 97.5th
     percentile of the values), ``reason``.
     """
     draws = bootstrap or Bootstrap()
@@ -203,9 +207,9 @@ def _spread(scenario: str, measure: str, values: Array) -> dict[str, Any]:
 
 
 def split_halves(yes: Array, halves: int = HALVES, seed: int = 0) -> Array:
-    """r of the shares of yes of two random halves of the people, (halves,).
+    """Return r between the fractions of yes of two random halves of the people, (halves,).
 
-    Of an odd number of people the second half has one more. NaN where r is undefined; empty with
+    If the number of people is odd, the second half has one more. NaN if r is undefined; empty for
     fewer than two people.
     """
     n = len(yes)
@@ -218,9 +222,10 @@ def split_halves(yes: Array, halves: int = HALVES, seed: int = 0) -> Array:
 
 
 def spearman_brown(r: npt.ArrayLike, factor: float = 2.0) -> Array:
-    """The r to expect of groups ``factor`` times as large; NaN for r of -1 / (factor - 1) or less.
+    """Return the expected r of groups ``factor`` times as large, by Spearman and Brown.
 
-    A negative r has no such reading for two halves, but is not clipped.
+    NaN for r of -1 / (factor - 1) or less. A negative r has no meaning for two halves, but is not
+    clipped.
     """
     values = np.asarray(r, dtype=np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):

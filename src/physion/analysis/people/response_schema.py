@@ -1,8 +1,8 @@
-"""The columns of participant-level data, as data: who writes them and who reads them share this.
+"""Schema of participant-level data, shared by the experiment's export and the analysis.
 
 Two tables make a study's data: one row a participant and trial (`TRIAL_COLUMNS`) and one row a
 session (`SESSION_COLUMNS`). The experiment exports exactly these columns and writes its data
-dictionary from `data_dictionary`; the analysis refuses a file that breaks them, with the row.
+dictionary with `data_dictionary`; the analysis refuses a file that violates them and names the row.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ Kind = Literal["text", "integer", "number", "flag", "choice", "time"]
 
 @dataclass(frozen=True)
 class Column:
-    """One column: what it means and what it may hold.
+    """A column of participant-level data: its meaning and its allowed values.
 
-    ``required``: the column must be there. ``may_be_empty``: a cell may be empty (not known). The
-    bounds ``low`` and ``high`` are inclusive and in ``unit``.
+    ``required``: the column must exist. ``may_be_empty``: a cell may be empty (unknown). The bounds
+    ``low`` and ``high`` are inclusive and in ``unit``.
     """
 
     name: str
@@ -133,17 +133,19 @@ SESSION_COLUMNS: tuple[Column, ...] = (
 
 
 def data_dictionary(columns: Sequence[Column]) -> list[dict[str, Any]]:
-    """The columns as plain values for JSON: name, kind, about, unit, low, high, choices, ..."""
+    """Return the columns as plain values for JSON: name, kind, about, unit, low, high, choices,
+    ...
+    """
     return [{**asdict(column), "choices": list(column.choices)} for column in columns]
 
 
 def check_table(table: pd.DataFrame, columns: Sequence[Column], where: str) -> pd.DataFrame:
-    """``table`` with the types of its ``columns``; columns that no schema knows are left out.
+    """Return ``table`` with the types of its ``columns``; columns not in the schema are dropped.
 
-    Cells may be text, as from CSV, or typed, as from parquet. Types that come out: str for text,
-    choice and time (empty where not known), Int64 for integer, float64 (NaN), boolean for flag
-    (bool where no cell may be empty). An optional column that is absent stays absent. Raises
-    `BadInputError` for a missing column or the first cell that breaks it.
+    Cells may be text, as from CSV, or typed, as from parquet. Resulting types: str for text, choice
+    and time (empty if unknown), Int64 for integer, float64 (NaN) for number, boolean for flag (bool
+    if no cell may be empty). An optional column that is absent stays absent. Raises `BadInputError`
+    for a missing column or the first invalid cell.
     """
     require_columns(table, [column.name for column in columns if column.required], where)
     present = [column for column in columns if column.name in table.columns]

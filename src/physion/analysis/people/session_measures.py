@@ -1,4 +1,6 @@
-"""What exclusion rules look at: runs, alternations, accuracy and response times of a session."""
+"""Measures of a session for the exclusion rules: streaks, alternations, accuracy, response
+times.
+"""
 
 from __future__ import annotations
 
@@ -13,15 +15,15 @@ from physion.errors import BadInputError
 
 
 def longest_streak(yes: npt.ArrayLike) -> int:
-    """Length of the longest run of one answer; 0 without answers."""
+    """Return the length of the longest run of one answer; 0 without answers."""
     answers = np.asarray(yes, dtype=bool)
     return _longest_run(answers[1:] == answers[:-1]) + 1 if len(answers) else 0
 
 
 def longest_alternation(yes: npt.ArrayLike, begins_with: bool | None = None) -> int:
-    """Answers in the longest stretch in which every one differs from the one before.
+    """Return the length of the longest run of answers in which each differs from the one before.
 
-    ``begins_with``: only count stretches from their first such answer on.
+    ``begins_with``: count only from the first answer of this value on, in each run.
     """
     answers = np.asarray(yes, dtype=bool)
     if not len(answers):
@@ -34,7 +36,7 @@ def longest_alternation(yes: npt.ArrayLike, begins_with: bool | None = None) -> 
 
 
 def _longest_run(same: npt.NDArray[np.bool_]) -> int:
-    """How many True stand in a row at most."""
+    """Return the length of the longest run of True."""
     ends = np.flatnonzero(np.concatenate(([True], ~same, [True])))
     return int(np.max(np.diff(ends))) - 1
 
@@ -42,15 +44,14 @@ def _longest_run(same: npt.NDArray[np.bool_]) -> int:
 def session_measures(
     responses: Responses, expected: Mapping[str, int] | None = None
 ) -> pd.DataFrame:
-    """What the rules look at, one row a session, in the order of ``responses.sessions``.
+    """Return the measures for the rules, one row a session, in the order of ``responses.sessions``.
 
-    ``expected``: test trials by scenario, or by session where people see subsets; where absent,
-    the stimuli of the scenario that any session answered. Columns: ``session``,
-    ``participant``, ``scenario``, ``expected``, ``trials``, ``accuracy``, ``yes``,
-    ``mean_log_rt``, ``median_log_rt``, ``no_log_rt`` (trials without a response time above 0),
-    ``longest_streak``, ``longest_alternation``, ``longest_alternation_from_first``,
-    ``familiarization_trials``, ``familiarization_correct``.
-    Raises `BadInputError` where no session has a test answer.
+    ``expected``: number of test trials by scenario, or by session if people see subsets; by default
+    the stimuli of the scenario that any session answered. Columns: ``session``, ``participant``,
+    ``scenario``, ``expected``, ``trials``, ``accuracy``, ``yes``, ``mean_log_rt``,
+    ``median_log_rt``, ``no_log_rt`` (trials without a response time above 0), ``longest_streak``,
+    ``longest_alternation``, ``longest_alternation_from_first``, ``familiarization_trials``,
+    ``familiarization_correct``. Raises `BadInputError` if no session has a test answer.
     """
     test = responses.test
     if test.empty:

@@ -1,1 +1,1 @@
-"""Statistics as functions of arrays."""
+"""Statistics of arrays: agreement, correlation, kappa, calibration, bootstrap, paired tests."""

@@ -1,7 +1,7 @@
-"""How alike two sets of answers are: plain functions of arrays over stimuli.
+"""Agreement of two sets of answers: functions of arrays over stimuli.
 
-Throughout, ``x`` is a model's P(contact) and ``y`` the share of people who say yes. What is
-undefined is NaN; nothing is clipped, rounded or corrected without saying so.
+Throughout, ``x`` is a model's P(contact) and ``y`` the fraction of people who say yes. What is
+undefined is NaN; nothing is clipped, rounded or corrected unless stated.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ FEWEST = 3
 
 
 def pearson(x: npt.ArrayLike, y: npt.ArrayLike) -> float:
-    """Pearson's r of two arrays of shape (n,); NaN where either is constant or n < 3."""
+    """Return Pearson's r of two arrays of shape (n,); NaN if either is constant or n < 3."""
     a, b = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     if len(a) < FEWEST:
         return float("nan")
@@ -31,7 +31,7 @@ def pearson(x: npt.ArrayLike, y: npt.ArrayLike) -> float:
 
 
 def rmsd(x: npt.ArrayLike, y: npt.ArrayLike) -> float:
-    """Root of the mean squared difference, in the unit of the answers; NaN without any.
+    """Return the root of the mean squared difference; NaN for empty arrays.
 
     The "RMSE" of the released notebooks is this divided by sqrt(n).
     """
@@ -40,11 +40,11 @@ def rmsd(x: npt.ArrayLike, y: npt.ArrayLike) -> float:
 
 
 def sampling_variance(y: npt.ArrayLike, count: npt.ArrayLike) -> Array:
-    """By how much a share of yes varies because only ``count`` people answered; shape (n,).
+    """Return the variance of a fraction of yes due to only ``count`` people having answered, (n,).
 
-    It is y(1 - y) / (count - 1), the unbiased estimate for independent answers, NaN for one
-    person. A share of 0 or 1 gives 0, so that single stimuli can be underestimated; the mean over
-    stimuli, for which alone it is used, is not.
+    It is y(1 - y) / (count - 1), the unbiased estimate for independent answers, NaN for one person.
+    A fraction of 0 or 1 gives 0, so it can be too small for single stimuli, but not in the mean
+    over stimuli, for which alone it is used.
     """
     share, people = np.asarray(y, dtype=np.float64), np.asarray(count, dtype=np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -52,14 +52,14 @@ def sampling_variance(y: npt.ArrayLike, count: npt.ArrayLike) -> Array:
 
 
 def reliability(y: npt.ArrayLike, count: npt.ArrayLike, people: float | None = None) -> float:
-    """The expected r of the average of these people with the average of as many others.
+    """Return the expected r of the average of these people with that of as many others.
 
-    Per-stimulus tables hold no single answers, so no split halves; instead the variance over
-    stimuli is split into the binomial one (`sampling_variance`) and the rest:
-    reliability = rest / (rest + binomial). ``people`` asks for groups of that size instead (half
-    of the count gives what the official split halves give). Answers of one person are taken to be
-    independent, given the stimulus. NaN where people's answers are constant, where one person
-    alone answered, or where the binomial variance exceeds what is there.
+    Per-stimulus tables contain no single answers and thus no split halves; instead the variance
+    over stimuli is split into the binomial one (`sampling_variance`) and the rest: reliability =
+    rest / (rest + binomial). ``people`` gives another size of the groups (half of the count
+    corresponds to the official split halves). Answers of one person are assumed to be independent,
+    given the stimulus. NaN if people's answers are constant, only one person answered, or the
+    binomial variance exceeds the total.
     """
     share = np.asarray(y, dtype=np.float64)
     if len(share) < FEWEST:
@@ -75,23 +75,26 @@ def reliability(y: npt.ArrayLike, count: npt.ArrayLike, people: float | None = N
 
 
 def ceiling(y: npt.ArrayLike, count: npt.ArrayLike) -> float:
-    """The expected r with the average of these people of a model that knows the true shares.
+    """Return the noise ceiling of r: the expected r of a model that knows the true fractions of
+    yes.
 
-    The square root of `reliability`: a perfect model would reach this and not 1, since the average
-    of finitely many people is noisy. A model can exceed it by luck. NaN as there.
+    The square root of `reliability`: less than 1, since the average of finitely many people is
+    noisy. A model can exceed it by chance. NaN as for `reliability`.
     """
     return float(np.sqrt(reliability(y, count)))
 
 
 def rmsd_floor(y: npt.ArrayLike, count: npt.ArrayLike) -> float:
-    """The expected RMSD of a model that knows the true shares: the root of the mean
-    `sampling_variance`; NaN without stimuli or with one person alone."""
+    """Return the expected RMSD of a model that knows the true fractions of yes.
+
+    The root of the mean `sampling_variance`; NaN without stimuli or with one person alone.
+    """
     noise = sampling_variance(y, count)
     return float(np.sqrt(np.mean(noise))) if len(noise) else float("nan")
 
 
 def why_no_r(x: npt.ArrayLike, y: npt.ArrayLike) -> str:
-    """In words why Pearson's r of these is undefined; empty where it is defined."""
+    """Return why Pearson's r of these is undefined; empty if it is defined."""
     a, b = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     if not np.isfinite(b).all():
         return "r: no answers of people"

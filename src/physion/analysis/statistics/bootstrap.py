@@ -1,10 +1,10 @@
-"""Intervals by resampling stimuli, people, or whatever else is numbered.
+"""Bootstrap intervals by resampling stimuli or people.
 
-Stimuli are drawn with replacement, since they are what one wants to generalise over; each scenario
-keeps its number of them. Where the answers of single participants are known, people are drawn
-likewise (`people`), or both (`model_people`); tables by stimulus permit the stimuli alone. All
-models of a comparison that answered the same stimuli get the same draws, so that differences
-between them are paired.
+Stimuli are drawn with replacement, since results are to generalise over them; each scenario keeps
+its number of stimuli. If the answers of single participants are known, people are drawn likewise
+(`people`), or both (`model_people`); tables by stimulus permit stimuli only. All models of a
+comparison that answered the same stimuli get the same draws, so that differences between them are
+paired.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Bootstrap:
-    """How intervals are made: draws, seed, and the share of draws that an interval spans."""
+    """Settings of the bootstrap: draws, seed, and the fraction of draws that an interval covers."""
 
     resamples: int = 1000
     seed: int = 0
@@ -34,17 +34,16 @@ class Bootstrap:
             raise BadInputError("a bootstrap needs resamples >= 1 and a level between 0 and 1")
 
     def weights(self, stratum: str, n: int) -> Array:
-        """How often each of ``n`` stimuli or people is drawn: (resamples, n), rows that sum to n.
+        """Return how often each of ``n`` stimuli or people is drawn: (resamples, n), rows sum to n.
 
-        A function of the seed, the name of the stratum and n, and of nothing else.
+        It depends on the seed, the name of the stratum and n alone.
         """
         return _weights(self.resamples, self.seed, stratum, n)
 
     def interval(self, draws: Array) -> tuple[float, float]:
-        """The percentile interval of a statistic's ``draws`` (resamples,).
+        """Return the percentile interval of a statistic's ``draws`` (resamples,).
 
-        Draws in which the statistic is undefined are left out. NaN, NaN where that leaves less than
-        half of them.
+        Draws in which the statistic is undefined are left out; NaN, NaN if less than half remain.
         """
         defined = draws[np.isfinite(draws)]
         if 2 * len(defined) < len(draws):

@@ -1,4 +1,4 @@
-"""Is a P(contact) of 0.8 right 8 times in 10? Brier score, its parts, and the reliability curve."""
+"""Calibration of P(contact): Brier score, its decomposition, and the reliability curve."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ BINS = 10
 
 
 def brier(p: npt.ArrayLike, label: npt.ArrayLike) -> float:
-    """Mean squared difference of probability and outcome, 0 (perfect) to 1; NaN without any.
+    """Return the mean squared difference of probability and outcome, 0 (perfect) to 1.
 
-    0.25 is what a P of 0.5 throughout has.
+    A constant P of 0.5 has 0.25; NaN for empty arrays.
     """
     values, truth = _checked(p, label)
     return float(np.mean((values - truth) ** 2)) if len(values) else float("nan")
@@ -27,17 +27,19 @@ def brier(p: npt.ArrayLike, label: npt.ArrayLike) -> float:
 
 @dataclass(frozen=True)
 class Decomposition:
-    """Brier score = reliability - resolution + uncertainty + within.
+    """Decomposition of the Brier score: reliability - resolution + uncertainty + within.
 
-    - ``reliability``: mean squared distance of a bin's share of contact from its mean P: 0 is best;
-    - ``resolution``: variance of the bins' shares of contact: large is good;
-    - ``uncertainty``: base rate times one minus base rate: nothing the model can do about it;
-    - ``within``: what bins of more than one value of P leave over (Stephenson and others, 2008:
-      variance of P within bins less twice its covariance with the outcome); 0 where every bin holds
-      one value;
-    - ``skill``: 1 - brier / uncertainty, above 0 where the model beats the base rate; NaN for one
-      outcome alone;
-    - ``calibration_error``: mean distance (not squared) of share and mean P, each bin by its size.
+    - ``reliability``: mean squared distance of a bin's fraction of contact from its mean P: 0 is
+      best;
+    - ``resolution``: variance of the bins' fractions of contact: large is good;
+    - ``uncertainty``: base rate times one minus base rate, independent of the model;
+    - ``within``: remainder of bins with more than one value of P (Stephenson and others, 2008:
+      variance of P within bins less twice its covariance with the outcome); 0 if every bin has one
+      value;
+    - ``skill``: 1 - brier / uncertainty, above 0 if the model is better than the base rate; NaN for
+      one outcome alone;
+    - ``calibration_error``: mean distance (not squared) of fraction and mean P, weighted by bin
+      size.
     """
 
     brier: float
@@ -51,7 +53,7 @@ class Decomposition:
 
 
 def decompose(p: npt.ArrayLike, label: npt.ArrayLike, bins: int = BINS) -> Decomposition:
-    """The Brier score and its parts, with ``bins`` of equal width (`reliability_curve`)."""
+    """Return the Brier score and its parts, with ``bins`` of equal width (`reliability_curve`)."""
     values, truth = _checked(p, label)
     if not len(values):
         nan = float("nan")
@@ -81,10 +83,11 @@ def decompose(p: npt.ArrayLike, label: npt.ArrayLike, bins: int = BINS) -> Decom
 def reliability_curve(
     p: npt.ArrayLike, label: npt.ArrayLike, bins: int = BINS, level: float = 0.95
 ) -> pd.DataFrame:
-    """One row a bin of equal width in 0..1, empty ones too.
+    """Return one row for each bin of equal width in 0..1, including empty ones.
 
-    Columns: ``from``, ``to`` (the last bin includes 1), ``stimuli``, ``mean_p``, ``share`` (of
-    stimuli with contact) with ``low``, ``high`` (Wilson's interval); NaN in empty bins.
+    Columns: ``from``, ``to`` (the last bin includes 1), ``stimuli``, ``mean_p``, ``share``
+    (fraction of stimuli with contact) with ``low``, ``high`` (Wilson's interval); NaN in empty
+    bins.
     """
     values, truth = _checked(p, label)
     at = _bin(values, bins)
@@ -111,7 +114,7 @@ def reliability_curve(
 def calibration_table(
     names: list[str], p_contact: npt.ArrayLike, label: npt.ArrayLike, bins: int = BINS
 ) -> pd.DataFrame:
-    """`decompose` of each model: ``p_contact`` (m, s) with NaN for stimuli that a model lacks."""
+    """Apply `decompose` to each model: ``p_contact`` (m, s), NaN for stimuli that a model lacks."""
     values, truth = np.asarray(p_contact, np.float64), np.asarray(label, np.float64)
     rows = []
     for name, own in zip(names, values, strict=True):
@@ -138,7 +141,7 @@ def _checked(p: npt.ArrayLike, label: npt.ArrayLike) -> tuple[Array, Array]:
 
 
 def check_probabilities(p: npt.ArrayLike, gaps: bool = False) -> None:
-    """Raise `BadInputError` with the first value that is not in 0..1 (``gaps``: or NaN)."""
+    """Raise `BadInputError` with the first value outside 0..1 (``gaps``: NaN is allowed)."""
     values = np.asarray(p, dtype=np.float64)
     good = (values >= 0) & (values <= 1) | (np.isnan(values) & gaps)
     if not good.all():

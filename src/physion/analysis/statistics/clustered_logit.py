@@ -1,4 +1,4 @@
-"""Logistic regression of answers whose rows are not independent: clustered standard errors."""
+"""Logistic regression of answers with standard errors clustered by participant."""
 
 from __future__ import annotations
 
@@ -23,14 +23,27 @@ def clustered_logit(
     cluster: str = "participant",
     level: float = 0.95,
 ) -> pd.DataFrame:
-    """Logistic regression of a bool column on numeric ones, one row a term.
+    """Fit a logistic regression of a bool column on numeric ones; one row a term.
 
-    ``fixed``: a column whose every value gets an intercept of its own (the first is the base).
-    ``cluster``: standard errors allow for any dependence of rows with one value of it (sandwich
-    estimate with the usual small-sample factor, as statsmodels has it). Columns: ``term``, ``b``
-    (log odds), ``se``, ``z``, ``p`` (two-sided), ``low``, ``high`` (interval of b), ``rows``,
-    ``clusters``, ``reason``. Where a term is constant, or separates right from wrong without
-    error, its numbers are NaN and the reason says so.
+    Parameters
+    ----------
+    rows
+        The table.
+    outcome, terms
+        Columns of the response and of the predictors.
+    fixed
+        Column whose every value gets an intercept of its own (the first is the base).
+    cluster
+        Column by which rows are dependent (sandwich estimate with the usual small-sample factor, as
+        in statsmodels).
+    level
+        Level of the intervals.
+
+    Returns
+    -------
+    ``term``, ``b`` (log odds), ``se``, ``z``, ``p`` (two-sided), ``low``, ``high`` (interval of b),
+    ``rows``, ``clusters``, ``reason``. If a term is constant, or separates right from wrong
+    perfectly, its numbers are NaN and the reason states it.
     """
     require_columns(rows, [outcome, cluster, *terms, *([fixed] if fixed else [])], "the rows")
     y = rows[outcome].to_numpy(dtype=np.float64)

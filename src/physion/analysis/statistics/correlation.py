@@ -11,9 +11,10 @@ Array = npt.NDArray[np.float64]
 
 
 def correlate_rows(x: npt.ArrayLike, y: npt.ArrayLike) -> Array:
-    """r of row k of ``x`` with row k of ``y``, both (k, stimuli), on what neither lacks: (k,).
+    """Return r of row k of ``x`` with row k of ``y``, both (k, stimuli), where both are known:
+    (k,).
 
-    NaN where fewer than 3 are shared or one is constant, as in `agreement.pearson`.
+    NaN if fewer than 3 are shared or one is constant, as in `agreement.pearson`.
     """
     a, b = np.asarray(x, dtype=np.float64) - 0.5, np.asarray(y, dtype=np.float64) - 0.5
     shared = np.isfinite(a) & np.isfinite(b)
@@ -26,10 +27,10 @@ def correlate_rows(x: npt.ArrayLike, y: npt.ArrayLike) -> Array:
 
 
 def correlate_resampled(x: npt.ArrayLike, y: npt.ArrayLike, weights: npt.ArrayLike) -> Array:
-    """r of each row of ``x`` (m, stimuli) with each row of ``y`` (resamples, stimuli).
+    """Return r of each row of ``x`` (m, stimuli) with each row of ``y`` (resamples, stimuli).
 
-    ``weights`` (resamples, stimuli) says how often a stimulus stands in that resample. Shape
-    (resamples, m). Gaps (NaN) are left out pair by pair.
+    ``weights`` (resamples, stimuli) is how often a stimulus is drawn. Shape (resamples, m). Gaps
+    (NaN) are left out pair by pair.
     """
     a, b = np.asarray(x, dtype=np.float64) - 0.5, np.asarray(y, dtype=np.float64) - 0.5
     has_a, has_b = np.isfinite(a).astype(np.float64), np.isfinite(b)
@@ -42,7 +43,7 @@ def correlate_resampled(x: npt.ArrayLike, y: npt.ArrayLike, weights: npt.ArrayLi
 
 
 def correlation_from_sums(n: Array, x: Array, y: Array, xx: Array, yy: Array, xy: Array) -> Array:
-    """r from sums of values that lie around 0, so that little is lost in the subtractions."""
+    """Return r from sums of values, their squares and products; centre the values near 0."""
     with np.errstate(divide="ignore", invalid="ignore"):
         spread_x, spread_y = xx / n - (x / n) ** 2, yy / n - (y / n) ** 2
         defined = (n >= FEWEST) & (np.minimum(spread_x, spread_y) >= CONSTANT**2)

@@ -18,7 +18,9 @@ Array = npt.NDArray[np.float64]
 
 
 def as_answers(answers: npt.ArrayLike, what: str = "answers") -> Array:
-    """``answers`` as float64 of shape (raters, stimuli) with 0, 1 or NaN, else `BadInputError`."""
+    """Return ``answers`` as float64 (raters, stimuli) with 0, 1 or NaN, else raise
+    `BadInputError`.
+    """
     try:
         values = np.asarray(answers, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -40,9 +42,9 @@ def as_answers(answers: npt.ArrayLike, what: str = "answers") -> Array:
 def cross_kappa(
     first: npt.ArrayLike, second: npt.ArrayLike, weights: npt.ArrayLike | None = None
 ) -> Array:
-    """Kappa of every rater of ``first`` (n, stimuli) with every one of ``second``: (n, m).
+    """Return kappa of every rater of ``first`` (n, stimuli) with every one of ``second``: (n, m).
 
-    ``weights`` (stimuli,) counts how often each stimulus stands in the sample: a bootstrap draw.
+    ``weights`` (stimuli,) counts how often each stimulus is in the sample, as in a bootstrap draw.
     """
     a, b = as_answers(first, "first answers"), as_answers(second, "second answers")
     if a.shape[1] != b.shape[1]:
@@ -52,22 +54,22 @@ def cross_kappa(
 
 
 def pairwise_kappa(answers: npt.ArrayLike) -> Array:
-    """Kappa of every two raters, shape (n, n), symmetric; 1 (or NaN) on the diagonal."""
+    """Return kappa of every two raters, shape (n, n), symmetric; 1 (or NaN) on the diagonal."""
     values = as_answers(answers)
     return cross_kappa(values, values)
 
 
 def correctness(answers: npt.ArrayLike, labels: npt.ArrayLike) -> Array:
-    """1 where an answer equals the label, 0 where not, NaN where there is no answer."""
+    """Return 1 for an answer that equals the label, 0 for another, NaN without an answer."""
     values, truth = as_answers(answers), as_answers(labels, "labels")
     right = np.where(values == truth, 1.0, 0.0)
     return np.where(np.isnan(values) | np.isnan(truth), np.nan, right)
 
 
 def pairwise_correlation(answers: npt.ArrayLike) -> Array:
-    """Pearson's r of the binary answers of every two raters, (n, n), on what both answered.
+    """Return Pearson's r of the binary answers of every two raters, (n, n), where both answered.
 
-    NaN where one of them gives one answer throughout, or where fewer than 3 stimuli are shared.
+    NaN if one of them always gives the same answer, or fewer than 3 stimuli are shared.
     """
     values = as_answers(answers)
     given = (~np.isnan(values)).astype(np.float64)
@@ -82,16 +84,16 @@ def pairwise_correlation(answers: npt.ArrayLike) -> Array:
 
 
 def pair_values(matrix: Array) -> Array:
-    """The values of an (n, n) matrix above its diagonal: each pair once, shape (n (n-1) / 2,)."""
+    """Return the values of an (n, n) matrix above its diagonal: each pair once, (n (n-1) / 2,)."""
     return np.asarray(matrix[np.triu_indices(len(matrix), 1)], dtype=np.float64)
 
 
 def resampled_mean_of_pairs(matrix: Array, weights: npt.ArrayLike) -> Array:
-    """The mean over pairs of raters in each resample of the raters, shape (resamples,).
+    """Return the mean over pairs of raters in each resample of the raters, shape (resamples,).
 
     ``matrix`` (n, n) holds a pair's value, ``weights`` (resamples, n) how often each rater is
-    drawn. A rater who is drawn twice makes no pair with himself: his agreement of 1 would lift the
-    mean. Pairs without a value are left out; NaN where no pair is left.
+    drawn. A rater who is drawn twice makes no pair with themselves: the agreement of 1 would raise
+    the mean. Pairs without a value are left out; NaN if no pair is left.
     """
     drawn = np.asarray(weights, dtype=np.float64)
     valid = np.isfinite(matrix) & ~np.eye(len(matrix), dtype=bool)
@@ -102,9 +104,10 @@ def resampled_mean_of_pairs(matrix: Array, weights: npt.ArrayLike) -> Array:
 
 
 def resampled_kappa(answers: npt.ArrayLike, other: npt.ArrayLike, weights: npt.ArrayLike) -> Array:
-    """Kappa of each rater (n, stimuli) with one other (stimuli,) in each resample of the stimuli.
+    """Return kappa of each rater (n, stimuli) with one other (stimuli,) in each resample of the
+    stimuli.
 
-    ``weights`` (resamples, stimuli) says how often a stimulus is drawn. Shape (resamples, n).
+    ``weights`` (resamples, stimuli) is how often a stimulus is drawn. Shape (resamples, n).
     """
     (yes_a, given_a), (yes_b, given_b) = _split(as_answers(answers)), _split(as_answers(other))
     drawn = np.asarray(weights, dtype=np.float64)
@@ -125,10 +128,10 @@ def resampled_mean_kappa(
     stimuli: npt.ArrayLike | None,
     raters: npt.ArrayLike | None,
 ) -> Array:
-    """The mean kappa of all pairs in each resample of stimuli, of raters, or of both.
+    """Return the mean kappa of all pairs in each resample of stimuli, of raters, or of both.
 
-    ``stimuli`` (resamples, stimuli) and ``raters`` (resamples, n) count the draws; None leaves that
-    side as it is. Shape (resamples,).
+    ``stimuli`` (resamples, stimuli) and ``raters`` (resamples, n) count the draws; None: not
+    resampled. Shape (resamples,).
     """
     values = as_answers(answers)
     if stimuli is None:
@@ -147,7 +150,7 @@ def resampled_mean_kappa(
 
 
 def _split(values: Array) -> tuple[Array, Array | None]:
-    """Answers with 0 where there is none, and 1 where there is one (None: everywhere)."""
+    """Return answers with 0 for missing ones, and a mask of 0 and 1 (None: nothing is missing)."""
     given = ~np.isnan(values)
     if given.all():
         return values, None
@@ -155,7 +158,7 @@ def _split(values: Array) -> tuple[Array, Array | None]:
 
 
 def _kappa(a: tuple[Array, Array | None], b: tuple[Array, Array | None], weights: Array) -> Array:
-    """Kappa from matrix products: one where nothing is missing, else four; weights (stimuli,)."""
+    """Return kappa by matrix products: one if nothing is missing, else four; weights (stimuli,)."""
     yes_a, yes_b = a[0] * weights, b[0]
     both = yes_a @ yes_b.T
     if a[1] is None and b[1] is None:
@@ -169,9 +172,10 @@ def _kappa(a: tuple[Array, Array | None], b: tuple[Array, Array | None], weights
 
 
 def _from_counts(n: Array, mine: Array, yours: Array, both: Array) -> Array:
-    """Kappa from counts: shared stimuli, either one's yes, both yes.
+    """Return kappa from counts: shared stimuli, yes of either rater, yes of both.
 
-    Over n squared, in whole numbers: 1 - chance is then 0 exactly where it should be.
+    Numerator and denominator are multiplied by n squared, so that they are whole numbers and 1 -
+    chance is exactly 0 where it should be.
     """
     chance = mine * yours + (n - mine) * (n - yours)
     agree = n * (n - mine - yours + 2 * both)

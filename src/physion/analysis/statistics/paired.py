@@ -1,4 +1,4 @@
-"""Do two models differ? Tests for answers to the same stimuli, and corrections for many of them."""
+"""Paired tests of differences between models, and corrections for multiple comparisons."""
 
 from __future__ import annotations
 
@@ -23,7 +23,11 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class McNemar:
-    """``only_first``: stimuli that the first alone has right; ``only_second``; ``p``: two-sided."""
+    """Result of McNemar's test.
+
+    ``only_first``: stimuli that only the first model answers correctly; ``only_second``; ``p``:
+    two-sided.
+    """
 
     only_first: int
     only_second: int
@@ -31,10 +35,10 @@ class McNemar:
 
 
 def mcnemar_exact(first: npt.ArrayLike, second: npt.ArrayLike) -> McNemar:
-    """Are two models right equally often? The exact test of McNemar on paired right answers.
+    """Test whether two models are right equally often: McNemar's exact test of paired answers.
 
     ``first``, ``second``: 1 right, 0 wrong, NaN not answered; stimuli that one of them lacks are
-    left out. Without a stimulus on which they differ p is 1: nothing speaks against equality.
+    left out. If they never differ, p is 1.
     """
     a, b = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
     only_a, only_b = int(np.sum((a == 1) & (b == 0))), int(np.sum((a == 0) & (b == 1)))
@@ -47,7 +51,7 @@ def mcnemar_exact(first: npt.ArrayLike, second: npt.ArrayLike) -> McNemar:
 def r_difference_draws(
     first: npt.ArrayLike, second: npt.ArrayLike, people: npt.ArrayLike, weights: npt.ArrayLike
 ) -> Array:
-    """r(first, people) - r(second, people) in each resample of the stimuli, (resamples,)."""
+    """Return r(first, people) - r(second, people) in each resample of the stimuli, (resamples,)."""
     pair = np.stack([np.asarray(first, np.float64), np.asarray(second, np.float64)])
     drawn = np.asarray(weights, dtype=np.float64)
     shares = np.broadcast_to(np.asarray(people, dtype=np.float64), drawn.shape)
@@ -62,11 +66,11 @@ def r_permutation_p(
     permutations: int = 2000,
     seed: int = 0,
 ) -> float:
-    """Two-sided p of the difference of two models' r with people, by swapping the two.
+    """Return the two-sided p of the difference of two models' r with people, by permutation.
 
-    Under the null hypothesis the models are exchangeable once each is standardised, since r knows
-    neither shift nor scale; for every stimulus a fair coin decides whether the two change places.
-    p = (1 + count of |difference| as large) / (1 + permutations). NaN where an r is undefined.
+    Under the null hypothesis the standardised models are exchangeable, since r does not depend on
+    shift and scale; for every stimulus the two are swapped with probability 1/2. p = (1 + count of
+    |difference| as large) / (1 + permutations). NaN if an r is undefined.
     """
     a, b = np.asarray(first, np.float64), np.asarray(second, np.float64)
     y = np.asarray(people, np.float64)
@@ -84,7 +88,9 @@ def r_permutation_p(
 
 @lru_cache(maxsize=2)
 def _coins(permutations: int, n: int, seed: int) -> Array:
-    """0 or 1 for each permutation and stimulus; kept, since all pairs of models toss the same."""
+    """Return 0 or 1 for each permutation and stimulus; cached, since all pairs of models share
+    them.
+    """
     rng = generator("swap", seed, n)
     coins = (rng.random((permutations, n)) < 0.5).astype(np.float64)
     coins.flags.writeable = False
@@ -92,7 +98,7 @@ def _coins(permutations: int, n: int, seed: int) -> Array:
 
 
 def _swapped_r(a: Array, b: Array, y: Array, swap: Array) -> Array:
-    """r with ``y`` of ``a``, in which the stimuli of ``swap`` have the value of ``b``."""
+    """Return r with ``y`` of ``a`` with the values of ``b`` at the stimuli of ``swap``."""
     change = swap @ np.stack([b - a, b * b - a * a, (b - a) * y], axis=1)
     n, ones = float(len(a)), np.ones(len(swap))
     return correlation_from_sums(
@@ -105,7 +111,7 @@ def _swapped_r(a: Array, b: Array, y: Array, swap: Array) -> Array:
 
 
 def holm(p: npt.ArrayLike) -> Array:
-    """p values by Holm's step-down method, which bounds the chance of any false alarm.
+    """Return p values corrected by Holm's step-down method, which controls the family-wise error.
 
     NaN stays NaN and is not counted as a test.
     """
@@ -115,7 +121,9 @@ def holm(p: npt.ArrayLike) -> Array:
 
 
 def benjamini_hochberg(p: npt.ArrayLike) -> Array:
-    """p values by Benjamini and Hochberg, which bounds the share of false alarms among alarms."""
+    """Return p values corrected by Benjamini and Hochberg, which controls the false discovery
+    rate.
+    """
 
     def step_up(ordered: Array) -> Array:
         scaled = ordered * len(ordered) / np.arange(1, len(ordered) + 1)
@@ -148,12 +156,27 @@ def compare_models(
     strata: Sequence[str] | None = None,
     permutations: int = 2000,
 ) -> pd.DataFrame:
-    """Every two models on the same stimuli, one row a pair.
+    """Test every two models on the same stimuli; one row a pair.
 
-    ``correct`` and ``p_contact`` (m, s) with NaN for stimuli that a model lacks, ``people`` (s,)
-    the share of people who say yes. ``strata`` (s,) names the scenario of each stimulus: every one
-    keeps its number of stimuli when they are drawn. A pair is compared on the stimuli that both
-    answered. Columns:
+    Parameters
+    ----------
+    names
+        Names of the m models.
+    correct, p_contact
+        (m, s), NaN for stimuli that a model lacks. A pair is compared on the stimuli that both
+        answered.
+    people
+        (s,): fraction of people who say yes.
+    bootstrap
+        Draws for the intervals.
+    strata
+        (s,): scenario of each stimulus; every scenario keeps its number of stimuli when they are
+        drawn.
+    permutations
+        Permutations of the test of differences in r.
+
+    Returns
+    -------
     ``first``, ``second``, ``stimuli``, ``accuracy_difference`` (first - second), ``only_first``,
     ``only_second``, ``p_accuracy`` (McNemar, exact), ``r_difference`` with ``_low``, ``_high``
     (bootstrap over stimuli), ``p_r`` (permutations), and of both p the corrected ``_holm`` and
@@ -202,7 +225,7 @@ def compare_models(
 
 
 def _stratified(bootstrap: Bootstrap, strata: list[str]) -> Array:
-    """How often each stimulus is drawn, (resamples, s), each stratum by itself."""
+    """Return how often each stimulus is drawn, (resamples, s), separately by stratum."""
     names = np.array(strata, dtype=object)
     weights = np.zeros((bootstrap.resamples, len(names)))
     for name in dict.fromkeys(strata):
