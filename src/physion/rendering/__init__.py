@@ -1,1 +1,1 @@
-"""Frames of a trial: colour, depth, normals, ids, optical flow."""
+"""Rendering of trials: colour, depth, normals, object ids and optical flow of each frame."""

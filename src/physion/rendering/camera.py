@@ -1,4 +1,4 @@
-"""The pinhole camera: matrices, and the way between world points and pixels.
+"""Pinhole camera: its matrices, and conversion between world points and pixels.
 
 Camera axes are x right, y down, z forward (along the optical axis). Pixel coordinates are
 continuous: the picture spans 0..width and 0..height, and the centre of the pixel in column ``j``
@@ -22,14 +22,15 @@ Floats = NDArray[np.float64]
 
 
 def axes(camera: Camera) -> Floats:
-    """Rows are the camera's right, down and forward axes in the world, (3, 3), orthonormal.
+    """Return the camera's right, down and forward axes in the world as rows (3, 3).
 
-    A camera that looks straight up or down has no upright direction; +y is then up in the picture.
+    They are orthonormal, with the world's z upright in the picture. For a camera that looks
+    straight up or down, +y is upright.
     """
     forward = np.subtract(camera.target, camera.position).astype(np.float64)
     length = float(norm(forward))
     if length == 0.0:
-        raise BadInputError("camera: position and target are the same point; move one of them")
+        raise BadInputError("the camera's position and target are the same point; move one of them")
     forward /= length
     right = np.cross(forward, (0.0, 0.0, 1.0))
     if norm(right) < 1e-9:
@@ -39,7 +40,7 @@ def axes(camera: Camera) -> Floats:
 
 
 def view_matrix(camera: Camera) -> Floats:
-    """World to camera coordinates, (4, 4), applied to column vectors (x, y, z, 1)."""
+    """Return the matrix (4, 4) from world (x, y, z, 1) to camera coordinates."""
     matrix = np.eye(4)
     matrix[:3, :3] = axes(camera)
     matrix[:3, 3] = apply(-matrix[:3, :3], camera.position)
@@ -47,15 +48,20 @@ def view_matrix(camera: Camera) -> Floats:
 
 
 def intrinsics(camera: Camera, width: int, height: int) -> Floats:
-    """Camera coordinates to homogeneous pixels, (3, 3); the third coordinate is the depth."""
+    """Return the matrix (3, 3) from camera coordinates to homogeneous pixels (x w, y w, w).
+
+    w is the depth. The focal length in pixels is height / (2 tan(fov / 2)); ``width`` and
+    ``height`` are in pixels.
+    """
     focal = 0.5 * height / tan(0.5 * camera.fov)
     return np.array([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]])
 
 
 def projection_matrix(camera: Camera, width: int, height: int) -> Floats:
-    """Camera coordinates to clip space as OpenGL defines it (x right, y up, z in -w..w), (4, 4).
+    """Return the matrix (4, 4) from camera coordinates to the clip space of OpenGL.
 
-    It is what a viewer of another program needs; the rasteriser uses `intrinsics`.
+    There x is right, y up, and z in -w..w. Other programs need it; the rasteriser uses
+    `intrinsics`.
     """
     scale = 1.0 / tan(0.5 * camera.fov)
     near, far = camera.near, camera.far
@@ -71,11 +77,7 @@ def projection_matrix(camera: Camera, width: int, height: int) -> Floats:
 
 @dataclass(frozen=True)
 class View:
-    """A camera with a picture size: everything that a projection needs.
-
-    ``to_pixels`` (3, 4) takes world points (x, y, z, 1) to homogeneous pixels (x w, y w, w), where
-    w is the depth in metres.
-    """
+    """Camera together with the size of its picture in pixels."""
 
     camera: Camera
     width: int
@@ -83,14 +85,17 @@ class View:
 
     @property
     def to_pixels(self) -> Floats:
-        """World to homogeneous pixels, (3, 4)."""
+        """Matrix (3, 4) from world (x, y, z, 1) to homogeneous pixels (x w, y w, w).
+
+        w is the depth in metres.
+        """
         camera = self.camera
         return multiply(intrinsics(camera, self.width, self.height), view_matrix(camera)[:3])
 
     def project(self, points: ArrayLike) -> tuple[Floats, Floats]:
-        """Pixel coordinates (..., 2) and depths (...) in metres of world points (..., 3).
+        """Return pixel coordinates (..., 2) and depths (...) in metres of world points (..., 3).
 
-        Points behind the camera get a negative depth; their pixels mean nothing.
+        Points behind the camera have a negative depth; their pixel coordinates have no meaning.
         """
         world = np.asarray(points, np.float64)
         matrix = self.to_pixels
@@ -100,14 +105,14 @@ class View:
             return homogeneous[..., :2] / depth[..., None], depth
 
     def unproject(self, pixels: ArrayLike, depth: ArrayLike) -> Floats:
-        """World points (..., 3) seen at pixel coordinates (..., 2) at a planar depth (...)."""
-        at = np.asarray(pixels, np.float64)
-        rays = apply(self.ray_matrix, np.concatenate([at, np.ones_like(at[..., :1])], axis=-1))
+        """Return world points (..., 3) at pixel coordinates (..., 2) and planar depths (...)."""
+        xy = np.asarray(pixels, np.float64)
+        rays = apply(self.ray_matrix, np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1))
         return np.asarray(np.asarray(self.camera.position) + rays * np.asarray(depth)[..., None])
 
     @property
     def ray_matrix(self) -> Floats:
-        """Return the matrix (3, 3) from pixels (x, y, 1) to the world vector of depth 1 there."""
+        """Matrix (3, 3) from a pixel (x, y, 1) to the world vector from the camera to depth 1."""
         matrix = intrinsics(self.camera, self.width, self.height)
         focal, x, y = matrix[0, 0], matrix[0, 2], matrix[1, 2]
         pixel_to_camera = [[1.0, 0.0, -x], [0.0, 1.0, -y], [0.0, 0.0, focal]]

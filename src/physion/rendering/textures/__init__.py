@@ -1,1 +1,1 @@
-"""Procedural textures."""
+"""Procedural textures: painting, mip levels, lookup."""

@@ -1,4 +1,4 @@
-"""Metals, plastics, stones and fabrics, and what baskets and dogs are covered with."""
+"""Painters of the textures of metals, plastics, stones, fabrics, wicker and fur."""
 
 from __future__ import annotations
 
@@ -22,78 +22,79 @@ from physion.rendering.textures.noise import (
 GREY = (1.0, 1.0, 1.0)
 
 
-def _plain(rng: np.random.Generator) -> tuple[F32, F32]:
+def _paint_plain(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint nothing: white and flat."""
     return np.ones((SIZE, SIZE, 3), np.float32), flat()
 
 
-def _metal(rng: np.random.Generator) -> tuple[F32, F32]:
-    """Brushed sheet."""
+def _paint_metal(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint brushed sheet metal."""
     value = 0.86 + 0.03 * noise(rng, 4, 200) + 0.02 * noise(rng, 3, 3)
     return tint(np.clip(value, 0, 1), (1, 1, 1)), flat()
 
 
-def _cloth(rng: np.random.Generator) -> tuple[F32, F32]:
-    """Fine weave, visible from near only."""
+def _paint_cloth(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint a fine weave that is visible only from near."""
     u, v = grid()
     weave = sin(2 * np.pi * 128 * u) * sin(2 * np.pi * 128 * v)
     value = 0.88 + 0.05 * weave + 0.02 * noise(rng, 12, 12)
     return tint(np.clip(value, 0, 1), (1, 1, 1)), flat()
 
 
-def _brushed(rng: np.random.Generator) -> tuple[F32, F32]:
-    """Scratched all one way by a wire brush."""
+def _paint_brushed(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint metal with the parallel scratches of a wire brush."""
     streaks = 0.7 * noise(rng, 2.5, 120) + 0.5 * noise(rng, 5, 30) + 0.3 * noise(rng, 12, 220)
     return tint(np.clip(0.70 + 0.15 * streaks, 0.1, 1), GREY), flat()
 
 
-def _cast(rng: np.random.Generator) -> tuple[F32, F32]:
-    """Raw cast iron: dark, with a rough skin and pits."""
+def _paint_cast(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint raw cast iron: dark, with a rough surface and pits."""
     skin = 0.6 * noise(rng, 40, 40) + 0.5 * noise(rng, 110, 110)
     pits = np.clip(noise(rng, 45, 45) - 1.5, 0, 1)
     value = 0.42 + 0.06 * skin - 0.22 * pits + 0.04 * noise(rng, 4, 4)
     return tint(np.clip(value, 0.05, 1), GREY), flat()
 
 
-def _hammered(rng: np.random.Generator) -> tuple[F32, F32]:
-    """Beaten with a ball hammer: each dent is bright on one side and dark on the other."""
-    near, second, _ = cells(rng, 260)
-    share = near / (near + second)
-    depth = 0.05 * share**2
+def _paint_hammered(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint hammered metal, with dents that are bright on one side and dark on the other."""
+    nearest, second, _ = cells(rng, 260)
+    edge = nearest / (nearest + second)
+    depth = 0.05 * edge**2
     slope = (np.roll(depth, -1, 0) - np.roll(depth, 1, 0)) * (SIZE / 2)
     slope += 0.5 * (np.roll(depth, -1, 1) - np.roll(depth, 1, 1)) * (SIZE / 2)
-    value = 0.66 + 0.42 * np.clip(slope, -0.8, 0.8) - 0.12 * smooth(share, 0.4, 0.5)
+    value = 0.66 + 0.42 * np.clip(slope, -0.8, 0.8) - 0.12 * smooth(edge, 0.4, 0.5)
     return tint(np.clip(value, 0.05, 1), GREY), flat()
 
 
-def _matte(rng: np.random.Generator) -> tuple[F32, F32]:
-    """Moulded with a fine grain."""
+def _paint_matte(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint moulded plastic with a fine grain."""
     return tint(np.clip(0.92 + 0.035 * noise(rng, 130, 130), 0, 1), GREY), flat()
 
 
-def _speckled(rng: np.random.Generator) -> tuple[F32, F32]:
-    """Pressed from shredded plastic: flakes of many shades in a pale ground."""
-    near, _, which = cells(rng, 900)
+def _paint_speckled(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint recycled plastic: flakes of many colours in a pale ground."""
+    nearest, _, cell = cells(rng, 900)
     shade = uniform(rng, 0.12, 1.0, (901, 3)).astype(np.float32) * uniform(rng, 0.3, 1, (901, 1))
     flake = rng.random(901) < 0.42
     size = uniform(rng, 0.006, 0.020, 901).astype(np.float32)
-    inside = 1.0 - smooth(near / size[which], 0.85, 1.0)
-    share = (inside * flake[which])[..., None]
-    color = 0.86 * (1.0 - share) + share * shade[which]
+    inside = 1.0 - smooth(nearest / size[cell], 0.85, 1.0)
+    weight = (inside * flake[cell])[..., None]
+    color = 0.86 * (1.0 - weight) + weight * shade[cell]
     return np.asarray(np.clip(color, 0.02, 1), np.float32), flat()
 
 
-def _granite(rng: np.random.Generator) -> tuple[F32, F32]:
-    """Crystals of grey quartz, white feldspar and black mica."""
-    _, _, which = cells(rng, 5200)
+def _paint_granite(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint crystals of grey quartz, white feldspar and black mica."""
+    _, _, cell = cells(rng, 5200)
     kinds = np.array([0.86, 0.52, 0.10], np.float32)
     kind = rng.choice(3, 5201, p=[0.46, 0.34, 0.2])
     shade = (kinds[kind] + 0.05 * standard_normal(rng, 5201)).astype(np.float32)
-    value = shade[which] + 0.03 * noise(rng, 6, 6)
+    value = shade[cell] + 0.03 * noise(rng, 6, 6)
     return tint(np.clip(value, 0.03, 1), (1.0, 0.97, 0.95)), flat()
 
 
-def _marble(rng: np.random.Generator) -> tuple[F32, F32]:
-    """White marble with branching grey veins."""
+def _paint_marble(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint white marble with branching grey veins."""
     clouds = noise(rng, 3, 3)
     bent = noise(rng, 2.2, 2.2) + 0.30 * noise(rng, 7, 7) + 0.07 * noise(rng, 24, 24)
     fine = noise(rng, 3.2, 3.2) + 0.35 * noise(rng, 11, 11)
@@ -103,8 +104,8 @@ def _marble(rng: np.random.Generator) -> tuple[F32, F32]:
     return tint(np.clip(value, 0.1, 1), (1.0, 0.985, 0.97)), flat()
 
 
-def _sandstone(rng: np.random.Generator) -> tuple[F32, F32]:
-    """Grains of sand in wavy layers."""
+def _paint_sandstone(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint grains of sand in wavy layers."""
     _, v = grid()
     height = v + 0.012 * noise(rng, 2, 2) + 0.004 * noise(rng, 9, 9)
     layers = sin(2 * np.pi * 7 * height) + 0.7 * sin(2 * np.pi * (17 * height + 0.3))
@@ -113,8 +114,8 @@ def _sandstone(rng: np.random.Generator) -> tuple[F32, F32]:
     return np.stack([value, 0.86 * power(value, 1.1), 0.66 * power(value, 1.2)], -1), flat()
 
 
-def _slate(rng: np.random.Generator) -> tuple[F32, F32]:
-    """Cleft slate: dark sheets, one above the other, their broken edges in the light."""
+def _paint_slate(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint cleft slate: dark sheets in steps, whose broken edges are bright."""
     steps = noise(rng, 3, 7) + 0.30 * noise(rng, 14, 26) + 0.08 * noise(rng, 50, 80)
     sheets = np.floor(1.8 * steps)
     edge = smooth(1.8 * steps - sheets, 0.0, 0.14)
@@ -123,8 +124,8 @@ def _slate(rng: np.random.Generator) -> tuple[F32, F32]:
     return tint(np.clip(value, 0.05, 1), (0.88, 0.96, 1.0)), flat()
 
 
-def _linen(rng: np.random.Generator) -> tuple[F32, F32]:
-    """Plain weave of uneven threads, thick and thin ones both ways."""
+def _paint_linen(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint a plain weave of threads of uneven thickness."""
     u, v = grid()
     weft, warp = noise(rng, 4, 44), noise(rng, 44, 4)
     over = sin(2 * np.pi * 56 * u) * sin(2 * np.pi * 56 * v)
@@ -133,8 +134,8 @@ def _linen(rng: np.random.Generator) -> tuple[F32, F32]:
     return tint(np.clip(value, 0.1, 1), (1.0, 0.98, 0.94)), flat()
 
 
-def _canvas(rng: np.random.Generator) -> tuple[F32, F32]:
-    """Coarse basket weave: pairs of threads over pairs of threads, like a chequerboard."""
+def _paint_canvas(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint a coarse basket weave: pairs of threads over pairs of threads, as a chequerboard."""
     u, v = grid()
     count = 28
     x, y = (u * count) % 1.0, (v * count) % 1.0
@@ -147,8 +148,8 @@ def _canvas(rng: np.random.Generator) -> tuple[F32, F32]:
     return tint(np.clip(value, 0.05, 1).astype(np.float32), (1.0, 0.98, 0.95)), flat()
 
 
-def _denim(rng: np.random.Generator) -> tuple[F32, F32]:
-    """Twill: diagonal ridges with white threads between them."""
+def _paint_denim(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint twill: diagonal ridges with white threads between them."""
     u, v = grid()
     ridge = 0.5 + 0.5 * sin(2 * np.pi * (22 * (u + v) + 0.06 * noise(rng, 30, 30)))
     weft = np.clip(0.6 + 0.4 * noise(rng, 150, 25), 0, 1)
@@ -157,8 +158,8 @@ def _denim(rng: np.random.Generator) -> tuple[F32, F32]:
     return tint(np.clip(value + 0.04 * noise(rng, 120, 5), 0.05, 1), GREY), flat()
 
 
-def _wool(rng: np.random.Generator) -> tuple[F32, F32]:
-    """Stocking stitch: columns of small Vs in fluffy yarn."""
+def _paint_wool(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint stocking stitch: columns of small Vs in fluffy yarn."""
     u, v = grid()
     columns, rows = 18, 26
     x = (u * columns) % 1.0
@@ -170,8 +171,8 @@ def _wool(rng: np.random.Generator) -> tuple[F32, F32]:
     return tint(np.clip(0.30 + 0.55 * yarn + fluff, 0.03, 1), GREY), flat()
 
 
-def _wicker(rng: np.random.Generator) -> tuple[F32, F32]:
-    """Flat strips that pass over and under upright canes."""
+def _paint_wicker(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint flat strips that pass over and under upright canes."""
     u, v = grid()
     canes, strips = 12, 20
     row = (v * strips).astype(int)
@@ -183,19 +184,19 @@ def _wicker(rng: np.random.Generator) -> tuple[F32, F32]:
     return np.stack([value, 0.88 * power(value, 1.1), 0.72 * power(value, 1.2)], -1), flat()
 
 
-def _fur(rng: np.random.Generator) -> tuple[F32, F32]:
-    """Short hair that lies along v."""
+def _paint_fur(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint short hair that lies along v."""
     hair = 0.6 * noise(rng, 110, 14) + 0.5 * noise(rng, 45, 8)
     value = 0.80 + 0.11 * hair + 0.05 * noise(rng, 5, 5)
     return tint(np.clip(value, 0.1, 1), GREY), flat()
 
 
-def _moon(rng: np.random.Generator) -> tuple[F32, F32]:
-    """Grey dust, dark seas, craters with bright rims."""
+def _paint_moon(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint grey dust, dark plains, and craters with bright rims."""
     seas = smooth(noise(rng, 2.5, 2.5), 0.1, 0.9)
-    near, _, which = cells(rng, 90)
+    nearest, _, cell = cells(rng, 90)
     size = uniform(rng, 0.008, 0.035, 91).astype(np.float32)
-    inside = near / size[which]
+    inside = nearest / size[cell]
     rim = exp(-(((inside - 1.0) / 0.18) ** 2))
     pit = 1.0 - smooth(inside, 0.6, 1.0)
     value = 0.78 - 0.38 * seas + 0.16 * rim - 0.14 * pit + 0.03 * noise(rng, 30, 30)
@@ -203,23 +204,23 @@ def _moon(rng: np.random.Generator) -> tuple[F32, F32]:
 
 
 MATERIAL_PAINTERS: dict[str, Painter] = {
-    "plain": _plain,
-    "metal": _metal,
-    "metal_brushed": _brushed,
-    "metal_cast": _cast,
-    "metal_hammered": _hammered,
-    "plastic_matte": _matte,
-    "plastic_speckled": _speckled,
-    "stone_granite": _granite,
-    "stone_marble": _marble,
-    "stone_sandstone": _sandstone,
-    "stone_slate": _slate,
-    "cloth": _cloth,
-    "fabric_canvas": _canvas,
-    "fabric_denim": _denim,
-    "fabric_linen": _linen,
-    "fabric_wool": _wool,
-    "moon": _moon,
-    "wicker": _wicker,
-    "fur": _fur,
+    "plain": _paint_plain,
+    "metal": _paint_metal,
+    "metal_brushed": _paint_brushed,
+    "metal_cast": _paint_cast,
+    "metal_hammered": _paint_hammered,
+    "plastic_matte": _paint_matte,
+    "plastic_speckled": _paint_speckled,
+    "stone_granite": _paint_granite,
+    "stone_marble": _paint_marble,
+    "stone_sandstone": _paint_sandstone,
+    "stone_slate": _paint_slate,
+    "cloth": _paint_cloth,
+    "fabric_canvas": _paint_canvas,
+    "fabric_denim": _paint_denim,
+    "fabric_linen": _paint_linen,
+    "fabric_wool": _paint_wool,
+    "moon": _paint_moon,
+    "wicker": _paint_wicker,
+    "fur": _paint_fur,
 }

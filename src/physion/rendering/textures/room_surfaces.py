@@ -1,4 +1,4 @@
-"""Surfaces of rooms: carpet, plaster, tiles, paving."""
+"""Painters of the textures of rooms: carpet, plaster, tiles, paving."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from physion.numerics.elementary import exp, power, sin
 from physion.rendering.textures.noise import F32, Painter, flat, grid, noise, tint, uniform
 
 
-def _carpet(rng: np.random.Generator) -> tuple[F32, F32]:
-    """Loops of wool in rows, some of them paler."""
+def _paint_carpet(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint loops of wool in rows, some of them paler."""
     u, v = grid()
     rows = sin(2 * np.pi * 70 * v) * sin(2 * np.pi * (70 * u + 0.5 * np.floor(70 * v)))
     fleck = noise(rng, 110, 90)
@@ -18,8 +18,8 @@ def _carpet(rng: np.random.Generator) -> tuple[F32, F32]:
     return np.clip(tint(value, (1.0, 1.0, 1.0)), 0.02, 1), 0.0002 * height
 
 
-def _plaster(rng: np.random.Generator) -> tuple[F32, F32]:
-    """Trowelled plaster: broad strokes and grit."""
+def _paint_plaster(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint trowelled plaster: broad strokes and grit."""
     strokes = noise(rng, 8, 26) + 0.6 * noise(rng, 34, 16)
     grit = noise(rng, 120, 120)
     value = 0.90 + 0.012 * strokes + 0.008 * grit + 0.015 * noise(rng, 2, 2)
@@ -28,14 +28,14 @@ def _plaster(rng: np.random.Generator) -> tuple[F32, F32]:
     ) + 0.00015 * grit
 
 
-def _smooth_plaster(rng: np.random.Generator) -> tuple[F32, F32]:
-    """Painted wall with hardly a trace of the roller."""
+def _paint_smooth_plaster(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint a painted wall with faint traces of the roller."""
     value = 0.95 + 0.004 * noise(rng, 90, 90) + 0.006 * noise(rng, 2, 2)
     return tint(np.clip(value, 0, 1), (1, 1, 1)), 0.00012 * noise(rng, 60, 60)
 
 
-def _tiles(rng: np.random.Generator) -> tuple[F32, F32]:
-    """Four by four stoneware tiles, each mottled and of its own shade, with pale joints."""
+def _paint_tiles(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint four by four stoneware tiles, mottled, in different shades, with pale joints."""
     u, v = grid()
     count = 4
     column, row = (u * count).astype(int), (v * count).astype(int)
@@ -50,8 +50,8 @@ def _tiles(rng: np.random.Generator) -> tuple[F32, F32]:
     return np.clip(np.nan_to_num(color), 0, 1), 0.0009 * clouds - 0.002 * joint[..., 0]
 
 
-def _paving(rng: np.random.Generator) -> tuple[F32, F32]:
-    """Grey setts of a yard, in courses."""
+def _paint_paving(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint the grey setts of a yard, in courses."""
     u, v = grid()
     row = (v * 16).astype(int)
     shifted = (u * 8 + 0.5 * (row % 2)) % 8
@@ -63,9 +63,9 @@ def _paving(rng: np.random.Generator) -> tuple[F32, F32]:
 
 
 ROOM_PAINTERS: dict[str, Painter] = {
-    "carpet": _carpet,
-    "plaster": _plaster,
-    "smooth_plaster": _smooth_plaster,
-    "tiles": _tiles,
-    "paving": _paving,
+    "carpet": _paint_carpet,
+    "plaster": _paint_plaster,
+    "smooth_plaster": _paint_smooth_plaster,
+    "tiles": _paint_tiles,
+    "paving": _paint_paving,
 }

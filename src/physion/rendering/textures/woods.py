@@ -1,4 +1,4 @@
-"""Woods: their figure, grain and pores."""
+"""Painters of the textures of woods: figure, grain and pores."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from physion.numerics.elementary import exp, power, sin, tanh
 from physion.rendering.textures.noise import F32, Painter, flat, grid, noise, tint
 
 
-def _ash(rng: np.random.Generator) -> tuple[F32, F32]:
-    """Sawn ash: the rings of a trunk cut lengthwise, with a pointed figure in the middle."""
+def _paint_ash(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint sawn ash: a trunk's rings cut lengthwise, with a pointed figure in the middle."""
     u, v = grid()
     warp = 0.026 * noise(rng, 2.5, 0.8) + 0.003 * noise(rng, 10, 2)
     depth = 0.10 + 0.16 * sin(2 * np.pi * (v + 0.1)) + 0.02 * noise(rng, 1.5, 2)
@@ -24,8 +24,8 @@ def _ash(rng: np.random.Generator) -> tuple[F32, F32]:
     return tint(np.clip(value, 0.05, 1.0), (0.98, 0.90, 0.76)), flat()
 
 
-def _cedar(rng: np.random.Generator) -> tuple[F32, F32]:
-    """Red cedar glued from narrow staves, each cut from another board."""
+def _paint_cedar(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint red cedar glued from narrow staves, each cut from another board."""
     u, v = grid()
     staves = 5
     index = np.minimum((u * staves).astype(int), staves - 1)
@@ -41,8 +41,8 @@ def _cedar(rng: np.random.Generator) -> tuple[F32, F32]:
     return np.clip(color, 0, 1), flat()
 
 
-def _oak(rng: np.random.Generator) -> tuple[F32, F32]:
-    """Quarter-sawn oak: straight grain, long dark pores, pale flecks across."""
+def _paint_oak(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint quarter-sawn oak: straight grain, long dark pores, pale flecks across."""
     u, _ = grid()
     bands = sin(2 * np.pi * (16 * u + 0.35 * noise(rng, 3, 1.0)))
     pores = np.clip(noise(rng, 130, 9) - 0.9, 0, 1.5)
@@ -51,8 +51,8 @@ def _oak(rng: np.random.Generator) -> tuple[F32, F32]:
     return tint(np.clip(value, 0.08, 1.0), (1.0, 0.88, 0.70)), flat()
 
 
-def _pine(rng: np.random.Generator) -> tuple[F32, F32]:
-    """Pale pine: wide growth lines that flow round knots."""
+def _paint_pine(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint pale pine: wide growth rings that bend around knots."""
     u, v = grid()
     bent, dark = np.zeros_like(u), np.zeros_like(u)
     for x, y, size in ((0.26, 0.3, 0.030), (0.71, 0.62, 0.038), (0.5, 0.93, 0.022)):
@@ -70,8 +70,8 @@ def _pine(rng: np.random.Generator) -> tuple[F32, F32]:
     return np.asarray(color, np.float32), flat()
 
 
-def _walnut(rng: np.random.Generator) -> tuple[F32, F32]:
-    """Dark walnut: broad waves of light and dark under fine streaks."""
+def _paint_walnut(rng: np.random.Generator) -> tuple[F32, F32]:
+    """Paint dark walnut: broad light and dark waves under fine streaks."""
     u, v = grid()
     flow = 5 * u + 0.22 * sin(2 * np.pi * v) + 0.5 * noise(rng, 2.0, 1.2)
     waves = sin(2 * np.pi * flow) + 0.5 * sin(2 * np.pi * (3 * flow + 0.2))
@@ -82,9 +82,9 @@ def _walnut(rng: np.random.Generator) -> tuple[F32, F32]:
 
 
 WOOD_PAINTERS: dict[str, Painter] = {
-    "wood_ash": _ash,
-    "wood_cedar": _cedar,
-    "wood_oak": _oak,
-    "wood_pine": _pine,
-    "wood_walnut": _walnut,
+    "wood_ash": _paint_ash,
+    "wood_cedar": _paint_cedar,
+    "wood_oak": _paint_oak,
+    "wood_pine": _paint_pine,
+    "wood_walnut": _paint_walnut,
 }
