@@ -13,15 +13,20 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 from starlette.requests import Request
 
-from physion.experiment.experimenter.access import gate as gates
-from physion.experiment.experimenter.access.attempts import ADDRESSES, BY_ADDRESS, OVERALL, Attempts
+from physion.experiment.experimenter.access import access_control
+from physion.experiment.experimenter.access.attempts import (
+    BY_ADDRESS,
+    MAX_ADDRESSES,
+    OVERALL,
+    LoginAttempts,
+)
 from physion.experiment.experimenter.access.login import (
-    AT_MOST,
     CONFIRMED_FOR,
     COOKIE,
-    IDLE,
-    LONGEST,
-    Logins,
+    IDLE_TIMEOUT,
+    MAX_DURATION,
+    MAX_LOGINS,
+    LoginRegistry,
 )
 from physion.experiment.study.identity import Secrets, check_password, set_password
 from support.experiment.experimenter_client import BASE, Lab, lab
@@ -41,9 +46,11 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
 def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The gate's time, in a list of one; it stands still."""
     now = [1000.0]
-    original = gates.Gate.__init__
+    original = access_control.AccessControl.__init__
     monkeypatch.setattr(
-        gates.Gate, "__init__", lambda self, check: original(self, check, lambda: now[0])
+        access_control.AccessControl,
+        "__init__",
+        lambda self, check: original(self, check, lambda: now[0]),
     )
     return now
 
@@ -57,7 +64,7 @@ def test_waits_double_after_the_free_tries_and_end_somewhere() -> None:
 
 
 def test_an_address_that_fails_waits_and_others_do_not() -> None:
-    attempts = Attempts()
+    attempts = LoginAttempts()
     for _ in range(BY_ADDRESS.free):
         assert attempts.begin("192.0.2.1", 0.0) == 0
     assert attempts.begin("192.0.2.1", 0.0) == 1.0
@@ -68,14 +75,14 @@ def test_an_address_that_fails_waits_and_others_do_not() -> None:
 
 
 def test_a_whole_ipv6_network_is_one_address() -> None:
-    attempts = Attempts()
+    attempts = LoginAttempts()
     waits = [attempts.begin(f"2001:db8::{number:x}", 0.0) for number in range(6)]
     assert waits == [0, 0, 0, 0, 0, 1.0]
     assert attempts.begin("2001:db8:0:1::1", 0.0) == 0
 
 
 def test_failures_are_forgotten_after_success_and_after_an_hour() -> None:
-    attempts = Attempts()
+    attempts = LoginAttempts()
     for _ in range(10):
         attempts.begin("192.0.2.1", 0.0)
     assert attempts.begin("192.0.2.1", 0.0) > 0
@@ -85,7 +92,7 @@ def test_failures_are_forgotten_after_success_and_after_an_hour() -> None:
 
 
 def test_guessing_from_many_addresses_is_slowed_but_locks_nobody_out() -> None:
-    attempts = Attempts()
+    attempts = LoginAttempts()
     attempts.begin("198.51.100.7", 0.0)
     attempts.succeeded("198.51.100.7")
     tried, now = 0, 0.0
@@ -98,42 +105,44 @@ def test_guessing_from_many_addresses_is_slowed_but_locks_nobody_out() -> None:
 
 
 def test_addresses_are_kept_in_bounds() -> None:
-    attempts = Attempts()
-    for number in range(ADDRESSES + 500):
+    attempts = LoginAttempts()
+    for number in range(MAX_ADDRESSES + 500):
         attempts._by_address.pop("x", None)
         attempts.begin(f"10.{number >> 16}.{number >> 8 & 255}.{number & 255}", 100.0 * number)
-    assert len(attempts._by_address) == ADDRESSES
+    assert len(attempts._by_address) == MAX_ADDRESSES
 
 
 # --- logins --------------------------------------------------------------------------------------
 
 
 def test_a_login_ends_when_idle_and_in_any_case() -> None:
-    logins = Logins()
+    logins = LoginRegistry()
     token = logins.open(0.0)
-    assert logins.find(token, IDLE) is not None
-    assert logins.find(token, IDLE + 100, by_person=False) is not None
-    assert logins.find(token, 2 * IDLE + 1) is None, "pages that refresh do not keep it open"
+    assert logins.find(token, IDLE_TIMEOUT) is not None
+    assert logins.find(token, IDLE_TIMEOUT + 100, by_person=False) is not None
+    assert logins.find(token, 2 * IDLE_TIMEOUT + 1) is None, (
+        "pages that refresh do not keep it open"
+    )
     token, now = logins.open(0.0), 0.0
-    while now + IDLE <= LONGEST:
-        now += IDLE
+    while now + IDLE_TIMEOUT <= MAX_DURATION:
+        now += IDLE_TIMEOUT
         assert logins.find(token, now) is not None
-    assert logins.find(token, LONGEST + 1) is None
+    assert logins.find(token, MAX_DURATION + 1) is None
 
 
 def test_no_token_is_kept_and_logins_are_bounded() -> None:
-    logins = Logins()
-    tokens = [logins.open(0.0) for _ in range(AT_MOST + 1)]
-    assert len(set(tokens)) == AT_MOST + 1 and all(len(token) >= 43 for token in tokens)
+    logins = LoginRegistry()
+    tokens = [logins.open(0.0) for _ in range(MAX_LOGINS + 1)]
+    assert len(set(tokens)) == MAX_LOGINS + 1 and all(len(token) >= 43 for token in tokens)
     assert not any(token in repr(vars(logins)) for token in tokens)
     assert logins.find(tokens[0], 0.0) is None and logins.find(tokens[1], 0.0) is not None
 
 
 def test_form_tokens_belong_to_one_browser_and_one_server() -> None:
-    logins = Logins()
+    logins = LoginRegistry()
     assert logins.is_form_token("a", logins.form_token("a"))
     for browser, given in (("b", logins.form_token("a")), ("", logins.form_token("")), ("a", ""),
-                           ("a", "é"), ("a", Logins().form_token("a"))):  # fmt: skip
+                           ("a", "é"), ("a", LoginRegistry().form_token("a"))):  # fmt: skip
         assert not logins.is_form_token(browser, given)
 
 
@@ -191,7 +200,7 @@ def test_a_wrong_password_opens_nothing(served: Lab) -> None:
         answer = visitor.submit("/login", visitor.token(), password=password)
         assert answer.status_code in (403, 429)
         assert visitor.see().status_code == 303
-    assert "Too many tries" in visitor.log_in("wrong").text
+    assert "Too many attempts" in visitor.log_in("wrong").text
 
 
 def test_wrong_passwords_bring_waits_that_growing_tries_cannot_pass(
@@ -236,7 +245,7 @@ def test_a_login_that_is_over_shows_nothing(clock: list[float], tmp_path: Path) 
     with lab(tmp_path) as own:
         visitor = own.experimenter()
         assert visitor.see("/export").status_code == 200
-        clock[0] += IDLE + 1
+        clock[0] += IDLE_TIMEOUT + 1
         assert visitor.see("/export").status_code == 303
         assert visitor.log_in().status_code == 303
         assert visitor.open_payments().status_code == 200
@@ -283,7 +292,7 @@ def test_a_password_that_changes_while_it_is_looked_at_opens_nothing(tmp_path: P
     """In three steps: it is right, then changed, and someone else's page tells the server."""
     set_up = Secrets.create(tmp_path, PASSWORD)
     kept = [set_up]
-    gate = gates.Gate(lambda: kept[0])
+    gate = access_control.AccessControl(lambda: kept[0])
     token = gate.logins.open(0.0)
 
     def change(secrets: Secrets, password: str) -> bool:
@@ -296,7 +305,7 @@ def test_a_password_that_changes_while_it_is_looked_at_opens_nothing(tmp_path: P
     try:
         assert asyncio.run(gate.try_password(request, PASSWORD)) is None
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(gates, "check_password", change)
+            patch.setattr(access_control, "check_password", change)
             assert asyncio.run(gate.try_password(request, PASSWORD)) == 0.0
     finally:
         gate.close()

@@ -10,16 +10,21 @@ import sqlalchemy as sa
 pytest.importorskip("sqlalchemy", reason="the extra 'experiment' is not installed")
 
 from physion.experiment.experimenter.figures import HEIGHT, WIDTH, accuracy_histogram, rt_histogram
-from physion.experiment.experimenter.overview import browser_of, expected_end, funnel, rate_of
-from physion.experiment.experimenter.pages import minutes
+from physion.experiment.experimenter.overview import (
+    browser_label,
+    expected_end,
+    funnel,
+    refresh_rate_label,
+)
 from physion.experiment.experimenter.statistics.flagging import Flags
 from physion.experiment.experimenter.statistics.summaries import (
-    Answered,
-    Summaries,
-    Summary,
-    standing_of,
+    AnswerCounts,
+    SessionSummary,
+    SummaryCache,
+    session_state,
 )
-from physion.experiment.experimenter.statistics.worker import Clerk
+from physion.experiment.experimenter.statistics.worker import StatisticsWorker
+from physion.experiment.experimenter.templating import minutes
 from physion.experiment.store.database import open_database, upgrade
 from physion.experiment.store.tables import ANSWERS, SESSIONS
 from physion.experiment.study.identity import Secrets
@@ -47,27 +52,27 @@ def test_there_is_no_expected_end_without_a_rate() -> None:
 def test_everybody_is_in_the_funnel_once() -> None:
     stages = [("done", "finished")] * 5 + [("test", "left")] * 2 + [("test", "going")]
     stages += [("consent", "declined"), ("demographics", "withdrawn")]
-    steps = funnel([Summary({}, state, stage, Answered()) for stage, state in stages])
+    steps = funnel([SessionSummary({}, state, stage, AnswerCounts()) for stage, state in stages])
     assert [step.reached for step in steps] == [10, 9, 9, 9, 9, 6, 5, 5]
     assert [step.left for step in steps] == [0, 0, 0, 0, 2, 0, 0, 0]
     assert [step.withdrawn for step in steps] == [1, 0, 0, 0, 0, 1, 0, 0]
-    assert steps[4].going == 1 and steps[-1].share == 50.0
+    assert steps[4].going == 1 and steps[-1].percent == 50.0
 
 
 def test_histograms_hold_everybody() -> None:
     shares = [0.0, 0.05, 0.5, 0.55, 0.999, 1.0, 0.15, 0.3, 29 / 100]
     drawn = accuracy_histogram(shares)
-    counts = {bar.words.split(":")[0]: int(bar.words.split(": ")[1]) for bar in drawn.bars}
+    counts = {bar.label.split(":")[0]: int(bar.label.split(": ")[1]) for bar in drawn.bars}
     assert sum(counts.values()) == len(shares)
     assert counts["95–100 %"] == 2 and counts["15–20 %"] == 1 and counts["30–35 %"] == 1
     assert counts["50–55 %"] == 1 and counts["25–30 %"] == 1
     times = rt_histogram([0.0, 1e-9, 50.0, 100.0, 800.0, 19_999.0, 1e9])
-    assert sum(int(bar.words.split(": ")[1]) for bar in times.bars) == 7
+    assert sum(int(bar.label.split(": ")[1]) for bar in times.bars) == 7
     for figure in (drawn, times):
         for bar in figure.bars:
             assert bar.x >= 0 and bar.x + bar.width <= WIDTH and bar.y >= 0
             assert bar.y + bar.height <= HEIGHT - figure.base + 0.01
-    assert accuracy_histogram([]).bars == () and "none yet" in rt_histogram([]).words
+    assert accuracy_histogram([]).bars == () and "none yet" in rt_histogram([]).label
 
 
 @pytest.mark.parametrize(
@@ -82,15 +87,15 @@ def test_histograms_hold_everybody() -> None:
     ],
 )
 def test_browsers_by_their_own_words(agent: str, name: str) -> None:
-    assert browser_of(agent) == name
+    assert browser_label(agent) == name
 
 
 def test_refresh_rates_are_the_usual_ones() -> None:
     given = (59.94, 60.3, 144.1, 119.9, 83.0, None, 0, "60", True, float("nan"))
     names = ["60 Hz", "60 Hz", "144 Hz", "120 Hz", "about 85 Hz"]
-    assert [rate_of(hz) for hz in given[:5]] == names
-    assert [rate_of(hz) for hz in given[5:8]] == ["not known"] * 3
-    assert rate_of(given[9]) == "not known"
+    assert [refresh_rate_label(hz) for hz in given[:5]] == names
+    assert [refresh_rate_label(hz) for hz in given[5:8]] == ["not known"] * 3
+    assert refresh_rate_label(given[9]) == "not known"
 
 
 def test_spans_of_time_in_words() -> None:
@@ -100,10 +105,10 @@ def test_spans_of_time_in_words() -> None:
 
 def test_states_of_sessions() -> None:
     facts = {"finished_at": None, "withdrawn_at": None, "consented_at": 1.0, "last_seen": 100.0}
-    assert standing_of(facts, 1000.0) == "going" and standing_of(facts, 1001.0) == "left"
-    assert standing_of(facts | {"withdrawn_at": 5.0}, 1000.0) == "withdrawn"
-    assert standing_of(facts | {"withdrawn_at": 5.0, "consented_at": None}, 10.0) == "declined"
-    assert standing_of(facts | {"finished_at": 5.0}, 1e9) == "finished"
+    assert session_state(facts, 1000.0) == "going" and session_state(facts, 1001.0) == "left"
+    assert session_state(facts | {"withdrawn_at": 5.0}, 1000.0) == "withdrawn"
+    assert session_state(facts | {"withdrawn_at": 5.0, "consented_at": None}, 10.0) == "declined"
+    assert session_state(facts | {"finished_at": 5.0}, 1e9) == "finished"
 
 
 def test_flags_are_found_anew_whenever_the_rules_would_read_something_else(
@@ -120,8 +125,8 @@ def test_flags_are_found_anew_whenever_the_rules_would_read_something_else(
             asked.append(state)
             return Flags("preregistered")
 
-    clerk = Clerk(study, engine)
-    clerk._flagger = Listening()  # type: ignore[assignment]
+    worker = StatisticsWorker(study, engine)
+    worker._flagger = Listening()  # type: ignore[assignment]
 
     def look(**values: float | None) -> None:
         with engine.connect().execution_options(physion_writes=True) as connection:
@@ -129,8 +134,8 @@ def test_flags_are_found_anew_whenever_the_rules_would_read_something_else(
                 own = SESSIONS.c.session == names[0]
                 connection.execute(sa.update(SESSIONS).where(own).values(**values))
                 connection.commit()
-        clerk._read_at = -1e9
-        clerk.overview("person")
+        worker._read_at = -1e9
+        worker.overview("person")
 
     look(finished_at=None, withdrawn_at=None)
     look()
@@ -152,7 +157,7 @@ def test_summaries_grow_as_answers_come(tmp_path: Path, database_url: str) -> No
         connection.execute(sa.delete(ANSWERS).where(ANSWERS.c.phase == "test"))
         connection.execute(sa.update(SESSIONS).values(answered_test=0))
         connection.commit()
-        growing = Summaries(study, engine)
+        growing = SummaryCache(study, engine)
         assert all(summary.answered.test == 0 for summary in growing.refresh(0.0))
         late = [row for row in rows if row["phase"] == "test" and row["trial"] < 3]
         later = [row for row in rows if row["phase"] == "test" and row["trial"] >= 3]
@@ -168,7 +173,7 @@ def test_summaries_grow_as_answers_come(tmp_path: Path, database_url: str) -> No
             growing.refresh(0.0)
     grown = growing.refresh(0.0)
     assert [summary.facts["session"] for summary in grown] == names
-    for old, new in zip(grown, Summaries(study, engine).refresh(0.0), strict=True):
+    for old, new in zip(grown, SummaryCache(study, engine).refresh(0.0), strict=True):
         assert sorted(old.answered.rt_ms) == sorted(new.answered.rt_ms)
         assert old.answered.correct == new.answered.correct
         assert old.answered.full == new.answered.full and old.stage == new.stage

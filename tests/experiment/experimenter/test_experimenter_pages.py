@@ -232,7 +232,7 @@ def test_pages_of_an_empty_study(tmp_path: Path, database_url: str) -> None:
         for page in ("", "?kind=simulated", "?kind=preview", "/sessions", "/export"):
             assert visitor.see(page).status_code == 200, page
         assert "No session yet" in visitor.see().text
-        assert "No session is like this" in visitor.see("/sessions").text
+        assert "No matching session" in visitor.see("/sessions").text
         assert "No ids are stored" in visitor.open_payments().text
         assert table_after(visitor.see().text, "Progress")[1][2] == "0 of 100"
 
@@ -245,9 +245,10 @@ def test_one_id_and_two(tmp_path: Path) -> None:
                 few.store.engine, few.study, few.secrets, 1, ends=("finished",), seed=seed
             )
             said.append(visitor.open_payments().text)
-    assert "The id to copy" in said[0] and "the stored id should go. It is removed" in said[0]
-    assert "All 2 ids, one a line, to copy" in said[1]
-    assert "the 2 stored ids should go. They are removed" in said[1]
+    assert "The id to copy" in said[0]
+    assert "the stored id should be deleted. It is removed" in said[0]
+    assert "All 2 ids, one per line, to copy" in said[1]
+    assert "the 2 stored ids should be deleted. They are removed" in said[1]
 
 
 def test_pages_of_one_hostile_session(tmp_path: Path, database_url: str) -> None:
@@ -286,9 +287,9 @@ def test_pages_of_one_hostile_session(tmp_path: Path, database_url: str) -> None
 
 
 def with_flags(visitor: Visitor) -> str:
-    """The overview once flags are worked out, which it does not wait for."""
+    """The overview once flags are computed, which it does not wait for."""
     until = time.monotonic() + 60
-    while "being worked out" in (text := visitor.see().text):
+    while "being computed" in (text := visitor.see().text):
         assert time.monotonic() < until
         time.sleep(0.2)
     return str(text)

@@ -12,7 +12,7 @@ from pandas.testing import assert_frame_equal
 
 from physion.analysis.people.response_schema import SESSION_COLUMNS, TRIAL_COLUMNS, check_table
 from physion.errors import PhysionError, UnknownNameError
-from physion.experiment.experimenter.statistics.summaries import Summaries
+from physion.experiment.experimenter.statistics.summaries import SummaryCache
 from physion.experiment.export import trial_rows
 from physion.experiment.export.answer_tables import read_tables, snapshot
 from physion.experiment.export.session_rows import (
@@ -182,7 +182,7 @@ def test_sessions_of_a_scenario_that_is_gone_are_left_out_by_name(
         count = (of_kind & (before["scenario"] == "drop")).sum()
         assert found.left_out[kind, said] == count > 0
     # The experimenter's pages go on.
-    summaries = Summaries(fewer, engine).refresh(NOW)
+    summaries = SummaryCache(fewer, engine).refresh(NOW)
     stages = {s.stage for s in summaries if s.facts["scenario"] == "drop"}
     assert stages == {"done", "familiarization"}
 

@@ -1,1 +1,1 @@
-"""The experimenter's pages: how the study goes, its sessions, payments and the export."""
+"""The experimenter's pages: progress of the study, sessions, payments and export."""

@@ -1,4 +1,4 @@
-"""What ``physion experiment export`` writes, as one zip file."""
+"""The export of ``physion experiment export``, packed as one zip file."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from physion.experiment.study.study import Study
 
 
 def export_archive(study: Study, engine: Engine, folder: Path, simulated: bool) -> Path:
-    """Exports into a new folder below ``folder``, which must be private, and packs it.
+    """Export the study into the private folder ``folder``; return the path of a zip file of it.
 
-    ``simulated``: with simulated participants, who are marked as such.
+    ``simulated``: whether to include simulated participants, which are marked as such.
     """
     from physion.experiment.export.export_study import export_study
 
@@ -28,7 +28,7 @@ def export_archive(study: Study, engine: Engine, folder: Path, simulated: bool) 
 
 
 def file_name(study: Study) -> str:
-    """Name of the study for a file: letters, digits, points and dashes alone."""
-    words = f"{study.name}-{study.version}"
-    kept = "".join(c if c.isascii() and (c.isalnum() or c in "-.") else "-" for c in words)
+    """Return name and version of the study as a file name of letters, digits, dots and dashes."""
+    name = f"{study.name}-{study.version}"
+    kept = "".join(c if c.isascii() and (c.isalnum() or c in "-.") else "-" for c in name)
     return kept.strip("-.")[:80] or "study"

@@ -1,4 +1,4 @@
-"""The page that makes an export and sends it as one zip file."""
+"""The page that creates an export and sends it as one zip file."""
 
 from __future__ import annotations
 
@@ -13,34 +13,36 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, Response
 
 from physion.errors import PhysionError
-from physion.experiment.experimenter.access.gate import HEADERS
+from physion.experiment.experimenter.access.access_control import HEADERS
 from physion.experiment.experimenter.archive import file_name
-from physion.experiment.experimenter.front import Front, go
-from physion.experiment.experimenter.statistics.process import Desk
+from physion.experiment.experimenter.page_context import PageContext, redirect
+from physion.experiment.experimenter.statistics.process import StatisticsProcess
 
-EXPORT_PATIENCE = 900.0
-"""Seconds that an export may take."""
+EXPORT_TIMEOUT = 900.0
+"""Maximum duration of an export in seconds."""
 
 
 class ExportPages:
-    """One method an address; one export at a time. ``running``: there is one."""
+    """Request handlers of the export page; only one export (``running``) at a time."""
 
-    def __init__(self, front: Front) -> None:
-        self._front = front
+    def __init__(self, context: PageContext) -> None:
+        self._context = context
         self.running = False
 
     async def show(self, request: Request) -> Response:
-        if self._front.gate.login(request) is None:
-            return go("/login")
-        return self._front.show(request, "export.html", here="export", problem="")
+        """Show the form."""
+        if self._context.access.login(request) is None:
+            return redirect("/login")
+        return self._context.render(request, "export.html", here="export", problem="")
 
     async def make(self, request: Request) -> Response:
-        sent = await self._front.sent(request, self._refuse)
+        """Create an export and send it."""
+        sent = await self._context.read_submission(request, self._refuse)
         if isinstance(sent, Response):
             return sent
         _, fields = sent
         if self.running:
-            return self._refuse(request, "An export is being made already.", 409)
+            return self._refuse(request, "Another export is in progress.", 409)
         folder = Path(tempfile.mkdtemp(prefix="physion-export-"))
         self.running = True
         try:
@@ -56,18 +58,19 @@ class ExportPages:
         day = time.strftime("%Y-%m-%d", time.gmtime())
         return FileResponse(
             packed, media_type="application/zip", headers=dict(HEADERS),
-            filename=f"{file_name(self._front.study)}-{day}.zip",
+            filename=f"{file_name(self._context.study)}-{day}.zip",
             background=BackgroundTask(shutil.rmtree, folder, ignore_errors=True),
         )  # fmt: skip
 
     async def _pack(self, folder: Path, simulated: bool) -> Path:
-        """The export as a zip file, made by a process of its own."""
-        clerk = Desk(self._front.study, self._front.url, EXPORT_PATIENCE)
+        """Create the zip file in a separate process."""
+        process = StatisticsProcess(self._context.study, self._context.url, EXPORT_TIMEOUT)
         try:
-            packed: Path = await clerk.ask("export", folder=folder, simulated=simulated)
+            packed: Path = await process.query("export", folder=folder, simulated=simulated)
         finally:
-            await run_in_threadpool(clerk.close)
+            await run_in_threadpool(process.close)
         return packed
 
     def _refuse(self, request: Request, problem: str, status: int) -> Response:
-        return self._front.show(request, "export.html", status, here="export", problem=problem)
+        """Show the form again with a message."""
+        return self._context.render(request, "export.html", status, here="export", problem=problem)

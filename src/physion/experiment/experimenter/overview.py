@@ -1,4 +1,4 @@
-"""The overview: how far each scenario is, where people stop, how they do, how movies were shown."""
+"""Statistics of the overview page: progress, drop-out, accuracy and how movies were displayed."""
 
 from __future__ import annotations
 
@@ -12,22 +12,34 @@ from statistics import fmean, median, stdev
 
 from physion.experiment.experimenter.figures import Histogram, accuracy_histogram, rt_histogram
 from physion.experiment.experimenter.statistics.flagging import Flags
-from physion.experiment.experimenter.statistics.summaries import STAGES, STATES, Summary
+from physion.experiment.experimenter.statistics.summaries import STAGES, STATES, SessionSummary
 from physion.experiment.study.study import Study
 
-RATE_OVER = 20
-"""So many of the last finishers tell the present rate, ..."""
-RATE_FROM = 3
-"""... no fewer than these, ..."""
-RATE_WITHIN = 86_400.0
-"""... and none of them longer ago than this, in seconds."""
+RATE_SESSIONS = 20
+"""The current rate is estimated from at most this many of the last finished sessions, ..."""
+MIN_RATE_SESSIONS = 3
+"""... from at least this many, ..."""
+RATE_WINDOW = 86_400.0
+"""... all of them finished within this many seconds."""
 
 
 @dataclass(frozen=True)
-class Progress:
-    """A row of the table of progress. ``flagged`` counts finished sessions, None while not known;
-    ``done_at`` is when the last one is expected to finish at the present rate, None where there is
-    no telling. ``states`` counts sessions by `STATES`."""
+class ScenarioProgress:
+    """Row of the progress table.
+
+    Attributes
+    ----------
+    scenario
+        Scenario, or ``All``.
+    wanted
+        Number of complete sessions wanted.
+    states
+        Number of sessions in each of `STATES`.
+    flagged
+        Number of flagged finished sessions; None while unknown.
+    done_at
+        Expected completion time at the current rate (Unix time); None if it cannot be estimated.
+    """
 
     scenario: str
     wanted: int
@@ -36,27 +48,33 @@ class Progress:
     done_at: float | None
 
     @property
-    def share(self) -> float:
-        """Finished of wanted in %, at most 100."""
+    def percent(self) -> float:
+        """Finished sessions in percent of the wanted ones, at most 100."""
         return min(100.0, 100.0 * self.states["finished"] / self.wanted) if self.wanted else 0.0
 
 
 @dataclass(frozen=True)
-class Step:
-    """A row of the funnel: how many reached a stage, how many ended there, how many are in it."""
+class FunnelStage:
+    """Row of the drop-out funnel: sessions that reached a stage, are in it, or ended in it.
+
+    ``percent`` is the percentage of sessions that reached the stage.
+    """
 
     name: str
     reached: int
-    share: float
+    percent: float
     going: int
     left: int
     withdrawn: int
 
 
 @dataclass(frozen=True)
-class Performance:
-    """How the people of a scenario did who answered all test trials; None where there are none.
-    ``margin``: half of a 95 % confidence interval of the mean."""
+class ScenarioPerformance:
+    """Accuracy and response times in a scenario, of people who answered all test trials.
+
+    ``accuracy`` is the mean over people, ``margin`` half the width of its 95 % confidence interval
+    (normal approximation). Values are None if there are too few people.
+    """
 
     scenario: str
     people: int
@@ -68,8 +86,8 @@ class Performance:
 
 
 @dataclass(frozen=True)
-class Shown:
-    """How the movies of some trials were shown, as counts of trials; see `summaries.Answered`."""
+class DisplayCounts:
+    """Counts of trials by how their movie was displayed; see `summaries.AnswerCounts`."""
 
     name: str
     sessions: int
@@ -82,33 +100,47 @@ class Shown:
     hidden: int
 
     @property
-    def share(self) -> float | None:
-        """Trials with all frames in %, of those whose number of frames is known."""
+    def percent(self) -> float | None:
+        """Trials with all frames in percent of those whose number of frames is known."""
         known = self.trials - self.unknown
         return 100.0 * self.full / known if known else None
 
 
 @dataclass(frozen=True)
 class Overview:
-    """All that the overview shows, of sessions of one kind."""
+    """Content of the overview page, for sessions of one kind."""
 
     kind: str
     sessions: int
     kinds: Mapping[str, int]
-    progress: tuple[Progress, ...]
-    total: Progress
-    funnel: tuple[Step, ...]
-    performance: tuple[Performance, ...]
-    shown: Shown
-    browsers: tuple[Shown, ...]
-    refresh_rates: tuple[Shown, ...]
+    progress: tuple[ScenarioProgress, ...]
+    total: ScenarioProgress
+    funnel: tuple[FunnelStage, ...]
+    performance: tuple[ScenarioPerformance, ...]
+    shown: DisplayCounts
+    browsers: tuple[DisplayCounts, ...]
+    refresh_rates: tuple[DisplayCounts, ...]
     rules: tuple[tuple[str, tuple[int, ...]], ...]
 
 
-def look_over(
-    study: Study, summaries: Sequence[Summary], flags: Flags, now: float, kind: str
+def compute_overview(
+    study: Study, summaries: Sequence[SessionSummary], flags: Flags, now: float, kind: str
 ) -> Overview:
-    """The overview of the sessions of a ``kind``."""
+    """Compute the overview of the sessions of one kind.
+
+    Parameters
+    ----------
+    study
+        The study.
+    summaries
+        Summaries of all sessions.
+    flags
+        Flags of the sessions of this kind.
+    now
+        Current Unix time, for the expected completion.
+    kind
+        ``person``, ``simulated`` or ``preview``.
+    """
     chosen = [summary for summary in summaries if summary.facts["kind"] == kind]
     by_scenario = {
         name: [s for s in chosen if s.facts["scenario"] == name] for name in study.scenarios
@@ -124,103 +156,131 @@ def look_over(
         _total(rows, chosen, flags),
         funnel(chosen),
         tuple(_performance(study, name, part) for name, part in by_scenario.items()),
-        _shown("All", chosen),
-        _grouped(chosen, lambda s: browser_of(str(s.facts["device"].get("user_agent", "")))),
-        _grouped(chosen, lambda s: rate_of(s.facts["device"].get("refresh_hz"))),
+        _display_counts("All", chosen),
+        _grouped(chosen, lambda s: browser_label(str(s.facts["device"].get("user_agent", "")))),
+        _grouped(chosen, lambda s: refresh_rate_label(s.facts["device"].get("refresh_hz"))),
         _rules(list(by_scenario.values()), flags),
     )
 
 
 def _progress(
-    name: str, wanted: int, part: Sequence[Summary], flags: Flags, now: float
-) -> Progress:
+    name: str, wanted: int, part: Sequence[SessionSummary], flags: Flags, now: float
+) -> ScenarioProgress:
     states = Counter(summary.state for summary in part)
     counts = {state: states[state] for state in STATES}
     finished = [float(s.facts["finished_at"]) for s in part if s.state == "finished"]
-    return Progress(
+    return ScenarioProgress(
         name, wanted, counts, _flagged(part, flags), expected_end(finished, wanted, now)
     )
 
 
-def _total(rows: Sequence[Progress], part: Sequence[Summary], flags: Flags) -> Progress:
-    """All scenarios together; their end is that of the last, where all of them can be told."""
+def _total(
+    rows: Sequence[ScenarioProgress], part: Sequence[SessionSummary], flags: Flags
+) -> ScenarioProgress:
+    """Return the total row; its completion time is the latest one, if all can be estimated."""
     counts = {state: sum(row.states[state] for row in rows) for state in STATES}
     open_rows = [row for row in rows if row.states["finished"] < row.wanted]
     ends = [row.done_at for row in open_rows]
     known = [end for end in ends if end is not None]
     done_at = max(known) if known and len(known) == len(ends) else None
-    return Progress("All", sum(r.wanted for r in rows), counts, _flagged(part, flags), done_at)
+    return ScenarioProgress(
+        "All", sum(r.wanted for r in rows), counts, _flagged(part, flags), done_at
+    )
 
 
-def _flagged(part: Sequence[Summary], flags: Flags) -> int | None:
+def _flagged(part: Sequence[SessionSummary], flags: Flags) -> int | None:
+    """Count the flagged finished sessions; None if the flags are not known."""
     if not flags.are_known:
         return None
     return sum(s.state == "finished" and bool(flags.of(s.facts["session"])) for s in part)
 
 
 def expected_end(finished: Sequence[float], wanted: int, now: float) -> float | None:
-    """When ``wanted`` sessions will have finished, at the rate of the last `RATE_OVER` of them.
+    """Estimate when ``wanted`` sessions will have finished, from the current rate.
 
-    The rate counts the time since the last one too, so that it falls when nobody comes any more.
-    None where enough have finished, or too few lately for a rate.
+    The rate is that of the last `RATE_SESSIONS` sessions. It includes the time since the last
+    one, so it decreases while nobody finishes. With n recent sessions, the first at time t, the
+    result is ``now + missing * (now - t) / (n - 1)``.
+
+    Parameters
+    ----------
+    finished
+        Times at which sessions finished (Unix time, seconds).
+    wanted
+        Number of sessions wanted.
+    now
+        Current time.
+
+    Returns
+    -------
+    float or None
+        The expected time; None if enough have finished, or too few recently.
     """
     missing = wanted - len(finished)
-    lately = sorted(t for t in finished if now - t <= RATE_WITHIN)[-RATE_OVER:]
-    if missing <= 0 or len(lately) < RATE_FROM or now <= lately[0]:
+    recent = sorted(t for t in finished if now - t <= RATE_WINDOW)[-RATE_SESSIONS:]
+    if missing <= 0 or len(recent) < MIN_RATE_SESSIONS or now <= recent[0]:
         return None
-    return now + missing * (now - lately[0]) / (len(lately) - 1)
+    return now + missing * (now - recent[0]) / (len(recent) - 1)
 
 
-def funnel(part: Sequence[Summary]) -> tuple[Step, ...]:
-    """Every stage with those who reached it, and those who are there or ended there."""
+def funnel(part: Sequence[SessionSummary]) -> tuple[FunnelStage, ...]:
+    """Count for each stage the sessions that reached it, are in it, or ended in it."""
     order = list(STAGES)
     at = {stage: Counter(s.state for s in part if s.stage == stage) for stage in order}
     steps = []
-    for place, stage in enumerate(order):
-        reached = sum(at[later].total() for later in order[place:])
-        share = 100.0 * reached / len(part) if part else 0.0
-        here = at[stage]
-        gone = here["withdrawn"] + here["declined"]
-        steps.append(Step(STAGES[stage], reached, share, here["going"], here["left"], gone))
+    for index, stage in enumerate(order):
+        reached = sum(at[later].total() for later in order[index:])
+        percent = 100.0 * reached / len(part) if part else 0.0
+        states = at[stage]
+        ended = states["withdrawn"] + states["declined"]
+        steps.append(
+            FunnelStage(STAGES[stage], reached, percent, states["going"], states["left"], ended)
+        )
     return tuple(steps)
 
 
-def _performance(study: Study, name: str, part: Sequence[Summary]) -> Performance:
+def _performance(study: Study, name: str, part: Sequence[SessionSummary]) -> ScenarioPerformance:
     trials = len(study.phase(name, "test"))
-    whole = [s.answered for s in part if trials and s.answered.test >= trials]
-    shares = [answered.correct / answered.test for answered in whole]
-    times = list(chain.from_iterable(answered.rt_ms for answered in whole))
-    margin = 1.96 * stdev(shares) / math.sqrt(len(shares)) if len(shares) > 1 else None
-    return Performance(
+    complete = [s.answered for s in part if trials and s.answered.test >= trials]
+    accuracies = [answered.correct / answered.test for answered in complete]
+    times = list(chain.from_iterable(answered.rt_ms for answered in complete))
+    margin = 1.96 * stdev(accuracies) / math.sqrt(len(accuracies)) if len(accuracies) > 1 else None
+    return ScenarioPerformance(
         name,
-        len(whole),
-        fmean(shares) if shares else None,
+        len(complete),
+        fmean(accuracies) if accuracies else None,
         margin,
-        accuracy_histogram(shares),
+        accuracy_histogram(accuracies),
         median(times) if times else None,
         rt_histogram(times),
     )
 
 
-def _shown(name: str, part: Sequence[Summary]) -> Shown:
-    found = [summary.answered for summary in part if summary.answered.trials]
-    names = ("trials", "full", "short", "over", "unknown", "dropped", "hidden")
-    return Shown(name, len(found), *(sum(getattr(a, word) for a in found) for word in names))
+def _display_counts(name: str, part: Sequence[SessionSummary]) -> DisplayCounts:
+    """Sum the display counts of the sessions that have answers."""
+    counts = [summary.answered for summary in part if summary.answered.trials]
+    fields = ("trials", "full", "short", "over", "unknown", "dropped", "hidden")
+    return DisplayCounts(
+        name, len(counts), *(sum(getattr(c, field) for c in counts) for field in fields)
+    )
 
 
-def _grouped(part: Sequence[Summary], name_of: Callable[[Summary], str]) -> tuple[Shown, ...]:
-    groups: dict[str, list[Summary]] = {}
+def _grouped(
+    part: Sequence[SessionSummary], label: Callable[[SessionSummary], str]
+) -> tuple[DisplayCounts, ...]:
+    """Sum the display counts by the label of each session, most trials first."""
+    groups: dict[str, list[SessionSummary]] = {}
     for summary in part:
         if summary.answered.trials:
-            groups.setdefault(name_of(summary), []).append(summary)
-    found = [_shown(name, members) for name, members in groups.items()]
-    return tuple(sorted(found, key=lambda shown: -shown.trials))
+            groups.setdefault(label(summary), []).append(summary)
+    rows = [_display_counts(name, members) for name, members in groups.items()]
+    return tuple(sorted(rows, key=lambda row: -row.trials))
 
 
 def _rules(
-    parts: Sequence[Sequence[Summary]], flags: Flags
+    parts: Sequence[Sequence[SessionSummary]], flags: Flags
 ) -> tuple[tuple[str, tuple[int, ...]], ...]:
-    """Each rule with the finished sessions that it flags, by scenario."""
+    """Count for each rule the finished sessions that it flags, by scenario."""
     if not flags.are_known:
         return ()
     done = [[s.facts["session"] for s in part if s.state == "finished"] for part in parts]
@@ -240,17 +300,17 @@ _BROWSERS = (
 )
 
 
-def browser_of(user_agent: str) -> str:
-    """Name and main version, as ``Firefox 140``; ``other`` where none of the usual ones."""
+def browser_label(user_agent: str) -> str:
+    """Return name and major version of a browser, such as ``Firefox 140``, or ``other``."""
     for name, pattern in _BROWSERS:
-        found = re.search(pattern, user_agent[:1000])
-        if found:
-            return f"{name} {found[1]}"
+        match = re.search(pattern, user_agent[:1000])
+        if match:
+            return f"{name} {match[1]}"
     return "other" if user_agent else "not known"
 
 
-def rate_of(refresh_hz: object) -> str:
-    """The usual rate of screens that is within 3 % of a measured one, else to 5 Hz."""
+def refresh_rate_label(refresh_hz: object) -> str:
+    """Return the common refresh rate within 3 % of the measured one, else round to 5 Hz."""
     if not isinstance(refresh_hz, int | float) or not refresh_hz > 0:
         return "not known"
     for usual in (30, 50, 60, 75, 90, 100, 120, 144, 165, 240):

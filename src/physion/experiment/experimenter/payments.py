@@ -1,4 +1,4 @@
-"""Whom to pay: the ids that recruiters know, beside the sessions of people."""
+"""Rows of the payments page: sessions of people with their recruiters' ids."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from physion.experiment.study.recruitment import completion
 from physion.experiment.study.study import Study
 
 PAGE = 100
-"""Rows on one page."""
+"""Rows per page."""
 _SESSION = ("source", "session", "reference", "scenario", "finished_at", "withdrawn_at",
             "answered_test")  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Payment:
-    """One person's session. ``recruiter``: further parameters of the recruiter's address."""
+    """Session of a person with the raw id; ``recruiter``: further parameters of the entry URL."""
 
     source: str
     raw_id: str
@@ -36,8 +36,23 @@ class Payment:
 
 @dataclass(frozen=True)
 class Payments:
-    """A page of payments. ``ids`` are those of all rows that were chosen, each once, in order;
-    ``stored`` counts raw ids in the database, people's or not."""
+    """One page of the list of payments.
+
+    Attributes
+    ----------
+    rows
+        Payments on this page.
+    found
+        Number of selected sessions, on all pages.
+    page, pages
+        This page, and number of pages.
+    ids
+        Unique raw ids of all selected sessions, in order.
+    sources
+        Recruiters of the stored ids.
+    stored
+        Number of raw ids in the database, including those of other kinds of sessions.
+    """
 
     rows: tuple[Payment, ...]
     found: int
@@ -51,9 +66,20 @@ class Payments:
 def read_payments(
     study: Study, secrets: Secrets, engine: Engine, *, source: str, finished: bool, page: int
 ) -> Payments:
-    """Sessions of people whose raw id is stored, those that finished last first.
+    """Read a page of the sessions of people whose raw id is stored, last finished first.
 
-    ``source``: of this recruiter alone, empty: of all. ``finished``: finished sessions alone.
+    Parameters
+    ----------
+    study, secrets
+        The study and its keys, for completion codes.
+    engine
+        The database.
+    source
+        Only sessions from this recruiter; empty: from all.
+    finished
+        Only finished sessions.
+    page
+        Number of the page from 1; numbers out of range give the closest page.
     """
     session, ids = SESSIONS.c, RAW_IDS.c
     chosen = [session.kind == "person"]
@@ -86,5 +112,6 @@ def read_payments(
 
 
 def _code(study: Study, secrets: Secrets, row: object) -> str | None:
+    """Return the completion code of a finished session."""
     finished = getattr(row, "finished_at", None) is not None
     return completion(study, secrets, row, row).code if finished else None

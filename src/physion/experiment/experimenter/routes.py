@@ -1,4 +1,4 @@
-"""The experimenter's pages as addresses below ``/experimenter``."""
+"""URL paths of the experimenter's pages under ``/experimenter``, and their request handlers."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from fastapi import APIRouter, FastAPI
 from starlette.requests import Request
 from starlette.responses import Response
 
-from physion.experiment.experimenter.access.gate import drop_cookie, set_cookie
+from physion.experiment.experimenter.access.access_control import drop_cookie, set_cookie
 from physion.experiment.experimenter.export_pages import ExportPages
-from physion.experiment.experimenter.front import WRONG_FORM, Front, go
+from physion.experiment.experimenter.page_context import WRONG_FORM, PageContext, redirect
 from physion.experiment.experimenter.payment_pages import PaymentPages
-from physion.experiment.experimenter.session_list import KINDS, Choice
+from physion.experiment.experimenter.session_list import KINDS, SessionFilter
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.study import Study
 from physion.experiment.web.page_files import read_page_files
@@ -29,15 +29,15 @@ LOG = logging.getLogger(__name__)
 
 
 def build_router(study: Study, secrets: Secrets, store: Store) -> APIRouter:
-    """The pages of a study, to be included below ``/experimenter``."""
-    front = Front(study, secrets, store.engine.url.render_as_string(hide_password=False))
-    pages, exports = _Pages(front), ExportPages(front)
-    payments = PaymentPages(front, store, exports)
+    """Return the router of the pages of a study, to be included under ``/experimenter``."""
+    context = PageContext(study, secrets, store.engine.url.render_as_string(hide_password=False))
+    pages, exports = _Pages(context), ExportPages(context)
+    payments = PaymentPages(context, store, exports)
 
     @contextlib.asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         yield
-        await front.close()
+        await context.close()
 
     router = APIRouter(lifespan=lifespan, include_in_schema=False)
     for method, path, page in (
@@ -60,90 +60,101 @@ def build_router(study: Study, secrets: Secrets, store: Store) -> APIRouter:
 
 
 class _Pages:
-    """Login, overview and sessions: one method an address."""
+    """Request handlers of login, overview, sessions and static files."""
 
-    def __init__(self, front: Front) -> None:
-        self._front = front
+    def __init__(self, context: PageContext) -> None:
+        self._context = context
         self._files = read_page_files(Path(__file__).parent / "static")
 
     async def login_page(self, request: Request) -> Response:
-        if self._front.gate.login(request) is not None:
-            return go("")
+        """Show the login form."""
+        if self._context.access.login(request) is not None:
+            return redirect("")
         return self._login_form(request)
 
     async def login(self, request: Request) -> Response:
-        fields = await self._front.gate.form(request)
+        """Check the password and log in."""
+        fields = await self._context.access.form(request)
         if fields is None:
             return self._login_form(request, WRONG_FORM, 403)
-        wait = await self._front.gate.try_password(request, fields.get("password", ""))
+        wait = await self._context.access.try_password(request, fields.get("password", ""))
         if wait is None:
             LOG.info("an experimenter logged in")
-            self._front.gate.logins.close(self._front.gate.token(request))
-            response = go("")
-            set_cookie(request, response, self._front.gate.logins.open(self._front.gate.clock()))
+            self._context.access.logins.close(self._context.access.token(request))
+            response = redirect("")
+            set_cookie(
+                request, response, self._context.access.logins.open(self._context.access.clock())
+            )
             return response
         LOG.warning("a login of an experimenter was refused")
-        return self._front.refuse_password(request, wait, self._login_form)
+        return self._context.refuse_password(request, wait, self._login_form)
 
     async def logout(self, request: Request) -> Response:
-        if await self._front.gate.form(request) is None:
-            return self._front.problem(request, WRONG_FORM, 403)
-        self._front.gate.logins.close(self._front.gate.token(request))
-        response = go("/login")
+        """Log out."""
+        if await self._context.access.form(request) is None:
+            return self._context.render_problem(request, WRONG_FORM, 403)
+        self._context.access.logins.close(self._context.access.token(request))
+        response = redirect("/login")
         drop_cookie(request, response)
         return response
 
     def _login_form(
         self, request: Request, problem: str = "", status: int = 200, wait: float = 0.0
     ) -> Response:
-        visit = self._front.gate.visit(request)
-        response = self._front.page("login.html", visit, status, problem=problem)
+        visit = self._context.access.visit(request)
+        response = self._context.render_with_token("login.html", visit, status, problem=problem)
         set_cookie(request, response, visit)
         if wait:
             response.headers["retry-after"] = str(math.ceil(wait))
         return response
 
     async def overview(self, request: Request) -> Response:
+        """Show the overview."""
         by_person = request.query_params.get("auto") != "1"
-        if self._front.gate.login(request, by_person) is None:
-            return go("/login")
+        if self._context.access.login(request, by_person) is None:
+            return redirect("/login")
         kind = request.query_params.get("kind", "")
         kind = kind if kind in KINDS else "person"
-        found = await self._front.ask(request, "overview", kind=kind)
+        found = await self._context.query_statistics(request, "overview", kind=kind)
         if isinstance(found, Response):
             return found
         overview, flags = found
-        return await self._front.draw(
+        return await self._context.render_in_thread(
             request, "overview.html", here="overview", overview=overview, flags=flags
         )
 
     async def sessions(self, request: Request) -> Response:
-        if self._front.gate.login(request) is None:
-            return go("/login")
-        choice = Choice.read(request.query_params, self._front.study.scenarios)
-        found = await self._front.ask(request, "sessions", choice=choice)
+        """Show the table of sessions."""
+        if self._context.access.login(request) is None:
+            return redirect("/login")
+        choice = SessionFilter.from_query(request.query_params, self._context.study.scenarios)
+        found = await self._context.query_statistics(request, "sessions", choice=choice)
         if isinstance(found, Response):
             return found
         listed, flags = found
-        return await self._front.draw(
+        return await self._context.render_in_thread(
             request, "sessions.html", here="sessions", listed=listed, choice=listed.choice,
             flags=flags,
         )  # fmt: skip
 
     async def session(self, request: Request) -> Response:
-        if self._front.gate.login(request) is None:
-            return go("/login")
-        found = await self._front.ask(
+        """Show one session."""
+        if self._context.access.login(request) is None:
+            return redirect("/login")
+        found = await self._context.query_statistics(
             request, "session", session=request.path_params["session"][:100]
         )
         if isinstance(found, Response):
             return found
         if found is None:
-            return self._front.problem(request, "There is no such session.", 404)
-        return await self._front.draw(request, "session.html", here="sessions", page=found)
+            return self._context.render_problem(request, "There is no such session.", 404)
+        return await self._context.render_in_thread(
+            request, "session.html", here="sessions", page=found
+        )
 
     async def static(self, request: Request) -> Response:
+        """Send a style sheet, script or icon."""
         found = self._files.get(request.path_params["name"])
         if found is None:
-            return self._front.problem(request, "There is nothing at this address.", 404)
+            return self._context.render_problem(request, "There is nothing at this address.", 404)
         return found.response(request)

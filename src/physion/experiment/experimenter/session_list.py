@@ -1,4 +1,4 @@
-"""The table of sessions: chosen, sorted, cut into pages."""
+"""The table of sessions: filtering, sorting and pagination."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Any
 from urllib.parse import urlencode
 
 from physion.experiment.experimenter.statistics.flagging import Flags
-from physion.experiment.experimenter.statistics.summaries import STAGES, STATES, Summary
+from physion.experiment.experimenter.statistics.summaries import STAGES, STATES, SessionSummary
 
 PAGE = 50
-"""Sessions on one page."""
+"""Sessions per page."""
 KINDS = {"person": "People", "simulated": "Simulated", "preview": "Previews"}
-"""Kinds of sessions and what they are called."""
+"""Kinds of sessions and their labels."""
 SORTS = (
     "reference", "scenario", "source", "state", "started", "minutes", "trials", "accuracy", "rt",
     "flags", "frames",
@@ -23,8 +23,8 @@ ANY = "any"
 
 
 @dataclass(frozen=True)
-class Choice:
-    """What of the table is shown; words that mean nothing fall back to the defaults."""
+class SessionFilter:
+    """Filter, sort order and page of the table, as given in the query of the URL."""
 
     kind: str = "person"
     scenario: str = ""
@@ -35,8 +35,8 @@ class Choice:
     page: int = 1
 
     @classmethod
-    def read(cls, query: Mapping[str, str], scenarios: Sequence[str]) -> Choice:
-        """The choice that an address makes, ``?kind=person&state=left&sort=accuracy``."""
+    def from_query(cls, query: Mapping[str, str], scenarios: Sequence[str]) -> SessionFilter:
+        """Parse a query such as ``?kind=person&state=left``; invalid values give the defaults."""
 
         def one_of(name: str, known: Sequence[str], default: str) -> str:
             given = query.get(name, default)
@@ -53,31 +53,34 @@ class Choice:
         )
 
     def link(self, **changes: Any) -> str:
-        """The address of this choice with changes; only what is not the default is named."""
-        default = asdict(Choice())
+        """Return the query of this filter with some values changed, without default values."""
+        default = asdict(SessionFilter())
         wanted = asdict(replace(self, **changes))
-        words = {
+        query = {
             name: int(value) if isinstance(value, bool) else value
             for name, value in wanted.items()
             if value != default[name]
         }
-        return "?" + urlencode(words)
+        return "?" + urlencode(query)
 
     def sort_link(self, column: str) -> str:
-        """Sorts by ``column``, or the other way round where it is sorted by it already."""
+        """Return the query that sorts by ``column``; or reverses the current order."""
         down = not self.down if column == self.sort else column in ("started", "flags", "frames")
         return self.link(sort=column, down=down, page=1)
 
 
 def page_number(given: str) -> int:
-    """The number of a page in an address; 1 where it is none."""
+    """Parse a page number in a query; return 1 if it is invalid."""
     return int(given) if given.isascii() and given.isdigit() and len(given) < 7 else 1
 
 
 @dataclass(frozen=True)
-class Line:
-    """A row of the table. ``minutes`` from the beginning to the end, or to the last sign of life;
-    ``troubled``: trials not shown with all frames."""
+class SessionLine:
+    """Row of the table of sessions.
+
+    ``minutes`` is the duration to the end of the session, or to its last request. ``incomplete``
+    counts trials whose movie was not displayed with all frames.
+    """
 
     session: str
     reference: str
@@ -91,30 +94,32 @@ class Line:
     accuracy: float | None
     rt_ms: float | None
     flags: tuple[str, ...]
-    troubled: int
+    incomplete: int
     hidden: int
 
 
 @dataclass(frozen=True)
 class SessionList:
-    """One page of the table; ``found`` counts all that were chosen."""
+    """One page of the table; ``found`` counts the selected sessions on all pages."""
 
-    choice: Choice
-    lines: tuple[Line, ...]
+    choice: SessionFilter
+    lines: tuple[SessionLine, ...]
     found: int
     pages: int
     kinds: Mapping[str, int]
     rules: tuple[str, ...]
 
 
-def list_sessions(summaries: Sequence[Summary], flags: Flags, choice: Choice) -> SessionList:
-    """The page that was chosen; a page beyond the last is the last."""
+def list_sessions(
+    summaries: Sequence[SessionSummary], flags: Flags, choice: SessionFilter
+) -> SessionList:
+    """Return the selected page; a number beyond the last page gives the last page."""
     kinds = {kind: sum(s.facts["kind"] == kind for s in summaries) for kind in KINDS}
     chosen = [s for s in summaries if _is_chosen(s, flags, choice)]
     lines = [_line(summary, flags) for summary in chosen]
     key = _KEYS[choice.sort]
     known = [line for line in lines if key(line) is not None]
-    # What is not known stands last, whichever way the rest is sorted.
+    # Missing values come last in either sort order.
     lines = sorted(known, key=key, reverse=choice.down) + [x for x in lines if key(x) is None]
     pages = max(1, -(-len(lines) // PAGE))
     page = min(max(1, choice.page), pages)
@@ -122,7 +127,8 @@ def list_sessions(summaries: Sequence[Summary], flags: Flags, choice: Choice) ->
     return SessionList(replace(choice, page=page), part, len(lines), pages, kinds, flags.rules)
 
 
-def _is_chosen(summary: Summary, flags: Flags, choice: Choice) -> bool:
+def _is_chosen(summary: SessionSummary, flags: Flags, choice: SessionFilter) -> bool:
+    """Return whether a session passes the filter."""
     facts = summary.facts
     rules = flags_shown(summary, flags)
     return (
@@ -133,23 +139,23 @@ def _is_chosen(summary: Summary, flags: Flags, choice: Choice) -> bool:
     )
 
 
-def flags_shown(summary: Summary, flags: Flags) -> tuple[str, ...]:
-    """The flags of a session; of one that is going on it is too early to tell."""
+def flags_shown(summary: SessionSummary, flags: Flags) -> tuple[str, ...]:
+    """Return the flags of a session; none while it is in progress, since they may change."""
     return () if summary.state == "going" else flags.of(str(summary.facts["session"]))
 
 
-def _line(summary: Summary, flags: Flags) -> Line:
+def _line(summary: SessionSummary, flags: Flags) -> SessionLine:
     facts, answered = summary.facts, summary.answered
     end = facts["finished_at"] or facts["withdrawn_at"] or facts["last_seen"]
-    return Line(
+    return SessionLine(
         facts["session"], facts["reference"], facts["scenario"], facts["source"], summary.state,
         STAGES[summary.stage], facts["started_at"], max(0.0, end - facts["started_at"]) / 60,
         answered.test, answered.accuracy, answered.median_rt, flags_shown(summary, flags),
-        answered.troubled, answered.hidden,
+        answered.incomplete, answered.hidden,
     )  # fmt: skip
 
 
-_KEYS: Mapping[str, Callable[[Line], Any]] = {
+_KEYS: Mapping[str, Callable[[SessionLine], Any]] = {
     "reference": lambda line: line.reference,
     "scenario": lambda line: line.scenario,
     "source": lambda line: line.source,
@@ -160,5 +166,5 @@ _KEYS: Mapping[str, Callable[[Line], Any]] = {
     "accuracy": lambda line: line.accuracy,
     "rt": lambda line: line.rt_ms,
     "flags": lambda line: len(line.flags),
-    "frames": lambda line: line.troubled,
+    "frames": lambda line: line.incomplete,
 }

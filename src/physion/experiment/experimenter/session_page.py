@@ -1,4 +1,4 @@
-"""All that is stored about one session, but for the id that the recruiter knows."""
+"""Content of the page of one session: everything stored about it except the raw id."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from sqlalchemy import Connection, Engine, select
 
 from physion.experiment.experimenter.session_list import flags_shown
 from physion.experiment.experimenter.statistics.flagging import Flags
-from physion.experiment.experimenter.statistics.summaries import Summary, labels_of
+from physion.experiment.experimenter.statistics.summaries import SessionSummary, stimulus_labels
 from physion.experiment.store.tables import ANSWERS, EVENTS, SESSIONS, STUDIES
 from physion.experiment.study.study import Study
 
 EVENTS_SHOWN = 500
-"""Events of one session that its page shows, from the first on."""
+"""Maximum number of events shown on the page of a session."""
 
 
 @dataclass(frozen=True)
 class AnswerLine:
-    """One answer in the order in which it came; ``label`` None: no longer in the study."""
+    """One answer; ``label`` is None if its stimulus is no longer in the study."""
 
     phase: str
     trial: int
@@ -39,13 +39,13 @@ class AnswerLine:
 
     @property
     def correct(self) -> bool | None:
-        """None where there is no label."""
+        """Whether the answer is right; None if the label is unknown."""
         return None if self.label is None else (self.response == "yes") == self.label
 
 
 @dataclass(frozen=True)
 class EventLine:
-    """Something that happened; ``data`` is JSON text."""
+    """One browser event; ``data`` is JSON text."""
 
     kind: str
     at_ms: float
@@ -55,11 +55,14 @@ class EventLine:
 
 @dataclass(frozen=True)
 class SessionPage:
-    """``row`` holds the columns of the table of sessions, ``others`` the same person's further
-    sessions as (session, scenario, state)."""
+    """Content of the page of a session.
+
+    ``row`` has the columns of the table of sessions; ``others`` are further sessions of the same
+    person as (session, scenario, state).
+    """
 
     row: Mapping[str, Any]
-    summary: Summary
+    summary: SessionSummary
     flags: tuple[str, ...]
     study: str
     answers: tuple[AnswerLine, ...]
@@ -69,9 +72,28 @@ class SessionPage:
 
 
 def read_session_page(
-    study: Study, engine: Engine, summaries: Sequence[Summary], flags: Flags, session: str
+    study: Study, engine: Engine, summaries: Sequence[SessionSummary], flags: Flags, session: str
 ) -> SessionPage | None:
-    """The page of a session; None where there is none of that name."""
+    """Read the content of the page of a session.
+
+    Parameters
+    ----------
+    study
+        The study.
+    engine
+        The database.
+    summaries
+        Summaries of all sessions.
+    flags
+        Flags of the sessions of this kind.
+    session
+        Identifier of the session.
+
+    Returns
+    -------
+    SessionPage or None
+        None if there is no such session.
+    """
     summary = next((s for s in summaries if s.facts["session"] == session), None)
     if summary is None:
         return None
@@ -95,7 +117,7 @@ def read_session_page(
 def _answers(
     study: Study, connection: Connection, session: str, scenario: str
 ) -> tuple[AnswerLine, ...]:
-    labels = labels_of(study)
+    labels = stimulus_labels(study)
     table = ANSWERS.c
     rows = connection.execute(
         select(*(column for column in table if column.name != "details"))

@@ -1,1 +1,1 @@
-"""Login to the experimenter's pages."""
+"""Access control of the experimenter's pages: logins, cookies and login attempts."""

@@ -1,4 +1,4 @@
-"""How long someone has to wait before the next try of a password."""
+"""Delays between login attempts, which grow with the number of failures."""
 
 from __future__ import annotations
 
@@ -7,37 +7,39 @@ from dataclasses import dataclass
 
 from physion.experiment.web.rate_limits import network_of
 
-ADDRESSES = 10_000
-"""Addresses that are kept; beyond that the one that failed longest ago is forgotten."""
+MAX_ADDRESSES = 10_000
+"""Maximum number of addresses kept; the one with the oldest failure is dropped first."""
 FORGET_AFTER = 3600.0
-"""Seconds without a failure after which the failures of an address are forgotten."""
+"""Seconds after the last failure at which the failures of an address are forgotten."""
 
 
 @dataclass(frozen=True)
-class Waits:
-    """``free`` failures cost nothing; then the wait doubles from one second up to ``longest``."""
+class Backoff:
+    """Exponential backoff: no delay for ``free`` failures, then 1 s, doubled up to ``longest``."""
 
     free: int
     longest: float
 
     def after(self, failures: int) -> float:
-        """Seconds to wait after so many failures."""
+        """Return the seconds to wait after this number of failures."""
         over = failures - self.free
         return 0.0 if over < 0 else min(self.longest, 2.0 ** min(over, 30))
 
 
-BY_ADDRESS = Waits(free=5, longest=900.0)
-OVERALL = Waits(free=50, longest=5.0)
-"""For all addresses together. It is short, so that whoever guesses from many addresses is slowed
-down without the experimenter being locked out."""
+BY_ADDRESS = Backoff(free=5, longest=900.0)
+OVERALL = Backoff(free=50, longest=5.0)
+"""Backoff for all addresses together. It is short: guessing from many addresses is slowed down, but
+the experimenter is not locked out."""
 
 
 @dataclass
 class _Failures:
+    """Number and time of the recent failures of one address, or of all."""
+
     count: int = 0
     last: float = 0.0
 
-    def wait(self, waits: Waits, now: float) -> float:
+    def wait(self, waits: Backoff, now: float) -> float:
         if now - self.last > FORGET_AFTER:
             return 0.0
         return max(0.0, self.last + waits.after(self.count) - now)
@@ -47,12 +49,12 @@ class _Failures:
         self.last = now
 
 
-class Attempts:
-    """Counts failures by address and overall. Times are seconds of any steady clock.
+class LoginAttempts:
+    """Counter of failed login attempts by address and overall.
 
-    A try is counted as failed when it begins (`begin`) and taken back when it succeeds, so that
-    many tries at once do not all pass before the first of them has failed. An address that has
-    succeeded before waits for its own failures alone.
+    An attempt counts as failed from its start (`begin`) until it succeeds, so that simultaneous
+    attempts are limited too. An address that has logged in before is delayed by its own failures
+    only. Times are seconds of a monotonic clock.
     """
 
     def __init__(self) -> None:
@@ -61,7 +63,7 @@ class Attempts:
         self._trusted: OrderedDict[str, None] = OrderedDict()
 
     def begin(self, address: str, now: float) -> float:
-        """0 where a try may be made now, which is then counted; else the seconds to wait."""
+        """Start an attempt: return 0 if it is allowed now, otherwise the seconds to wait."""
         who = network_of(address)
         own = self._by_address.get(who, _Failures())
         wait = own.wait(BY_ADDRESS, now)
@@ -73,16 +75,16 @@ class Attempts:
         self._overall.add(now)
         self._by_address[who] = own
         self._by_address.move_to_end(who)
-        while len(self._by_address) > ADDRESSES:
+        while len(self._by_address) > MAX_ADDRESSES:
             self._by_address.popitem(last=False)
         return 0.0
 
     def succeeded(self, address: str) -> None:
-        """The password was right: the address begins anew."""
+        """Record that the password was right: the failures of the address are forgotten."""
         who = network_of(address)
         self._by_address.pop(who, None)
         self._overall.count = max(0, self._overall.count - 1)
         self._trusted[who] = None
         self._trusted.move_to_end(who)
-        while len(self._trusted) > ADDRESSES:
+        while len(self._trusted) > MAX_ADDRESSES:
             self._trusted.popitem(last=False)

@@ -1,7 +1,6 @@
-"""Who is logged in: sessions in memory, their cookie, and the tokens of forms.
+"""Logins of experimenters: kept in memory, identified by a cookie; and tokens of forms.
 
-Nothing is written to disk: a restart of the server logs everybody out, and so does another
-password.
+Nothing is written to disk: a restart of the server or a new password ends all logins.
 """
 
 from __future__ import annotations
@@ -14,61 +13,61 @@ from dataclasses import dataclass
 
 COOKIE = "physion_experimenter"
 PATH = "/experimenter"
-IDLE = 2 * 3600.0
-"""Seconds without anything being asked for by a person after which a login ends."""
-LONGEST = 12 * 3600.0
-"""Seconds after which a login ends in any case."""
+IDLE_TIMEOUT = 2 * 3600.0
+"""Seconds without a request by a person after which a login ends."""
+MAX_DURATION = 12 * 3600.0
+"""Maximum duration of a login in seconds."""
 CONFIRMED_FOR = 600.0
-"""Seconds for which the password, given once more, opens the page of payments."""
-AT_MOST = 100
-"""Logins kept at once; beyond that the oldest ends."""
+"""Seconds for which the payments page stays open after the password was given again."""
+MAX_LOGINS = 100
+"""Maximum number of logins; beyond it the oldest one ends."""
 
 
 @dataclass
 class Login:
-    """One browser that gave the password; times are seconds of a steady clock."""
+    """Login of one browser; times are seconds of a monotonic clock."""
 
     made: float
     seen: float
     confirmed: float | None = None
 
     def is_over(self, now: float) -> bool:
-        """Too old, or idle for too long."""
-        return now - self.made > LONGEST or now - self.seen > IDLE
+        """Return whether the login is too old or was idle for too long."""
+        return now - self.made > MAX_DURATION or now - self.seen > IDLE_TIMEOUT
 
     def may_see_payments(self, now: float) -> bool:
-        """Was the password given a short while ago?"""
+        """Return whether the password was given again recently."""
         return self.confirmed is not None and now - self.confirmed <= CONFIRMED_FOR
 
 
-class Logins:
-    """The logins of one server process, by the hash of their token."""
+class LoginRegistry:
+    """All logins of one server process, stored by the hash of their token."""
 
     def __init__(self) -> None:
         self._open: OrderedDict[str, Login] = OrderedDict()
         self._form_key = secrets.token_bytes(32)
-        self.under = ""
-        """The hash of the password with which all of them were opened."""
+        self.password_hash = ""
+        """Hash of the password with which the current logins were opened."""
 
-    def password_is(self, under: str) -> None:
-        """The password has this hash now: with another one than before, all logins end."""
-        if under != self.under:
+    def set_password_hash(self, password_hash: str) -> None:
+        """Set the hash of the current password; if it has changed, all logins end."""
+        if password_hash != self.password_hash:
             self._open.clear()
-            self.under = under
+            self.password_hash = password_hash
 
     def open(self, now: float) -> str:
-        """A new login; its token goes into the cookie and is not kept."""
-        token = new_visit()
+        """Open a login; return its token for the cookie, of which only the hash is kept."""
+        token = new_cookie_token()
         self._open[_hashed(token)] = Login(now, now)
-        while len(self._open) > AT_MOST:
+        while len(self._open) > MAX_LOGINS:
             self._open.popitem(last=False)
         return token
 
     def find(self, token: str, now: float, by_person: bool = True) -> Login | None:
-        """The login of a token, None where there is none or it is over.
+        """Return the login of a token, or None if there is none or it has ended.
 
-        ``by_person``: someone asked for this, so the login is not idle; a page that refreshes
-        by itself does not keep it open.
+        ``by_person``: the request was made by a person, which resets the idle time; automatic
+        refreshes do not.
         """
         key = _hashed(token)
         login = self._open.get(key)
@@ -82,22 +81,22 @@ class Logins:
         return login
 
     def close(self, token: str) -> None:
-        """Ends a login, if there is one."""
+        """End the login of this token, if there is one."""
         self._open.pop(_hashed(token), None)
 
     def form_token(self, token: str) -> str:
-        """What every form of the browser with this cookie has to bring."""
+        """Return the token that forms of the browser with this cookie must contain."""
         return hmac.new(self._form_key, token.encode(), hashlib.sha256).hexdigest()
 
     def is_form_token(self, token: str, given: str) -> bool:
-        """Does a form come from a page that this browser was given?"""
+        """Return whether ``given`` is the form token of the browser with this cookie."""
         return bool(token) and hmac.compare_digest(
             self.form_token(token).encode(), given.encode("utf-8", "replace")
         )
 
 
-def new_visit() -> str:
-    """A random word for a cookie; 256 bits."""
+def new_cookie_token() -> str:
+    """Return a random token for a cookie (256 bits)."""
     return secrets.token_urlsafe(32)
 
 

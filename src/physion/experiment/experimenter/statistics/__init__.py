@@ -1,1 +1,1 @@
-"""Statistics of the experimenter's pages, computed in a process of their own."""
+"""Statistics of the experimenter's pages, computed in a separate process."""

@@ -1,7 +1,7 @@
-"""Which sessions the study's exclusion rules flag, worked out behind the pages.
+"""Flags of sessions by the study's exclusion rules, computed in a background thread.
 
-`Flagger` runs in the process of `desk`, in a thread of its own: pages show the last flags there
-are, with their age, and never wait for new ones longer than `PATIENCE`.
+`FlagCache` runs in the statistics process. Pages show the latest available flags with the time of
+their computation, and wait for new ones for at most `MAX_WAIT`.
 """
 
 from __future__ import annotations
@@ -18,19 +18,29 @@ from physion.errors import PhysionError
 from physion.experiment.study.study import Study
 
 LOG = logging.getLogger(__name__)
-PATIENCE = 2.0
-"""Seconds for which a page waits for flags that are being worked out."""
-REST = 10.0
-"""Seconds at least between the beginnings of two workings-out; after a long one, ten times its
-length, so that flags never take more than a tenth of one core."""
+MAX_WAIT = 2.0
+"""Maximum seconds for which a page waits for flags that are being computed."""
+MIN_INTERVAL = 10.0
+"""Minimum seconds between the starts of two computations. After a long computation it is ten times
+its duration, so that flags never take more than a tenth of one core."""
 
 
 @dataclass(frozen=True)
 class Flags:
-    """The rules that flag each session of one kind, and when this was found.
+    """The rules that flag each session of one kind.
 
-    ``by_session`` holds flagged sessions alone. ``problem`` says why there are no flags. ``at``
-    is None where none have been worked out yet.
+    Attributes
+    ----------
+    rule_set
+        Name of the rule set.
+    rules
+        Names of its rules.
+    by_session
+        Rules that flag a session, for flagged sessions only.
+    at
+        Unix time of the computation; None if there has been none yet.
+    problem
+        Why there are no flags, or empty.
     """
 
     rule_set: str
@@ -41,59 +51,63 @@ class Flags:
 
     @property
     def are_known(self) -> bool:
-        """Were flags worked out?"""
+        """Whether the flags have been computed successfully."""
         return self.at is not None and not self.problem
 
     def of(self, session: str) -> tuple[str, ...]:
-        """The rules that flag a session."""
+        """Return the rules that flag a session."""
         return self.by_session.get(session, ())
 
 
-Find = Callable[[], Mapping[str, Flags]]
-"""Works out the flags of the sessions of each kind."""
+FindFlags = Callable[[], Mapping[str, Flags]]
+"""Computes the flags of all sessions, by kind of session."""
 
 
-class Flagger:
-    """Keeps flags up to date. ``state`` of the data tells whether they would be other ones."""
+class FlagCache:
+    """Cache of flags, recomputed when ``state``, a version token of the data, changes."""
 
-    def __init__(self, find: Find, rule_set: str) -> None:
-        self._find, self._nothing = find, Flags(rule_set)
+    def __init__(self, find: FindFlags, rule_set: str) -> None:
+        self._find, self._empty = find, Flags(rule_set)
         self._flags: Mapping[str, Flags] = {}
         self._state: object = None
-        self._begun, self._took = -1e9, 0.0
+        self._started, self._took = -1e9, 0.0
         self._thread: threading.Thread | None = None
 
     def flags(self, kind: str, state: object) -> Flags:
-        """The flags of a kind; new ones are begun where the data are in another ``state``."""
-        resting = time.monotonic() < self._begun + max(REST, 10 * self._took)
-        if state != self._state and not resting and not self._is_busy():
-            self._begun = time.monotonic()
+        """Return the flags of a kind; start a new computation if ``state`` has changed.
+
+        ``state`` can be any value that changes with the data. The result may be of an older state
+        if the new flags are not available within `MAX_WAIT`.
+        """
+        too_soon = time.monotonic() < self._started + max(MIN_INTERVAL, 10 * self._took)
+        if state != self._state and not too_soon and not self._is_busy():
+            self._started = time.monotonic()
             self._thread = threading.Thread(target=self._work, args=(state,), daemon=True)
             self._thread.start()
         if self._thread is not None:
-            self._thread.join(PATIENCE)
-        return self._flags.get(kind, self._nothing)
+            self._thread.join(MAX_WAIT)
+        return self._flags.get(kind, self._empty)
 
     def _is_busy(self) -> bool:
         return self._thread is not None and self._thread.is_alive()
 
     def _work(self, state: object) -> None:
-        begun = time.monotonic()
+        started = time.monotonic()
         try:
             self._flags = self._find()
-        except Exception as error:  # the pages go on without flags, and say why
-            LOG.exception("flags could not be worked out")
+        except Exception as error:  # the pages continue without flags and show the error
+            LOG.exception("flags could not be computed")
             problem = f"{type(error).__name__}: {error}"
-            broken = replace(self._nothing, at=time.time(), problem=problem)
+            broken = replace(self._empty, at=time.time(), problem=problem)
             self._flags = {"person": broken, "simulated": broken}
         self._state = state
-        self._took = time.monotonic() - begun
+        self._took = time.monotonic() - started
 
 
 def find_flags(study: Study, engine: Engine) -> Mapping[str, Flags]:
-    """The flags of people and of simulated participants, each among their own.
+    """Compute the flags of people and of simulated participants, separately for each kind.
 
-    Previews have none: they are in no export, and the rules read what the export holds.
+    Previews have no flags: the rules are applied to exported data, which excludes previews.
     """
     from physion.analysis.people.exclusions import RULE_SETS, RULES, flag_sessions
     from physion.analysis.people.participants import clean
@@ -101,18 +115,18 @@ def find_flags(study: Study, engine: Engine) -> Mapping[str, Flags]:
 
     trials, sessions = read_tables(engine, study)
     expected = {name.lower(): len(study.phase(name, "test")) for name in study.scenarios}
-    found = {"preview": Flags(study.exclusions, problem="previews are never analysed")}
+    result = {"preview": Flags(study.exclusions, problem="previews are never analysed")}
     for kind, simulated in (("person", False), ("simulated", True)):
         rows = trials[trials["simulated"] == simulated]
         if not (rows["phase"] == "test").any():
-            found[kind] = Flags(study.exclusions, RULES, {}, time.time())
+            result[kind] = Flags(study.exclusions, RULES, {}, time.time())
             continue
         people = sessions[sessions["simulated"] == simulated]
         try:
             responses = clean(rows, people, where="the database")
             table = flag_sessions(responses, RULE_SETS[study.exclusions], expected=expected)
         except PhysionError as error:
-            found[kind] = Flags(study.exclusions, at=time.time(), problem=str(error))
+            result[kind] = Flags(study.exclusions, at=time.time(), problem=str(error))
             continue
         marks = table.set_index("session")[list(RULES)]
         by_session = {
@@ -120,5 +134,5 @@ def find_flags(study: Study, engine: Engine) -> Mapping[str, Flags]:
             for session, row in zip(marks.index, marks.to_numpy(), strict=True)
             if row.any()
         }
-        found[kind] = Flags(study.exclusions, RULES, by_session, time.time())
-    return found
+        result[kind] = Flags(study.exclusions, RULES, by_session, time.time())
+    return result

@@ -1,8 +1,8 @@
-"""The desk at which pages ask: a process that reads and counts, so that the server does not.
+"""Background process that computes the statistics of the pages, so the server is not blocked.
 
-Counting in the server's own process would hold up participants' answers: Python runs one thread at
-a time. The process is started by the first question and again where it died; it ends by itself when
-the server is gone, since its end of the pipe closes.
+In the server's own process, the computation would delay participants' answers, since only one
+Python thread runs at a time. The process is started by the first request and restarted if it has
+died. It ends when the server ends, because the pipe between them is then stopped.
 """
 
 from __future__ import annotations
@@ -24,36 +24,36 @@ from physion.errors import PhysionError
 from physion.experiment.study.study import Study
 
 LOG = logging.getLogger(__name__)
-PATIENCE = 120.0
-"""Seconds that a question may take before the process is given up."""
-TRIES = 2
-LOOK_UP = 0.25
-"""Seconds after which a waiting thread looks whether the server is still there."""
+TIMEOUT = 120.0
+"""Seconds that a request may take before the process is killed."""
+ATTEMPTS = 2
+POLL_INTERVAL = 0.25
+"""Interval in seconds at which a waiting thread checks whether the server is still running."""
 
 
-class DeskError(PhysionError):
-    """A question without an answer: the process died, took too long, or failed."""
+class StatisticsError(PhysionError):
+    """The statistics process died, took too long, or failed."""
 
 
-class Desk:
-    """Asks one question at a time of a `Clerk` in another process."""
+class StatisticsProcess:
+    """Client of a `StatisticsWorker` in another process; sends one request at a time."""
 
-    def __init__(self, study: Study, url: str, patience: float = PATIENCE) -> None:
-        # Texts are not needed there.
-        self._study, self._url, self._patience = replace(study, texts={}), url, patience
+    def __init__(self, study: Study, url: str, timeout: float = TIMEOUT) -> None:
+        # The worker does not need the texts.
+        self._study, self._url, self._timeout = replace(study, texts={}), url, timeout
         self._lock = threading.Lock()
         self._threads = ThreadPoolExecutor(4, thread_name_prefix="desk")
         self._process: BaseProcess | None = None
         self._pipe: Connection | None = None
 
-    async def ask(self, question: str, **arguments: Any) -> Any:
-        """The answer to a question, a method of the clerk. Raises `PhysionError`."""
+    async def query(self, request: str, **arguments: Any) -> Any:
+        """Call the worker's method ``request`` and return its result; may raise `PhysionError`."""
         loop = asyncio.get_running_loop()
-        return await loop.run_in_executor(self._threads, self._ask, question, arguments)
+        return await loop.run_in_executor(self._threads, self._query, request, arguments)
 
     @contextlib.asynccontextmanager
-    async def closed(self) -> AsyncIterator[None]:
-        """Nothing is read meanwhile; questions wait."""
+    async def stopped(self) -> AsyncIterator[None]:
+        """Stop the process for the duration of the context, so that it reads nothing."""
         if self._process is not None:
             self._process.kill()
         await asyncio.to_thread(self._lock.acquire)
@@ -64,44 +64,47 @@ class Desk:
             self._lock.release()
 
     def close(self) -> None:
-        """Ends the process, without waiting for an answer that is on its way."""
+        """Stop the process without waiting for pending results."""
         if self._process is not None:
             self._process.kill()
         self._threads.shutdown(wait=True, cancel_futures=True)
         with self._lock:
             self._end()
 
-    def _ask(self, question: str, arguments: dict[str, Any]) -> Any:
-        for _ in range(TRIES):
+    def _query(self, request: str, arguments: dict[str, Any]) -> Any:
+        """Send a request, restarting the process once if it has ended; return the result."""
+        for _ in range(ATTEMPTS):
             with self._lock:
                 try:
-                    kind, found = self._exchange(question, arguments)
+                    kind, found = self._exchange(request, arguments)
                     break
                 except (EOFError, OSError):
-                    # It may have ended for want of questions just now: once more with a new one.
+                    # The process may just have ended after its idle time: retry with a new one.
                     self._end()
         else:
-            raise DeskError("the process that counts ended before it answered")
+            raise StatisticsError("the statistics process ended without a result")
         if kind == "refused":
             raise PhysionError(found)
         if kind == "failed":
-            LOG.error("the question %r failed:\n%s", question, found)
-            raise DeskError("this could not be worked out; the server's log says why")
+            LOG.error("the request %r failed:\n%s", request, found)
+            raise StatisticsError("the statistics could not be computed; see the server's log")
         return found
 
-    def _exchange(self, question: str, arguments: dict[str, Any]) -> tuple[str, Any]:
+    def _exchange(self, request: str, arguments: dict[str, Any]) -> tuple[str, Any]:
+        """Send one request over the pipe and wait for the reply."""
         pipe = self._pipe if self._pipe is not None else self._begin()
-        pipe.send((question, arguments))
-        until = time.monotonic() + self._patience
-        while not pipe.poll(LOOK_UP):
-            # A server that ends must not wait for a page that nobody will see.
-            if time.monotonic() > until or not threading.main_thread().is_alive():
+        pipe.send((request, arguments))
+        deadline = time.monotonic() + self._timeout
+        while not pipe.poll(POLL_INTERVAL):
+            # Do not block a server that is shutting down.
+            if time.monotonic() > deadline or not threading.main_thread().is_alive():
                 self._end()
-                raise DeskError(f"no answer within {self._patience:g} s; try again later")
+                raise StatisticsError(f"no result within {self._timeout:g} s; try again later")
         kind, found = pipe.recv()
         return kind, found
 
     def _begin(self) -> Connection:
+        """Start the process; return the connection to it."""
         from physion.experiment.experimenter.statistics.worker import serve_questions
 
         context = multiprocessing.get_context("spawn")
@@ -117,6 +120,7 @@ class Desk:
         return self._pipe
 
     def _end(self) -> None:
+        """Kill the process and close the connection."""
         if self._pipe is not None:
             self._pipe.close()
         if self._process is not None:

@@ -1,4 +1,4 @@
-"""What is known of every session, kept up to date without reading all answers each time."""
+"""Summaries of all sessions, updated incrementally: only new answers are read from the database."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ STATES = {
     "withdrawn": "Withdrawn",
     "declined": "Declined",
 }
-"""States of a session; who dropped out may still come back and go on."""
+"""States of a session and their labels. Participants who dropped out may still continue."""
 
 STAGES = {
     "consent": "Consent",
@@ -39,7 +39,7 @@ STAGES = {
     "feedback": "Feedback",
     "done": "Finished",
 }
-"""Where a session stands, in order."""
+"""Stages of a session in order, and their labels."""
 
 _SESSION = (*SESSION_COLUMNS, SESSIONS.c.source, SESSIONS.c.last_seen, SESSIONS.c.device)
 _ANSWER = (
@@ -47,16 +47,28 @@ _ANSWER = (
     "frames_shown", "frames_dropped", "visibility_changes",
 )  # fmt: skip
 _CHUNK = 200
-"""Sessions whose answers one statement reads."""
+"""Number of sessions whose answers are read in one query."""
 
 
 @dataclass
-class Answered:
-    """Sums over the answers of a session. ``rt_ms`` and ``correct`` are of the test alone.
+class AnswerCounts:
+    """Counts over the answers of a session.
 
-    Trials of both phases by how the movie was shown: ``full`` (as many frames as expected),
-    ``short`` (fewer), ``over`` (more), ``unknown`` (the browser could not say); ``dropped``: with
-    frames decoded and dropped; ``hidden``: while the page was hidden or shown again.
+    Attributes
+    ----------
+    familiarization, test
+        Number of answers in each phase.
+    familiarization_correct, correct
+        Number of right answers in familiarization and in the test.
+    rt_ms
+        Response times of the test in ms.
+    full, short, over, unknown
+        Trials of both phases whose movie was displayed with as many frames as expected, fewer,
+        more, or an unknown number (not reported by the browser).
+    dropped
+        Trials in which the browser dropped decoded frames.
+    hidden
+        Trials during which the page was hidden or shown again.
     """
 
     familiarization: int = 0
@@ -73,26 +85,26 @@ class Answered:
 
     @property
     def trials(self) -> int:
-        """Answers of both phases."""
+        """Number of answers in both phases."""
         return self.familiarization + self.test
 
     @property
     def accuracy(self) -> float | None:
-        """Share of right test answers; None without any."""
+        """Fraction of right test answers; None without answers."""
         return self.correct / self.test if self.test else None
 
     @property
     def median_rt(self) -> float | None:
-        """Median response time of the test in ms; None without any."""
+        """Median response time of the test in ms; None without answers."""
         return median(self.rt_ms) if self.rt_ms else None
 
     @property
-    def troubled(self) -> int:
-        """Trials whose movie was not shown with all its frames, as far as known."""
+    def incomplete(self) -> int:
+        """Number of trials whose movie was displayed with too few or too many frames."""
         return self.short + self.over
 
     def add(self, answer: Row[Any], label: bool | None) -> None:
-        """Counts one answer; ``label`` None: the stimulus is in the study no more."""
+        """Add one answer; ``label`` is None if its stimulus is no longer in the study."""
         correct = label is not None and (answer.response == "yes") == label
         if answer.phase == "test":
             self.test += 1
@@ -115,47 +127,49 @@ class Answered:
 
 
 @dataclass
-class Summary:
-    """A session: its row (``facts``), where it stands, and sums over its answers."""
+class SessionSummary:
+    """Summary of a session: its database row (``facts``), state, stage and answer counts."""
 
     facts: Mapping[str, Any]
     state: str
     stage: str
-    answered: Answered
+    answered: AnswerCounts
 
 
-_NOTHING = Answered()
+_NOTHING = AnswerCounts()
 
 
-class Summaries:
-    """Summaries of all sessions. `refresh` reads the rows of sessions, and the answers of those
-    sessions alone that have got more of them: an answer, once stored, is never altered.
+class SummaryCache:
+    """Cache of the summaries of all sessions.
+
+    `refresh` reads the rows of all sessions, but answers only of sessions with new ones. This is
+    sufficient because stored answers are never changed.
     """
 
     def __init__(self, study: Study, engine: Engine) -> None:
         self._engine = engine
-        self._labels = labels_of(study)
+        self._labels = stimulus_labels(study)
         self._trials = TrialCounts(study)
-        self._answered: dict[str, Answered] = {}
+        self._answered: dict[str, AnswerCounts] = {}
 
-    def refresh(self, now: float) -> list[Summary]:
-        """All sessions at the moment ``now``, in the order in which they began."""
+    def refresh(self, now: float) -> list[SessionSummary]:
+        """Return the summaries of all sessions at the Unix time ``now``, sorted by start time."""
         with self._engine.connect() as connection:
             rows = connection.execute(select(*_SESSION).order_by(SESSIONS.c.started_at)).all()
             self._read_answers(connection, rows)
         return [self._summary(row, now) for row in rows]
 
-    def _summary(self, row: Row[Any], now: float) -> Summary:
+    def _summary(self, row: Row[Any], now: float) -> SessionSummary:
         facts = row._asdict()
-        return Summary(
+        return SessionSummary(
             facts,
-            standing_of(facts, now),
+            session_state(facts, now),
             self._stage(facts),
             self._answered.get(row.session, _NOTHING),
         )
 
     def _read_answers(self, connection: Connection, rows: Sequence[Row[Any]]) -> None:
-        """Adds up the answers of sessions whose number of answers is not the known one."""
+        """Count the answers of the sessions whose number of answers has changed."""
         scenarios = {
             row.session: row.scenario
             for row in rows
@@ -165,33 +179,36 @@ class Summaries:
         for part in _parts(list(scenarios)):
             chosen = select(*columns).where(ANSWERS.c.session.in_(part))
             answers = connection.execute(chosen.order_by(ANSWERS.c.session)).all()
-            found = {session: Answered() for session in part}
+            counts = {session: AnswerCounts() for session in part}
             for answer in answers:
                 label = self._labels.get((scenarios[answer.session], answer.stimulus))
-                found[answer.session].add(answer, label)
-            self._answered |= found
+                counts[answer.session].add(answer, label)
+            self._answered |= counts
 
     def _counts(self, session: str) -> tuple[int, int]:
         known = self._answered.get(session, _NOTHING)
         return known.familiarization, known.test
 
     def _stage(self, facts: Mapping[str, Any]) -> str:
-        """Where a session stands, or stood when it was withdrawn."""
+        """Return the stage of a session, or the stage at which it was withdrawn."""
         columns = {column.name: facts[column.name] for column in SESSION_COLUMNS}
         session = Session(**columns | {"withdrawn_at": None})
-        # How long the phases of a preview were whose scenario is gone is not known any more.
+        # The number of trials is unknown for previews of scenarios that were removed.
         known = self._trials.has(session.scenario)
         trials = self._trials.of(session.scenario) if known else dict.fromkeys(PHASES, 1_000_000)
         return stage_of(session, trials)
 
 
-def labels_of(study: Study) -> dict[tuple[str, str], bool]:
-    """How each stimulus of each scenario ends."""
+def stimulus_labels(study: Study) -> dict[tuple[str, str], bool]:
+    """Return the label (contact or not) of each stimulus, by scenario and name."""
     return {(each.scenario, each.stimulus): each.label for each in study.stimuli}
 
 
-def standing_of(facts: Mapping[str, Any], now: float) -> str:
-    """A word of `STATES`. Who leaves before agreeing to take part has declined."""
+def session_state(facts: Mapping[str, Any], now: float) -> str:
+    """Return the state (one of `STATES`) of a session at the Unix time ``now``.
+
+    A participant who withdraws before giving consent has declined.
+    """
     if facts["finished_at"] is not None:
         return "finished"
     if facts["withdrawn_at"] is not None:

@@ -1,4 +1,4 @@
-"""Between browser and pages: cookies, forms, headers, and the check of the password."""
+"""Access control of the experimenter's pages: cookies, form tokens, headers, password checks."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from urllib.parse import parse_qsl
 from starlette.requests import Request
 from starlette.responses import Response
 
-from physion.experiment.experimenter.access.attempts import Attempts
+from physion.experiment.experimenter.access.attempts import LoginAttempts
 from physion.experiment.experimenter.access.login import (
     COOKIE,
-    LONGEST,
+    MAX_DURATION,
     PATH,
     Login,
-    Logins,
-    new_visit,
+    LoginRegistry,
+    new_cookie_token,
 )
 from physion.experiment.study.identity import Secrets, check_password
 
@@ -33,48 +33,57 @@ HEADERS = {
     "x-content-type-options": "nosniff",
     "referrer-policy": "no-referrer",
 }
-"""On every page; stricter than the participants' pages, which a recruiter may show in a frame."""
+"""Headers of every page; stricter than those of the participants' pages, which recruiters embed."""
 MAX_FORM = 8192
-"""Bytes of a form."""
+"""Maximum size of a form in bytes."""
 CHECKS_AT_ONCE = 2
-"""Passwords checked at once: each takes tens of MiB and of milliseconds."""
+"""Passwords checked in parallel; each check takes tens of MiB and tens of milliseconds."""
 CHECKS_WAITING = 8
-"""Checks waiting for their turn; more are sent away."""
+"""Maximum number of checks in progress or queued; further attempts are refused."""
 
 
-class Gate:
-    """Who may see the pages. One for a server process; used from its event loop alone."""
+class AccessControl:
+    """Login state of a server process; to be used from its event loop only."""
 
     def __init__(
         self, read_secrets: Callable[[], Secrets], clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self.logins, self.clock = Logins(), clock
-        self._read_secrets, self._attempts = read_secrets, Attempts()
+        self.logins, self.clock = LoginRegistry(), clock
+        self._read_secrets, self._attempts = read_secrets, LoginAttempts()
         self._threads = ThreadPoolExecutor(CHECKS_AT_ONCE, thread_name_prefix="password")
         self._waiting = 0
 
     def login(self, request: Request, by_person: bool = True) -> Login | None:
-        """The login of the browser; None where it has to give the password first."""
-        self.logins.password_is(self._read_secrets().password_hash)
+        """Return the login of the browser, or None if it must give the password first.
+
+        ``by_person``: the request was made by a person, not by an automatic refresh.
+        """
+        self.logins.set_password_hash(self._read_secrets().password_hash)
         return self.logins.find(self.token(request), self.clock(), by_person)
 
     def token(self, request: Request) -> str:
-        """The word in the browser's cookie, empty without one."""
+        """Return the token in the browser's cookie, or an empty text."""
         return request.cookies.get(COOKIE, "")[:200]
 
     def visit(self, request: Request) -> str:
-        """The browser's word, a new one where it has none yet: forms are bound to it."""
-        return self.token(request) or new_visit()
+        """Return the browser's cookie token, or a new one, to which forms are bound."""
+        return self.token(request) or new_cookie_token()
 
     async def form(self, request: Request) -> dict[str, str] | None:
-        """The fields of a form; None where it did not come from a page of ours."""
+        """Return the fields of a form, or None if its token is not valid for this browser."""
         fields = await read_form(request)
         good = self.logins.is_form_token(self.token(request), fields.get("form_token", ""))
         return fields if good else None
 
     async def try_password(self, request: Request, password: str) -> float | None:
-        """None where the password is right; else the seconds to wait before the next try, 0 where
-        it was wrong, more where it was not even looked at."""
+        """Check a password.
+
+        Returns
+        -------
+        float or None
+            None if the password is right, 0 if it is wrong, otherwise the seconds to wait before
+            the next attempt (the password was not checked).
+        """
         address = request.client.host if request.client else ""
         if self._waiting >= CHECKS_WAITING:
             return 2.0
@@ -82,41 +91,41 @@ class Gate:
         if wait > 0:
             return wait
         secrets = self._read_secrets()
-        self.logins.password_is(secrets.password_hash)
+        self.logins.set_password_hash(secrets.password_hash)
         self._waiting += 1
         try:
             loop = asyncio.get_running_loop()
             right = await loop.run_in_executor(self._threads, check_password, secrets, password)
         finally:
             self._waiting -= 1
-        # It may have been changed meanwhile.
-        if not right or self.logins.under != secrets.password_hash:
+        # The password may have been changed during the check.
+        if not right or self.logins.password_hash != secrets.password_hash:
             return 0.0
         self._attempts.succeeded(address)
         return None
 
     def close(self) -> None:
-        """Ends the threads."""
+        """Stop the threads that check passwords."""
         self._threads.shutdown(wait=False, cancel_futures=True)
 
 
 def set_cookie(request: Request, response: Response, token: str) -> None:
-    """The cookie of a login, or of a visit before it."""
+    """Set the cookie of a login, or of a visit before login."""
     response.set_cookie(
-        COOKIE, token, max_age=int(LONGEST), path=PATH, secure=request.url.scheme == "https",
+        COOKIE, token, max_age=int(MAX_DURATION), path=PATH, secure=request.url.scheme == "https",
         httponly=True, samesite="strict",
     )  # fmt: skip
 
 
 def drop_cookie(request: Request, response: Response) -> None:
-    """Makes the browser forget its cookie."""
+    """Delete the browser's cookie."""
     response.delete_cookie(
         COOKIE, path=PATH, secure=request.url.scheme == "https", httponly=True, samesite="strict"
     )
 
 
 async def read_form(request: Request) -> dict[str, str]:
-    """The fields of a small form, the last of each name; none where it is something else."""
+    """Return the fields of a URL-encoded form; empty if the body is too large or malformed."""
     kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if kind != "application/x-www-form-urlencoded":
         return {}

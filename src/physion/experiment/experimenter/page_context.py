@@ -1,0 +1,117 @@
+"""Services shared by all of the experimenter's pages: access control, statistics, rendering."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from typing import Any
+
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import RedirectResponse, Response
+
+from physion.errors import PhysionError
+from physion.experiment.experimenter.access.access_control import HEADERS, AccessControl
+from physion.experiment.experimenter.access.login import PATH, Login
+from physion.experiment.experimenter.session_list import KINDS
+from physion.experiment.experimenter.statistics.process import StatisticsProcess
+from physion.experiment.experimenter.statistics.summaries import STATES
+from physion.experiment.experimenter.templating import make_environment
+from physion.experiment.store.sessions import ACTIVE_WITHIN
+from physion.experiment.study.identity import Secrets
+from physion.experiment.study.study import Study
+
+REFRESH_SECONDS = 30
+"""Interval of the automatic refresh of the overview."""
+FORGET_WORD = "delete"
+"""Word that must be typed to confirm the deletion of raw ids."""
+WRONG_PASSWORD = "This is not the password."
+WRONG_FORM = "This form was no longer valid. Please try again."
+
+
+class PageContext:
+    """Shared state of the experimenter's pages of one served study.
+
+    ``url``: SQLAlchemy URL of its database, with password.
+    """
+
+    def __init__(self, study: Study, secrets: Secrets, url: str) -> None:
+        self.study, self.secrets, self.url = study, secrets, url
+        self.access = AccessControl(self._read_secrets)
+        self.statistics = StatisticsProcess(study, url)
+        self._templates = make_environment(
+            study=study, kinds=KINDS, states=STATES, active_minutes=round(ACTIVE_WITHIN / 60),
+            refresh_seconds=REFRESH_SECONDS, forget_word=FORGET_WORD,
+        )  # fmt: skip
+
+    async def close(self) -> None:
+        """Stop the threads and the statistics process."""
+        self.access.close()
+        await run_in_threadpool(self.statistics.close)
+
+    def _read_secrets(self) -> Secrets:
+        """Read the file again at each check, so that a new password takes effect at once."""
+        try:
+            return Secrets.load(self.study.folder)
+        except PhysionError:
+            return self.secrets
+
+    async def read_submission(
+        self, request: Request, form: Callable[..., Response]
+    ) -> tuple[Login, dict[str, str]] | Response:
+        """Return the login and the fields of a submitted form.
+
+        If the browser is not logged in, return a redirect to the login instead; if the form token
+        is invalid, the response of ``form``, which shows the form again.
+        """
+        login = self.access.login(request)
+        if login is None:
+            return redirect("/login")
+        fields = await self.access.form(request)
+        return form(request, WRONG_FORM, 403) if fields is None else (login, fields)
+
+    async def query_statistics(self, request: Request, name: str, **arguments: Any) -> Any:
+        """Return a result of the statistics process, or an error page."""
+        try:
+            return await self.statistics.query(name, **arguments)
+        except PhysionError as error:
+            return self.render_problem(request, str(error), 503)
+
+    def render_problem(self, request: Request, problem: str, status: int) -> Response:
+        """Return an error page, or a redirect to the login if the browser is not logged in."""
+        if self.access.login(request) is None:
+            return redirect("/login")
+        return self.render(request, "problem.html", status, here="", problem=problem)
+
+    def render(self, request: Request, template: str, status: int = 200, **values: Any) -> Response:
+        """Render a page whose forms are bound to the browser's cookie."""
+        return self.render_with_token(template, self.access.token(request), status, **values)
+
+    async def render_in_thread(self, *given: Any, **values: Any) -> Response:
+        """Render a page in a thread; for pages that take milliseconds."""
+        return await run_in_threadpool(self.render, *given, **values)
+
+    def render_with_token(self, template: str, token: str, status: int, **values: Any) -> Response:
+        """Render a page whose forms are bound to this cookie token."""
+        now = time.time()
+        text = self._templates.get_template(template).render(
+            form_token=self.access.logins.form_token(token), now=now, **values
+        )
+        return Response(text, status, HEADERS, "text/html; charset=utf-8")
+
+    def refuse_password(
+        self, request: Request, wait: float, form: Callable[..., Response]
+    ) -> Response:
+        """Show ``form`` again with the message for a result of `AccessControl.try_password`."""
+        if wait == 0:
+            return form(request, WRONG_PASSWORD, 403)
+        seconds = math.ceil(wait)
+        unit = "second" if seconds == 1 else "seconds"
+        problem = f"Too many attempts. Please wait {seconds} {unit} and try again."
+        return form(request, problem, 429, wait)
+
+
+def redirect(path: str) -> Response:
+    """Return a redirect to another of the experimenter's pages."""
+    return RedirectResponse(f"{PATH}{path}", 303, headers=HEADERS)
