@@ -339,6 +339,7 @@ def leaderboard_metrics() -> list[Metric]:
     on_leaderboard=True,
 )
 def accuracy(sample: Sample) -> Array:
+    """Return the fraction of correct answers."""
     return sample.sums.correct / sample.sums.n
 
 
@@ -354,6 +355,9 @@ def accuracy(sample: Sample) -> Array:
     in_scores=True,
 )
 def accuracy_simulated(sample: Sample) -> Array:
+    """Return the fraction of answers that equal the outcome of the trial that the model was
+    shown.
+    """
     return sample.sums.correct_shown / sample.sums.n
 
 
@@ -367,6 +371,7 @@ def accuracy_simulated(sample: Sample) -> Array:
     in_scores=True,
 )
 def human_accuracy(sample: Sample) -> Array:
+    """Return the mean over stimuli of the fraction of people who are right."""
     return sample.sums.human / sample.sums.n_people
 
 
@@ -382,6 +387,7 @@ def human_accuracy(sample: Sample) -> Array:
     on_leaderboard=True,
 )
 def difference(sample: Sample) -> Array:
+    """Return the accuracy of the model minus that of people on the same stimuli."""
     return (sample.sums.correct_people - sample.sums.human) / sample.sums.n_people
 
 
@@ -398,6 +404,9 @@ def difference(sample: Sample) -> Array:
     on_leaderboard=True,
 )
 def pearson_r(sample: Sample) -> Array:
+    """Return Pearson's r of P(contact) with P(yes); NaN if either is constant or for less than 3
+    stimuli.
+    """
     return _correlation(sample.sums)
 
 
@@ -411,6 +420,7 @@ def pearson_r(sample: Sample) -> Array:
     in_scores=True,
 )
 def r_same_outcome(sample: Sample) -> Array:
+    """Return Pearson's r over the stimuli whose shown outcome is the official one."""
     return _correlation(sample.sums_same_outcome)
 
 
@@ -426,6 +436,7 @@ def r_same_outcome(sample: Sample) -> Array:
     on_leaderboard=True,
 )
 def rmsd(sample: Sample) -> Array:
+    """Return the root of the mean squared difference of P(contact) and P(yes)."""
     return np.sqrt(sample.sums.square / sample.sums.n_people)
 
 
@@ -439,6 +450,9 @@ def rmsd(sample: Sample) -> Array:
     in_measures=True,
 )
 def euclid_over_n(sample: Sample) -> Array:
+    """Return the RMSD divided by the root of the number of stimuli, as the released notebooks
+    do.
+    """
     return rmsd(sample) / np.sqrt(sample.sums.n_people)
 
 
@@ -461,6 +475,7 @@ def _errors_by_participant(sample: Sample) -> Array:
     by_participant=_kappa_by_participant,
 )
 def kappa(sample: Sample) -> Array:
+    """Return Cohen's kappa with each participant, mean over participants."""
     return sample.mean_kappa
 
 
@@ -474,6 +489,7 @@ def kappa(sample: Sample) -> Array:
     in_measures=True,
 )
 def kappa_gap(sample: Sample) -> Array:
+    """Return the mean kappa with participants minus the mean kappa among participants."""
     return sample.mean_kappa - sample.kappa_among_people
 
 
@@ -488,6 +504,7 @@ def kappa_gap(sample: Sample) -> Array:
     by_participant=_errors_by_participant,
 )
 def error_consistency(sample: Sample) -> Array:
+    """Return the kappa of correctness with each participant, mean over participants."""
     return sample.mean_error_consistency
 
 

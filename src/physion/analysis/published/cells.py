@@ -1,10 +1,10 @@
-"""The published table of model accuracies by scenario, and the one that a reader takes it for.
+"""Published table of model accuracies by scenario, next to the setting that readers expect.
 
-The table of the paper's supplement (S1) bears no protocol. Each of its 88 values is the mean over
+The table of the paper's supplement (S1) names no protocol. Each of its 88 values is the mean over
 all rows that the released results have for a model and a scenario: every readout, every training
-protocol, every run. It thus mixes *detection* (readout *full*, which sees the outcome) into
-accuracies of *prediction*. A reader expects the paper's main setting: trained on *all* scenarios,
-readout *observed+simulated*.
+protocol, every run. It thus mixes *detection* (readout *full*, which sees the outcome) with
+*prediction*. A reader expects the paper's main setting: trained on *all* scenarios, readout
+*observed+simulated*.
 """
 
 from __future__ import annotations
@@ -32,14 +32,13 @@ MOST_STIMULI = 400
 
 
 def accuracy_table(tables: PublishedTables, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
-    """The published mean of each model and scenario beside the cell that a reader expects.
+    """Return the published mean of each model and scenario and the value that a reader expects.
 
     Columns: ``model``, ``scenario``; ``published`` with ``published_low``, ``published_high``
-    (bootstrap over the rows that it averages: how it would move with other protocols and seeds,
-    not with other stimuli), ``rows`` (how many), ``without_copies`` (the mean with
-    *observed* once);
+    (bootstrap over the rows that it averages: variation with other protocols and seeds, not with
+    other stimuli), ``rows`` (number of rows), ``without_copies`` (the mean with *observed* once);
     ``expected`` with ``expected_low``, ``expected_high`` (Wilson's 95 % interval: other stimuli of
-    the kind) and ``runs`` (seeds averaged in it), ``stimuli`` (tested; see `count_tested`),
+    the kind), ``runs`` (seeds averaged in it), ``stimuli`` (tested; see `count_tested`),
     ``difference`` (expected - published).
     """
     draws = bootstrap or Bootstrap()
@@ -77,7 +76,7 @@ def accuracy_table(tables: PublishedTables, bootstrap: Bootstrap | None = None) 
 
 
 def grid(table: pd.DataFrame, column: str) -> pd.DataFrame:
-    """One column of `accuracy_table` as models by scenarios, with their mean last."""
+    """Return one column of `accuracy_table` as models by scenarios, with their mean last."""
     wide = table.pivot(index="model", columns="scenario", values=column)
     wide = wide.reindex(index=list(dict.fromkeys(table["model"])))
     wide = wide[[name for name in SCENARIOS if name in wide]]
@@ -85,10 +84,11 @@ def grid(table: pd.DataFrame, column: str) -> pd.DataFrame:
 
 
 def count_tested(runs: pd.DataFrame) -> dict[tuple[str, str], int]:
-    """How many stimuli each model was tested on in each scenario, by (model, scenario).
+    """Return how many stimuli each model was tested on, by (model, scenario).
 
-    The released tables do not say; the accuracies are fractions, so the number is recovered from
-    their denominators. Models see all test trials of a scenario, also those that no person saw.
+    The released tables do not contain it; the accuracies are fractions, so the number follows from
+    their denominators. Models see all test trials of a scenario, including those that no person
+    saw.
     """
     largest: dict[tuple[str, str], int] = {}
     common = dict.fromkeys(runs["scenario"], 1)
@@ -109,7 +109,7 @@ def _denominator(share: float) -> int:
 
 
 def wilson(share: float, n: float, level: float = 0.95) -> tuple[float, float]:
-    """Wilson's interval of a share of ``n`` independent trials; NaN, NaN where undefined."""
+    """Return Wilson's interval of a fraction of ``n`` independent trials; NaN, NaN if undefined."""
     if not (np.isfinite(share) and n > 0):
         return float("nan"), float("nan")
     z = float(stats.norm.ppf(0.5 + level / 2))
@@ -119,7 +119,7 @@ def wilson(share: float, n: float, level: float = 0.95) -> tuple[float, float]:
 
 
 def copies_of_observed(tables: PublishedTables) -> tuple[int, int]:
-    """Of the rows with the second copy of *observed*: how many equal the first one, and all."""
+    """Count the rows with the second copy of *observed*: those equal to the first one, and all."""
     cell = ["model", "scenario", "training", "seed", "file"]
     runs = tables.runs
     again = runs[runs["readout"] == OBSERVED_AGAIN].set_index(cell)["accuracy"]
@@ -128,7 +128,7 @@ def copies_of_observed(tables: PublishedTables) -> tuple[int, int]:
 
 
 def averaged_in_words(tables: PublishedTables) -> str:
-    """What a published value averages, counted in the tables at hand."""
+    """Return what a published value averages, counted in the tables at hand, as text."""
     equal, copies = copies_of_observed(tables)
     counts = tables.runs.groupby("model")["accuracy"].size() / tables.runs["scenario"].nunique()
     per_model = ", ".join(f"{model} {n:g}" for model, n in counts[counts > 3].items())

@@ -1,13 +1,13 @@
-"""The numbers of the paper's Results section, with the comparison behind each of them.
+"""Numbers of the paper's Results section, with the comparison behind each of them.
 
 The printed numbers come from linear mixed models of the accuracies in the released table, fitted in
-R with lmerTest. Which rows and terms each of them had follows from the released notebook and from
-the numbers themselves, which are met to the printed digit:
+R with lmerTest. Which rows and terms each model had follows from the released notebook and from the
+numbers themselves, which are reproduced to the printed digit:
 
-- an earlier state of the table held most runs *twice* (1728 rows of readouts A, B, C where the
-  released one has 1008): all but those of the particle models and of the second file of SVG. Some
-  printed numbers were made from that state; t grows by up to the square root of two by it;
-- several sentences stand beside the number of another comparison: `Claim.differs` says which.
+- an earlier state of the table held most runs *twice* (1728 rows of readouts A, B, C; the released
+  one has 1008): all but those of the particle models and of the second file of SVG. Some printed
+  numbers were made from that state, which increases t by up to the square root of two;
+- several sentences have the number of another comparison: see `Claim.differs`.
 """
 
 from __future__ import annotations
@@ -28,13 +28,12 @@ Rows = Literal["twice", "once"]
 
 @dataclass(frozen=True)
 class Contrast:
-    """Accuracy ~ x + a random intercept for each of ``groups``, on some of the rows.
+    """Comparison of accuracies: accuracy ~ x + a random intercept for each of ``groups``.
 
-    ``models``: whose rows. ``column``, ``high``: x is 1 where the column has one of these values
-    and 0 elsewhere. ``readouts``, ``trainings``: the rows to take (empty: all). ``beside``: further
-    values of the column that get terms of their own, so that x is against the rest.
-    ``intercept``: the term asked for is the intercept, not x. ``chance``: x is None, the mean is
-    held against 0.5.
+    ``models``: whose rows. ``column``, ``high``: x is 1 if the column has one of these values and 0
+    else. ``readouts``, ``trainings``: the rows to take (empty: all). ``beside``: further values of
+    the column that get terms of their own, so that x is compared with the rest. ``intercept``: the
+    tested term is the intercept, not x. ``chance``: there is no x, the mean is tested against 0.5.
     """
 
     words: str
@@ -50,11 +49,11 @@ class Contrast:
 
 @dataclass(frozen=True)
 class Claim:
-    """A sentence of the paper with a number.
+    """Sentence of the paper with a number.
 
-    ``printed``: b, t and p as printed, where they are; ``run``: the comparison behind the number,
-    made on the state ``rows`` of the table; ``asked``: the comparison that the sentence describes
-    (None: the same one); ``differs``: what differs, in words.
+    ``printed``: b, t and p as printed, if they are; ``run``: the comparison that was made, on the
+    state ``rows`` of the table; ``asked``: the comparison that the sentence describes (None: the
+    same one); ``differs``: the difference, as text.
     """
 
     name: str

@@ -1,9 +1,9 @@
-"""The panels of the paper's main comparison as tables: accuracy, kappa, readouts, trainings.
+"""Panels of the paper's main comparison as tables: accuracy, kappa, readouts, trainings.
 
 Panels A to C show training *all* and readout *observed+simulated*, of SVG and RPIN the first seed
-alone (as the released code selects); panels D and E vary the readout and the training. The
-intervals of the panels are bootstraps over the eight scenario values. Panel B (r with the average
-person) needs the predictions for single stimuli, which the released tables do not hold.
+only (as the released code selects); panels D and E vary the readout and the training. The intervals
+of the panels are bootstraps over the eight scenario values. Panel B (r with the average person)
+needs the predictions for single stimuli, which the released tables do not contain.
 """
 
 from __future__ import annotations
@@ -43,17 +43,18 @@ SELECTION = (
 
 
 def panel_a(tables: PublishedTables, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
-    """Accuracy of each model by scenario beside people; see `_measure`."""
+    """Return the accuracy of each model and of people by scenario; see `_measure`."""
     return _measure(tables, "accuracy", bootstrap or Bootstrap())
 
 
 def panel_c(tables: PublishedTables, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
-    """Cohen's kappa of each model with participants, median over them; see `_measure`."""
+    """Return Cohen's kappa of each model with participants, median over them; see `_measure`."""
     return _measure(tables, "kappa", bootstrap or Bootstrap())
 
 
 def panel_d(tables: PublishedTables, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
-    """Accuracy by readout, trained on all scenarios, averaged over runs, then over scenarios.
+    """Return accuracy by readout, trained on all scenarios, averaged over runs, then over
+    scenarios.
 
     Columns: ``model``, ``readout``, ``scenarios`` (averaged), ``runs`` (of one scenario),
     ``accuracy`` with ``low`` and ``high``.
@@ -64,19 +65,21 @@ def panel_d(tables: PublishedTables, bootstrap: Bootstrap | None = None) -> pd.D
 
 
 def panel_e(tables: PublishedTables, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
-    """Accuracy by training protocol, readout observed+simulated; columns as `panel_d`, with
-    ``training`` in place of ``readout``."""
+    """Return accuracy by training protocol, readout observed+simulated; columns as `panel_d`, with
+    ``training`` instead of ``readout``.
+    """
     cell = tables.mean_runs()
     rows = cell[cell["readout"] == EXPECTED["readout"]]
     return _by(rows, "training", tuple(TRAININGS.values()), bootstrap or Bootstrap())
 
 
 def _measure(tables: PublishedTables, measure: str, draws: Bootstrap) -> pd.DataFrame:
-    """One row a model and scenario, then its mean over scenarios.
+    """Return one row a model and scenario, then its mean over scenarios.
 
     Columns: ``model``, ``scenario``, the measure with ``low`` and ``high`` (of the mean: bootstrap
-    over scenarios; of a kappa: percentiles over participants; else NaN), ``people`` (what people
-    have) with ``zone_low``, ``zone_high``, and ``in_zone`` (is the model within? None without one).
+    over scenarios; of a kappa: percentiles over participants; else NaN), ``people`` (their value)
+    with ``zone_low``, ``zone_high``, and ``in_zone`` (whether the model is within; None without a
+    zone).
     """
     runs = tables.distinct
     chosen = runs[(runs[list(EXPECTED)] == pd.Series(EXPECTED)).all(axis=1)]

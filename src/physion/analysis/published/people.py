@@ -1,4 +1,4 @@
-"""What the paper says of people beside what the released tables of people give."""
+"""Statements of the paper about people, and what the released tables of people contain."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ THIRDS = ((0.0, 1 / 3, "hard", 0.10), (1 / 3, 2 / 3, "chance", 0.22), (2 / 3, 1.
 
 
 def people_by_scenario(tables: PublishedTables, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
-    """One row a scenario, then the mean over scenarios.
+    """Return one row a scenario, then the mean over scenarios.
 
-    Columns: those of `PublishedTables.people`; ``half_r_full`` (split-half r stepped up by
-    Spearman and Brown to all of the people: 2 r / (1 + r), which the released numbers are not);
+    Columns: those of `PublishedTables.people`; ``half_r_full`` (split-half r corrected by Spearman
+    and Brown to all of the people: 2 r / (1 + r); the released numbers are not corrected);
     ``stimuli`` and ``participants`` of the tables by stimulus, ``accuracy_by_stimulus`` (their
-    mean; a laxer exclusion than ``accuracy``), ``below_chance`` (stimuli on which p + 1.96
-    sqrt(p (1 - p) / n) < 0.5). In the row of the mean ``zone_low`` and ``zone_high``, likewise of
-    kappa, are the paper's grey bands (`zones.released_zone`), and so are ``half_r_low`` and
+    mean; a laxer exclusion than ``accuracy``), ``below_chance`` (stimuli on which p + 1.96 sqrt(p
+    (1 - p) / n) < 0.5). In the row of the mean ``zone_low`` and ``zone_high``, likewise of kappa,
+    are the paper's grey bands (`zones.released_zone`), and so are ``half_r_low`` and
     ``half_r_high`` for r (as `zones.released_r_zone`).
     """
     draws = bootstrap or Bootstrap()
@@ -66,7 +66,7 @@ def _mean_row(table: pd.DataFrame, draws: Bootstrap) -> dict[str, object]:
 
 
 def people_claims(tables: PublishedTables) -> pd.DataFrame:
-    """Statements of the paper about people: ``claim``, ``printed``, ``ours``, ``note``."""
+    """Return the paper's statements about people: ``claim``, ``printed``, ``ours``, ``note``."""
     means = tables.people["accuracy"].to_numpy(dtype=np.float64)
     test = stats.ttest_1samp(means, 0.5)
     stimuli = tables.stimuli

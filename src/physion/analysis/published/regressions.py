@@ -1,4 +1,4 @@
-"""The regressions of the paper's Results section: as printed, as they were run, as they read."""
+"""Regressions of the paper's Results section: as printed, as they were run, as they read."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ once."""
 
 
 def published_regressions(tables: PublishedTables) -> pd.DataFrame:
-    """One row a number of the paper.
+    """Return one row for each number of the paper.
 
-    Columns: ``claim``, ``sentence``; ``printed_b``, ``printed_t``, ``printed_p`` (as printed, empty
-    where not); ``compared`` (what the number compares) and ``state`` (rows twice or once); for each
-    of `FITS` its `ESTIMATES`, as ``run_b`` and so on; ``asked`` (what the sentence would compare);
-    ``met`` (printed figures that ``run`` meets after rounding, and those it does not, in words),
-    ``differs`` (in words).
+    Columns: ``claim``, ``sentence``; ``printed_b``, ``printed_t``, ``printed_p`` (as printed, else
+    empty); ``compared`` (what the number compares) and ``state`` (rows twice or once); for each of
+    `FITS` its `ESTIMATES`, as ``run_b`` and so on; ``asked`` (what the sentence would compare);
+    ``met`` (printed figures that ``run`` reproduces after rounding, and those it does not),
+    ``differs`` (the difference, as text).
     """
     records = [_record(claim, tables) for claim in CLAIMS]
     columns = ["claim", "sentence", "printed_b", "printed_t", "printed_p", "compared", "state"]
@@ -43,7 +43,7 @@ def published_regressions(tables: PublishedTables) -> pd.DataFrame:
 
 
 def released_state(runs: pd.DataFrame, rows: Rows) -> pd.DataFrame:
-    """The rows of readouts A, B, C: each once, or as often as the earlier state held them."""
+    """Return the rows of readouts A, B, C: each once, or as often as in the earlier state."""
     kept = runs[runs["readout"].isin(("full", "observed+simulated", "observed"))]
     if rows == "once":
         return kept
@@ -71,7 +71,9 @@ def _record(claim: Claim, tables: PublishedTables) -> dict[str, Any]:
 
 
 def contrast_rows(contrast: Contrast, tables: PublishedTables, rows: Rows) -> pd.DataFrame:
-    """The rows that a contrast compares, with ``x`` and one column ``beside_…`` a further term."""
+    """Return the rows that a contrast compares, with ``x`` and one column ``beside_…`` a further
+    term.
+    """
     people = tables.people[["scenario", "accuracy"]].assign(model=PEOPLE)
     table = pd.concat([released_state(tables.runs, rows), people], ignore_index=True)
     table = table[table["model"].isin(contrast.models)]
@@ -87,7 +89,7 @@ def contrast_rows(contrast: Contrast, tables: PublishedTables, rows: Rows) -> pd
 
 
 def fit_contrast(contrast: Contrast, tables: PublishedTables, rows: Rows) -> dict[str, float]:
-    """The `ESTIMATES` of one contrast on one state of the table."""
+    """Return the `ESTIMATES` of one contrast on one state of the table."""
     table = contrast_rows(contrast, tables, rows)
     if not contrast.groups:
         return _against_chance(table["accuracy"])
@@ -106,7 +108,9 @@ def _against_chance(values: pd.Series) -> dict[str, float]:
 
 
 def _met(claim: Claim, fit: dict[str, float]) -> str:
-    """Which printed figures the fit meets after rounding, in words; empty without a number."""
+    """Return which printed figures the fit reproduces after rounding, as text; empty without a
+    number.
+    """
     met: list[str] = []
     missed: list[str] = []
     for name in ("b", "t", "p"):
@@ -118,7 +122,7 @@ def _met(claim: Claim, fit: dict[str, float]) -> str:
 
 
 def _meets(value: float, printed: str) -> bool:
-    """Does a value round to what is printed, or lie below a printed bound?"""
+    """Return whether a value rounds to what is printed, or is less than a printed bound."""
     if printed.startswith("<"):
         return value < float(printed[1:])
     number = printed.removeprefix("=")

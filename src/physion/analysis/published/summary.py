@@ -1,4 +1,4 @@
-"""The published results of the original study, recomputed from its released tables."""
+"""Published results of the original study, recomputed from its released tables."""
 
 from __future__ import annotations
 
@@ -40,22 +40,22 @@ REGRESSIONS = (
 
 @dataclass(frozen=True)
 class PublishedResults:
-    """``tables`` by the names of `TITLES`, and ``words``: what each of them is made of."""
+    """Results: ``tables`` by the names of `TITLES`, and ``words``: descriptions of them."""
 
     tables: Mapping[str, pd.DataFrame]
     words: Mapping[str, str]
 
 
 def published_results(folder: Path, bootstrap: Bootstrap | None = None) -> PublishedResults:
-    """Everything from the official data in ``folder`` (``results/`` and ``humans/``).
+    """Recompute all results from the official data in ``folder`` (``results/`` and ``humans/``).
 
-    Raises `BadInputError` for what is missing or wrong in it.
+    Raises `BadInputError` for missing or invalid files.
     """
     return results_of(read_published(folder), bootstrap)
 
 
 def results_of(released: PublishedTables, bootstrap: Bootstrap | None = None) -> PublishedResults:
-    """`published_results` of tables that are read already."""
+    """Recompute all results from tables that are already read."""
     draws = bootstrap or Bootstrap()
     tables = {
         "accuracies": accuracy_table(released, draws),

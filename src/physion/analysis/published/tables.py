@@ -1,11 +1,11 @@
-"""The result tables that the original study released, read whole and checked.
+"""Reader of the result tables that the original study released, complete and checked.
 
 A row of the released tables is one *run*: a model with a seed, a training protocol and a readout,
-tested on one scenario. Two facts of these tables matter to whoever averages them:
+tested on one scenario. Two properties matter for averages:
 
 - readout ``D`` exists for SVG and RPIN alone and repeats readout ``C`` (*observed*) to the last
   digit, so that an average over all rows counts *observed* twice for these two;
-- SVG has four runs of three seeds: seed 1 stands in two result files, with different numbers.
+- SVG has four runs of three seeds: seed 1 is in two result files, with different numbers.
 """
 
 from __future__ import annotations
@@ -66,12 +66,12 @@ _RUN = re.compile(r"_readout_[A-D]_(?P<file>.*)$")
 
 @dataclass(frozen=True)
 class PublishedTables:
-    """The released results as tables with the names of the paper.
+    """Released results as tables with the names of the paper.
 
     - ``runs``: one row a run and scenario: ``scenario``, ``model``, ``readout``, ``training``,
-      ``seed`` (int), ``file`` (name of the result file), ``encoder`` (the architecture that the
-      table states), ``accuracy`` (0 to 1), ``kappa_low``, ``kappa``, ``kappa_high`` (2.5th, 50th,
-      97.5th percentile over participants of Cohen's kappa), ``kappa_stimuli``;
+      ``seed`` (int), ``file`` (name of the result file), ``encoder`` (the architecture in the
+      table), ``accuracy`` (0 to 1), ``kappa_low``, ``kappa``, ``kappa_high`` (2.5th, 50th, 97.5th
+      percentile over participants of Cohen's kappa), ``kappa_stimuli``;
     - ``people``: one row a scenario: ``accuracy`` with ``accuracy_low``, ``accuracy_high``
       (bootstrap over participants), ``zone_low``, ``zone_high`` (2.5th and 97.5th percentile of
       participants), ``kappa_low``, ``kappa``, ``kappa_high`` (percentiles over pairs), ``half_r``,
@@ -87,12 +87,13 @@ class PublishedTables:
 
     @property
     def distinct(self) -> pd.DataFrame:
-        """The runs without the second copy of *observed*."""
+        """Runs without the second copy of *observed*."""
         return self.runs[self.runs["readout"] != OBSERVED_AGAIN]
 
     def mean_runs(self) -> pd.DataFrame:
-        """One row a model, scenario, training and readout: accuracy and kappa averaged over seeds,
-        each run once; ``runs`` counts them."""
+        """Average accuracy and kappa over seeds, each run once: one row a model, scenario, training
+        and readout; ``runs`` counts them.
+        """
         cell = ["model", "scenario", "training", "readout"]
         return self.distinct.groupby(cell, as_index=False, sort=False).agg(
             accuracy=("accuracy", "mean"), kappa=("kappa", "mean"), runs=("accuracy", "size")
@@ -100,9 +101,9 @@ class PublishedTables:
 
 
 def read_published(folder: Path) -> PublishedTables:
-    """The released tables in ``folder``, which holds ``results/`` and ``humans/``.
+    """Read the released tables in ``folder``, which contains ``results/`` and ``humans/``.
 
-    Raises `BadInputError` for what is missing, out of range or stands twice.
+    Raises `BadInputError` for what is missing, out of range or occurs twice.
     """
     results = folder / "results"
     if not results.is_dir():
@@ -112,7 +113,7 @@ def read_published(folder: Path) -> PublishedTables:
 
 
 def in_paper_order(table: pd.DataFrame, columns: Sequence[str]) -> pd.DataFrame:
-    """``table`` sorted by ``columns``, models and scenarios in the order of the paper."""
+    """Sort ``table`` by ``columns``, models and scenarios in the order of the paper."""
     ranks = {"model": list(MODELS.values()), "scenario": [*SCENARIOS]}
     place = {
         name: table[name].map({value: at for at, value in enumerate(order)}).fillna(len(order))
@@ -181,7 +182,7 @@ def _named(values: pd.Series, names: dict[str, str], where: str) -> pd.Series:
 
 
 def _seeds(table: pd.DataFrame, where: str) -> pd.Series:
-    """The seed of the encoder, or of the dynamics where the encoder was not trained."""
+    """Return the seed of the encoder, or of the dynamics if the encoder was not trained."""
     own = table["Encoder Training Seed"]
     words = own.where(own.str.strip() != "", table["Dynamics Training Seed"])
     numbers = as_numbers(words.rename("Encoder Training Seed"), 0, 1e9, where)

@@ -1,1 +1,1 @@
-"""Tables of predictions and answers: read, checked and scored."""
+"""Tables of predictions and answers: readers, checks and scores."""

@@ -43,12 +43,11 @@ _ALWAYS_ONE_EACH = ("contain",)
 
 
 def attributes_from_names(stimuli: Iterable[str]) -> pd.DataFrame:
-    """Attributes by what official names say, `MISLABELLED` ones corrected; columns `COLUMNS`, one
-    row a stimulus.
+    """Return the attributes that official names contain, with `MISLABELLED` ones corrected.
 
-    A name that does not mention scenery (``..._simple_box``) stands for a stimulus without it: 0.
-    ``elements`` are NaN where the name gives none or, as in Link, a range of them. Raises
-    `BadInputError` for a name of no official scenario.
+    One row a stimulus with `COLUMNS`. A name without scenery (``..._simple_box``) means none: 0.
+    ``elements`` are NaN if the name contains none or, as in Link, a range. Raises `BadInputError`
+    for a name of no official scenario.
     """
     rows = [_from_name(canonical_name(name)) for name in stimuli]
     table = pd.DataFrame(rows, columns=list(COLUMNS))
@@ -85,7 +84,7 @@ def _first(patterns: tuple[re.Pattern[str], ...], text: str) -> float:
 
 
 def attributes_from_table(table: pd.DataFrame, where: str = "table of attributes") -> pd.DataFrame:
-    """Attributes from a table with ``stimulus``, ``scenario`` and any of `ATTRIBUTES`."""
+    """Return the attributes of a table with ``stimulus``, ``scenario`` and any of `ATTRIBUTES`."""
     require_columns(table, ["stimulus", "scenario"], where)
     given = [name for name in ATTRIBUTES if name in table]
     if not given:
@@ -103,6 +102,6 @@ def attributes_from_table(table: pd.DataFrame, where: str = "table of attributes
 
 
 def better_attributes(first: pd.DataFrame, second: pd.DataFrame) -> pd.DataFrame:
-    """``first`` where it knows the stimulus, ``second`` for the others: metadata, then names."""
+    """Return ``first`` with the stimuli added that only ``second`` contains."""
     missing = second[~second["stimulus"].isin(first["stimulus"])]
     return pd.concat([first, missing], ignore_index=True)

@@ -1,4 +1,4 @@
-"""Tables from outside: read whole and checked, or refused with one clear line."""
+"""Readers of tables from outside: complete and checked, or refused with one clear message."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Array = npt.NDArray[np.float64]
 
 
 def read_csv(path: Path, columns: Iterable[str]) -> pd.DataFrame:
-    """The CSV file at ``path`` as text, which must have ``columns`` and at least one row.
+    """Read the CSV file at ``path`` as text; it must have ``columns`` and at least one row.
 
     Raises `BadInputError` for a file that is absent, of another kind, empty, or lacks a column.
     """
@@ -32,7 +32,7 @@ def read_csv(path: Path, columns: Iterable[str]) -> pd.DataFrame:
 
 
 def read_table(path: Path, columns: Iterable[str]) -> pd.DataFrame:
-    """A parquet table, typed as it is, or a CSV file as text (`read_csv`).
+    """Read a parquet table with its types, or a CSV file as text (`read_csv`).
 
     Raises `BadInputError` as `read_csv` does.
     """
@@ -55,7 +55,9 @@ def require_columns(table: pd.DataFrame, columns: Iterable[str], where: str) -> 
 
 
 def as_numbers(values: pd.Series, low: float, high: float, where: str) -> Array:
-    """``values`` as finite float64 in [low, high]; `BadInputError` names the first other one."""
+    """Return ``values`` as finite float64 in [low, high]; `BadInputError` names the first other
+    one.
+    """
     numbers: Array = np.asarray(pd.to_numeric(values, errors="coerce"), dtype=np.float64)
     good = np.isfinite(numbers) & (numbers >= low) & (numbers <= high)
     if not good.all():
@@ -68,7 +70,9 @@ def as_numbers(values: pd.Series, low: float, high: float, where: str) -> Array:
 
 
 def as_booleans(values: pd.Series, where: str) -> npt.NDArray[np.bool_]:
-    """``values`` as bool: True/False, 1/0 or yes/no in any case; else `BadInputError`."""
+    """Return ``values`` as bool: True/False, 1/0 or yes/no in any case; else raise
+    `BadInputError`.
+    """
     words = {"true": True, "1": True, "1.0": True, "yes": True}
     words |= {"false": False, "0": False, "0.0": False, "no": False}
     found = [words.get(str(value).strip().lower()) for value in values]

@@ -1,9 +1,9 @@
-"""One table of many prediction files: how accurate, how like people, made by which versions.
+"""Leaderboard: one table of many prediction files with accuracy, similarity to people and versions.
 
-Each file is compared by itself, on the stimuli that people saw and it predicts, so that files made
-on different sets of trials can stand in one table; the column ``stimuli`` says on how many. A file
-that cannot be compared is not dropped silently: it stands in `Leaderboard.refused` with the reason.
-A model that lacks stimuli ranks after those that lack none, whatever its scores.
+Each file is compared separately, on the stimuli that people saw and it predicts, so that files made
+on different sets of trials can be in one table; the column ``stimuli`` counts them. A file that
+cannot be compared is listed in `Leaderboard.refused` with the reason. A model that lacks stimuli
+ranks after those that lack none, whatever its scores.
 """
 
 from __future__ import annotations
@@ -60,10 +60,16 @@ def columns() -> list[str]:
 
 @dataclass(frozen=True)
 class Leaderboard:
-    """The ranked table (`columns`), what was left out of each file (``file``, ``agent``,
-    ``scenario``, ``reason``, ``stimuli``), the files that could not be compared (``file``,
-    ``reason``), the answers of people that were left out (`Responses.dropped`; None: there were no
-    single answers), and the choices in words."""
+    """Ranked table of models.
+
+    - ``table``: see `columns`.
+    - ``dropped``: what was left out of each file: ``file``, ``agent``, ``scenario``, ``reason``,
+      ``stimuli``.
+    - ``refused``: files that could not be compared: ``file``, ``reason``.
+    - ``dropped_answers``: excluded answers of people (`Responses.dropped`); None without single
+      answers.
+    - ``settings``: the settings as text, by name.
+    """
 
     table: pd.DataFrame
     dropped: pd.DataFrame
@@ -87,14 +93,27 @@ def leaderboard(
 ) -> Leaderboard:
     """Score every model of every file, best accuracy first; see `sort_leaderboard`.
 
-    ``humans``, ``labels``, ``exclude``, ``exclude_ledge``: as `comparison.compare`. ``responses``:
-    answers of single participants, of which the sessions that ``rules`` flag are left out; they
-    give kappa and, where ``humans`` is None, stand in for it. ``expected``: see
-    `exclusions.flag_sessions`. ``scenario``: one of the eight, *mean* (each counting the same) or
-    *pooled*.
+    Parameters
+    ----------
+    files
+        CSV files of predictions.
+    humans, labels, exclude, exclude_ledge
+        As in `comparison.compare`.
+    responses
+        Answers of single participants; the sessions that ``rules`` flag are left out. They give
+        kappa and, if ``humans`` is None, replace it.
+    rules, expected
+        As in `exclusions.flag_sessions`.
+    scenario
+        One of the eight, *mean* (with equal weights) or *pooled*.
+    bootstrap
+        Draws for the intervals.
 
-    Raises `BadInputError` where there is no file, or not one that can be compared; where no session
-    is left; where the outcomes of the responses contradict ``labels``.
+    Raises
+    ------
+    BadInputError
+        If no file is given or none can be compared, no session is left, or the outcomes of the
+        responses contradict ``labels``.
     """
     if not files:
         raise BadInputError("no file of predictions was given")
@@ -148,7 +167,7 @@ def _unflagged(
     expected: Mapping[str, int] | None,
     labels: Mapping[str, bool] | None,
 ) -> tuple[Responses | None, dict[str, str]]:
-    """The responses without flagged sessions, and how they were flagged in words."""
+    """Return the responses without flagged sessions, and the rules as text."""
     if responses is None:
         return None, {}
     if labels is not None:
@@ -162,10 +181,10 @@ def _unflagged(
 
 
 def _asked(rested: pd.DataFrame, dropped: pd.DataFrame) -> pd.Series:
-    """How many stimuli a whole submission would have, by scenario.
+    """Return the number of stimuli of a complete submission, by scenario.
 
-    What people saw: what a model answered of it and what it lacks. Without people: what all files
-    name together.
+    With people, what they saw: what a model predicted of it and what it lacks. Without people, what
+    all files contain together.
     """
     keys = ["file", "agent", "scenario"]
     lacking = dropped[dropped["reason"] == NOT_PREDICTED].groupby(keys)["stimuli"].sum()
@@ -176,7 +195,7 @@ def _asked(rested: pd.DataFrame, dropped: pd.DataFrame) -> pd.Series:
 
 
 def _with_asked(table: pd.DataFrame, asked: pd.Series, scenario: str) -> pd.DataFrame:
-    """``of_scenarios`` and ``of_stimuli``, and a reason where a model lacks some of them."""
+    """Add ``of_scenarios`` and ``of_stimuli``, and a reason if a model lacks some of them."""
     whole = asked if scenario in (MEAN, POOLED) else asked[[scenario]]
     table = table.assign(of_scenarios=len(whole), of_stimuli=int(whole.sum()))
     for place, row in table.iterrows():
@@ -191,18 +210,18 @@ def _with_asked(table: pd.DataFrame, asked: pd.Series, scenario: str) -> pd.Data
 
 
 def _is_partial(rows: Any) -> Any:
-    """Does a row, or do the rows of a table, rest on fewer stimuli than there are?"""
+    """Return whether a row, or each row of a table, is about fewer stimuli than there are."""
     return rows["stimuli"] < rows["of_stimuli"]
 
 
 def sort_leaderboard(
     table: pd.DataFrame, by: str = "accuracy", ascending: bool | None = None
 ) -> pd.DataFrame:
-    """The table sorted by any column, ``rank`` by that order, NaN last, ties by model and file.
+    """Sort the table by any column; ``rank`` follows that order, NaN last, ties by model and file.
 
-    By a score, models that lack stimuli come after those that lack none: means over other
-    scenarios do not compare. ``ascending`` None puts the best first: large scores, small RMSD,
-    words by the alphabet. Raises `UnknownNameError` with the closest columns.
+    By a metric, models that lack stimuli come after those that lack none, since means over other
+    scenarios are not comparable. ``ascending`` None puts the best first: large scores, small RMSD,
+    text alphabetically. Raises `UnknownNameError` with the closest columns.
     """
     if by not in table.columns or by == "rank":
         raise UnknownNameError("column", by, [name for name in table.columns if name != "rank"])
@@ -224,7 +243,7 @@ def sort_leaderboard(
 def _people(
     humans: pd.DataFrame | None, labels: Mapping[str, bool] | None, test: pd.DataFrame | None
 ) -> tuple[pd.DataFrame | None, Mapping[str, bool] | None]:
-    """People by stimulus and outcomes: those given, else those of the single answers."""
+    """Return people by stimulus and outcomes: those given, else those of the single answers."""
     if test is None:
         return humans, labels
     known = test.drop_duplicates("stimulus").set_index("stimulus")["label"]

@@ -1,4 +1,4 @@
-"""What one file gives to the leaderboard: its models, the versions that made them, their scores."""
+"""Rows of the leaderboard from one file: its models, their versions and their scores."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from physion.errors import BadInputError
 
 
 def read_submission(path: Path) -> tuple[pd.DataFrame, dict[str, str]]:
-    """The checked rows of a file, and for each of its models the versions that made it."""
+    """Read the checked rows of a file, and for each of its models the versions that made it."""
     raw = read_csv(path, REQUIRED)
     rows = name_models(check_predictions(raw, str(path)))
     beside = sidecar_versions(path)
@@ -35,10 +35,11 @@ def read_submission(path: Path) -> tuple[pd.DataFrame, dict[str, str]]:
 
 
 def sidecar_versions(path: Path) -> str:
-    """The entry ``versions`` of the JSON file beside a table of predictions; empty without one.
+    """Return the entry ``versions`` of the JSON file next to a table of predictions; empty without
+    one.
 
-    The file is called as the table, with ``.json`` for or after its ending; ``versions`` is text,
-    or an object of names and versions. Raises `BadInputError` where it is something else.
+    The file has the name of the table, with ``.json`` for or after its ending; ``versions`` is
+    text, or an object of names and versions. Raises `BadInputError` for anything else.
     """
     for beside in (path.with_suffix(".json"), path.with_name(path.name + ".json")):
         if not beside.is_file():
@@ -63,7 +64,7 @@ def score_models(
     scenario: str,
     draws: Bootstrap,
 ) -> pd.DataFrame:
-    """One row a model of one file."""
+    """Return one row for each model of one file."""
     chosen = found.scores[found.scores["scenario"] == scenario]
     if chosen.empty:
         raise BadInputError(f"nothing of scenario {scenario!r} can be compared")

@@ -1,4 +1,4 @@
-"""What models answered: tables with the column names of the official result files."""
+"""Predictions of models: tables with the column names of the official result files."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ DISTINGUISHING = (
 
 
 def read_predictions(paths: list[Path]) -> pd.DataFrame:
-    """The rows of several CSV files of predictions, checked; see `check_predictions`."""
+    """Read and check the rows of several CSV files of predictions; see `check_predictions`."""
     if not paths:
         raise BadInputError("no file of predictions was given")
     tables = []
@@ -61,14 +61,14 @@ def read_predictions(paths: list[Path]) -> pd.DataFrame:
 
 
 def check_predictions(table: pd.DataFrame, where: str = "predictions") -> pd.DataFrame:
-    """One row a model and stimulus, with our column names; the order of rows is kept.
+    """Return one row a model and stimulus with our column names, in the order of ``table``.
 
-    Columns: ``model`` (the name), ``readout`` (*observed*, *observed+simulated*, *full*, or what
-    stands there), ``stimulus`` (canonical), ``scenario`` (None where nothing tells it),
-    ``p_contact`` (0 to 1), ``predicted`` and ``actual`` (bool), and those of `DISTINGUISHING`
-    that are there, as text. ``actual`` is the outcome of the trial that the model was shown, so
-    for our own simulations the simulated outcome; ``recorded`` is the official one where a column
-    *Recorded Outcome* gives it (bool), else None. Raises `BadInputError`.
+    Columns: ``model`` (the name), ``readout`` (*observed*, *observed+simulated*, *full*, or another
+    name), ``stimulus`` (canonical), ``scenario`` (None if unknown), ``p_contact`` (0 to 1),
+    ``predicted`` and ``actual`` (bool), and those of `DISTINGUISHING` that are present, as text.
+    ``actual`` is the outcome of the trial that the model was shown, so for our own simulations the
+    simulated outcome; ``recorded`` is the official one if a column *Recorded Outcome* contains it
+    (bool), else None. Raises `BadInputError`.
     """
     require_columns(table, REQUIRED, where)
     table = table.reset_index(drop=True)
@@ -97,11 +97,11 @@ def check_predictions(table: pd.DataFrame, where: str = "predictions") -> pd.Dat
 
 
 def name_models(predictions: pd.DataFrame) -> pd.DataFrame:
-    """``predictions`` with ``agent``, a name for each model that no other one bears.
+    """Return ``predictions`` with ``agent``, a unique name for each model.
 
-    It is model and readout, and where these two are shared by several models also what tells them
-    apart (training set, seed, ...). Raises `BadInputError` where one model predicts a stimulus
-    twice, or where two models were shown trials of one name but of different outcome.
+    It is model and readout and, if several models share these, also what distinguishes them
+    (training set, seed, ...). Raises `BadInputError` if one model predicts a stimulus twice, or if
+    two models were shown trials of one name but of different outcome.
     """
     agent = predictions["model"] + " · " + predictions["readout"]
     for column in DISTINGUISHING:
@@ -128,13 +128,13 @@ def name_models(predictions: pd.DataFrame) -> pd.DataFrame:
 
 
 def _text(values: pd.Series) -> pd.Series:
-    """Values as text, nothing for an absent one, seeds without the decimals pandas gives them."""
+    """Return values as text, empty if absent, and seeds without the decimals that pandas adds."""
     words = values.astype(object).where(values.notna(), "").map(str).str.strip()
     return words.str.replace(r"^(\d+)\.0$", r"\1", regex=True).replace({"nan": "", "None": ""})
 
 
 def _scenarios(table: pd.DataFrame, stimulus: pd.Series) -> pd.Series:
-    """By the stimulus, else by the scenario that the readout was tested on, else None."""
+    """Return the scenario of each row by its stimulus, else by *Readout Test Data*, else None."""
     known = {*SCENARIOS, *OFFICIAL_SCENARIOS}
     tested = table.get("Readout Test Data", pd.Series("", index=table.index)).astype(str)
     found = [
@@ -155,10 +155,10 @@ def _recorded(table: pd.DataFrame, where: str) -> pd.Series:
 
 
 def _relative(trained: pd.Series, scenario: pd.Series) -> pd.Series:
-    """``same`` where the training scenario is the tested one; all else stays as it is.
+    """Return ``same`` if the training scenario is the tested one; all else is unchanged.
 
-    Without this a model trained on each scenario in turn would count as eight models. An absent
-    training scenario stays absent, also beside a stimulus whose scenario nothing tells.
+    Otherwise a model trained on each scenario in turn would count as eight models. An absent
+    training scenario stays absent, even for a stimulus of unknown scenario.
     """
     ours = trained.map(lambda name: OFFICIAL_SCENARIOS.get(name.lower(), name.lower()))
     left_out = trained.str.lower().str.startswith(("all_but", "no_"))

@@ -1,7 +1,7 @@
-"""What people answered: accuracy for each stimulus, from the official tables.
+"""Accuracy of people for each stimulus, from the official tables.
 
-The official files give, for each stimulus, the share of correct answers and the number of people.
-Three sets of people are about in the official data: everybody (column ``correct`` of
+The official files contain, for each stimulus, the fraction of correct answers and the number of
+people. The official data has three sets of people: everybody (column ``correct`` of
 ``stimulus_names_and_labels.csv``), a first exclusion (the files read here, 66 to 96 people) and a
 stricter one (``human_accuracy_by_scenario.csv``, 1 to 8 people fewer). The means of the last two
 differ by at most 0.005.
@@ -33,13 +33,13 @@ _FILE = re.compile(r"human_accuracy-(?P<scenario>[a-zA-Z]+)(?P<red>-redyellow)?_
 
 
 def read_humans(folder: Path, dominoes: DominoesLook = "plain") -> pd.DataFrame:
-    """People's answers by stimulus, from a folder of official ``human_accuracy-*.csv`` files.
+    """Read the answers of people by stimulus from a folder of ``human_accuracy-*.csv`` files.
 
-    Columns: ``stimulus`` (canonical name), ``scenario`` (ours), ``accuracy`` (share of correct
+    Columns: ``stimulus`` (canonical name), ``scenario`` (ours), ``accuracy`` (fraction of correct
     answers, 0 to 1), ``count`` (people, 1 or more). Rows are sorted by scenario and stimulus.
 
-    Raises `BadInputError` for a missing or empty folder, a missing column, a value out of range,
-    a stimulus that occurs twice, or a look of Dominoes that is not there.
+    Raises `BadInputError` for a missing or empty folder, a missing column, a value out of range, a
+    stimulus that occurs twice, or a look of Dominoes that does not exist.
     """
     if dominoes not in get_args(DominoesLook):
         raise BadInputError(f"dominoes is {dominoes!r}; choose plain, redyellow or pooled")
@@ -76,7 +76,7 @@ def _read_file(path: Path, scenario: str, redyellow: bool) -> pd.DataFrame:
 
 
 def _choose_look(table: pd.DataFrame, dominoes: DominoesLook, folder: Path) -> pd.DataFrame:
-    """Keep one row a Dominoes stimulus: of one look, or of both weighted by their people."""
+    """Return one row a Dominoes stimulus: of one look, or of both weighted by their people."""
     in_dominoes = table["scenario"] == "dominoes"
     if dominoes == "pooled":
         total = table["accuracy"] * table["count"]
@@ -92,10 +92,10 @@ def _choose_look(table: pd.DataFrame, dominoes: DominoesLook, folder: Path) -> p
 
 
 def read_labels(path: Path) -> dict[str, bool]:
-    """Official outcome by canonical stimulus, from ``stimulus_names_and_labels.csv``.
+    """Read the official outcome by canonical stimulus from ``stimulus_names_and_labels.csv``.
 
-    Not from ``readout_labels.csv``: that one is about the trials on which readouts are trained,
-    some of which bear the names of test trials. Raises `BadInputError`.
+    Not from ``readout_labels.csv``, which is about the trials on which readouts are trained; some
+    of these have the names of test trials. Raises `BadInputError`.
     """
     raw = read_csv(path, ("stim_ID", "label"))
     names = raw["stim_ID"].map(canonical_name)
@@ -105,10 +105,10 @@ def read_labels(path: Path) -> dict[str, bool]:
 
 
 def read_human_zone(path: Path) -> pd.DataFrame:
-    """The middle 95 % of participants by scenario, from ``human_accuracy_by_scenario.csv``.
+    """Read the middle 95 % of participants by scenario from ``human_accuracy_by_scenario.csv``.
 
     Columns: ``scenario`` (ours), ``low``, ``high``: the 2.5th and the 97.5th percentile of the
-    accuracies of single participants, which per-stimulus tables cannot give.
+    accuracies of single participants, which per-stimulus tables do not contain.
     """
     raw = read_csv(path, ("scenario", "pct_2.5", "pct_97.5"))
     zone = pd.DataFrame(
@@ -123,19 +123,20 @@ def read_human_zone(path: Path) -> pd.DataFrame:
 
 
 def find_beside(humans: Path, sibling: str, name: str) -> Path | None:
-    """The official file ``name`` in the folder of people's answers, beside it, or in the folder
-    ``sibling`` beside it; None where it is in none of these."""
+    """Return the official file ``name`` in or next to the folder of people's answers.
+
+    It may also be in the folder ``sibling`` next to that folder. None if it is in none of these.
+    """
     parent = humans.resolve().parent
     places = (humans / name, parent / name, parent / sibling / name)
     return next((place for place in places if place.is_file()), None)
 
 
 def with_labels(humans: pd.DataFrame, labels: Mapping[str, bool]) -> pd.DataFrame:
-    """``humans`` with ``label`` and ``p_yes``, the share of people who said yes.
+    """Return ``humans`` with ``label`` and ``p_yes``, the fraction of people who said yes.
 
-    Whoever is right says yes where the agent does touch the patient: ``p_yes`` is the accuracy
-    where the label is True, else one minus it. Stimuli without a label get NaN in both (``label``
-    is of dtype object then).
+    ``p_yes`` is the accuracy if the label is True, else one minus it. Stimuli without a label get
+    NaN in both (``label`` is then of dtype object).
     """
     known = {canonical_name(name): bool(value) for name, value in labels.items()}
     label = humans["stimulus"].map(known).astype(object)

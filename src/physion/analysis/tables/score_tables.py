@@ -1,4 +1,4 @@
-"""Tables of scores: one row a model and scenario, then their mean and the pool."""
+"""Tables of scores: one row a model and scenario, then their mean and the pooled stimuli."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def _scores(sample: Sample) -> dict[str, Array]:
 
 
 def _one_class(rows: pd.DataFrame) -> bool:
-    """Do all of several stimuli end alike?"""
+    """Return whether several stimuli all have the same label."""
     return len(rows) > 1 and rows["label"].nunique() == 1
 
 
@@ -125,15 +125,15 @@ def _record(
 def people_table(
     people: pd.DataFrame, zone: pd.DataFrame | None, bootstrap: Bootstrap
 ) -> pd.DataFrame:
-    """The people by scenario and, in row `MEAN`, averaged over scenarios.
+    """Return the people by scenario and, in row `MEAN`, averaged over scenarios.
 
     ``people`` has a row a stimulus, from `responses.with_labels`.
 
-    Columns: ``scenario``, ``stimuli``, ``people`` (median number a stimulus), ``base_rate`` (share
-    of stimuli with contact), ``yes`` (mean share who say yes), ``accuracy`` with ``_low`` and
-    ``_high`` (bootstrap over stimuli), ``reliability`` and ``ceiling`` (see `agreement`), and
-    ``zone_low``, ``zone_high``: the middle 95 % of participants where ``zone`` gives it, else NaN;
-    always NaN in the mean, since nobody took part in more than one scenario.
+    Columns: ``scenario``, ``stimuli``, ``people`` (median number a stimulus), ``base_rate``
+    (fraction of stimuli with contact), ``yes`` (mean fraction who say yes), ``accuracy`` with
+    ``_low`` and ``_high`` (bootstrap over stimuli), ``reliability`` and ``ceiling`` (see
+    `agreement`), and ``zone_low``, ``zone_high``: the middle 95 % of participants if ``zone``
+    contains it, else NaN; always NaN in the mean, since nobody took part in more than one scenario.
     """
     zones = {} if zone is None else zone.set_index("scenario")[["low", "high"]].T.to_dict()
     records, draws = [], []

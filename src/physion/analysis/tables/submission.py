@@ -1,7 +1,7 @@
-"""Is a file of predictions fit to be compared? Every fault with its row, none hidden by the first.
+"""Validation of a file of predictions: every fault with its row.
 
 Rows are counted from 1 below the header. An *error* makes a comparison wrong or impossible; a
-*warning* is worth a look.
+*warning* should be checked.
 """
 
 from __future__ import annotations
@@ -33,8 +33,9 @@ __all__ = ["Checked", "Fault", "Reference", "read_index", "validate"]
 
 @dataclass(frozen=True)
 class Checked:
-    """What `validate` found: faults in the order of the checks, what was not checked and why, and
-    the models with the number of rows of each."""
+    """Result of `validate`: faults in the order of the checks, checks that were not possible and
+    why, and the number of rows of each model.
+    """
 
     file: str
     rows: int
@@ -44,14 +45,14 @@ class Checked:
 
     @property
     def errors(self) -> int:
-        """How many faults forbid a comparison."""
+        """Number of faults that forbid a comparison."""
         return sum(fault.level == "error" for fault in self.faults)
 
 
 def validate(path: Path, reference: Reference | None = None) -> Checked:
     """Check the file of predictions at ``path``.
 
-    Raises `BadInputError` where it is no CSV table at all; everything else becomes a fault.
+    Raises `BadInputError` if it is no CSV table; everything else becomes a fault.
     """
     against = reference or Reference()
     # A row that ends early has no value in its last columns.
@@ -79,13 +80,13 @@ def validate(path: Path, reference: Reference | None = None) -> Checked:
 
 
 def read_index(path: Path) -> pd.DataFrame:
-    """An index of trials (parquet or CSV) with at least ``trial`` and ``split``."""
+    """Read an index of trials (parquet or CSV) with at least ``trial`` and ``split``."""
     file = path / "index.parquet" if path.is_dir() else path
     return read_table(file, ("trial", "split"))
 
 
 def _unchecked(table: pd.DataFrame, against: Reference) -> tuple[str, ...]:
-    """What could not be checked, in words."""
+    """Return what could not be checked, as text."""
     left = []
     if against.labels is None and against.index is None:
         left.append("whether the stimuli are known and all there: no list of them was given")

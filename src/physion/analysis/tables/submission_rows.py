@@ -1,4 +1,4 @@
-"""What can be wrong in the rows of a file of predictions, from the file alone."""
+"""Checks of a file of predictions that need the file alone."""
 
 from __future__ import annotations
 
@@ -30,8 +30,9 @@ _ALIKE = {
 
 @dataclass(frozen=True)
 class Fault:
-    """One thing that is wrong: ``row`` (from 1, None where it is the file or many rows),
-    ``stimulus`` and ``column`` (empty where none is meant), ``level`` (error or warning)."""
+    """A fault: ``row`` (from 1, None if it is about the file or many rows), ``stimulus`` and
+    ``column`` (empty if not about one), ``level`` (error or warning).
+    """
 
     kind: str
     message: str
@@ -47,6 +48,7 @@ class Fault:
 
 
 def columns(table: pd.DataFrame) -> list[Fault]:
+    """Check that the required columns exist once."""
     faults = [
         Fault("columns", f"column {name!r} is missing", column=name)
         for name in REQUIRED
@@ -63,6 +65,7 @@ def columns(table: pd.DataFrame) -> list[Fault]:
 def each(
     bad: pd.Series, table: pd.DataFrame, stimulus: pd.Series, kind: str, column: str, expected: str
 ) -> list[Fault]:
+    """Return one fault for each row where ``bad`` is True."""
     return [
         Fault(
             kind,
@@ -76,6 +79,7 @@ def each(
 
 
 def blank(table: pd.DataFrame, stimulus: pd.Series) -> list[Fault]:
+    """Check that models, readouts and stimuli have names."""
     faults = []
     for column in ("Model", "Readout Type", "Stimulus Name"):
         empty = table[column].str.strip() == ""
@@ -84,6 +88,7 @@ def blank(table: pd.DataFrame, stimulus: pd.Series) -> list[Fault]:
 
 
 def probabilities(table: pd.DataFrame, stimulus: pd.Series) -> list[Fault]:
+    """Check that probabilities lie in 0..1 and sum to 1."""
     faults: list[Fault] = []
     values = {}
     for column in ("Predicted Prob_true", "Predicted Prob_false"):
@@ -109,11 +114,12 @@ def probabilities(table: pd.DataFrame, stimulus: pd.Series) -> list[Fault]:
 
 
 def booleans(values: pd.Series) -> pd.Series:
-    """True, False, or None for any other word."""
+    """Return True, False, or None for any other text."""
     return values.str.strip().str.lower().map(_WORDS).astype(object)
 
 
 def outcomes(table: pd.DataFrame, stimulus: pd.Series) -> list[Fault]:
+    """Check that outcomes are True or False and agree with the probability."""
     faults: list[Fault] = []
     for column in ("Predicted Outcome", "Actual Outcome"):
         bad = booleans(table[column]).isna()
@@ -136,6 +142,7 @@ def outcomes(table: pd.DataFrame, stimulus: pd.Series) -> list[Fault]:
 
 
 def readouts(table: pd.DataFrame) -> list[Fault]:
+    """Warn of readouts with other than the official names."""
     known = {*READOUTS, *READOUTS.values(), "D"}
     odd = sorted({*table["Readout Type"].str.strip()} - known - {""})
     return [
@@ -151,6 +158,7 @@ def readouts(table: pd.DataFrame) -> list[Fault]:
 
 
 def duplicates(table: pd.DataFrame, stimulus: pd.Series) -> list[Fault]:
+    """Check that no model predicts a stimulus twice with one readout."""
     named = [name for name in DISTINGUISHING if name in table.columns]
     key = table[["Model", "Readout Type", *named]].assign(stimulus=stimulus)
     first = key.groupby(list(key.columns), sort=False).cumcount() == 0
@@ -169,9 +177,9 @@ def duplicates(table: pd.DataFrame, stimulus: pd.Series) -> list[Fault]:
 
 
 def alike(table: pd.DataFrame, stimulus: pd.Series) -> list[Fault]:
-    """Warnings where all outcomes, or all answers, of a model in a scenario are one and the same.
+    """Warn if all outcomes, or all answers, of a model in a scenario are the same.
 
-    Values that are wrong in themselves, and single rows, are left to the other checks.
+    Invalid values and single rows are left to the other checks.
     """
     values = {
         "Actual Outcome": booleans(table["Actual Outcome"]),
@@ -196,7 +204,7 @@ def alike(table: pd.DataFrame, stimulus: pd.Series) -> list[Fault]:
 
 
 def shorten(faults: list[Fault]) -> list[Fault]:
-    """At most `SHOWN` of one kind, level and column one by one, the others as a count."""
+    """Return at most `SHOWN` faults of one kind, level and column, and the others as a count."""
     kept: list[Fault] = []
     counts: dict[tuple[str, str, str], int] = {}
     for fault in faults:

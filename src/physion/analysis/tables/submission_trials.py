@@ -1,8 +1,8 @@
-"""Is what a file predicts what should be predicted: known trials, all, and test trials alone?
+"""Checks of the trials that a file predicts: known, complete, and test trials only.
 
-Names alone do not tell test trials from those that readouts were fitted on: 1184 of the 1200
-official test names are also names of (other) readout trials. Leakage is looked for where something
-tells: an index of the dataset, a list of fitted stimuli, a column ``Split``.
+Names alone do not identify test trials: 1184 of the 1200 official test names are also names of
+(other) readout trials. Leakage is therefore checked with an index of the dataset, a list of fitted
+stimuli, or a column ``Split``.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ TESTING = ("testing", "test")
 
 @dataclass(frozen=True)
 class Reference:
-    """What a submission is held against; what is None is not checked.
+    """What a submission is checked against; what is None is not checked.
 
     - ``labels``: official outcome of every stimulus that should be predicted, by canonical name;
-    - ``index``: the trials of a dataset: ``trial``, ``split``, and where given ``digest`` (of the
+    - ``index``: the trials of a dataset: ``trial``, ``split``, and optionally ``digest`` (of the
       motion) and ``scene_digest``;
     - ``fitted``: canonical names of the stimuli on which the readout was fitted.
     """
@@ -39,6 +39,7 @@ class Reference:
 def labels(
     table: pd.DataFrame, stimulus: pd.Series, labels: Mapping[str, bool] | None
 ) -> list[Fault]:
+    """Check the outcomes of the file against the official ones."""
     if labels is None:
         return []
     official = stimulus.map(dict(labels)).astype(object)
@@ -63,7 +64,7 @@ def labels(
 
 
 def coverage(table: pd.DataFrame, stimulus: pd.Series, against: Reference) -> list[Fault]:
-    """Stimuli that nobody knows, and known ones without a prediction."""
+    """Find unknown stimuli, and known ones without a prediction."""
     wanted: set[str] = set(against.labels or ())
     trials: set[str] = set()
     if against.index is not None:
@@ -117,7 +118,7 @@ def _scenario_by_name(names: set[str], against: Reference) -> dict[str, str]:
 
 
 def leaks(table: pd.DataFrame, stimulus: pd.Series, against: Reference) -> list[Fault]:
-    """Stimuli that a readout or a model may have been fitted on."""
+    """Find stimuli on which a readout or a model may have been fitted."""
     reason = pd.Series("", index=table.index, dtype=object)
     if "Split" in table.columns:
         split = table["Split"].str.strip().str.lower()
@@ -145,14 +146,14 @@ def _leak(message: str, row: int, stimulus: pd.Series) -> Fault:
 
 
 def _cross_fitted(table: pd.DataFrame) -> pd.Series:
-    """Rows that a readout answered which was fitted on other parts of the set (``Fold`` >= 0)."""
+    """Return rows whose readout was fitted on other folds of the set (``Fold`` >= 0)."""
     if "Fold" not in table.columns:
         return pd.Series(False, index=table.index)
     return pd.to_numeric(table["Fold"], errors="coerce").fillna(-1) >= 0
 
 
 def _twins(stimulus: pd.Series, index: pd.DataFrame) -> list[Fault]:
-    """Test trials whose scene or motion is that of a trial of another split."""
+    """Find test trials whose scene or motion equals that of a trial of another split."""
     faults = []
     seen = index["trial"].map(canonical_name).isin(set(stimulus))
     testing = index[index["split"].isin(TESTING) & seen]
