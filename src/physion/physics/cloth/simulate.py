@@ -26,7 +26,13 @@ from physion.numerics.linear_algebra import unit
 from physion.numerics.rotations import rotate_vectors
 from physion.physics.cloth.sheet import sheet_springs, sheet_vertices
 from physion.physics.cloth.solids import fill_bodies, particles_of, surface_particles
-from physion.physics.cloth.solver import Record, Rules, Solids, run_cloth
+from physion.physics.cloth.solver import (
+    ClothOptions,
+    ClothRecord,
+    MovingSolids,
+    Solids,
+    run_cloth,
+)
 from physion.physics.trajectory import ENVIRONMENT, Contacts, Floats, State, Trajectory
 from physion.scenes.scene import FRAME_TIME, GRAVITY, Body, Scene
 
@@ -216,18 +222,18 @@ def _run(
     positions: Points,
     rotations: Points,
     settings: ClothSettings,
-) -> Record:
+) -> ClothRecord:
     """Simulate one cloth of the scene."""
     cloth, frames, bodies = scene.cloths[number], len(positions), len(scene.bodies)
     watched = _other_body(scene, cloth.name)
-    record = Record(
+    record = ClothRecord(
         np.zeros((frames, len(points), 3)),
         np.full(frames, np.nan),
         np.full((frames, bodies + 1), np.inf),
         np.zeros((frames, bodies + 1, 2, 3)),
         np.zeros((frames, bodies + 1)),
     )
-    rules = Rules(
+    options = ClothOptions(
         FRAME_TIME,
         settings.substeps,
         settings.iterations,
@@ -245,18 +251,8 @@ def _run(
         if watched >= 0
         else np.zeros((0, 3))
     )
-    run_cloth(
-        points,
-        velocities,
-        sheet_springs(cloth),
-        solids,
-        positions,
-        rotations,
-        rules,
-        watched,
-        particles,
-        record,
-    )
+    scenery = MovingSolids(solids, positions, rotations, watched, particles)
+    run_cloth(points, velocities, sheet_springs(cloth), scenery, options, record)
     record.distance[:] -= settings.rest_distance
     return record
 
@@ -270,14 +266,14 @@ def _other_body(scene: Scene, cloth: str) -> int:
     return other if other < len(scene.bodies) else -1
 
 
-def _contacts(scene: Scene, records: list[Record], settings: ClothSettings) -> Contacts:
+def _contacts(scene: Scene, records: list[ClothRecord], settings: ClothSettings) -> Contacts:
     """Rows of all cloths, sorted by frame, then by pair."""
     rows = []
     for number, (cloth, record) in enumerate(zip(scene.cloths, records, strict=True)):
         # A correction by d metres within one step is a change of velocity by d / step.
         mass = cloth.mass / cloth.resolution**2
-        impulse = record.pushed * mass * settings.substeps / FRAME_TIME
-        touching = (record.gap <= 0) | (record.pushed > 0)
+        impulse = record.normal_correction * mass * settings.substeps / FRAME_TIME
+        touching = (record.gap <= 0) | (record.normal_correction > 0)
         for frame, body in np.argwhere(touching & np.isfinite(record.gap)):
             floor = body == len(scene.bodies)
             point, normal = record.contact[frame, body]

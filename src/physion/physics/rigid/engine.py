@@ -106,9 +106,7 @@ class RigidRun:
         self.scene, self.settings = scene, settings
         self.model = build_model(scene, settings)
         self.finder = ContactFinder(self.model, settings, scene.floor)
-        actors = self.model.actors
-        model = self.model
-        actors = model.actors
+        model, actors = self.model, self.model.actors
         self.bodies = Bodies(
             model.start_x.copy(),
             model.start_q.copy(),
@@ -135,8 +133,8 @@ class RigidRun:
     def step(self) -> None:
         """Move by one frame."""
         settings, model, bodies, sleep = self.settings, self.model, self.bodies, self.sleep
-        pushed = any(push.frame == self.frame for push in self.scene.pushes)
-        if not pushed and np.count_nonzero(sleep.asleep) == model.actors:
+        all_asleep = np.count_nonzero(sleep.asleep) == model.actors
+        if all_asleep and all(push.frame != self.frame for push in self.scene.pushes):
             self.frame += 1
             self.history.append(self.history[-1])
             return
