@@ -9,14 +9,32 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from physion.numerics.linear_algebra import norm, unit
+from physion.numerics.linear_algebra import norm
 from physion.registry import Registry
 from physion.scenes.scene import Vec3
 
+F64 = NDArray[np.float64]
 Rect = tuple[float, float, float, float]
+"""Rectangle in the plane of a wall, in metres: u from, u to, v from, v to."""
+
+
+class Wall(NamedTuple):
+    """Rectangular wall from ``corner`` along ``u`` and ``v`` (metres); u x v points inwards."""
+
+    corner: Vec3
+    u: Vec3
+    v: Vec3
+
+    def arrays(self) -> tuple[F64, F64, F64, float, float]:
+        """Return corner (3,), unit vectors along u and v (3,), and the two lengths in metres."""
+        corner, u, v = (np.asarray(x, np.float64) for x in self)
+        width, height = float(norm(u)), float(norm(v))
+        return corner, u / width, v / height, width, height
 
 
 @dataclass(frozen=True)
@@ -74,27 +92,23 @@ class Room:
 rooms: Registry[Room] = Registry("room")
 
 
-def _wall(
-    corner: Vec3, u: Vec3, v: Vec3, openings: Sequence[Rect], **surface: object
-) -> Iterator[Panel]:
-    """Yield the panels of a wall with rectangular openings.
+def _wall_panels(wall: Wall, openings: Sequence[Rect], **surface: object) -> Iterator[Panel]:
+    """Yield the panels of a wall with openings.
 
-    An opening is (u from, u to, v from, v to) in metres. The wall is cut along the sides of all
-    openings into a grid; ``surface`` are the other fields of `Panel`.
+    The wall is cut along the sides of all openings into a grid; ``surface`` are the other fields of
+    the panels.
     """
-    start, du, dv = (np.asarray(x, np.float64) for x in (corner, u, v))
-    width, height = norm(du), norm(dv)
-    du, dv = du / width, dv / height
-    across = sorted({0.0, float(width), *(x for o in openings for x in o[:2])})
-    upward = sorted({0.0, float(height), *(y for o in openings for y in o[2:])})
+    corner, u, v, width, height = wall.arrays()
+    across = sorted({0.0, width, *(x for o in openings for x in o[:2])})
+    upward = sorted({0.0, height, *(y for o in openings for y in o[2:])})
     for a, b in pairwise(across):
         for c, d in pairwise(upward):
             if any(o[0] <= a and b <= o[1] and o[2] <= c and d <= o[3] for o in openings):
                 continue
             yield Panel(
-                _vec(start + a * du + c * dv),
-                _vec((b - a) * du),
-                _vec((d - c) * dv),
+                _vec(corner + a * u + c * v),
+                _vec((b - a) * u),
+                _vec((d - c) * v),
                 **surface,  # type: ignore[arg-type]
             )
 
@@ -104,15 +118,12 @@ def _vec(value: np.ndarray) -> Vec3:
     return (float(value[0]), float(value[1]), float(value[2]))
 
 
-def _reveal(
-    corner: Vec3, u: Vec3, v: Vec3, opening: Rect, depth: float, **surface: object
-) -> Iterator[Panel]:
-    """Yield the four sides of an opening through a wall ``depth`` metres thick."""
-    start, du, dv = (np.asarray(x, np.float64) for x in (corner, u, v))
-    du, dv = unit(du), unit(dv)
-    back = -depth * np.cross(du, dv)
+def _reveal(wall: Wall, opening: Rect, depth: float, **surface: object) -> Iterator[Panel]:
+    """Yield the four sides of an opening in a wall that is ``depth`` metres thick."""
+    corner, u, v, _, _ = wall.arrays()
+    back = -depth * np.cross(u, v)
     a, b, c, d = opening
-    p = [start + x * du + y * dv for x, y in ((a, c), (b, c), (b, d), (a, d))]
+    p = [corner + x * u + y * v for x, y in ((a, c), (b, c), (b, d), (a, d))]
     for i in range(4):
         side = p[(i + 1) % 4] - p[i]
         yield Panel(_vec(p[i]), _vec(side), _vec(back), **surface)  # type: ignore[arg-type]
@@ -128,14 +139,14 @@ def _slab(low: Vec3, high: Vec3, **surface: object) -> Iterator[Panel]:
         yield Panel(_vec(corner), _vec(u), _vec(v), **surface)  # type: ignore[arg-type]
 
 
-def _four_walls(half_x: float, half_y: float, height: float) -> list[tuple[Vec3, Vec3, Vec3]]:
-    """Return corner, u and v of the walls at -x, +x, -y and +y; u x v points into the room."""
+def _four_walls(half_x: float, half_y: float, height: float, floor: float = 0.0) -> list[Wall]:
+    """Return the walls at -x, +x, -y and +y around a room, standing at height ``floor``."""
     x, y, h = half_x, half_y, (0.0, 0.0, height)
     return [
-        ((-x, -y, 0.0), (0.0, 2 * y, 0.0), h),
-        ((x, y, 0.0), (0.0, -2 * y, 0.0), h),
-        ((x, -y, 0.0), (-2 * x, 0.0, 0.0), h),
-        ((-x, y, 0.0), (2 * x, 0.0, 0.0), h),
+        Wall((-x, -y, floor), (0.0, 2 * y, 0.0), h),
+        Wall((x, y, floor), (0.0, -2 * y, 0.0), h),
+        Wall((x, -y, floor), (-2 * x, 0.0, 0.0), h),
+        Wall((-x, y, floor), (2 * x, 0.0, 0.0), h),
     ]
 
 
@@ -152,12 +163,12 @@ def _box_room() -> Room:
         2: [(6.2, 7.5), (8.8, 10.1)],
         3: [(2.9, 4.2)],
     }
-    for index, (corner, u, v) in enumerate(_four_walls(half, half, height)):
+    for index, wall in enumerate(_four_walls(half, half, height)):
         openings = [(a, b, 2.75, 3.65) for a, b in windows[index]]
-        panels += _wall(corner, u, v, openings, **PLASTER)
+        panels += _wall_panels(wall, openings, **PLASTER)
         for opening in openings:
-            panels += _reveal(corner, u, v, opening, 0.35, color=(0.72, 0.72, 0.74))
-            panels.append(_pane(corner, u, v, opening, 0.35, (0.84, 0.85, 0.90), 0.78))
+            panels += _reveal(wall, opening, 0.35, color=(0.72, 0.72, 0.74))
+            panels.append(_pane(wall, opening, 0.35, (0.84, 0.85, 0.90), 0.78))
     panels += _coffers(half, height)
     return Room(
         panels=tuple(panels),
@@ -185,27 +196,25 @@ def _coffers(half: float, height: float) -> list[Panel]:
     inner, rise = half - 0.8, 0.30
     across, back = (2 * inner, 0.0, 0.0), (0.0, -2 * inner, 0.0)
     panels = [Panel((-inner, inner, height + rise), across, back, **pale)]  # type: ignore[arg-type]
-    for corner, u, v in _four_walls(inner, inner, rise):
-        panels.append(Panel((corner[0], corner[1], height), u, v, **pale))  # type: ignore[arg-type]
+    sides = _four_walls(inner, inner, rise, floor=height)
+    panels += [Panel(*side, **pale) for side in sides]  # type: ignore[arg-type]
     hole = [(0.8, 2 * half - 0.8, 0.8, 2 * half - 0.8)]
-    panels += _wall((-half, half, height), (2 * half, 0, 0), (0, -2 * half, 0), hole, **beam)
-    for at in (-1.9, 1.9):
-        panels += _slab((-inner, at - 0.2, height), (inner, at + 0.2, height + rise), **beam)
-        panels += _slab((at - 0.2, -inner, height), (at + 0.2, inner, height + rise), **beam)
+    border = Wall((-half, half, height), (2 * half, 0, 0), (0, -2 * half, 0))
+    panels += _wall_panels(border, hole, **beam)
+    for middle in (-1.9, 1.9):
+        low, high = middle - 0.2, middle + 0.2
+        panels += _slab((-inner, low, height), (inner, high, height + rise), **beam)
+        panels += _slab((low, -inner, height), (high, inner, height + rise), **beam)
     return panels
 
 
-def _pane(
-    corner: Vec3, u: Vec3, v: Vec3, opening: Rect, depth: float, color: Vec3, emission: float
-) -> Panel:
-    """Return what is seen through an opening: a plane of light behind it."""
-    start, du, dv = (np.asarray(x, np.float64) for x in (corner, u, v))
-    du, dv = unit(du), unit(dv)
+def _pane(wall: Wall, opening: Rect, depth: float, color: Vec3, emission: float) -> Panel:
+    """Return what is seen through an opening: a glowing panel ``depth`` metres behind it."""
+    corner, u, v, _, _ = wall.arrays()
     a, b, c, d = opening
-    at = start + a * du + c * dv - depth * np.cross(du, dv)
-    return Panel(
-        _vec(at), _vec((b - a) * du), _vec((d - c) * dv), color, "glow", 2.0, emission, False
-    )
+    start = corner + a * u + c * v - depth * np.cross(u, v)
+    across, upward = _vec((b - a) * u), _vec((d - c) * v)
+    return Panel(_vec(start), across, upward, color, "glow", 2.0, emission, False)
 
 
 def _bright_room() -> Room:
@@ -224,23 +233,23 @@ def _bright_room() -> Room:
     }
     walls = _four_walls(x, y, height)
     for index, wall in enumerate(walls):
-        panels += _wall(wall[0], wall[1], wall[2], doors[index], **WHITE)
+        panels += _wall_panels(wall, doors[index], **WHITE)
         for opening in doors[index]:
-            panels += _reveal(*wall, opening, 0.25, color=(0.86, 0.86, 0.87))
+            panels += _reveal(wall, opening, 0.25, color=(0.86, 0.86, 0.87))
     for index, opening in ((0, doors[0][0]), (1, doors[1][0]), (3, doors[3][0])):
-        panels.append(_pane(*walls[index], opening, 0.25, (0.72, 0.72, 0.74), 0.7))
-    panels.append(_pane(*walls[0], doors[0][1], 0.25, (0.80, 0.85, 0.88), 0.9))
+        panels.append(_pane(walls[index], opening, 0.25, (0.72, 0.72, 0.74), 0.7))
+    panels.append(_pane(walls[0], doors[0][1], 0.25, (0.80, 0.85, 0.88), 0.9))
     panels += _door_frames(-y - 0.12)
     panels += _yard(-y - 0.25)
+    # A beam under the ceiling, and three pillars at the walls.
     panels += _slab((-x, y - 0.9, 2.75), (x, y, height), **WHITE)
     panels += _slab((-4.6, y - 0.45, 0.0), (-2.9, y, 2.75), **WHITE)
     panels += _slab((x - 0.5, -1.0, 0.0), (x, 0.6, height), **WHITE)
     panels += _slab((-x, 0.6, 0.0), (-x + 0.5, 2.2, height), **WHITE)
-    for at in ((-3.0, -2.2), (0.0, -2.2), (3.0, -2.2), (-3.0, 2.0), (0.0, 2.0), (3.0, 2.0)):
-        spot = (at[0], at[1] + 0.2, height - 0.005)
-        panels.append(
-            Panel(spot, (0.2, 0, 0), (0, -0.2, 0), (1, 0.97, 0.92), "glow", 2.0, 1.4, False)
-        )
+    for spot in ((-3.0, -2.2), (0.0, -2.2), (3.0, -2.2), (-3.0, 2.0), (0.0, 2.0), (3.0, 2.0)):
+        corner = (spot[0], spot[1] + 0.2, height - 0.005)
+        across, back, color = (0.2, 0.0, 0.0), (0.0, -0.2, 0.0), (1.0, 0.97, 0.92)
+        panels.append(Panel(corner, across, back, color, "glow", 2.0, 1.4, False))
     return Room(
         panels=tuple(panels),
         low=(-x, -y, 0.0),
@@ -272,12 +281,12 @@ def _door_frames(y: float) -> list[Panel]:
 
 def _yard(y: float) -> list[Panel]:
     """Return a terrace, paving, a low brick wall, houses and an overcast sky behind the doors."""
-    out = {"occluded": False}
+    outside = {"occluded": False}
     wood, stone, brick = (0.80, 0.66, 0.54), (0.62, 0.62, 0.63), (0.60, 0.52, 0.45)
     panels = [
-        Panel((-12, y - 1.2, -0.02), (24, 0, 0), (0, 1.25, 0), wood, "planks", 3.0, **out),  # type: ignore[arg-type]
-        Panel((-14, y - 9, -0.10), (28, 0, 0), (0, 7.8, 0), stone, "paving", 1.6, **out),  # type: ignore[arg-type]
-        Panel((14, y - 9, -0.1), (-28, 0, 0), (0, 0, 1.3), brick, "paving", 1.3, **out),  # type: ignore[arg-type]
+        Panel((-12, y - 1.2, -0.02), (24, 0, 0), (0, 1.25, 0), wood, "planks", 3.0, **outside),  # type: ignore[arg-type]
+        Panel((-14, y - 9, -0.10), (28, 0, 0), (0, 7.8, 0), stone, "paving", 1.6, **outside),  # type: ignore[arg-type]
+        Panel((14, y - 9, -0.1), (-28, 0, 0), (0, 0, 1.3), brick, "paving", 1.3, **outside),  # type: ignore[arg-type]
         Panel(
             (40, y - 16, -1), (-80, 0, 0), (0, 0, 22), (0.80, 0.83, 0.87), "glow", 2.0, 0.75, False
         ),
