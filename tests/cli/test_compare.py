@@ -1,4 +1,4 @@
-"""The verb compare: its old form, and the verbs below it."""
+"""The verb compare and its sub-verbs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from physion.trials.layout import TrialPaths
 
 
 def predictions(official: Path, path: Path, model: str = "m", skill: float = 0.8) -> Path:
-    """A made-up model that is right about the share ``skill`` of the official stimuli."""
+    """Write predictions that are right for the fraction ``skill`` of the official stimuli."""
     names = pd.read_csv(official / "stimuli" / "stimulus_names_and_labels.csv")
     right = np.random.default_rng(0).random(len(names)) < skill
     said = names["label"].to_numpy() == right
@@ -86,7 +86,7 @@ def test_without_files_it_says_so(capsys: pytest.CaptureFixture[str]) -> None:
 
 @dataclass(frozen=True)
 class Own:
-    """A study of one's own stimuli: predictions, answers, a dataset, and who should see what."""
+    """Write a study of new stimuli: predictions, responses, dataset, expected stimuli."""
 
     predictions: Path
     responses: Path
@@ -95,7 +95,7 @@ class Own:
 
 
 def own_study(folder: Path) -> Own:
-    """Eight people a scenario; the first of Drop was shown 12 of the 16 stimuli."""
+    """Return eight people per scenario; the first of Drop saw 12 of the 16 stimuli."""
     generator = np.random.default_rng(1)
     stimuli = [(scenario, f"{scenario}_{k:03d}") for scenario in ("collide", "drop")
                for k in range(16)]  # fmt: skip

@@ -1,4 +1,4 @@
-"""The command line: help is quick, faults are one line with exit code 2."""
+"""Command line: quick help, errors in one line with exit code 2."""
 
 from __future__ import annotations
 

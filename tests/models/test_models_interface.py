@@ -1,4 +1,4 @@
-"""What every model keeps to, and what the interface refuses."""
+"""Properties of every model, and inputs that the interface rejects."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TINY = {"encoder": "test_vit", "image_size": 64, "weights": "random", "hidden": 
 
 
 def tiny(name: str) -> Any:
-    """A model in its smallest setting."""
+    """Build a model in its smallest configuration."""
     return build_model(name, **({} if name == "noisy-simulation" else TINY))
 
 
@@ -134,7 +134,7 @@ def test_published_encoders_have_their_feature_sizes() -> None:
 
 
 class _Foreign(nn.Module):
-    """A model as another package would bring it."""
+    """Model as another package would define it."""
 
     spec = Spec(image_size=8)
 

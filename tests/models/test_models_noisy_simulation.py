@@ -1,4 +1,4 @@
-"""The noisy simulator, with an engine made by hand and with the real one."""
+"""Noisy simulation, with an engine for tests and with the real one."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FRAMES = 120
 
 
 def scene(offset: float = 0.0, name: str = "pair", **more: Any) -> Scene:
-    """A ball that flies past a box, ``offset`` metres beside its middle, 0.5 m beyond it."""
+    """Return a scene with a ball that passes a box at a lateral distance of ``offset`` metres."""
     bodies = (
         Body("ball", "sphere", (0.0, offset, 0.0)),
         Body("box", "cube", (2.0, 0.0, 0.0), mass=3.0),
@@ -38,7 +38,7 @@ def scene(offset: float = 0.0, name: str = "pair", **more: Any) -> Scene:
 
 
 class StraightEngine:
-    """Everything flies on in a straight line; ball and box touch closer than 0.5 m."""
+    """Engine of straight motion, in which ball and box touch when closer than 0.5 m."""
 
     name = "straight 1"
 
@@ -240,7 +240,7 @@ def replace_length(trajectory: Trajectory, frames: int) -> Trajectory:
 
 
 def rolling(offset: float) -> Scene:
-    """A real ball pushed towards a cube two metres away."""
+    """Return a scene with a ball that is pushed towards a cube two metres away."""
     return Scene(
         f"rolling {offset}",
         "collide",
@@ -255,7 +255,7 @@ def rolling(offset: float) -> Scene:
 
 
 def falling(offset: float) -> Scene:
-    """A cube that falls for 0.65 s towards a wide low box, ``offset`` metres beside its middle."""
+    """Return a cube that falls for 0.65 s onto a low box, ``offset`` metres from its centre."""
     return Scene(
         f"falling {offset}",
         "drop",
@@ -268,8 +268,8 @@ def falling(offset: float) -> Scene:
     )
 
 
-def test_with_the_real_engine_hit_and_miss_are_told_apart() -> None:
-    """The cube is still in the air after 0.45 s; no noise of 5 cm/s turns hit into miss."""
+def test_with_the_real_engine_hit_and_miss_differ() -> None:
+    """The cube is still in the air after 0.45 s; noise of 5 cm/s does not change the outcome."""
     real = build_model("noisy-simulation", samples=8, velocity=0.05)
     answers = []
     for offset, hits in ((0.0, True), (3.0, False)):

@@ -1,4 +1,4 @@
-"""Encoder weights: seeded, recorded, and never executed."""
+"""Weights of encoders: seeded, named in the tables, and never executed."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def picture() -> Tensor:
 
 @pytest.fixture(scope="module")
 def trained() -> nn.Module:
-    """An encoder with a classifier, as a training script would save it."""
+    """Save an encoder with a classifier, as a training script would."""
     torch.manual_seed(5)
     model: nn.Module = timm.create_model(NAME, pretrained=False)
     return model.eval()
@@ -82,7 +82,7 @@ def test_another_file_of_the_same_name_is_another_encoder(
 
 
 class _Evil:
-    """Runs a command when it is unpickled."""
+    """Object that runs a command when it is unpickled."""
 
     def __init__(self, target: Path) -> None:
         self.target = target

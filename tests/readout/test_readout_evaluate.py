@@ -1,4 +1,4 @@
-"""The road from movies to predictions."""
+"""Evaluation of models, from movies to the table of predictions."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def accuracy(table: pd.DataFrame, protocol: str) -> float:
 
 
 def test_full_is_far_above_chance_and_observed_is_not(done: Evaluation) -> None:
-    """The dot turns after the observed part: who is right before that has seen the future."""
+    """The dot changes direction after the observed part, which therefore does not predict it."""
     table = done.predictions
     assert accuracy(table, "full") > 0.5 + 3 * np.sqrt(0.25 / 40)
     for protocol in ("observed", "observed+simulated"):

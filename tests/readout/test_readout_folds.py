@@ -1,4 +1,4 @@
-"""Who is trained on, who is fitted on, who is tested: never the same trial."""
+"""Folds: trials that train, fit and test are disjoint."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from physion.training.protocols import Training
 
 
 def index(counts: dict[str, int], scenarios: tuple[str, ...] = ("drop", "roll")) -> pd.DataFrame:
-    """An index with every physics once."""
+    """Return an index in which no physics occurs twice."""
     rows = [
         {
             "trial": f"{scenario}_{split}_{i}",

@@ -1,4 +1,4 @@
-"""The exact readout against scikit-learn, and where there is nothing to fit."""
+"""Exact readout: agreement with scikit-learn, and degenerate cases."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from physion.readout.protocols import Readout, flatten_time
 
 
 def problem(n: int, d: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Noisy answers that two of d features tell; features of many scales and offsets."""
+    """Return features of many scales and offsets, two of which determine noisy labels."""
     rng = np.random.default_rng(seed)
     plain = rng.normal(size=(n, d))
     answers = plain[:, 0] + plain[:, 1] + rng.normal(size=n) > 0

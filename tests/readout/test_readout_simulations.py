@@ -1,4 +1,4 @@
-"""Simulators in the road: fitted on readout trials, stored, and never shown the future."""
+"""Evaluation of simulators: fitted on readout trials, stored, and blind to the future."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ CONFIG = NoisySimulationConfig(
 
 
 class Flight:
-    """The ball flies on along x; it touches the box if it passes within 0.5 m of it."""
+    """Engine in which the ball flies along x and touches the box within 0.5 m of it."""
 
     name = "flight 1"
 
@@ -69,7 +69,7 @@ class Flight:
 
 
 class Shelf:
-    """As much of a `Dataset` as simulators use: an index, and trials with scene and trajectory."""
+    """Minimal `Dataset`: an index, and trials with scene and trajectory."""
 
     def __init__(self, readout: int = 12, testing: int = 10) -> None:
         rng = np.random.default_rng(0)
@@ -77,9 +77,9 @@ class Shelf:
         for split, count in (("readout", readout), ("testing", testing)):
             for i in range(count):
                 name = f"collide_{split}_{i}"
-                beside = float(rng.uniform(0.2, 0.8))
+                lateral = float(rng.uniform(0.2, 0.8))
                 bodies = (
-                    Body("ball", "sphere", (0.0, beside, 0.0)),
+                    Body("ball", "sphere", (0.0, lateral, 0.0)),
                     Body("box", "cube", (1.8, 0.0, 0.0)),
                 )
                 scene = Scene(
@@ -102,7 +102,7 @@ class Shelf:
 
 @pytest.mark.parametrize("column", ["contact", "recorded_contact"])
 def test_the_noise_is_fitted_on_readout_trials_alone(tmp_path: Path, column: str) -> None:
-    """Fitted to the outcome recorded elsewhere, or to our own where there is none."""
+    """The fit uses recorded outcomes, or simulated ones where there is no record."""
     shelf: Any = Shelf()
     shelf.index["recorded_contact"] = pd.array([pd.NA] * len(shelf.index), "boolean")
     (fold,) = plan_folds(shelf.index, Training.ALL, 5, 0)
@@ -137,7 +137,7 @@ def test_the_table_names_the_outcomes_that_were_fitted(
     assert set(table["Fit Labels"]) == {expected}
 
 
-def test_predictions_are_shares_and_say_their_scale(tmp_path: Path) -> None:
+def test_predictions_are_fractions_and_state_their_scale(tmp_path: Path) -> None:
     shelf: Any = Shelf()
     model = NoisySimulation(replace(CONFIG, scales=(1.0,)), Flight())
     evaluation = evaluate_model(shelf, model, tmp_path, config=EvaluationConfig())
@@ -193,7 +193,7 @@ def test_without_readout_trials_the_tested_ones_are_cross_fitted(tmp_path: Path)
 
 
 class Oracle:
-    """A state model of another package: it answers by the contacts that it is shown."""
+    """State model of another package that reports the contacts it receives."""
 
     spec = Spec(modalities=("state",))
 
@@ -221,8 +221,8 @@ def test_other_state_models_are_shown_the_observed_part_alone(tmp_path: Path) ->
 
 
 @pytest.mark.slow
-def test_the_road_on_real_trials(tmp_path: Path) -> None:
-    """Sampled, simulated, rendered; seen by an encoder, and simulated again."""
+def test_evaluation_of_generated_trials(tmp_path: Path) -> None:
+    """Generated trials, evaluated with an encoder and with simulations."""
     from physion.compute.local import LocalExecutor, SerialExecutor
     from physion.trials.dataset import Dataset
     from physion.trials.making.generate import generate

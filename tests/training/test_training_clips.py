@@ -1,4 +1,4 @@
-"""Clips and cached features; above all that nothing hands out a frame of the future."""
+"""Clips and stored features; observed sources cannot reach a later frame."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_no_frame_of_the_future_is_handed_out(dots: Dataset, frame: int) -> None
 
 
 def test_nothing_inside_the_observed_clips_leads_to_the_future(dots: Dataset) -> None:
-    """Everything they hold, however deep, knows the observed movies and not the full ones."""
+    """No object reachable from an observed source refers to the full movies."""
     seen: set[int] = set()
 
     def walk(thing: object) -> None:
@@ -121,7 +121,7 @@ def test_unknown_trials_get_the_closest_ones(dots: Dataset) -> None:
 
 
 class _Counting:
-    """An encoder that counts the clips it sees; its features are mean colours."""
+    """Encoder that counts its clips; the features are mean colours."""
 
     spec = SPEC
 

@@ -1,4 +1,4 @@
-"""The loop: falls, resumes to the bit, stops at NaN; its checkpoints; its protocols."""
+"""Training loop, checkpoints and protocols: the loss falls, resuming is exact, NaN stops."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ def cpu() -> Fabric:
 
 
 def waves(trials: int = 24, time: int = 25, size: int = 6) -> np.ndarray:
-    """Features that move on circles: easy to predict, and never equal to the last ones."""
+    """Return features that move on circles: predictable, but never equal to the last ones."""
     rng = np.random.default_rng(0)
     phase, speed = rng.uniform(0, 6, (trials, 1, size)), rng.uniform(0.3, 0.5, (trials, 1, size))
     return np.sin(phase + speed * np.arange(time)[None, :, None]).astype(np.float32)
 
 
 class Net(nn.Module):
-    """A small network with dropout, so that randomness inside a model is tested as well."""
+    """Small network with dropout, which also tests random operations in a model."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -108,7 +108,7 @@ def test_training_depends_on_its_seed(cpu: Fabric) -> None:
 
 
 def test_the_optimiser_keeps_its_moments(cpu: Fabric, tmp_path: Path) -> None:
-    """Adam made anew at every step, as released, would take steps of one length."""
+    """Adam that is created again at every step, as released, would take steps of equal length."""
     run(cpu, 20, tmp_path)
     from safetensors.torch import load_file
 
@@ -171,7 +171,7 @@ def test_a_pickle_in_place_of_a_checkpoint_is_not_run(cpu: Fabric, tmp_path: Pat
 def test_dynamics_learn_and_beat_standing_still(
     dynamics: str, scale: float, residual: bool, cpu: Fabric
 ) -> None:
-    """Whatever the units of the features, the loss falls and the rollout is better than a copy."""
+    """For any unit of the features, the loss falls and the rollout is better than a copy."""
     model = build_model(
         "frozen-encoder", encoder="test_vit", image_size=32, weights="random", hidden=64,
         dynamics=dynamics, residual=residual,
