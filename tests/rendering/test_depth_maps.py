@@ -20,14 +20,14 @@ WINDOW = 5
 
 
 def depth_map(depth: NDArray[np.float64] | float, occupied: bool = True) -> DepthMap:
-    """A map whose texel coordinates and depth are the world's x, y and z."""
+    """Return a map whose texel coordinates and depth are the world's x, y and z."""
     matrix = np.eye(3, 4)
     texels = np.array(np.broadcast_to(depth, (SIZE, SIZE)), np.float32)
     return DepthMap(matrix, texels, np.full((4, 4), occupied))
 
 
 def half_blocked(column: int, depth: float = 0.0) -> DepthMap:
-    """Something at this depth in all texels left of ``column``."""
+    """Return a map with something at this depth in all texels left of ``column``."""
     return depth_map(np.where(np.arange(SIZE) < column, depth, np.inf))
 
 

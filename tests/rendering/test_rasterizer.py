@@ -50,7 +50,7 @@ def draw(
 
 
 def sample_positions() -> NDArray[np.float64]:
-    """Pixel coordinates (SIZE, SIZE, S, 2) of all samples."""
+    """Return the pixel coordinates (SIZE, SIZE, S, 2) of all samples."""
     x, y = np.meshgrid(np.arange(SIZE) + 0.5, np.arange(SIZE) + 0.5)
     return np.asarray(np.stack([x, y], axis=-1)[:, :, None] + SAMPLES)
 
@@ -127,7 +127,7 @@ def test_the_nearer_triangle_is_seen_whatever_the_order() -> None:
 def geometry(
     faces: ArrayLike, normals: ArrayLike, following: NDArray[np.float64]
 ) -> GeometryBuffers:
-    """The G-buffer of the triangle of this module, two-sided, as object 7."""
+    """Return the G-buffer of the triangle of this module, two-sided, as object 7."""
     triangles, buffer = draw(homogeneous(CORNERS, DEPTHS), faces, two_sided=True)
     out = GeometryBuffers(
         np.full((SIZE, SIZE), np.inf, np.float32),

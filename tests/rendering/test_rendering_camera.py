@@ -1,4 +1,4 @@
-"""Camera matrices against numbers worked out by hand."""
+"""Camera matrices against numbers computed by hand."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ def test_intrinsics() -> None:
     ],
 )
 def test_project(point: tuple[float, ...], pixel: tuple[float, ...], depth: float) -> None:
-    found, at = VIEW.project(point)
-    np.testing.assert_allclose(found, pixel, atol=1e-9)
-    assert at == pytest.approx(depth)
+    result, result_depth = VIEW.project(point)
+    np.testing.assert_allclose(result, pixel, atol=1e-9)
+    assert result_depth == pytest.approx(depth)
     np.testing.assert_allclose(VIEW.unproject(pixel, depth), point, atol=1e-12)
 
 
@@ -58,8 +58,8 @@ def test_projection_matrix_agrees_with_pixels() -> None:
     clip = seen @ projection_matrix(camera, 320, 200).T
     ndc = clip[:, :3] / clip[:, 3:]
     pixels = np.stack([(ndc[:, 0] + 1) * 160, (1 - ndc[:, 1]) * 100], axis=1)
-    found, depth = View(camera, 320, 200).project(points)
-    np.testing.assert_allclose(pixels, found, atol=1e-9)
+    result, depth = View(camera, 320, 200).project(points)
+    np.testing.assert_allclose(pixels, result, atol=1e-9)
     near_far = np.array([[0, 0, 0.2, 1], [0, 0, 30.0, 1]]) @ projection_matrix(camera, 320, 200).T
     np.testing.assert_allclose(near_far[:, 2] / near_far[:, 3], [-1, 1], atol=1e-9)
     np.testing.assert_allclose(clip[:, 3], depth)
@@ -71,6 +71,6 @@ def test_straight_down_has_y_upright() -> None:
     assert pixel[1] < 50.0
 
 
-def test_a_camera_that_looks_at_itself_is_refused() -> None:
+def test_a_camera_at_its_own_target_is_an_error() -> None:
     with pytest.raises(BadInputError, match="same point"):
         axes(Camera((1.0, 1.0, 1.0), (1.0, 1.0, 1.0)))

@@ -1,4 +1,4 @@
-"""Depth, ids, normals and flow against values from geometry, not from the renderer."""
+"""Depth, ids, normals and flow of whole frames against ray casting and known motion."""
 
 from __future__ import annotations
 
@@ -41,18 +41,18 @@ def pixel_centers(width: int, height: int) -> Array:
 
 
 def rays(scene: Scene, size: int = 256) -> tuple[Array, Array]:
-    """Eye (3,) and vectors (H, W, 3) that reach a depth of one metre."""
+    """Return the camera position (3,) and the vectors (H, W, 3) from it to depth 1 m."""
     eye = np.asarray(scene.camera.position)
     view = View(scene.camera, size, size)
     return eye, view.unproject(pixel_centers(size, size), np.ones((size, size))) - eye
 
 
 def inner(mask: NDArray[np.generic]) -> NDArray[np.bool_]:
-    """Pixels whose eight neighbours are of the same kind: all but the border."""
+    """Return which pixels have the same value as their eight neighbours."""
     padded = np.pad(mask, 1, mode="edge")
     height, width = mask.shape
-    around = [padded[i : i + height, j : j + width] == mask for i in range(3) for j in range(3)]
-    return np.all(around, axis=0)
+    neighbours = [padded[i : i + height, j : j + width] == mask for i in range(3) for j in range(3)]
+    return np.all(neighbours, axis=0)
 
 
 def render(scene: Scene, size: int = 256) -> Frame:
@@ -60,7 +60,7 @@ def render(scene: Scene, size: int = 256) -> Frame:
 
 
 def ball_hits(scene: Scene, center: Array, radius: float) -> Array:
-    """Depth of a sphere at each pixel, NaN where the ray misses it."""
+    """Return the depth of a sphere at each pixel, NaN where the ray misses it."""
     eye, ray = rays(scene)
     a = (ray**2).sum(-1)
     b = ray @ (eye - center)
@@ -123,7 +123,7 @@ def test_box_silhouette_and_normals() -> None:
 
 
 def expected_flow(scene: Scene, frame: Frame, moved: Array) -> Array:
-    """Flow (K, 2) of pixels whose surface points move to ``moved`` (H, W, 3)."""
+    """Return the flow (H, W, 2) of pixels whose surface points move to ``moved`` (H, W, 3)."""
     pixels, _ = View(scene.camera, 256, 256).project(moved)
     return pixels - pixel_centers(256, 256)
 
@@ -156,8 +156,8 @@ def test_flow_of_cloth_is_its_motion() -> None:
     sheet = flat_sheet(cloth)
     matrix = np.eye(3) + 0.1 * np.random.default_rng(5).standard_normal((3, 3))
     shift = np.array([0.03, -0.05, 0.04])
-    places = np.repeat([[scene.bodies[0].position]], 2, axis=0)
-    trajectory = trajectory_of(places, None, np.array([sheet, sheet @ matrix.T + shift]))
+    positions = np.repeat([[scene.bodies[0].position]], 2, axis=0)
+    trajectory = trajectory_of(positions, None, np.array([sheet, sheet @ matrix.T + shift]))
     frame = Renderer(scene, trajectory).render(0, EXACT)
     assert frame.ids is not None and frame.flow is not None
     mask = frame.ids == 2
@@ -167,7 +167,7 @@ def test_flow_of_cloth_is_its_motion() -> None:
     np.testing.assert_allclose(frame.flow[mask], expected, atol=2e-3)
 
 
-def test_flow_leads_to_the_same_thing_in_the_next_frame() -> None:
+def test_flow_leads_to_the_same_object_in_the_next_frame() -> None:
     scene, trajectory = tumbling()
     renderer = Renderer(scene, trajectory)
     now, later = renderer.render(0, EXACT), renderer.render(1, EXACT)
@@ -180,7 +180,7 @@ def test_flow_leads_to_the_same_thing_in_the_next_frame() -> None:
     assert (unmoved == now.ids[inside]).mean() < 0.95
 
 
-def test_flow_of_what_rests_and_of_the_last_frame_is_zero() -> None:
+def test_flow_of_resting_objects_and_of_the_last_frame_is_zero() -> None:
     scene, trajectory = tumbling()
     renderer = Renderer(scene, trajectory)
     first, last = renderer.render(0, EXACT), renderer.render(-1, EXACT)
@@ -206,16 +206,16 @@ def test_cloth_is_seen_from_both_sides_and_faces_the_camera(height: float) -> No
 
 
 def test_faces_seen_from_behind_are_culled() -> None:
-    around = body("around", "cube", (2.4, 1.9, 0.8), scale=(1.0, 1.0, 1.0))
-    frame = render(scene_of(around, body("other", at=(0.0, 0.0, 0.0))))
+    enclosing = body("enclosing", "cube", (2.4, 1.9, 0.8), scale=(1.0, 1.0, 1.0))
+    frame = render(scene_of(enclosing, body("other", at=(0.0, 0.0, 0.0))))
     assert frame.ids is not None
     assert not (frame.ids == 1).any()
     assert (frame.ids == 2).any()
 
 
 @pytest.mark.parametrize("name", [n for n in shapes.names() if not n.startswith("test:")])
-def test_every_shape_is_closed_to_the_eye(name: str) -> None:
-    """Culling the back faces of a closed mesh that is wound outwards takes nothing away."""
+def test_every_shape_is_closed(name: str) -> None:
+    """Culling the back faces of a closed mesh that is wound outwards changes no depth."""
     mesh = shape(name).mesh
     view = View(Camera((2.2, 1.4, 1.6), (0.0, 0.0, 0.4)), 128, 128)
     homogeneous = mesh.vertices @ view.to_pixels[:, :3].T + view.to_pixels[:, 3]

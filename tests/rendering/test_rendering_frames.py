@@ -1,4 +1,4 @@
-"""Frames as users get them: repeatable, independent of each other, in sane colours."""
+"""Whole frames: repeatable, independent of each other, with plausible colours."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ def digest(frame: Frame) -> str:
 def test_shapes_and_types_of_the_passes() -> None:
     scene, trajectory = tumbling()
     frame = Renderer(scene, trajectory, 96, 64).render(0, ALL)
-    found = {name: (getattr(frame, name).shape, getattr(frame, name).dtype.name) for name in ALL}
-    assert found == {
+    types = {name: (getattr(frame, name).shape, getattr(frame, name).dtype.name) for name in ALL}
+    assert types == {
         "color": ((64, 96, 3), "uint8"),
         "depth": ((64, 96), "float32"),
         "normals": ((64, 96, 3), "float32"),
@@ -130,7 +130,7 @@ def floor_color(frame: Frame, view: View, point: tuple[float, float, float]) -> 
     return float(frame.color[int(y) - 1 : int(y) + 2, int(x) - 1 : int(x) + 2].mean())
 
 
-def test_things_throw_soft_shadows_and_darken_the_ground_they_stand_on() -> None:
+def test_objects_throw_soft_shadows_and_occlude_the_ground_around_them() -> None:
     camera = Camera((0.0, 3.0, 2.5), (0.0, 0.0, 0.0))
     view = View(camera, 256, 256)
     far = body("far", at=(2.0, -2.0, 0.0), scale=(0.1, 0.1, 0.1))
@@ -146,9 +146,9 @@ def test_things_throw_soft_shadows_and_darken_the_ground_they_stand_on() -> None
     steps = [floor_color(shaded, view, (x + dx, y, 0.0)) for dx in (0.2, 0.4, 0.6)]
     assert steps[0] < steps[1] < steps[2]
     low = scene_of(far, body("box", at=(0.0, 0.0, 0.0), scale=(0.4, 0.4, 0.4)), camera=camera)
-    beside = Renderer(low, resting(low)).render(0)
+    occluded = Renderer(low, resting(low)).render(0)
     spot = (0.27, 0.0, 0.0)  # towards the light, where no shadow falls
-    assert floor_color(beside, view, spot) < 0.98 * floor_color(plain, view, spot)
+    assert floor_color(occluded, view, spot) < 0.98 * floor_color(plain, view, spot)
 
 
 def test_color_is_anti_aliased() -> None:
@@ -179,7 +179,7 @@ def test_textures_keep_their_mean_over_the_levels_and_their_bytes() -> None:
     np.testing.assert_array_equal(build_atlas(names).texels, atlas.texels)
 
 
-def test_role_map_points_out_agent_and_patient() -> None:
+def test_role_map_shows_agent_and_patient() -> None:
     scene, trajectory = tumbling()
     ids = Renderer(scene, trajectory, 128, 128).render(0, ("ids",)).ids
     assert ids is not None
@@ -190,7 +190,7 @@ def test_role_map_points_out_agent_and_patient() -> None:
     assert set(colors[(ids != 1) & (ids != 4)][:, 3]) == {0}
 
 
-def test_bad_requests_say_what_is_wrong() -> None:
+def test_errors_name_what_is_wrong() -> None:
     scene, trajectory = tumbling()
     renderer = Renderer(scene, trajectory, 32, 32)
     with pytest.raises(UnknownNameError, match="closest: color"):

@@ -1,4 +1,4 @@
-"""Scenes of the original study: everything in them can be drawn."""
+"""Scenes of the original study can be rendered."""
 
 from __future__ import annotations
 

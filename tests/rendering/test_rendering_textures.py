@@ -1,4 +1,4 @@
-"""Textures: seamless, in range, told apart, alike at every size, and painted parts of props."""
+"""Textures: seamless, in range, distinguishable, the same at every size; parts of props."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NEAR = Camera((1.3, 1.0, 0.9), (0.0, 0.0, 0.35))
 
 
 def level(name: str, index: int) -> np.ndarray:
-    """Linear albedo (side, side, 3) of one level of a texture."""
+    """Return the linear albedo (side, side, 3) of one level of a texture."""
     atlas = build_atlas((name,))
     start, side = atlas.starts[0, index], SIZE >> index
     texels = atlas.texels[start : start + side * side, :3]
@@ -44,7 +44,7 @@ def test_texture_is_in_range_and_keeps_its_mean(name: str) -> None:
 @pytest.mark.parametrize("name", sorted(PAINTERS))
 @pytest.mark.parametrize("axis", [0, 1])
 def test_texture_repeats_without_a_seam(name: str, axis: int) -> None:
-    """Over the edge it changes no more than where it changes most inside."""
+    """The step across the edge is no larger than the largest step inside."""
     image = level(name, 1)
     steps = np.abs(np.diff(image, axis=axis)).mean(axis=(1 - axis, 2))
     over = np.abs(image.take(0, axis) - image.take(-1, axis)).mean()
@@ -58,13 +58,13 @@ def test_every_look_has_a_finish(name: str) -> None:
     assert 0 <= kind.reflectance < 1 and 0 <= kind.metalness <= 1 and kind.specular >= 0
 
 
-def test_materials_differ_in_texture_or_in_shine() -> None:
+def test_materials_differ_in_texture_or_in_finish() -> None:
     finishes = [FINISHES[name] for names in MATERIALS.values() for name in names]
     assert len(set(finishes)) == len(finishes)
 
 
 def picture(texture: str, size: int) -> np.ndarray:
-    """A ball and a cube of a grey of this texture, linear in 0..1."""
+    """Render a ball and a cube with this texture in grey; sRGB in 0..1."""
     look = Look((0.7, 0.7, 0.7), texture)
     scene = scene_of(
         body("cube", "cube", (0.3, -0.2, 0.0), scale=(0.5, 0.5, 0.5), look=look, kinematic=True),
@@ -76,7 +76,7 @@ def picture(texture: str, size: int) -> np.ndarray:
     return frame.color.astype(float) / 255.0
 
 
-def test_materials_are_told_apart_in_a_small_picture() -> None:
+def test_materials_can_be_distinguished_in_a_small_picture() -> None:
     names = [name for names in MATERIALS.values() for name in names]
     shots = {name: picture(name, 128) for name in names}
     for a, b in itertools.combinations(names, 2):
@@ -85,7 +85,7 @@ def test_materials_are_told_apart_in_a_small_picture() -> None:
 
 @pytest.mark.parametrize("name", ["wood_oak", "fabric_denim", "fabric_linen", "stone_granite"])
 def test_small_pictures_are_large_ones_seen_from_afar(name: str) -> None:
-    """Without aliasing a picture is the mean of one of four times its pixels."""
+    """Without aliasing, a picture is the mean of 2 x 2 pixels of one of twice the size."""
     small, large = picture(name, 64), picture(name, 128)
     mean = large.reshape(64, 2, 64, 2, 3).mean((1, 3))
     inside = slice(4, -4)

@@ -56,7 +56,7 @@ BYTES = 60.0
 
 
 def along(angle: float) -> tuple[float, float, float]:
-    """Unit vector that is tilted from +z towards +y by an angle in radians."""
+    """Return the unit vector that is tilted from +z towards +y by an angle in radians."""
     return (0.0, math.sin(angle), math.cos(angle))
 
 
@@ -79,7 +79,7 @@ def material_of(**fields: object) -> NDArray[np.void]:
 def plane(
     angle: float, light: NDArray[np.void], material: NDArray[np.void]
 ) -> tuple[ShadingInputs, NDArray[np.int32]]:
-    """A large plane through the origin, tilted by ``angle``, seen from straight above.
+    """Return a large plane through the origin, tilted by ``angle``, seen from straight above.
 
     Its texture coordinates are metres.
     """
@@ -112,7 +112,7 @@ def plane(
 
 
 def shaded(angle: float, light: NDArray[np.void] | None = None, **material: object) -> np.void:
-    """The `POINT` in the middle of the picture of a plane, which is the origin."""
+    """Return the `POINT` in the middle of the picture of a plane, which is the origin."""
     light = light_from() if light is None else light
     inputs, ids = plane(angle, light, material_of(**material))
     points = np.zeros(SIZE * SIZE + 1, POINT)
@@ -232,7 +232,7 @@ def test_only_level_surfaces_are_occluded_by_things_near_them(degrees: int) -> N
 
 
 def flat_map(depth: float) -> DepthMap:
-    """A map of the ground around the origin, 0.25 m a texel, seen from above."""
+    """Return a map of the ground around the origin, 0.25 m a texel, seen from above."""
     size = 8 * BLOCK
     matrix = np.array([[4.0, 0, 0, size / 2], [0, 4.0, 0, size / 2], [0, 0, -1.0, 0]])
     return DepthMap(matrix, np.full((size, size), depth, np.float32), np.ones((8, 8), bool))
