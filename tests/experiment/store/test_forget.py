@@ -206,7 +206,7 @@ def test_the_verb_forget(database: str, tmp_path: Path, capsys: pytest.CaptureFi
     study = str(tmp_path)
     assert main(["experiment", "forget", study]) == 2
     assert main(["experiment", "forget", study, "--all", "--participant", "0" * 32]) == 2
-    assert capsys.readouterr().err.count("say whose ids") == 2
+    assert capsys.readouterr().err.count("give the ids to delete") == 2
     assert main(["experiment", "forget", study, "--all", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {"forgotten": 60}
     assert main(["experiment", "forget", str(tmp_path / "none"), "--all"]) == 2

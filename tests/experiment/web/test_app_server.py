@@ -271,4 +271,4 @@ def test_the_warning_is_printed(
     study: Study, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     assert main(["experiment", "serve", str(tmp_path / "nothing"), "--host", "0.0.0.0"]) == 2
-    assert "travel unencrypted" in capsys.readouterr().err
+    assert "sent unencrypted" in capsys.readouterr().err

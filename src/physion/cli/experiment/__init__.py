@@ -1,1 +1,1 @@
-"""The verb ``experiment`` and its parts."""
+"""The verb ``experiment`` and its sub-verbs."""

@@ -1,20 +1,20 @@
-"""Run the experiment with people: make a study, serve it, export what they answered.
+"""Run the experiment with people: create a study, serve it, export the answers.
 
-`physion experiment init DIR --trials DATASET`: a study folder from our trials, or --stimuli LISTS.
+`physion experiment init DIR --trials DATASET`: create a study folder (or from --stimuli LISTS).
 
-`physion experiment serve DIR`: the web server, for people and the experimenter.
+`physion experiment serve DIR`: run the web server for participants and the experimenter.
 
-`physion experiment links DIR`: addresses for Prolific, SONA, MTurk, previews and pilots.
+`physion experiment links DIR`: print links for Prolific, SONA, MTurk, previews and piloting.
 
-`physion experiment simulate DIR`: simulated participants for piloting, marked as such for good.
+`physion experiment simulate DIR`: run simulated participants, permanently marked as such.
 
-`physion experiment export DIR`: the answers as the analysis reads them, with a data dictionary.
+`physion experiment export DIR`: export the answers for the analysis, with a data dictionary.
 
-`physion experiment password DIR`: a new password for the experimenter's pages.
+`physion experiment password DIR`: set a new password for the experimenter's pages.
 
-`physion experiment forget DIR`: delete the ids that recruiters gave, or all of a session.
+`physion experiment forget DIR`: delete recruiters' ids, or all data of a session.
 
-Each says more with --help.
+For details, use --help after any of these.
 """
 
 from __future__ import annotations
@@ -36,30 +36,30 @@ SUBVERBS = {
     "password": "physion.cli.experiment.password",
     "forget": "physion.cli.experiment.forget",
 }
-"""Words after ``physion experiment``, and the module of each."""
+"""Sub-verbs of ``physion experiment``, and the module of each."""
 NEEDED = ("fastapi", "uvicorn", "sqlalchemy", "alembic", "argon2", "jinja2", "pydantic")
-"""Modules of the extra ``experiment``."""
+"""Modules that the extra ``experiment`` installs."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """The experiment itself does nothing: say what to do."""
+    """Options of ``physion experiment`` without a sub-verb."""
 
     words: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     """One of init, serve, links, simulate, export, password, forget."""
 
 
 def main(options: Options) -> int:
-    """Say which words there are; 2, since nothing was done."""
+    """Print the sub-verbs; return exit status 2, since nothing was done."""
     from physion.cli.output import console
 
     if options.words:
-        raise UnknownNameError("word after 'physion experiment'", options.words[0], SUBVERBS)
+        raise UnknownNameError("sub-verb of 'physion experiment'", options.words[0], SUBVERBS)
     console.print((__doc__ or "").strip(), markup=False, soft_wrap=True)
     return 2
 
 
 def require_extra() -> None:
-    """`MissingExtraError` unless everything is installed that the experiment needs."""
+    """Raise `MissingExtraError` unless the extra ``experiment`` is installed."""
     if any(find_spec(name) is None for name in NEEDED):
         raise MissingExtraError("the experiment", "experiment")

@@ -1,6 +1,6 @@
-"""Write a study's data into a folder: CSV and parquet for the analysis, Psych-DS and BIDS.
+"""Export the data of a study: CSV and parquet for the analysis, Psych-DS and BIDS.
 
-A server may run meanwhile; the export is the data of one moment.
+The server may be running; the export is a consistent snapshot.
 """
 
 from __future__ import annotations
@@ -15,26 +15,26 @@ import tyro
 
 @dataclass(frozen=True)
 class Options:
-    """What to export, and where to."""
+    """Options of ``physion experiment export``."""
 
     study: Annotated[Path, tyro.conf.Positional]
     """Folder of the study."""
     out: Path | None = None
-    """Folder to write; an export that is there is replaced. STUDY/export if not given."""
+    """Folder to write; an existing export is replaced. Default: STUDY/export."""
     database: str | None = None
-    """URL of a PostgreSQL database; responses.sqlite in the folder if not given."""
+    """URL of a PostgreSQL database. Default: responses.sqlite in the study folder."""
     scenario: str | None = None
-    """Only this scenario."""
+    """Export only this scenario."""
     simulated: bool = True
-    """With simulated participants, who are marked as such."""
+    """Include simulated participants, marked as such."""
     layout: Literal["both", "psych-ds", "bids"] = "both"
-    """Which conventions to follow besides the tables."""
+    """Conventions to write besides the tables."""
     json: bool = False
     """Print the counts as one JSON object."""
 
 
 def main(options: Options) -> int:
-    """Export, and say how many sessions there are and what was left out."""
+    """Export; print the number of sessions and what was left out."""
     from physion.cli.experiment.experiment import require_extra
 
     require_extra()

@@ -1,7 +1,8 @@
-"""Delete the ids that recruiters gave, of some participants or of all; answers stay.
+"""Delete the recruiters' ids of some or all participants, or all data of a session.
 
-With --session all of a session goes, answers too; the row stays, as of somebody who withdrew.
-Stop the server first. What is gone cannot be brought back: pay the participants before.
+With --participant or --all only ids are deleted; answers are kept. With --session all data of a
+session are deleted; its row is kept, as of a participant who withdrew. Stop the server first.
+Deletion cannot be undone, so pay the participants before.
 """
 
 from __future__ import annotations
@@ -16,30 +17,30 @@ import tyro
 
 @dataclass(frozen=True)
 class Options:
-    """Whose ids, or which sessions."""
+    """Options of ``physion experiment forget``."""
 
     study: Annotated[Path, tyro.conf.Positional]
     """Folder of the study."""
     participant: tuple[str, ...] = ()
-    """Participants, as an export names them (32 digits)."""
+    """Delete the ids of these participants, given as in the export (32 digits)."""
     all: bool = False
-    """The ids of all participants."""
+    """Delete the ids of all participants."""
     session: tuple[str, ...] = ()
-    """References (as K7QF-29XM) of sessions of which all is deleted."""
+    """Delete all data of the sessions with these references (such as K7QF-29XM)."""
     database: str | None = None
-    """URL of a PostgreSQL database; responses.sqlite in the folder if not given."""
+    """URL of a PostgreSQL database. Default: responses.sqlite in the study folder."""
     json: bool = False
     """Print one JSON object."""
 
 
 def main(options: Options) -> int:
-    """Delete, and say how many ids or sessions there were."""
+    """Delete; print the number of ids or sessions."""
     from physion.cli.experiment.experiment import require_extra
     from physion.errors import BadInputError
 
     if [bool(options.participant), options.all, bool(options.session)].count(True) != 1:
         raise BadInputError(
-            "say whose ids: --participant HASH, or --all; or which session: --session REFERENCE"
+            "give the ids to delete, --participant HASH or --all, or a session, --session REFERENCE"
         )
     require_extra()
     from physion.experiment.store.database import sqlite_url

@@ -1,7 +1,7 @@
-"""Make a study folder: from trials of ours, or from official lists of stimuli and their movies.
+"""Create a study folder from a generated dataset, or from official stimulus lists and movies.
 
-Movies are cut to their observed frames; words, settings and stimuli are files to read and edit.
-A command that was stopped goes on where it stopped. The experimenter's password is shown once.
+Movies are cut to their observed frames. Texts, settings and stimuli are files that can be edited.
+An interrupted command can be repeated and continues. The experimenter's password is shown once.
 """
 
 from __future__ import annotations
@@ -24,50 +24,50 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Options:
-    """Which stimuli, and what the study is called. All else is in study.toml."""
+    """Options of ``physion experiment init``; all other settings are in study.toml."""
 
     folder: Annotated[Path, tyro.conf.Positional]
     """Folder of the study; new or empty."""
     trials: Path | None = None
-    """Dataset whose testing and familiarization trials people see."""
+    """Dataset from which testing and familiarization trials are drawn."""
     stimuli: tuple[Path, ...] = ()
-    """In place of --trials: official lists of stimuli (JSON or CSV), one a scenario."""
+    """Instead of --trials: official stimulus lists (JSON or CSV), one per scenario."""
     familiarization: tuple[Path, ...] = ()
-    """Lists of the same form with the stimuli to practise on, in their order, one a scenario."""
+    """Lists of the familiarization stimuli in the same format, in their order, one per scenario."""
     familiarization_trials: Path | None = None
-    """In place of --familiarization: dataset whose familiarization trials are taken."""
+    """Instead of --familiarization: dataset from which familiarization trials are drawn."""
     movies: Path | None = None
-    """Folder with the movies of the lists, STIM_ID.mp4, all frames; they are cut."""
+    """Folder with the movies of the lists, STIM_ID.mp4, with all frames; they will be cut."""
     maps: Path | None = None
-    """Folder with the maps of the lists, looked for beside the movies if not given."""
+    """Folder with the maps of the lists. Default: searched for next to the movies."""
     scenario: tuple[str, ...] = ()
-    """Scenarios of --trials; all that have testing trials if not given."""
+    """Scenarios of --trials. Default: all that have testing trials."""
     test: int | None = None
-    """Test trials of a session, half with contact; 150, or whole lists, if not given."""
+    """Test trials per session, half with contact. Default: 150, or the whole lists."""
     practice: int = 10
-    """Familiarization trials that are taken from a dataset, half with contact."""
+    """Familiarization trials drawn from a dataset, half with contact."""
     look: Literal["free", "redyellow"] = "free"
-    """Colours of trials from a dataset; people saw free ones."""
+    """Colours of trials from a dataset; free in the official study."""
     name: str | None = None
-    """Short name of the study; that of the folder if not given."""
+    """Short name of the study. Default: the name of the folder."""
     title: str = "Predict what happens"
-    """What participants see above everything."""
+    """Title at the top of the participants' pages."""
     contact: str = NO_CONTACT
-    """Whom participants can ask."""
+    """Contact for participants: name and e-mail address."""
     participants: int = 100
     """Complete sessions wanted for each scenario."""
     languages: tuple[str, ...] = ("en", "de")
     """Languages whose texts are copied into the study."""
     seed: int = 0
-    """Decides which trials are drawn, and all orders."""
+    """Seed of the draw of trials and of all trial orders."""
     password_file: Path | None = None
-    """File with the experimenter's password; one is made and shown if not given."""
+    """File with the experimenter's password. Default: a random one is created and shown."""
     json: bool = False
     """Print one JSON object."""
 
 
 def main(options: Options) -> int:
-    """Make the study; print its password once, and what to do next."""
+    """Create the study; print its password once, and the next steps."""
     from physion.cli.experiment.experiment import require_extra
 
     require_extra()
@@ -81,6 +81,7 @@ def main(options: Options) -> int:
 
 
 def _choose(options: Options) -> StimulusSelection:
+    """Select the stimuli from the dataset or the lists."""
     from physion.experiment.study.init_trials import TEST, choose_trials
 
     if (options.trials is None) == (not options.stimuli):
@@ -108,10 +109,10 @@ def _choose_listed(options: Options) -> StimulusSelection:
     if options.movies is None:
         raise BadInputError("--stimuli needs --movies DIR, the folder with STIM_ID.mp4")
     if options.scenario:
-        raise BadInputError("--scenario goes with --trials; a list is of one scenario")
+        raise BadInputError("--scenario goes with --trials; each list is of one scenario")
     if bool(options.familiarization) == (options.familiarization_trials is not None):
         raise BadInputError(
-            "give the stimuli to practise on: --familiarization LISTS of the same form, or "
+            "give the familiarization stimuli: --familiarization LISTS in the same format, or "
             "--familiarization-trials DATASET (physion generate DATASET --split familiarization)"
         )
     listed = choose_listed(
@@ -150,7 +151,7 @@ def _study(options: Options, scenarios: tuple[str, ...]) -> Study:
 
 
 def _password(path: Path | None) -> str:
-    """The password in a file, its first line; else a new one of 96 random bits."""
+    """Return the first line of the password file, or a random password (96 bits)."""
     from physion.experiment.study.identity import MAX_PASSWORD, MIN_PASSWORD
     from physion.experiment.study.plain_files import read_plain
 
@@ -188,7 +189,7 @@ def _print(options: Options, study: Study, chosen: StimulusSelection, password: 
     lines = [f"study: {study.folder}"]
     if password is not None:
         lines.append(f"password of the experimenter's pages, shown only now: {password}")
-    lines.append("next: set title and contact in study.toml, read texts/ (the consent!), and then")
+    lines.append("next: set title and contact in study.toml, edit texts/ (the consent!), then run")
     lines.append(f"  physion experiment serve {study.folder}")
     for line in lines:
         console.print(line, markup=False, soft_wrap=True)

@@ -1,4 +1,4 @@
-"""The addresses of a study to hand out, by recruiter and scenario; to look at it; to pilot it."""
+"""Print the entry links of a study by scenario: for recruiters, previews and piloting."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import tyro
 
 @dataclass(frozen=True)
 class Options:
-    """Whose links."""
+    """Options of ``physion experiment links``."""
 
     study: Annotated[Path, tyro.conf.Positional]
     """Folder of the study."""
     base_url: str = "http://127.0.0.1:8000"
-    """Address by which people reach the server."""
+    """Public root URL of the server."""
     json: bool = False
     """Print one JSON object."""
 

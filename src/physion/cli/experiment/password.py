@@ -1,6 +1,6 @@
-"""Give the experimenter's pages a new password, asked for at the terminal or read from a file.
+"""Set a new password of the experimenter's pages, typed at the terminal or read from a file.
 
-A server that runs takes it at once: whoever is logged in has to give the new one.
+A running server uses it at once; all logins end.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ MAX_BYTES = 10_000
 
 @dataclass(frozen=True)
 class Options:
-    """Of which study."""
+    """Options of ``physion experiment password``."""
 
     study: Annotated[Path, tyro.conf.Positional]
     """Folder of the study."""
     password_file: Path | None = None
-    """Its first line is the password; asked for if not given. (Other people on a machine can see
-    the words of a command, so that the password is none of them.)"""
+    """File with the password in its first line. Default: ask at the terminal. (There is no option
+    for the password itself, since other users of the machine can see command lines.)"""
     json: bool = False
     """Print one JSON object."""
 
@@ -36,17 +36,17 @@ def main(options: Options) -> int:
     require_extra()
     from physion.experiment.study.identity import Secrets, set_password
 
-    Secrets.load(options.study)  # what is wrong with the folder comes before the question
+    Secrets.load(options.study)  # report errors of the folder before asking
     set_password(options.study, read_password(options.password_file))
     if options.json:
         print(json_module.dumps({"password": "set"}))
     else:
-        print("the new password holds from now on; whoever was logged in has to give it")
+        print("the new password is set; all logins have ended")
     return 0
 
 
 def read_password(path: Path | None) -> str:
-    """The first line of a file, or what is typed twice at the terminal."""
+    """Return the first line of a file, or a password typed twice at the terminal."""
     from getpass import getpass
 
     from physion.errors import BadInputError
@@ -54,15 +54,15 @@ def read_password(path: Path | None) -> str:
     if path is not None:
         return password_in(path)
     if not sys.stdin.isatty():
-        raise BadInputError("there is no terminal to ask at: give --password-file FILE")
+        raise BadInputError("there is no terminal to type the password: give --password-file FILE")
     password = getpass("new password: ")
-    if password != getpass("once more: "):
+    if password != getpass("repeat: "):
         raise BadInputError("the two passwords differ; nothing was changed")
     return password
 
 
 def password_in(path: Path) -> str:
-    """The first line of a file, without blanks around it."""
+    """Return the first line of a file without surrounding spaces."""
     from physion.errors import BadInputError
     from physion.experiment.study.plain_files import read_plain
 

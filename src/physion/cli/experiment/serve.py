@@ -1,6 +1,6 @@
-"""Serve a study to participants, and the experimenter's pages, until it is stopped.
+"""Run the web server of a study, for participants and the experimenter, until it is stopped.
 
-SIGTERM and Ctrl+C end it after the requests in work; every acknowledged answer is on the disk.
+SIGTERM and Ctrl+C stop it after the current requests. Every acknowledged answer is on disk.
 """
 
 from __future__ import annotations
@@ -16,32 +16,32 @@ import tyro
 
 @dataclass(frozen=True)
 class Options:
-    """What to serve, and where."""
+    """Options of ``physion experiment serve``."""
 
     study: Annotated[Path, tyro.conf.Positional]
     """Folder of the study."""
     host: str = "127.0.0.1"
-    """Address to listen on; 0.0.0.0 for all."""
+    """IP address to listen on; 0.0.0.0 for all."""
     port: int = 8000
-    """Port to listen on; 0 takes a free one."""
+    """Port to listen on; 0 for any free port."""
     database: str | None = None
-    """URL of a PostgreSQL database; responses.sqlite in the folder if not given."""
+    """URL of a PostgreSQL database. Default: responses.sqlite in the study folder."""
     base_url: str = ""
-    """Address by which people reach the server, where it differs (behind a proxy)."""
+    """Public root URL of the server, if it differs (behind a proxy)."""
     behind_proxy: tuple[str, ...] = ()
-    """Addresses or networks of proxies, whose X-Forwarded-For and -Proto are believed."""
+    """Addresses or networks of proxies whose X-Forwarded-For and -Proto headers are trusted."""
     https_cert: Path | None = None
     """Certificate chain (PEM), to serve https without a proxy."""
     https_key: Path | None = None
-    """Its private key (PEM)."""
+    """Private key of the certificate (PEM)."""
     log_requests: bool = False
-    """Write a line for each request to standard error: method, path and status, no ids."""
+    """Log method, path and status of each request to standard error, without ids."""
     json: bool = False
-    """Say where it serves as one JSON object."""
+    """Print the URLs as one JSON object."""
 
 
 def main(options: Options) -> int:
-    """Serve; 0 after a stop that was asked for."""
+    """Serve until stopped; return exit status 0."""
     from physion.cli.experiment.experiment import require_extra
 
     require_extra()
@@ -61,8 +61,8 @@ def main(options: Options) -> int:
 
     if address.is_readable_on_the_way():
         warn(
-            "warning: answers and ids travel unencrypted; give --https-cert and --https-key, or "
-            "put a proxy with https in front and name it by --behind-proxy"
+            "warning: answers and ids are sent unencrypted; give --https-cert and --https-key, or "
+            "use a proxy with https and name it by --behind-proxy"
         )
 
     def say(url: str) -> None:

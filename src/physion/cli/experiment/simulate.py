@@ -1,10 +1,10 @@
-"""Send simulated participants through a study, by HTTP as a browser does: a pilot of the server.
+"""Run simulated participants through a study over HTTP, as a browser does, to test the server.
 
-Their sessions are marked as simulated for good and never counted with people. They are right with a
-probability that depends on person and stimulus; for that they read the outcomes in the study
-folder, which the server never sends. The same --seed sends the same people: who finished before
-stays as is, who left comes back (to the end with --dropouts 0). Exit code 1 where a participant did
-not get through.
+Their sessions are permanently marked as simulated and never counted with people. They answer
+correctly with a probability that depends on person and stimulus; for this they read the outcomes in
+the study folder, which the server never sends. The same --seed gives the same participants: those
+who have finished are left as they are, those who dropped out continue (to the end with --dropouts
+0). The exit status is 1 if any participant was refused or failed.
 """
 
 from __future__ import annotations
@@ -27,32 +27,32 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Options:
-    """Who goes through which study."""
+    """Options of ``physion experiment simulate``."""
 
     study: Annotated[Path, tyro.conf.Positional]
-    """Study folder, the one that is served."""
+    """Folder of the study."""
     participants: int = 20
-    """So many, spread over the scenarios in turn."""
+    """Number of participants, distributed over the scenarios in turn."""
     scenario: str | None = None
-    """One scenario; all of the study if not given."""
+    """Only this scenario. Default: all scenarios of the study."""
     url: str | None = None
-    """A running server, such as http://127.0.0.1:8000; if not given, one is started and stopped."""
+    """URL of a running server, such as http://127.0.0.1:8000. Default: start one and stop it."""
     database: str | None = None
     """URL of a PostgreSQL database for the server that is started."""
     pace: float = 0.0
     """Seconds before each answer; people take about 6."""
     seed: int = 0
-    """Other seeds send other people."""
+    """Seed of the participants."""
     dropouts: float = 0.1
-    """Share of people who close the page before a random test trial."""
+    """Fraction of participants who close the page before a random test trial."""
     at_once: int = 50
-    """Most people at the same time."""
+    """Maximum number of simultaneous participants."""
     json: bool = False
     """Print one JSON object."""
 
 
 def main(options: Options) -> int:
-    """Simulate; 1 if someone was refused or got no answer."""
+    """Simulate; return exit status 1 if any participant was refused or failed."""
     from physion.cli.experiment.experiment import require_extra
 
     require_extra()
@@ -79,7 +79,7 @@ def main(options: Options) -> int:
 
 
 def summary(study: Study, plan: SimulationPlan, visits: list[Visit]) -> dict[str, Any]:
-    """What is printed: outcomes, answers, repeated requests, accuracy, reasons of failures."""
+    """Return counts of outcomes, answers and repeated requests, mean accuracy, failure reasons."""
     right = [visit.result.accuracy for visit in visits if visit.result is not None]
     return {
         "study": study.name,
@@ -108,6 +108,7 @@ def _check(options: Options) -> None:
 
 @contextmanager
 def _server(options: Options) -> Iterator[str]:
+    """Yield the URL of the given server, or of one that is started for the duration."""
     if options.url is not None:
         yield options.url.rstrip("/")
         return
@@ -119,6 +120,7 @@ def _server(options: Options) -> Iterator[str]:
 
 @contextmanager
 def _progress(options: Options) -> Iterator[Any]:
+    """Display a progress bar; yield the function to call after each participant."""
     from physion.cli.output import Stages
 
     with Stages() as stages:
@@ -140,8 +142,9 @@ def _print(found: dict[str, Any], json: bool) -> None:
         print(json_module.dumps(found))
         return
     outcomes = ("done", "done_before", "left", "refused", "failed")
-    words = [f"{found[name]} {name.replace('_', ' ')}" for name in outcomes if name in found]
-    line = f"{', '.join(words)}; {found['answers']} answers, {found['asked_again']} asked again"
+    counts = [f"{found[name]} {name.replace('_', ' ')}" for name in outcomes if name in found]
+    repeated = f"{found['asked_again']} requests repeated"
+    line = f"{', '.join(counts)}; {found['answers']} answers, {repeated}"
     if found["mean_accuracy"] is not None:
         line += f", mean accuracy {found['mean_accuracy']:.3f}"
     console.print(line, markup=False, soft_wrap=True)
