@@ -19,7 +19,7 @@ from physion.report.viewer.passes import (
     paint_normals,
     ranges_of,
 )
-from physion.scenes.looks import RED, YELLOW, mistakable
+from physion.scenes.looks import RED, YELLOW, is_mistakable
 from support.viewer_dataset import PLANS, make_scene
 
 
@@ -41,7 +41,7 @@ def test_ids_show_the_roles_and_nothing_else_in_red_and_yellow() -> None:
     assert picture[0].tolist() == [list(c) for c in (ROOM, AGENT, PATIENT, OTHERS[2])]
     for color in (ROOM, *OTHERS):
         share = tuple(channel / 255 for channel in color)
-        assert not mistakable(share, RED) and not mistakable(share, YELLOW)
+        assert not is_mistakable(share, RED) and not is_mistakable(share, YELLOW)
     assert len(set(OTHERS)) == len(OTHERS)
 
 

@@ -1,4 +1,4 @@
-"""Scenes hold their own rules and survive JSON without loss."""
+"""Scenes check their consistency and are written to JSON and read back without loss."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def small_scene() -> Scene:
 
 
 @given(points, st.tuples(sizes, sizes, sizes), sizes, st.text(max_size=8), st.integers(0, 500))
-def test_json_loses_nothing(
+def test_json_round_trip_is_exact(
     point: tuple[float, float, float],
     size: tuple[float, float, float],
     mass: float,

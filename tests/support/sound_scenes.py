@@ -11,7 +11,7 @@ from scipy.optimize import linprog
 
 from physion.numerics.rotations import rotate_vectors
 from physion.scenes.looks import TEXTURES
-from physion.scenes.sampling.placement import on_screen, world_bounds
+from physion.scenes.sampling.placement import project_to_image, world_bounds
 from physion.scenes.scene import Body, Cloth, Scene
 from physion.scenes.shapes.primitives import shape
 
@@ -95,4 +95,4 @@ def assert_seen(scene: Scene) -> None:
     """The middles of agent and patient are in the picture."""
     for name in (scene.roles.agent, scene.roles.patient):
         center = bounds(thing(scene, name)).mean(axis=0)
-        assert max(map(abs, on_screen(scene.camera, center))) < 1, name
+        assert max(map(abs, project_to_image(scene.camera, center))) < 1, name

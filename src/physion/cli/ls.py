@@ -15,7 +15,7 @@ from physion.errors import BadInputError
 from physion.models.interface import models
 from physion.physics.engine import engines
 from physion.scenes.looks import MATERIALS
-from physion.scenes.sampling.parameters import drawn_limits
+from physion.scenes.sampling.parameters import describe_limits
 from physion.scenes.sampling.preset import Preset, get_preset, load_presets
 from physion.scenes.sampling.registry import as_record, scenarios
 from physion.scenes.shapes.primitives import shapes
@@ -102,7 +102,7 @@ def _print_preset(preset: Preset, as_json: bool) -> int:
     if as_json:
         print(json_module.dumps(_facts(preset)))
         return 0
-    limits = drawn_limits(preset.params)
+    limits = describe_limits(preset.params)
     for key, value in _flat(as_record(preset.params)).items():
         line = f"{key} = {json_module.dumps(value)}   # {limits.get(key, '')}"
         console.print(line, markup=False, soft_wrap=True)

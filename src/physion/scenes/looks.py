@@ -103,18 +103,18 @@ def pick_material(rng: np.random.Generator, names: Sequence[str]) -> str:
     return choice[int(rng.integers(len(choice)))]
 
 
-def too_near(color: Vec3, other: Vec3, margin: float = MARGIN) -> bool:
+def colors_are_similar(color: Vec3, other: Vec3, margin: float = MARGIN) -> bool:
     """Return whether no channel of two colours differs by more than ``margin``."""
     return all(abs(a - b) <= margin for a, b in zip(color, other, strict=True))
 
 
-def mistakable(color: Vec3, role: Vec3) -> bool:
+def is_mistakable(color: Vec3, role: Vec3) -> bool:
     """Return whether people may take ``color`` for the colour of a role (red or yellow)."""
     hue, saturation, value = colorsys.rgb_to_hsv(*color)
     low, high = ROLE_HUES[role]
     same_hue = low <= hue <= high or low <= hue - 1 <= high
     strong = saturation >= STRONG_SATURATION and value >= STRONG_VALUE
-    return too_near(color, role, ROLE_MARGIN) or (same_hue and strong)
+    return colors_are_similar(color, role, ROLE_MARGIN) or (same_hue and strong)
 
 
 def random_color(
@@ -126,7 +126,7 @@ def random_color(
     """
     while True:
         red, green, blue = (float(channel) for channel in rng.random(3))
-        if not any(too_near((red, green, blue), other, margin) for other in avoid):
+        if not any(colors_are_similar((red, green, blue), other, margin) for other in avoid):
             return red, green, blue
 
 
@@ -152,11 +152,11 @@ def with_role_colors(scene: Scene) -> Scene:
         if thing.name == scene.roles.patient:
             return YELLOW
         color = thing.look.color
-        while any(mistakable(color, role) for role in (RED, YELLOW)):
+        while any(is_mistakable(color, role) for role in (RED, YELLOW)):
             color = random_color(rng)
         return color
 
-    bodies = tuple(_colored(body, color_of(body)) for body in scene.bodies)
+    bodies = tuple(_set_color(body, color_of(body)) for body in scene.bodies)
     cloths = tuple(
         dataclasses.replace(cloth, look=dataclasses.replace(cloth.look, color=color_of(cloth)))
         for cloth in scene.cloths
@@ -164,5 +164,5 @@ def with_role_colors(scene: Scene) -> Scene:
     return dataclasses.replace(scene, bodies=bodies, cloths=cloths)
 
 
-def _colored(body: Body, color: Vec3) -> Body:
+def _set_color(body: Body, color: Vec3) -> Body:
     return dataclasses.replace(body, look=dataclasses.replace(body.look, color=color))

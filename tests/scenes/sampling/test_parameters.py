@@ -1,4 +1,4 @@
-"""Draws stay in their ranges; parameters are read from tables, and checked, with their limits."""
+"""Random draws stay in their ranges; parameters are read from tables and checked."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ from physion.scenes.sampling.parameters import (
     Shapes,
     Sizes,
     check_params,
+    describe_limits,
     draw_axes,
     draw_count,
     draw_frame,
     draw_rotation,
-    drawn_limits,
     pick,
     read_params,
     retry,
@@ -49,7 +49,7 @@ from physion.scenes.sampling.rules import (
     draw_body,
     draw_push,
     draw_zone,
-    raised_to_floor,
+    raise_to_floor,
     require_apart,
 )
 from physion.scenes.scene import Body, Look
@@ -60,7 +60,7 @@ SEEDS = st.integers(0, 2**32 - 1).map(np.random.default_rng)
 
 
 def ranges(low: float, high: float) -> SearchStrategy[Range]:
-    """Ranges between two values, points among them."""
+    """Return a strategy of ranges between two values, some of length zero."""
     ends = st.floats(low, high, allow_subnormal=False)
     return st.tuples(ends, ends).map(lambda pair: (min(pair), max(pair)))
 
@@ -115,14 +115,14 @@ def test_the_last_frame_is_left_out() -> None:
 
 @settings(deadline=None)
 @given(SEEDS, axes(-360, 360))
-def test_turns_are_rotations(rng: np.random.Generator, limits: Axes) -> None:
+def test_drawn_rotations_are_unit_quaternions(rng: np.random.Generator, limits: Axes) -> None:
     turn = draw_rotation(rng, limits)
     assert math.isclose(math.hypot(*turn), 1.0)
     if isinstance(limits[0], float):
         assert turn[1] == turn[2] == 0, "one angle turns about the upright"
 
 
-def test_three_angles_turn_as_unity_does() -> None:
+def test_euler_rotation_has_unity_order() -> None:
     rng = np.random.default_rng(0)
     turn = draw_rotation(rng, ((90.0, 90.0), (0.0, 0.0), (90.0, 90.0)))
     # About x first, which lays z along -y, then about z, which brings that along x.
@@ -151,7 +151,7 @@ def test_names_are_picked_from_those_given(rng: np.random.Generator, names: list
     ranges(0, 10),
     ranges(0, 1),
 )
-def test_bodies_are_as_their_rule_says(
+def test_bodies_follow_their_rule(
     rng: np.random.Generator,
     kind: str,
     scale: Axes,
@@ -170,7 +170,7 @@ def test_bodies_are_as_their_rule_says(
     assert within(body.contact.restitution, bounce)
     assert body.contact.static_friction >= body.contact.dynamic_friction
     assert within(body.contact.static_friction, (static[0], max(static[1], dynamic[1])))
-    raised = raised_to_floor(body)
+    raised = raise_to_floor(body)
     corners = rotate_vectors(raised.rotation, shape(kind).mesh.vertices * raised.scale)
     lowest = corners[:, 2].min() + raised.position[2]
     assert lowest > -1e-9 and raised.position[:2] == body.position[:2]
@@ -179,7 +179,7 @@ def test_bodies_are_as_their_rule_says(
 
 @settings(deadline=None)
 @given(SEEDS, ranges(0, 20), ranges(-90, 90), ranges(0, 3), st.floats(-3, 3), ranges(0, 100))
-def test_pushes_are_as_their_rule_says(
+def test_pushes_follow_their_rule(
     rng: np.random.Generator,
     speed: Range,
     heading: Range,
@@ -202,7 +202,7 @@ def test_pushes_are_as_their_rule_says(
 
 @settings(deadline=None)
 @given(SEEDS, st.sampled_from(SOLIDS), st.floats(0, 2))
-def test_push_points_jitter_about_the_body_and_not_above(
+def test_push_points_are_jittered_but_not_above_the_body(
     rng: np.random.Generator, kind: str, jitter: float
 ) -> None:
     body = Body("probe", kind, (0.0, 0.0, 0.0), (0.5, 0.5, 0.5))
@@ -223,7 +223,7 @@ def test_zones_are_fixed_flat_and_slippery_once_they_slip(
     assert zone.contact.static_friction == pytest.approx(10 * zone.contact.dynamic_friction)
 
 
-def test_apart_or_not() -> None:
+def test_require_apart() -> None:
     cube = Body("one", "cube", (0.0, 0.0, 0.0))
     require_apart(cube, Body("other", "cube", (1.001, 0.0, 0.0)))
     require_apart(cube, Body("other", "cube", (0.0, 0.0, 1.001)))
@@ -231,7 +231,7 @@ def test_apart_or_not() -> None:
         require_apart(cube, Body("other", "cube", (0.999, 0.0, 0.0)))
 
 
-def test_placing_says_what_stands_in_the_way() -> None:
+def test_retry_reports_the_most_frequent_reason() -> None:
     answers = iter(["too wide"] * 3 + ["too high"] + [None])
     retry(5, "it", lambda: next(answers))
     for order in (["too wide", "too high", "too wide"], ["too high", "too wide", "too wide"]):
@@ -305,7 +305,7 @@ BELOW_LEAST = {
     ("scenario", "key"), [(name, key) for name, keys in BELOW_LEAST.items() for key in keys]
 )
 @pytest.mark.parametrize("value", [0, [0, 1], [np.float64(0), np.float64(1)]])
-def test_what_must_be_there_is_not_nothing(scenario: str, key: str, value: Any) -> None:
+def test_sizes_of_zero_are_refused(scenario: str, key: str, value: Any) -> None:
     rule, name = key.split(".")
     kind = scenarios.get(scenario).params
     with pytest.raises(BadInputError, match=f"here: {rule}: {name} is 0, allowed is 0[.]") as error:
@@ -316,7 +316,7 @@ def test_what_must_be_there_is_not_nothing(scenario: str, key: str, value: Any) 
 @pytest.mark.parametrize(
     "value", [(np.float64(3), np.float64(2)), (np.float64(1),) * 4, [(np.float64(1),), np.int64(2)]]
 )
-def test_numbers_of_numpy_are_told_as_any_other(value: Any) -> None:
+def test_numpy_numbers_are_shown_as_plain_numbers(value: Any) -> None:
     with pytest.raises(BadInputError, match=r"^mine: width must .*\d\]$") as error:
         check_params(dataclasses.replace(Sample(), width=value), "mine")
     assert "np." not in str(error.value)
@@ -351,11 +351,11 @@ def test_unknown_keys_are_refused(key: str) -> None:
 
 @pytest.mark.parametrize("name", scenarios.names())
 def test_parameters_survive_their_record(name: str) -> None:
-    """What a trial keeps of its parameters is a table that makes them again."""
+    """The parameters stored with a trial are a table from which they can be read again."""
     kind = scenarios.get(name).params
     check_params(kind(), name)
     assert read_params(kind, json.loads(json.dumps(as_record(kind()))), name) == kind()
-    limits = drawn_limits(kind())
+    limits = describe_limits(kind())
     assert limits["room"] == "names of rooms" and limits["camera.height"] == "0 to 50 m"
     assert all(limits.values())
 

@@ -1,4 +1,4 @@
-"""The preset files that come with the package, and what is said about bad ones."""
+"""Preset files of the package, and error messages for bad preset files."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def published() -> list[Preset]:
     return [preset for preset in all_presets() if preset.published]
 
 
-def test_every_published_configuration_is_there_once() -> None:
+def test_every_published_configuration_is_a_preset_once() -> None:
     counts = Counter(preset.scenario for preset in published())
     assert counts == {
         "dominoes": 15,
@@ -101,7 +101,7 @@ def test_every_preset_draws_sound_scenes(preset: Preset) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scenario", SCENARIOS)
-def test_both_outcomes_are_common_where_people_practise(scenario: str) -> None:
+def test_familiarization_has_both_outcomes(scenario: str) -> None:
     params = get_preset(scenario, FAMILIARIZATION).params
     contacts = 0
     for index in range(16):
@@ -110,7 +110,7 @@ def test_both_outcomes_are_common_where_people_practise(scenario: str) -> None:
     assert 3 <= contacts <= 13
 
 
-def test_what_was_published_is_what_the_tables_hold(official: Path) -> None:
+def test_published_values_equal_the_tables(official: Path) -> None:
     stimuli = official / "stimuli"
     tested: Counter[str] = Counter()
     with (stimuli / "stimulus_names_and_labels.csv").open(newline="") as file:
@@ -137,7 +137,7 @@ def test_what_was_published_is_what_the_tables_hold(official: Path) -> None:
 
 
 def read_command_line(file: Path) -> dict[str, str]:
-    """Its options by name, written as ``--name=value`` or on two lines; flags have no value."""
+    """Return its options by name, written as ``--name=value`` or on two lines."""
     options: dict[str, str] = {}
     name = ""
     for word in file.read_text().split("\n"):
@@ -177,7 +177,7 @@ params.target = { shapes = "cone", scale = [0.2, 0.2, [0.4, 0.5]] }
 """
 
 
-def test_a_file_of_ones_own(tmp_path: Path) -> None:
+def test_user_preset_file(tmp_path: Path) -> None:
     file = tmp_path / "own.toml"
     file.write_text(GOOD)
     other = get_preset("collide", f"{file}:other").params
@@ -196,7 +196,7 @@ def test_a_file_of_ones_own(tmp_path: Path) -> None:
         get_preset("collide", "yeet_bx")
 
 
-def test_ones_own_may_be_based_on_one_that_comes_with_the_scenario() -> None:
+def test_user_presets_may_be_based_on_presets_of_the_scenario() -> None:
     text = """
     scenario = "collide"
     shared.room = "empty"

@@ -1,4 +1,4 @@
-"""Support, Contain and Link: bodies that stand on, in and around one another."""
+"""Support, Contain and Link: stacks of bodies and their stands."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import pytest
 
 from physion.errors import BadInputError, BadSceneError
 from physion.physics.engine import simulate
-from physion.scenes.sampling.clearance import GAP, is_clear_of, raised_clear_of, required_rise
+from physion.scenes.sampling.clearance import GAP, is_clear_of, raise_above, required_rise
 from physion.scenes.sampling.parameters import LEAST_MASS, Range, yaw
 from physion.scenes.sampling.placement import world_bounds
 from physion.scenes.sampling.preset import get_preset, load_presets, parse_presets
@@ -24,8 +24,8 @@ from physion.scenes.sampling.stacks import (
     SMALLEST,
     StackRule,
     choose_position,
-    top_height,
-    with_mass_by_volume,
+    height_of_top,
+    set_mass_by_volume,
 )
 from physion.scenes.scenarios import contain, link, support
 from physion.scenes.scene import Body, Scene
@@ -63,13 +63,13 @@ def test_rise_of_boxes_is_exact() -> None:
     assert required_rise(dataclasses.replace(high, position=(0.76, 0.0, 0.2)), (low,)) == 0
     turned = Body("high", "cube", (0.0, 0.0, 0.9), (1, 1, 1), yaw(0.5))
     assert required_rise(turned, (low,)) == pytest.approx(0.1, abs=1e-9)
-    assert raised_clear_of(turned, (low,)).position[2] == pytest.approx(1.0 + GAP)
+    assert raise_above(turned, (low,)).position[2] == pytest.approx(1.0 + GAP)
     # Something high over its head counts as well: it is to end above everything.
     roof = Body("roof", "cube", (0.0, 0.0, 5.0), (1.0, 1.0, 0.5))
     assert required_rise(turned, (low, roof)) == pytest.approx(4.6, abs=1e-9)
 
 
-def test_ball_goes_as_deep_as_it_can() -> None:
+def test_rise_of_a_ball_above_curved_shapes() -> None:
     cone = Body("cone", "cone", (0.0, 0.0, 0.0))
     ball = Body("ball", "sphere", (0.0, 0.0, 0.0), (0.4, 0.4, 0.4))
     assert required_rise(ball, (cone,)) == pytest.approx(1.0, abs=0.01)  # on the tip
@@ -83,7 +83,7 @@ def test_ball_goes_as_deep_as_it_can() -> None:
 
 @pytest.mark.parametrize("holder", ["bowl", "torus", "pipe", "cone", "prop:basket"])
 @pytest.mark.parametrize("shape", ["sphere", "cube", "cylinder", "torus"])
-def test_cleared_bodies_are_free_and_not_too_high(holder: str, shape: str) -> None:
+def test_raised_bodies_do_not_overlap_and_are_not_too_high(holder: str, shape: str) -> None:
     rng = np.random.default_rng(7)
     for _ in range(4):
         size = rng.uniform(0.15, 0.6)
@@ -91,14 +91,14 @@ def test_cleared_bodies_are_free_and_not_too_high(holder: str, shape: str) -> No
         at = (*rng.uniform(-0.1, 0.1, 2), 0.01)
         above = Body("above", shape, at, (size, size, size), yaw(rng.uniform(0, 6)))
         rise = required_rise(above, (below,))
-        free = raised_clear_of(above, (below,))
+        free = raise_above(above, (below,))
         assert not meet(free, below)
         if rise > 0:
             x, y, z = free.position
             assert meet(dataclasses.replace(free, position=(x, y, z - GAP - 0.008)), below)
 
 
-def test_beside_is_about_level_rectangles() -> None:
+def test_is_clear_of_compares_footprints() -> None:
     one = Body("one", "cube", (0.0, 0.0, 5.0))
     assert is_clear_of(
         one, (Body("far", "cube", (1.1, 0.0, 0.0)), Body("off", "cube", (0.3, 2, 0)))
@@ -108,9 +108,9 @@ def test_beside_is_about_level_rectangles() -> None:
 
 def test_masses_are_those_of_the_official_logs() -> None:
     cap = Body("cap", "cylinder", (0, 0, 0), (0.2, 0.2, 0.4), mass=2.0)
-    assert with_mass_by_volume(cap).mass == pytest.approx(0.256)
+    assert set_mass_by_volume(cap).mass == pytest.approx(0.256)
     ring = Body("ring", "torus", (0, 0, 0), (0.35, 0.35, 0.35), mass=2.0)
-    assert with_mass_by_volume(ring, 0.25).mass == pytest.approx(0.1715)
+    assert set_mass_by_volume(ring, 0.25).mass == pytest.approx(0.1715)
     stand = dataclasses.replace(
         link.STAND,
         attachment=dataclasses.replace(
@@ -173,7 +173,7 @@ def test_towers_stand_and_shrink() -> None:
     assert [b.scale[0] for b in blocks] == pytest.approx([0.7, 0.6, 0.5, 0.4])
     assert [b.position[2] for b in blocks] == pytest.approx([0.01, 0.71, 1.31, 1.81])
     assert target.position == pytest.approx((0, 0, 2.21))
-    assert scene.camera.target == pytest.approx((0, 0, top_height(target) / 2))
+    assert scene.camera.target == pytest.approx((0, 0, height_of_top(target) / 2))
     assert [b.mass for b in blocks] == pytest.approx([2 * (b.scale[0] / 0.5) ** 3 for b in blocks])
     (push,) = scene.pushes
     assert push.frame == 15 and push.impulse[1] == push.impulse[2] == 0
@@ -191,7 +191,7 @@ def test_no_block_vanishes() -> None:
         assert min(b.mass for b in scene.bodies) > 0.001
 
 
-def test_jitter_is_a_share_of_the_size() -> None:
+def test_jitter_is_a_fraction_of_the_size() -> None:
     wide = dataclasses.replace(support.BLOCKS, count=(5, 5), jitter=0.3)
     shares = [
         abs(b.position[axis]) / b.scale[axis]
@@ -209,13 +209,15 @@ def test_links_are_on_the_pole_and_below_the_cap() -> None:
             joints = [(joint.parent, joint.child) for joint in scene.joints]
             assert joints == [("base", "attachment"), ("attachment", "cap")]
             pole, cap = body(scene, "attachment"), body(scene, "cap")
-            assert pole.position[2] == pytest.approx(top_height(body(scene, "base")))
-            assert cap.position[2] == pytest.approx(top_height(pole))
+            assert pole.position[2] == pytest.approx(height_of_top(body(scene, "base")))
+            assert cap.position[2] == pytest.approx(height_of_top(pole))
             for ring in [*members(scene, "member"), body(scene, "target")]:
-                assert pole.position[2] <= ring.position[2] and top_height(ring) < cap.position[2]
+                assert (
+                    pole.position[2] <= ring.position[2] and height_of_top(ring) < cap.position[2]
+                )
 
 
-def test_what_cannot_be_placed_says_why() -> None:
+def test_what_cannot_be_placed_is_an_error_with_reason() -> None:
     tall = dataclasses.replace(link.LINKS, count=(3, 3))
     short = dataclasses.replace(link.STAND.attachment, scale=((0.1, 0.1), (0.1, 0.1), (0.2, 0.2)))
     capped = dataclasses.replace(link.STAND, capped=True, attachment=short)
@@ -230,12 +232,12 @@ def test_what_cannot_be_placed_says_why() -> None:
 def test_stands() -> None:
     boxed = draw(contain, get_preset("contain", "box").params)
     basket, cone = body(boxed, "attachment"), body(boxed, "base")
-    assert basket.shape == "prop:basket" and basket.position[2] >= top_height(cone)
+    assert basket.shape == "prop:basket" and basket.position[2] >= height_of_top(cone)
     factors = np.array(basket.scale) / NATURAL_SIZES["basket"]
     assert factors == pytest.approx(factors[0]) and 0.5 <= factors[0] <= 0.6
     assert not boxed.joints
     plain = draw(contain, get_preset("contain", "bowl").params)
-    rim = top_height(body(plain, "base"))
+    rim = height_of_top(body(plain, "base"))
     assert "attachment" not in plain.names()
     lowest = min((*members(plain, "member"), body(plain, "target")), key=lambda b: b.position[2])
     # Dropped into the bowl from its rim, as officially, not from the bottom.
@@ -244,7 +246,7 @@ def test_stands() -> None:
     assert body(ring, "zone").shape == "torus" and body(ring, "base").position[2] == 0
 
 
-def test_rings_as_zones_are_stepped_over() -> None:
+def test_rings_as_zones_do_not_stop_the_probe() -> None:
     heights = set()
     for index in range(20):
         params = get_preset("link", "nl6_aCyl_bCube_occ1_dis1_boxroom").params
@@ -259,7 +261,7 @@ def within(values: Sequence[float], limits: Range) -> bool:
 
 
 def limits(axes: object, axis: int) -> Range:
-    """What a parameter file's sizes allow along an axis."""
+    """Return the range of sizes along an axis that parameters allow."""
     assert isinstance(axes, tuple)
     found: Range = axes[axis] if isinstance(axes[0], tuple) else axes
     return found
@@ -305,15 +307,15 @@ def test_official_trials_could_have_been_drawn(scenario: str, official: Path) ->
             # Some official blocks are so small that a cube of 1 kg would be below the least mass.
             heavy = dataclasses.replace(one, mass=1e4)
             assert within(
-                [1e4 * one.mass / with_mass_by_volume(heavy, share).mass], params.stack.member.mass
+                [1e4 * one.mass / set_mass_by_volume(heavy, share).mass], params.stack.member.mass
             )
             assert one.shape in params.stack.member.shapes
         if scenario == "link":
             assert len(scene.joints) == params.stand.attached + params.stand.capped
 
 
-def test_our_trials_start_where_the_official_ones_do(official: Path) -> None:
-    """The lowest of a stack, above the top of what it stands on: the same median within 3 cm."""
+def test_stacks_start_at_the_official_height(official: Path) -> None:
+    """Height of the lowest body above the top of the stand: equal medians within 3 cm."""
     for scenario, module in (("contain", contain), ("link", link)):
         presets = {preset.official: preset.params for preset in load_presets(scenario).values()}
         theirs: dict[str, list[float]] = {}
@@ -333,8 +335,8 @@ def test_our_trials_start_where_the_official_ones_do(official: Path) -> None:
             assert abs(float(np.median(ours)) - float(np.median(heights))) < allowed, name
 
 
-def test_bounds_of_the_probe_are_free(official: Path) -> None:
-    """Officially, too, no probe starts within its stand: the check refuses no published trial."""
+def test_official_probes_start_outside_their_stand(official: Path) -> None:
+    """No published trial is refused by the check that the probe starts outside its stand."""
     for scenario in ("support", "contain", "link"):
         for scene in official_trials(official, scenario):
             probe = body(scene, str(scene.roles.probe))

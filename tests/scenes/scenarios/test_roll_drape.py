@@ -1,4 +1,4 @@
-"""Roll and Drape: what they draw, beside what the official command logs hold."""
+"""Roll and Drape: sampled scenes compared with the official command logs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
 from physion.physics.rigid.hulls import collision_hulls
 from physion.scenes.sampling.parameters import euler_rotation
-from physion.scenes.sampling.placement import on_screen, world_bounds, world_corners
+from physion.scenes.sampling.placement import project_to_image, world_bounds, world_corners
 from physion.scenes.sampling.preset import Preset, load_presets, parse_presets
 from physion.scenes.sampling.registry import sample_scene
 from physion.scenes.sampling.rules import BodyRule
@@ -65,7 +65,7 @@ def span(values: Sequence[Any]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def inside(outer: Sequence[Any], inner: Sequence[Any], slack: float = 0.0) -> bool:
-    """Whether the span of ``inner`` lies in that of ``outer``, widened by a share of its width."""
+    """Return whether the range of ``inner`` is in that of ``outer``, extended by ``slack``."""
     (low, high), (inner_low, inner_high) = span(outer), span(inner)
     room = slack * (high - low) + 1e-4
     return bool((inner_low >= low - room).all() and (inner_high <= high + room).all())
@@ -150,7 +150,7 @@ def test_roll_is_drawn_as_the_official_scenes(official: Path, preset: Preset) ->
         assert inside(*speeds, slack=0.2) and inside(*headings, slack=0.2)
 
 
-def test_roll_draws_each_template_and_says_which() -> None:
+def test_roll_samples_and_records_each_template() -> None:
     params = roll.Params(template=roll.TEMPLATES)
     seen = set()
     for index in range(SAMPLES):
@@ -181,7 +181,7 @@ def in_ramp(points: np.ndarray, ramp: Body) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", ["ramp_with_platform_30", "ramp_with_platform_60"])
-def test_target_starts_clear_of_the_ramp(name: str) -> None:
+def test_target_starts_outside_the_ramp(name: str) -> None:
     rule = dataclasses.replace(roll.RampRule(), shapes=(name,), drop=0.0, lift=0.01)
     rule = dataclasses.replace(
         rule, target=BodyRule(("dumbbell", "cube"), (0.3, 0.3), roll.ANY_ROTATION)
@@ -310,10 +310,10 @@ def test_cloth_is_the_agent_and_nothing_meets_on_the_floor() -> None:
         top = max(world_bounds(thing)[1, 2] for thing in settle_solids(scene).bodies)
         assert top < scene.cloths[0].position[2] + 0.01
         for point in (scene.cloths[0].position, world_bounds(body(scene, "zone")).mean(axis=0)):
-            assert max(map(abs, on_screen(scene.camera, point))) < 1
+            assert max(map(abs, project_to_image(scene.camera, point))) < 1
 
 
-def test_extra_anchor_is_as_frequent_as_said() -> None:
+def test_third_anchor_has_its_probability() -> None:
     scenes = [draw("drape", drape.Params(), index) for index in range(300)]
     extra = [body(s, "anchor_extra") for s in scenes if "anchor_extra" in s.names()]
     assert abs(len(extra) / 300 - 0.7) < 0.1
@@ -330,14 +330,14 @@ def test_larger_cloth_has_more_vertices() -> None:
         assert cloth.size == (size, size, 0.0) and cloth.resolution == vertices
 
 
-def test_what_cannot_be_placed_says_why() -> None:
+def test_what_cannot_be_placed_is_an_error_with_reason() -> None:
     tight = drape.AnchorRule(between=(0.0, 0.0), jitter=0.0)
     with pytest.raises(BadSceneError, match=r"anchor_right .*100 tries.*anchor_left"):
         draw("drape", drape.Params(anchors=tight), 0)
 
 
 @pytest.mark.parametrize("key", ["height", "extra_height"])
-def test_anchors_keep_some_height(key: str) -> None:
+def test_anchors_have_a_minimum_height(key: str) -> None:
     text = 'scenario = "drape"\n[presets.low.params]\nanchors = { height_jitter = 0.7, '
     higher = parse_presets(text + "height = 0.71, extra_height = 0.8 }", "own.toml")["low"].params
     draw("drape", higher, 0)
@@ -350,8 +350,8 @@ def test_anchors_keep_some_height(key: str) -> None:
         draw("drape", drape.Params(anchors=low), 0)
 
 
-def test_props_have_the_numbers_of_python() -> None:
-    """Those of numpy would be printed as such in messages."""
+def test_natural_sizes_are_python_floats() -> None:
+    """Numbers of numpy would be shown as np.float64(...) in messages."""
     scene = draw("drape", drape.Params(), 0)
     assert {type(side) for one in scene.bodies for side in one.scale} == {float}
 

@@ -1,4 +1,4 @@
-"""What holds for the scenes of every scenario."""
+"""Properties of the scenes of every scenario."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 
 from physion.errors import BadInputError, BadSceneError, UnknownNameError
 from physion.numerics.rotations import rotate_vectors
-from physion.scenes.looks import RED, YELLOW, mistakable, with_role_colors
+from physion.scenes.looks import RED, YELLOW, is_mistakable, with_role_colors
 from physion.scenes.sampling.placement import CameraRule, SceneryRule, place_camera, world_bounds
 from physion.scenes.sampling.preset import get_preset, parse_presets
 from physion.scenes.sampling.registry import Scenario, sample_scene, scenarios
@@ -50,7 +50,7 @@ def draw(scenario: Scenario, index: int, distractors: int = 2, occluders: int = 
     return scenario.sample(params, trial_seed("test", scenario.name, "train", index))
 
 
-def test_overlap_tells_apart() -> None:
+def test_overlap_of_hulls() -> None:
     cube = shape("cube").mesh.vertices
     assert overlap(cube, cube + np.array([0.9, 0.9, 0.9]))
     assert not overlap(cube, cube + np.array([1.01, 0, 0]))
@@ -59,7 +59,7 @@ def test_overlap_tells_apart() -> None:
     assert not overlap(cone, cone + np.array([0.9, 0, 0.5]))
 
 
-def test_scene_is_valid_and_says_who_is_who(scenario: Scenario) -> None:
+def test_scene_is_valid_and_has_roles(scenario: Scenario) -> None:
     for index in TRIALS:
         scene = draw(scenario, index)
         assert scene.scenario == scenario.name
@@ -79,7 +79,7 @@ def test_json_round_trip(scenario: Scenario) -> None:
     assert Scene.from_json(scene.to_json()) == scene
 
 
-def test_agent_and_patient_are_in_the_picture(scenario: Scenario) -> None:
+def test_agent_and_patient_are_in_the_image(scenario: Scenario) -> None:
     for index in TRIALS:
         assert_seen(draw(scenario, index))
 
@@ -89,7 +89,7 @@ def test_nothing_overlaps_at_the_start(scenario: Scenario) -> None:
         assert not overlapping(draw(scenario, index)), index
 
 
-def test_scenery_stands_clear_of_the_scene(scenario: Scenario) -> None:
+def test_scenery_is_outside_the_bodies(scenario: Scenario) -> None:
     for index in TRIALS:
         scene = draw(scenario, index, distractors=2, occluders=2)
         scenery = [bounds(one) for one in scene.bodies if one.scenery]
@@ -122,7 +122,7 @@ def test_scenery_changes_neither_motion_nor_camera_nor_looks(scenario: Scenario)
         assert by_name["distractor_0"].shape == body(more, "distractor_0").shape
 
 
-def test_scenery_stands_behind_and_before(scenario: Scenario) -> None:
+def test_scenery_is_behind_and_in_front(scenario: Scenario) -> None:
     for index in TRIALS:
         scene = draw(scenario, index)
         toward = np.array(scene.camera.position[:2])
@@ -147,19 +147,19 @@ def test_role_colors(scenario: Scenario) -> None:
         assert after.texture == before.texture
         if name in (scene.roles.agent, scene.roles.patient):
             continue
-        near = any(mistakable(before.color, c) for c in (RED, YELLOW))
+        near = any(is_mistakable(before.color, c) for c in (RED, YELLOW))
         assert near == (before.color != after.color)
-        assert not any(mistakable(after.color, c) for c in (RED, YELLOW))
+        assert not any(is_mistakable(after.color, c) for c in (RED, YELLOW))
 
 
-def test_what_passes_for_red_or_yellow() -> None:
-    assert mistakable((0.9, 0.2, 0.1), RED) and mistakable((0.45, 0.05, 0.05), RED)
-    assert mistakable((0.8, 0.8, 0.1), YELLOW) and mistakable((0.5, 0.48, 0.05), YELLOW)
+def test_colors_mistakable_for_red_or_yellow() -> None:
+    assert is_mistakable((0.9, 0.2, 0.1), RED) and is_mistakable((0.45, 0.05, 0.05), RED)
+    assert is_mistakable((0.8, 0.8, 0.1), YELLOW) and is_mistakable((0.5, 0.48, 0.05), YELLOW)
     for fine in [(0.45, 0.3, 0.18), (0.1, 0.1, 0.9), (0.1, 0.0, 0.0), (0.85, 0.84, 0.8)]:
-        assert not mistakable(fine, RED) and not mistakable(fine, YELLOW)
+        assert not is_mistakable(fine, RED) and not is_mistakable(fine, YELLOW)
 
 
-def test_unknown_scenario_gives_the_closest() -> None:
+def test_unknown_scenario_error_has_closest_names() -> None:
     with pytest.raises(UnknownNameError, match="dominoes"):
         sample_scene("domino", trial_seed("test", "domino", "train", 0))
 
@@ -169,14 +169,14 @@ def test_default_parameters_are_used_and_recorded() -> None:
     assert scene.parameters["height"] == [1.25, 1.5]
 
 
-def test_camera_that_cannot_see_says_so() -> None:
+def test_camera_that_cannot_see_the_agent_is_an_error() -> None:
     far = Body("far", "cube", (0.0, 40.0, 0.0))
     rule = CameraRule((1.0, 1.0), (45.0, 45.0), (1.0, 1.0))
     with pytest.raises(BadSceneError, match=r"^no camera shows far: [^\d]*$"):
         place_camera(np.random.default_rng(0), rule, 0.5, (far,))
 
 
-def test_scenery_stands_apart_or_says_that_it_does_not_fit() -> None:
+def test_scenery_does_not_overlap_or_is_an_error() -> None:
     params, crowded = get_preset("dominoes", "default").params, Counter[str]()
     for count in (4, 12):
         rule = dataclasses.replace(params.scenery, distractors=count, occluders=count // 2)
@@ -197,7 +197,7 @@ def test_scenery_stands_apart_or_says_that_it_does_not_fit() -> None:
 
 
 @pytest.mark.parametrize("key", ["distractors", "occluders"])
-def test_there_are_at_most_a_dozen_of_each(key: str) -> None:
+def test_scenery_counts_are_limited(key: str) -> None:
     text = f'scenario = "drop"\n[presets.many.params]\nscenery.{key} = 13'
     with pytest.raises(BadInputError, match=f"many': scenery: {key} is 13, allowed is 0 to 12"):
         parse_presets(text, "own.toml")
@@ -214,7 +214,7 @@ def test_camera_follows_the_official_rule() -> None:
 
 
 def still_row(**changed: object) -> Dominoes:
-    """Two metres of upright dominoes that stand where they should."""
+    """Return parameters of two metres of upright dominoes without jitter of orientation."""
     middle = dataclasses.replace(Dominoes().middle, turn_deg=(0.0, 0.0))
     values = {"length": 2.0, "middle": middle, "spacing_jitter": 0.0, "lateral_jitter": 0.0}
     return dataclasses.replace(Dominoes(), **(values | changed))
@@ -235,7 +235,7 @@ def test_dominoes_rows() -> None:
     assert len(gaps) == 4, "any of them may be left out"
 
 
-def test_dominoes_say_what_does_not_fit() -> None:
+def test_dominoes_that_do_not_fit_are_an_error() -> None:
     seed = trial_seed("test", "dominoes", "train", 0)
     with pytest.raises(BadSceneError, match=r"2 m long .*100 tries: no room for 30 dominoes"):
         sample_scene("dominoes", seed, still_row(middles=30))
@@ -245,7 +245,7 @@ def test_dominoes_say_what_does_not_fit() -> None:
         sample_scene("collide", seed, dataclasses.replace(Collide(), length=0.2))
 
 
-def test_pushes_turn_with_the_probe() -> None:
+def test_pushes_rotate_with_the_probe() -> None:
     probe = dataclasses.replace(Dominoes().probe, turn_deg=(40.0, 60.0))
     for index in TRIALS:
         seed = trial_seed("test", "dominoes", "train", index)
@@ -258,7 +258,7 @@ def test_pushes_turn_with_the_probe() -> None:
         assert 40 <= math.degrees(2 * math.atan2(z, w)) <= 60
 
 
-def test_drop_stands_on_what_is_below() -> None:
+def test_lower_body_of_drop_is_on_zone_or_floor() -> None:
     zone = Drop().zone
     for center, height in (((0.0, 0.0), 0.01), ((0.0, 1.0), 0.01), ((0.0, 3.0), 0.0)):
         params = dataclasses.replace(Drop(), zone=dataclasses.replace(zone, center=center))
@@ -267,7 +267,7 @@ def test_drop_stands_on_what_is_below() -> None:
         assert body(scene, "zone").position == (*center, 0.0)
 
 
-def test_drop_falls_free_and_is_looked_at() -> None:
+def test_drop_falls_freely_and_is_in_view() -> None:
     large = dataclasses.replace(Drop().dropped, scale=(0.9, 1.0))
     for index in TRIALS:
         seed = trial_seed("test", "drop", "train", index)
@@ -282,7 +282,7 @@ def test_drop_falls_free_and_is_looked_at() -> None:
         assert low.camera.position[2] == low.floor + 0.25, "not lower than the rule allows"
 
 
-def test_drop_turns_as_it_is_told() -> None:
+def test_drop_orientation_follows_parameters() -> None:
     upright = dataclasses.replace(Drop().dropped, turn_deg=(0.0, 0.0))
     params = dataclasses.replace(Drop(), dropped=upright, even_turn=False)
     seed = trial_seed("test", "drop", "train", 0)
@@ -296,7 +296,7 @@ def test_drop_turns_as_it_is_told() -> None:
     assert np.var(ups) == pytest.approx(1 / 3, abs=0.05) and abs(np.mean(ups)) < 0.1
 
 
-def test_collide_places() -> None:
+def test_collide_positions() -> None:
     lifted = dataclasses.replace(Collide(), lift=0.2, zone_jitter=0.3)
     asides = []
     for index in range(40):

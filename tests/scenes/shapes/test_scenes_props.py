@@ -1,4 +1,4 @@
-"""Props: unit-bounded closed stand-ins, and the bounds of the models that they stand for."""
+"""Props: closed shapes in the unit box, and the bounds of the models that they replace."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from physion.scenes.looks import (
     TEXTURES,
     YELLOW,
     expand_materials,
-    mistakable,
+    is_mistakable,
     pick_material,
     prop_look,
 )
@@ -41,7 +41,7 @@ OFFICIAL = (
 )
 
 
-def test_there_are_many_props_and_each_is_listed_once() -> None:
+def test_props_are_listed_once() -> None:
     assert len(NAMES) == len(set(NAMES)) >= 24
     assert set(PROPS) == {PREFIX + name for name in NAMES}
     assert set(NATURAL_SIZES) == set(NAMES)
@@ -86,7 +86,7 @@ def test_triangles_have_area_and_the_highest_faces_up(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", PROPS)
-def test_parts_with_looks_of_their_own_are_never_taken_for_agent_or_patient(name: str) -> None:
+def test_looks_of_parts_are_not_mistakable_for_role_colors(name: str) -> None:
     prop = shape(name)
     assert isinstance(prop, PropShape)
     assert len(prop.paint) == len(prop.mesh.faces)
@@ -94,7 +94,7 @@ def test_parts_with_looks_of_their_own_are_never_taken_for_agent_or_patient(name
     assert 0 in prop.paint, "some of a prop has the look of its body"
     for look in (*prop.own_looks, *(prop_look(np.random.default_rng(i), name) for i in range(20))):
         assert look.texture in TEXTURES
-        assert not any(mistakable(look.color, role) for role in (RED, YELLOW))
+        assert not any(is_mistakable(look.color, role) for role in (RED, YELLOW))
 
 
 @pytest.mark.parametrize("word", OFFICIAL)
@@ -107,7 +107,7 @@ def test_official_categories_have_props(word: str) -> None:
     assert prop_for(single).removeprefix(PREFIX) in props
 
 
-def test_every_prop_is_reached_by_a_word_of_the_official_libraries() -> None:
+def test_every_prop_has_an_official_category() -> None:
     reached = {name for names in PROP_CATEGORIES.values() for name in names}
     words = ("canoe", "baseball bat", "coin", "person", "jug", "throw pillow", "sculpture")
     reached |= {prop_for(word).removeprefix(PREFIX) for word in (*words, "wineglass")}
@@ -152,7 +152,7 @@ def test_unknown_materials_get_the_closest_names(name: str) -> None:
         expand_materials(["stone", name])
 
 
-def test_materials_are_drawn_evenly_and_again_alike() -> None:
+def test_materials_are_drawn_uniformly_and_reproducibly() -> None:
     drawn = [pick_material(np.random.default_rng(i), ["stone", "plain"]) for i in range(400)]
     assert drawn == [
         pick_material(np.random.default_rng(i), ["stone", "plain"]) for i in range(400)
@@ -164,7 +164,7 @@ def test_materials_are_drawn_evenly_and_again_alike() -> None:
         pick_material(np.random.default_rng(0), [])
 
 
-def test_every_category_leads_to_a_prop_that_exists() -> None:
+def test_every_category_has_an_existing_prop() -> None:
     for category in ("vase", "Chair", "dog", "coffee maker", "garden plant", "table lamp", "box"):
         assert prop_for(category) in PROPS
         assert prop_for(category) != FALLBACK
@@ -189,7 +189,7 @@ def record(**changes: object) -> dict[str, object]:
     return {"models": {"thing": {"bounds": {**faces, **changes}, "category": "vase"}}}
 
 
-def test_bounds_become_our_axes(tmp_path: Path) -> None:
+def test_model_bounds_are_converted_to_our_axes(tmp_path: Path) -> None:
     (tmp_path / "b.json").write_text(json.dumps(record()))
     bounds = read_model_bounds(tmp_path / "b.json")["thing"]
     assert bounds.bottom == pytest.approx((0.5, 1.0, 0.5))
@@ -197,7 +197,7 @@ def test_bounds_become_our_axes(tmp_path: Path) -> None:
     assert bounds.category == "vase"
 
 
-def test_records_turned_inside_out_and_flat_are_mended(tmp_path: Path) -> None:
+def test_inverted_and_flat_model_bounds_are_corrected(tmp_path: Path) -> None:
     swapped = record(left={"x": 2, "y": 2, "z": 0}, right={"x": -1, "y": 2, "z": 0})
     (tmp_path / "b.json").write_text(json.dumps(swapped))
     assert read_model_bounds(tmp_path / "b.json")["thing"].size == pytest.approx((3, 6, 3))

@@ -1,4 +1,4 @@
-"""Shapes: bounds of the official records, closed outward meshes, pieces that stand for them."""
+"""Shapes: official bounds, closed meshes oriented outwards, collision pieces that fill them."""
 
 from __future__ import annotations
 
@@ -69,11 +69,11 @@ def any_shape(request: pytest.FixtureRequest) -> Shape:
     return shape(request.param)
 
 
-def test_all_official_names_are_there() -> None:
+def test_all_official_shapes_are_registered() -> None:
     assert set(BOUNDS) == set(NAMES)
 
 
-def test_unknown_name_gives_the_closest() -> None:
+def test_unknown_shape_error_has_closest_names() -> None:
     with pytest.raises(UnknownNameError, match="torus"):
         shape("tours")
 
@@ -82,7 +82,7 @@ def test_same_shape_is_built_once() -> None:
     assert shape("bowl") is shape("bowl")
 
 
-def test_bounds_are_those_of_the_record(any_shape: Shape) -> None:
+def test_bounds_equal_official_record(any_shape: Shape) -> None:
     assert any_shape.bounds == pytest.approx(np.array(BOUNDS[any_shape.name]), abs=6e-4)
 
 
@@ -95,12 +95,12 @@ def test_mesh_is_closed_and_faces_outward(any_shape: Shape) -> None:
     assert (solid.area_faces > 1e-9).all()
 
 
-def test_volume_agrees_with_an_independent_one(any_shape: Shape) -> None:
+def test_volume_agrees_with_trimesh(any_shape: Shape) -> None:
     assert any_shape.volume == pytest.approx(as_trimesh(any_shape.mesh).volume, rel=1e-9)
 
 
 @pytest.mark.parametrize("name", sorted(VOLUMES))
-def test_volume_is_the_geometric_one(name: str) -> None:
+def test_volume_equals_closed_form(name: str) -> None:
     assert shape(name).volume == pytest.approx(VOLUMES[name], rel=0.025)
 
 
@@ -164,7 +164,7 @@ def test_mass_properties_at_any_scale(name: str, scale: tuple[float, float, floa
     assert np.trace(pieces.inertia) == pytest.approx(np.trace(ours.inertia), rel=0.05)
 
 
-def test_mass_properties_of_a_box_are_the_textbook_ones() -> None:
+def test_mass_properties_of_a_box_equal_closed_form() -> None:
     x, y, z = 0.3, 0.5, 2.0
     found = shape("cube").mass_properties((x, y, z))
     assert found.center == pytest.approx([0, 0, z / 2])
@@ -175,8 +175,8 @@ def test_mass_properties_of_a_box_are_the_textbook_ones() -> None:
 @pytest.mark.parametrize(
     ("name", "recorded"), [("torus", 0.26175), ("pipe", 0.51461), ("dumbbell", 0.88731)]
 )
-def test_collider_boxes_add_up_to_the_record(name: str, recorded: float) -> None:
-    """The one check of what bounds leave open: the boxes round all pieces have this volume."""
+def test_volume_of_piece_boxes_equals_official_record(name: str, recorded: float) -> None:
+    """The bounding boxes of all pieces have the recorded volume."""
     boxes = [np.ptp(piece.mesh.vertices, axis=0) for piece in shape(name).pieces]
     assert sum(map(np.prod, boxes)) == pytest.approx(recorded, rel=0.02)
 
@@ -195,7 +195,7 @@ REST = [
 def test_pivot_height_at_rest_is_that_of_official_trials(
     name: str, lying_on: str, recorded: float
 ) -> None:
-    """Official objects at rest tell their shape: how high the pivot lies, in units of the scale."""
+    """Height of the pivot of official objects at rest, in units of the scale."""
     solid = hull(shape(name).mesh.vertices)
     corners = solid.vertices[solid.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -216,7 +216,7 @@ def test_ramp_rises_towards_plus_x() -> None:
     ).filter(lambda p: np.linalg.matrix_rank(np.array(p) - np.array(p[0])) == 3)
 )
 @settings(max_examples=60, deadline=None)
-def test_hull_of_any_points_is_closed_and_holds_them(points: list[tuple[int, int, int]]) -> None:
+def test_hull_is_closed_and_contains_its_points(points: list[tuple[int, int, int]]) -> None:
     solid = hull(np.array(points, float))
     volume, center, _ = solid_properties(solid)
     assert volume > 0

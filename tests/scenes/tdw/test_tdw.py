@@ -26,7 +26,7 @@ def xyz(x: float, y: float, z: float) -> dict[str, float]:
 
 
 def thing(id_: int, name: str, position: dict[str, float], **more: Any) -> list[Command]:
-    """The commands that create one object, as the official generator writes them."""
+    """Return the commands that create one object, as the official generator writes them."""
     commands: list[Command] = [
         {
             "$type": "add_object",
@@ -124,7 +124,7 @@ def test_a_trial_becomes_a_scene(tmp_path: Path, packed: bool) -> None:
         ((90, 90, 0), {(0, 1, 0): (1, 0, 0)}),
     ],
 )
-def test_turns_keep_their_meaning(
+def test_rotations_are_converted_to_our_axes(
     euler: tuple[float, float, float], moved: dict[tuple[float, ...], tuple[float, ...]]
 ) -> None:
     w, x, y, z = quaternion_from_euler(xyz(*euler))
@@ -186,7 +186,7 @@ def test_fixed_joints_drag_and_materials(tmp_path: Path) -> None:
     )
 
 
-def test_unknown_commands_are_counted_and_copies_found(tmp_path: Path) -> None:
+def test_unknown_commands_are_counted_and_duplicates_found(tmp_path: Path) -> None:
     frames = [[*two_cubes(), {"$type": "summon_dragon"}, {"$type": "summon_dragon"}]]
     write_log(tmp_path / "config", [frames, frames])
     found = read_scenes(tmp_path)
@@ -195,7 +195,7 @@ def test_unknown_commands_are_counted_and_copies_found(tmp_path: Path) -> None:
     assert (len(unique), copies) == (1, 1)
 
 
-def test_a_broken_line_costs_its_trial_alone(tmp_path: Path) -> None:
+def test_a_broken_line_fails_its_trial_only(tmp_path: Path) -> None:
     path = write_log(tmp_path / "config", [[two_cubes()], [two_cubes()]])
     lines = path.read_text().splitlines()
     lines[1] = '[{"$type": "add_object", trial 0'
@@ -227,7 +227,7 @@ def test_bad_commands_name_line_and_trial(tmp_path: Path, command: Command, comp
     assert failure.trial == "1" and complaint in failure.message and "line 4" in failure.message
 
 
-def test_missing_metadata_costs_its_log_alone(tmp_path: Path) -> None:
+def test_missing_metadata_fails_its_log_only(tmp_path: Path) -> None:
     write_log(tmp_path / "a", [[two_cubes()]])
     write_log(tmp_path / "b", [[two_cubes()]])
     (tmp_path / "a" / "metadata.json").unlink()
@@ -250,7 +250,7 @@ def test_folders_without_logs_are_refused(tmp_path: Path) -> None:
         read_scenes(tmp_path / "nowhere")
 
 
-def test_official_logs_import_whole(official: Path) -> None:
+def test_official_logs_are_imported_completely(official: Path) -> None:
     found = read_scenes(official / "scenes")
     assert found.failures == [] and not found.unknown
     assert {trial.scene.scenario for trial in found.trials} == {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -19,6 +19,9 @@ AIM_HEIGHT = 0.5
 FLOORS = {"box": 0.0, "bright": 0.0043, "empty": 0.0}
 """Height of each room's floor, metres. In the official ``tdw_room`` (here ``bright``) bodies placed
 at 0 come to rest 4 to 5 mm higher than in ``box_room_2018`` (here ``box``)."""
+
+
+MovableT = TypeVar("MovableT", Body, Cloth)
 
 
 class SceneParams(Protocol):
@@ -127,11 +130,11 @@ def build_scene(
     return Scene(
         name=scene_name(scenario, seed),
         scenario=scenario,
-        bodies=tuple(raised(body, floor) for body in (*bodies, *scenery)),
+        bodies=tuple(move_up(body, floor) for body in (*bodies, *scenery)),
         roles=roles,
         camera=eye,
-        cloths=tuple(raised(cloth, floor) for cloth in cloths),
-        pushes=tuple(_raised_push(push, floor) for push in pushes),
+        cloths=tuple(move_up(cloth, floor) for cloth in cloths),
+        pushes=tuple(_move_push_up(push, floor) for push in pushes),
         joints=tuple(joints),
         room=params.room,
         floor=floor,
@@ -141,13 +144,13 @@ def build_scene(
     )
 
 
-def raised(thing: Any, height: float) -> Any:
+def move_up(thing: MovableT, height: float) -> MovableT:
     """Return a body or cloth moved up by ``height`` metres."""
     x, y, z = thing.position
     return replace(thing, position=(x, y, z + height))
 
 
-def _raised_push(push: Push, height: float) -> Push:
+def _move_push_up(push: Push, height: float) -> Push:
     if push.point is None:
         return push
     x, y, z = push.point

@@ -13,7 +13,7 @@ import numpy as np
 from physion.numerics.elementary import cos, sin, tan
 from physion.numerics.linear_algebra import apply, inverse, multiply, norm
 from physion.numerics.rotations import rotate_vectors
-from physion.scenes.sampling.build import raised
+from physion.scenes.sampling.build import move_up
 from physion.scenes.sampling.placement import world_bounds
 from physion.scenes.scene import Body
 from physion.scenes.shapes.meshes import Points
@@ -41,10 +41,10 @@ SLOPES = _slope_grid()
 """(K, 2): slopes along x and y, up to nearly upright."""
 
 
-def raised_clear_of(body: Body, obstacles: Sequence[Body]) -> Body:
+def raise_above(body: Body, obstacles: Sequence[Body]) -> Body:
     """Return the body, raised above all ``obstacles`` that it would start in or under."""
     rise = required_rise(body, obstacles)
-    return raised(body, rise + GAP) if rise > 0 else body  # type: ignore[no-any-return]
+    return move_up(body, rise + GAP) if rise > 0 else body
 
 
 def required_rise(body: Body, obstacles: Sequence[Body]) -> float:

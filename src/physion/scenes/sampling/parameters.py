@@ -224,13 +224,13 @@ def check_together(params: Any, where: str) -> None:
         raise BadInputError(f"{where}: {problem}")
 
 
-def drawn_limits(params: Any) -> dict[str, str]:
+def describe_limits(params: Any) -> dict[str, str]:
     """Return as text what each key of the parameters allows; nested keys are joined by dots."""
     allowed: dict[str, str] = {}
     for key, hint in field_types(type(params)).items():
         value = getattr(params, key)
         if dataclasses.is_dataclass(value):
-            allowed |= {f"{key}.{name}": text for name, text in drawn_limits(value).items()}
+            allowed |= {f"{key}.{name}": text for name, text in describe_limits(value).items()}
         else:
             allowed[key] = _allowed_text(hint)
     return allowed

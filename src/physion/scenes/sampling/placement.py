@@ -109,7 +109,7 @@ def world_bounds(body: Body) -> NDArray[np.float64]:
     return np.stack([corners.min(axis=0), corners.max(axis=0)])
 
 
-def on_screen(camera: Camera, point: ArrayLike) -> tuple[float, float]:
+def project_to_image(camera: Camera, point: ArrayLike) -> tuple[float, float]:
     """Project ``point`` to a square image: (right, up) in -1..1, infinite if out of depth range."""
     forward = unit(np.subtract(camera.target, camera.position))
     right = unit(np.cross(forward, [0.0, 0.0, 1.0]))
@@ -136,7 +136,7 @@ def place_camera(
         if rule.mirror and rng.random() < rule.mirror:
             x = -x
         camera = Camera((x, y, uniform(rng, rule.height)), (0.0, 0.0, aim_height))
-        if all(max(map(abs, on_screen(camera, center))) < 0.98 for center in centers):
+        if all(max(map(abs, project_to_image(camera, center))) < 0.98 for center in centers):
             return camera
     names = " and ".join(body.name for body in seen)
     raise BadSceneError(

@@ -135,7 +135,7 @@ def draw_body(
     )
 
 
-def raised_to_floor(body: Body) -> Body:
+def raise_to_floor(body: Body) -> Body:
     """Return the body, raised if a part of it is below the floor (rotated bodies may be)."""
     missing = max(0.0, -float(world_bounds(body)[0, 2]))
     x, y, z = body.position

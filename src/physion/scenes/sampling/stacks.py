@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from physion.numerics.linear_algebra import norm
-from physion.scenes.sampling.build import Palette, raised
-from physion.scenes.sampling.clearance import GAP, raised_clear_of
+from physion.scenes.sampling.build import Palette, move_up
+from physion.scenes.sampling.clearance import GAP, raise_above
 from physion.scenes.sampling.parameters import (
     LEAST_MASS,
     Counts,
@@ -104,7 +104,7 @@ class Stand:
         return self.holders if self.cap is None else (*self.holders, self.cap)
 
 
-def with_mass_by_volume(body: Body, factor: float = 1.0) -> Body:
+def set_mass_by_volume(body: Body, factor: float = 1.0) -> Body:
     """Return the body with a mass proportional to its volume, at least `LEAST_MASS`.
 
     ``body.mass`` is that of a cube of `UNIT_VOLUME`; the result is multiplied by ``factor``.
@@ -113,7 +113,7 @@ def with_mass_by_volume(body: Body, factor: float = 1.0) -> Body:
     return replace(body, mass=max(mass, LEAST_MASS))
 
 
-def top_height(body: Body) -> float:
+def height_of_top(body: Body) -> float:
     """Return the height of the top of a body that is not tilted, metres."""
     return body.position[2] + float(shape(body.shape).bounds[1, 2]) * body.scale[2]
 
@@ -152,7 +152,7 @@ def draw_stack(
     name
         Names of the bodies are this and an index: ``name_0``, ``name_1``, ...
     mass_factor
-        Factor of the masses (`with_mass_by_volume`).
+        Factor of the masses (`set_mass_by_volume`).
     """
     bodies: list[Body] = []
     for i, look in enumerate(looks):
@@ -161,9 +161,9 @@ def draw_stack(
         x, y, z = (max(side + grown, SMALLEST) for side in body.scale)
         right, ahead = (side * uniform(rng, (-rule.jitter, rule.jitter)) for side in (x, y))
         body = replace(body, scale=(x, y, z), position=(right, ahead, start))
-        body = raised_clear_of(with_mass_by_volume(body, mass_factor), (*obstacles, *bodies))
+        body = raise_above(set_mass_by_volume(body, mass_factor), (*obstacles, *bodies))
         bodies.append(body)
-        start = top_height(body)
+        start = height_of_top(body)
     return bodies
 
 
@@ -171,37 +171,39 @@ def draw_stand(
     rng: np.random.Generator, rule: StandRule, zone: Body, base_look: Look, attachment_look: Look
 ) -> Stand:
     """Draw the base in the centre of the scene, with attachment and cap if ``rule`` has them."""
-    base = with_mass_by_volume(_draw_stand_body(rng, rule.base, "base", 0.0, base_look))
+    base = set_mass_by_volume(_draw_stand_body(rng, rule.base, "base", 0.0, base_look))
     through = base.shape in OPEN_BELOW
-    height = 0.0 if through else top_height(base)
-    base = raised_clear_of(base, (zone,))
-    top = base.position[2] if through else top_height(base)
+    height = 0.0 if through else height_of_top(base)
+    base = raise_above(base, (zone,))
+    top = base.position[2] if through else height_of_top(base)
     start = height + zone.scale[2]
     if not rule.attached:
         return Stand((base,), None, (), top, start)
     pole = _draw_stand_body(rng, rule.attachment, "attachment", top, attachment_look)
-    pole = raised_clear_of(
-        with_mass_by_volume(pole, ATTACHMENT_MASS_FACTORS.get(pole.shape, 1.0)), (zone, base)
+    pole = raise_above(
+        set_mass_by_volume(pole, ATTACHMENT_MASS_FACTORS.get(pole.shape, 1.0)), (zone, base)
     )
     joints = [Joint("base", "attachment")] if rule.joined else []
     if pole.shape == "cone":
         start += CONE_RISE * float(norm(pole.scale[:2])) / pole.scale[2]
     if not rule.capped:
         return Stand((base, pole), None, tuple(joints), top, start)
-    cap = with_mass_by_volume(_draw_stand_body(rng, rule.base, "cap", top_height(pole), base_look))
+    cap = set_mass_by_volume(
+        _draw_stand_body(rng, rule.base, "cap", height_of_top(pole), base_look)
+    )
     joints += [Joint("attachment", "cap")] if rule.joined else []
     # In the official code the cap raises the stack as if it were a second base.
-    start += top_height(cap) - cap.position[2]
+    start += height_of_top(cap) - cap.position[2]
     return Stand((base, pole), cap, tuple(joints), top, start)
 
 
-def lowered_under_cap(stack: Sequence[Body], stand: Stand) -> list[Body] | None:
+def lower_below_cap(stack: Sequence[Body], stand: Stand) -> list[Body] | None:
     """Return the stack, lowered to end below the cap if there is one; None if it does not fit."""
     if stand.cap is None or not stack:
         return list(stack)
-    above = max(top_height(stack[-1]) + GAP - stand.cap.position[2], 0.0)
+    above = max(height_of_top(stack[-1]) + GAP - stand.cap.position[2], 0.0)
     low = stack[0].position[2] - above
-    return [raised(body, -above) for body in stack] if low >= stand.top else None
+    return [move_up(body, -above) for body in stack] if low >= stand.top else None
 
 
 def choose_position(rng: np.random.Generator, count: int, choice: tuple[int, int]) -> int:

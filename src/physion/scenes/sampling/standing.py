@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from physion.scenes.sampling.build import Palette, SceneParams, build_scene
-from physion.scenes.sampling.clearance import is_clear_of, raised_clear_of
+from physion.scenes.sampling.clearance import is_clear_of, raise_above
 from physion.scenes.sampling.parameters import retry
 from physion.scenes.sampling.rules import (
     BodyRule,
@@ -26,8 +26,8 @@ from physion.scenes.sampling.stacks import (
     draw_looks,
     draw_stack,
     draw_stand,
-    lowered_under_cap,
-    top_height,
+    height_of_top,
+    lower_below_cap,
 )
 from physion.scenes.scene import Body, Look, Roles, Scene, Vec3
 from physion.seeds import child_generator
@@ -104,8 +104,10 @@ def sample_standing(
     rng, palette = child_generator(seed, "placement"), Palette.of(seed)
     member = params.stack.member
     agent_look = palette.agent_look(member.textures)
-    base_look = _painted(palette.look(params.stand.base.textures), base_color)
-    attachment_look = _painted(palette.look(params.stand.attachment.textures), attachment_color)
+    base_look = _set_look_color(palette.look(params.stand.base.textures), base_color)
+    attachment_look = _set_look_color(
+        palette.look(params.stand.attachment.textures), attachment_color
+    )
     probe_look = palette.look(params.probe.textures)
     zone = draw_zone(rng, params.zone, palette.look(params.zone.textures))
     looks = draw_looks(rng, params.stack, palette, params.monochrome)
@@ -118,10 +120,10 @@ def sample_standing(
         stand = draw_stand(rng, params.stand, zone, base_look, attachment_look)
         obstacles = (zone, *stand.holders)
         stack = draw_stack(rng, params.stack, stand.start, obstacles, looks, "member", STACK_MASS)
-        fitting = lowered_under_cap(stack, stand)
+        fitting = lower_below_cap(stack, stand)
         start = (-params.length / 2, 0.0, 0.0)
         probe = draw_body(push_rng, params.probe, "probe", start, probe_look, angular_drag=0.0)
-        probe = raised_clear_of(probe, (zone,))
+        probe = raise_above(probe, (zone,))
         if fitting is None:
             return "the stack does not fit under the cap"
         if not is_clear_of(probe, (*stand.bodies, *fitting)):
@@ -140,11 +142,11 @@ def sample_standing(
         bodies=(zone, target, result.probe, *result.stand.bodies, *others),
         roles=Roles("target", "zone", "probe"),
         max_frames=MAX_FRAMES,
-        aim_height=top_height(result.stack[-1]) / 2,
+        aim_height=height_of_top(result.stack[-1]) / 2,
         pushes=(draw_push(push_rng, params.push, result.probe),),
         joints=result.stand.joints,
     )
 
 
-def _painted(look: Look, color: Vec3 | None) -> Look:
+def _set_look_color(look: Look, color: Vec3 | None) -> Look:
     return look if color is None else replace(look, color=color)

@@ -17,7 +17,7 @@ from physion.scenes.sampling.rules import (
     draw_body,
     draw_push,
     draw_zone,
-    raised_to_floor,
+    raise_to_floor,
     require_apart,
 )
 from physion.scenes.scene import Roles, Scene
@@ -73,11 +73,11 @@ def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
     zone = draw_zone(rng, params.zone, palette.look(params.zone.textures), (params.length, aside))
     look = palette.agent_look(params.target.textures)
     position = (params.length / 2, 0.0, 0.0)
-    target = raised_to_floor(draw_body(rng, params.target, "target", position, look))
+    target = raise_to_floor(draw_body(rng, params.target, "target", position, look))
     push_rng = child_generator(seed, "push")
     look = palette.look(params.probe.textures, params.monochrome)
     position = (-params.length / 2, 0.0, params.lift)
-    probe = raised_to_floor(
+    probe = raise_to_floor(
         draw_body(push_rng, params.probe, "probe", position, look, angular_drag=0.0)
     )
     require_apart(probe, target)

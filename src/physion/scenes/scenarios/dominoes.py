@@ -19,7 +19,7 @@ from physion.scenes.sampling.rules import (
     draw_body,
     draw_push,
     draw_zone,
-    raised_to_floor,
+    raise_to_floor,
     require_apart,
 )
 from physion.scenes.scene import Body, Look, Roles, Scene
@@ -83,10 +83,10 @@ def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
     x, y, _ = zone.position
     zone = replace(zone, position=(x + zone.scale[0], y, 0.0))
     look = palette.agent_look(params.target.textures)
-    target = raised_to_floor(draw_body(rng, params.target, "target", (half, 0.0, 0.0), look))
+    target = raise_to_floor(draw_body(rng, params.target, "target", (half, 0.0, 0.0), look))
     push_rng = child_generator(seed, "push")
     look = palette.look(params.probe.textures)
-    probe = raised_to_floor(
+    probe = raise_to_floor(
         draw_body(push_rng, params.probe, "probe", (-half, 0.0, 0.0), look, angular_drag=0.0)
     )
     require_apart(probe, target)
@@ -139,7 +139,7 @@ def _draw_row(
         jitter = params.spacing_jitter
         x += spacing * uniform(rng, (1 - jitter, 1 + jitter))
         aside = uniform(rng, (-params.lateral_jitter, params.lateral_jitter))
-        body = raised_to_floor(draw_body(rng, params.middle, f"middle_{i}", (0.0, 0.0, 0.0), look))
+        body = raise_to_floor(draw_body(rng, params.middle, f"middle_{i}", (0.0, 0.0, 0.0), look))
         low, high = (float(bound) for bound in world_bounds(body)[:, 0])
         first, last = taken + BODY_GAP - low, end - BODY_GAP - high
         if first > last:

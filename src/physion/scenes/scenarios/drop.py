@@ -19,7 +19,7 @@ from physion.scenes.sampling.parameters import (
 )
 from physion.scenes.sampling.placement import CameraRule, SceneryRule, world_bounds
 from physion.scenes.sampling.registry import scenario
-from physion.scenes.sampling.rules import BodyRule, ZoneRule, draw_body, draw_zone, raised_to_floor
+from physion.scenes.sampling.rules import BodyRule, ZoneRule, draw_body, draw_zone, raise_to_floor
 from physion.scenes.scene import Body, Quat, Roles, Scene
 from physion.seeds import child_generator
 
@@ -119,7 +119,7 @@ def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
 
 def _put_on_zone(lower: Body, zone: Body) -> Body:
     """Return the lower body, on the zone if it is above it, otherwise on the floor."""
-    lower = raised_to_floor(lower)
+    lower = raise_to_floor(lower)
     below, body = world_bounds(zone), world_bounds(lower)
     apart = (below[1, :2] <= body[0, :2]).any() or (body[1, :2] <= below[0, :2]).any()
     x, y, z = lower.position

@@ -33,7 +33,7 @@ from physion.scenes.sampling.rules import (
     draw_body,
     draw_push,
     draw_zone,
-    raised_to_floor,
+    raise_to_floor,
 )
 from physion.scenes.scenarios import collide
 from physion.scenes.scene import Body, Roles, Scene, SurfaceMaterial
@@ -222,9 +222,7 @@ def _sample_ledge(params: Params, seed: np.random.SeedSequence) -> Scene:
         look=palette.look(rule.textures),
     )
     position = (-rule.length / 2, 0.0, 0.0)
-    target = raised_to_floor(
-        draw_body(rng, rule.target, "target", position, look, angular_drag=0.0)
-    )
+    target = raise_to_floor(draw_body(rng, rule.target, "target", position, look, angular_drag=0.0))
     push = draw_push(child_generator(seed, "push"), rule.push, target)
     return build_scene(
         "roll",

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from physion.scenes.sampling.build import Palette, build_scene
-from physion.scenes.sampling.clearance import is_clear_of, raised_clear_of
+from physion.scenes.sampling.clearance import is_clear_of, raise_above
 from physion.scenes.sampling.parameters import Length, Room, retry
 from physion.scenes.sampling.placement import CameraRule, SceneryRule
 from physion.scenes.sampling.registry import scenario
@@ -23,8 +23,8 @@ from physion.scenes.sampling.stacks import (
     StackRule,
     draw_looks,
     draw_stack,
-    top_height,
-    with_mass_by_volume,
+    height_of_top,
+    set_mass_by_volume,
 )
 from physion.scenes.scene import Body, Roles, Scene
 from physion.seeds import child_generator
@@ -89,13 +89,11 @@ def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
     def attempt() -> str | None:
         floor = zone.scale[2]
         blocks = draw_stack(rng, params.stack, floor, (zone,), looks, "block")
-        top = top_height(blocks[-1]) if blocks else floor
-        cap = with_mass_by_volume(
-            draw_body(rng, params.cap, "target", (0.0, 0.0, top), target_look)
-        )
+        top = height_of_top(blocks[-1]) if blocks else floor
+        cap = set_mass_by_volume(draw_body(rng, params.cap, "target", (0.0, 0.0, top), target_look))
         start = (-params.length / 2, 0.0, 0.0)
         probe = draw_body(push_rng, params.probe, "probe", start, probe_look, angular_drag=0.0)
-        drawn[:] = [raised_clear_of(cap, (zone, *blocks)), raised_clear_of(probe, (zone,)), *blocks]
+        drawn[:] = [raise_above(cap, (zone, *blocks)), raise_above(probe, (zone,)), *blocks]
         return None if is_clear_of(drawn[1], blocks) else "the probe would start inside the tower"
 
     retry(TRIES, "support", attempt)
@@ -107,6 +105,6 @@ def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
         bodies=(zone, *drawn),
         roles=Roles("target", "zone", "probe"),
         max_frames=MAX_FRAMES,
-        aim_height=top_height(target) / 2,
+        aim_height=height_of_top(target) / 2,
         pushes=(draw_push(push_rng, params.push, probe),),
     )

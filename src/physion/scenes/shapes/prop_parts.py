@@ -82,13 +82,13 @@ def prop(name: str, size: Vec3) -> Callable[[PartsBuilder], PartsBuilder]:
     NATURAL_SIZES[name] = size
 
     def add(parts_of: PartsBuilder) -> PartsBuilder:
-        shapes.register(PREFIX + name)(lambda: _fitted(name, list(parts_of())))
+        shapes.register(PREFIX + name)(lambda: _fit_to_unit_box(name, list(parts_of())))
         return parts_of
 
     return add
 
 
-def _fitted(name: str, parts: list[PropPart]) -> PropShape:
+def _fit_to_unit_box(name: str, parts: list[PropPart]) -> PropShape:
     whole = merge((part.mesh for part in parts), smooth=CURVED)
     low, high = whole.bounds
     scale = 1 / (high - low)
