@@ -31,7 +31,7 @@ TEXTURES = (
 RED: Vec3 = (1.0, 0.0, 0.0)
 YELLOW: Vec3 = (1.0, 1.0, 0.0)
 MARGIN = 0.25
-"""Two colours are too similar if no channel differs by more than this (official-system.md, 2.3)."""
+"""Two colours are too similar if no channel differs by more (docs/official-system.md, 2.3)."""
 ROLE_MARGIN = 0.33
 """The same for colours that may be mistaken for red or yellow: the middle official margin."""
 ROLE_HUES: dict[Vec3, tuple[float, float]] = {
