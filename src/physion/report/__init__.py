@@ -1,4 +1,4 @@
-"""Tables, figures and one page that compare models with people."""
+"""Report of a comparison: tables, figures and one page."""
 
 from physion.report.build import build_report, compare_files
 from physion.report.inputs import ReportInputs

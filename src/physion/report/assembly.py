@@ -1,4 +1,4 @@
-"""From checked tables to all that a report needs: people, comparison, tests."""
+"""Assembly of the inputs of a report from checked tables: people, comparison, tests."""
 
 from __future__ import annotations
 
@@ -39,6 +39,7 @@ def people_from_files(
     expected: Mapping[str, int] | None = None,
     attributes: pd.DataFrame | None = None,
 ) -> PeopleResults:
+    """Read responses and run every analysis of people."""
     chosen = rules_called(rules)
     read = read_any_responses(responses, sessions)
     if labels is not None:
@@ -55,6 +56,7 @@ def people_from_files(
 
 
 def people_in_words(responses: Sequence[Path], people: PeopleResults) -> str:
+    """Describe the responses and the flagged sessions."""
     flags = people.tables["flags"]
     return (
         f"answers of single participants from {', '.join(path.name for path in responses)}: "
@@ -64,7 +66,7 @@ def people_in_words(responses: Sequence[Path], people: PeopleResults) -> str:
 
 
 def expected_in_words(people: PeopleResults, given: bool) -> str:
-    """What a session must have, and how many did not have it."""
+    """Describe how many trials a session must have, and how many sessions had fewer."""
     flags = people.tables["flags"]
     counts = flags.groupby("scenario")["expected"].agg(["min", "max"])
     each = ", ".join(
@@ -80,7 +82,7 @@ def expected_in_words(people: PeopleResults, given: bool) -> str:
 
 
 def attributes_in_words(people: PeopleResults) -> str:
-    """From where the attributes of the stimuli come."""
+    """Describe where the attributes of the stimuli come from."""
     sources = people.tables["attributes"]["source"].value_counts()
     stimuli = len(people.tables["by_stimulus"])
     return (
@@ -96,7 +98,7 @@ def with_participants(
     exclude_ledge: bool,
     draws: Bootstrap,
 ) -> ReportInputs:
-    """The comparison with the sessions that are not flagged, and with all complete ones."""
+    """Compare with the sessions that are not flagged, and with all complete ones."""
     settings: dict[str, Any] = {
         "exclude": excluded,
         "exclude_ledge": exclude_ledge,
@@ -133,7 +135,7 @@ def completed(
     movies: Mapping[str, Path],
     draws: Bootstrap,
 ) -> ReportInputs:
-    """Adds the choices, and tests of pairs and calibration where no participants gave them."""
+    """Add the settings and, without participants, paired tests and calibration."""
     paired, calibration = inputs.paired, inputs.calibration
     if inputs.beside is None:
         paired = paired_table(inputs.comparison, draws)
@@ -153,13 +155,13 @@ def completed(
 
 
 def _by_model(comparison: Comparison, column: str) -> pd.DataFrame:
-    """Models by stimuli of one column of ``comparison.stimuli``."""
+    """Return models by stimuli of one column of ``comparison.stimuli``."""
     wide = comparison.stimuli.pivot(index="agent", columns="stimulus", values=column)
     return wide.loc[comparison.agents].astype("float64")
 
 
 def paired_table(comparison: Comparison, bootstrap: Bootstrap) -> pd.DataFrame | None:
-    """`paired.compare_models` on all stimuli together; None for one model alone."""
+    """Return `paired.compare_models` on all stimuli together; None for one model alone."""
     if len(comparison.agents) < 2:
         return None
     rows = comparison.stimuli.assign(
@@ -182,7 +184,7 @@ def paired_table(comparison: Comparison, bootstrap: Bootstrap) -> pd.DataFrame |
 
 
 def calibration_scores(comparison: Comparison) -> pd.DataFrame:
-    """`calibration.calibration_table` of all models against the official outcomes."""
+    """Return `calibration.calibration_table` of all models against the official outcomes."""
     p_contact = _by_model(comparison, "p_contact")
     truth = comparison.stimuli.drop_duplicates("stimulus").set_index("stimulus")["label"]
     return calibration_table(

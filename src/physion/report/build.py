@@ -1,4 +1,4 @@
-"""From a comparison, or from files, to a folder with the report, its tables and its figures."""
+"""Writers of a report, from a comparison or from files: a folder with page, tables and figures."""
 
 from __future__ import annotations
 
@@ -53,9 +53,9 @@ _LOOKS = {
 def build_report(inputs: ReportInputs, folder: Path) -> Path:
     """Write ``report.html``, ``report.json``, ``tables/*.csv`` and ``figures/*.{svg,png,csv}``.
 
-    The path of the page, which needs none of the other files. Every file is whole or absent, the
-    page comes last, and the same inputs give the same bytes. Raises `BadInputError`, before
-    anything is written, where ``folder`` is a file or a movie is not one.
+    Returns the path of the page, which needs none of the other files. Every file is complete or
+    absent, the page is written last, and the same inputs give the same bytes. Raises
+    `BadInputError`, before anything is written, if ``folder`` is a file or a movie is not readable.
     """
     check_movies(inputs)
     pictures = prepare_folder(folder)
@@ -70,7 +70,9 @@ def build_report(inputs: ReportInputs, folder: Path) -> Path:
 
 
 def report_numbers(inputs: ReportInputs) -> dict[str, Any]:
-    """Every table of a report, and the choices, as plain values for JSON; NaN becomes null."""
+    """Return every table of a report, and the settings, as plain values for JSON; NaN becomes
+    null.
+    """
     values: dict[str, Any] = {
         name: json.loads(table.to_json(orient="records", double_precision=15))
         for name, table in inputs.tables().items()
@@ -101,20 +103,49 @@ def compare_files(
     methods: Mapping[str, str] | None = None,
     movies: Mapping[str, Path] | None = None,
 ) -> Path:
-    """Compare predictions in CSV files with people and write the report; the page's path.
+    """Compare predictions in CSV files with people, write the report and return the page's path.
 
-    ``humans``: folder of ``human_accuracy-*.csv``, or None. ``labels``: a CSV file with
-    ``stim_ID`` and ``label``, or outcomes by stimulus; None looks for the official file in
-    ``humans``, beside it, and in ``stimuli`` beside it, then goes by *Recorded Outcome* of the
-    predictions. ``responses``: participant-level answers in place of ``humans``: our export
-    (with its table of ``sessions``) or the study's raw files; sessions are flagged by ``rules``
-    (a name of `exclusions.RULE_SETS`). ``expected``: which stimuli a session must have, as the
-    file of `people_results.read_expected` or as counts by scenario or session; None: what
-    anyone answered. ``attributes``: elements, distractors and occluders of one's own stimuli,
-    as a table of `attributes.attributes_from_table`, its file, or a dataset. ``zone``: the
-    official table of participants' percentiles; None looks for it likewise, in ``results``, and
-    goes on without. ``exclude``: a file of stimuli to leave out, one a line. ``methods``: see
-    `ReportInputs`. Raises `BadInputError`, before anything is written.
+    Parameters
+    ----------
+    predictions
+        CSV files with the official column names.
+    humans
+        Folder of ``human_accuracy-*.csv``, or None.
+    labels
+        CSV file with ``stim_ID`` and ``label``, or outcomes by stimulus. None looks for the
+        official file in ``humans``, next to it, and in ``stimuli`` next to it, and else uses
+        *Recorded Outcome* of the predictions.
+    folder
+        Folder for the report.
+    responses, sessions
+        Participant-level answers instead of ``humans``: our export (with its table of sessions) or
+        the study's raw files.
+    rules
+        Name of the exclusion rules, see `exclusions.RULE_SETS`.
+    expected
+        The stimuli that a session must have: a file for `read_expected`, or counts by scenario or
+        session; None: those that anyone answered.
+    attributes
+        Elements, distractors and occluders of one's own stimuli: a table of
+        `attributes.attributes_from_table`, its file, or a dataset.
+    zone
+        Official table of participants' percentiles; None looks for it in ``results`` likewise, and
+        goes on without.
+    exclude
+        File of stimuli to exclude, one a line.
+    exclude_ledge
+        Whether to exclude the Roll stimuli with a ledge.
+    dominoes
+        Which people count for Dominoes in ``humans``.
+    bootstrap
+        Draws for the intervals.
+    methods, movies
+        See `ReportInputs`.
+
+    Raises
+    ------
+    BadInputError
+        Before anything is written.
     """
     draws = bootstrap or Bootstrap()
     rows = read_predictions(predictions)
@@ -157,7 +188,7 @@ def _with_averages(
     dominoes: DominoesLook,
     settings: Mapping[str, Any],
 ) -> tuple[Comparison, dict[str, str]]:
-    """The comparison with people's averages, if there are any, and its choices in words."""
+    """Return the comparison with people's averages, if there are any, and its settings as text."""
     if humans is None:
         known = read_labels(labels) if isinstance(labels, Path) else labels
         return compare(rows, None, known, **settings), {}

@@ -1,4 +1,4 @@
-"""The mixed models of a report: of people's single answers, and of the models' accuracies."""
+"""Mixed models of a report: of people's single answers, and of the models' accuracies."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ CROSSED = "(1|participant) + (1|stimulus)"
 
 @dataclass(frozen=True)
 class MixedTable:
-    """A mixed model for the page: what it asks, its formula, its fit, or why there is none.
+    """Mixed model of the report: its question, formula and fit, or the reason why there is none.
 
-    ``term``: the one whose coefficients are tested together, where the question is about it.
+    ``term``: the term whose coefficients are tested together, if the question is about one.
     """
 
     name: str
@@ -34,7 +34,7 @@ class MixedTable:
     term: str = ""
 
     def table(self) -> pd.DataFrame:
-        """Fixed effects, then the standard deviation of each grouping, as one table."""
+        """Return fixed effects, then the standard deviation of each grouping, as one table."""
         if self.fit is None:
             return pd.DataFrame({"term": ["(none)"], "reason": [self.reason]})
         random = self.fit.random.assign(term="sd of " + self.fit.random["group"].astype(str))
@@ -47,7 +47,7 @@ Fitter = Callable[[str, pd.DataFrame], MixedFit]
 def _fitted(
     name: str, about: str, formula: str, fitter: Fitter, rows: pd.DataFrame, term: str = ""
 ) -> MixedTable:
-    """A fit, or the fitter's reason for not giving one."""
+    """Fit a model; if the fitter refuses, keep its reason."""
     try:
         return MixedTable(name, about, formula, fitter(formula, rows), term=term)
     except PhysionError as error:
@@ -55,7 +55,9 @@ def _fitted(
 
 
 def fits_of_people(people: PeopleResults) -> list[MixedTable]:
-    """The preregistered models of single answers; flags on all complete sessions."""
+    """Fit the preregistered models of single answers, and the effect of flags on all complete
+    sessions.
+    """
     stimuli = with_attributes(people.tables["by_stimulus"], people.tables["attributes"])
     rows = answer_rows(people.kept.test, stimuli)
     scenario = "scenario + " if rows["scenario"].nunique() > 1 else ""
@@ -85,7 +87,7 @@ def fits_of_people(people: PeopleResults) -> list[MixedTable]:
 
 
 def fits_of_models(comparison: Comparison) -> list[MixedTable]:
-    """Linear models of accuracy by model and scenario, as the study compared models.
+    """Fit linear models of accuracy by model and scenario, as the study compared models.
 
     Coefficients are differences to the model, and the readout, that comes first in the files. Each
     row is the accuracy of one model in one scenario.

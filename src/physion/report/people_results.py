@@ -1,4 +1,4 @@
-"""All that the answers of single participants say, computed once for tables, figures and page."""
+"""Results of all analyses of people, computed once for tables, figures and page."""
 
 from __future__ import annotations
 
@@ -50,20 +50,20 @@ from physion.stimulus_names import OFFICIAL_SCENARIOS, canonical_name, scenario_
 
 @dataclass(frozen=True)
 class PeopleResults:
-    """The people of a study: who was flagged, and what the others answered.
+    """Results about the people of a study.
 
-    ``kept``: the responses of the main analysis, without flagged sessions and left-out stimuli;
-    ``rules``: by which sessions were flagged; ``tables``: by name, each from the function of
-    `physion.analysis` that bears its columns:
+    ``kept``: the responses of the main analysis, without flagged sessions and excluded stimuli;
+    ``whole``: those of all complete first sessions; ``rules``: the exclusion rules; ``tables``: by
+    name, with the columns of the function in parentheses:
 
     - ``flags`` (`exclusions.flag_sessions`), ``flag_counts``, ``flag_effects``;
     - ``with_and_without``: `people.accuracy_by_scenario` without and with flagged sessions;
     - ``participants``, ``by_scenario``, ``by_stimulus`` (`people.accuracy_by_...`);
-    - ``agreement``: how alike people are (`people.agreement_by_scenario`);
+    - ``agreement``: agreement among people (`people.agreement_by_scenario`);
     - ``yes_bias``, ``side_bias``, ``learning``, ``background``, ``background_tests``;
     - ``attributes`` of the stimuli that people answered, and ``hypotheses``
       (`hypotheses.regress_hypotheses`);
-    - ``left_out``: answers that were dropped, with their reasons.
+    - ``left_out``: dropped answers, with their reasons.
     """
 
     kept: Responses
@@ -72,12 +72,12 @@ class PeopleResults:
     tables: dict[str, pd.DataFrame]
 
     def labels(self) -> dict[str, bool]:
-        """The outcome of every stimulus that people answered."""
+        """Return the outcome of every stimulus that people answered."""
         rows = self.whole.test.drop_duplicates("stimulus")
         return {str(s): bool(v) for s, v in zip(rows["stimulus"], rows["label"], strict=True)}
 
     def zone(self) -> pd.DataFrame:
-        """The middle 95 % of participants by scenario, as `analysis.compare` takes it."""
+        """Return the middle 95 % of participants by scenario, as `analysis.compare` takes it."""
         table = self.tables["by_scenario"]
         rows = table[table["zone_low"].notna()]
         return rows[["scenario", "zone_low", "zone_high"]].set_axis(
@@ -86,9 +86,9 @@ class PeopleResults:
 
 
 def read_any_responses(files: Sequence[Path], sessions: Path | None = None) -> Responses:
-    """Responses of our experiment's export (one file), or raw files of the original study.
+    """Read the export of our experiment (one file), or raw files of the original study.
 
-    The study's files are known by their column ``gameID``. Raises `BadInputError`.
+    The study's files are recognised by their column ``gameID``. Raises `BadInputError`.
     """
     official = [p for p in files if p.suffix.lower() != ".parquet" and "gameID" in read_csv(p, ())]
     if official and len(official) < len(files):
@@ -103,17 +103,17 @@ def read_any_responses(files: Sequence[Path], sessions: Path | None = None) -> R
 
 
 def rules_called(name: str) -> ExclusionRules:
-    """The rules of this name; `UnknownNameError` with the closest ones."""
+    """Return the rules of this name; raise `UnknownNameError` with the closest ones."""
     if name not in RULE_SETS:
         raise UnknownNameError("set of exclusion rules", name, RULE_SETS)
     return RULE_SETS[name]
 
 
 def read_expected(path: Path) -> dict[str, int]:
-    """How many stimuli a session must have, from the list of them (CSV or parquet).
+    """Read how many stimuli a session must have from the list of them (CSV or parquet).
 
-    Columns: ``stimulus``, and ``session`` where each has a list of its own or else ``scenario``.
-    The keys are sessions or scenarios, as `exclusions.flag_sessions` takes them.
+    Columns: ``stimulus``, and ``session`` (if each has a list of its own) or ``scenario``. The keys
+    are sessions or scenarios, as for `exclusions.flag_sessions`.
     """
     table = read_table(path, ("stimulus",))
     if "session" not in table and "scenario" not in table:
@@ -128,7 +128,8 @@ def read_expected(path: Path) -> dict[str, int]:
 
 
 def read_attributes(path: Path) -> pd.DataFrame:
-    """Attributes of one's own stimuli: a table (CSV or parquet), or a dataset or its index.
+    """Read the attributes of one's own stimuli: a table (CSV or parquet), or a dataset or its
+    index.
 
     Columns: ``stimulus`` (or ``trial``), ``scenario``, any of `attributes.ATTRIBUTES`.
     """
@@ -149,12 +150,29 @@ def analyse_people(
     exclude_ledge: bool = True,
     bootstrap: Bootstrap | None = None,
 ) -> PeopleResults:
-    """Flag sessions, leave out stimuli, then every analysis of people.
+    """Flag sessions, exclude stimuli, then run every analysis of people.
 
-    ``expected``: how many test trials a session must have, by scenario or by session; where it is
-    silent, the stimuli of the scenario that anyone answered. ``attributes``: of one's own stimuli,
-    from `attributes.attributes_from_table`; stimuli that it lacks go by their official names.
-    Raises `BadInputError` where no session remains, or ``expected`` names none.
+    Parameters
+    ----------
+    responses
+        Answers of participants.
+    rules
+        Exclusion rules.
+    expected
+        Number of test trials that a session must have, by scenario or by session; by default the
+        stimuli of the scenario that anyone answered.
+    attributes
+        Attributes of one's own stimuli, from `attributes.attributes_from_table`; those of other
+        stimuli come from official names.
+    exclude, exclude_ledge
+        Stimuli to exclude, and whether to exclude Roll's ledges.
+    bootstrap
+        Draws for the intervals.
+
+    Raises
+    ------
+    BadInputError
+        If no session remains, or ``expected`` names none.
     """
     draws = bootstrap or Bootstrap()
     _check_expected(responses, expected)
@@ -184,7 +202,7 @@ def analyse_people(
 
 
 def _check_expected(responses: Responses, expected: Mapping[str, int] | None) -> None:
-    """Refuse a list that is about none of these sessions."""
+    """Refuse a list that names none of these sessions and scenarios."""
     known = {*responses.sessions["session"], *responses.sessions["scenario"]}
     if expected is not None and not known & set(expected):
         raise BadInputError(
@@ -194,7 +212,7 @@ def _check_expected(responses: Responses, expected: Mapping[str, int] | None) ->
 
 
 def _sets(shown: Responses, flags: pd.DataFrame) -> tuple[Responses, Responses]:
-    """The responses without flagged sessions, and all complete first sessions."""
+    """Return the responses without flagged sessions, and those of all complete first sessions."""
     whole = set(flags.loc[~flags["incomplete"] & ~flags["repeated"], "session"])
     return (
         without_flagged(shown, flags),
@@ -209,7 +227,7 @@ def _flag_effects(responses: Responses, flags: pd.DataFrame) -> pd.DataFrame:
 
 
 def _attributes(stimuli: pd.Series, given: pd.DataFrame | None) -> pd.DataFrame:
-    """Attributes of ``stimuli``: those given, else as official names tell them, else none."""
+    """Return the attributes of ``stimuli``: those given, else those in official names."""
     named = [name for name in stimuli if scenario_of(name) is not None]
     by_name = (
         attributes_from_names(named) if named else pd.DataFrame(columns=list(ATTRIBUTE_COLUMNS))

@@ -1,4 +1,4 @@
-"""Files of a report: folders, tables, figures."""
+"""Writers of the files of a report: folders, tables, figures."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from physion.report.page.document import Picture, page_kind
 
 
 def prepare_folder(folder: Path) -> Path:
-    """Make ``folder`` with its ``tables`` and ``figures``; the path of the latter."""
+    """Make ``folder`` with its ``tables`` and ``figures``, and return the path of the latter."""
     if folder.exists() and not folder.is_dir():
         raise BadInputError(f"{folder} is a file; give a folder for the report")
     for place in ("tables", "figures"):
@@ -23,7 +23,7 @@ def prepare_folder(folder: Path) -> Path:
 
 
 def write_plot(plot: Plot, folder: Path) -> Picture:
-    """Write a figure as SVG and PNG with its table beside it; what the page shows of it."""
+    """Write a figure as SVG and PNG with its table, and return what the page shows of it."""
     write_csv(folder / f"{plot.name}.csv", plot.table)
     figure = plot.draw(plot.table, theme.LIGHT)
     light = {kind: theme.figure_bytes(figure, kind) for kind in ("svg", "png")}
@@ -36,5 +36,5 @@ def write_plot(plot: Plot, folder: Path) -> Picture:
 
 
 def write_csv(path: Path, table: pd.DataFrame) -> None:
-    """A table as CSV, whole or not at all."""
+    """Write a table as CSV, completely or not at all."""
     write_atomic(path, table.to_csv(index=False, lineterminator="\n").encode())

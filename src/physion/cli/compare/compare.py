@@ -30,7 +30,7 @@ SUBVERBS = {
 
 @dataclass(frozen=True)
 class Options:
-    """Whom to compare. What is None is as `physion.report.compare_files` has it."""
+    """Predictions and people to compare."""
 
     predictions: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Prediction files with the official column names."""
@@ -71,7 +71,7 @@ class Options:
 
 
 def main(options: Options) -> int:
-    """Write the report and print where it is."""
+    """Write the report and print its path."""
     from physion.cli.output import console
     from physion.report.build import compare_files
 

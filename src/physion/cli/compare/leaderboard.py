@@ -23,7 +23,7 @@ SHOWN = ("rank", "model", "readout", "training", "scenarios", "stimuli")
 
 @dataclass(frozen=True)
 class Options:
-    """Which files, and what they are compared with."""
+    """Prediction files, and the people to compare them with."""
 
     predictions: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Prediction files with the official column names."""
@@ -56,7 +56,7 @@ class Options:
 
 
 def main(options: Options) -> int:
-    """Print the table; 1 if a file could not be compared."""
+    """Print the table; return 1 if a file could not be compared."""
     board = _board(options)
     record = _record(board)
     if options.out is not None:
@@ -93,7 +93,7 @@ def _board(options: Options) -> Leaderboard:
 
 
 def _people(options: Options) -> dict[str, Any]:
-    """Responses, and the choices that were made about them."""
+    """Return the responses, and the options about them."""
     from physion.errors import BadInputError
     from physion.report.people_results import read_any_responses, read_expected, rules_called
 
@@ -110,7 +110,7 @@ def _people(options: Options) -> dict[str, Any]:
 
 
 def _record(board: Leaderboard) -> dict[str, Any]:
-    """The board as JSON values; NaN is null."""
+    """Return the board as JSON values; NaN is null."""
     tables = {"rows": board.table, "dropped": board.dropped, "refused": board.refused}
     if board.dropped_answers is not None:
         tables["dropped_answers"] = board.dropped_answers
@@ -152,7 +152,7 @@ def _print(table: pd.DataFrame) -> None:
 
 
 def _print_notes(board: Leaderboard) -> None:
-    """What was ranked last, refused and left out, and by which rules people were."""
+    """Print what was ranked last, refused and left out, and the exclusion rules."""
     partial = board.table[board.table["stimuli"] < board.table["of_stimuli"]]
     notes = [f"not whole, so after those that are: {row.model}: {row.reason}" for row in
              partial.itertuples()]  # fmt: skip

@@ -33,7 +33,7 @@ class Options:
 
 
 def main(options: Options) -> int:
-    """Print the tables, and write the page where asked."""
+    """Print the tables, and write the page if asked."""
     from physion.analysis.published.summary import published_results
     from physion.cli.output import console
     from physion.report.page.published_report import build_published_report, published_numbers

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Options:
-    """Which files, and what they are held against."""
+    """Prediction files, and what they are checked against."""
 
     predictions: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Prediction files with the official column names."""
@@ -35,7 +35,7 @@ class Options:
 
 
 def main(options: Options) -> int:
-    """Print the faults; 1 if one of them is an error."""
+    """Print the faults; return 1 if one of them is an error."""
     from physion.analysis.tables.submission import validate
     from physion.errors import BadInputError
 

@@ -1,1 +1,1 @@
-"""Figures of a report."""
+"""Figures of a report: one function each, listed in `registry`."""

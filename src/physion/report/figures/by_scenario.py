@@ -1,4 +1,4 @@
-"""Figures of models beside people: measures by scenario, effects by condition, generalization.
+"""Drawings of models and people: measures by scenario, effects by condition, generalization.
 
 Every function draws its table and nothing else; `figure_tables` makes the tables.
 """
@@ -24,7 +24,7 @@ from physion.report.words import number, protocol_names
 
 
 def label(agent: str, width: int = 48) -> str:
-    """The name of a model on an axis, as on the page, broken into lines."""
+    """Return the name of a model for an axis, as on the page, broken into lines."""
     return textwrap.fill(protocol_names(str(agent)), width)
 
 
@@ -39,7 +39,8 @@ LABELS = {
 
 
 def measure_figure(table: pd.DataFrame, measure: str, theme: Theme = LIGHT) -> Figure:
-    """One measure by scenario and model, with intervals, people as a line, their zone as a band.
+    """Draw one measure by scenario and model, with intervals, people as a line, their zone as a
+    band.
 
     ``table``: see `figure_tables.MEASURE_COLUMNS`. One panel a scenario and one for the mean; the
     dotted line is chance.
@@ -145,7 +146,7 @@ def _measure_handles(
 
 
 def grouped_figure(table: pd.DataFrame, words: str, chance: float, theme: Theme = LIGHT) -> Figure:
-    """Rows are models, marks are conditions: how much the condition matters to each model.
+    """Draw a measure by model (rows) and condition (marks).
 
     ``table``: see `figure_tables.GROUPED_COLUMNS`; one panel for each of its ``panel``.
     """
@@ -199,10 +200,11 @@ def _group_handles(groups: Sequence[str], people: float, theme: Theme) -> list[L
 
 
 def generalization_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
-    """Trained on (rows) x tested on (columns), accuracy less that of people; one panel a model.
+    """Draw accuracy less that of people, trained on (rows) x tested on (columns); one panel a
+    model.
 
-    ``table``: see `figure_tables.GENERALIZATION_COLUMNS`. The number stands in each cell, so that
-    the colours, purple below people and orange above, may be lost in print.
+    ``table``: see `figure_tables.GENERALIZATION_COLUMNS`. Each cell contains its number, so that
+    the colours, purple below people and orange above, are not needed in print.
     """
     agents = list(table["agent"].unique())
     trained, tested = (list(table[name].unique()) for name in ("trained", "tested"))

@@ -1,4 +1,4 @@
-"""Figures over stimuli: models against people, accuracies, response times, calibration.
+"""Drawings over stimuli: models against people, accuracies, response times, calibration.
 
 Every function draws its table and nothing else; `figure_tables` makes the tables.
 """
@@ -38,7 +38,7 @@ SQUARE = 1.16
 
 
 def scatter_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
-    """Points: P(contact) of each model against the share of people who say yes, by stimulus.
+    """Draw P(contact) of each model against the fraction of people who say yes, by stimulus.
 
     ``table``: see `figure_tables.scatter_table`. A panel a model, in it a square a scenario, so
     that no colour is needed; hollow points are stimuli whose simulated outcome is not the official
@@ -63,7 +63,7 @@ def scatter_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
 
 
 def _squares(axis: Axes, rows: pd.DataFrame, scenarios: Sequence[str], theme: Theme) -> None:
-    """The squares of one model, beside each other on one axis, which is quick to draw."""
+    """Draw the squares of one model next to each other on one axis, which is fast."""
     left = SQUARE * np.arange(len(scenarios))
     frame = np.array([(0, 0), (1, 1), (np.nan, np.nan), (0, 1), (0, 0), (1, 0), (np.nan, np.nan)])
     lines = np.concatenate([frame + np.array([x, 0]) for x in left])
@@ -112,7 +112,8 @@ def _scatter_handles(theme: Theme) -> list[Line2D]:
 
 
 def difficulty_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
-    """How many stimuli people get right how often, by scenario, with the tail below chance.
+    """Draw the distribution of people's accuracy over stimuli, by scenario, with the tail below
+    chance.
 
     ``table``: from `difficulty.below_chance`.
     """
@@ -144,7 +145,7 @@ def difficulty_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
 
 
 def _tail_bars(axis: Axes, rows: pd.DataFrame, theme: Theme) -> None:
-    """Stacked bars; those without height are not drawn."""
+    """Draw stacked bars; those without height are not drawn."""
     corrected = rows["exact"].to_numpy(dtype=bool)
     alone = rows["released"].to_numpy(dtype=bool) & ~corrected
     below = np.zeros(len(BINS) - 1)
@@ -166,7 +167,7 @@ def _tail_hatch(place: int) -> str:
 
 
 def response_time_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
-    """Mean log response time of a stimulus against its accuracy, by scenario, with a line.
+    """Draw the mean log response time of a stimulus against its accuracy, by scenario, with a line.
 
     ``table``: see `figure_tables.response_time_table`.
     """
@@ -196,9 +197,10 @@ def response_time_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
 
 
 def calibration_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
-    """Reliability curves: how often contact follows where a model says so much; one panel a model.
+    """Draw reliability curves: the fraction of contact by predicted P(contact); one panel a model.
 
-    ``table``: see `figure_tables.calibration_table`. The area of a point goes with its stimuli.
+    ``table``: see `figure_tables.calibration_table`. The area of a point is proportional to its
+    stimuli.
     """
     agents = list(table["agent"].unique())
     columns = 3 if len(agents) <= 6 else 5

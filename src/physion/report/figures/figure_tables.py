@@ -1,6 +1,6 @@
-"""The tables behind the figures: what is drawn is what stands here.
+"""Tables of the figures: each figure draws exactly its table.
 
-Each function gives one table, plain rows and columns, that is written beside the figure as CSV.
+Each function returns one table, plain rows and columns, that is written next to the figure as CSV.
 """
 
 from __future__ import annotations
@@ -42,16 +42,16 @@ ALL_BUT, ONLY, ANOTHER = PROTOCOLS["all but this"], PROTOCOLS["same"], "another 
 
 
 def accuracy_table(comparison: Comparison) -> pd.DataFrame:
-    """Accuracy by scenario and model, beside people; `MEASURE_COLUMNS`."""
+    """Return accuracy by scenario and model, with people; `MEASURE_COLUMNS`."""
     people = _accuracy_of_people(comparison)
     return _measure(_scores(comparison, "accuracy"), people, "people")
 
 
 def r_table(comparison: Comparison, zones: pd.DataFrame | None = None) -> pd.DataFrame:
-    """Pearson's r with the average person; the dashed line is its ceiling; `MEASURE_COLUMNS`.
+    """Return Pearson's r with the average person; the dashed line is its noise ceiling.
 
-    ``zones`` (`zones.human_zones`): what single participants reach with the average of the others;
-    in the mean the paper's band, as in `zones.released_r_zone`.
+    Columns: `MEASURE_COLUMNS`. ``zones`` (`zones.human_zones`): the range of single participants
+    with the average of the others; in the mean the paper's band, as in `zones.released_r_zone`.
     """
     people = comparison.people.set_index("scenario")[["ceiling"]].set_axis(["people"], axis=1)
     people = _with_zone(people, zones, "r", released=False)
@@ -63,9 +63,9 @@ def r_table(comparison: Comparison, zones: pd.DataFrame | None = None) -> pd.Dat
 
 
 def kappa_table(comparison: Comparison, beside: PeopleComparison) -> pd.DataFrame:
-    """Mean kappa with participants; people: their mean kappa with each other; `MEASURE_COLUMNS`.
+    """Return mean kappa with participants, and the mean kappa of people with each other.
 
-    Intervals draw people and stimuli.
+    Columns: `MEASURE_COLUMNS`. Intervals draw people and stimuli.
     """
     rows = beside.scores[beside.scores["measure"] == "kappa"].rename(
         columns={"model": "agent", "scenario": "panel", "low_both": "low", "high_both": "high"}
@@ -98,7 +98,7 @@ def _accuracy_of_people(comparison: Comparison) -> pd.DataFrame:
 
 
 def _released(people: pd.DataFrame) -> pd.DataFrame:
-    """Adds the paper's band in the row of the mean, where there are scenarios to draw."""
+    """Add the paper's band in the row of the mean, if there are scenarios to draw."""
     values = people.drop(index=MEAN, errors="ignore")["people"]
     if MEAN in people.index and len(values) > 2 and values.notna().all():
         _, low, high = released_zone(values.to_numpy(dtype=np.float64))
@@ -137,14 +137,16 @@ def _measure(rows: pd.DataFrame, people: pd.DataFrame, people_is: str) -> pd.Dat
 
 
 def scatter_table(comparison: Comparison, agents: Sequence[str]) -> pd.DataFrame:
-    """P(contact) and the share of yes: a row a model and stimulus, in the order of ``agents``."""
+    """Return P(contact) and the fraction of yes, a row a model and stimulus, in the order of
+    ``agents``.
+    """
     columns = ["agent", "scenario", "stimulus", "p_yes", "p_contact", "label", "simulated"]
     rows = comparison.stimuli[comparison.stimuli["agent"].isin(agents)]
     return rows[columns].reset_index(drop=True)
 
 
 def difficulty_table(comparison: Comparison, by_stimulus: pd.DataFrame | None) -> pd.DataFrame:
-    """Which stimuli people get wrong more often than by guessing; see `difficulty.below_chance`.
+    """Return the stimuli with people's accuracy and its tests; see `difficulty.below_chance`.
 
     ``by_stimulus``: all that people answered; without it those that any model predicts.
     """
@@ -156,12 +158,12 @@ def difficulty_table(comparison: Comparison, by_stimulus: pd.DataFrame | None) -
 
 
 def response_time_table(by_stimulus: pd.DataFrame) -> pd.DataFrame:
-    """Columns ``scenario``, ``stimulus``, ``count``, ``accuracy``, ``mean_log_rt``."""
+    """Return ``scenario``, ``stimulus``, ``count``, ``accuracy``, ``mean_log_rt``."""
     return by_stimulus[["scenario", "stimulus", "count", "accuracy", "mean_log_rt"]]
 
 
 def calibration_table(comparison: Comparison) -> pd.DataFrame:
-    """`calibration.reliability_curve` of each model on all its stimuli, with its ``brier`` score.
+    """Return the reliability curve of each model on all its stimuli, with its ``brier`` score.
 
     The outcome is the official one.
     """
@@ -177,11 +179,12 @@ def calibration_table(comparison: Comparison) -> pd.DataFrame:
 def thirds_table(
     comparison: Comparison, answers: pd.DataFrame | None = None, bootstrap: Bootstrap | None = None
 ) -> pd.DataFrame:
-    """r with the average person within the stimuli that are hard, chance and easy for people.
+    """Return r with the average person within the stimuli that are hard, chance and easy for
+    people.
 
     `MEASURE_COLUMNS` and ``stimuli``, their number; a panel a third; all scenarios pooled,
     intervals by drawing stimuli of the third. With the ``answers`` of participants (``test`` of
-    `participants.Responses`) the dashed line is what halves of them reach with each other.
+    `participants.Responses`) the dashed line is the r of halves of them with each other.
     """
     draws = bootstrap or Bootstrap()
     people = _halves_by_third(comparison, answers)
@@ -200,7 +203,7 @@ THIRD_WORDS = dict(zip(THIRDS, ("hard (up to 1/3)", "chance", "easy (from 2/3)")
 
 
 def _third(own: pd.DataFrame, name: str, draws: Bootstrap) -> dict[str, float | str]:
-    """r of one model within one third, with its interval."""
+    """Return r of one model within one third, with its interval."""
     rows = own.sort_values("stimulus", kind="stable")
     part = rows[(difficulty_third(rows["human_accuracy"]) == name).to_numpy()]
     x, y = (part[[key]].to_numpy(np.float64).T for key in ("p_contact", "p_yes"))
@@ -217,7 +220,7 @@ def _third(own: pd.DataFrame, name: str, draws: Bootstrap) -> dict[str, float | 
 def _halves_by_third(
     comparison: Comparison, answers: pd.DataFrame | None
 ) -> dict[str, dict[str, float | str]]:
-    """What `difficulty.r_by_third` says of people, for the columns of each third's panel."""
+    """Return the r of halves of the people by third, for the columns of each third's panel."""
     none: dict[str, float | str] = {"people": np.nan, "people_is": "", "zone_low": np.nan,
                                     "zone_high": np.nan, "zone": ""}  # fmt: skip
     if answers is None:
@@ -241,11 +244,12 @@ def _halves_by_third(
 def effects_table(
     comparison: Comparison, predictions: pd.DataFrame, bootstrap: Bootstrap | None = None
 ) -> pd.DataFrame:
-    """Accuracy by readout and by training protocol, averaged over seeds, then over scenarios.
+    """Return accuracy by readout and by training protocol, averaged over seeds, then over
+    scenarios.
 
     ``predictions``: from `predictions.read_predictions`. `GROUPED_COLUMNS`; the panel of readouts
-    holds the training protocol fixed (*all* where it occurs), that of trainings the readout. A
-    panel that no model has two conditions for is absent. Intervals draw stimuli.
+    has one training protocol (*all* if it occurs), that of trainings one readout. A panel is absent
+    if no model has two conditions. Intervals draw stimuli.
     """
     rows = _with_training(comparison, predictions)
     if len(rows.drop_duplicates(["readout", "training"])) < 2:
@@ -275,7 +279,9 @@ _READOUT_ORDER = tuple(READOUTS[letter] for letter in "CBA")
 
 
 def _with_training(comparison: Comparison, predictions: pd.DataFrame) -> pd.DataFrame:
-    """The stimuli of a comparison with ``trained`` (what stands there) and ``training``."""
+    """Return the stimuli of a comparison with ``trained`` (as in the predictions) and
+    ``training``.
+    """
     found = pd.Series("", index=predictions.index, dtype=object)
     for column in reversed(DATASETS[1:3]):
         if column in predictions:
@@ -319,11 +325,11 @@ def _effect(
 
 
 def generalization_table(comparison: Comparison, predictions: pd.DataFrame) -> pd.DataFrame:
-    """Accuracy less that of people, trained on x tested on; `GENERALIZATION_COLUMNS`.
+    """Return accuracy less that of people, trained on x tested on; `GENERALIZATION_COLUMNS`.
 
-    Seeds are averaged; models of one training alone are left out. Where no model was tested on
-    another scenario than it was trained on, one row `ONLY` holds what would be the diagonal.
-    Without people the difference is to 0.5, a guesser's accuracy, and ``people`` NaN.
+    Seeds are averaged; models of one training alone are left out. If no model was tested on another
+    scenario than it was trained on, the diagonal becomes one row `ONLY`. Without people the
+    difference is to 0.5, the accuracy of guessing, and ``people`` is NaN.
     """
     rows = _with_training(comparison, predictions)
     parts = {*SCENARIOS, ALL_BUT}

@@ -37,6 +37,7 @@ _PROTOCOLS = (
 
 @register_figure("accuracy", section=BY_SCENARIO, heading="Accuracy", order=10)
 def accuracy(inputs: ReportInputs) -> Plot:
+    """Return accuracy by scenario and model."""
     comparison = inputs.comparison
     caption = "Fraction of answers that equal the official outcome, with bootstrap intervals."
     if comparison.has_people:
@@ -50,6 +51,7 @@ def accuracy(inputs: ReportInputs) -> Plot:
 
 @register_figure("r", section=BY_SCENARIO, heading="Correlation with the average person", order=20)
 def correlation(inputs: ReportInputs) -> Plot | None:
+    """Return Pearson's r with the average person, by scenario and model."""
     if not inputs.comparison.has_people:
         return None
     zones = None if inputs.beside is None else inputs.beside.zones
@@ -71,6 +73,7 @@ def correlation(inputs: ReportInputs) -> Plot | None:
     "kappa", section=BY_SCENARIO, heading="Agreement with single participants", order=30
 )
 def kappa(inputs: ReportInputs) -> Plot | None:
+    """Return Cohen's kappa with participants, by scenario and model."""
     if inputs.beside is None:
         return None
     caption = (
@@ -84,6 +87,7 @@ def kappa(inputs: ReportInputs) -> Plot | None:
 
 @register_figure("effects", section=TRAINING, order=40)
 def effects(inputs: ReportInputs) -> Plot | None:
+    """Return accuracy by readout and by training protocol."""
     if inputs.predictions is None:
         return None
     table = tables.effects_table(inputs.comparison, inputs.predictions)
@@ -100,6 +104,7 @@ def effects(inputs: ReportInputs) -> Plot | None:
 
 @register_figure("generalization", section=TRAINING, order=50)
 def generalization(inputs: ReportInputs) -> Plot | None:
+    """Return accuracy by training and tested scenario."""
     if inputs.predictions is None:
         return None
     table = tables.generalization_table(inputs.comparison, inputs.predictions)
@@ -113,6 +118,7 @@ def generalization(inputs: ReportInputs) -> Plot | None:
 
 @register_figure("scatter", section=BY_STIMULUS, heading="Models against people", order=60)
 def scatter(inputs: ReportInputs) -> Plot | None:
+    """Return P(contact) against the fraction of people who say yes."""
     comparison, shown = inputs.comparison, inputs.scatter_agents()
     if not comparison.has_people:
         return None
@@ -130,6 +136,7 @@ def scatter(inputs: ReportInputs) -> Plot | None:
 
 @register_figure("thirds", section=BY_STIMULUS, heading="Hard, chance and easy stimuli", order=70)
 def thirds(inputs: ReportInputs) -> Plot | None:
+    """Return r within hard, chance and easy stimuli."""
     if not inputs.comparison.has_people:
         return None
     caption = (
@@ -151,6 +158,7 @@ def thirds(inputs: ReportInputs) -> Plot | None:
 
 @register_figure("calibration", section=BY_STIMULUS, heading="Calibration of P(contact)", order=80)
 def calibration(inputs: ReportInputs) -> Plot:
+    """Return the reliability curves."""
     caption = (
         "Reliability: of the stimuli to which a model gives about this P(contact), the fraction "
         "that ends in contact, in ten bins with Wilson's 95 % intervals; the area of a point is "
@@ -164,6 +172,7 @@ def calibration(inputs: ReportInputs) -> Plot:
 
 @register_figure("difficulty", section=BY_STIMULUS, heading="Stimuli that mislead people", order=90)
 def difficulty(inputs: ReportInputs) -> Plot | None:
+    """Return the distribution of people's accuracy over stimuli."""
     if not inputs.comparison.has_people:
         return None
     caption = (
@@ -180,6 +189,7 @@ def difficulty(inputs: ReportInputs) -> Plot | None:
 
 @register_figure("response_time", section=BY_STIMULUS, heading="Response times", order=100)
 def response_time(inputs: ReportInputs) -> Plot | None:
+    """Return response times against accuracy."""
     if inputs.people is None:
         return None
     table = tables.response_time_table(inputs.people.tables["by_stimulus"])

@@ -1,7 +1,7 @@
-"""How figures look: colours on white and on dark paper, marks that need no colour, and their bytes.
+"""Appearance of figures: colours on light and dark pages, marks that need no colour, and the bytes.
 
-Colours are those of Okabe and Ito; what a colour says, a hatch or the shape of a marker says too.
-The bytes depend on the tables and on the version of matplotlib, not on the time or the process.
+Colours are those of Okabe and Ito; every difference of colour is also one of hatch or marker. The
+bytes depend on the tables and on the version of matplotlib, not on the time or the process.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 
 @dataclass(frozen=True)
 class Theme:
-    """The colours of page and figures: paper, ink, faint lines, the human zone."""
+    """Colours of page and figures: paper, ink, faint lines, human zone, palette."""
 
     name: str
     paper: str
@@ -30,7 +30,7 @@ class Theme:
     palette: tuple[str, ...]
 
     def mark(self, place: int) -> tuple[str, str]:
-        """Colour and marker of the ``place``-th of things that are told apart."""
+        """Return colour and marker of the ``place``-th of things to distinguish."""
         return self.palette[place % len(self.palette)], MARKERS[place % len(MARKERS)]
 
 
@@ -45,9 +45,9 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 
 @dataclass(frozen=True)
 class Plot:
-    """A figure as data: what is drawn is ``table`` and nothing else.
+    """Figure as data: it draws ``table`` and nothing else.
 
-    ``name``: of its files; ``words``: what it shows, under it; ``draw`` makes it in a theme.
+    ``name``: of its files; ``words``: its caption; ``draw``: draws the table in a theme.
     """
 
     name: str
@@ -59,11 +59,11 @@ class Plot:
 def panels(
     count: int, columns: int, size: tuple[float, float], above: float = 0.9, **shared: Any
 ) -> tuple[Figure, list[Axes]]:
-    """A figure of ``count`` panels, each about ``size`` inches, and its axes row by row.
+    """Return a figure of ``count`` panels, each about ``size`` inches, and its axes row by row.
 
-    Where there are fewer than ``columns``, the rest of the width stays empty, so that panels are
-    as large as in other figures. ``above`` is room for the legend. Of panels that share an axis
-    only the outer ones have ticks with numbers, see `outer`. Call it inside
+    With fewer panels than ``columns`` the rest of the width stays empty, so that panels have the
+    size that they have in other figures. ``above`` is space for the legend. Of panels that share an
+    axis only the outer ones have ticks with numbers, see `outer`. Call it inside
     ``rc_context(style(theme))``.
     """
     rows = math.ceil(count / columns)
@@ -78,7 +78,7 @@ def panels(
 
 
 def outer(axis: Axes, place: int, count: int, columns: int, shared: Mapping[str, Any]) -> None:
-    """Takes ticks that would have no numbers, and gives them where no panel stands below."""
+    """Remove ticks without numbers, and add them to a panel with no panel below."""
     if shared.get("sharex"):
         last = place + columns >= count
         axis.tick_params(axis="x", bottom=last, labelbottom=last)
@@ -88,19 +88,19 @@ def outer(axis: Axes, place: int, count: int, columns: int, shared: Mapping[str,
 
 
 def legend(figure: Figure, handles: Sequence[Any], columns: int) -> None:
-    """One legend for all panels, above them."""
+    """Draw one legend for all panels, above them."""
     figure.legend(
         handles=list(handles), loc="outside upper center", ncols=min(columns, len(handles))
     )
 
 
 def title(axis: Axes, words: str) -> None:
-    """The heading of a panel."""
+    """Set the heading of a panel."""
     axis.set_title(words, fontsize=10, fontweight="bold", loc="left")
 
 
 def figure_bytes(figure: Figure, kind: str) -> bytes:
-    """A figure as ``svg`` or ``png``, without date, program version or random names."""
+    """Return a figure as ``svg`` or ``png``, without date, program version or random names."""
     metadata: dict[str, None] = {"Date": None} if kind == "svg" else {"Software": None}
     buffer = io.BytesIO()
     with matplotlib.rc_context({"svg.hashsalt": "physion", "svg.fonttype": "path"}):
@@ -111,7 +111,7 @@ def figure_bytes(figure: Figure, kind: str) -> bytes:
 
 
 def style(theme: Theme) -> Any:
-    """Settings for ``rc_context``; its type in matplotlib spells out every key."""
+    """Return settings for ``rc_context``; the type in matplotlib would list every key."""
     return {
         "font.family": "DejaVu Sans",
         "font.size": 9,

@@ -1,1 +1,1 @@
-"""The page of a report."""
+"""Page of a report."""

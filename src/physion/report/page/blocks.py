@@ -1,4 +1,4 @@
-"""The pieces of the report page: tables, lists and cards, every text escaped."""
+"""Building blocks of the report page: tables, lists and cards; every text is escaped."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ MOST_BARS = 8
 
 
 def details(title: str, content: str) -> str:
-    """A part that opens on a click; ``content`` is HTML."""
+    """Return a part that opens on a click; ``content`` is HTML."""
     return f"<details><summary>{escape(title)}</summary>\n{content}</details>"
 
 
 def p_value(value: float) -> str:
-    """A p value to three decimals, or ``< .001``."""
+    """Return a p value with three decimals, or ``< .001``."""
     if pd.isna(value):
         return "NaN"
     return "&lt; 0.001" if value < 0.001 else number(value, 3)
 
 
 def undefined(reason: str) -> str:
-    """``NaN`` with its reason on hovering, as HTML."""
+    """Return ``NaN`` with its reason on hovering, as HTML."""
     return f'<span class="none" title="{escape(reason)}">NaN</span>'
 
 
 def interval(row: pd.Series, key: str, low: str = "", high: str = "", digits: int = 2) -> str:
-    """A value with its interval in small print, as HTML; NaN with its reason where undefined.
+    """Return a value with its interval in small print, as HTML; NaN with its reason if undefined.
 
     ``low`` and ``high``: columns of the bounds, if they are not ``key`` with _low and _high.
     """
@@ -52,7 +52,7 @@ def interval(row: pd.Series, key: str, low: str = "", high: str = "", digits: in
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table of the page: its heading, and how the value of ``key`` is written."""
+    """Column of a table of the page: its heading, and the format of the value of ``key``."""
 
     heading: str
     key: str
@@ -62,7 +62,7 @@ class Column:
     high: str = ""
 
     def cell(self, row: pd.Series) -> str:
-        """The cell as HTML."""
+        """Return the cell as HTML."""
         value = row.get(self.key)
         if self.kind == "interval":
             return interval(row, self.key, self.low, self.high, self.digits)
@@ -78,13 +78,15 @@ class Column:
 
 
 def rows_table(rows: pd.DataFrame, columns: Sequence[Column], caption: str = "") -> str:
-    """A table of some columns of ``rows``; reasons of undefined numbers are listed below it."""
+    """Return a table of some columns of ``rows``, with reasons of undefined numbers listed below
+    it.
+    """
     cells = [[column.cell(row) for column in columns] for _, row in rows.iterrows()]
     return table([column.heading for column in columns], cells, caption) + notes(rows, columns)
 
 
 def notes(rows: pd.DataFrame, columns: Sequence[Column]) -> str:
-    """The column ``reason`` of rows, once each, with how many rows it is about."""
+    """Return the values of ``reason`` once each, with the rows that they are about."""
     if "reason" not in rows:
         return ""
     given = rows[rows["reason"].astype(str).str.len() > 0]
@@ -97,18 +99,18 @@ def notes(rows: pd.DataFrame, columns: Sequence[Column]) -> str:
 
 
 def words_list(values: Mapping[str, str]) -> str:
-    """Names and what they mean or say."""
+    """Return names and their meanings as a list."""
     rows = "".join(f"<dt>{escape(k)}</dt><dd>{escape(v)}</dd>" for k, v in values.items())
     return f"<dl>{rows}</dl>"
 
 
 def paragraph(words: str) -> str:
-    """Words as a paragraph."""
+    """Return text as a paragraph."""
     return f"<p>{escape(words)}</p>"
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]], caption: str = "") -> str:
-    """A table; the header and the caption are text, the cells are HTML."""
+    """Return a table; the header and the caption are text, the cells are HTML."""
     head = "".join(f'<th scope="col">{escape(name)}</th>' for name in header)
     lines = []
     for first, *rest in rows:
@@ -138,10 +140,7 @@ def shown_metrics(comparison: Comparison) -> list[Metric]:
 
 
 def overall_table(comparison: Comparison, which: str, caption: str = "") -> str:
-    """A row a model: accuracy against both outcomes, beside people; r with its ceiling; RMSD.
-
-    What is about simulated outcomes is absent where they all are the official ones.
-    """
+    """Return the table of scores: a row a model, the metrics, and the noise ceiling of r."""
     rows = comparison.scores[comparison.scores["scenario"] == which]
     shown = shown_metrics(comparison)
     header = ["model", "readout", "stimuli", *(metric.heading for metric in shown)]
@@ -165,13 +164,13 @@ def overall_table(comparison: Comparison, which: str, caption: str = "") -> str:
 
 
 def _model_words(row: pd.Series) -> str:
-    """The model's name with what tells it from others of that name, but without the readout."""
+    """Return the model's name with what distinguishes it from others, but without the readout."""
     head = f"{row['model']} · {row['readout']}"
     return str(row["model"]) + str(row["agent"]).removeprefix(head)
 
 
 def matrix(comparison: Comparison, key: str) -> str:
-    """A score by model (rows) and scenario (columns), people on top."""
+    """Return a score by model (rows) and scenario (columns), people on top."""
     scores = comparison.scores
     columns = [*in_order(comparison.stimuli["scenario"]), MEAN, POOLED]
     rows = []
@@ -202,7 +201,7 @@ _NO_ZONE = "known only of scenarios of which all stimuli that single participant
 
 
 def people(comparison: Comparison) -> str:
-    """The people by scenario."""
+    """Return the table of people by scenario."""
     header = ["scenario", "stimuli", "people", "base rate", "say yes", "accuracy", "zone"]
     rows = []
     for _, row in comparison.people.assign(reason="").iterrows():
@@ -224,7 +223,7 @@ def people(comparison: Comparison) -> str:
 
 
 def definitions(comparison: Comparison) -> str:
-    """What the columns mean; those that are hidden, see `overall_table`, are not explained."""
+    """Return the definitions of the columns that `overall_table` shows."""
     meaning = {metric.heading: metric.definition for metric in shown_metrics(comparison)}
     meaning |= {
         "NaN": "undefined; the reason is below the table or shown on hovering",
@@ -235,7 +234,9 @@ def definitions(comparison: Comparison) -> str:
 
 
 def changed(comparison: Comparison, links: Mapping[str, str] | None = None) -> str:
-    """The trials whose simulated outcome is not the official one; ``links``: to their movies."""
+    """Return the trials whose simulated outcome is not the official one; ``links``: to their
+    movies.
+    """
     rows = comparison.changed
     if rows.empty:
         return "<p>None.</p>"
@@ -261,13 +262,13 @@ def changed(comparison: Comparison, links: Mapping[str, str] | None = None) -> s
 
 
 def stimulus_link(stimulus: str, links: Mapping[str, str]) -> str:
-    """The name of a stimulus, a link where ``links`` has its movie."""
+    """Return the name of a stimulus, as a link if ``links`` has its movie."""
     name = f"<code>{escape(stimulus)}</code>"
     return f'<a href="{escape(links[stimulus])}">{name}</a>' if stimulus in links else name
 
 
 def dropped(comparison: Comparison) -> str:
-    """Counts of what was left out, and why."""
+    """Return counts of what was excluded, and why."""
     rows = comparison.dropped
     if rows.empty:
         return "<p>Nothing.</p>"
@@ -281,7 +282,7 @@ def dropped(comparison: Comparison) -> str:
 
 
 def card(comparison: Comparison, row: pd.Series, movie: str) -> str:
-    """One stimulus: its movie (HTML), outcome, what people and what every model said."""
+    """Return one stimulus: its movie (HTML), outcome, and the answers of people and every model."""
     own = comparison.stimuli[comparison.stimuli["stimulus"] == row["stimulus"]]
     bars = [_bar("people say yes", row["p_yes"], "human")]
     named = own["agent"] == row["agent"]
@@ -300,7 +301,7 @@ def card(comparison: Comparison, row: pd.Series, movie: str) -> str:
 
 
 def _bar(name: str, value: float, kind: str) -> str:
-    """A labelled bar; a ``meter`` would be coloured by the browser as good or bad."""
+    """Return a labelled bar; browsers would colour a ``meter`` as good or bad."""
     width = number(100 * value, 0)
     return (
         f'<div class="bar {kind}"><span>{escape(name)}</span><b>{percent(value)}</b>'
@@ -313,5 +314,5 @@ def _outcome(value: bool) -> str:
 
 
 def percent(value: float) -> str:
-    """A share in percent, or ``NaN``."""
+    """Return a fraction in percent, or ``NaN``."""
     return f"{100 * value:.0f} %" if np.isfinite(value) else "NaN"

@@ -1,4 +1,4 @@
-"""The frame of a page that needs nothing beside it: no network, no script, no other file."""
+"""Frame of a page that needs no network, no script and no other file."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ SVG_LIMIT = 500_000
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure in two themes, as bytes by kind: ``svg`` and ``png``, of the dark one that which
-    `page_kind` names; ``words`` stand under it."""
+    """Figure in two themes as bytes by kind: ``svg`` and ``png``, of the dark one only the kind
+    that `page_kind` names; ``words``: the caption.
+    """
 
     name: str
     light: Mapping[str, bytes]
@@ -26,24 +27,24 @@ class Picture:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a page under a heading; ``content`` is HTML."""
+    """Part of a page under a heading; ``content`` is HTML."""
 
     title: str
     content: str
 
     @property
     def anchor(self) -> str:
-        """The heading as the name of a place in the page."""
+        """Heading as the target of links in the page."""
         return re.sub(r"[^a-z0-9]+", "-", self.title.lower()).strip("-")
 
 
 def page_kind(figure: Mapping[str, bytes]) -> str:
-    """As what a figure is embedded: ``svg``, or ``png`` where the drawing would be too heavy."""
+    """Return the format for embedding a figure: ``svg``, or ``png`` if the drawing is too large."""
     return "svg" if len(figure["svg"]) <= SVG_LIMIT else "png"
 
 
 def render_document(title: str, lead: str, sections: Sequence[Section]) -> str:
-    """The page as text: heading, ``lead`` (HTML), contents, sections."""
+    """Return the page as text: heading, ``lead`` (HTML), contents, sections."""
     links = "".join(f'<li><a href="#{s.anchor}">{escape(s.title)}</a></li>' for s in sections)
     parts = [
         f'<section id="{s.anchor}"><h2>{escape(s.title)}</h2>\n{s.content}</section>'
@@ -82,7 +83,7 @@ def _style() -> str:
 
 
 def figure(picture: Picture) -> str:
-    """A figure with its words, light or dark as the reader's system asks."""
+    """Return a figure with its caption, light or dark as the reader's system asks."""
     kind = page_kind(picture.light)
     mime = {"svg": "image/svg+xml", "png": "image/png"}[kind]
     light, dark = (data_uri(mime, theme[kind]) for theme in (picture.light, picture.dark))
@@ -95,5 +96,5 @@ def figure(picture: Picture) -> str:
 
 
 def data_uri(mime: str, data: bytes) -> str:
-    """Bytes as an address that holds them."""
+    """Return a data URI that contains the bytes."""
     return f"data:{mime};base64,{base64.b64encode(data).decode('ascii')}"

@@ -1,4 +1,4 @@
-"""Which stimuli a page shows, and their movies within a budget of bytes."""
+"""Stimuli that a page shows, and their movies within a limit of bytes."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ _MIME = {
 
 
 def movies_of(folder: Path) -> dict[str, Path]:
-    """The movies of a dataset's testing trials, by canonical stimulus, as `ReportInputs` has them.
+    """Return the movies of a dataset's testing trials, by canonical stimulus, for `ReportInputs`.
 
-    Raises `BadInputError` where ``folder`` is no dataset or has no testing trial.
+    Raises `BadInputError` if ``folder`` is no dataset or has no testing trial.
     """
     from physion.trials.dataset import Dataset
 
@@ -38,12 +38,12 @@ def movies_of(folder: Path) -> dict[str, Path]:
 
 
 def widest_gaps(comparison: Comparison, count: int) -> pd.DataFrame:
-    """The stimuli on which a model and people differ most, at most ``count`` rows.
+    """Return the stimuli on which a model and people differ most, at most ``count`` rows.
 
-    Models take turns, each naming the stimulus of its largest |P(contact) - share of yes| that is
-    not yet there; ties go by name. Stimuli whose simulated outcome is not the official one are
-    passed over, since there it is the physics that differs and not the model. Rows of
-    ``comparison.stimuli``: that of the model which named it.
+    Models alternate: each adds the stimulus with its largest |P(contact) - P(yes)| that is not yet
+    chosen; ties are resolved by name. Stimuli whose simulated outcome is not the official one are
+    skipped, since there the physics differs and not the model. The result has rows of
+    ``comparison.stimuli``, each of the model that added it.
     """
     rows = comparison.stimuli
     rows = rows[(rows["label"] == rows["simulated"]) & rows["gap"].notna()]
@@ -64,7 +64,9 @@ def widest_gaps(comparison: Comparison, count: int) -> pd.DataFrame:
 
 
 def gaps(inputs: ReportInputs) -> str:
-    """A card for each of the widest gaps, with its movie while the budget of bytes lasts."""
+    """Return a card for each of the largest differences, with its movie within the limit of
+    bytes.
+    """
     chosen = widest_gaps(inputs.comparison, inputs.movie_count)
     if chosen.empty:
         return "<p>None: every simulated outcome differs from the official one.</p>"
@@ -82,7 +84,7 @@ def gaps(inputs: ReportInputs) -> str:
 
 
 def check_movies(inputs: ReportInputs) -> None:
-    """Raise `BadInputError` for a movie that would be shown and is absent or of a wrong kind."""
+    """Raise `BadInputError` for a movie to be shown that is absent or of a wrong kind."""
     if not inputs.comparison.has_people:
         return
     for stimulus in widest_gaps(inputs.comparison, inputs.movie_count)["stimulus"]:
@@ -99,7 +101,7 @@ def _mime(path: Path) -> str:
 
 
 def _movie(path: Path | None, stimulus: str, budget: int) -> tuple[str, int]:
-    """A movie or picture as HTML, and its bytes; words in its place where it cannot be shown."""
+    """Return a movie or picture as HTML, and its bytes; text instead if it cannot be shown."""
     if path is None:
         return '<p class="none">no movie given</p>', 0
     mime = _mime(path)

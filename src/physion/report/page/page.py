@@ -1,4 +1,4 @@
-"""The page of a comparison: models beside people, with all choices, tests and counts."""
+"""Page of a comparison of models with people, with all settings, tests and counts."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from physion.report.words import plural, protocol_names
 def render_page(
     inputs: ReportInputs, pictures: Sequence[Picture], folder: Path | None = None
 ) -> str:
-    """The page as text; the same inputs give the same text. Raises `BadInputError` for a movie.
+    """Return the page as text; the same inputs give the same text. Raises `BadInputError` for a
+    movie.
 
-    ``folder``: where the page will lie, so that it can link to the movies of other stimuli than
-    those that it holds itself.
+    ``folder``: the folder of the page, for links to the movies that it does not contain.
     """
     shown = {picture.name: figure(picture) for picture in pictures}
     links = _links(inputs, folder)
@@ -44,7 +44,7 @@ def render_page(
 
 
 def _links(inputs: ReportInputs, folder: Path | None) -> Mapping[str, str]:
-    """Addresses of the movies by stimulus, relative to the page."""
+    """Return the addresses of the movies by stimulus, relative to the page."""
     if folder is None:
         return {}
     base = folder.resolve()
@@ -146,7 +146,7 @@ def _left_out(inputs: ReportInputs) -> str:
 
 
 def _cannot_be_said(inputs: ReportInputs) -> list[str]:
-    """What a full report would hold and this one lacks, and why."""
+    """Return what a complete report would contain and this one lacks, and why."""
     words = []
     if not inputs.comparison.has_people:
         words.append(

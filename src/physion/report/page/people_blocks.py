@@ -1,4 +1,4 @@
-"""The parts of the page about people: how well, how alike, who was left out and what it changes."""
+"""Parts of the page about people: accuracy, agreement, biases, difficulty."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MORE = "every scenario, and why an interval is missing, is in tables/measures.cs
 
 
 def people(inputs: ReportInputs, shown: Mapping[str, str]) -> str:
-    """How well and how alike people answer."""
+    """Return accuracy of and agreement among people."""
     if not inputs.comparison.has_people:
         return ""
     parts = [averages(inputs.comparison)]
@@ -70,7 +70,9 @@ _ALIKE = {
 
 
 def _agreement(found: Mapping[str, pd.DataFrame]) -> str:
-    """A row a scenario: mean over pairs or halves, their middle 95 %, the interval of the mean."""
+    """Return a row a scenario: mean over pairs or halves, their middle 95 %, the interval of the
+    mean.
+    """
     rows = found["agreement"]
     cells, reasons = [], []
     for name in in_order(rows["scenario"]):
@@ -164,7 +166,7 @@ def _hypotheses(found: Mapping[str, pd.DataFrame]) -> str:
 
 
 def measures(inputs: ReportInputs) -> str:
-    """Every measure of every model with its three intervals, and models among themselves."""
+    """Return every measure of every model with its three intervals, and kappa among models."""
     if inputs.beside is None:
         return ""
     scores = inputs.beside.scores
@@ -191,7 +193,7 @@ def measures(inputs: ReportInputs) -> str:
 
 
 def _mean_pairs(pairs: pd.DataFrame) -> str:
-    """Kappa of every two models, mean over scenarios, as a matrix."""
+    """Return kappa of every two models, mean over scenarios, as a matrix."""
     if pairs.empty:
         return paragraph("One model alone makes no pair.")
     mean = pairs.groupby(["first", "second"], sort=False)["kappa"].mean()
@@ -212,7 +214,9 @@ def _mean_pairs(pairs: pd.DataFrame) -> str:
 
 
 def fooled(inputs: ReportInputs, links: Mapping[str, str]) -> str:
-    """The stimuli in the tail, with links to their movies."""
+    """Return the stimuli that people get wrong more often than by guessing, with links to
+    movies.
+    """
     if inputs.people is not None:
         rows = inputs.people.tables["by_stimulus"]
     else:

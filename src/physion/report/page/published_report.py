@@ -1,4 +1,4 @@
-"""The page of the published results: what was printed beside what a reader expects."""
+"""Page of the published results: the printed numbers and those that a reader expects."""
 
 from __future__ import annotations
 
@@ -31,9 +31,10 @@ TITLE = "The published results of the original study, recomputed from its releas
 
 
 def build_published_report(results: PublishedResults, folder: Path) -> Path:
-    """Write ``report.html``, ``published.json``, ``tables/*.csv``, ``figures/*``; the page's path.
+    """Write ``report.html``, ``published.json``, ``tables/*.csv``, ``figures/*``; return the page's
+    path.
 
-    The same inputs give the same bytes. Raises `BadInputError` where ``folder`` is a file.
+    The same inputs give the same bytes. Raises `BadInputError` if ``folder`` is a file.
     """
     pictures = prepare_folder(folder)
     for name, rows in results.tables.items():
@@ -47,7 +48,7 @@ def build_published_report(results: PublishedResults, folder: Path) -> Path:
 
 
 def published_numbers(results: PublishedResults) -> dict[str, Any]:
-    """Every table, as a list of rows, and what is said of them, for JSON; NaN becomes null."""
+    """Return every table, as a list of rows, and its description for JSON; NaN becomes null."""
     tables = {
         name: json.loads(rows.to_json(orient="records", double_precision=15))
         for name, rows in results.tables.items()
@@ -59,7 +60,7 @@ def published_numbers(results: PublishedResults) -> dict[str, Any]:
 
 
 def published_plots(results: PublishedResults) -> list[Plot]:
-    """Panels A, C, D and E of the paper's main figure."""
+    """Return panels A, C, D and E of the paper's main figure."""
     tables, words = results.tables, results.words["panels"]
     rows = tables["panel_a"]
     people = float(rows.loc[rows["scenario"] == MEAN, "people"].iloc[0])

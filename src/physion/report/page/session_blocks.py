@@ -1,4 +1,4 @@
-"""The parts of the page about sessions: who was flagged, and what changes with them."""
+"""Parts of the page about sessions: which were flagged, and the effect of excluding them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from physion.report.people_results import PeopleResults
 
 
 def sessions(inputs: ReportInputs) -> str:
-    """Who was flagged, by which rule, and what changes with flagged sessions."""
+    """Return which sessions were flagged, by which rule, and the effect of flagged sessions."""
     if inputs.people is None:
         return ""
     found = inputs.people.tables
@@ -51,7 +51,7 @@ def _flag_counts(counts: pd.DataFrame) -> str:
 
 
 def _with_and_without(inputs: ReportInputs) -> str:
-    """People's accuracy, and the models' scores, without and with the flagged sessions."""
+    """Return people's accuracy, and the models' scores, without and with the flagged sessions."""
     assert inputs.people is not None
     rows = inputs.people.tables["with_and_without"]
     columns = [Column("people", "people", "count"), Column("accuracy", "accuracy", "interval", 3)]
@@ -85,7 +85,7 @@ def _with_and_without(inputs: ReportInputs) -> str:
 
 
 def rules_in_words(rules: ExclusionRules) -> str:
-    """The rules of a set with their thresholds."""
+    """Describe the rules of a set with their thresholds."""
     words = []
     if rules.streak_percentile is not None:
         words.append(
@@ -110,7 +110,7 @@ def rules_in_words(rules: ExclusionRules) -> str:
 
 
 def dropped(found: PeopleResults) -> str:
-    """Answers left out, by step and reason."""
+    """Return counts of excluded answers, by step and reason."""
     rows = found.tables["left_out"]
     if rows.empty:
         return paragraph("Nothing.")
@@ -124,7 +124,7 @@ def dropped(found: PeopleResults) -> str:
 
 
 def methods(inputs: ReportInputs) -> dict[str, str]:
-    """The choices that participant-level answers bring, in words."""
+    """Return the settings about participant-level answers, as text."""
     if inputs.people is None:
         return {}
     return {

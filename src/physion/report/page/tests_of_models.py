@@ -1,4 +1,4 @@
-"""The parts of the page that test: models against each other, mixed models, calibration."""
+"""Parts of the page with tests: models against each other, mixed models, calibration."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from physion.report.words import number
 
 
 def tests(inputs: ReportInputs) -> str:
-    """Paired tests of models, then mixed models."""
+    """Return paired tests of models, then mixed models."""
     parts = []
     if inputs.paired is not None:
         parts += ["<h3>Models against each other</h3>", _paired(inputs.paired)]

@@ -1,1 +1,1 @@
-"""The page that shows a dataset."""
+"""Page that shows a dataset."""

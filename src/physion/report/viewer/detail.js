@@ -1,16 +1,22 @@
-// One trial: passes, scene in 3D, time line and tables, all at the same frame.
+// The detail view of one trial: passes, 3D view, time line and tables, all at the same frame.
 
 const CAPTIONS = {
   color: () => ["Colour", ""],
   depth: ({ near, far }) => ["Depth", `${near.toFixed(1)} (bright) to ${far.toFixed(1)} m`],
   normals: () => ["Normals", "x, y, z: red, green, blue"],
-  ids: () => ["Ids", "one colour a thing"],
-  flow: ({ flow }) => ["Flow", `up to ${flow.toFixed(1)} px a frame`],
+  ids: () => ["Ids", "one colour per object"],
+  flow: ({ flow }) => ["Flow", `up to ${flow.toFixed(1)} px per frame`],
 };
 
 class Detail {
+  /**
+   * @param {any[]} cards Data of the trials.
+   * @param {() => void} onClose
+   */
   constructor(cards, onClose) {
     this.cards = cards;
+    /** Meshes by name, parsed when first needed. @type {any} */
+    this.shapes = undefined;
     this.dialog = byId("detail");
     this.labelled = true;
     this.dialog.addEventListener("close", () => {
@@ -56,16 +62,16 @@ class Detail {
   }
 
   buildPasses(strip, detail) {
-    this.tiles = strip.tiles.map((name, place) => {
+    this.tiles = strip.tiles.map((name, index) => {
       const { width, height } = strip;
       const canvas = make("canvas", { width, height, role: "img", "aria-label": `${name} pass` });
-      return { canvas, place, name, width, height };
+      return { canvas, index, name, width, height };
     });
     const figures = this.tiles.map(({ canvas, name }) => {
-      const [title, words] = CAPTIONS[name](detail.ranges ?? {});
-      return make("figure", {}, canvas, make("figcaption", {}, make("b", {}, title), " ", words));
+      const [title, text] = CAPTIONS[name](detail.ranges ?? {});
+      return make("figure", {}, canvas, make("figcaption", {}, make("b", {}, title), " ", text));
     });
-    const things = detail.legend.map(({ name, role, color }) => {
+    const objects = detail.legend.map(({ name, role, color }) => {
       const swatch = document.createElementNS("http://www.w3.org/2000/svg", "svg");
       const square = document.createElementNS("http://www.w3.org/2000/svg", "rect");
       const [width, height] = ["100%", "100%"];
@@ -74,48 +80,53 @@ class Detail {
       }
       swatch.setAttribute("aria-hidden", "true");
       swatch.append(square);
-      const words = role ? `${name} (${role})` : name;
-      return detail.passes ? make("li", {}, swatch, words) : make("li", {}, words);
+      const label = role ? `${name} (${role})` : name;
+      return detail.passes ? make("li", {}, swatch, label) : make("li", {}, label);
     });
     this.note = make("p", { class: "note", hidden: true, role: "status" });
-    const legend = make("ul", { class: "legend", tabindex: 0, "aria-label": "Things in the scene" }, ...things);
+    const legend = make(
+      "ul", { class: "legend", tabindex: 0, "aria-label": "Objects in the scene" }, ...objects,
+    );
     byId("passes").className = detail.passes ? "" : "alone";
     byId("passes").replaceChildren(...figures, legend, this.note);
   }
 
   buildScene(detail) {
-    const place = byId("solid");
-    place.hidden = false;
+    const container = byId("solid");
+    container.hidden = false;
     if (!detail.motion) {
-      place.replaceChildren(make("p", { class: "note" },
+      container.replaceChildren(make("p", { class: "note" },
         "Other passes and the 3D view of this trial are not in the page. A page built with more " +
         "details (--details) has them."));
       return;
     }
     const canvas = make("canvas", {
       tabindex: 0, role: "application", id: "scene3d",
-      "aria-label": "Scene in 3D. Arrow keys turn it, with shift they move it, plus and minus zoom, 0 goes back to the camera of the trial.",
+      "aria-label": "Scene in 3D. Arrow keys rotate it, with shift they move it, plus and minus zoom, 0 returns to the camera of the trial.",
     });
     this.shapes ??= block("shapes");
     this.scene = new Scene3D(canvas, detail.motion, this.shapes);
     if (!this.scene.gl) {
       this.scene = null;
-      place.replaceChildren(make("p", { class: "note" }, "The 3D view needs WebGL 2, which this browser does not offer."));
+      container.replaceChildren(
+        make("p", { class: "note" }, "The 3D view needs WebGL 2, which this browser does not offer."),
+      );
       return;
     }
     const camera = make("button", { type: "button", title: "View of the trial's camera (0)" }, "Camera view");
     camera.onclick = () => this.scene.reset();
-    const check = (words, name) => {
+    const check = (label, name) => {
       const box = make("input", { type: "checkbox", checked: true });
       box.onchange = () => {
         this.scene[name] = box.checked;
         this.scene.draw();
       };
-      return make("label", {}, box, ` ${words}`);
+      return make("label", {}, box, ` ${label}`);
     };
-    const boxes = [check("ways and touches", "ways")];
+    const boxes = [check("paths and contacts", "paths")];
     if (detail.motion.bodies.some((body) => body.scenery)) boxes.push(check("scenery", "scenery"));
-    place.replaceChildren(canvas, make("div", { class: "under" }, camera, ...boxes, make("span", {}, "drag to turn, wheel to zoom")));
+    const hint = make("span", {}, "drag to rotate, wheel to zoom");
+    container.replaceChildren(canvas, make("div", { class: "under" }, camera, ...boxes, hint));
   }
 
   buildTables(tables) {
@@ -159,16 +170,16 @@ class Detail {
     byId("play").textContent = this.player.playing ? "Pause" : "Play";
   }
 
-  // Every pass is a part of one movie, so that they cannot fall out of step.
+  // All passes are tiles of one movie, so that they stay synchronous.
   paint(video) {
     if (!video) {
       this.note.hidden = false;
-      this.note.textContent = "This browser cannot play the movies (H.264); the rest works.";
+      this.note.textContent = "This browser cannot play the movies (H.264); everything else works.";
       return;
     }
-    for (const { canvas, place, width, height } of this.tiles) {
-      const from = [place * width, 0, width, height];
-      canvas.getContext("2d").drawImage(video, ...from, 0, 0, width, height);
+    for (const { canvas, index, width, height } of this.tiles) {
+      const source = [index * width, 0, width, height];
+      canvas.getContext("2d").drawImage(video, ...source, 0, 0, width, height);
     }
   }
 

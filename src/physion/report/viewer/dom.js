@@ -1,7 +1,15 @@
-// Elements, text and numbers. Text from trials becomes text nodes and attributes, never markup.
+// DOM helpers and decoding of data. Text of trials becomes text nodes and attributes, never markup.
 
+/** @param {string} id @returns {any} */
 const byId = (id) => document.getElementById(id);
 
+/**
+ * Create an element.
+ * @param {string} tag
+ * @param {Record<string, any>} [attributes] `true` gives an empty attribute; `false` and `null` none.
+ * @param {...(Node|string)} children
+ * @returns {any}
+ */
 function make(tag, attributes = {}, ...children) {
   const element = document.createElement(tag);
   for (const [name, value] of Object.entries(attributes)) {
@@ -11,8 +19,10 @@ function make(tag, attributes = {}, ...children) {
   return element;
 }
 
+// Parse a JSON block of the page.
 const block = (id) => JSON.parse(byId(id).textContent);
 
+// Decode base64.
 function bytes(base64) {
   const text = atob(base64);
   const array = new Uint8Array(text.length);
@@ -20,9 +30,10 @@ function bytes(base64) {
   return array;
 }
 
+// Decode base64 to a typed array.
 const numbers = (base64, Kind) => new Kind(bytes(base64).buffer);
 
-// Points that were stored on a grid over their bounds.
+// Decode points that are quantised to 16 bits within their bounding box.
 function gridPoints(grid) {
   const steps = numbers(grid.data, Uint16Array);
   const points = new Float32Array(steps.length);
@@ -39,14 +50,14 @@ const plural = (count, noun) => `${count} ${noun}${count === 1 ? "" : "s"}`;
 
 const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
 
-// Short facts of a trial; those that give the answer away can be hidden by their class.
+// Short facts of a trial; those that reveal the outcome have a class by which they can be hidden.
 function badges(card) {
-  const found = [];
-  const add = (words, kind) => found.push(make("span", { class: `badge ${kind}` }, words));
+  const spans = [];
+  const add = (label, kind) => spans.push(make("span", { class: `badge ${kind}` }, label));
   add(card.contact ? `contact at ${card.first}` : "no contact", `answer ${card.contact ? "yes" : ""}`);
   if (card.observed) add("while observed", "answer yes");
   if (card.robust !== null) add(`robust ${card.robust.toFixed(2)}`, "answer");
   add(card.split, "");
   if (card.preset) add(card.preset, "");
-  return found;
+  return spans;
 }

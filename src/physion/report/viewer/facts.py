@@ -1,4 +1,4 @@
-"""What a trial is, in words and numbers: the card, the marks of the time line, the tables."""
+"""Facts about a trial for the viewer: the card, the marks of the time line, the tables."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _OUTCOME = ("contact", "first_frame", "observed", "min_distance", "robust", "rec
 
 
 def card(trial: Trial) -> dict[str, Any]:
-    """What the grid shows and filters by."""
+    """Return what the grid shows and filters by."""
     meta, labels = trial.metadata, trial.labels
     robust = labels.robust
     return {
@@ -56,7 +56,7 @@ def card(trial: Trial) -> dict[str, Any]:
 
 
 def _words(trial: Trial) -> str:
-    """All that the search looks through, in small letters."""
+    """Return the text that the search looks through, in lower case."""
     meta, scene = trial.metadata, trial.scene
     parts = [meta.trial, meta.dataset, meta.scenario, meta.split, meta.preset, meta.seed]
     parts += [meta.digest, meta.scene_digest, meta.look, scene.room]
@@ -67,7 +67,7 @@ def _words(trial: Trial) -> str:
 
 
 def contact_runs(trial: Trial) -> list[list[int]]:
-    """Frames in which agent and patient touch, as runs: first and last frame of each."""
+    """Return the frames in which agent and patient touch, as runs: first and last frame of each."""
     runs: list[list[int]] = []
     for frame in contact_frames(trial.scene, trial.trajectory).tolist():
         if runs and runs[-1][1] == frame - 1:
@@ -78,7 +78,7 @@ def contact_runs(trial: Trial) -> list[list[int]]:
 
 
 def legend(scene: Scene) -> list[dict[str, Any]]:
-    """Name, role and colour (0..255) in the picture of ids of everything in the scene."""
+    """Return name, role and colour (0..255) in the picture of ids of everything in the scene."""
     colors = thing_colors(scene)
     return [
         {"name": name, "role": role_of(scene, name), "color": list(color)}
@@ -87,7 +87,7 @@ def legend(scene: Scene) -> list[dict[str, Any]]:
 
 
 def tables(trial: Trial) -> list[Table]:
-    """Everything that decides a trial, and what came of it."""
+    """Return tables of the scene, the settings and the outcome of a trial."""
     scene = trial.scene
     found = [
         _bodies_table(scene),
@@ -107,7 +107,7 @@ def _table(title: str, header: Sequence[str] | None, rows: Iterable[Sequence[obj
 
 
 def _trial_table(trial: Trial) -> Table:
-    """Times and labels first, then the rest of the metadata as it stands in the file."""
+    """Return times and labels first, then the other metadata in the order of the file."""
     meta, labels = trial.metadata, trial.labels
     facts: dict[str, object] = {
         "physics_seconds": meta.physics_seconds,
@@ -175,7 +175,7 @@ def _stage_table(scene: Scene) -> Table:
 
 
 def _flat(path: str, value: Any) -> list[tuple[str, object]]:
-    """Nested parameters as rows of path and value; lists of plain values stay in one row."""
+    """Return nested parameters as rows of path and value; lists of plain values stay in one row."""
     if isinstance(value, Mapping):
         rows = [_flat(f"{path}.{key}" if path else str(key), v) for key, v in value.items()]
         return [row for part in rows for row in part]
@@ -186,7 +186,7 @@ def _flat(path: str, value: Any) -> list[tuple[str, object]]:
 
 
 def text(value: object) -> str:
-    """A value of any kind as people read it: numbers in four digits, a dash for what is absent."""
+    """Return any value as readable text: numbers with four digits, a dash if absent."""
     if isinstance(value, list | tuple):
         return ", ".join(text(v) for v in value) if value else "none"
     if _absent(value):

@@ -1,6 +1,11 @@
-// The grid: cards by scenario, what of them is chosen, and which of their movies play.
+// The grid of cards by scenario, with filters, and the playback of their movies.
 
 class Grid {
+  /**
+   * @param {any[]} cards Data of the trials.
+   * @param {Record<string, number>} totals Numbers of trials in the dataset by scenario.
+   * @param {(number: number) => void} open Opens a trial.
+   */
   constructor(cards, totals, open) {
     this.cards = cards;
     this.totals = totals;
@@ -63,16 +68,16 @@ class Grid {
 
   matches(card) {
     const value = (id) => byId(id).value;
-    const told = (wish, fact) => !wish || (wish === "yes") === fact;
+    const agrees = (wanted, fact) => !wanted || (wanted === "yes") === fact;
     const words = value("search").toLowerCase().split(/\s+/).filter(Boolean);
     const least = Number(value("robust"));
     return (
       ["scenario", "split", "preset"].every((name) => !value(name) || card[name] === value(name)) &&
       words.every((word) => card.words.includes(word)) &&
-      // Filters by the outcome would tell it.
+      // Filters by the outcome would reveal it.
       (!this.labelled ||
-        (told(value("contact"), card.contact) &&
-          told(value("observed"), card.observed) &&
+        (agrees(value("contact"), card.contact) &&
+          agrees(value("observed"), card.observed) &&
           (least === 0 || (card.robust !== null && card.robust >= least))))
     );
   }
@@ -110,18 +115,18 @@ class Grid {
     for (const video of this.visible) this.run(video);
   }
 
-  // While a trial is looked at, the grid behind it rests.
-  rest(resting) {
-    this.resting = resting;
+  // Pause the movies while an open trial covers the grid.
+  setCovered(covered) {
+    this.covered = covered;
     for (const video of this.visible) this.run(video);
   }
 
   run(video) {
-    if (this.playing && !this.resting) video.play().catch(() => {});
+    if (this.playing && !this.covered) video.play().catch(() => {});
     else video.pause();
   }
 
-  // Movies are unpacked when they come into sight: browsers play only so many at once.
+  // Load movies when they become visible, since browsers limit the number of loaded movies.
   seen(entries) {
     for (const { target: video, isIntersecting } of entries) {
       if (isIntersecting && !this.visible.has(video)) {
@@ -138,7 +143,7 @@ class Grid {
     }
   }
 
-  // With hidden labels movies start again before what is to be predicted.
+  // With hidden labels, restart movies at the end of the observed part.
   step() {
     requestAnimationFrame(this.step);
     if (this.labelled) return;

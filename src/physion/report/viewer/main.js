@@ -1,9 +1,10 @@
-// The page: the grid, the trial that is looked at, and its name in the address.
+// The page: the grid, the open trial, and its name in the URL.
 
 const cards = block("cards");
 const title = document.title;
 
-const named = () => {
+// Return the number of the trial that the URL names, -1 for none.
+const namedTrial = () => {
   const match = /^#trial=(.*)$/.exec(location.hash);
   if (!match) return -1;
   try {
@@ -14,35 +15,35 @@ const named = () => {
   }
 };
 
-const address = (hash) => {
+const setHash = (hash) => {
   if (location.hash !== hash) history.replaceState(null, "", hash || location.pathname + location.search);
 };
 
-let open = -1;
+let openTrial = -1;
 const detail = new Detail(cards, () => {
-  grid.rest(false);
-  grid.items[open]?.button.focus();
-  open = -1;
+  grid.setCovered(false);
+  grid.items[openTrial]?.button.focus();
+  openTrial = -1;
   document.title = title;
-  address("");
+  setHash("");
 });
 const show = (number) => {
-  open = number;
-  grid.rest(true);
+  openTrial = number;
+  grid.setCovered(true);
   document.title = `${cards[number].trial} – ${title}`;
   detail.open(number);
-  address(`#trial=${encodeURIComponent(cards[number].trial)}`);
+  setHash(`#trial=${encodeURIComponent(cards[number].trial)}`);
 };
 const grid = new Grid(cards, block("totals"), show);
 
-// To the next or previous trial of those that the filters leave.
-const turn = (by) => {
+// Show the next (1) or previous (-1) of the trials that match the filters.
+const showNeighbour = (by) => {
   const numbers = grid.chosen.map((item) => item.number);
-  const place = numbers.indexOf(open);
-  if (numbers.length) show(numbers[(place + by + numbers.length) % numbers.length]);
+  const index = numbers.indexOf(openTrial);
+  if (numbers.length) show(numbers[(index + by + numbers.length) % numbers.length]);
 };
-byId("next").onclick = () => turn(1);
-byId("previous").onclick = () => turn(-1);
+byId("next").onclick = () => showNeighbour(1);
+byId("previous").onclick = () => showNeighbour(-1);
 
 byId("labels").onclick = () => {
   const labelled = !grid.labelled;
@@ -52,6 +53,9 @@ byId("labels").onclick = () => {
   detail.setLabelled(labelled);
 };
 
-addEventListener("hashchange", () => named() >= 0 && named() !== open && show(named()));
+addEventListener("hashchange", () => {
+  const number = namedTrial();
+  if (number >= 0 && number !== openTrial) show(number);
+});
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => detail.scene?.draw());
-if (named() >= 0) show(named());
+if (namedTrial() >= 0) show(namedTrial());

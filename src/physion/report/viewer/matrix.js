@@ -1,4 +1,4 @@
-// Vectors and 4 x 4 matrices in columns, as WebGL takes them.
+// Vectors, quaternions (w, x, y, z) and column-major 4 x 4 matrices, as WebGL expects them.
 
 const add = (a, b) => a.map((v, i) => v + b[i]);
 const subtract = (a, b) => a.map((v, i) => v - b[i]);
@@ -38,8 +38,8 @@ function lookAt(eye, target) {
   ];
 }
 
-// A vector turned by a quaternion (w, x, y, z).
-function turned([w, x, y, z], v) {
+// Rotate a vector by a unit quaternion (w, x, y, z).
+function rotate([w, x, y, z], v) {
   const axis = [x, y, z];
   return add(v, times(cross(axis, add(cross(axis, v), times(v, w))), 2));
 }

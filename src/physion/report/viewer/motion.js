@@ -1,12 +1,12 @@
-// Where bodies and cloths are at a frame.
+// Poses of bodies and vertices of cloths at each frame.
 class Motion {
   constructor(data, shapes) {
     this.data = data;
     this.start = numbers(data.start.positions, Float32Array);
-    this.startTurns = numbers(data.start.rotations, Int16Array);
+    this.startRotations = numbers(data.start.rotations, Int16Array);
     this.positions = numbers(data.positions, Float32Array);
-    this.turns = numbers(data.rotations, Int16Array);
-    this.place = new Map(data.moving.map((body, k) => [body, k]));
+    this.rotations = numbers(data.rotations, Int16Array);
+    this.movingIndex = new Map(data.moving.map((body, k) => [body, k]));
     this.cloths = data.cloths.map((cloth) => ({ ...cloth, points: gridPoints(cloth.points) }));
     this.middles = data.bodies.map((body) => {
       const { low, size } = shapes[body.shape].points;
@@ -14,42 +14,45 @@ class Motion {
     });
   }
 
+  // Return position and rotation (quaternion) of a body.
   pose(body, frame) {
-    const k = this.place.get(body);
+    const k = this.movingIndex.get(body);
     const moves = k !== undefined;
     const row = moves ? frame * this.data.moving.length + k : body;
-    const [at, turns] = moves ? [this.positions, this.turns] : [this.start, this.startTurns];
-    const turn = [...turns.subarray(4 * row, 4 * row + 4)];
-    return { shift: [...at.subarray(3 * row, 3 * row + 3)], turn: unit(turn) };
+    const positions = moves ? this.positions : this.start;
+    const rotations = moves ? this.rotations : this.startRotations;
+    const rotation = unit([...rotations.subarray(4 * row, 4 * row + 4)]);
+    return { position: [...positions.subarray(3 * row, 3 * row + 3)], rotation };
   }
 
+  // Return the centre of a body's bounding box.
   middle(body, frame) {
-    const { shift, turn } = this.pose(body, frame);
-    return add(shift, turned(turn, this.middles[body]));
+    const { position, rotation } = this.pose(body, frame);
+    return add(position, rotate(rotation, this.middles[body]));
   }
 
-  // The points of a cloth, on straight lines between the instants that were kept.
+  // Return the vertices of a cloth, interpolated linearly between the stored instants.
   sheet(cloth, frame) {
     const { instants, points, side } = cloth;
     let k = 0;
     while (k < instants.length - 2 && instants[k + 1] <= frame) k++;
     const next = Math.min(k + 1, instants.length - 1);
     const span = instants[next] - instants[k];
-    const share = span > 0 ? clamp((frame - instants[k]) / span, 0, 1) : 0;
+    const weight = span > 0 ? clamp((frame - instants[k]) / span, 0, 1) : 0;
     const size = 3 * side * side;
     const out = new Float32Array(size);
     for (let i = 0; i < size; i++) {
-      out[i] = (1 - share) * points[k * size + i] + share * points[next * size + i];
+      out[i] = (1 - weight) * points[k * size + i] + weight * points[next * size + i];
     }
     return out;
   }
 
-  // The way of a thing with a role: one point a frame.
-  way(role) {
+  // Return the path of the object with a role, one point per frame; null if it does not move.
+  path(role) {
     const out = new Float32Array(3 * this.data.frames);
     const body = this.data.bodies.findIndex((b) => b.role === role);
     const cloth = this.cloths.find((c) => c.role === role);
-    if (!this.place.has(body) && !cloth) return null;
+    if (!this.movingIndex.has(body) && !cloth) return null;
     for (let frame = 0; frame < this.data.frames; frame++) {
       out.set(cloth ? this.mean(this.sheet(cloth, frame)) : this.middle(body, frame), 3 * frame);
     }
@@ -63,6 +66,7 @@ class Motion {
   }
 }
 
+// Return the triangles of a square grid of vertices.
 function sheetFaces(side) {
   const faces = [];
   for (let i = 0; i < side - 1; i++) {
@@ -74,6 +78,7 @@ function sheetFaces(side) {
   return new Uint16Array(faces);
 }
 
+// Return vertex normals, weighted by the area of the faces and not normalised.
 function sheetNormals(points, faces) {
   const out = new Float32Array(points.length);
   const at = (i) => [points[3 * i], points[3 * i + 1], points[3 * i + 2]];
@@ -85,7 +90,8 @@ function sheetNormals(points, faces) {
   return out;
 }
 
-// A grid of metres, in pieces of one: software drivers drop long lines that pass the camera.
+// Grid of 1 m lines on the floor, in segments of 1 m: software drivers drop long lines that pass
+// behind the camera.
 function floorLines(height) {
   const points = [];
   for (let i = -6; i <= 6; i++) {

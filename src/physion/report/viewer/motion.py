@@ -1,7 +1,7 @@
 """Motion for the 3D view: meshes once for each shape, poses and cloth in few bytes.
 
-Arrays go into the page as base64 of little-endian numbers; `pack` and its counterpart in the
-page's script agree on that.
+Arrays go into the page as base64 of little-endian numbers; `pack` and its counterpart in the page's
+script use the same format.
 """
 
 from __future__ import annotations
@@ -29,12 +29,14 @@ STEPS = 65535
 
 
 def pack(values: NDArray[Any], kind: str) -> str:
-    """``values`` as base64 of numbers of the numpy type ``kind`` (``<f4``, ``<i2``, ...)."""
+    """Return ``values`` as base64 of numbers of the numpy type ``kind`` (``<f4``, ``<i2``, ...)."""
     return base64.b64encode(np.ascontiguousarray(values, np.dtype(kind)).tobytes()).decode("ascii")
 
 
 def pack_grid(values: NDArray[np.floating]) -> dict[str, Any]:
-    """Points (..., 3) on a grid of `STEPS` over their bounds: ``low``, ``size`` and ``data``."""
+    """Quantise points (..., 3) to a grid of `STEPS` over their bounds: ``low``, ``size`` and
+    ``data``.
+    """
     points = np.nan_to_num(np.asarray(values, np.float64)).reshape(-1, 3)
     low = points.min(axis=0) if len(points) else np.zeros(3)
     size = np.ptp(points, axis=0) if len(points) else np.zeros(3)
@@ -47,10 +49,10 @@ def pack_grid(values: NDArray[np.floating]) -> dict[str, Any]:
 
 
 def pack_shapes(names: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Meshes by the name of their shape, at unit scale, as the 3D view reads them.
+    """Return meshes by the name of their shape, at unit scale, for the 3D view.
 
     ``points`` and ``normals`` (signed bytes, -127..127) of the corners, ``faces`` as triples of
-    them; corners on a crease come once for each side.
+    them; corners on a crease occur once for each side.
     """
     packed = {}
     for name in sorted(set(names)):
@@ -74,7 +76,7 @@ def pack_shapes(names: Iterable[str]) -> dict[str, dict[str, Any]]:
 
 
 def pack_motion(scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
-    """Everything that the 3D view draws of a trial; ``scene`` in the colours to be shown."""
+    """Return everything that the 3D view draws of a trial; ``scene`` has the colours to show."""
     positions, rotations = trajectory.positions, trajectory.rotations
     moves = np.any(positions != positions[:1], axis=(0, 2)) | np.any(
         rotations != rotations[:1], axis=(0, 2)
@@ -99,7 +101,7 @@ def pack_motion(scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
 
 
 def role_of(scene: Scene, name: str) -> str | None:
-    """``agent``, ``patient``, ``probe``, or None for all other things."""
+    """Return ``agent``, ``patient``, ``probe``, or None for all other bodies."""
     roles = {scene.roles.probe: "probe", scene.roles.patient: "patient", scene.roles.agent: "agent"}
     return roles.get(name)
 
@@ -121,7 +123,7 @@ def _turns(rotations: NDArray[np.floating]) -> str:
 
 
 def _cloths(scene: Scene, trajectory: Trajectory) -> list[dict[str, Any]]:
-    """Each cloth on fewer vertices and at fewer instants than the trajectory has."""
+    """Return each cloth with fewer vertices and frames than the trajectory has."""
     count = min(len(trajectory), CLOTH_INSTANTS)
     instants = np.unique(np.rint(np.linspace(0, len(trajectory) - 1, count)).astype(int))
     packed, first = [], 0
@@ -146,7 +148,7 @@ def _cloths(scene: Scene, trajectory: Trajectory) -> list[dict[str, Any]]:
 
 
 def _touches(scene: Scene, trajectory: Trajectory) -> list[list[float]]:
-    """Where agent and patient touch in the frames that count as contact: rows of frame, x, y, z."""
+    """Return the contact points of agent and patient: rows of frame, x, y, z."""
     agent, patient = (scene.index(name) for name in (scene.roles.agent, scene.roles.patient))
     contacts = trajectory.contacts
     pair = (contacts.bodies == sorted((agent, patient))).all(axis=1)

@@ -1,4 +1,4 @@
-"""Image passes as colours: depth, normals, ids and flow turned into pictures for the eye."""
+"""Image passes as pictures: depth, normals, ids and flow in colours."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ NOWHERE: tuple[int, int, int] = (128, 128, 128)
 
 @dataclass(frozen=True)
 class Ranges:
-    """What the ends of the colour scales stand for in all frames of one trial.
+    """Ends of the colour scales, the same for all frames of one trial.
 
     ``near``, ``far``: metres, ``far`` above ``near``. ``flow``: pixels a frame, above zero.
     """
@@ -49,10 +49,10 @@ class Ranges:
 
 
 def ranges_of(frames: Sequence[Frame]) -> Ranges:
-    """Scales that fit all ``frames``, which hold depth and flow.
+    """Return scales that fit all ``frames``, which contain depth and flow.
 
-    The most distant hundredth of the depths is left out, so that a window in a wall does not
-    take all the colours; so is the fastest two-hundredth of what moves.
+    The most distant hundredth of the depths is left out, so that a window in a wall does not use up
+    the scale; so is the fastest two-hundredth of the flow.
     """
     depths = [f.depth[np.isfinite(f.depth)] for f in frames if f.depth is not None]
     depth = np.concatenate(depths) if depths else np.zeros(0)
@@ -67,7 +67,7 @@ def ranges_of(frames: Sequence[Frame]) -> Ranges:
 
 
 def paint(frame: Frame, scene: Scene, ranges: Ranges) -> list[Picture]:
-    """All passes of a frame as pictures (H, W, 3) uint8, in the order of `PASSES`."""
+    """Return all passes of a frame as pictures (H, W, 3) uint8, in the order of `PASSES`."""
     assert frame.color is not None and frame.depth is not None and frame.normals is not None
     assert frame.ids is not None and frame.flow is not None
     painted = {
@@ -81,39 +81,46 @@ def paint(frame: Frame, scene: Scene, ranges: Ranges) -> list[Picture]:
 
 
 def paint_depth(depth: NDArray[np.floating], near: float, far: float) -> Picture:
-    """Depth (H, W) in metres: bright at ``near``, dark at ``far`` and where nothing is seen."""
+    """Return depth (H, W) in metres as grey: bright at ``near``, dark at ``far`` and where
+    undefined.
+    """
     share = 1.0 - np.clip((np.asarray(depth, np.float64) - near) / (far - near), 0.0, 1.0)
     colors = colormaps["magma"](np.nan_to_num(share), bytes=True)
     return np.ascontiguousarray(colors[..., :3])
 
 
 def paint_normals(normals: NDArray[np.floating]) -> Picture:
-    """Normals (H, W, 3), world axes: -1..1 along x, y, z as red, green, blue.
+    """Return normals (H, W, 3) in world axes as colours: -1..1 along x, y, z as red, green, blue.
 
-    Mid grey, which no unit normal has, stands where nothing is seen.
+    Undefined normals are mid grey, which no unit normal has.
     """
     return _bytes(np.asarray(normals, np.float64) * 0.5 + 0.5)
 
 
 def thing_colors(scene: Scene) -> list[tuple[int, int, int]]:
-    """The colour of each of `Scene.names` in the picture of ids: agent red, patient yellow."""
+    """Return the colour of each of `Scene.names` in the picture of ids: agent red, patient
+    yellow.
+    """
     names = scene.names()
     roles = {scene.roles.agent: AGENT, scene.roles.patient: PATIENT}
     return [roles.get(name, OTHERS[i % len(OTHERS)]) for i, name in enumerate(names)]
 
 
 def paint_ids(ids: NDArray[np.integer], scene: Scene) -> Picture:
-    """Ids (H, W), 0 the room and i + 1 the i-th of `Scene.names`, in the colours of the things."""
+    """Return ids (H, W), 0 the room and i + 1 the i-th of `Scene.names`, in the colours of the
+    bodies.
+    """
     table = np.array([ROOM, *thing_colors(scene)], np.uint8)
     return np.asarray(table[ids])
 
 
 def paint_flow(flow: NDArray[np.floating], scale: float) -> Picture:
-    """Flow (H, W, 2), pixels right and down: direction as hue, speed as brightness.
+    """Return flow (H, W, 2), pixels right and down, as colours: direction as hue, speed as
+    brightness.
 
-    Red goes right, and the hue runs through yellow (down), cyan (left) to violet (up). Full
+    Red is to the right, and the hue goes through yellow (down), cyan (left) to violet (up). Full
     brightness is ``scale`` pixels or more, half of it a quarter of that, so that slow motion is
-    seen too; black is rest; grey is undefined.
+    visible; black is rest; grey is undefined.
     """
     x, y = (np.asarray(flow[..., k], np.float64) for k in (0, 1))
     known = np.isfinite(x) & np.isfinite(y)
@@ -127,5 +134,5 @@ def paint_flow(flow: NDArray[np.floating], scale: float) -> Picture:
 
 
 def _bytes(values: NDArray[np.floating]) -> Picture:
-    """Values 0..1 as 0..255, rounded; others are brought to the nearer end."""
+    """Return values 0..1 as 0..255, rounded; others are clipped."""
     return np.asarray(np.rint(np.clip(np.nan_to_num(values), 0.0, 1.0) * 255), np.uint8)

@@ -1,9 +1,21 @@
-// One clock for everything that moves in the detail view. The movie is the clock while it plays;
-// where the browser cannot play it, the time of day is.
+// The clock of the detail view. It follows the movie while that plays, or the system's clock if the
+// browser cannot play the movie.
 
 class Player {
+  /**
+   * @param {number} frames Number of frames of the trial.
+   * @param {number} baseRate Frames per second at speed 1.
+   * @param {any} strip The movie of all passes: data, rate, and stride in frames.
+   * @param {(frame: number) => void} onFrame Called when the frame changes.
+   * @param {(video: HTMLVideoElement|null) => void} onPicture Called with each new picture of the
+   *   movie, or with null if the movie cannot be played.
+   */
   constructor(frames, baseRate, strip, onFrame, onPicture) {
-    Object.assign(this, { frames, baseRate, strip, onFrame, onPicture });
+    this.frames = frames;
+    this.baseRate = baseRate;
+    this.strip = strip;
+    this.onFrame = onFrame;
+    this.onPicture = onPicture;
     this.limit = frames;
     this.frame = 0;
     this.speed = 1;
@@ -32,7 +44,7 @@ class Player {
   }
 
   fail() {
-    // Taking the movie away at the end is no failure of it.
+    // Removing the movie in `close` is not a failure.
     if (this.closed) return;
     this.broken = true;
     this.onPicture(null);
@@ -57,7 +69,7 @@ class Player {
     if (this.broken) return;
     this.video.playbackRate = (this.speed * this.baseRate) / (this.strip.rate * this.strip.stride);
     this.video.play().catch((error) => {
-      // A pause that follows at once rejects the play; only then is nothing wrong.
+      // An immediate pause also rejects `play`, which is harmless; only a blocked start is not.
       if (error.name === "NotAllowedError") this.pause();
     });
   }
@@ -65,7 +77,7 @@ class Player {
   pause() {
     this.playing = false;
     this.video.pause();
-    // The movie may have gone on by a picture before it stood.
+    // The movie may have advanced by a picture before it paused.
     this.seek(this.frame);
   }
 
@@ -75,7 +87,7 @@ class Player {
     this.since = performance.now();
     this.from = this.frame;
     if (!this.broken) {
-      // The middle of a picture's time, so that rounding cannot show its neighbour.
+      // Seek to the middle of the picture's interval, so that rounding cannot show its neighbour.
       this.wanted = (Math.floor(this.frame / this.strip.stride) + 0.5) / this.strip.rate;
       if (!this.video.seeking) this.video.currentTime = this.wanted;
     }
@@ -91,12 +103,12 @@ class Player {
     this.onPicture(this.video);
   }
 
-  // Where browsers tell which picture is on the screen, everything else follows that picture.
+  // Follow the picture on the screen, in browsers that report it.
   picture(_, { mediaTime }) {
     if (this.closed) return;
     this.video.requestVideoFrameCallback(this.picture);
     this.presented = mediaTime;
-    // After a seek the picture may come to the screen later than the seek is said to be over.
+    // After a seek the picture may appear later than the event `seeked`.
     this.onPicture(this.video);
   }
 
@@ -118,8 +130,8 @@ class Player {
       this.play();
       return;
     }
-    const told = "requestVideoFrameCallback" in this.video;
-    if (!this.broken && !told && this.video.readyState >= 2) this.onPicture(this.video);
+    const reports = "requestVideoFrameCallback" in this.video;
+    if (!this.broken && !reports && this.video.readyState >= 2) this.onPicture(this.video);
     if (frame !== this.frame) {
       this.frame = frame;
       this.onFrame(frame);

@@ -1,7 +1,7 @@
-// The scene in 3D: bodies and cloths at a frame, the ways of agent, patient and probe, and where
-// they touch. Turned by mouse, touch or keys. WebGL 2, no library.
+// 3D view of the scene: bodies and cloths at a frame, the paths of agent, patient and probe, and
+// their contact points. Controlled by mouse, touch or keys. WebGL 2, no library.
 
-const WAY_COLORS = { agent: [0.9, 0.15, 0.15], patient: [0.85, 0.68, 0], probe: [0.5, 0.35, 0.9] };
+const PATH_COLORS = { agent: [0.9, 0.15, 0.15], patient: [0.85, 0.68, 0], probe: [0.5, 0.35, 0.9] };
 
 class Scene3D {
   constructor(canvas, data, shapes) {
@@ -11,7 +11,7 @@ class Scene3D {
     this.frame = 0;
     this.limit = data.frames;
     this.scenery = true;
-    this.ways = true;
+    this.paths = true;
     this.gl = canvas.getContext("webgl2", { antialias: true, alpha: false });
     this.reset();
     if (!this.gl) return;
@@ -57,9 +57,9 @@ class Scene3D {
       return { cloth, faces, buffers: new Buffers(gl, points, new Float32Array(points.length), faces, usage) };
     });
     this.floor = new Buffers(gl, floorLines(this.data.floor), null, null);
-    this.lines = Object.keys(WAY_COLORS).flatMap((role) => {
-      const points = this.motion.way(role);
-      return points ? [{ color: WAY_COLORS[role], buffers: new Buffers(gl, points, null, null) }] : [];
+    this.lines = Object.keys(PATH_COLORS).flatMap((role) => {
+      const points = this.motion.path(role);
+      return points ? [{ color: PATH_COLORS[role], buffers: new Buffers(gl, points, null, null) }] : [];
     });
     this.touchFrames = this.data.touches.map((touch) => touch[0]);
     this.touches = new Buffers(
@@ -86,7 +86,7 @@ class Scene3D {
   draw() {
     const { gl, canvas } = this;
     if (!gl || !this.solid || this.waiting) return;
-    // Many changes between two pictures of the screen are drawn once.
+    // Draw several changes within one animation frame only once.
     this.waiting = requestAnimationFrame(() => {
       this.waiting = 0;
       if (this.gl) this.paint(gl, canvas);
@@ -116,8 +116,8 @@ class Scene3D {
     gl.uniform3fv(at.eye, eye);
     this.data.bodies.forEach((body, i) => {
       if (body.scenery && !this.scenery) return;
-      const { shift, turn } = this.motion.pose(i, this.frame);
-      this.paintMesh(gl, this.meshes[body.shape], body.color, body.scale, shift, turn);
+      const { position, rotation } = this.motion.pose(i, this.frame);
+      this.paintMesh(gl, this.meshes[body.shape], body.color, body.scale, position, rotation);
     });
     for (const { cloth, faces, buffers } of this.sheets) {
       const points = this.motion.sheet(cloth, this.frame);
@@ -126,12 +126,12 @@ class Scene3D {
     }
   }
 
-  paintMesh(gl, buffers, color, scale, shift, turn) {
+  paintMesh(gl, buffers, color, scale, position, rotation) {
     const { at } = this.solid;
     gl.uniform3fv(at.color, color);
     gl.uniform3fv(at.scale, scale);
-    gl.uniform3fv(at.shift, shift);
-    gl.uniform4fv(at.turn, turn);
+    gl.uniform3fv(at.translation, position);
+    gl.uniform4fv(at.rotation, rotation);
     gl.bindVertexArray(buffers.array);
     gl.drawElements(gl.TRIANGLES, buffers.count, gl.UNSIGNED_SHORT, 0);
   }
@@ -148,14 +148,14 @@ class Scene3D {
       gl.drawArrays(mode, first, count);
     };
     paint(this.floor, gl.LINES, dark ? [1, 1, 1, 0.14] : [0, 0, 0, 0.14], 1, 0, this.floor.count);
-    if (!this.ways) return;
+    if (!this.paths) return;
     for (const { color, buffers } of this.lines) {
       const done = this.frame + 1;
       paint(buffers, gl.LINE_STRIP, [...color, 1], 1, 0, done);
       paint(buffers, gl.POINTS, [...color, 1], 4, 0, done);
       paint(buffers, gl.POINTS, [...color, 0.35], 2.5, done, this.limit - done);
     }
-    // What has touched by now lies before everything, since touches hide between the bodies.
+    // Contact points so far are drawn in front, since they are hidden between the bodies.
     const touched = this.touchFrames.filter((frame) => frame <= this.frame).length;
     gl.disable(gl.DEPTH_TEST);
     paint(this.touches, gl.POINTS, dark ? [1, 1, 1, 1] : [0, 0, 0, 1], 5, 0, touched);

@@ -1,7 +1,7 @@
-"""The text of the viewer's page: template, style, script and data, none of them able to escape.
+"""Text of the viewer's page: template, style, script and data, all escaped.
 
 Everything that comes from trials goes into blocks of JSON, which the script shows as text. The
-page's policy allows its own script and style alone, by their hashes, and no network at all.
+page's policy allows only its own script and style, by their hashes, and no network.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ SCRIPTS = (
 
 @dataclass(frozen=True)
 class TrialData:
-    """One trial: its ``card`` in the grid, its small ``movie``, and the ``detail`` of a click."""
+    """Data of one trial: its ``card`` in the grid, its small ``movie``, and the ``detail`` view."""
 
     card: Mapping[str, Any]
     movie: Mapping[str, Any]
@@ -48,7 +48,9 @@ def render_viewer(
     totals: Mapping[str, int],
     shapes: Mapping[str, Any],
 ) -> str:
-    """The page as text. ``totals``: trials of each scenario; ``shapes``: see `pack_shapes`."""
+    """Return the page as text. ``totals``: trials of each scenario; ``shapes``: see
+    `pack_shapes`.
+    """
     style, script = _style(), _script()
     blocks = [
         _block("cards", [trial.card for trial in trials]),
@@ -68,7 +70,7 @@ def render_viewer(
 
 
 def embed_json(value: Any) -> str:
-    """JSON that cannot end the element it stands in: no ``<``, ``>`` or ``&`` in it."""
+    """Return JSON without ``<``, ``>`` and ``&``, so that it cannot end its element."""
     try:
         text = json.dumps(value, separators=(",", ":"), sort_keys=True, allow_nan=False)
     except ValueError as error:
@@ -100,7 +102,7 @@ def _hash(text: str) -> str:
 
 
 def _style() -> str:
-    """The style of the report, and on top of it that of the viewer."""
+    """Return the style of the report, followed by that of the viewer."""
     report = files("physion.report").joinpath("report.css").read_text(encoding="utf-8")
     return "\n" + report + _part("viewer.css")
 

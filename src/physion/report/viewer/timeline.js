@@ -1,4 +1,4 @@
-// The time line: what is observed, where agent and patient touch, and where the player is.
+// The time line: the observed part, the contacts of agent and patient, and the current frame.
 
 class TimeLine {
   constructor(card, runs, seek) {
@@ -8,7 +8,7 @@ class TimeLine {
     this.scrub.oninput = () => seek(Number(this.scrub.value));
     const track = byId("track");
     track.replaceChildren();
-    // The slider's ends are the middles of the first and the last frame.
+    // The ends of the slider are the centres of the first and the last frame.
     this.last = Math.max(card.frames - 1, 1);
     this.mark(track, "seen", -0.5, card.observedFrames - 0.5);
     for (const [from, to] of runs) this.mark(track, "touch answer", from - 0.5, to + 0.5);
@@ -17,10 +17,10 @@ class TimeLine {
   }
 
   mark(track, kind, from, to) {
-    const share = (frame) => clamp(frame / this.last, 0, 1) * 100;
+    const percent = (frame) => clamp(frame / this.last, 0, 1) * 100;
     const mark = make("i", { class: kind });
-    mark.style.left = `${share(from)}%`;
-    if (to !== null) mark.style.width = `${share(to) - share(from)}%`;
+    mark.style.left = `${percent(from)}%`;
+    if (to !== null) mark.style.width = `${percent(to) - percent(from)}%`;
     track.append(mark);
   }
 

@@ -1,4 +1,4 @@
-"""The movies of the page: small ones for the grid, and one with all passes side by side."""
+"""Movies of the viewer: small ones for the grid, and one with all passes side by side."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CRF = 25
 
 @dataclass(frozen=True)
 class Strip:
-    """A movie whose every picture shows ``tiles`` side by side, each ``width`` x ``height``.
+    """Movie whose every picture shows ``tiles`` side by side, each ``width`` x ``height``.
 
     It shows every ``stride``-th frame of the trial at ``rate`` pictures a second.
     """
@@ -47,16 +47,16 @@ class Strip:
 
 
 def fitted(width: int, height: int, longest: int) -> tuple[int, int]:
-    """Width and height, both even, of a picture whose longer side is about ``longest``."""
+    """Return width and height, both even, of a picture whose longer side is about ``longest``."""
     scale = min(1.0, longest / max(width, height))
     even = [max(2, 2 * round(side * scale / 2)) for side in (width, height)]
     return even[0], even[1]
 
 
 def small_movie(path: Path, trial: Trial, longest: int) -> Strip:
-    """The movie at ``path`` at ``longest`` pixels along its longer side, all frames of it.
+    """Return the movie at ``path`` scaled to ``longest`` pixels along its longer side, all frames.
 
-    A trial that was made without movies is rendered from its state instead.
+    A trial that was made without movies is rendered from its state.
     """
     meta = trial.metadata
     width, height = fitted(meta.width, meta.height, longest)
@@ -77,7 +77,9 @@ def _color(frame: Frame) -> NDArray[np.uint8]:
 
 
 def passes_movie(trial: Trial, longest: int, stride: int) -> tuple[Strip, Ranges]:
-    """All passes of every ``stride``-th frame, rendered from the state, and their scales."""
+    """Render all passes of every ``stride``-th frame from the state; return the movie and the
+    scales.
+    """
     meta = trial.metadata
     width, height = fitted(meta.width, meta.height, longest)
     renderer = trial.renderer(width, height)

@@ -1,34 +1,43 @@
-// The little of WebGL 2 that the 3D view needs: two programs, and vertices on the card.
+// WebGL 2 helpers of the 3D view: two shader programs and vertex buffers.
 
 const SOLID = [`#version 300 es
   in vec3 point, normal;
-  uniform mat4 view; uniform vec3 scale, shift; uniform vec4 turn;
-  out vec3 side, place;
-  vec3 turned(vec3 v) { return v + 2.0 * cross(turn.yzw, cross(turn.yzw, v) + turn.x * v); }
+  uniform mat4 view; uniform vec3 scale, translation; uniform vec4 rotation;
+  out vec3 world_normal, world_position;
+  vec3 rotate(vec3 v) {
+    return v + 2.0 * cross(rotation.yzw, cross(rotation.yzw, v) + rotation.x * v);
+  }
   void main() {
-    place = turned(point * scale) + shift;
-    side = turned(normal / scale);
-    gl_Position = view * vec4(place, 1.0);
+    world_position = rotate(point * scale) + translation;
+    world_normal = rotate(normal / scale);
+    gl_Position = view * vec4(world_position, 1.0);
   }`, `#version 300 es
   precision highp float;
-  in vec3 side, place; uniform vec3 color, eye; out vec4 shown;
+  in vec3 world_normal, world_position; uniform vec3 color, eye; out vec4 pixel;
   void main() {
-    vec3 n = normalize(side), look = normalize(eye - place);
-    if (dot(n, look) < 0.0) n = -n;
-    float lamp = max(dot(n, normalize(vec3(0.35, -0.5, 0.8))), 0.0);
-    float sky = 0.5 + 0.5 * n.z, rim = max(dot(n, look), 0.0);
-    shown = vec4(color * (0.28 + 0.24 * sky + 0.4 * lamp + 0.16 * rim), 1.0);
+    vec3 n = normalize(world_normal), to_eye = normalize(eye - world_position);
+    if (dot(n, to_eye) < 0.0) n = -n;
+    float directional = max(dot(n, normalize(vec3(0.35, -0.5, 0.8))), 0.0);
+    float sky = 0.5 + 0.5 * n.z, facing = max(dot(n, to_eye), 0.0);
+    pixel = vec4(color * (0.28 + 0.24 * sky + 0.4 * directional + 0.16 * facing), 1.0);
   }`];
 
 const PLAIN = [`#version 300 es
   in vec3 point; uniform mat4 view; uniform float size;
   void main() { gl_Position = view * vec4(point, 1.0); gl_PointSize = size; }`, `#version 300 es
   precision highp float;
-  uniform vec4 color; out vec4 shown; void main() { shown = color; }`];
+  uniform vec4 color; out vec4 pixel; void main() { pixel = color; }`];
 
+/**
+ * Compile a program; `at` are the locations of its uniforms.
+ * @param {WebGL2RenderingContext} gl
+ * @param {string[]} sources Vertex and fragment shader.
+ */
 function compile(gl, [vertex, fragment]) {
   const program = gl.createProgram();
-  for (const [kind, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+  /** @type {[number, string][]} */
+  const shaders = [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]];
+  for (const [kind, source] of shaders) {
     const shader = gl.createShader(kind);
     gl.shaderSource(shader, source);
     gl.compileShader(shader);
@@ -46,7 +55,7 @@ function compile(gl, [vertex, fragment]) {
   return { program, at };
 }
 
-// Vertices on the graphics card; `faces` is null for points and lines.
+// Vertex buffers of a mesh; `normals` and `faces` are null for points and lines.
 class Buffers {
   constructor(gl, points, normals, faces, usage = gl.STATIC_DRAW) {
     this.gl = gl;
@@ -64,13 +73,13 @@ class Buffers {
     this.count = faces ? faces.length : points.length / 3;
   }
 
-  fill(place, values, kind, usage) {
+  fill(location, values, kind, usage) {
     const { gl } = this;
     const buffer = gl.createBuffer();
     gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
     gl.bufferData(gl.ARRAY_BUFFER, values, usage);
-    gl.enableVertexAttribArray(place);
-    gl.vertexAttribPointer(place, 3, kind, kind === gl.BYTE, 0, 0);
+    gl.enableVertexAttribArray(location);
+    gl.vertexAttribPointer(location, 3, kind, kind === gl.BYTE, 0, 0);
     return buffer;
   }
 

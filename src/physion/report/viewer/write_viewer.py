@@ -1,4 +1,4 @@
-"""One HTML page that shows a dataset: movies by scenario, and each trial from all sides."""
+"""Writer of the viewer: one HTML page that shows a dataset, by scenario and in detail."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from physion.trials.dataset import Dataset
 
 @dataclass(frozen=True)
 class ViewerOptions:
-    """How much of a dataset goes into the page, and how large.
+    """Settings of the viewer.
 
-    - ``trials``: of each scenario at most so many; ``details``: so many of them with all passes
-      and the scene in 3D.
+    - ``trials``: largest number of each scenario; ``details``: how many of them with all passes and
+      the scene in 3D.
     - ``scenario``, ``split``: only these, or all.
     - ``card_size``, ``pass_size``: pixels of the longer side of the movies.
-    - ``stride``: passes are shown of every so manieth frame.
+    - ``stride``: every how many frames the passes are shown.
     """
 
     trials: int = 6
@@ -49,7 +49,7 @@ class ViewerOptions:
 
 @dataclass(frozen=True)
 class ViewerReport:
-    """What `build_viewer` wrote: where, how many bytes, how many trials, and how many left out."""
+    """Result of `build_viewer`: path, bytes, and numbers of trials shown and left out."""
 
     page: Path
     size: int
@@ -100,10 +100,10 @@ def _unwritable(out: Path, reason: str) -> BadInputError:
 def choose_trials(
     index: pd.DataFrame, options: ViewerOptions
 ) -> tuple[pd.DataFrame, dict[str, int]]:
-    """Rows of the index for the page, and how many trials each scenario has to choose from.
+    """Return the rows of the index for the page, and how many trials each scenario has.
 
-    Of each scenario the first trials, splits taking turns. The column ``detailed`` says which
-    of them are shown with all passes.
+    Of each scenario the first trials are taken, alternating between splits. The column ``detailed``
+    marks those that are shown with all passes.
     """
     table = index
     for column, wanted in (("scenario", options.scenario), ("split", options.split)):
@@ -124,7 +124,7 @@ def choose_trials(
 def _trial_data(
     dataset: Dataset, row: pd.Series, options: ViewerOptions
 ) -> tuple[TrialData, set[str]]:
-    """What the page holds of one trial, and the shapes that its 3D view needs."""
+    """Return the data of one trial, and the shapes that its 3D view needs."""
     paths = dataset.paths(row["trial"])
     trial = dataset.trial(row["trial"])
     if trial.metadata.playback_rate < 1:
