@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from physion.analysis import Comparison
+from physion.analysis.models.mixed_fits import fits_of_models
 from physion.analysis.people.difficulty import below_chance
 from physion.analysis.tables.stimuli import MEAN
 from physion.report.figures import by_scenario as figures
@@ -23,7 +24,6 @@ from physion.report.figures import by_stimulus as figures_stimuli
 from physion.report.figures import figure_tables, theme
 from physion.report.figures.registry import make_plots
 from physion.report.inputs import ReportInputs
-from physion.report.mixed_fits import fits_of_models
 from physion.report.page import blocks
 from physion.report.page.document import Picture
 from physion.report.page.page import render_page

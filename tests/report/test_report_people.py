@@ -12,10 +12,10 @@ import pandas as pd
 import pytest
 
 from physion.analysis import Bootstrap
+from physion.analysis.models.model_tests import permutations_of
 from physion.analysis.statistics.kappa import cross_kappa
 from physion.errors import BadInputError, UnknownNameError
 from physion.report import compare_files
-from physion.report.inputs import permutations_of
 
 SCENARIOS = ("collide", "drop")
 STEMS = {"collide": "pilot_it2_collision_simple_box", "drop": "pilot_it2_drop_simple_box"}

@@ -19,23 +19,22 @@ from physion.analysis import (
 )
 from physion.analysis.models.comparison import Comparison
 from physion.analysis.people.exclusions import PREREGISTERED
+from physion.analysis.people.results import read_attributes, read_expected
+from physion.analysis.results import results_with_averages, results_with_participants
 from physion.analysis.tables.responses import LABELS_FILE, DominoesLook, find_beside
 from physion.analysis.tables.stimuli import read_stimulus_list
 from physion.atomic import write_atomic
 from physion.errors import BadInputError
-from physion.report.assembly import (
-    attributes_in_words,
-    completed,
-    expected_in_words,
-    people_from_files,
-    people_in_words,
-    with_participants,
-)
 from physion.report.figures.registry import make_plots
 from physion.report.inputs import ReportInputs
 from physion.report.page.movies import check_movies
 from physion.report.page.page import render_page
-from physion.report.people_results import read_attributes, read_expected
+from physion.report.settings_text import (
+    attributes_in_words,
+    expected_in_words,
+    people_from_files,
+    people_in_words,
+)
 from physion.report.write import prepare_folder, write_csv, write_plot
 
 ZONE_FILE = "human_accuracy_by_scenario.csv"
@@ -160,7 +159,9 @@ def compare_files(
             expected=read_expected(expected) if isinstance(expected, Path) else expected,
             attributes=read_attributes(attributes) if isinstance(attributes, Path) else attributes,
         )  # fmt: skip
-        inputs = with_participants(rows, people, excluded, exclude_ledge, draws)
+        results = results_with_participants(
+            rows, people, exclude=excluded, exclude_ledge=exclude_ledge, bootstrap=draws
+        )
         choices.setdefault("Official outcomes", "those recorded with the responses")
         choices.setdefault("People", people_in_words(responses, people))
         choices.setdefault(
@@ -175,9 +176,10 @@ def compare_files(
         comparison, words = _with_averages(
             rows, humans, labels, zone, dominoes, {**settings, "bootstrap": draws}
         )
-        inputs = ReportInputs(comparison)
+        results = results_with_averages(comparison, rows, draws)
         choices = {**words, **choices}
-    return build_report(completed(inputs, rows, choices, movies or {}, draws), folder)
+    inputs = ReportInputs.of(results, methods=choices, movies=movies or {})
+    return build_report(inputs, folder)
 
 
 def _with_averages(

@@ -14,6 +14,7 @@ from pandas.testing import assert_frame_equal
 from physion.analysis.people.exclusions import flag_sessions
 from physion.analysis.people.participants import read_responses
 from physion.analysis.people.response_schema import check_table
+from physion.analysis.people.results import read_expected
 from physion.analysis.tables.csv_table import read_table
 from physion.cli.experiment import export as experiment_export
 from physion.cli.main import main
@@ -27,7 +28,6 @@ from physion.experiment.store.database import open_database, sqlite_url, upgrade
 from physion.experiment.store.tables import ANSWERS, RAW_IDS, SESSIONS, STUDIES
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.study import Recruitment, Study
-from physion.report.people_results import read_expected
 from support.experiment import experimenter_rows
 from support.experiment.experimenter_rows import insert_sessions
 from support.experiment.tiny_study import make_tiny_study

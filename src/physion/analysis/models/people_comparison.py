@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -18,12 +17,10 @@ from physion.analysis.models.model_people import (
     model_pairs,
     models_of,
 )
+from physion.analysis.models.model_tests import calibration_scores, paired_tests, pool_measured
 from physion.analysis.models.zones import human_zones, released_r_zone
 from physion.analysis.people.people import HALVES, all_answers, split_halves
 from physion.analysis.statistics.bootstrap import Bootstrap
-from physion.analysis.statistics.calibration import calibration_table
-from physion.analysis.statistics.kappa import correctness
-from physion.analysis.statistics.paired import compare_models
 from physion.analysis.tables.csv_table import require_columns
 from physion.analysis.tables.stimuli import MEAN
 
@@ -96,12 +93,13 @@ def compare_everywhere(
     tables = [measure_table(one, draws) for one in measured]
     if len(measured) > 1:
         tables.append(_mean_table(measured, draws))
+    pooled = pool_measured(measured)
     return PeopleComparison(
         scores=_with_zone(pd.concat(tables, ignore_index=True), zone),
         zones=zone,
         pairs=pd.concat(pairs, ignore_index=True),
-        tests=_tests(measured, draws, permutations),
-        calibration=_calibration(measured),
+        tests=paired_tests(pooled, draws, permutations),
+        calibration=calibration_scores(pooled),
         dropped=pd.concat(dropped, ignore_index=True)[["agent", "scenario", "reason", "stimuli"]],
     )
 
@@ -150,24 +148,3 @@ def _with_zone(scores: pd.DataFrame, zones: pd.DataFrame) -> pd.DataFrame:
     inside = joined["value"].between(joined["zone_low"], joined["zone_high"])
     words = inside.map({True: "yes", False: "no"})
     return joined.assign(in_zone=words.where(known, ""))
-
-
-def _tests(measured: Sequence[Measured], bootstrap: Bootstrap, permutations: int) -> pd.DataFrame:
-    right = [correctness(one.models.predicted, one.answers.label) for one in measured]
-    p_contact = [one.models.p_contact for one in measured]
-    shares = [one.answers.shares() for one in measured]
-    return compare_models(
-        list(measured[0].models.names),
-        np.concatenate(right, axis=1),
-        np.concatenate(p_contact, axis=1),
-        np.concatenate(shares),
-        bootstrap,
-        strata=[one.answers.scenario for one in measured for _ in one.answers.stimuli],
-        permutations=permutations,
-    )
-
-
-def _calibration(measured: Sequence[Measured]) -> pd.DataFrame:
-    p_contact: Any = np.concatenate([one.models.p_contact for one in measured], axis=1)
-    label = np.concatenate([one.answers.label for one in measured])
-    return calibration_table(list(measured[0].models.names), p_contact, label)

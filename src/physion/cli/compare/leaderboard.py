@@ -94,8 +94,8 @@ def _board(options: Options) -> Leaderboard:
 
 def _people(options: Options) -> dict[str, Any]:
     """Return the responses, and the options about them."""
+    from physion.analysis.people.results import read_any_responses, read_expected, rules_called
     from physion.errors import BadInputError
-    from physion.report.people_results import read_any_responses, read_expected, rules_called
 
     if not options.responses:
         if options.sessions or options.rules or options.expected:

@@ -7,10 +7,10 @@ from html import escape
 import pandas as pd
 
 from physion.analysis.people.exclusions import RULES, ExclusionRules
+from physion.analysis.people.results import PeopleResults
 from physion.analysis.tables.stimuli import MEAN, in_order
 from physion.report.inputs import ReportInputs
 from physion.report.page.blocks import Column, paragraph, rows_table, table, undefined
-from physion.report.people_results import PeopleResults
 
 
 def sessions(inputs: ReportInputs) -> str:

@@ -7,8 +7,9 @@ from html import escape
 import numpy as np
 import pandas as pd
 
-from physion.report.inputs import ReportInputs, permutations_of
-from physion.report.mixed_fits import MixedTable
+from physion.analysis.models.mixed_fits import MixedTable
+from physion.analysis.models.model_tests import permutations_of
+from physion.report.inputs import ReportInputs
 from physion.report.page.blocks import Column, details, paragraph, rows_table
 from physion.report.words import number
 

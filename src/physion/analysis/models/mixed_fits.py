@@ -12,9 +12,9 @@ from physion.analysis.mixed.logistic import fit_logistic
 from physion.analysis.mixed.result import MixedFit
 from physion.analysis.models.comparison import Comparison
 from physion.analysis.people.hypotheses import HYPOTHESES, answer_rows, with_attributes
+from physion.analysis.people.results import PeopleResults
 from physion.analysis.tables.stimuli import MEAN, POOLED
 from physion.errors import PhysionError
-from physion.report.people_results import PeopleResults
 
 CROSSED = "(1|participant) + (1|stimulus)"
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pandas as pd
 
-from physion.analysis import Bootstrap
 from physion.analysis.people.biases import (
     accuracy_by_background,
     background,
@@ -36,6 +35,7 @@ from physion.analysis.people.people import (
     accuracy_by_stimulus,
     agreement_by_scenario,
 )
+from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.tables.attributes import (
     ATTRIBUTES,
     attributes_from_names,

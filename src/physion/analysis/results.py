@@ -1,0 +1,112 @@
+"""All results of a comparison, computed here so that the report only draws."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import pandas as pd
+
+from physion.analysis.models.comparison import Comparison, compare
+from physion.analysis.models.mixed_fits import MixedTable, fits_of_models, fits_of_people
+from physion.analysis.models.model_tests import (
+    calibration_scores,
+    paired_tests,
+    permutations_of,
+    pool_comparison,
+)
+from physion.analysis.models.people_comparison import PeopleComparison, compare_everywhere
+from physion.analysis.people.people import accuracy_by_stimulus
+from physion.analysis.people.results import PeopleResults
+from physion.analysis.statistics.bootstrap import Bootstrap
+
+
+@dataclass(frozen=True)
+class ComparisonResults:
+    """Results of a comparison of models with people.
+
+    - ``comparison``: from `compare`.
+    - ``predictions``: from `predictions.read_predictions`, for what needs readout and training.
+    - ``people``: results about single participants; None if only their averages are known.
+    - ``beside``: models and single participants, from `people_comparison.compare_everywhere`.
+    - ``comparison_all``: the comparison with all complete sessions, including flagged ones.
+    - ``paired``: from `model_tests.paired_tests`, all scenarios pooled; None for one model.
+    - ``calibration``: from `model_tests.calibration_scores`.
+    - ``mixed``: from `mixed_fits`.
+    """
+
+    comparison: Comparison
+    predictions: pd.DataFrame | None = None
+    people: PeopleResults | None = None
+    beside: PeopleComparison | None = None
+    comparison_all: Comparison | None = None
+    paired: pd.DataFrame | None = None
+    calibration: pd.DataFrame | None = None
+    mixed: tuple[MixedTable, ...] = ()
+
+
+def results_with_averages(
+    comparison: Comparison, predictions: pd.DataFrame, bootstrap: Bootstrap | None = None
+) -> ComparisonResults:
+    """Complete a comparison with people's averages, or without people, by tests and fits."""
+    pooled = pool_comparison(comparison)
+    several = len(comparison.agents) > 1
+    return ComparisonResults(
+        comparison,
+        predictions=predictions,
+        paired=paired_tests(pooled, bootstrap or Bootstrap()) if several else None,
+        calibration=calibration_scores(pooled),
+        mixed=tuple(fits_of_models(comparison)),
+    )
+
+
+def results_with_participants(
+    predictions: pd.DataFrame,
+    people: PeopleResults,
+    *,
+    exclude: Iterable[str] = (),
+    exclude_ledge: bool = True,
+    bootstrap: Bootstrap | None = None,
+) -> ComparisonResults:
+    """Compare models with the sessions that are not flagged, and with all complete ones.
+
+    Parameters
+    ----------
+    predictions
+        From `predictions.read_predictions`.
+    people
+        From `people.results.analyse_people`.
+    exclude, exclude_ledge, bootstrap
+        As in `compare`.
+    """
+    draws = bootstrap or Bootstrap()
+    settings: dict[str, Any] = {
+        "exclude": tuple(exclude),
+        "exclude_ledge": exclude_ledge,
+        "bootstrap": draws,
+    }
+    main = compare(
+        predictions,
+        people.tables["by_stimulus"],
+        people.labels(),
+        zone=people.zone(),
+        zone_origin="from the responses themselves",
+        participants=True,
+        **settings,
+    )
+    everybody = accuracy_by_stimulus(people.whole.test, draws)
+    whole = compare(predictions, everybody, people.labels(), **settings)
+    agents = len(main.agents)
+    permutations = permutations_of(agents * (agents - 1) // 2)
+    beside = compare_everywhere(main.stimuli, people.kept.test, draws, permutations=permutations)
+    return ComparisonResults(
+        main,
+        predictions=predictions,
+        people=people,
+        comparison_all=whole,
+        beside=beside,
+        paired=beside.tests if agents > 1 else None,
+        calibration=beside.calibration,
+        mixed=(*fits_of_people(people), *fits_of_models(main)),
+    )

@@ -1,0 +1,82 @@
+"""Settings about participants as text, for the page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import pandas as pd
+
+from physion.analysis.people.participants import check_labels
+from physion.analysis.people.results import (
+    PeopleResults,
+    analyse_people,
+    read_any_responses,
+    rules_called,
+)
+from physion.analysis.statistics.bootstrap import Bootstrap
+from physion.report.words import plural
+
+
+def people_from_files(
+    responses: Sequence[Path],
+    sessions: Path | None,
+    rules: str,
+    labels: Mapping[str, bool] | None,
+    excluded: list[str],
+    exclude_ledge: bool,
+    draws: Bootstrap,
+    *,
+    expected: Mapping[str, int] | None = None,
+    attributes: pd.DataFrame | None = None,
+) -> PeopleResults:
+    """Read responses and run every analysis of people."""
+    chosen = rules_called(rules)
+    read = read_any_responses(responses, sessions)
+    if labels is not None:
+        check_labels(read, labels)
+    return analyse_people(
+        read,
+        rules=chosen,
+        expected=expected,
+        attributes=attributes,
+        exclude=excluded,
+        exclude_ledge=exclude_ledge,
+        bootstrap=draws,
+    )
+
+
+def people_in_words(responses: Sequence[Path], people: PeopleResults) -> str:
+    """Describe the responses and the flagged sessions."""
+    flags = people.tables["flags"]
+    return (
+        f"answers of single participants from {', '.join(path.name for path in responses)}: "
+        f"{len(flags)} sessions, {int(flags['flagged'].sum())} of them flagged by the rules "
+        f"“{people.rules.name}” and left out of the main analysis"
+    )
+
+
+def expected_in_words(people: PeopleResults, given: bool) -> str:
+    """Describe how many trials a session must have, and how many sessions had fewer."""
+    flags = people.tables["flags"]
+    counts = flags.groupby("scenario")["expected"].agg(["min", "max"])
+    each = ", ".join(
+        f"{name} {row['min']}" + (f" to {row['max']}" if row["max"] > row["min"] else "")
+        for name, row in counts.iterrows()
+    )
+    by = (
+        "by the list that was given"
+        if given
+        else "all stimuli of the scenario that anyone answered"
+    )
+    return f"{by}: {each}; {plural(int(flags['incomplete'].sum()), 'session')} had fewer"
+
+
+def attributes_in_words(people: PeopleResults) -> str:
+    """Describe where the attributes of the stimuli come from."""
+    sources = people.tables["attributes"]["source"].value_counts()
+    stimuli = len(people.tables["by_stimulus"])
+    return (
+        f"of {stimuli} stimuli {sources.get('table', 0)} by the table that was given, "
+        f"{sources.get('name', 0)} by their official names, {stimuli - sources.sum()} not known"
+    )
