@@ -103,6 +103,7 @@ def _choose(options: Options) -> StimulusSelection:
 
 
 def _choose_listed(options: Options) -> StimulusSelection:
+    """Select the stimuli from official lists."""
     from physion.experiment.study.init_official import choose_listed
     from physion.experiment.study.init_trials import choose_familiarization
 
@@ -135,6 +136,7 @@ def _choose_listed(options: Options) -> StimulusSelection:
 
 
 def _study(options: Options, scenarios: tuple[str, ...]) -> Study:
+    """Return the settings of the new study."""
     from physion.experiment.study.study import Study
 
     return Study(
@@ -167,6 +169,7 @@ def _password(path: Path | None) -> str:
 
 
 def _print(options: Options, study: Study, chosen: StimulusSelection, password: str | None) -> None:
+    """Print the counts of stimuli, the password and the next steps."""
     from physion.cli.output import console
 
     counts = {

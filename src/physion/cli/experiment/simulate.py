@@ -94,6 +94,7 @@ def summary(study: Study, plan: SimulationPlan, visits: list[Visit]) -> dict[str
 
 
 def _check(options: Options) -> None:
+    """Check that the options are valid and consistent."""
     from physion.errors import BadInputError
 
     if options.participants < 1 or options.at_once < 1:
@@ -136,6 +137,7 @@ def _progress(options: Options) -> Iterator[Any]:
 
 
 def _print(found: dict[str, Any], json: bool) -> None:
+    """Print the summary as text or JSON."""
     from physion.cli.output import console
 
     if json:

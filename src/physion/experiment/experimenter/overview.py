@@ -166,6 +166,7 @@ def compute_overview(
 def _progress(
     name: str, wanted: int, part: Sequence[SessionSummary], flags: Flags, now: float
 ) -> ScenarioProgress:
+    """Return the row of the progress table for one scenario."""
     states = Counter(summary.state for summary in part)
     counts = {state: states[state] for state in STATES}
     finished = [float(s.facts["finished_at"]) for s in part if s.state == "finished"]
@@ -240,6 +241,7 @@ def funnel(part: Sequence[SessionSummary]) -> tuple[FunnelStage, ...]:
 
 
 def _performance(study: Study, name: str, part: Sequence[SessionSummary]) -> ScenarioPerformance:
+    """Return accuracy and response times of the people who completed one scenario."""
     trials = len(study.phase(name, "test"))
     complete = [s.answered for s in part if trials and s.answered.test >= trials]
     accuracies = [answered.correct / answered.test for answered in complete]

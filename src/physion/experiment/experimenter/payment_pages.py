@@ -90,6 +90,7 @@ class PaymentPages:
     def _confirm_form(
         self, request: Request, problem: str = "", status: int = 200, wait: float = 0.0
     ) -> Response:
+        """Show the password form."""
         response = self._context.render(
             request, "confirm.html", status, here="payments", problem=problem
         )

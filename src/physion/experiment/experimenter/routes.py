@@ -101,6 +101,7 @@ class _Pages:
     def _login_form(
         self, request: Request, problem: str = "", status: int = 200, wait: float = 0.0
     ) -> Response:
+        """Show the login form, with a cookie to which it is bound."""
         visit = self._context.access.visit(request)
         response = self._context.render_with_token("login.html", visit, status, problem=problem)
         set_cookie(request, response, visit)

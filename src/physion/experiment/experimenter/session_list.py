@@ -145,6 +145,7 @@ def flags_shown(summary: SessionSummary, flags: Flags) -> tuple[str, ...]:
 
 
 def _line(summary: SessionSummary, flags: Flags) -> SessionLine:
+    """Return the row of the table for one session."""
     facts, answered = summary.facts, summary.answered
     end = facts["finished_at"] or facts["withdrawn_at"] or facts["last_seen"]
     return SessionLine(

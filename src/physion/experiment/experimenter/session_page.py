@@ -117,6 +117,7 @@ def read_session_page(
 def _answers(
     study: Study, connection: Connection, session: str, scenario: str
 ) -> tuple[AnswerLine, ...]:
+    """Read the answers of a session in order."""
     labels = stimulus_labels(study)
     table = ANSWERS.c
     rows = connection.execute(
@@ -135,6 +136,7 @@ def _answers(
 
 
 def _events(connection: Connection, session: str) -> tuple[EventLine, ...]:
+    """Read the events of a session in order."""
     rows = connection.execute(
         select(EVENTS).where(EVENTS.c.session == session).order_by(EVENTS.c.event)
     )

@@ -65,6 +65,7 @@ def read_events(connection: Connection, sessions: pa.Table) -> Iterator[pa.Table
 
 
 def _event_table(rows: list[Any], numbers: list[int]) -> pa.Table:
+    """Return the exported table of these events."""
     stored_at = np.array([row.stored_at for row in rows], dtype=np.float64)
     # Keys are sorted because databases may return them in another order.
     data = [json.dumps(row.data, sort_keys=True, ensure_ascii=False) for row in rows]

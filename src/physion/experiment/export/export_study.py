@@ -209,6 +209,7 @@ def _write_csv(path: Path, header: Sequence[str], rows: Sequence[Sequence[Any]])
 
 
 def _write_psych_ds(folder: Path, study: Study, sessions: SessionTable, until: str | None) -> None:
+    """Write the Psych-DS dataset from the tables already written."""
     began = pc.min(sessions.table.column("started_at")).as_py()
     write_psych_ds(
         folder / "psych-ds",

@@ -110,6 +110,7 @@ def _why_not(row: _Row, wanted: SessionSelection, study: Study) -> str | None:
 
 
 def _session_table(rows: Sequence[_Row]) -> pa.Table:
+    """Return the exported table of these sessions."""
     columns: dict[str, pa.Array] = {}
     for column in SESSION_COLUMNS:
         values = [_session_value(row, column.name) for row in rows]

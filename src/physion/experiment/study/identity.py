@@ -79,6 +79,7 @@ class Secrets:
 
 
 def _write(path: Path, secrets: Secrets) -> None:
+    """Write the secrets file, readable by its owner only."""
     content = {
         "version": VERSION,
         "hash_key": secrets.hash_key.hex(),
@@ -89,6 +90,7 @@ def _write(path: Path, secrets: Secrets) -> None:
 
 
 def _parse(path: Path, content: bytes) -> Secrets:
+    """Parse and check the content of the secrets file."""
     try:
         values: Any = json.loads(content)
         if values["version"] != VERSION:

@@ -232,6 +232,7 @@ def _first_existing(folders: Sequence[Path], names: Sequence[str]) -> Path:
 def _source(
     row: ListedStimulus, scenario: str, phase: str, place: int, files: _MediaFinder
 ) -> StimulusSource:
+    """Return the source files of one row of a list."""
     return StimulusSource(
         stimulus=row.stimulus,
         scenario=scenario,

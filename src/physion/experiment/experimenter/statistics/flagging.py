@@ -92,6 +92,7 @@ class FlagCache:
         return self._thread is not None and self._thread.is_alive()
 
     def _work(self, state: object) -> None:
+        """Compute the flags; runs in the background thread."""
         started = time.monotonic()
         try:
             self._flags = self._find()

@@ -160,6 +160,7 @@ class SummaryCache:
         return [self._summary(row, now) for row in rows]
 
     def _summary(self, row: Row[Any], now: float) -> SessionSummary:
+        """Return the summary of one session from its database row."""
         facts = row._asdict()
         return SessionSummary(
             facts,

@@ -101,6 +101,7 @@ def serve_questions(study: Study, url: str, connection: Connection) -> None:
 
 
 def _reply(worker: StatisticsWorker, question: str, arguments: Mapping[str, Any]) -> Reply:
+    """Call the requested method; return its result or error."""
     questions: dict[str, Callable[..., Any]] = {
         "overview": worker.overview,
         "sessions": worker.sessions,
