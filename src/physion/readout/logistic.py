@@ -44,20 +44,19 @@ _TOLERANCE = 1e-9
 
 @dataclass(frozen=True)
 class ReadoutConfig:
-    """Settings of a readout.
-
-    - ``grid``: inverse penalties C, ascending. ``folds``: of the cross-validation that chooses.
-    - ``seed``: of the folds and of undersampling.
-    - ``balance``: undersample the more frequent label of the fit trials, as the released code did;
-      tested trials are never undersampled.
-    - ``released``: scikit-learn's lbfgs with 200 iterations instead of the exact optimum.
-    """
+    """Settings of a readout."""
 
     grid: tuple[float, ...] = C_GRID
+    """Inverse penalties C among which cross-validation chooses, ascending."""
     folds: int = FOLDS
+    """Folds of this cross-validation."""
     seed: int = 0
+    """Seed of the folds and of undersampling."""
     balance: bool = False
+    """Undersample the more frequent label of the fit trials, as the released code did; tested
+    trials are never undersampled."""
     released: bool = False
+    """Use scikit-learn's lbfgs with 200 iterations, as released, instead of the exact optimum."""
 
     def __post_init__(self) -> None:
         if not self.grid or min(self.grid) <= 0 or list(self.grid) != sorted(set(self.grid)):
