@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from physion.scenes.sampling.preset import parse_presets
 from support.paths import ROOT
 
 
@@ -40,3 +41,10 @@ def test_paths_on_the_pages_exist(page: str) -> None:
     text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
     paths = {path for path in re.findall(r"`(src/physion/[\w/.*]+)`", text) if "NAME" not in path}
     assert all(list(ROOT.glob(path)) for path in paths), paths
+
+
+def test_preset_file_of_the_scenes_page_is_read() -> None:
+    text = (ROOT / "docs" / "scenes.md").read_text(encoding="utf-8")
+    (toml,) = re.findall(r"```toml\n(.*?)```", text, re.S)
+    presets = parse_presets(toml, "my.toml")
+    assert presets["heavy_ball_slope"].params.probe.mass == (8.0, 8.0)

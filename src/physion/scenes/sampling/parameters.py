@@ -360,6 +360,7 @@ def retry(tries: int, what: str, attempt: typing.Callable[[], str | None]) -> No
         if reason is None:
             return
         reasons[reason] = reasons.get(reason, 0) + 1
+    reason = max(reasons, key=lambda one: reasons[one])
     raise BadSceneError(
-        f"{what} could not be placed in {tries} tries: {max(reasons, key=lambda one: reasons[one])}"
+        f"{what} could not be placed in {tries} tries: {reason}; change sizes or distances"
     )

@@ -78,7 +78,7 @@ class StandParams(SceneParams, Protocol):
 
     @property
     def monochrome(self) -> bool:
-        """Whether the bodies of the stack share one colour."""
+        """Whether the bodies of the stack have one colour."""
         ...
 
 

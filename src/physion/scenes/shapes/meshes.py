@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull
 
 from physion.numerics.elementary import cos, sin
-from physion.numerics.linear_algebra import apply, dot, ordered_sum, outer
+from physion.numerics.linear_algebra import apply, dot, ordered_sum
 
 Points = NDArray[np.float64]
 Faces = NDArray[np.int32]
@@ -130,25 +130,14 @@ def merge(meshes: Iterable[Mesh], smooth: float | None = None) -> Mesh:
     )
 
 
-def solid_properties(mesh: Mesh) -> tuple[float, Points, Points]:
-    """Return volume, centre of mass (3,), and inertia tensor (3, 3) about it for a mass of 1 kg.
+def solid_properties(mesh: Mesh) -> tuple[float, Points]:
+    """Return the volume and the centroid (3,) of the solid inside a closed mesh.
 
-    The mesh is closed and has uniform density. The integrals are sums over the tetrahedra from the
-    origin to every face and exact (Tonon, Journal of Mathematics and Statistics 1, 2005).
+    The integrals are exact sums over the tetrahedra from the origin to every face. The mass
+    properties of bodies are those of their collision pieces: see `physion.physics.rigid.mass`.
     """
     a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
     volumes = dot(a, np.cross(b, c)) / 6.0
     volume = float(ordered_sum(volumes))
-    total = a + b + c
-    center = ordered_sum(volumes[:, None] * total, axis=0) / (4.0 * volume)
-    second = np.zeros((3, 3))
-    for point in (a, b, c, total):
-        second += ordered_sum(outer(volumes[:, None] * point, point), axis=0)
-    second /= 20.0 * volume
-    return volume, center, inertia_from_second_moment(second - outer(center, center))
-
-
-def inertia_from_second_moment(second: Points) -> Points:
-    """Return the inertia tensor (3, 3) of a unit mass from its second moments about the centre."""
-    trace = second[0, 0] + second[1, 1] + second[2, 2]
-    return np.asarray(trace * np.eye(3) - second)
+    centroid = ordered_sum(volumes[:, None] * (a + b + c), axis=0) / (4.0 * volume)
+    return volume, centroid

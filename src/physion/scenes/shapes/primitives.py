@@ -1,12 +1,12 @@
-"""Registry of shapes, and the primitives: their meshes, collision pieces and mass properties.
+"""Registry of shapes, and the primitives: their meshes and collision pieces.
 
-Sizes are those of the official model records (docs/official-system.md, section 1.2), with
-their (x, y up, z) written as our (x, z, y up): the pivot is the centre of the bottom face, so that
-a shape stands on z = 0. The records give bounds alone; their "volume" is not that of the solid but,
-as far as it can be checked, the summed volume of boxes round the convex colliders: for shapes that
-are their own hull it is exactly that of the bounding box, and for a torus of 16 colliders it yields
-the same hole that a published picture shows (radius 0.429 against 0.430). What bounds and that sum
-leave open is a named constant here, with its reason.
+Sizes are those of the official model records (docs/official-system.md, section 1.2), with their
+axes (x, y up, z) converted to ours (x, z, y up). The pivot is the centre of the bottom face, so
+that a shape stands on z = 0. A record gives bounds and a "volume", which is not the volume of the
+solid but, as far as can be checked, the sum of the volumes of the bounding boxes of the convex
+colliders: for convex shapes it equals the volume of the bounding box, and for a torus of 16
+colliders it gives an inner radius of 0.429, where a published picture shows 0.430. What bounds and
+volume leave open is a named constant here, with its reason.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.numerics.elementary import arctan2, cos, sin
-from physion.numerics.linear_algebra import ordered_sum, outer
 from physion.registry import Registry
 from physion.scenes.scene import Vec3
 from physion.scenes.shapes.meshes import (
@@ -30,7 +29,6 @@ from physion.scenes.shapes.meshes import (
     box,
     extrude,
     hull,
-    inertia_from_second_moment,
     revolve,
     solid_properties,
 )
@@ -40,38 +38,38 @@ CURVED = math.radians(40.0)
 """Crease angle of round shapes: walls are shaded smoothly, rims are sharp."""
 ROUND_SEGMENTS = 32
 CONE_SEGMENTS = 22
-"""From the record: 0.9898 wide and 1 deep, which is a 22-sided cone with corners on one axis."""
+"""The record is 0.9898 wide and 1 deep, as for a 22-sided cone with corners on one axis."""
 RING_SEGMENTS = 16
 """Sides of the torus, counted in a published picture."""
 TORUS_INNER = 0.429
 """Inner radius of the torus: 0.688 (sd 0.004) of the outer 0.625, measured on 8 corners of a
 torus-shaped zone in a published picture; 0.429 from the boxes of 16 colliders (0.2618)."""
 TORUS_BEVEL = 0.06
-"""The torus' section is a rectangle with corners cut off by this much, judged from pictures."""
+"""The cross-section of the torus is a rectangle with corners cut by this length (from pictures)."""
 PIPE_INNER = 0.389
-"""Inner radius of the pipe: the boxes of 16 to 32 colliders add up to the record's 0.5146 for
-0.386 to 0.391."""
+"""Inner radius of the pipe: the boxes of 16 to 32 colliders have the recorded volume of 0.5146 for
+radii of 0.386 to 0.391."""
 BOWL_RADIUS, BOWL_HEIGHT = 0.4904, 0.3789
 BOWL_FLAT = 0.2
-"""Radius of the bowl's flat bottom, fitted: of 0.12, 0.2 and 0.28 it misses the official final
-positions of contained objects least (reference: a wholly round bottom suits bowls, not vases)."""
+"""Radius of the bowl's flat bottom: of 0.12, 0.2 and 0.28 it predicts the official final positions
+of contained objects best."""
 BOWL_WALL = 0.045
-"""Thickness of the bowl's wall: 0.03 to 0.055 fit the record's 0.1715, by the number of colliders;
-the rim in pictures looks no thicker."""
+"""Thickness of the bowl's wall. The recorded volume of 0.1715 allows 0.03 to 0.055, depending on
+the number of colliders; the rim in pictures is not thicker."""
 BOWL_PIECE_WALL = 0.035
-"""Thickness at the corners of the bowl's pieces: the hull of a sector also fills the hollow behind
-its chords, and with this corner thickness the pieces have the volume of the drawn wall."""
+"""Thickness of the bowl's collision pieces at their corners. A convex sector is thicker in its
+middle than at its corners; with this value the pieces have the volume of the drawn wall."""
 DUMBBELL_HEAD, DUMBBELL_BAR = 0.375, 0.1206
-"""Half sizes of a dumbbell's two cubes and of the square bar between them, each a third of its
-length. Official ones come to rest on four sides and stand on narrow ones, so the heads are flat;
-boxes of these sizes add up to the record's 0.8873."""
+"""Half sizes of a dumbbell's two cubes and of the square bar between them; each is a third of its
+length. Official dumbbells come to rest on four sides and on their ends, so the heads are cubes;
+boxes of these sizes have the recorded volume of 0.8873."""
 RAMP_FOOT, RAMP_DEPTH = 1.629, 2.0
-"""Distance of the pivot from the foot of a ramp, and its width. The lengths in the records are
-those of slopes of 30 and 60 per cent and one platform of 1.61. The records put the foot at +x, but
-what comes to rest in front of the official ramps shows that it lies at -x."""
+"""Distance of a ramp's pivot from its foot, and its width. The recorded lengths are those of slopes
+of 30 and 60 per cent and a platform of 1.61. In the records the foot is at +x, but objects that
+come to rest in front of official ramps show that it is at -x."""
 BOWL_SEGMENTS = 24
 PIPE_SECTORS, BOWL_SECTORS, BOWL_BANDS = 16, 12, 3
-"""Convex sectors that stand for a hollow shape in contacts, and bands of the bowl's wall."""
+"""Number of convex sectors that a hollow shape is divided into, and of bands of the bowl's wall."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,19 +105,6 @@ class ConvexPiece:
 
 
 @dataclass(frozen=True, eq=False)
-class MassProperties:
-    """Volume, centre of mass and inertia of a body of uniform density.
-
-    ``volume`` is in cubic metres, ``center`` (3,) in metres in the shape's coordinates. ``inertia``
-    (3, 3) is about the centre for a mass of 1 kg: multiply it by the body's mass.
-    """
-
-    volume: float
-    center: Points
-    inertia: Points
-
-
-@dataclass(frozen=True, eq=False)
 class Shape:
     """Shape at unit scale: a closed mesh for rendering and convex pieces for collisions.
 
@@ -140,28 +125,6 @@ class Shape:
     def bounds(self) -> Points:
         """Return the smallest and largest coordinates (2, 3) of the mesh."""
         return self.mesh.bounds
-
-    def mass_properties(
-        self, scale: Vec3 = (1.0, 1.0, 1.0), of: Literal["solid", "pieces"] = "solid"
-    ) -> MassProperties:
-        """Return the mass properties at ``scale``, of the mesh or of the collision pieces.
-
-        Unity computes those of a body from its colliders, which corresponds to ``of="pieces"``.
-        """
-        parts = [self.mesh] if of == "solid" else [piece.mesh for piece in self.pieces]
-        parts_properties = [solid_properties(part.moved(scale)) for part in parts]
-        volumes = np.array([volume for volume, _, _ in parts_properties])
-        volume = float(ordered_sum(volumes))
-        weights = volumes / volume
-        centers = np.stack([center for _, center, _ in parts_properties])
-        center = ordered_sum(weights[:, None] * centers, axis=0)
-        inertia = np.zeros((3, 3))
-        for weight, part_center, (_, _, part_inertia) in zip(
-            weights, centers, parts_properties, strict=True
-        ):
-            arm = part_center - center
-            inertia += weight * (part_inertia + inertia_from_second_moment(outer(arm, arm)))
-        return MassProperties(volume, center, inertia)
 
 
 Outline = list[tuple[float, float]]

@@ -34,7 +34,7 @@ CORNERS = ((1, 1), (-1, 1), (-1, -1), (1, -1))
 
 @prop("chair", (0.43, 0.497, 0.878))
 def _chair() -> Iterable[PropPart]:
-    """A wooden dining chair with three slats and a padded seat."""
+    """Model a wooden dining chair with three slats and a padded seat."""
     yield board((0, 0.01, 0.43), (0.215, 0.215, 0.025))
     yield cushion((0, 0.01, 0.463), (0.205, 0.205, 0.022), 0.02, PAD)
     for x in (-0.19, 0.19):
@@ -49,7 +49,7 @@ def _chair() -> Iterable[PropPart]:
 
 @prop("cafe_chair", (0.46, 0.482, 0.864))
 def _cafe_chair() -> Iterable[PropPart]:
-    """A bistro chair of bent tubes with a round seat."""
+    """Model a bistro chair of bent tubes with a round seat."""
     yield lathe([(0.19, 0.44), (0.205, 0.45), (0.205, 0.465), (0.19, 0.475)])
     for x in (-1, 1):
         yield tube([(0.14 * x, 0.12, 0.45), (0.17 * x, 0.2, 0.0)], 0.011)
@@ -66,7 +66,7 @@ def _cafe_chair() -> Iterable[PropPart]:
 
 @prop("armchair", (0.82, 0.865, 0.849))
 def _armchair() -> Iterable[PropPart]:
-    """An upholstered easy chair."""
+    """Model an upholstered easy chair."""
     yield cushion((0, 0.0, 0.22), (0.36, 0.38, 0.12), 0.04)
     yield cushion((0, 0.06, 0.4), (0.27, 0.34, 0.085), 0.06)
     back = cushion((0, -0.28, 0.57), (0.33, 0.11, 0.28), 0.07)
@@ -81,7 +81,7 @@ def _armchair() -> Iterable[PropPart]:
 
 @prop("stool", (0.429, 0.427, 0.5))
 def _stool() -> Iterable[PropPart]:
-    """A round wooden stool on four splayed legs."""
+    """Model a round wooden stool on four splayed legs."""
     yield lathe([(0.16, 0.455), (0.18, 0.465), (0.18, 0.49), (0.165, 0.5)])
     feet = [(0.2 * x, 0.2 * y, 0.015) for x, y in CORNERS]
     for x, y, z in feet:
@@ -93,7 +93,7 @@ def _stool() -> Iterable[PropPart]:
 
 @prop("bar_stool", (0.42, 0.42, 0.78))
 def _bar_stool() -> Iterable[PropPart]:
-    """A padded seat on a steel column with a foot ring."""
+    """Model a padded seat on a steel column with a foot ring."""
     yield lathe(outline([(0.16, 0.68), (0.185, 0.71), (0.19, 0.75), (0.16, 0.78)], 3))
     yield lathe([(0.1, 0.665), (0.16, 0.68)], look=CHROME, sides=16)
     yield lathe([(0.21, 0.0), (0.21, 0.012), (0.05, 0.035), (0.03, 0.06)], look=CHROME)
@@ -105,7 +105,7 @@ def _bar_stool() -> Iterable[PropPart]:
 
 @prop("table", (1.1, 1.1, 0.74))
 def _table() -> Iterable[PropPart]:
-    """A round dining table on a turned column with four feet."""
+    """Model a round dining table on a turned column with four feet."""
     yield lathe([(0.52, 0.7), (0.55, 0.715), (0.55, 0.735), (0.54, 0.74)], sides=32)
     column = [(0.06, 0.08), (0.085, 0.2), (0.05, 0.4), (0.065, 0.58), (0.2, 0.705)]
     yield lathe(outline(column, 3), sides=16)
@@ -117,7 +117,7 @@ def _table() -> Iterable[PropPart]:
 
 @prop("coffee_table", (1.1, 0.6, 0.42))
 def _coffee_table() -> Iterable[PropPart]:
-    """A low table with a shelf under its top."""
+    """Model a low table with a shelf under its top."""
     yield cushion((0, 0, 0.4), (0.55, 0.3, 0.02), 0.01)
     yield board((0, 0, 0.14), (0.47, 0.22, 0.01))
     for x, y in CORNERS:
@@ -129,7 +129,7 @@ def _coffee_table() -> Iterable[PropPart]:
 
 @prop("side_table", (0.46, 0.46, 0.55))
 def _side_table() -> Iterable[PropPart]:
-    """A small round table with three slanting legs."""
+    """Model a small round table with three slanting legs."""
     yield lathe([(0.215, 0.52), (0.23, 0.53), (0.23, 0.545), (0.22, 0.55)], sides=32)
     yield lathe([(0.12, 0.495), (0.12, 0.52)], sides=16)
     for angle in np.arange(3) * 2 * math.pi / 3 + math.pi / 2:
@@ -139,7 +139,7 @@ def _side_table() -> Iterable[PropPart]:
 
 @prop("desk", (1.2, 0.6, 0.75))
 def _desk() -> Iterable[PropPart]:
-    """A writing desk with a stack of drawers on one side."""
+    """Model a writing desk with a stack of drawers on one side."""
     yield board((0, 0, 0.735), (0.6, 0.3, 0.015))
     yield board((0.36, -0.01, 0.4), (0.2, 0.27, 0.32))
     for z in (0.23, 0.43, 0.62):
@@ -154,7 +154,7 @@ def _desk() -> Iterable[PropPart]:
 
 @prop("lamp", (0.4, 0.4, 0.62))
 def _lamp() -> Iterable[PropPart]:
-    """A table lamp: a turned foot under a cloth shade."""
+    """Model a table lamp: a turned foot under a cloth shade."""
     foot = [(0.1, 0.0), (0.1, 0.02), (0.06, 0.05), (0.09, 0.14), (0.1, 0.22), (0.05, 0.31)]
     yield lathe(outline([*foot, (0.018, 0.35)], 3), sides=20)
     yield tube([(0, 0, 0.34), (0, 0, 0.45)], 0.012, CHROME)
@@ -164,7 +164,7 @@ def _lamp() -> Iterable[PropPart]:
 
 @prop("floor_lamp", (0.46, 0.46, 1.6))
 def _floor_lamp() -> Iterable[PropPart]:
-    """A thin pole on a heavy disc, a drum shade on top."""
+    """Model a thin pole on a heavy disc, a drum shade on top."""
     yield lathe([(0.15, 0.0), (0.15, 0.02), (0.14, 0.03), (0.02, 0.04)])
     yield tube([(0, 0, 0.03), (0, 0, 1.4)], 0.013)
     yield sleeve([(0.23, 1.28), (0.18, 1.6)], 0.006, SHADE)
@@ -173,7 +173,7 @@ def _floor_lamp() -> Iterable[PropPart]:
 
 @prop("desk_lamp", (0.22, 0.57, 0.573))
 def _desk_lamp() -> Iterable[PropPart]:
-    """A jointed arm that holds a cone over the desk."""
+    """Model a jointed arm that holds a cone over the desk."""
     base = lathe([(0.11, 0.0), (0.11, 0.015), (0.1, 0.025), (0.02, 0.035)]).moved((0, -0.1, 0))
     yield base
     elbow, wrist = (0.0, -0.25, 0.3), (0.0, 0.09, 0.5)

@@ -30,7 +30,7 @@ SHOES = Look((0.1, 0.09, 0.09), "plastic_matte")
 
 
 def _leaf(path: ArrayLike, widths: ArrayLike, fold: float = 0.25) -> PropPart:
-    """A leaf along ``path`` (K, 3): pointed at both ends, folded along its middle."""
+    """Model a leaf along ``path`` (K, 3): pointed at both ends, folded along its middle."""
     points = np.asarray(path, np.float64)
     way = points[-1] - points[0]
     across = np.cross(way, (0.0, 0.0, 1.0))
@@ -48,7 +48,7 @@ def _leaf(path: ArrayLike, widths: ArrayLike, fold: float = 0.25) -> PropPart:
 
 
 def _pot(radius: float, height: float, look: Look) -> Iterable[PropPart]:
-    """A flower pot with a rim, full of soil."""
+    """Model a flower pot with a rim, full of soil."""
     lip = 0.8 * height
     wall = [(0.7 * radius, 0.0), (0.92 * radius, lip), (radius, lip + 0.005), (radius, height)]
     yield lathe(wall, wall=0.1 * radius, look=look)
@@ -57,7 +57,7 @@ def _pot(radius: float, height: float, look: Look) -> Iterable[PropPart]:
 
 @prop("plant", (0.46, 0.482, 0.676))
 def _plant() -> Iterable[PropPart]:
-    """A garden plant: a tuft of arching blades in a clay pot."""
+    """Model a garden plant: a tuft of arching blades in a clay pot."""
     yield from _pot(0.14, 0.22, CLAY)
     # The same plant for everybody.
     seed = named_seed("prop", "plant")
@@ -75,7 +75,7 @@ def _plant() -> Iterable[PropPart]:
 
 @prop("houseplant", (0.508, 0.473, 0.832))
 def _houseplant() -> Iterable[PropPart]:
-    """A rubber plant: a stem with broad leaves all the way up, in a white pot."""
+    """Model a rubber plant: a stem with broad leaves all the way up, in a white pot."""
     yield from _pot(0.15, 0.25, GLAZED)
     stem = curve([(0, 0, 0.2), (0.015, 0.01, 0.4), (-0.01, 0.0, 0.6), (0.0, 0.0, 0.74)], 2)
     yield tube(stem, np.linspace(0.014, 0.006, len(stem)), STALK, sides=6)
@@ -97,7 +97,7 @@ def _houseplant() -> Iterable[PropPart]:
 
 @prop("cactus", (0.33, 0.2, 0.58))
 def _cactus() -> Iterable[PropPart]:
-    """A ribbed column with two arms, in a clay pot."""
+    """Model a ribbed column with two arms, in a clay pot."""
     yield from _pot(0.1, 0.14, CLAY)
     yield _ribbed(np.array([(0, 0, z) for z in (0.1, 0.25, 0.4, 0.53)]), 0.05)
     left = [(-0.03, 0, 0.27), (-0.09, 0, 0.275), (-0.125, 0, 0.31), (-0.13, 0, 0.42)]
@@ -107,7 +107,7 @@ def _cactus() -> Iterable[PropPart]:
 
 
 def _ribbed(path: Points, radius: float) -> PropPart:
-    """A rounded tube with a star for its section."""
+    """Model a rounded tube with a star for its section."""
     part = tube(path, radius, sides=20, rounded=True)
     count = (len(part.mesh.vertices) - 2) // 20
     rings = part.mesh.vertices[:-2].reshape(count, 20, 3)
@@ -118,7 +118,7 @@ def _ribbed(path: Points, radius: float) -> PropPart:
 
 @prop("dog", (0.212, 0.886, 0.613))
 def _dog() -> Iterable[PropPart]:
-    """A standing hound: dark saddle, white legs, chest and muzzle."""
+    """Model a standing hound: dark saddle, white legs, chest and muzzle."""
     spine = [(-0.27, 0.385), (-0.2, 0.375), (-0.05, 0.365), (0.1, 0.355), (0.19, 0.375)]
     torso = tube(
         [(0, y, z) for y, z in spine],
@@ -149,7 +149,7 @@ def _dog() -> Iterable[PropPart]:
 
 
 def _head(at: Sequence[float]) -> Iterable[PropPart]:
-    """A hound's head with its skull about ``at``, looking to +y."""
+    """Model a hound's head with its skull about ``at``, looking to +y."""
     x, y, z = at
     skull = tube(
         [(x, y - 0.02, z), (x, y + 0.03, z + 0.003), (x, y + 0.07, z - 0.012)],
@@ -171,7 +171,7 @@ def _head(at: Sequence[float]) -> Iterable[PropPart]:
 
 @prop("dog_sitting", (0.258, 0.573, 0.618))
 def _dog_sitting() -> Iterable[PropPart]:
-    """The same hound, sitting upright."""
+    """Model the same hound, sitting upright."""
     spine = [(-0.11, 0.13), (-0.1, 0.2), (-0.02, 0.31), (0.06, 0.39)]
     torso = tube(
         [(0, y, z) for y, z in spine],
@@ -197,7 +197,7 @@ def _dog_sitting() -> Iterable[PropPart]:
 
 @prop("person", (0.565, 0.282, 1.75))
 def _person() -> Iterable[PropPart]:
-    """A standing man in a pullover and jeans."""
+    """Model a standing man in a pullover and jeans."""
     for x in (-0.095, 0.095):
         yield tube(
             [(x, 0, 0.95), (x, 0.01, 0.5), (x, -0.02, 0.07)],

@@ -57,7 +57,7 @@ WORLD = """
 
 @prop("globe", (0.325, 0.3, 0.446))
 def _globe() -> Iterable[PropPart]:
-    """A globe of the earth in a brass half ring on a wooden foot."""
+    """Model a globe of the earth in a brass half ring on a wooden foot."""
     yield lathe([(0.12, 0.0), (0.12, 0.02), (0.1, 0.03), (0.03, 0.05), (0.02, 0.085)])
     center, radius = (0.0, 0.0, 0.285), 0.15
     tilt = math.radians(23.4)
@@ -73,7 +73,7 @@ def _globe() -> Iterable[PropPart]:
 
 
 def _world(centers: NDArray[np.float64], kind: str) -> NDArray[np.bool_]:
-    """Which points about the middle of the earth lie on ``kind`` of ground."""
+    """Return which points (F, 3) around the globe's centre are of ``kind``: land (#) or ice (*)."""
     ground = np.array([[mark == kind for mark in row] for row in WORLD.split()], np.float64)
     x, y, z = centers.T
     row = (90 - np.degrees(arctan2(z, np.sqrt(x * x + y * y)))) / 10 - 0.5
@@ -91,14 +91,14 @@ def _world(centers: NDArray[np.float64], kind: str) -> NDArray[np.bool_]:
 
 @prop("moon_globe", (0.3, 0.3, 0.36))
 def _moon_globe() -> Iterable[PropPart]:
-    """A globe of the moon on a low ring."""
+    """Model a globe of the moon on a low ring."""
     yield lathe([(0.1, 0.0), (0.1, 0.02), (0.07, 0.04), (0.085, 0.08)], look=BRASS)
     yield ball((0, 0, 0.21), (0.15, 0.15, 0.15), sides=32)
 
 
 @prop("crate", (0.5, 0.5, 0.5))
 def _crate() -> Iterable[PropPart]:
-    """A slatted wooden crate."""
+    """Model a slatted wooden crate."""
     yield board((0, 0, 0.25), (0.215, 0.215, 0.24), INSIDE)
     for x in (-0.215, 0.215):
         for y in (-0.215, 0.215):
@@ -113,7 +113,7 @@ def _crate() -> Iterable[PropPart]:
 
 @prop("basket", (0.698, 0.696, 0.5))
 def _basket() -> Iterable[PropPart]:
-    """A square woven basket with a thick rim, open above."""
+    """Model a square woven basket with a thick rim, open above."""
     wall, flare = 0.02, 0.045
     yield block((0.3, 0.3), (0.3, 0.3), 0.0, wall)
     corners = [(-1, -1), (1, -1), (1, 1), (-1, 1)]
@@ -129,7 +129,7 @@ def _basket() -> Iterable[PropPart]:
 
 @prop("carton", (0.797, 0.59, 0.432))
 def _carton() -> Iterable[PropPart]:
-    """A cardboard box, its flaps open, with a label."""
+    """Model a cardboard box, its flaps open, with a label."""
     x, y, high, wall = 0.27, 0.19, 0.32, 0.004
     yield board((0, 0, wall), (x, y, wall))
     for side in (-1, 1):
@@ -145,7 +145,7 @@ def _carton() -> Iterable[PropPart]:
 
 @prop("pillow", (0.16, 0.42, 0.42))
 def _pillow() -> Iterable[PropPart]:
-    """A throw pillow: plump in the middle, thin at the seams, drawn out at the corners."""
+    """Model a throw pillow: plump in the middle, thin at the seams, drawn out at the corners."""
     sides, rings = 32, []
     angles = 2 * math.pi * (np.arange(sides) + 0.5) / sides
     c, s = cos(angles), sin(angles)
@@ -161,7 +161,7 @@ def _pillow() -> Iterable[PropPart]:
 
 @prop("sculpture", (0.64, 0.64, 0.72))
 def _sculpture() -> Iterable[PropPart]:
-    """A seated buddha on a plinth."""
+    """Model a seated buddha on a plinth."""
     yield lathe([(0.3, 0.0), (0.32, 0.02), (0.3, 0.05), (0.31, 0.08)])
     for side in (-1, 1):
         yield limb((side * 0.1, -0.04, 0.16), (side * 0.23, 0.1, 0.13), 0.075, 0.06)
@@ -177,7 +177,7 @@ def _sculpture() -> Iterable[PropPart]:
 
 @prop("boat", (0.584, 2.8, 0.45))
 def _boat() -> Iterable[PropPart]:
-    """A kayak with a cockpit."""
+    """Model a kayak with a cockpit."""
     rings = []
     stations = np.linspace(-1, 1, 15)
     beams = 0.28 * (1 - power(abs(stations), 2.2)) + 0.012
@@ -203,7 +203,7 @@ def _boat() -> Iterable[PropPart]:
 
 @prop("rod", (0.072, 1.0, 0.07))
 def _rod() -> Iterable[PropPart]:
-    """A baseball bat, lying."""
+    """Model a baseball bat, lying."""
     profile = [(-0.5, 0.024), (-0.485, 0.026), (-0.47, 0.016), (-0.2, 0.015), (0.1, 0.024)]
     profile += [(0.3, 0.033), (0.44, 0.036), (0.485, 0.032), (0.5, 0.02)]
     bat = tube([(0, y, 0.036) for y, _ in profile], [r for _, r in profile], sides=14)
@@ -213,5 +213,5 @@ def _rod() -> Iterable[PropPart]:
 
 @prop("slab", (0.4, 0.4, 0.03))
 def _slab() -> Iterable[PropPart]:
-    """A plate or a coin."""
+    """Model a plate or a coin."""
     yield lathe([(0.18, 0.0), (0.2, 0.01), (0.2, 0.02), (0.18, 0.03)])

@@ -29,28 +29,28 @@ DARK_INSIDE = Look((0.12, 0.11, 0.1), "plain")
 
 @prop("vase", (0.326, 0.326, 0.5))
 def _vase() -> Iterable[PropPart]:
-    """A round belly under a short neck and a flared lip."""
+    """Model a round belly under a short neck and a flared lip."""
     points = [(0.07, 0.0), (0.1, 0.07), (0.16, 0.22), (0.145, 0.33), (0.07, 0.42), (0.058, 0.46)]
     yield lathe(outline([*points, (0.088, 0.5)]), wall=0.014)
 
 
 @prop("vase_bottle", (0.301, 0.301, 0.62))
 def _vase_bottle() -> Iterable[PropPart]:
-    """A full body that narrows to a long thin neck."""
+    """Model a full body that narrows to a long thin neck."""
     points = [(0.1, 0.0), (0.14, 0.08), (0.15, 0.2), (0.12, 0.34), (0.05, 0.44), (0.04, 0.54)]
     yield lathe(outline([*points, (0.056, 0.61), (0.062, 0.62)]), wall=0.012)
 
 
 @prop("vase_beaker", (0.2, 0.2, 0.3))
 def _vase_beaker() -> Iterable[PropPart]:
-    """An open vase whose wall leans outwards, on a heavy foot."""
+    """Model an open vase whose wall leans outwards, on a heavy foot."""
     points = [(0.062, 0.0), (0.066, 0.02), (0.06, 0.05), (0.072, 0.16), (0.1, 0.3)]
     yield lathe(outline(points), wall=0.01)
 
 
 @prop("vase_amphora", (0.356, 0.3, 0.55))
 def _vase_amphora() -> Iterable[PropPart]:
-    """A two-handled jar with bands round its shoulder."""
+    """Model a two-handled jar with bands round its shoulder."""
     points = [(0.07, 0.0), (0.065, 0.03), (0.11, 0.14), (0.15, 0.3), (0.11, 0.4), (0.055, 0.45)]
     body = lathe(outline([*points, (0.05, 0.5), (0.075, 0.55)]), wall=0.014)
     band = Look((0.2, 0.13, 0.1), "plain")
@@ -62,7 +62,7 @@ def _vase_amphora() -> Iterable[PropPart]:
 
 @prop("jug", (0.2, 0.284, 0.26))
 def _jug() -> Iterable[PropPart]:
-    """A pitcher: a handle behind, a lip in front."""
+    """Model a pitcher: a handle behind, a lip in front."""
     body = [(0.07, 0.0), (0.09, 0.05), (0.1, 0.11), (0.075, 0.19), (0.078, 0.26)]
     part = lathe(outline(body), wall=0.009)
     # The rim is drawn out to a lip.
@@ -77,7 +77,7 @@ def _jug() -> Iterable[PropPart]:
 
 @prop("mug", (0.102, 0.102, 0.1))
 def _mug() -> Iterable[PropPart]:
-    """A mug of coffee; its handle is seen from the front and from the side."""
+    """Model a mug of coffee; its handle is seen from the front and from the side."""
     wall = [(0.038, 0.0), (0.0415, 0.006), (0.0425, 0.05), (0.0425, 0.1)]
     yield lathe(wall, wall=0.004)
     yield lathe([(0.0375, 0.07), (0.0375, 0.084)], look=COFFEE)
@@ -87,7 +87,7 @@ def _mug() -> Iterable[PropPart]:
 
 @prop("bowl", (0.34, 0.34, 0.15))
 def _bowl() -> Iterable[PropPart]:
-    """A fruit bowl with apples, oranges and a pear in it."""
+    """Model a fruit bowl with apples, oranges and a pear in it."""
     points = [(0.06, 0.0), (0.058, 0.014), (0.11, 0.035), (0.152, 0.075), (0.17, 0.12)]
     yield lathe(outline(points, 3), wall=0.009)
     green, orange = Look((0.45, 0.6, 0.2), "plastic_matte"), Look((0.8, 0.46, 0.2), "plastic_matte")
@@ -100,7 +100,7 @@ def _bowl() -> Iterable[PropPart]:
 
 @prop("wineglass", (0.091, 0.091, 0.2))
 def _wineglass() -> Iterable[PropPart]:
-    """A stemmed glass, half full."""
+    """Model a stemmed glass, half full."""
     yield lathe([(0.038, 0.0), (0.036, 0.003), (0.006, 0.012), (0.0045, 0.09), (0.008, 0.098)])
     bowl = [(0.006, 0.096), (0.032, 0.11), (0.045, 0.14), (0.042, 0.17), (0.035, 0.2)]
     yield lathe(outline(bowl), wall=0.002)
@@ -108,7 +108,7 @@ def _wineglass() -> Iterable[PropPart]:
 
 @prop("coffee_maker", (0.22, 0.342, 0.36))
 def _coffee_maker() -> Iterable[PropPart]:
-    """A filter machine: tank behind, head above, a glass pot of coffee on its plate."""
+    """Model a filter machine: tank behind, head above, a glass pot of coffee on its plate."""
     yield cushion((0, 0.01, 0.025), (0.11, 0.16, 0.025), 0.012)
     yield cushion((0, -0.105, 0.18), (0.11, 0.055, 0.18), 0.015)
     yield cushion((0, 0.005, 0.305), (0.11, 0.155, 0.055), 0.018)
@@ -127,7 +127,7 @@ def _coffee_maker() -> Iterable[PropPart]:
 
 @prop("moka_pot", (0.11, 0.18, 0.2))
 def _moka_pot() -> Iterable[PropPart]:
-    """An eight-sided stove pot with a black handle and knob."""
+    """Model an eight-sided stove pot with a black handle and knob."""
     foot = lathe([(0.055, 0.0), (0.055, 0.012), (0.04, 0.085)], sides=8)
     yield foot
     yield lathe([(0.042, 0.085), (0.042, 0.097)], look=CHROME, sides=16)
