@@ -54,6 +54,7 @@ def build_app(study: Study, secrets: Secrets, store: Store) -> FastAPI:
 
 
 def _serve_pages(app: FastAPI) -> None:
+    """Add the routes of the page and its static files."""
     index = read_page_file(PACKAGE / "pages" / "index.html")
     files = read_page_files(PACKAGE / "static")
 
@@ -68,6 +69,7 @@ def _serve_pages(app: FastAPI) -> None:
 
 
 def _serve_media(app: FastAPI, study: Study, secrets: Secrets) -> None:
+    """Add the route of movies and maps."""
     files = MediaFiles()
 
     @app.get("/media/{name}")
@@ -84,19 +86,23 @@ def _serve_media(app: FastAPI, study: Study, secrets: Secrets) -> None:
 
 
 async def _refused(request: Request, error: Exception) -> Response:
+    """Handle a refusal by the store."""
     assert isinstance(error, Refused)
     return refuse(error.code, error.message, error.state)
 
 
 async def _bad_body(request: Request, error: Exception) -> Response:
+    """Handle an invalid request body."""
     return refuse("bad_request", str(error))
 
 
 async def _bad_request(request: Request, error: Exception) -> Response:
+    """Handle a request that the framework finds invalid."""
     return refuse("bad_request")
 
 
 async def _framework_error(request: Request, error: Exception) -> Response:
+    """Handle an HTTP error of the framework, such as an unknown path."""
     assert isinstance(error, HTTPException)
     headers = dict(error.headers or {}) if error.status_code == 405 else None
     return refuse(code_of(error.status_code), status=error.status_code, headers=headers)

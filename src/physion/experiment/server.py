@@ -100,7 +100,7 @@ def serve(
         The study does not exist or is invalid, the port is in use, the certificate is bad, or the
         database cannot be reached or is used by another server.
     """
-    _check(address)
+    _check_address(address)
     _set_logging(log_requests)
     study = load_study(folder)
     check_media(study)
@@ -110,7 +110,7 @@ def serve(
     _allow_many_connections()
     with contextlib.closing(_listen(address)) as listening:
         port = int(listening.getsockname()[1])
-        url = address.base_url.rstrip("/") or f"{address.scheme}://{_as_host(address.host)}:{port}"
+        url = address.base_url.rstrip("/") or f"{address.scheme}://{_url_host(address.host)}:{port}"
         store = Store.open(study, secrets, database)
         try:
             app = build_app(study, secrets, store)
@@ -152,6 +152,7 @@ class _Server(uvicorn.Server):
                 signal.signal(number, handler)
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
+        """Stop serving; a second SIGINT stops at once."""
         self.force_exit = self.should_exit and number == signal.SIGINT
         self.should_exit = True
 
@@ -182,6 +183,7 @@ def _configure(app: FastAPI, address: Address) -> uvicorn.Config:
 
 
 def _listen(address: Address) -> socket.socket:
+    """Open the listening socket."""
     try:
         resolved = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM)[0]
         return socket.create_server(resolved[4][:2], family=resolved[0], backlog=2048)
@@ -194,7 +196,8 @@ def _listen(address: Address) -> socket.socket:
         ) from error
 
 
-def _check(address: Address) -> None:
+def _check_address(address: Address) -> None:
+    """Raise `BadInputError` for an invalid port, certificate or proxy."""
     if not 0 <= address.port <= 65535:
         # The system would silently use the port modulo 65536.
         raise BadInputError(f"--port must be from 0 to 65535, not {address.port}")
@@ -210,13 +213,14 @@ def _check(address: Address) -> None:
 
 
 def _is_loopback(host: str) -> bool:
+    """Return whether a host is the loopback interface."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return host == "localhost"
 
 
-def _as_host(host: str) -> str:
+def _url_host(host: str) -> str:
     """Return the host as written in a URL; the loopback address if it listens on all addresses."""
     if host in ("", "0.0.0.0", "::"):
         return "127.0.0.1"

@@ -77,6 +77,7 @@ class SimulatedBrowser:
 
 
 def _refusal(answer: httpx2.Response) -> wire.Refusal:
+    """Return the refusal in a response; a generic one if the body is not a `Refusal`."""
     try:
         return wire.Refusal.model_validate_json(answer.content)
     except ValueError:

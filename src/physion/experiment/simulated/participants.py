@@ -126,6 +126,7 @@ class Participation:
             self._visit.retries = self._browser.retries
 
     async def _run_stages(self) -> None:
+        """Enter and run all stages of the session."""
         public = wire.PublicStudy.model_validate_json(await self._browser.ask("GET", "/api/study"))
         await self._browser.ask("GET", f"/api/texts/{public.languages[0]}")
         state = await self._enter(public.languages[0])
@@ -146,6 +147,7 @@ class Participation:
         self._visit.outcome = "done"
 
     async def _enter(self, language: str) -> wire.SessionState:
+        """Enter by the pilot link and return the state of the session."""
         who = {
             "id": f"simulated-{self._plan.seed}-{self._visit.number}",
             "scenario": self._visit.scenario,
@@ -164,6 +166,7 @@ class Participation:
         return wire.SessionState.model_validate_json(answer)
 
     async def _submit_page(self, state: wire.SessionState) -> wire.SessionState:
+        """Submit the page of the current stage."""
         filled: dict[str, Any] = {
             "consent": {"agreed": True},
             "demographics": self._person.demographics(),
@@ -178,6 +181,7 @@ class Participation:
         return wire.SessionState.model_validate_json(answer)
 
     async def _run_phase(self, state: wire.SessionState, dropout: int | None) -> wire.SessionState:
+        """Answer the remaining trials of a phase, up to the dropout trial."""
         phase = state.stage
         assert phase == "familiarization" or phase == "test"
         answer = await self._browser.ask("GET", f"/api/trials/{phase}")
@@ -189,6 +193,7 @@ class Participation:
         return state
 
     async def _run_trial(self, phase: wire.Phase, media: wire.TrialMedia) -> wire.SessionState:
+        """Fetch the media of a trial and answer it."""
         await self._fetch(media.movie, media.map)
         stimulus = self._find_stimulus(phase, media.movie)
         body = build_answer(self._study, media, phase, self._person, stimulus)
@@ -216,6 +221,7 @@ class Participation:
         )
 
     async def _fetch(self, *paths: str) -> None:
+        """Fetch media, unless the plan leaves them out."""
         for path in paths if self._plan.media else ():
             if not await self._browser.ask("GET", path):
                 raise PhysionError(f"{path}: the server sent an empty file")

@@ -49,6 +49,7 @@ class SimulatedPerson:
     number: int
 
     def _rng(self, *names: str | int) -> np.random.Generator:
+        """Return the generator of one named draw of this person."""
         return generator("simulated", self.seed, self.number, *names)
 
     def probability_correct(self, stimulus: Stimulus) -> float:
@@ -90,4 +91,5 @@ class SimulatedPerson:
 
 
 def _logistic(log_odds: float) -> float:
+    """Return the probability of log odds."""
     return float(1 / (1 + np.exp(-log_odds)))

@@ -93,6 +93,7 @@ class ServerProcess:
         self._process = self._new_process()
 
     def _new_process(self) -> subprocess.Popen[bytes]:
+        """Start the server process; tests override this."""
         return subprocess.Popen(
             self._command, stdin=subprocess.DEVNULL, stdout=self._output, stderr=self._output
         )
@@ -135,6 +136,7 @@ class ServerProcess:
 
 
 def _free_port() -> int:
+    """Return a free TCP port."""
     with socket.socket() as probe:
         probe.bind((HOST, 0))
         return int(probe.getsockname()[1])

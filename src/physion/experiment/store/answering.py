@@ -32,7 +32,7 @@ _COUNT = {
 }
 
 
-def write_details(answer: Answer) -> str:
+def encode_details(answer: Answer) -> str:
     """Return the further measurements of an answer as JSON text.
 
     Raises
@@ -74,7 +74,7 @@ def store_answer(
     answer
         The answer as sent by the client.
     details
-        `write_details` of the answer.
+        `encode_details` of the answer.
     now
         Time of the server in seconds since 1970.
 
@@ -85,7 +85,7 @@ def store_answer(
     """
     known = answered(session, answer.phase)
     if answer.trial < known:
-        response = _stored_before(connection, trials, session, answer)
+        response = _read_stored(connection, trials, session, answer)
         duplicate = True
     else:
         _check_next(trials, session, answer, known)
@@ -94,14 +94,14 @@ def store_answer(
     # Stimuli cannot change while there are sessions, so an answered trial has this stimulus too.
     stimulus = trial_order(study, session.scenario, session.order_seed)[answer.phase][answer.trial]
     if not duplicate:
-        _store(connection, trials, session, stimulus, answer, details, now)
+        _insert_answer(connection, trials, session, stimulus, answer, details, now)
     feedback = None
     if answer.phase == PHASES[0]:
-        feedback = _feedback(study, secrets, session, stimulus, answer.trial, response)
+        feedback = _build_feedback(study, secrets, session, stimulus, answer.trial, response)
     return AnswerStored(duplicate=duplicate, feedback=feedback, state=state_of(session, trials))
 
 
-def _stored_before(
+def _read_stored(
     connection: Connection, trials: Mapping[str, int], session: Session, answer: Answer
 ) -> str:
     """Return the stored response of a trial if it has the same key; else raise `Refused`."""
@@ -117,6 +117,7 @@ def _stored_before(
 
 
 def _check_next(trials: Mapping[str, int], session: Session, answer: Answer, known: int) -> None:
+    """Raise `Refused` unless this trial is the next one of the session."""
     stage = stage_of(session, trials)
     if stage not in PHASES:
         raise Refused("wrong_stage", "No trial is next.", state_of(session, trials))
@@ -124,7 +125,7 @@ def _check_next(trials: Mapping[str, int], session: Session, answer: Answer, kno
         raise Refused("out_of_order", "Another trial is next.", state_of(session, trials))
 
 
-def _store(
+def _insert_answer(
     connection: Connection,
     trials: Mapping[str, int],
     session: Session,
@@ -133,6 +134,7 @@ def _store(
     details: str,
     now: float,
 ) -> None:
+    """Insert the answer and increase the session's count of answers."""
     loaded = (session.loaded_at_phase, session.loaded_at_trial)
     values: dict[str, Any] = {
         **answer.model_dump(exclude={"details"}),
@@ -155,7 +157,7 @@ def _store(
     setattr(session, f"answered_{answer.phase}", count)
 
 
-def _feedback(
+def _build_feedback(
     study: Study,
     secrets: Secrets,
     session: Session,
@@ -163,6 +165,7 @@ def _feedback(
     trial: int,
     response: str,
 ) -> Feedback:
+    """Return the feedback on a familiarization answer."""
     return Feedback(
         contact=stimulus.label,
         correct=(response == "yes") == stimulus.label,

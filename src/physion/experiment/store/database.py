@@ -44,7 +44,7 @@ def open_database(url: str, *, must_exist: bool = False) -> Engine:
     BadInputError
         The URL is of another kind, or with ``must_exist`` the SQLite file does not exist.
     """
-    address = _address(url)
+    address = _parse_url(url)
     if address.get_backend_name() == "postgresql":
         return _open_postgresql(address)
     assert address.database is not None
@@ -54,7 +54,8 @@ def open_database(url: str, *, must_exist: bool = False) -> Engine:
     return _open_sqlite(address, path)
 
 
-def _address(url: str) -> URL:
+def _parse_url(url: str) -> URL:
+    """Parse a database URL and choose its driver."""
     try:
         address = make_url(url)
         backend = address.get_backend_name()
@@ -68,6 +69,7 @@ def _address(url: str) -> URL:
 
 
 def _open_sqlite(address: URL, path: Path) -> Engine:
+    """Return an engine for an SQLite file, which is created if it is missing."""
     if not path.parent.is_dir():
         raise BadInputError(f"there is no folder {path.parent} for the database")
     # SQLite creates its log files with the permissions of the database file.
@@ -91,6 +93,7 @@ def _open_sqlite(address: URL, path: Path) -> Engine:
 
 
 def _open_postgresql(address: URL) -> Engine:
+    """Return an engine for a PostgreSQL database."""
     # Test pooled connections before use: a restart of the database closes them.
     engine = create_engine(
         address,
@@ -215,7 +218,7 @@ def upgrade(engine: Engine) -> None:
             config.attributes["connection"] = connection
             command.upgrade(config, "head")
     except DBAPIError as error:
-        raise _no_answer(engine, error) from error
+        raise _unreachable(engine, error) from error
 
 
 def check_version(engine: Engine) -> None:
@@ -225,7 +228,7 @@ def check_version(engine: Engine) -> None:
         with engine.connect() as connection:
             version = _read_version(connection)
     except SQLAlchemyError as error:
-        raise _no_answer(engine, error) from error
+        raise _unreachable(engine, error) from error
     _refuse_unknown(engine, script, version)
     if version != script.get_current_head():
         raise BadInputError(
@@ -235,6 +238,7 @@ def check_version(engine: Engine) -> None:
 
 
 def _refuse_unknown(engine: Engine, script: Any, version: str | None) -> None:
+    """Raise `BadInputError` if the schema version is newer than this package."""
     if version is not None and version not in {each.revision for each in script.walk_revisions()}:
         raise BadInputError(
             f"{_display_url(engine)} was written by a newer version of this package "
@@ -242,7 +246,8 @@ def _refuse_unknown(engine: Engine, script: Any, version: str | None) -> None:
         )
 
 
-def _no_answer(engine: Engine, error: SQLAlchemyError) -> PhysionError:
+def _unreachable(engine: Engine, error: SQLAlchemyError) -> PhysionError:
+    """Return the error for a database that does not answer."""
     reason = str(getattr(error, "orig", error)).splitlines()
     return PhysionError(
         f"{_display_url(engine)} does not answer: {reason[0] if reason else 'no reason given'}"
@@ -250,4 +255,5 @@ def _no_answer(engine: Engine, error: SQLAlchemyError) -> PhysionError:
 
 
 def _display_url(engine: Engine) -> str:
+    """Return the URL of the database without its password."""
     return engine.url.render_as_string(hide_password=True)

@@ -124,7 +124,7 @@ def enter_session(
     else:
         done = {each.scenario for each in sessions}
         scenario = _choose_scenario(connection, study, visitor, done)
-        session = _begin(connection, study, secrets, scenario, visitor)
+        session = _begin_session(connection, study, secrets, scenario, visitor)
     connection.execute(
         insert_or_skip(connection, TOKENS),
         {"token_hash": hash_token(visitor.token), "session": session.session, "made": visitor.now},
@@ -200,10 +200,11 @@ def _count_sessions(connection: Connection, visitor: Visitor) -> Mapping[str, _S
     return counts_by_scenario
 
 
-def _begin(
+def _begin_session(
     connection: Connection, study: Study, secrets: Secrets, scenario: str, visitor: Visitor
 ) -> Session:
-    number = _least_used(connection, study, scenario, visitor.kind) if study.orders else 0
+    """Insert a new session and return it."""
+    number = _least_used_order(connection, study, scenario, visitor.kind) if study.orders else 0
     connection.execute(
         insert_or_skip(connection, PARTICIPANTS),
         {"participant": visitor.participant, "first_seen": visitor.now},
@@ -221,7 +222,7 @@ def _begin(
         else individual_order_seed(study, scenario, visitor.participant),
         "order_number": number,
         "buttons": draw_buttons(study, visitor.participant),
-        "language": _language(study, visitor.enter.language),
+        "language": _match_language(study, visitor.enter.language),
         "started_at": visitor.now,
         "last_seen": visitor.now,
         "device": storable_values(visitor.enter.device.model_dump()),
@@ -233,7 +234,7 @@ def _begin(
     return session_from_row(study, row)
 
 
-def _least_used(connection: Connection, study: Study, scenario: str, kind: str) -> int:
+def _least_used_order(connection: Connection, study: Study, scenario: str, kind: str) -> int:
     """Return the number (from 1) of the prepared order with the fewest sessions so far."""
     columns = SESSIONS.c
     statement = (
@@ -245,7 +246,7 @@ def _least_used(connection: Connection, study: Study, scenario: str, kind: str) 
     return min(range(1, study.orders + 1), key=lambda number: (used.get(number, 0), number))
 
 
-def _language(study: Study, wanted: str) -> str:
+def _match_language(study: Study, wanted: str) -> str:
     """Return the best matching language of the study; ``de-AT`` falls back to ``de``."""
     known = {language.lower(): language for language in study.languages}
     wanted = wanted.lower()

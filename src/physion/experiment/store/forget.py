@@ -47,7 +47,7 @@ def forget(url: str, participants: Sequence[str] | None) -> int:
     PhysionError
         The study is being served, or another program reads the database.
     """
-    _check(participants)
+    _check_participants(participants)
     return _run_exclusively(
         url, lambda connection: _delete_raw_ids(connection, participants), (RAW_IDS,)
     )
@@ -105,13 +105,14 @@ async def forget_raw_ids(store: Store, participants: Sequence[str] | None = None
     The file is not vacuumed, which would delay answers: SQLite overwrites deleted rows by itself
     (``secure_delete``). Participants who enter again leave their ids again.
     """
-    _check(participants)
+    _check_participants(participants)
     count = await store.write(lambda connection: _delete_raw_ids(connection, participants))
     await asyncio.to_thread(_erase_deleted_bytes, store.engine, (RAW_IDS,), compact=False)
     return count
 
 
-def _check(participants: Sequence[str] | None) -> None:
+def _check_participants(participants: Sequence[str] | None) -> None:
+    """Raise `BadInputError` unless all names are participant hashes."""
     for name in participants or ():
         if not re.fullmatch(r"[0-9a-f]{32}", name):
             raise BadInputError(
@@ -120,6 +121,7 @@ def _check(participants: Sequence[str] | None) -> None:
 
 
 def _delete_raw_ids(connection: Connection, participants: Sequence[str] | None) -> int:
+    """Delete raw ids and return their number."""
     if participants is None:
         return connection.execute(delete(RAW_IDS)).rowcount
     names = list(dict.fromkeys(participants))
@@ -133,6 +135,7 @@ def _delete_raw_ids(connection: Connection, participants: Sequence[str] | None) 
 
 
 def _forget_session(connection: Connection, reference: str) -> None:
+    """Delete the data of the session with this reference."""
     columns = SESSIONS.c
     query = select(columns.session, columns.participant, columns.withdrawn_at)
     rows = connection.execute(query.where(columns.reference == reference)).all()
@@ -171,6 +174,7 @@ def _erase_deleted_bytes(engine: Engine, tables: Sequence[Table], *, compact: bo
 
 
 def _empty_log(driver: Any) -> None:
+    """Truncate SQLite's write-ahead log."""
     busy = driver.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()[0]
     if busy:
         raise PhysionError(

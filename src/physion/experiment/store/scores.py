@@ -58,6 +58,7 @@ class Scores:
             return {session: self._correct[session] for session in finished}
 
     def _count(self, connection: Connection, scenario: str, sessions: list[str]) -> None:
+        """Count the correct answers of these sessions and cache the counts."""
         correct: dict[str, int] = defaultdict(int)
         for session, stimulus, response in connection.execute(_TEST, {"sessions": sessions}):
             correct[session] += (response == "yes") == self._labels[scenario, stimulus]

@@ -26,13 +26,15 @@ MAX_LABEL = 200
 """Characters of a short text such as gender."""
 
 
-def _yes_or_no(value: Any) -> bool:
+def _check_bool(value: Any) -> bool:
+    """Validate a boolean."""
     if not isinstance(value, bool):
         raise ValueError("true or false")
     return value
 
 
-def _age(value: Any) -> int | None:
+def _check_age(value: Any) -> int | None:
+    """Validate an age in years or null."""
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | float) or value != int(value):
@@ -42,7 +44,8 @@ def _age(value: Any) -> int | None:
     return int(value)
 
 
-def _label(value: Any) -> str | None:
+def _check_label(value: Any) -> str | None:
+    """Validate a short text or null."""
     if value is None:
         return None
     if not isinstance(value, str) or len(value) > MAX_LABEL:
@@ -50,32 +53,34 @@ def _label(value: Any) -> str | None:
     return storable(value).strip() or None
 
 
-def _difficulty(value: Any) -> int:
+def _check_difficulty(value: Any) -> int:
+    """Validate a rating from 1 to 5."""
     if isinstance(value, bool) or value not in (1, 2, 3, 4, 5):
         raise ValueError("a whole number from 1 (very easy) to 5 (very hard)")
     return int(value)
 
 
-def _free_text(value: Any) -> str:
+def _check_text(value: Any) -> str:
+    """Validate a text, which may be empty."""
     if not isinstance(value, str):
         raise ValueError("text, which may be empty")
     return storable(value).strip()
 
 
 FIELDS: Mapping[str, Mapping[str, Callable[[Any], Any]]] = {
-    "consent": {"agreed": _yes_or_no},
+    "consent": {"agreed": _check_bool},
     "instructions": {},
     "ready": {},
-    "demographics": {"age": _age, "gender": _label, "education": _label},
+    "demographics": {"age": _check_age, "gender": _check_label, "education": _check_label},
     "feedback": {
-        "difficulty": _difficulty,
-        "technical_problems": _yes_or_no,
-        "text": _free_text,
+        "difficulty": _check_difficulty,
+        "technical_problems": _check_bool,
+        "text": _check_text,
     },
     "withdraw": {},
 }
 """Required fields of each page with their validators; null means "prefer not to say"."""
-OPTIONAL: Mapping[str, Mapping[str, Callable[[Any], Any]]] = {"consent": {"language": _label}}
+OPTIONAL: Mapping[str, Mapping[str, Callable[[Any], Any]]] = {"consent": {"language": _check_label}}
 """Optional fields of each page."""
 
 

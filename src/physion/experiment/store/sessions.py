@@ -174,6 +174,7 @@ def insert_or_skip(connection: Connection, table: Table) -> Any:
 
 @cache
 def _insert_or_skip(dialect: str, table: Table) -> Any:
+    """Return the statement of `insert_or_skip`, cached by dialect and table."""
     insert = postgresql.insert if dialect == "postgresql" else sqlite.insert
     # Without the option the rowcount of an INSERT is unreliable.
     return insert(table).on_conflict_do_nothing().execution_options(preserve_rowcount=True)

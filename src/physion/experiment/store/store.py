@@ -27,7 +27,7 @@ from physion.experiment.protocol.messages import (
     TrialMedia,
 )
 from physion.experiment.protocol.refused import Refused
-from physion.experiment.store.answering import store_answer, write_details
+from physion.experiment.store.answering import encode_details, store_answer
 from physion.experiment.store.database import (
     connect_writer,
     open_database,
@@ -118,7 +118,7 @@ class Store:
     async def state(self, token: str, load: bool = False) -> SessionState:
         """Return the state of a session; with ``load``, also count a load of the page."""
         if not load:
-            return await asyncio.to_thread(self._read, lambda c: self._state(c, token))
+            return await asyncio.to_thread(self._read, lambda c: self._read_state(c, token))
         now = time.time()
 
         def count(connection: Connection) -> SessionState:
@@ -138,27 +138,27 @@ class Store:
         The lists of both phases are available once consent is given, so that media can be loaded
         ahead.
         """
-        session, trials = self._read(lambda c: self._session(c, token))
+        session, trials = self._read(lambda c: self._read_session(c, token))
         stage = stage_of(session, trials)
         if stage == "withdrawn":
             raise Refused("wrong_stage", "This session has ended.", state_of(session, trials))
         if stage == "consent":
             raise Refused("not_yet", "Trials come after the consent.", state_of(session, trials))
-        return TrialList(phase=phase, trials=self._media(session, phase))
+        return TrialList(phase=phase, trials=self._list_media(session, phase))
 
     async def page(self, token: str, done: PageDone) -> SessionState:
         """Store a submitted page and return the new state."""
         values, now = check_page(done), time.time()
 
         def turn(connection: Connection) -> SessionState:
-            session, trials = self._session(connection, token)
+            session, trials = self._read_session(connection, token)
             return submit_page(connection, self.study, trials, session, done.page, values, now)
 
         return await self._writer.run(turn)
 
     async def answer(self, token: str, answer: Answer) -> AnswerStored:
         """Store one answer; repeating the request does not store it twice."""
-        details, token_hash, now = write_details(answer), hash_token(token), time.time()
+        details, token_hash, now = encode_details(answer), hash_token(token), time.time()
 
         def store(connection: Connection) -> AnswerStored:
             session = read_session(connection, self.study, token_hash)
@@ -174,12 +174,12 @@ class Store:
         now = time.time()
         rows = [
             {"batch": events.key, "kind": event.kind, "at_ms": event.at_ms, "stored_at": now,
-             "data": _event_data(event.data, index)}
+             "data": _check_event_data(event.data, index)}
             for index, event in enumerate(events.events)
         ]  # fmt: skip
 
         def store(connection: Connection) -> Stored:
-            session, trials = self._session(connection, token)
+            session, trials = self._read_session(connection, token)
             if stage_of(session, trials) == "withdrawn":
                 raise Refused("wrong_stage", "This session has ended.", state_of(session, trials))
             of_session = EVENTS.c.session == session.session
@@ -200,7 +200,7 @@ class Store:
 
     def result(self, token: str) -> Result:
         """Return accuracy, percentile and completion of a finished session."""
-        return self._read(lambda connection: self._result(connection, token))
+        return self._read(lambda connection: self._compute_result(connection, token))
 
     async def write(self, command: Callable[[Connection], T]) -> T:
         """Run any command in the writer; see `Writer` for the rules that it must follow."""
@@ -214,20 +214,24 @@ class Store:
             return False
 
     def _read(self, query: Callable[[Connection], T]) -> T:
+        """Run a query on a reading connection."""
         try:
             with self.engine.connect() as connection:
                 return query(connection)
         except OperationalError as error:
             raise Refused("unavailable", "The server cannot reach its database.") from error
 
-    def _session(self, connection: Connection, token: str) -> tuple[Session, Any]:
+    def _read_session(self, connection: Connection, token: str) -> tuple[Session, Any]:
+        """Return the session of a token and its numbers of trials."""
         session = read_session(connection, self.study, hash_token(token))
         return session, self._trials.of(session.scenario)
 
-    def _state(self, connection: Connection, token: str) -> SessionState:
-        return state_of(*self._session(connection, token))
+    def _read_state(self, connection: Connection, token: str) -> SessionState:
+        """Return the state of the session of a token."""
+        return state_of(*self._read_session(connection, token))
 
-    def _media(self, session: Session, phase: Phase) -> list[TrialMedia]:
+    def _list_media(self, session: Session, phase: Phase) -> list[TrialMedia]:
+        """Return the signed media and timing of the trials of a phase."""
         study, scenario, seed = self.study, session.scenario, session.order_seed
         crosses = fixations(study, scenario, seed, phase)
         return [
@@ -244,8 +248,9 @@ class Store:
             for trial, stimulus in enumerate(trial_order(study, scenario, seed)[phase])
         ]
 
-    def _result(self, connection: Connection, token: str) -> Result:
-        session, trials = self._session(connection, token)
+    def _compute_result(self, connection: Connection, token: str) -> Result:
+        """Compute the result of a finished session."""
+        session, trials = self._read_session(connection, token)
         stage = stage_of(session, trials)
         if stage != "done":
             code = "wrong_stage" if stage == "withdrawn" else "not_yet"
@@ -271,7 +276,8 @@ class Store:
         )
 
 
-def _event_data(data: dict[str, Any], index: int) -> dict[str, Any]:
+def _check_event_data(data: dict[str, Any], index: int) -> dict[str, Any]:
+    """Return the storable data of an event; raise `Refused` if they are invalid or too long."""
     try:
         size = len(json.dumps(data, allow_nan=False))
     except ValueError:

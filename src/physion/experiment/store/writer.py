@@ -38,7 +38,9 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(slots=True)
-class _Item:
+class _QueuedCommand:
+    """A queued command with the future of its result and the future's event loop."""
+
     command: Command[Any]
     future: Any
     loop: asyncio.AbstractEventLoop | None
@@ -46,6 +48,8 @@ class _Item:
 
 @dataclass(slots=True)
 class _Outcome:
+    """Result or error of a command."""
+
     value: Any = None
     error: BaseException | None = None
 
@@ -80,7 +84,7 @@ class Writer:
     ) -> None:
         self._connect, self._group, self._waiting = connect, group, waiting
         self._patience_s = patience_s
-        self._queue: SimpleQueue[_Item | None] = SimpleQueue()
+        self._queue: SimpleQueue[_QueuedCommand | None] = SimpleQueue()
         self._closing = False
         self._lock = threading.Lock()
         self._down_since: float | None = None
@@ -91,14 +95,14 @@ class Writer:
     def submit(self, command: Command[T]) -> Future[T]:
         """Queue a command; the returned future is done once its effects are committed."""
         future: Future[T] = Future()
-        self._put(_Item(command, future, None))
+        self._put(_QueuedCommand(command, future, None))
         return future
 
     async def run(self, command: Command[T]) -> T:
         """Run a command and await its result; a whole group wakes the event loop only once."""
         loop = asyncio.get_running_loop()
         future: asyncio.Future[T] = loop.create_future()
-        self._put(_Item(command, future, loop))
+        self._put(_QueuedCommand(command, future, loop))
         return await future
 
     def close(self) -> None:
@@ -109,7 +113,8 @@ class Writer:
                 self._queue.put(None)
         self._thread.join()
 
-    def _put(self, item: _Item) -> None:
+    def _put(self, item: _QueuedCommand) -> None:
+        """Queue a command, or raise `Refused` if the writer is overloaded or closing."""
         if self._queue.qsize() >= self._waiting:
             raise Refused("unavailable", "The server is overloaded; try again soon.")
         with self._lock:  # no command may be queued after the end mark
@@ -118,14 +123,15 @@ class Writer:
             self._queue.put(item)
 
     def _work(self) -> None:
+        """Run groups of commands until the writer is closed."""
         ended = False
         while not ended:
-            group, ended = self._take()
+            group, ended = self._take_group()
             if group:
-                self._perform(group)
-        self._drop()
+                self._run_group(group)
+        self._disconnect()
 
-    def _take(self) -> tuple[list[_Item], bool]:
+    def _take_group(self) -> tuple[list[_QueuedCommand], bool]:
         """Wait for a command; return it with the other waiting ones, and whether to stop then."""
         first = self._queue.get()
         if first is None:
@@ -141,13 +147,13 @@ class Writer:
             group.append(item)
         return group, False
 
-    def _perform(self, group: list[_Item]) -> None:
+    def _run_group(self, group: list[_QueuedCommand]) -> None:
         """Run and acknowledge a group; on failure wait for the database or run items one by one."""
         while True:
             try:
                 connection = self._begin()
             except Exception as error:
-                self._drop()
+                self._disconnect()
                 if self._wait(group, error):
                     continue
                 return
@@ -155,17 +161,17 @@ class Writer:
                 outcomes = [_run(item.command, connection) for item in group]
                 connection.commit()
             except Exception as error:
-                if self._undo(error):
+                if self._roll_back(error):
                     if self._wait(group, error):
                         continue
                 elif len(group) > 1:
                     for item in group:
-                        self._perform([item])
+                        self._run_group([item])
                 else:
-                    _settle(group, [_Outcome(error=error)])
+                    _set_outcomes(group, [_Outcome(error=error)])
                 return
             self._down_since = None
-            _settle(group, outcomes)
+            _set_outcomes(group, outcomes)
             return
 
     def _begin(self) -> Connection:
@@ -175,7 +181,7 @@ class Writer:
         self._connection.begin()
         return self._connection
 
-    def _undo(self, error: Exception) -> bool:
+    def _roll_back(self, error: Exception) -> bool:
         """Roll back a group; return whether it failed because the connection was lost."""
         connection = self._connection
         lost = isinstance(error, DBAPIError) and error.connection_invalidated
@@ -185,22 +191,23 @@ class Writer:
         except Exception:
             lost = True
         if lost:
-            self._drop()
+            self._disconnect()
         return lost
 
-    def _wait(self, group: list[_Item], error: Exception) -> bool:
+    def _wait(self, group: list[_QueuedCommand], error: Exception) -> bool:
         """Pause until the next attempt; after ``patience_s`` refuse the group and return False."""
         now = time.monotonic()
         if self._down_since is None:
             self._down_since = now
             _log.warning("the database does not answer: %s", _first_line(error))
         if self._closing or now - self._down_since > self._patience_s:
-            _settle(group, [_Outcome(error=_unavailable(error)) for _ in group])
+            _set_outcomes(group, [_Outcome(error=_unavailable(error)) for _ in group])
             return False
         time.sleep(PAUSE_S)
         return True
 
-    def _drop(self) -> None:
+    def _disconnect(self) -> None:
+        """Close the connection if there is one."""
         if self._connection is not None:
             with contextlib.suppress(SQLAlchemyError):
                 close_writer(self._connection)
@@ -208,26 +215,28 @@ class Writer:
 
 
 def _run(command: Command[Any], connection: Connection) -> _Outcome:
+    """Run a command; a refusal becomes its outcome, other errors are raised."""
     try:
         return _Outcome(value=command(connection))
     except Refused as refusal:
         return _Outcome(error=refusal)
 
 
-def _settle(group: Sequence[_Item], outcomes: Sequence[_Outcome]) -> None:
+def _set_outcomes(group: Sequence[_QueuedCommand], outcomes: Sequence[_Outcome]) -> None:
     """Set the futures of a group, with one wake-up of each event loop."""
     by_loop: dict[asyncio.AbstractEventLoop | None, list[tuple[Any, _Outcome]]] = {}
     for item, outcome in zip(group, outcomes, strict=True):
         by_loop.setdefault(item.loop, []).append((item.future, outcome))
     for loop, pairs in by_loop.items():
         if loop is None:
-            _resolve(pairs)
+            _set_futures(pairs)
             continue
         with contextlib.suppress(RuntimeError):  # the loop has ended
-            loop.call_soon_threadsafe(_resolve, pairs)
+            loop.call_soon_threadsafe(_set_futures, pairs)
 
 
-def _resolve(pairs: Sequence[tuple[Any, _Outcome]]) -> None:
+def _set_futures(pairs: Sequence[tuple[Any, _Outcome]]) -> None:
+    """Set the results or errors of futures."""
     for future, outcome in pairs:
         if future.done():  # cancelled
             continue
@@ -239,11 +248,13 @@ def _resolve(pairs: Sequence[tuple[Any, _Outcome]]) -> None:
 
 
 def _unavailable(error: Exception) -> Refused:
+    """Return the refusal for an unreachable database."""
     refusal = Refused("unavailable", "The server cannot reach its database; try again soon.")
     refusal.__cause__ = error
     return refusal
 
 
 def _first_line(error: Exception) -> str:
+    """Return the first line of the database driver's error message."""
     original = getattr(error, "orig", None) if not isinstance(error, PhysionError) else error
     return str(original or error).partition("\n")[0]

@@ -93,15 +93,18 @@ def build_api(study: Study, secrets: Secrets, store: Store) -> APIRouter:
     # First, because routes are matched in order and this one gets most requests.
     @router.post("/answers")
     async def post_answer(request: Request) -> Response:
+        """Store an answer."""
         answer = await read_message(request, Answer)
         return Reply(await store.answer(token_of(request), answer))
 
     @router.get("/study")
     async def get_study(request: Request) -> Response:
+        """Return the public settings of the study."""
         return Response(about, media_type="application/json")
 
     @router.get("/texts/{language}")
     async def get_texts(request: Request) -> Response:
+        """Return the texts of one language."""
         body = texts.get(request.path_params["language"])
         return (
             refuse("not_found") if body is None else Response(body, media_type="application/json")
@@ -109,6 +112,7 @@ def build_api(study: Study, secrets: Secrets, store: Store) -> APIRouter:
 
     @router.post("/enter")
     async def post_enter(request: Request) -> Response:
+        """Begin or continue a session."""
         enter = await read_message(request, Enter)
         if is_mturk_preview(enter):
             return refuse("not_yet", "Accept the task first.")
@@ -118,11 +122,13 @@ def build_api(study: Study, secrets: Secrets, store: Store) -> APIRouter:
 
     @router.get("/session")
     async def get_session(request: Request) -> Response:
+        """Return the state of the session."""
         load = request.query_params.get("load") == "true"
         return Reply(await store.state(token_of(request), load))
 
     @router.get("/trials/{phase}")
     async def get_trials(request: Request) -> Response:
+        """Return the trials of a phase."""
         phase = request.path_params["phase"]
         if phase not in PHASES:
             return refuse("not_found")
@@ -130,20 +136,24 @@ def build_api(study: Study, secrets: Secrets, store: Store) -> APIRouter:
 
     @router.post("/page")
     async def post_page(request: Request) -> Response:
+        """Store a submitted page."""
         page = await read_message(request, PageDone)
         return Reply(await store.page(token_of(request), page))
 
     @router.post("/events")
     async def post_events(request: Request) -> Response:
+        """Store events of the browser."""
         events = await read_message(request, Events)
         return Reply(await store.events(token_of(request), events))
 
     @router.get("/result")
     async def get_result(request: Request) -> Response:
+        """Return the result of a finished session."""
         return Reply(await run_in_threadpool(store.result, token_of(request)))
 
     @router.api_route("/health", methods=["GET", "HEAD"])
     async def get_health(request: Request) -> Response:
+        """Return whether the database answers."""
         answers = await run_in_threadpool(store.healthy)
         return Reply(Health(ok=True)) if answers else refuse("unavailable")
 

@@ -57,6 +57,7 @@ def parse_message(body: bytes, message: type[M]) -> M:
 
 
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return the object of JSON pairs; raise `BadBodyError` if a key is repeated."""
     unique = dict(pairs)
     if len(unique) != len(pairs):
         raise BadBodyError("the body has the same key twice")
@@ -64,10 +65,12 @@ def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _no_constant(word: str) -> NoReturn:
+    """Refuse the constants NaN and Infinity."""
     raise BadBodyError("the body has a number that is not finite")
 
 
 def _check(value: Any, depth: int) -> None:
+    """Check a JSON value and all values in it."""
     kind = type(value)
     if kind is str:
         _check_text(value)
@@ -88,6 +91,7 @@ def _check(value: Any, depth: int) -> None:
 
 
 def _check_text(text: str) -> None:
+    """Refuse a text with NUL or unpaired surrogates."""
     if "\x00" in text:
         raise BadBodyError("the body has a NUL character")
     if not text.isascii():

@@ -66,11 +66,13 @@ class LimitedHeadProtocol(HttpToolsProtocol):
         super().on_headers_complete()
 
     def _stop_timer(self) -> None:
+        """Cancel the timer of the head."""
         if self._head_timer is not None:
             self._head_timer.cancel()
             self._head_timer = None
 
     def _give_up(self) -> None:
+        """Close the connection because its head took too long."""
         self._head_timer = None
         if not self.transport.is_closing():
             logging.getLogger("physion.experiment").debug("closed a connection without a request")

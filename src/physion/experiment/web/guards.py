@@ -77,6 +77,7 @@ class _Exchange:
         self._started = False
 
     async def run(self) -> None:
+        """Check the request, run the application and send its response or a refusal."""
         refusal = self._read_headers() or self._check_rate()
         if refusal is not None:
             await self._refuse(refusal)
@@ -116,6 +117,7 @@ class _Exchange:
         return refuse("too_large") if self._declared > MAX_BODY else None
 
     def _check_rate(self) -> Reply | None:
+        """Return a refusal if the request exceeds a rate limit."""
         wait = self._limits.wait_time(
             self._scope["method"], self._path, self._token, self._address, time.monotonic()
         )
@@ -153,6 +155,7 @@ class _Exchange:
         await self._send(message)
 
     def _update_limits(self, status: int) -> None:
+        """Tell the rate limits the status of the response and any issued token."""
         now = time.monotonic()
         self._limits.record_status(status, self._path, self._token, self._address, now)
         issued = self._scope["state"].get(ISSUED_TOKEN)
@@ -160,6 +163,7 @@ class _Exchange:
             self._limits.add_token(issued, now)
 
     def _with_headers(self, message: Message) -> Message:
+        """Return the start of a response with the additional headers, and log it."""
         if log.isEnabledFor(logging.INFO):
             # No query, which may identify the participant; quoted, so it cannot forge log lines.
             path = quote(self._path[:200])
@@ -190,6 +194,7 @@ class _Exchange:
         await self._send({"type": "http.response.body", "body": b""})
 
     async def _drain_body(self) -> None:
+        """Read and discard the rest of the body, up to the limits on bytes and time."""
         taken = 0
         try:
             async with asyncio.timeout(LINGER_SECONDS):

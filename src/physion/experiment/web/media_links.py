@@ -78,6 +78,7 @@ def read_media_path(study: Study, secrets: Secrets, path: str) -> Path:
 
 
 def _signed_parts(study: Study, scenario: str, order_seed: int, item: str) -> tuple[str, ...]:
+    """Return the texts that the signature of a URL covers."""
     return "media", study.stimuli_digest, scenario, str(order_seed), item
 
 

@@ -53,6 +53,7 @@ class MediaFiles:
         return Response(content, headers=headers)
 
     def _keep(self, path: Path, content: bytes) -> None:
+        """Cache a file and evict the least recently used ones."""
         if path in self._kept or len(content) > self._most:
             return
         self._kept[path] = content
