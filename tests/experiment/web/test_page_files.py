@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import physion.experiment
+from physion.experiment.protocol import messages
 from physion.experiment.protocol.messages import REFUSALS
 from physion.experiment.study import texts
 
@@ -57,6 +58,17 @@ def test_the_page_asks_no_other_host_and_has_nothing_inline() -> None:
     for name, code in CODE.items():
         assert not re.search(r"https?://(?!\S*\\/)[a-z]", code), name
     assert "url(" not in (STATIC / "pages.css").read_text(encoding="utf-8")
+
+
+def test_types_of_messages_are_those_of_the_server() -> None:
+    """The interfaces of messages.d.ts have the fields of the pydantic models."""
+    declared = (STATIC / "messages.d.ts").read_text(encoding="utf-8")
+    interfaces = re.findall(r"export interface (\w+) \{\n(.*?)\n\}", declared, re.DOTALL)
+    assert len(interfaces) > 10
+    for name, body in interfaces:
+        fields = getattr(messages, name).model_fields
+        expected = [field.alias or key for key, field in fields.items()]
+        assert re.findall(r"^  (\w+)\??:", body, re.MULTILINE) == expected, name
 
 
 def test_refusals_are_known_by_the_words_of_the_server() -> None:

@@ -1,8 +1,8 @@
 /**
- * Answers on their way to the server: each is kept by the browser before it is sent, sent in order,
- * one at a time, and forgotten only when the server has stored it, or has refused it for good and
- * stored an event that holds it. Answers whose token the server does not know wait for another
- * token of their session.
+ * Queue of answers to send. Each answer is saved in the browser's storage before it is sent.
+ * Answers are sent in order, one at a time, and removed only when the server has stored them, or
+ * has refused them for good and stored an event with their data. Answers whose token the server
+ * does not know wait for another token of their session.
  * @module answer_queue
  */
 
@@ -11,35 +11,47 @@ import { keep, recall } from "./storage.js";
 
 const NAME = "answers";
 const DAY_MS = 86_400_000;
-/** Refusals that no other try and no other token will change. */
+/** Refusals that neither a retry nor another token can change. */
 const FINAL = ["already_answered", "out_of_order", "wrong_stage", "bad_request", "too_large"];
 
-/** @typedef {{token: string, session: string|null, answer: any}} Item `session`: its reference. */
+/** @typedef {import("./messages.js").Answer} Answer */
+/** @typedef {import("./messages.js").AnswerStored} AnswerStored */
 
+/**
+ * An answer with the token and the reference of its session; `resolve` and `reject` settle the
+ * promise of `add` and are missing after a reload of the page.
+ * @typedef {{token: string, session: string|null, answer: Answer,
+ *   resolve?: (stored: AnswerStored) => void, reject?: (error: Error) => void}} Item
+ */
+
+/** First-in, first-out queue of answers, persistent over reloads of the page. */
 export class AnswerQueue {
+  /** @type {Item[]} */
   #items = [];
+  /** The running loop of `#sendAll`. @type {Promise<void>|null} */
   #working = null;
   #stop = new AbortController();
-  /** Tokens with which nothing can be sent. */
-  #useless = new Set();
+  /** Tokens that the server does not know. @type {Set<string>} */
+  #invalidTokens = new Set();
+  /** Reference of the current session. @type {string|null} */
   #session = null;
 
   /**
    * @param {import("./api.js").Api} api
-   * @param {(refused: Refused) => void} onRefused Told of each answer that the server refused, for
-   *   good or (`unknown_token`) until its session is entered again.
+   * @param {(refused: Refused) => void} onRefused Called for each answer that the server refused,
+   *   for good or (`unknown_token`) until its session is entered again.
    */
   constructor(api, onRefused) {
     this.api = api;
     this.onRefused = onRefused;
   }
 
-  /** So many answers are on their way. @returns {number} */
+  /** Number of answers that can be sent. @returns {number} */
   get length() {
-    return this.#items.filter((item) => this.#canGo(item)).length;
+    return this.#items.filter((item) => this.#isSendable(item)).length;
   }
 
-  /** Take over what an earlier load of the page, or a crash, left behind. */
+  /** Add the answers that an earlier load of the page left in the storage. */
   load() {
     const known = new Set(this.#items.map((item) => item.answer.key));
     const left = (recall(NAME) ?? []).filter((item) => item?.answer && !known.has(item.answer.key));
@@ -48,13 +60,16 @@ export class AnswerQueue {
   }
 
   /**
-   * A session was entered: answers are added to it from now on, and those of it that wait for a
-   * token that works get this one.
-   * @param {string} token @param {string} session Its reference. @returns {boolean} Are there any?
+   * Set the session of the following answers, and give its token to its waiting answers.
+   * @param {string} token
+   * @param {string} session Reference of the session.
+   * @returns {boolean} Whether there were such answers.
    */
   enter(token, session) {
     this.#session = session;
-    const waiting = this.#items.filter((item) => !this.#canGo(item) && item.session === session);
+    const waiting = this.#items.filter(
+      (item) => !this.#isSendable(item) && item.session === session,
+    );
     if (waiting.length === 0) return false;
     for (const item of waiting) item.token = token;
     const keys = new Set(waiting.map((item) => item.answer.key));
@@ -67,16 +82,20 @@ export class AnswerQueue {
     return true;
   }
 
-  /** Do answers wait for another token than this one? @param {string} token @returns {boolean} */
+  /**
+   * Return whether answers with this token wait for another token.
+   * @param {string} token
+   * @returns {boolean}
+   */
   waits(token) {
-    return this.#items.some((item) => item.token === token && !this.#canGo(item));
+    return this.#items.some((item) => item.token === token && !this.#isSendable(item));
   }
 
   /**
-   * Keep an answer and send it. The promise is kept when the server has stored it, and broken when
-   * it refuses.
-   * @param {Object} answer An `Answer` with its key.
-   * @returns {Promise<any>} `AnswerStored`.
+   * Save an answer in the storage and send it. The promise resolves when the server has stored the
+   * answer, and rejects when it refuses it.
+   * @param {Answer} answer
+   * @returns {Promise<AnswerStored>}
    */
   add(answer) {
     const stored = new Promise((resolve, reject) => {
@@ -84,24 +103,25 @@ export class AnswerQueue {
       keep(NAME, [...(recall(NAME) ?? []), item]);
       this.#items.push({ ...item, resolve, reject });
     });
-    // Who does not wait for this answer hears of a refusal by onRefused.
+    // Callers that do not await this answer learn of a refusal by onRefused.
     stored.catch(() => {});
     this.#work();
     return stored;
   }
 
-  /** Resolves when nothing is left that can be sent. @returns {Promise<void>} */
+  /** Wait until no answer is left that can be sent. @returns {Promise<void>} */
   async empty() {
     while (this.length > 0 && !this.#stop.signal.aborted) await this.#work();
   }
 
-  /** Send nothing more: another tab has taken over, which finds the rest in the storage. */
+  /** Stop sending: another tab has taken over, and finds the remaining answers in the storage. */
   close() {
     this.#stop.abort(new DOMException("the queue is closed", "AbortError"));
   }
 
-  #canGo(item) {
-    return !this.#useless.has(item.token);
+  /** @param {Item} item @returns {boolean} */
+  #isSendable(item) {
+    return !this.#invalidTokens.has(item.token);
   }
 
   #work() {
@@ -112,7 +132,7 @@ export class AnswerQueue {
   async #sendAll() {
     const { signal } = this.#stop;
     while (!signal.aborted) {
-      const item = this.#items.find((one) => this.#canGo(one));
+      const item = this.#items.find((each) => this.#isSendable(each));
       if (!item) return;
       try {
         const options = { token: item.token, signal, expects: "duplicate" };
@@ -126,16 +146,22 @@ export class AnswerQueue {
     }
   }
 
+  /** @param {Item} item @param {Refused} error */
   async #refused(item, error) {
-    if (!FINAL.includes(error.code)) this.#useless.add(item.token);
-    else if (await this.#noted(item, error)) this.#forget(item);
+    if (!FINAL.includes(error.code)) this.#invalidTokens.add(item.token);
+    else if (await this.#storeRefusal(item, error)) this.#forget(item);
     else return;
     item.reject?.(error);
     this.onRefused(error);
   }
 
-  /** Has the server stored what was refused, so that no answer is lost without a trace? */
-  async #noted({ token, answer }, error) {
+  /**
+   * Send a refused answer as an event, so that it is not lost without a trace.
+   * @param {Item} item
+   * @param {Refused} error
+   * @returns {Promise<boolean>} False if the queue was closed before.
+   */
+  async #storeRefusal({ token, answer }, error) {
     const { key, phase, trial, response, rt_ms } = answer;
     const data = { code: error.code, phase, trial, response, rt_ms };
     const at_ms = Math.min(Math.round(performance.now()), DAY_MS);
@@ -143,11 +169,12 @@ export class AnswerQueue {
     try {
       await this.api.post("/api/events", events, { token, signal: this.#stop.signal });
     } catch (trouble) {
-      if (!(trouble instanceof Refused)) return false; // closed: the next load tries again
+      if (!(trouble instanceof Refused)) return false; // closed: the next page load tries again
     }
     return true;
   }
 
+  /** Remove an answer from the queue and the storage. @param {Item} item */
   #forget(item) {
     this.#items = this.#items.filter((other) => other !== item);
     const { key } = item.answer;

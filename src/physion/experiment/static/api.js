@@ -1,16 +1,16 @@
 /**
- * Requests to the server. What fails on the way (no connection, timeout, 5xx, 429, or an answer of
- * somebody else: a proxy, a firewall, a hotel's login page) is tried again, with growing pauses,
- * until our server answers; what it refuses is thrown as `Refused`.
- * Every request may be repeated safely: answers have keys, pages can be sent twice.
+ * Requests to the server, with retries. Failed requests (no connection, timeout, 5xx, 429, or a
+ * response of a proxy, a firewall or a captive portal) are repeated with growing pauses until the
+ * server answers; refusals are thrown as `Refused`.
+ * All requests are idempotent: answers have keys, and pages can be sent twice.
  * @module api
  */
 
-/** So long nothing may arrive; a slow connection is none the worse for being slow. */
+/** Longest time without any data; a slow but steady response is not given up. */
 const STALLED_MS = 15_000;
 const FIRST_PAUSE_MS = 500;
 const LONGEST_PAUSE_MS = 8_000;
-/** Words for refusals that stay. What else comes with a status of 4xx is not from our server. */
+/** Codes of final refusals. Any other response with a 4xx status is not from our server. */
 const CODES = new Set([
   "bad_request",
   "too_large",
@@ -26,11 +26,12 @@ const CODES = new Set([
   "not_found",
   "not_allowed",
 ]);
-const PASSING = [408, 429];
+/** Statuses that are worth a retry although they are 4xx. */
+const TEMPORARY = [408, 429];
 
-/** The server said no. `state`: where the session stands, where the server told it. */
+/** Refusal by the server; `state` is the state of the session if the server sent it. */
 export class Refused extends Error {
-  /** @param {number} status @param {any} body A `Refusal`. */
+  /** @param {number} status @param {import("./messages.js").Refusal} body */
   constructor(status, body) {
     super(body.message ?? `status ${status}`);
     this.status = status;
@@ -39,24 +40,24 @@ export class Refused extends Error {
   }
 }
 
-/** A failure that may pass: the request is tried again. */
+/** Temporary failure of a request, after which it is retried. */
 class Trouble extends Error {
   /**
    * @param {string} message
-   * @param {number} [pauseMs] What the server asks to wait.
-   * @param {number} [status] Of the answer, where there was one.
+   * @param {number} [pauseMs] Pause requested by the server.
+   * @param {number} [status] Status of the response, 0 without one.
    */
   constructor(message, pauseMs = 0, status = 0) {
     super(message);
     this.pauseMs = pauseMs;
-    /** Too many requests: who enters is told when it is tried again. */
+    /** Too many requests; the page for entering then shows the time of the next attempt. */
     this.crowd = status === 429;
     this.busy = this.crowd || status >= 500;
   }
 }
 
 /**
- * Waits, but not longer than until the browser is online again.
+ * Wait for some time, or until the browser is online again.
  * @param {number} ms @param {AbortSignal} [signal] @returns {Promise<void>}
  */
 function pause(ms, signal) {
@@ -76,71 +77,98 @@ function pause(ms, signal) {
 
 /**
  * @typedef {Object} Options
- * @property {string|null} [token] Of whom, where it is not the one who entered here.
+ * @property {string|null} [token] Token to send; that of the current session by default.
  * @property {AbortSignal} [signal]
- * @property {string} [expects] A name that the answer must have, else it is not our server's.
- * @property {(ms: number) => void} [onBusy] Told that there are too many requests, and when it is
- *   tried again; without it that counts as lost connection.
+ * @property {string} [expects] Field that the response must have to be accepted as our server's.
+ * @property {(ms: number) => void} [onBusy] Called when there are too many requests, with the time
+ *   until the next attempt; without it they are reported by `onTrouble`.
  */
 
+/** Client of the server's API. */
 export class Api {
   /**
-   * @param {(trouble: "lost"|"busy"|null) => void} onTrouble Called as requests begin to fail, fail
-   *   in the other way, or cease to fail.
+   * @param {(trouble: "lost"|"busy"|null) => void} onTrouble Called when requests begin to fail,
+   *   fail in the other way, or no longer fail (null).
    */
   constructor(onTrouble) {
     this.onTrouble = onTrouble;
     /** @type {string|null} */
     this.token = null;
-    /** How each request fails that fails now. @type {Map<symbol, "lost"|"busy">} */
+    /** Kind of failure of each failing request. @type {Map<symbol, "lost"|"busy">} */
     this.failing = new Map();
+    /** @type {"lost"|"busy"|null} */
     this.trouble = null;
   }
 
-  /** @param {string} path @param {Options} [options] @returns {Promise<any>} */
+  /**
+   * Send a GET request and return the JSON body.
+   * @param {string} path @param {Options} [options] @returns {Promise<any>}
+   */
   get(path, options = {}) {
     return this.#repeat(() => this.#json("GET", path, undefined, options), options.signal);
   }
 
-  /** @param {string} path @param {any} body @param {Options} [options] @returns {Promise<any>} */
+  /**
+   * Send a POST request and return the JSON body.
+   * @param {string} path @param {any} body @param {Options} [options] @returns {Promise<any>}
+   */
   post(path, body, options = {}) {
     const { signal, onBusy } = options;
     return this.#repeat(() => this.#json("POST", path, body, options), signal, onBusy);
   }
 
-  /** @param {string} path @param {AbortSignal} [signal] @returns {Promise<Blob>} */
+  /**
+   * Fetch a movie or an image.
+   * @param {string} path @param {AbortSignal} [signal] @returns {Promise<Blob>}
+   */
   blob(path, signal) {
     return this.#repeat(async () => {
       const response = await this.#fetch(path, {}, signal);
       const type = response.headers.get("Content-Type") ?? "";
-      if (!/^(video|image)\//.test(type)) throw new Trouble(`neither movie nor picture: ${type}`);
+      if (!/^(video|image)\//.test(type)) throw new Trouble(`neither movie nor image: ${type}`);
       return response.blob();
     }, signal);
   }
 
-  /** One try alone, that outlives the page. @param {string} path @param {any} body */
+  /**
+   * Send a POST request once, without retries, even while the page is being closed.
+   * @param {string} path @param {any} body
+   */
   async tell(path, body) {
     const init = { ...this.#init("POST", body, this.token), keepalive: true };
     await this.#fetch(path, init);
   }
 
-  /** @param {string} method @param {string} path @param {any} body @param {Options} options */
+  /**
+   * Send a request once and return the JSON body.
+   * @param {string} method @param {string} path @param {any} body @param {Options} options
+   * @returns {Promise<any>}
+   */
   async #json(method, path, body, { token = this.token, signal, expects }) {
     const response = await this.#fetch(path, this.#init(method, body, token), signal);
     const answer = await response.json().catch(() => null);
     const ours = answer && typeof answer === "object" && (!expects || expects in answer);
-    if (!ours) throw new Trouble(`status ${response.status}, but not our server's answer`);
+    if (!ours) throw new Trouble(`status ${response.status}, but not a response of our server`);
     return answer;
   }
 
+  /**
+   * @param {string} method @param {any} body @param {string|null} token
+   * @returns {RequestInit}
+   */
   #init(method, body, token) {
+    /** @type {Record<string, string>} */
     const headers = { Accept: "application/json" };
     if (token) headers.Authorization = `Bearer ${token}`;
     if (body !== undefined) headers["Content-Type"] = "application/json";
     return { method, headers, body: body === undefined ? undefined : JSON.stringify(body) };
   }
 
-  /** A whole answer, so that one that breaks off midway counts as failed. */
+  /**
+   * Fetch a complete response; an interrupted one counts as failed.
+   * @param {string} path @param {RequestInit} init @param {AbortSignal} [signal]
+   * @returns {Promise<Response>}
+   */
   async #fetch(path, init, signal) {
     const timeout = new AbortController();
     let timer = 0;
@@ -152,13 +180,12 @@ export class Api {
     const stop = () => timeout.abort();
     signal?.addEventListener("abort", stop);
     try {
-      const options = { credentials: "omit", signal: timeout.signal, ...init };
-      const response = await fetch(path, options);
+      const response = await fetch(path, { credentials: "omit", signal: timeout.signal, ...init });
       const whole = new Response(await bodyOf(response, arrived), response);
       if (response.ok) return whole;
       const { status } = response;
       const body = await whole.json().catch(() => null);
-      if (status < 500 && !PASSING.includes(status) && CODES.has(body?.error)) {
+      if (status < 500 && !TEMPORARY.includes(status) && CODES.has(body?.error)) {
         throw new Refused(status, body);
       }
       const seconds = Number(response.headers.get("Retry-After")) || 0;
@@ -174,6 +201,14 @@ export class Api {
     }
   }
 
+  /**
+   * Repeat a request until it succeeds or is refused.
+   * @template T
+   * @param {() => Promise<T>} attempt
+   * @param {AbortSignal} [signal]
+   * @param {((ms: number) => void)|null} [onBusy]
+   * @returns {Promise<T>}
+   */
   async #repeat(attempt, signal, onBusy = null) {
     let wait = FIRST_PAUSE_MS;
     const request = Symbol("request");
@@ -185,7 +220,7 @@ export class Api {
           if (!(error instanceof Trouble)) throw error;
           const crowd = error.crowd && onBusy;
           if (!crowd) this.#troubled(request, error.busy ? "busy" : "lost");
-          // Spread over time, so that a room of participants does not come back in one moment.
+          // Random pauses, so that many participants do not retry at the same moment.
           const ms = Math.max(error.pauseMs, wait / 2) + (Math.random() * wait) / 2;
           if (crowd) onBusy(ms);
           await pause(ms, signal);
@@ -197,6 +232,7 @@ export class Api {
     }
   }
 
+  /** Note how a request fails, null if not, and report a change. */
   #troubled(request, how) {
     if (how) this.failing.set(request, how);
     else this.failing.delete(request);
@@ -207,15 +243,20 @@ export class Api {
   }
 }
 
-/** What is in an answer; tells of each piece that arrives. @returns {Promise<Blob>} */
+/**
+ * Read the body of a response.
+ * @param {Response} response
+ * @param {() => void} arrived Called for each chunk that arrives.
+ * @returns {Promise<Blob>}
+ */
 async function bodyOf(response, arrived) {
-  const pieces = [];
+  const chunks = [];
   const reader = response.body?.getReader();
   while (reader) {
     const { done, value } = await reader.read();
     if (done) break;
     arrived();
-    pieces.push(value);
+    chunks.push(value);
   }
-  return new Blob(pieces, { type: response.headers.get("Content-Type") ?? "" });
+  return new Blob(chunks, { type: response.headers.get("Content-Type") ?? "" });
 }

@@ -1,5 +1,5 @@
 /**
- * Who comes, by the parameters of the address that recruiters and the lab give out.
+ * Identification of the participant by the URL parameters of recruiters and of the lab's links.
  * @module arrival
  */
 
@@ -7,12 +7,18 @@ const LONGEST_ID = 200;
 const LONGEST_OTHER = 500;
 
 /**
- * @param {string} search The query of the address.
- * @param {Array<{source: string, id: string, others: string[], preview: Object<string, string>}>}
- *   recruiters As the server names them, in the order in which they are tried.
- * @returns {{enter: Object, preview: boolean, named: boolean, language: string|null}} `enter`: the
- *   beginning of an `Enter`; `preview`: only information may be shown; `named`: the address says
- *   who comes, or in what way, so that it goes before what the browser remembers.
+ * The URL parameters of a visit. `enter`: the identifying fields of the message; `preview`: only
+ * information may be shown; `named`: the URL identifies the participant or has a signed key, so it
+ * takes precedence over a session that the browser remembers.
+ * @typedef {{enter: import("./messages.js").Enter, preview: boolean, named: boolean,
+ *   language: string|null}} Arrival
+ */
+
+/**
+ * Read the URL parameters.
+ * @param {string} search The query of the URL.
+ * @param {import("./messages.js").Recruiter[]} recruiters In the order in which they are matched.
+ * @returns {Arrival}
  */
 export function readArrival(search, recruiters) {
   const given = new URLSearchParams(search);
@@ -20,6 +26,7 @@ export function readArrival(search, recruiters) {
   const recruiter = recruiters.find(
     (one) => given.has(one.id) || Object.keys(one.preview ?? {}).some((name) => given.has(name)),
   );
+  /** @type {import("./messages.js").Enter} */
   const enter = { source: recruiter?.source ?? "link" };
   const id = recruiter ? given.get(recruiter.id)?.trim().slice(0, LONGEST_ID) : "";
   if (id) enter.id = id;

@@ -1,5 +1,5 @@
 /**
- * A question above what runs, which goes on below and takes no input meanwhile.
+ * A modal question. The page below goes on running but takes no input.
  * @module dialog
  */
 
@@ -7,9 +7,10 @@ import { el } from "./dom.js";
 import { focusHeading } from "./page_trial.js";
 
 /**
- * @param {import("./pages.js").Render} render Fills the question; its `done` answers it.
- * @param {AbortSignal} signal Takes the question back.
- * @returns {Promise<any>} The answer; null where it was closed without one (Escape).
+ * Show a question and wait for the answer.
+ * @param {import("./pages.js").Render} render Fills the dialog; its `done` gives the answer.
+ * @param {AbortSignal} signal Closes the dialog without an answer.
+ * @returns {Promise<any>} The answer; null if the dialog was closed without one (Escape).
  */
 export function ask(render, signal) {
   const page = el("div", { class: "page" });
@@ -35,5 +36,5 @@ export function ask(render, signal) {
   });
 }
 
-/** Is anything asked? Keys are for the question then. @returns {boolean} */
+/** Return whether a question is open; keys are then for the dialog. @returns {boolean} */
 export const isAsked = () => document.querySelector("dialog[open]") !== null;

@@ -1,14 +1,14 @@
 /**
- * Elements built without HTML text, so that no value can ever become markup.
+ * DOM helpers. Elements are built without HTML source, so that no value can become markup.
  * @module dom
  */
 
 /**
- * Make an element.
+ * Create an element.
  * @param {string} tag
- * @param {Object<string, any>} [attributes] `onclick` and the like take functions; `true` gives an
- *   empty attribute; `false`, `null` and `undefined` none.
- * @param {...(Node|string|null)} children Strings become text.
+ * @param {Object<string, any>} [attributes] Functions are event listeners (`onclick`, ...); `true`
+ *   gives an empty attribute; `false`, `null` and `undefined` give none.
+ * @param {...(Node|string|null)} children Strings become text nodes; null is skipped.
  * @returns {any} The element.
  */
 export function el(tag, attributes = {}, ...children) {
@@ -23,7 +23,8 @@ export function el(tag, attributes = {}, ...children) {
 }
 
 /**
- * Plain text as paragraphs: an empty line ends one; lines that begin with "- " make a list.
+ * Convert plain text to paragraphs, separated by empty lines; lines that begin with "- " form a
+ * list.
  * @param {string} text
  * @returns {HTMLElement[]}
  */
@@ -39,7 +40,7 @@ export function paragraphs(text) {
 }
 
 /**
- * A button.
+ * Create a button.
  * @param {string} label
  * @param {() => void} onclick
  * @param {Object<string, any>} [attributes]
@@ -49,21 +50,21 @@ export function button(label, onclick, attributes = {}) {
   return el("button", { type: "button", class: "button", onclick, ...attributes }, label);
 }
 
-/** Resolves in the next frame of the screen, with its time. @returns {Promise<number>} */
+/** Wait for the next animation frame and return its time. @returns {Promise<number>} */
 export const nextFrame = () => new Promise((resolve) => requestAnimationFrame(resolve));
 
-/** Resolves after so many milliseconds. @param {number} ms @returns {Promise<void>} */
+/** Wait for some milliseconds. @param {number} ms @returns {Promise<void>} */
 export const sleep = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
 
-/** Resolves as soon as the page can be seen. @returns {Promise<void>} */
+/** Wait until the page is visible. @returns {Promise<void>} */
 export function pageVisible() {
   if (!document.hidden) return Promise.resolve();
   return new Promise((resolve) => {
-    const seen = () => {
+    const changed = () => {
       if (document.hidden) return;
-      document.removeEventListener("visibilitychange", seen);
+      document.removeEventListener("visibilitychange", changed);
       resolve();
     };
-    document.addEventListener("visibilitychange", seen);
+    document.addEventListener("visibilitychange", changed);
   });
 }

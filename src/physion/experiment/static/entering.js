@@ -1,5 +1,5 @@
 /**
- * Who takes part in this browser now: somebody new, or who took part in it before.
+ * Enter the study: begin a session, or continue the one that URL or browser identify.
  * @module entering
  */
 
@@ -12,21 +12,24 @@ import {
   isFoundAgain,
   remember,
   remembered,
-  visitWord,
+  visitKey,
   whoOf,
 } from "./remembered.js";
 
+/** @typedef {import("./arrival.js").Arrival} Arrival */
+/** @typedef {import("./messages.js").SessionState} SessionState */
+
 /**
- * Begin a session, or go on with the one that the address or the browser knows.
- * @param {any} basis
- * @param {ReturnType<typeof import("./arrival.js").readArrival>} arrival
- * @returns {Promise<any>} `State`
+ * Begin a session, or continue the one that the URL or the browser identifies.
+ * @param {import("./session.js").Basis} basis
+ * @param {Arrival} arrival
+ * @returns {Promise<SessionState>}
  */
 export async function enter({ api, texts, study, log, frame }, arrival) {
   const device = await measureDevice();
   const who = await whoOf(arrival.enter);
   const known = remembered();
-  // On a shared computer the one who was here before may be somebody else.
+  // On a shared computer the remembered session may be another person's.
   const own = known && (who === null || known.who === who) ? known : null;
   if (own && who === null) {
     const state = await resume(api, own, arrival.enter.scenario);
@@ -39,7 +42,7 @@ export async function enter({ api, texts, study, log, frame }, arrival) {
   try {
     const onBusy = (ms) => showPage(frame.main, busyPage({ texts }, ms));
     const message = { ...arrival.enter, language: texts.language, device };
-    if (who === null) message.visit = visitWord(study);
+    if (who === null) message.visit = visitKey(study);
     const entered = await api.post("/api/enter", message, { onBusy });
     api.token = entered.token;
     remember({ token: entered.token, who, link: linkOf(arrival) });
@@ -47,14 +50,20 @@ export async function enter({ api, texts, study, log, frame }, arrival) {
     return await api.get("/api/session?load=true");
   } catch (error) {
     if (error.code !== "already_took_part" || !own) throw error;
-    // In the browser in which they took part, people still find their result.
+    // People can see their result again in the browser in which they took part.
     const state = await resume(api, own, arrival.enter.scenario);
     if (state?.stage !== "done") throw error;
     return state;
   }
 }
 
-/** The state of a remembered session; null where there is none, or it is of another scenario. */
+/**
+ * Return the state of a remembered session, or null if it is unknown or of another scenario.
+ * @param {import("./api.js").Api} api
+ * @param {import("./remembered.js").Remembered} session
+ * @param {string} [scenario]
+ * @returns {Promise<SessionState|null>}
+ */
 async function resume(api, { token, who }, scenario) {
   try {
     const state = await api.get("/api/session?load=true", { token });
@@ -62,7 +71,7 @@ async function resume(api, { token, who }, scenario) {
     api.token = token;
     return state;
   } catch (error) {
-    // Who came by an id has to come by it again, else a second session would begin.
+    // A person with an id must use the link with the id, else a second session would begin.
     if (error.code !== "unknown_token" || who !== null) throw error;
     forgetSession();
     return null;
@@ -70,9 +79,10 @@ async function resume(api, { token, who }, scenario) {
 }
 
 /**
- * How the next person at this computer begins; null where people have ids of their own.
- * @param {any} study `PublicStudy`
- * @param {ReturnType<typeof import("./arrival.js").readArrival>} arrival
+ * Return the function that starts the study for another person on this computer, or null if people
+ * are identified by ids.
+ * @param {import("./messages.js").PublicStudy} study
+ * @param {Arrival} arrival
  * @returns {(() => void)|null}
  */
 export function anotherPerson(study, arrival) {
@@ -84,17 +94,17 @@ export function anotherPerson(study, arrival) {
   };
 }
 
-/** Did whoever takes part here come without an id? @returns {boolean} */
+/** Return whether the current participant came without an id. @returns {boolean} */
 export const cameWithoutId = () => remembered()?.who === null;
 
-/** What an address names that is not about one person. */
+/** Return the query with the parameters that do not identify a person. @param {Arrival} arrival */
 function linkOf({ enter, language }) {
   const named = Object.entries({ scenario: enter.scenario, language });
   const query = new URLSearchParams(named.filter(([, value]) => value)).toString();
   return query && `?${query}`;
 }
 
-/** Where the browser keeps nothing, a reload needs the address to find the session again. */
+/** Remove the query from the URL, unless a reload would need it to find the session again. */
 function hideAddress(token) {
   if (!isFoundAgain(token)) return;
   window.history.replaceState(null, "", window.location.pathname);

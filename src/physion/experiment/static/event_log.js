@@ -1,6 +1,6 @@
 /**
- * What else happens in the browser (hidden, offline, errors, ...), sent in batches and never waited
- * for: losing one loses no data of the study.
+ * Log of other events in the browser (hidden, offline, errors, ...), sent in batches. Nothing waits
+ * for it; a lost event is not a loss of the study's data.
  * @module event_log
  */
 
@@ -11,8 +11,11 @@ const BATCH = 50;
 const MOST_KEPT = 500;
 const EVERY_MS = 5_000;
 
+/** Collects events and sends them every few seconds and when the page is left. */
 export class EventLog {
+  /** @type {import("./messages.js").Event[]} */
   #events = [];
+  /** The batch that is sent next. @type {import("./messages.js").Events|null} */
   #batch = null;
   #sending = false;
 
@@ -34,7 +37,8 @@ export class EventLog {
     window.addEventListener("unhandledrejection", (event) =>
       this.add("error", { message: String(event.reason) }),
     );
-    let resizing = 0;
+    /** @type {ReturnType<typeof setTimeout>|undefined} */
+    let resizing;
     window.addEventListener("resize", () => {
       clearTimeout(resizing);
       const size = () => ({ width: window.innerWidth, height: window.innerHeight });
@@ -43,7 +47,8 @@ export class EventLog {
   }
 
   /**
-   * @param {string} kind Lower case letters and "_".
+   * Add an event.
+   * @param {string} kind Lower-case letters and "_".
    * @param {Object<string, boolean|number|string|null>} [data]
    */
   add(kind, data = {}) {
@@ -56,20 +61,20 @@ export class EventLog {
     if (this.#events.length > MOST_KEPT) this.#events.shift();
   }
 
-  /** Send what there is, if anybody has entered; what fails stays for the next time. */
+  /** Send all events if a session has been entered; on failure keep them for the next time. */
   async send() {
     if (this.#sending || !this.api.token) return;
     this.#sending = true;
     try {
       while (this.#next()) await this.#sendBatch(this.#batch);
     } catch {
-      // The same batch goes the next time.
+      // The same batch is sent the next time.
     } finally {
       this.#sending = false;
     }
   }
 
-  /** Send everything at once, since the page goes. */
+  /** Send all batches at once because the page is being left. */
   leave() {
     if (!this.api.token) return;
     while (this.#next()) {
@@ -79,7 +84,7 @@ export class EventLog {
     }
   }
 
-  /** The batch that goes next: the same under the same key until it is stored, which it is once. */
+  /** Return the next batch; it keeps its key until it is stored, so that it is stored once. */
   #next() {
     if (!this.#batch && this.#events.length > 0) {
       this.#batch = { key: newKey(), events: this.#events.slice(0, BATCH) };
@@ -91,7 +96,7 @@ export class EventLog {
     try {
       await this.api.tell("/api/events", batch);
     } catch (error) {
-      // Another token may be let in; any other refusal will not become better by trying again.
+      // Another token may be accepted later; any other refusal is final.
       if (!error.code || error.code === "unknown_token") throw error;
     }
     this.#sent(batch);

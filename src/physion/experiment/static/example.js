@@ -1,5 +1,5 @@
 /**
- * The animated example of the instructions: flashing cue, then the observed movie, over and over.
+ * The animated example of the instructions: the flashing cue and the observed movie in a loop.
  * @module example
  */
 
@@ -9,8 +9,8 @@ import { Screen } from "./screen.js";
 const REST_MS = 1_000;
 
 /**
- * An element that shows the example of the session's scenario until the signal is given. It can be
- * paused, and waits to be started by who does not want movement.
+ * Create an element that shows the example of the session's scenario until the signal aborts. It
+ * can be paused, and does not start by itself if the user prefers reduced motion.
  * @param {import("./pages.js").Context} context
  * @param {AbortSignal} signal
  * @returns {HTMLElement}
@@ -20,10 +20,11 @@ export function showExample(context, signal) {
   const media = study.example[state.scenario];
   const box = el("div", { class: "example" });
   if (!media) return box;
-  const place = el("div", { class: "example-place" });
+  const container = el("div", { class: "example-place" });
+  /** @type {AbortController|null} */
   let run = null;
   const toggle = button("", () => (run ? pause() : play()), { class: "button quiet small" });
-  box.append(place, toggle);
+  box.append(container, toggle);
   const label = () => {
     toggle.textContent = texts.t(run ? "instructions.example_pause" : "instructions.example_play");
   };
@@ -36,7 +37,7 @@ export function showExample(context, signal) {
     const own = new AbortController();
     run = own;
     label();
-    loop(context, media, place, own.signal).catch((error) => {
+    loop(context, media, container, own.signal).catch((error) => {
       if (own.signal.aborted) return;
       log.add("example_failed", { message: String(error) });
       box.replaceChildren(el("p", { role: "alert" }, texts.t("instructions.example_failed")));
@@ -49,13 +50,20 @@ export function showExample(context, signal) {
   return box;
 }
 
-async function loop({ api, study }, media, place, signal) {
+/**
+ * Show cue and movie in a loop.
+ * @param {import("./pages.js").Context} context
+ * @param {import("./messages.js").TrialMedia} media
+ * @param {HTMLElement} container
+ * @param {AbortSignal} signal
+ */
+async function loop({ api, study }, media, container, signal) {
   const blobs = await Promise.all([media.movie, media.map].map((path) => api.blob(path, signal)));
   const [movie, map] = blobs.map((blob) => URL.createObjectURL(blob));
   try {
     for (;;) {
       const screen = new Screen(media, signal);
-      place.replaceChildren(screen.element);
+      container.replaceChildren(screen.element);
       try {
         await screen.load({ movie, map });
         await screen.flash({ ms: study.cue_ms, hz: study.flash_hz });

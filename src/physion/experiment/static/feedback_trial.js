@@ -1,6 +1,6 @@
 /**
- * A jsPsych plugin: after a familiarization answer, whether it was right, and the whole movie. Goes
- * on when the movie has been seen to its end.
+ * jsPsych plugin: feedback on a familiarization answer, with the full movie. The participant can
+ * continue when the movie has ended.
  * @module feedback_trial
  */
 
@@ -13,17 +13,17 @@ const info = {
   name: "physion-feedback",
   version: "1.0.0",
   parameters: {
-    /** Gives the server's `Feedback`, as a promise: it is told only after the answer is stored. */
+    /** Returns a promise of the server's `Feedback`, which follows the storing of the answer. */
     feedback: { type: ParameterType.FUNCTION, default: undefined },
-    /** Gives the address of a movie by its path, as a promise. */
+    /** Takes the path of a movie and returns a promise of its blob URL. */
     load: { type: ParameterType.FUNCTION, default: undefined },
     /** Size and rate of the movie: a `TrialMedia`. */
     media: { type: ParameterType.OBJECT, default: undefined },
-    /** Words by name: prompt, waiting, correct, incorrect, contact, no_contact, next, trouble, retry. */
+    /** Texts by name: prompt, waiting, correct, incorrect, contact, no_contact, next, trouble. */
     words: { type: ParameterType.OBJECT, default: undefined },
-    /** Called with the kind and data of what went wrong. */
+    /** Called with kind and data of an event. */
     log: { type: ParameterType.FUNCTION, default: () => {} },
-    /** Gives the AbortSignal that ends the trial. */
+    /** Returns the AbortSignal that ends the trial. */
     signal: { type: ParameterType.FUNCTION, default: () => new AbortController().signal },
   },
   data: {
@@ -33,6 +33,7 @@ const info = {
   },
 };
 
+/** The plugin class. */
 export class FeedbackTrial {
   static info = info;
 
@@ -41,7 +42,12 @@ export class FeedbackTrial {
     this.jsPsych = jsPsych;
   }
 
-  /** @param {HTMLElement} display @param {any} trial @param {() => void} on_load */
+  /**
+   * Run the trial.
+   * @param {HTMLElement} display
+   * @param {any} trial The parameters.
+   * @param {() => void} on_load
+   */
   async trial(display, trial, on_load) {
     const { words } = trial;
     const signal = trial.signal();
@@ -50,7 +56,7 @@ export class FeedbackTrial {
     const outcome = el("span", {});
     const next = button(words.next, () => {}, { disabled: true });
     const row = el("div", { class: "answers" }, next);
-    // The scene stands where it stood in the trial.
+    // The movie is at the same position as in the trial.
     display.replaceChildren(
       el(
         "div",
@@ -70,7 +76,7 @@ export class FeedbackTrial {
   }
 }
 
-/** What was right and the whole movie, until the participant goes on. */
+/** Show the verdict and the full movie, and wait until the participant continues. */
 async function feedbackOn(screen, { verdict, outcome, next }, trial, signal) {
   const { words } = trial;
   const feedback = await trial.feedback();
@@ -93,15 +99,15 @@ async function feedbackOn(screen, { verdict, outcome, next }, trial, signal) {
   return { correct: feedback.correct, contact: feedback.contact, frames_shown };
 }
 
-/** Play the movie; where it fails, say so and try again twice, then let the participant go on. */
+/** Play the movie; on failure show a message and retry twice, then let the participant continue. */
 async function playOnce(screen, address, trial, outcome) {
-  const told = outcome.textContent;
+  const text = outcome.textContent;
   for (let attempt = 1; attempt <= 3; attempt++) {
     try {
       await screen.load({ movie: address });
       screen.hide(false);
       await screen.play({ hide: false });
-      outcome.textContent = told;
+      outcome.textContent = text;
       return;
     } catch (error) {
       if (!(error instanceof MovieFailed)) throw error;

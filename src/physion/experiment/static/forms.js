@@ -1,9 +1,9 @@
 /**
- * The pages with questions, and their parts.
+ * Pages with forms: demographics and feedback.
  * @module forms
  */
 
-import { button, el, paragraphs } from "./dom.js";
+import { el, paragraphs } from "./dom.js";
 import { bound } from "./pages.js";
 
 const GENDERS = ["female", "male", "other"];
@@ -18,7 +18,11 @@ const EDUCATIONS = [
 ];
 const AGES = [18, 120];
 
-/** Age, gender, education; each may be left open. @returns {import("./pages.js").Render} */
+/**
+ * Render the demographics page: age, gender and education, all optional.
+ * @param {import("./pages.js").Context} context
+ * @returns {import("./pages.js").Render}
+ */
 export function demographicsPage({ texts }) {
   const { t } = bound(texts);
   return (page, done) => {
@@ -26,7 +30,7 @@ export function demographicsPage({ texts }) {
     age.autocomplete = "off";
     const wrong = el("p", { class: "wrong", id: "age-wrong", role: "alert" });
     age.setAttribute("aria-describedby", "age-wrong");
-    const choice = (name, words) => selectOf(name, words, t);
+    const choice = (name, options) => selectOf(name, options, t);
     const gender = choice("gender", GENDERS);
     const education = choice("education", EDUCATIONS);
     const check = (isWrong) => {
@@ -54,7 +58,11 @@ export function demographicsPage({ texts }) {
   };
 }
 
-/** Difficulty, technical problems, free text. @returns {import("./pages.js").Render} */
+/**
+ * Render the feedback page: difficulty, technical problems and free text.
+ * @param {import("./pages.js").Context} context
+ * @returns {import("./pages.js").Render}
+ */
 export function feedbackPage({ texts }) {
   const { t } = bound(texts);
   return (page, done) => {
@@ -75,8 +83,8 @@ export function feedbackPage({ texts }) {
     );
     const text = el("textarea", { id: "text", rows: 3, maxlength: 5000 });
     const send = () => {
-      const open = [difficulty, technical].filter((one) => !one.check());
-      if (open.length > 0) return open[0].focus();
+      const missing = [difficulty, technical].filter((group) => !group.check());
+      if (missing.length > 0) return missing[0].focus();
       return done({
         difficulty: Number(difficulty.value()),
         technical_problems: technical.value() === "yes",
@@ -96,7 +104,11 @@ export function feedbackPage({ texts }) {
   };
 }
 
-/** Years, null where left open, NaN where it is no age. */
+/**
+ * Return the age in years, null if the text is empty, NaN if it is not a valid age.
+ * @param {string} text
+ * @returns {number|null}
+ */
 function readAge(text) {
   if (text.trim() === "") return null;
   const years = /^\d{1,3}$/.test(text.trim()) ? Number(text) : NaN;
@@ -120,38 +132,39 @@ function field(id, label, control, ...more) {
   return el("div", { class: "field" }, el("label", { for: id }, label), control, ...more);
 }
 
-function selectOf(name, words, t) {
+/** Create a select box with an empty first option. */
+function selectOf(name, values, t) {
   const options = [
     el("option", { value: "" }, t("demographics.no_answer")),
-    ...words.map((word) => el("option", { value: word }, t(`demographics.${name}_${word}`))),
+    ...values.map((value) => el("option", { value }, t(`demographics.${name}_${value}`))),
   ];
   return el("select", { id: name }, ...options);
 }
 
-/** A group of which one has to be chosen. */
+/** Create a group of radio buttons of which one must be chosen. */
 function radios(name, question, choices, t) {
   const wrong = el("p", { class: "wrong", id: `${name}-wrong`, role: "alert" });
   const inputs = choices.map(([value]) =>
     el("input", { type: "radio", name, value, id: `${name}-${value}` }),
   );
-  const labels = choices.map(([value, word], place) =>
-    el("label", { class: "radio", for: `${name}-${value}` }, inputs[place], word),
+  const labels = choices.map(([value, label], index) =>
+    el("label", { class: "radio", for: `${name}-${value}` }, inputs[index], label),
   );
   const row = el("div", { class: `radios radios-${choices.length}` }, ...labels);
   const described = { role: "radiogroup", "aria-describedby": wrong.id };
   const element = el("fieldset", described, el("legend", {}, question), row, wrong);
   const chosen = () => inputs.find((input) => input.checked);
-  const say = (text) => {
+  const showError = (text) => {
     wrong.textContent = text;
     element.setAttribute("aria-invalid", String(text !== ""));
   };
-  element.addEventListener("change", () => say(""));
+  element.addEventListener("change", () => showError(""));
   return {
     element,
     value: () => chosen()?.value ?? "",
     focus: () => inputs[0].focus(),
     check() {
-      say(chosen() ? "" : t("common.required"));
+      showError(chosen() ? "" : t("common.required"));
       return Boolean(chosen());
     },
   };

@@ -1,11 +1,11 @@
 /**
- * What stands around the pages: title, progress, language, the way out, and word of the connection.
+ * Header and status line around the pages: title, progress, language, stop button and connection.
  * @module frame
  */
 
 import { button, el } from "./dom.js";
 
-const STAGES_WITH_WAY_OUT = [
+const STAGES_WITH_STOP_BUTTON = [
   "instructions",
   "familiarization",
   "ready",
@@ -17,20 +17,26 @@ const BACK_SHOWN_MS = 4_000;
 
 const byId = (id) => document.getElementById(id);
 
+/** The header and status line of the page. */
 export class Frame {
-  /** @param {any} study `PublicStudy` @param {import("./texts.js").Texts} texts */
+  /**
+   * @param {import("./messages.js").PublicStudy} study
+   * @param {import("./texts.js").Texts} texts
+   */
   constructor(study, texts) {
     this.study = study;
     this.main = byId("main");
+    /** @type {() => void} */
     this.onStop = () => {};
     /** @type {(language: string) => void} */
     this.onLanguage = () => {};
+    /** @type {import("./messages.js").SessionState|null} */
     this.state = null;
-    this.speak(texts);
+    this.setTexts(texts);
   }
 
-  /** Use these texts from now on. */
-  speak(texts) {
+  /** Use these texts from now on. @param {import("./texts.js").Texts} texts */
+  setTexts(texts) {
     this.texts = texts;
     document.documentElement.lang = texts.language;
     document.title = this.study.title;
@@ -39,7 +45,10 @@ export class Frame {
     byId("skip").hidden = false;
   }
 
-  /** Show what belongs to a stage of the session. @param {{state: any}} context */
+  /**
+   * Show the controls of the session's stage.
+   * @param {{state: import("./messages.js").SessionState}} context
+   */
   show({ state }) {
     this.state = state;
     const inTrials = state.stage === "familiarization" || state.stage === "test";
@@ -47,7 +56,7 @@ export class Frame {
     byId("progress").hidden = !inTrials;
     const tools = [];
     if (state.stage === "consent") tools.push(this.languageChooser());
-    if (STAGES_WITH_WAY_OUT.includes(state.stage)) {
+    if (STAGES_WITH_STOP_BUTTON.includes(state.stage)) {
       const stop = button(this.texts.t("stop.open"), () => this.onStop(), { class: "link" });
       tools.push(stop);
     }
@@ -57,7 +66,10 @@ export class Frame {
     byId("title").textContent = title.join(" · ");
   }
 
-  /** The trial that begins. @param {"familiarization"|"test"} phase @param {number} trial */
+  /**
+   * Show the progress when a trial begins.
+   * @param {import("./messages.js").Phase} phase @param {number} trial
+   */
   progress(phase, trial) {
     const trials = this.state.trials[phase];
     const key = phase === "test" ? "common.progress" : "common.practice_progress";
@@ -68,7 +80,7 @@ export class Frame {
     );
   }
 
-  /** @returns {HTMLElement} */
+  /** Create the select box of languages. @returns {HTMLElement} */
   languageChooser() {
     const { languages } = this.study;
     if (languages.length < 2) return el("span");
@@ -82,7 +94,10 @@ export class Frame {
     return el("span", { class: "language" }, label, select);
   }
 
-  /** Say how requests fail, or that they do no more. @param {"lost"|"busy"|null} trouble */
+  /**
+   * Show how requests fail, or for a while that they work again.
+   * @param {"lost"|"busy"|null} trouble
+   */
   connection(trouble) {
     const status = byId("status");
     clearTimeout(this.timer);

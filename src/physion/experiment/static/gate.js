@@ -1,5 +1,5 @@
 /**
- * Which devices, browsers and windows the experiment works on.
+ * Requirements of the experiment on device, browser and window.
  * @module gate
  */
 
@@ -9,8 +9,8 @@ const H264 = 'video/mp4; codecs="avc1.64001f"';
 const FRAMES_TIMED = 30;
 
 /**
- * Why this device or browser will not do: the name of a text of `refusal`, or null.
- * @param {any} study `PublicStudy`
+ * Return why this device or browser cannot be used, as the name of a text of `refusal`, or null.
+ * @param {import("./messages.js").PublicStudy} study
  * @returns {"browser"|"movies"|"device"|"screen"|null}
  */
 export function deviceProblem(study) {
@@ -21,18 +21,25 @@ export function deviceProblem(study) {
   if (!video.canPlayType(H264)) return "movies";
   if (navigator.maxTouchPoints === 0) return null;
   if (!matchMedia("(any-pointer: fine)").matches) return "device";
-  // Computers say how small the window is where it matters: zooming out helps there.
+  // On computers a small window is reported before trials, where zooming out helps.
   const { width, height } = window.screen;
   const small = width < study.min_width || height < study.min_height;
   return small && matchMedia("(pointer: coarse)").matches ? "screen" : null;
 }
 
-/** Is the window as large as the movies need it? @param {any} study @returns {boolean} */
+/**
+ * Return whether the window is large enough for the movies.
+ * @param {import("./messages.js").PublicStudy} study
+ * @returns {boolean}
+ */
 export function windowFits(study) {
   return window.innerWidth >= study.min_width && window.innerHeight >= study.min_height;
 }
 
-/** A `Device`: what is used, and the measured refresh rate of the screen. */
+/**
+ * Return properties of browser and screen, with the measured refresh rate.
+ * @returns {Promise<import("./messages.js").Device>}
+ */
 export async function measureDevice() {
   return {
     user_agent: navigator.userAgent.slice(0, 1000),
@@ -44,7 +51,10 @@ export async function measureDevice() {
   };
 }
 
-/** From the median time between frames of the screen; null where the page is not shown. */
+/**
+ * Measure the refresh rate in Hz by the median time between animation frames.
+ * @returns {Promise<number|null>} Null if the page is hidden.
+ */
 async function refreshRate() {
   const hidden = new Promise((resolve) => setTimeout(resolve, 2000, null));
   const timed = (async () => {

@@ -1,5 +1,5 @@
 /**
- * The page begins: study and texts, device, who comes; then the session.
+ * Entry point of the page: load study and texts, check the device, enter, run the session.
  * @module main
  */
 
@@ -17,25 +17,36 @@ import { keep, recall } from "./storage.js";
 import { takeOver } from "./tabs.js";
 import { Texts, chooseLanguage, offeredLanguage } from "./texts.js";
 
+/** @typedef {import("./session.js").Basis} Basis */
+
+/** Load the page and start the session. */
 async function begin() {
   const address = window.location.href;
   const api = new Api((trouble) => frame?.connection(trouble));
+  /** @type {Frame|null} */
   let frame = null;
   const study = await api.get("/api/study");
   const arrival = readArrival(window.location.search, study.recruiters);
   const language = chooseLanguage(study.languages, [arrival.language, recall("language")]);
   const texts = await loadTexts(api, language);
   frame = new Frame(study, texts);
+  /** @type {Basis} */
   const basis = { api, texts, study, frame, address, log: new EventLog(api) };
   window.addEventListener("pageshow", (event) => event.persisted && window.location.reload());
   const problem = deviceProblem(study);
   if (problem) return refuse(basis, problem);
-  if (arrival.preview) return tell(basis, "information");
+  if (arrival.preview) return showMessage(basis, "information");
   return takePart(basis, arrival);
 }
 
+/**
+ * Enter and run the session; show refusals.
+ * @param {Basis} basis
+ * @param {import("./arrival.js").Arrival} arrival
+ */
 async function takePart(basis, arrival) {
   const { api, frame, log } = basis;
+  /** @type {Session|null} */
   let session = null;
   const queue = new AnswerQueue(api, (error) => session?.refused(error));
   takeOver(() => {
@@ -43,7 +54,7 @@ async function takePart(basis, arrival) {
     else queue.close();
     log.add("other_tab");
     log.send();
-    tell(basis, "tabs", { label: "tabs.here", run: () => window.location.reload() });
+    showMessage(basis, "tabs", { label: "tabs.here", run: () => window.location.reload() });
   });
   queue.load();
   await queue.empty();
@@ -53,10 +64,10 @@ async function takePart(basis, arrival) {
       await queue.empty();
       state = await api.get("/api/session");
     }
-    const asked = [arrival.language, recall("language")];
-    const chosen = asked.some((tag) => offeredLanguage(basis.study.languages, tag));
-    if (!chosen) await speak(basis, state.language);
-    basis.speak = (language) => speak(basis, language);
+    const wanted = [arrival.language, recall("language")];
+    const chosen = wanted.some((tag) => offeredLanguage(basis.study.languages, tag));
+    if (!chosen) await setLanguage(basis, state.language);
+    basis.setLanguage = (language) => setLanguage(basis, language);
     basis.another = cameWithoutId() ? anotherPerson(basis.study, arrival) : null;
     session = new Session(basis, queue);
     frame.onStop = () => session.askToStop();
@@ -70,15 +81,20 @@ async function takePart(basis, arrival) {
   }
 }
 
+/** Change the language as the participant chose. */
 async function changeLanguage(basis, session, language) {
   basis.log.add("language", { language });
   keep("language", language);
-  await speak(basis, language);
+  await setLanguage(basis, language);
   session.restart();
 }
 
-/** Go on in a language; in that of before where the study has this one no more. */
-async function speak(basis, language) {
+/**
+ * Load the texts of a language; keep the current one if the study no longer has it.
+ * @param {Basis} basis
+ * @param {string} language
+ */
+async function setLanguage(basis, language) {
   if (language === basis.texts.language) return;
   try {
     basis.texts = await loadTexts(basis.api, language);
@@ -87,15 +103,15 @@ async function speak(basis, language) {
     basis.log.add("no_texts", { language });
     return;
   }
-  basis.frame.speak(basis.texts);
+  basis.frame.setTexts(basis.texts);
 }
 
 async function loadTexts(api, language) {
   return new Texts(language, await api.get(`/api/texts/${encodeURIComponent(language)}`));
 }
 
-/** One of the pages that only say something. */
-function tell({ texts, frame }, name, action = null) {
+/** Show a page with only a message: title and text of a table of the texts. */
+function showMessage({ texts, frame }, name, action = null) {
   const [title, text] = [texts.t(`${name}.title`), texts.t(`${name}.text`)];
   const labelled = action && { label: texts.t(action.label), run: action.run };
   document.body.classList.remove("in-trials");
@@ -104,16 +120,16 @@ function tell({ texts, frame }, name, action = null) {
   showPage(frame.main, messagePage({ title, text, action: labelled }));
 }
 
-/** Why it does not work, by the name of a text of `refusal`, or else by the server's sentence. */
+/** Show why the study cannot be used: the text of `refusal` with this name, else the message. */
 function refuse({ texts, frame, study, address }, name, message = "", another = null) {
   const known = texts.has(`refusal.${name}`);
   const size = { width: study.min_width, height: study.min_height };
-  const why = known ? texts.t(`refusal.${name}`, size) : texts.t("refusal.other", { message });
-  const text = `${why}\n\n${texts.t("refusal.contact", study)}`;
-  const again = { label: texts.t("refusal.again"), run: () => window.location.reload() };
-  // Where the browser was told the address first, a person is known by it.
-  const anew = { label: texts.t("refusal.again"), run: () => window.location.replace(address) };
-  const action = name === "unknown_token" ? anew : known ? null : again;
+  const reason = known ? texts.t(`refusal.${name}`, size) : texts.t("refusal.other", { message });
+  const text = `${reason}\n\n${texts.t("refusal.contact", study)}`;
+  const reload = { label: texts.t("refusal.again"), run: () => window.location.reload() };
+  // The URL by which the participant came identifies the person again.
+  const restart = { label: texts.t("refusal.again"), run: () => window.location.replace(address) };
+  const action = name === "unknown_token" ? restart : known ? null : reload;
   const title = texts.t(name === "already_took_part" ? "result.title" : "refusal.title");
   document.body.classList.remove("in-trials");
   document.getElementById("tools").replaceChildren();

@@ -1,5 +1,5 @@
 /**
- * Movies and maps of the next trials, loaded as blobs before they are needed and freed after.
+ * Preloading of the movies and maps of the next trials as blobs, which are freed after use.
  * @module media
  */
 
@@ -7,19 +7,30 @@ import { Refused } from "./api.js";
 
 const AT_ONCE = 2;
 
-/** @typedef {{movie: string, map: string}} Addresses Blob addresses of one trial. */
+/** @typedef {import("./messages.js").TrialMedia} TrialMedia */
+/** @typedef {{movie: string, map: string}} Addresses Blob URLs of one trial. */
+/**
+ * Loading state of one trial's media.
+ * @typedef {{stop: AbortController, addresses: Addresses|null, failed: boolean,
+ *   promise: Promise<Addresses>|null}} Entry
+ */
 
+/** Preloader of a phase's media. */
 export class Media {
+  /** The trials of the phase by index. @type {Map<number, TrialMedia>} */
   #trials = new Map();
+  /** @type {Map<number, Entry>} */
   #entries = new Map();
   #loading = 0;
   #from = 0;
+  /** @type {() => Promise<TrialMedia[]>} */
   #renew = async () => [];
+  /** @type {Promise<any>|null} */
   #renewal = null;
 
   /**
    * @param {import("./api.js").Api} api
-   * @param {number} ahead So many trials are loaded before they are shown.
+   * @param {number} ahead Number of trials to load ahead.
    */
   constructor(api, ahead) {
     this.api = api;
@@ -27,11 +38,11 @@ export class Media {
   }
 
   /**
-   * Begin with a list of trials; what another list held is freed.
-   * @param {Array<{trial: number, movie: string, map: string}>} trials
+   * Begin with a list of trials and free the media of the previous list.
+   * @param {TrialMedia[]} trials
    * @param {number} from First trial to be shown.
-   * @param {() => Promise<any[]>} renew Asks for the list anew: after the server was started again
-   *   it may have other addresses.
+   * @param {() => Promise<TrialMedia[]>} renew Requests the list again, since the URLs may change
+   *   when the server restarts.
    */
   start(trials, from, renew) {
     for (const trial of [...this.#entries.keys()]) this.#free(trial);
@@ -40,28 +51,28 @@ export class Media {
     this.advance(from);
   }
 
-  /** The trial is next: free what lies behind it, load what lies ahead. @param {number} trial */
+  /** Free the media before a trial and load those from it on. @param {number} trial */
   advance(trial) {
     this.#from = trial;
     for (const old of [...this.#entries.keys()]) if (old < trial) this.#free(old);
     this.#pump();
   }
 
-  /** How many of the trials ahead are loaded. @returns {{loaded: number, wanted: number}} */
+  /** Count the trials ahead that are loaded. @returns {{loaded: number, wanted: number}} */
   progress() {
     const wanted = this.#window();
     const loaded = wanted.filter((trial) => this.#entries.get(trial)?.addresses);
     return { loaded: loaded.length, wanted: wanted.length };
   }
 
-  /** @param {number} trial @returns {boolean} */
+  /** Return whether the media of a trial are loaded. @param {number} trial @returns {boolean} */
   isReady(trial) {
     return Boolean(this.#entries.get(trial)?.addresses);
   }
 
   /**
-   * The media of a trial, as soon as they are there.
-   * @param {number} trial In the window that `advance` set.
+   * Wait for the media of a trial.
+   * @param {number} trial Within the range that `advance` set.
    * @returns {Promise<Addresses>}
    */
   get(trial) {
@@ -69,29 +80,31 @@ export class Media {
     return this.#entries.get(trial).promise;
   }
 
-  /** Load a trial's media anew, after they failed to play. @param {number} trial */
+  /** Load the media of a trial again after they failed to play. @param {number} trial */
   reload(trial) {
     this.#free(trial);
     return this.get(trial);
   }
 
-  /** Were media refused that the next trials need? */
+  /** Return whether loading failed for one of the next trials. @returns {boolean} */
   failed() {
     return this.#window().some((trial) => this.#entries.get(trial)?.failed);
   }
 
-  /** Load anew what failed. */
+  /** Load again the media that failed. */
   retry() {
     for (const [trial, entry] of [...this.#entries]) if (entry.failed) this.#free(trial);
     this.#pump();
   }
 
+  /** Return the indices of the trials to have loaded. @returns {number[]} */
   #window() {
     return [...this.#trials.keys()].filter(
       (trial) => trial >= this.#from && trial < this.#from + this.ahead,
     );
   }
 
+  /** Start loading while fewer than AT_ONCE trials are being loaded. */
   #pump() {
     for (const trial of this.#window()) {
       if (this.#loading >= AT_ONCE) return;
@@ -101,6 +114,7 @@ export class Media {
 
   #load(trial) {
     const stop = new AbortController();
+    /** @type {Entry} */
     const entry = { stop, addresses: null, failed: false, promise: null };
     this.#loading += 1;
     entry.promise = this.#blobs(trial, stop.signal)
@@ -115,12 +129,12 @@ export class Media {
         this.#loading -= 1;
         this.#pump();
       });
-    // Whoever asks for the trial is told as well.
+    // Callers of `get` receive the error as well.
     entry.promise.catch(() => (entry.failed = true));
     this.#entries.set(trial, entry);
   }
 
-  /** Movie and map, by new addresses where the server does not take those that it gave. */
+  /** Fetch movie and map; request new URLs if the server no longer accepts the present ones. */
   async #blobs(trial, signal) {
     const fetched = ({ movie, map }) =>
       Promise.all([movie, map].map((path) => this.api.blob(path, signal)));
@@ -129,13 +143,13 @@ export class Media {
       return await fetched(old);
     } catch (error) {
       if (!(error instanceof Refused)) throw error;
-      if (this.#trials.get(trial) === old) await this.#askAnew();
+      if (this.#trials.get(trial) === old) await this.#renewOnce();
       return fetched(this.#trials.get(trial) ?? old);
     }
   }
 
-  /** Once for all trials that fail at the same time. */
-  #askAnew() {
+  /** Request the list of trials again, once for all trials that fail at the same time. */
+  #renewOnce() {
     const trials = this.#trials;
     this.#renewal ??= this.#renew()
       .then((list) => this.#trials === trials && (this.#trials = byNumber(list)))

@@ -1,5 +1,5 @@
 /**
- * A jsPsych plugin: one page with words and controls, between the trials.
+ * jsPsych plugin: one page with text and controls, between the trials.
  * @module page_trial
  */
 
@@ -12,19 +12,20 @@ const info = {
   version: "1.0.0",
   parameters: {
     /**
-     * Called with an empty element, which it fills, the function that ends the page with its data,
-     * and the AbortSignal that ends it without.
+     * A `Render`: called with an empty element to fill, a function that ends the page with its
+     * data, and an AbortSignal that ends it without.
      */
     render: { type: ParameterType.FUNCTION, default: undefined },
-    /** Gives the AbortSignal that ends the page. */
+    /** Returns the AbortSignal that ends the page. */
     signal: { type: ParameterType.FUNCTION, default: () => new AbortController().signal },
   },
   data: {
-    /** What was filled in, by name. */
+    /** Values of the form by name. */
     values: { type: ParameterType.OBJECT },
   },
 };
 
+/** The plugin class. */
 export class PageTrial {
   static info = info;
 
@@ -33,7 +34,12 @@ export class PageTrial {
     this.jsPsych = jsPsych;
   }
 
-  /** @param {HTMLElement} display @param {any} trial @param {() => void} on_load */
+  /**
+   * Run the page.
+   * @param {HTMLElement} display
+   * @param {any} trial The parameters.
+   * @param {() => void} on_load
+   */
   async trial(display, trial, on_load) {
     const over = new AbortController();
     const signal = trial.signal();
@@ -54,30 +60,30 @@ export class PageTrial {
 }
 
 /**
- * Fill a place with a page and put the focus on its heading, so that readers begin there.
- * @param {HTMLElement} place
+ * Show a page in a container and focus its heading, where screen readers begin.
+ * @param {HTMLElement} container
  * @param {(page: HTMLElement) => void} render
  */
-export function showPage(place, render) {
+export function showPage(container, render) {
   const page = document.createElement("div");
   page.className = "page";
   render(page);
-  place.replaceChildren(page);
+  container.replaceChildren(page);
   window.scrollTo(0, 0);
   focusHeading(page);
 }
 
 /**
- * What is awaited. Where it takes long, an empty place says so meanwhile.
+ * Await a promise; if it takes long and the container is empty, show a page meanwhile.
  * @template T
- * @param {HTMLElement} place
+ * @param {HTMLElement} container
  * @param {(page: HTMLElement) => void} render
  * @param {Promise<T>} awaited
  * @returns {Promise<T>}
  */
-export async function patiently(place, render, awaited) {
-  const say = () => place.querySelector("h1") ?? showPage(place, render);
-  const timer = setTimeout(say, LATE_MS);
+export async function patiently(container, render, awaited) {
+  const show = () => container.querySelector("h1") ?? showPage(container, render);
+  const timer = setTimeout(show, LATE_MS);
   try {
     return await awaited;
   } finally {
@@ -85,7 +91,7 @@ export async function patiently(place, render, awaited) {
   }
 }
 
-/** @param {HTMLElement} page */
+/** Focus the heading of a page. @param {HTMLElement} page */
 export function focusHeading(page) {
   const heading = page.querySelector("h1");
   if (!heading) return;

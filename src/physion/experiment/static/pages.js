@@ -1,5 +1,5 @@
 /**
- * The pages between the trials. Each function gives the `render` of a `PageTrial`.
+ * The pages between the trials. Each function returns the `render` parameter of a `PageTrial`.
  * @module pages
  */
 
@@ -10,26 +10,24 @@ import { focusHeading } from "./page_trial.js";
 const LATE_MS = 500;
 
 /**
- * @typedef {Object} Context What every page may need.
- * @property {import("./texts.js").Texts} texts
- * @property {any} study `PublicStudy`
- * @property {any} state `State`
- * @property {import("./api.js").Api} api
- * @property {import("./media.js").Media} media
- * @property {import("./event_log.js").EventLog} log
- * @property {string} address The address by which the participant came.
+ * The objects that pages use.
+ * @typedef {import("./session.js").Basis & {state: import("./messages.js").SessionState,
+ *   media: import("./media.js").Media}} Context
  */
 
-/** @typedef {(page: HTMLElement, done: (values?: any) => void, signal: AbortSignal) => void} Render */
+/**
+ * Fills a page; calls `done` with its data when the participant has finished it.
+ * @typedef {(page: HTMLElement, done: (values?: any) => void, signal: AbortSignal) => any} Render
+ */
 
-/** Minutes that so many trials take, with the pages before practice, as people say it. */
+/** Estimate the rounded minutes of so many trials, with the pages before practice. */
 function minutes(study, practice, test) {
   const seconds = practice * 12 + test * (study.cue_ms / 1000 + 4.5);
   const exact = (practice ? 3 : 0) + seconds / 60;
   return exact > 7.5 ? Math.round(exact / 5) * 5 : Math.max(2, Math.ceil(exact));
 }
 
-/** @param {Context} context @returns {Render} */
+/** Render the consent page. @param {Context} context @returns {Render} */
 export function consentPage({ texts, study, state }) {
   const { t } = bound(texts);
   const { familiarization, test } = state.trials;
@@ -53,7 +51,11 @@ export function consentPage({ texts, study, state }) {
     );
 }
 
-/** Several pages with an animated example. @param {Context} context @returns {Render} */
+/**
+ * Render the instructions: three pages, with an animated example.
+ * @param {Context} context
+ * @returns {Render}
+ */
 export function instructionsPages(context) {
   const { texts, state } = context;
   const { t } = bound(texts);
@@ -100,7 +102,7 @@ export function instructionsPages(context) {
   };
 }
 
-/** @param {Context} context @returns {Render} */
+/** Render the page between practice and test. @param {Context} context @returns {Render} */
 export function readyPage(context) {
   const { t } = bound(context.texts);
   const { test } = context.state.trials;
@@ -113,7 +115,11 @@ export function readyPage(context) {
     );
 }
 
-/** Shown until the next trials are loaded. @param {Context} context @returns {Render} */
+/**
+ * Render the page shown until the next trials are loaded.
+ * @param {Context} context
+ * @returns {Render}
+ */
 export function loadingPage(context) {
   const { texts, media } = context;
   const { t } = bound(texts);
@@ -142,7 +148,12 @@ export function loadingPage(context) {
   };
 }
 
-/** Shown while something is awaited that needs no action. @param {Context} context */
+/**
+ * Render the page shown while answers are being sent.
+ * @param {Context} context
+ * @param {() => Promise<any>} waited
+ * @returns {(page: HTMLElement, done: () => void) => void}
+ */
 export function waitingPage({ texts }, waited) {
   const { t } = bound(texts);
   return (page, done) => {
@@ -151,29 +162,36 @@ export function waitingPage({ texts }, waited) {
   };
 }
 
-/** Shown where an answer of the server takes long. @param {{texts: any}} context */
+/**
+ * Render the page shown while a response takes long.
+ * @param {{texts: import("./texts.js").Texts}} context
+ * @returns {(page: HTMLElement) => void}
+ */
 export function openingPage({ texts }) {
   const { t } = bound(texts);
   return messagePage({ title: t("saving.title"), text: t("saving.opening") });
 }
 
 /**
- * A page that stays, with all that was filled in, until it is stored; it takes no input meanwhile.
- * @param {{texts: any}} context @param {Render} render
- * @param {(values: any) => Promise<any>} store Called once. @returns {Render}
+ * Wrap a page so that it stays visible, with its input disabled, until its data are stored.
+ * @param {{texts: any}} context
+ * @param {Render} render
+ * @param {(values: any) => Promise<any>} store Called once.
+ * @returns {Render}
  */
 export function storedPage({ texts }, render, store) {
   const { t } = bound(texts);
   return (page, done, signal) => {
-    const told = el("span", { class: "small", role: "status" });
-    const late = () => (told.textContent = t("saving.sending"));
+    const status = el("span", { class: "small", role: "status" });
+    const late = () => (status.textContent = t("saving.sending"));
     let sent = false;
     const send = async (values = {}) => {
       if (sent) return;
       sent = true;
+      /** @type {NodeListOf<HTMLButtonElement>} */
       const controls = page.querySelectorAll("button, input, select, textarea");
       for (const control of controls) control.disabled = true;
-      page.querySelector(".buttons")?.prepend(told);
+      page.querySelector(".buttons")?.prepend(status);
       const timer = setTimeout(late, LATE_MS);
       await store(values).finally(() => clearTimeout(timer));
       done(values);
@@ -182,7 +200,7 @@ export function storedPage({ texts }, render, store) {
   };
 }
 
-/** Shown while many begin at once; counts down to the next try. */
+/** Render the page shown while too many begin at once, with a countdown to the next attempt. */
 export function busyPage({ texts }, ms) {
   const { t } = bound(texts);
   return async (page) => {
@@ -196,7 +214,12 @@ export function busyPage({ texts }, ms) {
   };
 }
 
-/** A heading, text, and where given a button, and one that matters less. */
+/**
+ * Render a page with heading and text and, if given, a main and a secondary button.
+ * @param {{title: string, text: string, action?: {label: string, run: () => void}|null,
+ *   quiet?: {label: string, run: () => void}|null}} content
+ * @returns {(page: HTMLElement) => void}
+ */
 export function messagePage({ title, text, action = null, quiet = null }) {
   return (page) => {
     page.append(el("h1", {}, title), ...paragraphs(text));
@@ -208,7 +231,12 @@ export function messagePage({ title, text, action = null, quiet = null }) {
   };
 }
 
-/** Shown before a trial while the window is too small. @param {Context} context */
+/**
+ * Render the page shown before a trial while the window is too small.
+ * @param {Context} context
+ * @param {() => boolean} fits
+ * @returns {Render}
+ */
 export function windowPage({ texts, study, address }, fits) {
   const { t } = bound(texts);
   return (page, done, signal) => {
@@ -232,7 +260,11 @@ export function windowPage({ texts, study, address }, fits) {
   };
 }
 
-/** Do you really want to stop? Ends with {stop}. @param {Context} context @returns {Render} */
+/**
+ * Render the question whether to stop; ends with {stop}.
+ * @param {Context} context
+ * @returns {Render}
+ */
 export function stopPage({ texts, study, state }) {
   const { t } = bound(texts);
   return (page, done) =>
@@ -249,7 +281,7 @@ export function stopPage({ texts, study, state }) {
     );
 }
 
-/** `t` without its object. */
+/** Return the method `t` of the texts, bound, for destructuring. */
 export function bound(texts) {
   return { t: texts.t.bind(texts) };
 }

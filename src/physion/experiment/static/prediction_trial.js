@@ -1,7 +1,7 @@
 /**
- * A jsPsych plugin: one trial of object contact prediction. Fixation cross; first frame with the
- * flashing map of agent and patient; the observed movie; then, with the movie hidden, YES or NO.
- * Where the page is hidden before the movie has ended, all of it is shown again.
+ * jsPsych plugin: one trial of object contact prediction. Sequence: fixation cross; first frame
+ * with the flashing map of agent and patient; the observed movie; then, with the movie hidden, YES
+ * or NO. If the page is hidden before the movie has ended, the trial is shown again from the start.
  * @module prediction_trial
  */
 
@@ -11,43 +11,43 @@ import { MovieFailed, Screen, round } from "./screen.js";
 
 const { ParameterType } = window.jsPsychModule;
 const ATTEMPTS = 3;
-/** So often is a trial shown again because the page was hidden; then it goes on as it can. */
+/** Most repetitions of a trial because the page was hidden; afterwards it continues regardless. */
 const REPEATS = 5;
 const DAY_MS = 86_400_000;
-/** Moments that are kept of each kind, so that an answer stays short. */
+/** Largest number of recorded times of each kind, to limit the size of an answer. */
 const MOST_NOTED = 100;
 
 const info = {
   name: "physion-prediction",
   version: "1.0.0",
   parameters: {
-    /** Gives the addresses of movie and map, as a promise; told how often they failed before. */
+    /** Takes the number of failures so far; returns a promise of the `Addresses`. */
     load: { type: ParameterType.FUNCTION, default: undefined },
-    /** Size and rate of the movie, its number of frames: a `TrialMedia`. */
+    /** Size, rate and number of frames of the movie: a `TrialMedia`. */
     media: { type: ParameterType.OBJECT, default: undefined },
     fixation_ms: { type: ParameterType.INT, default: 1000 },
-    /** How long the first frame is held with the flashing map above it. */
+    /** Duration of the first frame with the flashing map. */
     cue_ms: { type: ParameterType.INT, default: 2000 },
-    /** Whole cycles of the map in a second, on and off. */
+    /** On-off cycles of the map per second. */
     flash_hz: { type: ParameterType.FLOAT, default: 2 },
     /** Responses from left to right. */
     choices: { type: ParameterType.STRING, array: true, default: ["yes", "no"] },
     /** Keys from left to right. */
     keys: { type: ParameterType.KEYS, array: true, default: ["f", "j"] },
-    /** Words by name: prompt, yes, no, trouble, retry. */
+    /** Texts by name: prompt, yes, no, trouble, retry. */
     words: { type: ParameterType.OBJECT, default: undefined },
-    /** So often was the trial shown before, and left without an answer. */
+    /** How often the trial was shown before and left without an answer. */
     before: { type: ParameterType.INT, default: 0 },
-    /** Called when the participant begins to see the scene. */
+    /** Called when the scene becomes visible. */
     shown: { type: ParameterType.FUNCTION, default: () => {} },
-    /** Called with the kind and data of what went wrong. */
+    /** Called with kind and data of an event. */
     log: { type: ParameterType.FUNCTION, default: () => {} },
-    /** Gives the AbortSignal that ends the trial. */
+    /** Returns the AbortSignal that ends the trial. */
     signal: { type: ParameterType.FUNCTION, default: () => new AbortController().signal },
   },
   data: {
     response: { type: ParameterType.STRING },
-    /** From the moment in which the buttons were enabled. */
+    /** Response time since the buttons were enabled. */
     rt_ms: { type: ParameterType.FLOAT },
     /** mouse, touch or keyboard. */
     input: { type: ParameterType.STRING },
@@ -59,14 +59,15 @@ const info = {
     visibility_changes: { type: ParameterType.INT },
     window_width: { type: ParameterType.INT },
     window_height: { type: ParameterType.INT },
-    /** Moments of flashes and frames, in ms since the last cross; how often it was shown. */
+    /** Times of flashes and frames in ms since the last showing began; numbers of showings. */
     details: { type: ParameterType.OBJECT },
   },
 };
 
-/** The page was hidden before the movie had ended. */
+/** Raised when the page is hidden before the movie has ended. */
 class PageHidden extends Error {}
 
+/** The plugin class. */
 export class PredictionTrial {
   static info = info;
 
@@ -75,7 +76,12 @@ export class PredictionTrial {
     this.jsPsych = jsPsych;
   }
 
-  /** @param {HTMLElement} display @param {any} trial @param {() => void} on_load */
+  /**
+   * Show the trial until it is answered.
+   * @param {HTMLElement} display
+   * @param {any} trial The parameters.
+   * @param {() => void} on_load
+   */
   async trial(display, trial, on_load) {
     const signal = trial.signal();
     const over = new AbortController();
@@ -95,7 +101,7 @@ export class PredictionTrial {
             failed += 1;
             const { trial: number } = trial.media;
             trial.log("movie_failed", { trial: number, attempt, reason: error.message });
-            await tellTrouble(display, trial, failed);
+            await showFailure(display, trial, failed);
           } else throw error;
         } finally {
           seen.end();
@@ -107,7 +113,7 @@ export class PredictionTrial {
   }
 }
 
-/** One showing of the trial, from the fixation cross to the answer. */
+/** Show the trial once, from the fixation cross to the answer. */
 async function show(display, trial, signal, visibility, on_load) {
   const screen = new Screen(trial.media, trial.seen.signal);
   const buttons = trial.choices.map((choice, side) => answerButton(trial, choice, side));
@@ -130,7 +136,7 @@ async function show(display, trial, signal, visibility, on_load) {
   }
 }
 
-/** What happens on the screen, in its order. */
+/** Run cross, cue, movie and answer in sequence, and return the data of the trial. */
 async function run(screen, cross, buttons, trial, signal, visibility) {
   const start = await nextFrame();
   const loaded = trial.load(trial.failed).then((addresses) => screen.load(addresses));
@@ -171,11 +177,12 @@ async function run(screen, cross, buttons, trial, signal, visibility) {
   };
 }
 
-/** Resolves in the first frame of the screen at or after the moment. */
+/** Wait for the first animation frame at or after a time. */
 async function reach(moment, signal) {
   while ((await nextFrame()) < moment) signal.throwIfAborted();
 }
 
+/** Create the button of a response. */
 function answerButton(trial, choice, side) {
   const key = trial.keys[side];
   return el(
@@ -187,9 +194,13 @@ function answerButton(trial, choice, side) {
 }
 
 /**
- * Enable the buttons in the next frame of the screen and wait for one of them, or its key. The time
- * is that of the press, by mouse, finger or key. Presses that began before do not count, nor do
- * keys held down.
+ * Enable the buttons in the next animation frame and wait for one of them or its key. The response
+ * time is that of the press (mouse, finger or key). Presses that began earlier and repeated keys do
+ * not count.
+ * @param {HTMLButtonElement[]} buttons
+ * @param {any} trial
+ * @param {AbortSignal} signal
+ * @returns {Promise<{response: string, rt_ms: number, input: string, enabled: number}>}
  */
 function answered(buttons, trial, signal) {
   const over = new AbortController();
@@ -198,19 +209,19 @@ function answered(buttons, trial, signal) {
     signal.addEventListener("abort", () => reject(signal.reason), options);
     requestAnimationFrame(() => {
       const enabled = performance.now();
-      for (const one of buttons) one.disabled = false;
+      for (const each of buttons) each.disabled = false;
       const give = (event, side, input) => {
         const rt_ms = event.timeStamp - enabled;
         if (rt_ms >= 0) resolve({ response: trial.choices[side], rt_ms, input, enabled });
       };
-      buttons.forEach((one, side) => {
+      buttons.forEach((each, side) => {
         let down = null;
-        one.addEventListener("pointerdown", (event) => (down = event), options);
+        each.addEventListener("pointerdown", (event) => (down = event), options);
         const clicked = (event) => {
           if (event.detail === 0) give(event, side, "keyboard");
           else if (down) give(down, side, inputOf(down));
         };
-        one.addEventListener("click", clicked, options);
+        each.addEventListener("click", clicked, options);
       });
       const pressed = (event) => {
         const side = sideOf(event, trial.keys);
@@ -221,7 +232,10 @@ function answered(buttons, trial, signal) {
   }).finally(() => over.abort());
 }
 
-/** Which of the keys was pressed, -1 for none. Without Latin letters the key's place counts. */
+/**
+ * Return the index of the pressed key, -1 for none. On keyboards without Latin letters the physical
+ * position of the key counts.
+ */
 function sideOf(event, keys) {
   if (event.repeat || event.ctrlKey || event.altKey || event.metaKey) return -1;
   const side = keys.indexOf(event.key.toLowerCase());
@@ -229,13 +243,16 @@ function sideOf(event, keys) {
   return keys.findIndex((key) => event.code === `Key${key.toUpperCase()}`);
 }
 
+/** Return the input device of a pointer event as recorded in the answer. */
 function inputOf({ pointerType }) {
   return pointerType === "touch" || pointerType === "pen" ? "touch" : "mouse";
 }
 
 /**
- * A signal that also ends what runs when the page is hidden, where `repeat` says so, until `end`.
- * @param {AbortSignal} signal @param {boolean} repeat
+ * Create a signal that follows another one and, until `end` is called, notices when the page is
+ * hidden.
+ * @param {AbortSignal} signal
+ * @param {boolean} repeat Whether it also aborts when the page is hidden.
  */
 function whileSeen(signal, repeat) {
   const seen = new AbortController();
@@ -254,6 +271,7 @@ function whileSeen(signal, repeat) {
   return { signal: seen.signal, end: () => over.abort(), wasHidden: () => was };
 }
 
+/** Record the changes of the page's visibility until the signal aborts. */
 function watchVisibility(signal) {
   const changes = [];
   const changed = () => changes.push([performance.now(), document.visibilityState]);
@@ -261,8 +279,8 @@ function watchVisibility(signal) {
   return { changes };
 }
 
-/** Say that the movie did not play; after some tries, wait for the participant. */
-async function tellTrouble(display, trial, attempt) {
+/** Show that the movie failed; after some attempts, wait for the participant to retry. */
+async function showFailure(display, trial, attempt) {
   const message = el("p", { role: "alert" }, trial.words.trouble);
   const box = el("div", { class: "page" }, message);
   display.replaceChildren(box);

@@ -1,6 +1,6 @@
 /**
- * What this browser knows of who takes part in it: the token of the session, whose it is, and a
- * word for who comes without an id. No id is kept, only what it can be recognised by.
+ * The session that this browser remembers: its token, a hash of the participant's id, and a random
+ * key for participants without an id. Ids themselves are not stored.
  * @module remembered
  */
 
@@ -8,57 +8,64 @@ import { newKey } from "./random_key.js";
 import { keep, outlivesPage, recall } from "./storage.js";
 
 /**
- * @typedef {{token: string, who: string|null, link: string}} Remembered `who`: see `whoOf`; `link`:
- * what the address named besides, as a query, for the next person.
+ * A remembered session. `who`: see `whoOf`; `link`: query of the other URL parameters, for the next
+ * person on this computer.
+ * @typedef {{token: string, who: string|null, link: string}} Remembered
  */
 
-/** @returns {Remembered|null} */
+/** Return the remembered session. @returns {Remembered|null} */
 export function remembered() {
-  const found = recall("session");
-  return found?.token ? found : null;
+  const session = recall("session");
+  return session?.token ? session : null;
 }
 
-/** @param {Remembered} session */
+/** Remember a session. @param {Remembered} session */
 export function remember(session) {
   keep("session", session);
 }
 
-/** Does a reload find the session of this token? @param {string} token @returns {boolean} */
+/**
+ * Return whether a reload would find the session again.
+ * @param {string} token
+ * @returns {boolean}
+ */
 export const isFoundAgain = (token) => outlivesPage("session") && remembered()?.token === token;
 
-/** Forget the session that is remembered, and no more. */
+/** Forget only the session. */
 export function forgetSession() {
   keep("session", null);
 }
 
-/** Forget all that belongs to one person. @param {any} study `PublicStudy` */
+/** Forget all data of a person. @param {import("./messages.js").PublicStudy} study */
 export function forgetPerson(study) {
   for (const name of ["session", "language", visitName(study)]) keep(name, null);
 }
 
 /**
- * The word for whoever comes without an id, made when it is first asked for.
- * @param {any} study `PublicStudy` @returns {string}
+ * Return the random key of a participant without an id; draw and store it on the first call.
+ * @param {import("./messages.js").PublicStudy} study
+ * @returns {string}
  */
-export function visitWord(study) {
+export function visitKey(study) {
   const name = visitName(study);
   const known = recall(name);
   if (typeof known === "string") return known;
-  const made = newKey();
-  keep(name, made);
-  return made;
+  const key = newKey();
+  keep(name, key);
+  return key;
 }
 
 const visitName = (study) => `visit:${study.title}`;
 
 /**
- * What tells whether an address is of the same person; null where it names nobody.
- * @param {any} enter The beginning of an `Enter`. @returns {Promise<string|null>}
+ * Return a hash that identifies the person of a URL, or null if the URL identifies nobody.
+ * @param {import("./messages.js").Enter} enter
+ * @returns {Promise<string|null>}
  */
 export async function whoOf({ source, id, pass }) {
   if (!id && !pass) return null;
   const bytes = new TextEncoder().encode(JSON.stringify([source, id ?? null, pass ?? null]));
-  // Without https browsers lack it.
+  // Browsers lack it without HTTPS.
   if (!crypto.subtle) return plainHash(bytes);
   const digest = new Uint8Array(await crypto.subtle.digest("SHA-256", bytes));
   return Array.from(digest, hex).join("");
@@ -66,7 +73,7 @@ export async function whoOf({ source, id, pass }) {
 
 const hex = (byte) => byte.toString(16).padStart(2, "0");
 
-/** FNV-1a with 64 bits: tells ids apart, though it hides them less well. */
+/** 64-bit FNV-1a hash: distinguishes ids, but is not cryptographic. @param {Uint8Array} bytes */
 function plainHash(bytes) {
   let hash = 0xcbf29ce484222325n;
   for (const byte of bytes) hash = BigInt.asUintN(64, (hash ^ BigInt(byte)) * 0x100000001b3n);

@@ -1,17 +1,18 @@
 /**
- * The last page: how well it went, and how to get the credit.
+ * The last page: accuracy, percentile and how to get the credit.
  * @module result_page
  */
 
 import { button, el } from "./dom.js";
 import { bound } from "./pages.js";
 
-/** Hosts of the marketplace and of its place to try things. */
+/** Hosts of MTurk and its sandbox. */
 const MTURK = ["www.mturk.com", "workersandbox.mturk.com"];
 
 /**
+ * Render the result page.
  * @param {import("./pages.js").Context} context
- * @param {any} result `Result`
+ * @param {import("./messages.js").Result} result
  * @returns {(page: HTMLElement) => void}
  */
 export function resultPage({ texts, study, state, another }, result) {
@@ -24,8 +25,8 @@ export function resultPage({ texts, study, state, another }, result) {
       el("p", {}, t("result.accuracy", { correct, trials, percent })),
     );
     if (percentile !== null) {
-      const share = number(texts, percentile);
-      page.append(el("p", {}, t("result.percentile", { percentile: share })));
+      const rounded = number(texts, percentile);
+      page.append(el("p", {}, t("result.percentile", { percentile: rounded })));
     }
     page.append(el("p", {}, t("result.saved")));
     if (completion.code) page.append(codeBox(completion.code, t));
@@ -40,22 +41,24 @@ export function resultPage({ texts, study, state, another }, result) {
   };
 }
 
+/** Format a number without decimals in the language of the texts. */
 const number = (texts, value) =>
   new Intl.NumberFormat(texts.language, { maximumFractionDigits: 0 }).format(value);
 
+/** Create the box with the completion code and a button that copies it. */
 function codeBox(code, t) {
   const shown = el("output", { class: "code", id: "code", tabindex: "0" }, code);
-  const told = el("span", { role: "status", class: "small" });
-  const copy = button(t("result.copy"), async () => {
-    told.textContent = t((await copied(code, shown)) ? "result.copied" : "result.copy_failed");
+  const status = el("span", { role: "status", class: "small" });
+  const copyButton = button(t("result.copy"), async () => {
+    status.textContent = t((await copy(code, shown)) ? "result.copied" : "result.copy_failed");
   });
-  copy.classList.add("quiet");
+  copyButton.classList.add("quiet");
   const label = el("label", { for: "code" }, t("result.code"));
-  return el("div", { class: "code-box" }, label, shown, copy, told);
+  return el("div", { class: "code-box" }, label, shown, copyButton, status);
 }
 
-/** The clipboard is missing outside https; selecting is then the next best. */
-async function copied(code, shown) {
+/** Copy the code; select it if the clipboard is not available (without HTTPS). */
+async function copy(code, shown) {
   try {
     await navigator.clipboard.writeText(code);
     return true;
@@ -65,7 +68,7 @@ async function copied(code, shown) {
   }
 }
 
-/** A link, or a form where MTurk takes one. Only web addresses are ever followed. */
+/** Create a link back to the recruiter, or the form of MTurk. Only http(s) URLs are accepted. */
 function wayBack({ url, post }, t) {
   const web = /^https?:\/\//i.test(url);
   if (!web || (post && !isMTurk(url))) return el("p", {}, t("result.close"));
@@ -77,7 +80,7 @@ function wayBack({ url, post }, t) {
     el("input", { type: "hidden", name, value }),
   );
   const send = el("button", { type: "submit", class: "button", id: "go" }, t("result.go"));
-  // In the frame in which MTurk shows us, as the form in its documentation of ExternalQuestion.
+  // Sent within MTurk's frame, as in its documentation of ExternalQuestion.
   return el(
     "form",
     { method: "post", action: url },
@@ -86,6 +89,7 @@ function wayBack({ url, post }, t) {
   );
 }
 
+/** Return whether a URL is MTurk's address for submitted tasks. @param {string} url */
 function isMTurk(url) {
   const { protocol, host, pathname } = new URL(url);
   return protocol === "https:" && MTURK.includes(host) && pathname === "/mturk/externalSubmit";

@@ -1,6 +1,6 @@
 /**
- * The place where stimuli are shown: a movie with the map of agent and patient above it and a cover
- * that hides both. It flashes the map, plays the movie, and records what was really shown.
+ * Display of stimuli: a movie, the map of agent and patient above it, and a cover that hides both.
+ * Flashes the map, plays the movie, and records the frames that were actually presented.
  * @module screen
  */
 
@@ -10,7 +10,7 @@ const STALLED_MS = 3_000;
 const LOADED_MS = 10_000;
 const FIRST_FRAME_MS = 1_000;
 
-/** The movie could not be shown. `reason`: load, play, stalled. */
+/** Raised when the movie could not be shown. `reason`: load, play or stalled. */
 export class MovieFailed extends Error {
   /** @param {string} reason @param {string} [detail] */
   constructor(reason, detail = "") {
@@ -20,20 +20,24 @@ export class MovieFailed extends Error {
 }
 
 /**
- * Counts the frames that were presented, from what requestVideoFrameCallback reports. Callbacks may
- * be missed, so that the counter of presented frames counts; a frame that is presented twice (the
- * first one is, where the movie starts) counts once.
+ * Counter of presented frames, from the reports of requestVideoFrameCallback. Callbacks can be
+ * missed, so the browser's counter `presentedFrames` is used; a frame that is presented twice (as
+ * the first one is when the movie starts) counts once.
  */
 export class FrameCount {
-  /** @param {number} rate Frames a second of the movie. */
+  /** @param {number} rate Frames per second of the movie. */
   constructor(rate) {
     this.rate = rate;
     this.shown = 0;
-    /** @type {Array<[number, number, number]>} Moment (ms), frame, counter of presented frames. */
+    /** Time (ms), frame, counter of presented frames. @type {Array<[number, number, number]>} */
     this.seen = [];
   }
 
-  /** @param {number} now @param {{mediaTime: number, presentedFrames: number}} metadata */
+  /**
+   * Add a report.
+   * @param {number} now Time in ms.
+   * @param {{mediaTime: number, presentedFrames: number}} metadata
+   */
   add(now, metadata) {
     const frame = Math.round(metadata.mediaTime * this.rate);
     const last = this.seen.at(-1);
@@ -43,13 +47,15 @@ export class FrameCount {
   }
 }
 
+/** The stimulus display of one trial. */
 export class Screen {
+  /** @type {FrameCount|null} */
   #frames = null;
   #stop;
 
   /**
    * @param {{width: number, height: number, rate: number}} media
-   * @param {AbortSignal} stop Ends everything that runs here.
+   * @param {AbortSignal} stop Ends flashing and playing.
    */
   constructor(media, stop) {
     this.media = media;
@@ -71,7 +77,7 @@ export class Screen {
   }
 
   /**
-   * Load movie and map behind the cover, until the first frame is decoded and painted.
+   * Load movie and map behind the cover and wait until the first frame is painted.
    * @param {{movie: string, map?: string}} addresses
    */
   async load({ movie, map }) {
@@ -90,34 +96,34 @@ export class Screen {
       await decoded.catch(() => Promise.reject(new MovieFailed("load", "map")));
     }
     await loaded;
-    // Some browsers report no frame before the movie plays; it is painted all the same.
+    // Some browsers report no frame before the movie plays, although it is painted.
     await Promise.race([painted, sleep(FIRST_FRAME_MS)]);
     await nextFrame();
   }
 
-  /** Records each presented frame, from the first. */
-  #watch(first) {
+  /** Record each presented frame from now on. @param {(value?: any) => void} onFrame */
+  #watch(onFrame) {
     const frames = this.#frames;
-    const seen = (now, metadata) => {
+    const record = (now, metadata) => {
       if (this.#frames !== frames) return;
       frames.add(now, metadata);
-      first();
-      this.video.requestVideoFrameCallback(seen);
+      onFrame();
+      this.video.requestVideoFrameCallback(record);
     };
-    this.video.requestVideoFrameCallback(seen);
+    this.video.requestVideoFrameCallback(record);
   }
 
-  /** Show what is behind the cover, or hide it. @param {boolean} hidden */
+  /** Cover or uncover movie and map. @param {boolean} hidden */
   hide(hidden) {
     this.cover.hidden = !hidden;
   }
 
   /**
-   * Flash the map above the still first frame: on first, whole cycles only, in time with the
-   * screen's own frames.
-   * @param {{ms: number, hz: number}} cue `hz` 0: on all the time.
-   * @returns {Promise<{ms: number, changes: Array<[number, boolean]>}>} How long it really took and
-   *   when the map went on and off, in ms since the first frame was shown.
+   * Flash the map above the still first frame: whole cycles only, each beginning with the map on,
+   * in step with the animation frames.
+   * @param {{ms: number, hz: number}} cue With `hz` 0 the map is on all the time.
+   * @returns {Promise<{ms: number, changes: Array<[number, boolean]>}>} The actual duration, and
+   *   the times in ms at which the map was switched on and off, since the first frame was shown.
    */
   async flash({ ms, hz }) {
     const cycles = Math.floor((ms * hz) / 1000 + 1e-6);
@@ -135,7 +141,7 @@ export class Screen {
     for (let now = start; ; now = await nextFrame()) {
       this.#stop.throwIfAborted();
       const at = now - start;
-      // The frame of the screen that is nearest to the time, rather than the first one after it.
+      // Switch at the animation frame nearest to the nominal time, not at the first one after it.
       const ahead = Math.min(now - before, 20) / 2;
       before = now;
       if (at + ahead >= ms) {
@@ -148,17 +154,20 @@ export class Screen {
   }
 
   /**
-   * Play the loaded movie from its first frame to its end, and hide it in that moment if asked to.
-   * @param {{hide: boolean}} options
-   * @returns {Promise<{ms: number, startMs: number, ended: number}>} How long it took from its
-   *   start, and to its start; the moment of its end.
+   * Play the loaded movie to its end.
+   * @param {{hide: boolean}} options Whether to cover the movie at its end.
+   * @returns {Promise<{ms: number, startMs: number, ended: number}>} Duration of the movie, time
+   *   until it started, and the time of its end.
    */
   async play({ hide }) {
     const video = this.video;
     const watch = new AbortController();
     const signal = watch.signal;
-    let failed = (/** @type {any} */ error) => {};
-    let ended = (/** @type {number} */ at) => {};
+    /** @type {(error: any) => void} */
+    let failed;
+    /** @type {(at: number) => void} */
+    let ended;
+    /** @type {Promise<number>} */
     const end = new Promise((resolve, reject) => ([ended, failed] = [resolve, reject]));
     const on = (target, name, listener) => target.addEventListener(name, listener, { signal });
     on(this.#stop, "abort", () => failed(this.#stop.reason));
@@ -168,8 +177,8 @@ export class Screen {
       ended(performance.now());
     });
     // Browsers pause silent movies of hidden pages.
-    const goOn = () => !document.hidden && !video.ended && video.play().catch(() => {});
-    on(document, "visibilitychange", goOn);
+    const resume = () => !document.hidden && !video.ended && video.play().catch(() => {});
+    on(document, "visibilitychange", resume);
     const timer = this.#watchStall(failed);
     const start = performance.now();
     try {
@@ -189,6 +198,7 @@ export class Screen {
     }
   }
 
+  /** Call `failed` when the visible movie has not advanced for STALLED_MS. */
   #watchStall(failed) {
     let time = -1;
     let moved = performance.now();
@@ -200,7 +210,7 @@ export class Screen {
     }, 250);
   }
 
-  /** Give the decoder back: browsers allow only so many movies at a time. */
+  /** Release the video decoder, since browsers limit the number of loaded movies. */
   release() {
     this.video.onerror = null;
     this.video.removeAttribute("src");
@@ -208,8 +218,8 @@ export class Screen {
   }
 
   /**
-   * What was presented since `load`. Ask when the movie has ended a while ago: the last reports
-   * arrive after the last frame.
+   * Return what was presented since `load`. Call it some time after the end of the movie, because
+   * the last reports arrive after the last frame.
    * @returns {{shown: number, dropped: number|null, seen: Array<[number, number, number]>}}
    */
   record() {
@@ -222,5 +232,5 @@ export class Screen {
   }
 }
 
-/** @param {number} ms @returns {number} Tenths of a millisecond. */
+/** Round milliseconds to one decimal. @param {number} ms @returns {number} */
 export const round = (ms) => Math.round(ms * 10) / 10;

@@ -1,6 +1,7 @@
 /**
- * A session: from the state that the server tells, the next stretch of the experiment as a jsPsych
- * timeline; when it has ended, or the server has told of another state, the next one.
+ * A session. The state given by the server determines the next part of the experiment, which runs
+ * as a jsPsych timeline; when it has ended, or the server reports another state, the next part
+ * follows.
  * @module session
  */
 
@@ -24,45 +25,66 @@ const PAGES = {
   feedback: feedbackPage,
 };
 
-/** The stretch of the timeline that runs was left for another state. */
-class Left extends Error {}
+/** @typedef {import("./messages.js").SessionState} SessionState */
 
+/**
+ * The objects that exist before a session.
+ * @typedef {Object} Basis
+ * @property {import("./api.js").Api} api
+ * @property {import("./texts.js").Texts} texts
+ * @property {import("./messages.js").PublicStudy} study
+ * @property {import("./event_log.js").EventLog} log
+ * @property {import("./frame.js").Frame} frame
+ * @property {string} address The URL by which the participant came.
+ * @property {(language: string) => Promise<void>} [setLanguage] Changes the language.
+ * @property {(() => void)|null} [another] Starts the study for another person; null if it cannot.
+ */
+
+/** Raised when the running part of the timeline is left for another state. */
+class PartLeft extends Error {}
+
+/** Runs a session from its current state to its end. */
 export class Session {
-  #stretch = new AbortController();
+  /** Aborts the running part. */
+  #part = new AbortController();
   #closed = false;
+  /** The last refusal of an answer. @type {Refused|null} */
   #refused = null;
-  /** The question whether to stop, while it is asked. */
+  /** Closes the question whether to stop, while it is open. @type {AbortController|null} */
   #question = null;
   #withdraws = false;
-  /** The trial that runs, and how often the question was asked during it. */
+  /**
+   * The running trial, and how often the question was opened during it.
+   * @type {{phase: string|null, trial: number|null, asked: number}}
+   */
   #running = { phase: null, trial: null, asked: 0 };
-  /** How often the scene of a trial was begun to be seen, by phase and trial. */
+  /** How often the scene of a trial was shown, by phase and trial. @type {Map<string, number>} */
   #shown = new Map();
 
   /**
-   * @param {any} basis api, texts, study, log, frame (see frame.js), address; `speak` goes on in
-   *   another language; `another` begins anew for another person, null where that cannot be.
-   * @param {import("./answer_queue.js").AnswerQueue} queue Its refusals come to `refused`.
+   * @param {Basis} basis
+   * @param {import("./answer_queue.js").AnswerQueue} queue Reports its refusals to `refused`.
    */
   constructor(basis, queue) {
     this.basis = basis;
     this.queue = queue;
     this.media = new Media(basis.api, basis.study.preload);
+    /** @type {SessionState|null} */
     this.state = null;
   }
 
-  /** Everything that pages need. @returns {import("./pages.js").Context} */
+  /** The objects that pages use. @returns {import("./pages.js").Context} */
   get context() {
     return { ...this.basis, media: this.media, state: this.state };
   }
 
-  /** An answer was refused: go on from the state that the server told. */
+  /** Continue from the server's state after the refusal of an answer. @param {Refused} error */
   refused(error) {
     this.#refused = error;
     this.#leave();
   }
 
-  /** Another tab has taken over. */
+  /** End the session in this tab because another tab has taken over. */
   close() {
     this.#closed = true;
     this.#question?.abort();
@@ -70,7 +92,7 @@ export class Session {
     this.#leave();
   }
 
-  /** The participant asks to stop: what runs goes on below the question, and so does its clock. */
+  /** Ask whether to stop; the trial and its response time continue behind the question. */
   async askToStop() {
     if (this.#question) return;
     this.#question = new AbortController();
@@ -87,14 +109,14 @@ export class Session {
     this.#leave();
   }
 
-  /** Go through the session to its end. @param {any} state `State` @returns {Promise<void>} */
+  /** Run the session to its end. @param {SessionState} state @returns {Promise<void>} */
   async run(state) {
     this.state = state;
     while (!this.#closed) {
-      this.#stretch = new AbortController();
-      // The consent is read in any language, and then the session is in that one.
+      this.#part = new AbortController();
+      // The consent can be read in any language, which becomes the language of the session.
       const reading = this.state.stage === "consent" || this.#declined();
-      if (!reading) await this.basis.speak(this.state.language);
+      if (!reading) await this.basis.setLanguage(this.state.language);
       this.basis.frame.show(this.context);
       if (this.state.stage === "done" || this.state.stage === "withdrawn") return this.#end();
       try {
@@ -106,43 +128,51 @@ export class Session {
     }
   }
 
-  /** Was the consent declined, in this browser? The server keeps no language of who did. */
+  /**
+   * Return whether consent was declined in this browser; the server keeps no language in that case.
+   */
   #declined() {
     return this.state.stage === "withdrawn" && recall("declined") === this.state.reference;
   }
 
-  /** Show the page that is shown anew, in another language. */
+  /** Show the current page again, in another language. */
   restart() {
     this.#leave();
   }
 
   #leave() {
-    this.#stretch.abort(new Left());
+    this.#part.abort(new PartLeft());
   }
 
+  /**
+   * Return the state from which to continue after an error; throw the error if it is fatal.
+   * @param {any} error
+   * @returns {Promise<SessionState>}
+   */
   async #stateAfter(error) {
     const { api, log } = this.basis;
     const refused = error instanceof Refused ? error : this.#refused;
     if (refused?.code === "unknown_token" || this.queue.waits(api.token)) {
       throw refused ?? error;
     }
-    if (!(error instanceof Refused) && !(error instanceof Left)) {
+    if (!(error instanceof Refused) && !(error instanceof PartLeft)) {
       log.add("error", { message: String(error) });
       throw error;
     }
-    // Answers that are still on their way come first: the state then counts them.
+    // Send waiting answers first, so that the state counts them.
     if (this.queue.length > 0) showPage(this.basis.frame.main, this.#waiting());
     await this.queue.empty();
     if (this.#withdraws) return this.#withdraw();
-    const told = this.#refused?.state ?? refused?.state;
+    const known = this.#refused?.state ?? refused?.state;
     this.#refused = null;
-    const ask = (path) => this.#patiently(api.get(path));
-    const state = this.queue.length === 0 && told ? told : await ask("/api/session");
-    // What was seen already is marked in the answer as after a reload.
+    const request = (path) => this.#patiently(api.get(path));
+    const state = this.queue.length === 0 && known ? known : await request("/api/session");
+    // A trial that was seen already is marked in its answer, as after a reload.
     const seen = this.#shown.has(`${state.stage} ${state.trial}`);
-    return seen ? ask("/api/session?load=true") : state;
+    return seen ? request("/api/session?load=true") : state;
   }
 
+  /** Withdraw from the study. @returns {Promise<SessionState>} */
   async #withdraw() {
     const { api, log } = this.basis;
     this.#withdraws = false;
@@ -155,48 +185,54 @@ export class Session {
     }
   }
 
+  /**
+   * Render the page shown while answers are being sent.
+   * @returns {(page: HTMLElement, done?: () => void) => void}
+   */
   #waiting() {
     const render = pages.waitingPage(this.context, () => this.queue.empty());
     return (page, done = () => {}) => render(page, done);
   }
 
+  /** Run the current stage. @returns {Promise<SessionState>} The state after it. */
   #stage() {
     const { stage } = this.state;
     if (stage === "familiarization" || stage === "test") return this.#phase(stage);
     return this.#page(stage, PAGES[stage](this.context));
   }
 
+  /** Run a page and store it. @returns {Promise<SessionState>} */
   async #page(page, render) {
-    const { signal } = this.#stretch;
-    let told = null;
+    const { signal } = this.#part;
+    let outcome = null;
     const store = async (data) => {
       if (page === "consent") data.language = this.basis.texts.language;
       if (data.agreed === false) keep("declined", this.state.reference);
       const post = this.basis.api.post("/api/page", { page, data }, { signal });
-      // Refusals are for `run`; the page has ended either way.
-      told = await post.catch((error) => ({ error }));
+      // Refusals are handled by `run`; the page has ended in any case.
+      outcome = await post.catch((error) => ({ error }));
     };
     const stored = pages.storedPage(this.context, render, store);
     await this.#timeline([{ type: PageTrial, render: stored }]);
-    if (told.error) throw told.error;
-    return told;
+    if (outcome.error) throw outcome.error;
+    return outcome;
   }
 
-  /** What is awaited, with a page in between where it takes long. */
+  /** Await a promise, with a page meanwhile if it takes long. */
   #patiently(awaited) {
     return patiently(this.basis.frame.main, pages.openingPage(this.context), awaited);
   }
 
-  /** All trials of a phase that are not answered yet, and then the state after them. */
+  /** Run the remaining trials of a phase. @returns {Promise<SessionState>} The state after them. */
   async #phase(phase) {
     const { api } = this.basis;
-    const { signal } = this.#stretch;
+    const { signal } = this.#part;
     const list = async () => (await api.get(`/api/trials/${phase}`, { signal })).trials;
     const trials = await this.#patiently(list());
     this.media.start(trials, this.state.trial, list);
-    const left = trials.filter((trial) => trial.trial >= this.state.trial);
+    const remaining = trials.filter((trial) => trial.trial >= this.state.trial);
     await this.#timeline([
-      ...left.flatMap((media) => this.#trial(phase, media)),
+      ...remaining.flatMap((media) => this.#trial(phase, media)),
       {
         timeline: [{ type: PageTrial, render: this.#waiting() }],
         conditional_function: () => this.queue.length > 0,
@@ -205,6 +241,7 @@ export class Session {
     return this.#patiently(api.get("/api/session", { signal }));
   }
 
+  /** Return the timeline of one trial. */
   #trial(phase, media) {
     const { trial } = media;
     return trialPieces(this.context, phase, media, {
@@ -219,16 +256,16 @@ export class Session {
     });
   }
 
-  /** Run a timeline; gives what its trials gave. */
+  /** Run a jsPsych timeline and return the data of its trials. */
   async #timeline(pieces) {
-    const { signal } = this.#stretch;
+    const { signal } = this.#part;
     signal.throwIfAborted();
     const main = this.basis.frame.main;
     main.replaceChildren();
     const jsPsych = window.initJsPsych({
       display_element: main,
       use_webaudio: false,
-      // jsPsych makes its place a stop of the Tab key, at which there is nothing to do.
+      // jsPsych makes its container reachable by the Tab key, where there is nothing to do.
       on_trial_start: () => (main.tabIndex = -1),
     });
     const abort = () => jsPsych.abortExperiment();
@@ -243,6 +280,7 @@ export class Session {
     return jsPsych.data.get().values();
   }
 
+  /** Show the result, or that the session was declined or withdrawn. */
   async #end() {
     this.#question?.abort();
     const { texts, study, api, frame, another } = this.basis;
@@ -262,7 +300,10 @@ export class Session {
   }
 }
 
-/** An `Answer` from the data of a prediction trial. */
+/**
+ * Return the message with the data of a prediction trial.
+ * @returns {any} An `Answer`.
+ */
 function answerOf(phase, trial, data) {
   const names = Object.keys(PredictionTrial.info.data);
   const measured = Object.fromEntries(names.map((name) => [name, data[name]]));

@@ -1,23 +1,27 @@
 /**
- * What the browser keeps for the participant: the token, unsent answers, the language.
- * Where the browser keeps nothing (private windows of some), memory takes its place.
+ * Persistent storage of token, unsent answers and language. If the browser does not allow storage
+ * (as some in private windows), values are kept in memory.
  * @module storage
  */
 
 const memory = new Map();
 
-/** @param {string} name @returns {any} null where there is nothing or what is there is broken. */
+/**
+ * Return a stored value, or null if there is none or it is invalid.
+ * @param {string} name
+ * @returns {any}
+ */
 export function recall(name) {
   try {
     const text = window.localStorage.getItem(`physion:${name}`);
     if (text !== null) return JSON.parse(text);
   } catch {
-    // Neither an unreadable value nor a forbidden storage may stop a session.
+    // An invalid value or forbidden storage must not stop a session.
   }
   return memory.get(name) ?? null;
 }
 
-/** Would it still be there after a reload? @param {string} name @returns {boolean} */
+/** Return whether a value would survive a reload. @param {string} name @returns {boolean} */
 export function outlivesPage(name) {
   try {
     const text = window.localStorage.getItem(`physion:${name}`);
@@ -27,13 +31,13 @@ export function outlivesPage(name) {
   }
 }
 
-/** @param {string} name @param {any} value null forgets it. */
+/** Store a value. @param {string} name @param {any} value Null deletes it. */
 export function keep(name, value) {
   memory.set(name, value);
   try {
     if (value === null) window.localStorage.removeItem(`physion:${name}`);
     else window.localStorage.setItem(`physion:${name}`, JSON.stringify(value));
   } catch {
-    // Full or forbidden: memory holds it for as long as the page is open.
+    // Storage is full or forbidden: the value stays in memory while the page is open.
   }
 }

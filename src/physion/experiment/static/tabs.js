@@ -1,10 +1,10 @@
 /**
- * One tab at a time: the tab that was opened last goes on, the one before it stops.
+ * One tab at a time: the tab opened last continues, earlier ones stop.
  * @module tabs
  */
 
 /**
- * Take the study over from other tabs of this browser.
+ * Take over the study from other tabs of this browser.
  * @param {() => void} onLost Called once when another tab takes it over.
  */
 export function takeOver(onLost) {

@@ -1,12 +1,13 @@
 /**
- * The words of the pages, from the study's texts in one language.
+ * Texts of the pages in one language, from the study's files.
  * @module texts
  */
 
+/** The texts of one language. */
 export class Texts {
   /**
    * @param {string} language
-   * @param {Object<string, string>} words By dotted key.
+   * @param {Object<string, string>} words Texts by dotted key.
    */
   constructor(language, words) {
     this.language = language;
@@ -14,9 +15,9 @@ export class Texts {
   }
 
   /**
-   * The text of a key, with its {placeholders} filled in. The result is text, never markup.
+   * Return the text of a key with its {placeholders} filled in, as plain text.
    * @param {string} key
-   * @param {Object<string, string|number>} [values]
+   * @param {Record<string, any>} [values] Strings and numbers by placeholder.
    * @returns {string}
    */
   t(key, values = {}) {
@@ -30,27 +31,32 @@ export class Texts {
     );
   }
 
-  /** @param {string} key @returns {boolean} */
+  /** Return whether there is a text for a key. @param {string} key @returns {boolean} */
   has(key) {
     return key in this.words;
   }
 }
 
 /**
- * The language to begin with: what was asked for, else what the browser prefers, else the first.
- * @param {string[]} offered
- * @param {(string|null)[]} wanted In order of preference.
+ * Choose the first language: a wanted one, else one that the browser prefers, else the first.
+ * @param {string[]} offered Languages of the study.
+ * @param {(string|null)[]} wanted Language tags in order of preference.
  * @returns {string}
  */
 export function chooseLanguage(offered, wanted) {
   for (const tag of [...wanted, ...(navigator.languages ?? [])]) {
-    const found = offeredLanguage(offered, tag);
-    if (found) return found;
+    const language = offeredLanguage(offered, tag);
+    if (language) return language;
   }
   return offered[0];
 }
 
-/** The one that a tag means: `de-AT` means `de`. @returns {string|undefined} */
+/**
+ * Return the offered language that matches a tag: `de-AT` matches `de`.
+ * @param {string[]} offered
+ * @param {string|null} tag
+ * @returns {string|undefined}
+ */
 export function offeredLanguage(offered, tag) {
   const short = (tag ?? "").toLowerCase().split("-")[0];
   return offered.find((language) => language === tag || language === short);

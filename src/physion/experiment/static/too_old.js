@@ -1,2 +1,2 @@
-/* Run only by browsers that know no modules. */
+/* Run only by browsers without support for modules. */
 document.getElementById("too-old").hidden = false;

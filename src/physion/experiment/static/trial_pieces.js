@@ -1,6 +1,6 @@
 /**
- * One trial as pieces of a jsPsych timeline: the window is large enough, its media are loaded, the
- * prediction, and in practice the feedback.
+ * The jsPsych timeline of one trial: check the window size, wait for the media, show the prediction
+ * trial and, in practice, the feedback.
  * @module trial_pieces
  */
 
@@ -14,21 +14,29 @@ import { PredictionTrial } from "./prediction_trial.js";
 const TRIAL_WORDS = ["prompt", "yes", "no", "trouble", "retry"];
 const FEEDBACK_WORDS = ["waiting", "correct", "incorrect", "contact", "no_contact", "next"];
 
+/** @typedef {import("./messages.js").TrialMedia} TrialMedia */
 /**
- * @param {any} context See pages.js; with the frame besides.
- * @param {"familiarization"|"test"} phase
- * @param {any} media `TrialMedia`
+ * An answer and the promise of its acknowledgement.
+ * @typedef {{answer: any, stored: Promise<any>}} Given
+ */
+
+/**
+ * Return the timeline of one trial.
+ * @param {import("./pages.js").Context} context
+ * @param {import("./messages.js").Phase} phase
+ * @param {TrialMedia} media
  * @param {Object} session
- * @param {Map<string, number>} session.shown How often each scene was begun to be seen.
- * @param {() => void} session.started
- * @param {(data: any) => {answer: any, stored: Promise<any>}} session.answered
+ * @param {Map<string, number>} session.shown How often each scene was shown.
+ * @param {() => void} session.started Called when the trial starts.
+ * @param {(data: any) => Given} session.answered Called with the data of the trial.
  * @returns {Array<Object>}
  */
 export function trialPieces(context, phase, media, session) {
+  /** @type {Given|null} */
   let given = null;
   const prediction = predictionOf(context, phase, media, session);
   const answered = (data) => {
-    if (data.response) given = session.answered(data); // else it was left before
+    if (data.response) given = session.answered(data); // without a response the trial was left
   };
   return [
     ...beforeTrial(context, media.trial),
@@ -37,7 +45,7 @@ export function trialPieces(context, phase, media, session) {
   ];
 }
 
-/** Pages that are shown where the window is too small, or the media are not there yet. */
+/** Return the pages shown if the window is too small or the media are not loaded yet. */
 function beforeTrial(context, number) {
   const { study, log, media } = context;
   const fits = () => windowFits(study);
@@ -59,10 +67,11 @@ function beforeTrial(context, number) {
   ];
 }
 
+/** Return the prediction trial. */
 function predictionOf({ study, texts, frame, log, state, ...context }, phase, media, session) {
   const number = media.trial;
-  const place = `${phase} ${number}`;
-  const seen = () => session.shown.get(place) ?? 0;
+  const key = `${phase} ${number}`;
+  const seen = () => session.shown.get(key) ?? 0;
   return {
     type: PredictionTrial,
     media,
@@ -73,7 +82,7 @@ function predictionOf({ study, texts, frame, log, state, ...context }, phase, me
     choices: state.buttons.split("-"),
     words: words(texts, "trial", TRIAL_WORDS),
     before: seen,
-    shown: () => session.shown.set(place, seen() + 1),
+    shown: () => session.shown.set(key, seen() + 1),
     log: (kind, data) => log.add(kind, data),
     on_start: () => {
       session.started();
@@ -83,7 +92,12 @@ function predictionOf({ study, texts, frame, log, state, ...context }, phase, me
   };
 }
 
-/** What was right, once the answer is stored. @param {() => any} given Answer and its storing. */
+/**
+ * Return the feedback trial, which waits until the answer is stored.
+ * @param {import("./pages.js").Context} context
+ * @param {TrialMedia} media
+ * @param {() => Given} given
+ */
 function feedbackOf({ api, texts, log }, media, given) {
   return {
     type: FeedbackTrial,
@@ -99,7 +113,7 @@ function feedbackOf({ api, texts, log }, media, given) {
   };
 }
 
-/** The whole movie; the same answer sent again gives a new address where this one is refused. */
+/** Fetch the full movie; if its URL is refused, send the same answer again to get a new one. */
 async function fullMovie(api, path, answer) {
   try {
     return await api.blob(path);
@@ -110,7 +124,7 @@ async function fullMovie(api, path, answer) {
   }
 }
 
-/** Words of a table of the texts by their names there. */
+/** Return texts of a table by name. */
 function words(texts, table, names) {
   return Object.fromEntries(names.map((name) => [name, texts.t(`${table}.${name}`)]));
 }

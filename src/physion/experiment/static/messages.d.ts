@@ -1,0 +1,159 @@
+// Types of the messages of physion/experiment/protocol/messages.py, for the type check alone.
+
+export type Phase = "familiarization" | "test";
+export type Stage =
+  | "consent"
+  | "instructions"
+  | "familiarization"
+  | "ready"
+  | "test"
+  | "demographics"
+  | "feedback"
+  | "done"
+  | "withdrawn";
+
+export interface Device {
+  user_agent: string;
+  refresh_hz: number | null;
+  screen_width: number | null;
+  screen_height: number | null;
+  pixel_ratio: number | null;
+  touch: boolean | null;
+}
+
+/** Fields with a default may be left out. */
+export interface Enter {
+  source?: string;
+  id?: string;
+  visit?: string;
+  recruiter?: Record<string, string>;
+  scenario?: string;
+  language?: string;
+  pass?: string;
+  device?: Device;
+}
+
+export interface SessionState {
+  stage: Stage;
+  trial: number | null;
+  trials: Record<Phase, number>;
+  scenario: string;
+  language: string;
+  kind: "person" | "simulated" | "preview";
+  buttons: "yes-no" | "no-yes";
+  reference: string;
+}
+
+export interface Entered {
+  token: string;
+  state: SessionState;
+}
+
+export interface TrialMedia {
+  trial: number;
+  movie: string;
+  map: string;
+  frames: number;
+  rate: number;
+  width: number;
+  height: number;
+  fixation_ms: number;
+}
+
+export interface TrialList {
+  phase: Phase;
+  trials: TrialMedia[];
+}
+
+export interface Answer {
+  key: string;
+  phase: Phase;
+  trial: number;
+  response: "yes" | "no";
+  rt_ms: number;
+  input: "mouse" | "touch" | "keyboard";
+  fixation_ms: number | null;
+  cue_ms: number | null;
+  frames_shown: number | null;
+  frames_dropped: number | null;
+  movie_ms: number | null;
+  visibility_changes: number | null;
+  window_width: number | null;
+  window_height: number | null;
+  details: Record<string, any>;
+}
+
+export interface Feedback {
+  contact: boolean;
+  correct: boolean;
+  movie: string;
+  frames: number;
+}
+
+export interface AnswerStored {
+  duplicate: boolean;
+  feedback: Feedback | null;
+  state: SessionState;
+}
+
+export interface Event {
+  kind: string;
+  at_ms: number;
+  data: Record<string, boolean | number | string | null>;
+}
+
+export interface Events {
+  key: string | null;
+  events: Event[];
+}
+
+export interface Completion {
+  code: string | null;
+  url: string | null;
+  post: Record<string, string> | null;
+}
+
+export interface Result {
+  correct: number;
+  trials: number;
+  accuracy: number;
+  percentile: number | null;
+  completion: Completion;
+}
+
+export interface Recruiter {
+  source: string;
+  id: string;
+  others: string[];
+  preview: Record<string, string>;
+}
+
+export interface PublicStudy {
+  title: string;
+  contact: string;
+  languages: string[];
+  consent_version: string;
+  scenarios: string[];
+  id_needed: boolean;
+  min_width: number;
+  min_height: number;
+  cue_ms: number;
+  flash_hz: number;
+  preload: number;
+  example: Record<string, TrialMedia>;
+  recruiters: Recruiter[];
+}
+
+export interface Refusal {
+  error: string;
+  message: string;
+  state: SessionState | null;
+}
+
+declare global {
+  interface Window {
+    /** Globals of vendor/jspsych.min.js. */
+    jsPsychModule: any;
+    initJsPsych: (options: object) => any;
+  }
+}
