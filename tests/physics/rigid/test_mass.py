@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from physion.numerics.rotations import axis_angle_quaternion
-from physion.physics.rigid.mass import hull_mass, merge_masses
-from physion.scenes.shapes.primitives import ball_mesh
+from physion.physics.rigid.engine import RigidEngine
+from physion.physics.rigid.mass import body_mass, hull_mass, merge_masses
+from physion.physics.rigid.model import center_of_mass
+from physion.scenes.scene import Body, Camera, Joint, Push, Roles, Scene
+from physion.scenes.shapes.meshes import solid_properties
+from physion.scenes.shapes.primitives import ball_mesh, shape
 
 
 def box(
@@ -56,6 +61,41 @@ def test_a_ball_of_ever_more_facets_tends_to_two_fifths_of_m_r_squared() -> None
     assert errors[0].max() < 0.06
     assert np.allclose(errors[0] / errors[1], 4, rtol=0.1)
     assert np.allclose(errors[1] / errors[2], 4, rtol=0.1)
+
+
+def test_a_bowl_has_its_centre_in_the_wall_pieces_not_in_the_drawn_solid() -> None:
+    bowl = Body("a", "bowl", (0, 0, 0), (1.0, 1.0, 1.0))
+    drawn = solid_properties(shape("bowl").mesh)[1]
+    engine = body_mass(bowl).center
+    assert engine[:2].tolist() == pytest.approx([0, 0], abs=1e-9)
+    assert abs(engine[2] - drawn[2]) > 1e-4
+
+
+@pytest.mark.parametrize("name", ["bowl", "pipe"])
+def test_a_push_without_a_point_acts_at_the_centre_of_mass(name: str) -> None:
+    """The same impulse at `center_of_mass` moves the body in the same way, without spin."""
+    rotation = tuple(axis_angle_quaternion([1, 2, 3], 0.7).tolist())
+    body = Body("a", name, (0.3, -0.2, 5.0), (0.4, 0.5, 0.6), rotation, mass=2.0)
+    zone = Body("zone", "cube", (9.0, 9.0, 0.0), (1, 1, 0.01), kinematic=True)
+    roles = Roles("a", "zone")
+    scene = Scene("t", "t", (body, zone), roles, Camera((0, -3, 1)), pushes=(Push("a", (3, 1, 2)),))
+    point = tuple(center_of_mass(scene, "a").tolist())
+    paths = [
+        RigidEngine().simulate(replace(scene, pushes=(push,)), frames=3)
+        for push in (scene.pushes[0], replace(scene.pushes[0], point=point))
+    ]
+    assert np.allclose(paths[0].velocities, paths[1].velocities, atol=1e-6)
+    assert np.abs(paths[1].angular_velocities).max() < 1e-6
+
+
+def test_a_joined_body_is_pushed_at_the_common_centre() -> None:
+    base = Body("a", "cube", (0, 0, 0), (1, 1, 1), mass=3.0)
+    top = Body("b", "cube", (0, 0, 1.0), (1, 1, 1), mass=1.0)
+    zone = Body("zone", "cube", (9.0, 9.0, 0.0), (1, 1, 0.01), kinematic=True)
+    bodies, joints = (base, top, zone), (Joint("a", "b"),)
+    scene = Scene("t", "t", bodies, Roles("a", "zone"), Camera((0, -3, 1)), joints=joints)
+    assert center_of_mass(scene, "b").tolist() == pytest.approx([0, 0, 0.75])
+    assert center_of_mass(scene, "zone").tolist() == pytest.approx([9, 9, 0.005])
 
 
 def test_nothing_is_a_point() -> None:

@@ -168,7 +168,7 @@ class RigidRun:
         actor = self.model.actor_of
         rotated = rotate_vectors(self.bodies.q[actor], self.model.pivot)
         height = (self.bodies.x[actor] + rotated)[:, 2]
-        counted = np.unique(actor[height >= self.scene.ending.floor])
+        counted = actor[height >= self.scene.ending.floor]
         return bool(np.append(asleep, True)[counted].all())
 
     def trajectory(self, engine: str) -> Trajectory:

@@ -1,11 +1,16 @@
-"""Mass, centre and inertia of bodies made of convex pieces of one density."""
+"""Mass, centre of mass and inertia of bodies, from their convex pieces of uniform density.
+
+This is the one place where mass properties of bodies are computed: the engine, stored states and
+exported push points all use them. Like Unity, it takes them from the pieces that collide, not from
+the drawn solid.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull
 
 from physion.numerics.linear_algebra import (
@@ -18,30 +23,39 @@ from physion.numerics.linear_algebra import (
     outer,
 )
 from physion.numerics.rotations import rotation_matrices
+from physion.physics.rigid.hulls import collision_hulls
+from physion.scenes.scene import Body
 
-Array = NDArray[np.float64]
+F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class MassProperties:
-    """``mass`` in kg, ``center`` (3,) in metres, ``inertia`` (3, 3) about the centre in kg m²."""
+    """Mass properties of something rigid.
+
+    ``mass`` in kg, ``center`` (3,) of mass in metres, ``inertia`` (3, 3) about it in kg m².
+    """
 
     mass: float
-    center: Array
-    inertia: Array
+    center: F64
+    inertia: F64
 
-    def moved(self, position: Array, turn: Array) -> MassProperties:
-        """The same thing turned by the quaternion ``turn``, then put at ``position``."""
-        rotation = rotation_matrices(turn)
+    def moved(self, position: ArrayLike, rotation: ArrayLike) -> MassProperties:
+        """Return those of the same thing rotated by a quaternion (4,), then put at ``position``."""
+        matrix = rotation_matrices(rotation)
         return MassProperties(
             self.mass,
-            np.asarray(position) + apply(rotation, self.center),
-            multiply(multiply(rotation, self.inertia), rotation.T),
+            np.asarray(position) + apply(matrix, self.center),
+            multiply(multiply(matrix, self.inertia), matrix.T),
         )
 
 
 def merge_masses(parts: list[MassProperties]) -> MassProperties:
-    """Several things held together as one: masses add, inertias by the parallel axis theorem."""
+    """Return the mass properties of several things held together.
+
+    Inertias add by the parallel axis theorem: I = sum of I_i + m_i (|r_i|² 1 - r_i r_iᵀ), with r_i
+    from the common centre to that of part i.
+    """
     mass = sum(part.mass for part in parts)
     center = sum((part.mass * part.center for part in parts), np.zeros(3)) / mass
     inertia = np.zeros((3, 3))
@@ -51,10 +65,18 @@ def merge_masses(parts: list[MassProperties]) -> MassProperties:
     return MassProperties(mass, center, inertia)
 
 
-def hull_mass(hulls: list[Array], mass: float) -> MassProperties:
-    """Convex pieces with corners ``hulls`` and one density, ``mass`` kg together.
+def body_mass(body: Body) -> MassProperties:
+    """Return the mass properties of a body in its own frame, scaled; its pose is not applied."""
+    hulls = collision_hulls(body.shape, body.scale)
+    return hull_mass([hull.corners for hull in hulls], body.mass)
 
-    Where pieces overlap, matter counts twice, as it does in Unity. Without pieces: a point.
+
+def hull_mass(hulls: list[F64], mass: float) -> MassProperties:
+    """Return the mass properties of convex pieces of one density, ``mass`` kg together.
+
+    ``hulls`` are their corners, each (K, 3) in metres. Where pieces overlap, matter counts twice,
+    as in Unity. Without pieces, the mass has its centre at the origin and a radius of gyration of
+    1 m about every axis.
     """
     if not hulls:
         return MassProperties(mass, np.zeros(3), np.eye(3) * mass)
@@ -63,8 +85,11 @@ def hull_mass(hulls: list[Array], mass: float) -> MassProperties:
     return MassProperties(mass, whole.center, whole.inertia * factor)
 
 
-def _solid(corners: Array) -> MassProperties:
-    """A convex hull of density 1, as a sum of tetrahedra from a point inside."""
+def _solid(corners: F64) -> MassProperties:
+    """Return the mass properties of a convex hull of density 1, with corners (K, 3).
+
+    Sums over the tetrahedra from a point inside to every triangle of the surface.
+    """
     inside = ordered_mean(corners, axis=0)
     hull = ConvexHull(corners)
     triangles = corners[hull.simplices] - inside

@@ -19,7 +19,7 @@ from physion.numerics.linear_algebra import inverse, unit
 from physion.numerics.rotations import conjugate, multiply_quaternions, rotate_vectors
 from physion.physics.rigid.hulls import collision_hulls
 from physion.physics.rigid.manifold import HullFaces
-from physion.physics.rigid.mass import MassProperties, hull_mass, merge_masses
+from physion.physics.rigid.mass import MassProperties, body_mass, hull_mass, merge_masses
 from physion.physics.rigid.settings import RigidSettings
 from physion.scenes.scene import Scene
 
@@ -86,6 +86,18 @@ def group_bodies(scene: Scene) -> list[list[int]]:
     for i in moving:
         groups.setdefault(leader[i], []).append(i)
     return list(groups.values())
+
+
+def center_of_mass(scene: Scene, name: str) -> F64:
+    """Return the centre of mass (3,) of what a body moves with, at the start; metres, world.
+
+    This is where an impulse without a point acts: on all bodies that are joined to it together.
+    """
+    index = scene.index(name)
+    group = next((group for group in group_bodies(scene) if index in group), [index])
+    bodies = [scene.bodies[i] for i in group]
+    parts = [body_mass(body).moved(body.position, unit(body.rotation)) for body in bodies]
+    return merge_masses(parts).center
 
 
 def build_model(scene: Scene, settings: RigidSettings) -> RigidModel:

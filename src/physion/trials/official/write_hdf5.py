@@ -1,12 +1,12 @@
-"""One trial as an official HDF5 file: what never changes, every frame, and our own extras.
+"""Export of one trial as an official HDF5 file: static group, frames, and additional fields.
 
 Names, shapes and encodings are those of docs/official-system.md, section 4, with gzip alone.
-Static arrays all have one entry for each object (the originals leave scenery out of masses and
-frictions, so that they do not line up). Ids and counts are int64, measures float32. What the
-official layout has no place for stands apart, under ``physion/``: the scene, labels and metadata as
-JSON, the record for ``metadata.json``, the flow in pixels (``flow``: frames, rows, columns, (right,
-down), half precision), and the bytes of the trial file without passes (``trial_file``), of which an
-import makes the same trial again.
+All static arrays have one entry per object (in the originals, masses and frictions lack scenery
+and so do not align with the other arrays). Ids and counts are int64, measures float32. What the
+official layout does not provide is stored under ``physion/``: the scene, labels and metadata as
+JSON, the record for ``metadata.json``, the flow in pixels (``flow``: (frames, rows, columns, 2),
+right and down, half precision), and the bytes of the trial file without passes (``trial_file``),
+from which an import restores the same trial.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ import h5py
 import numpy as np
 
 import physion
+from physion.physics.rigid.model import center_of_mass
 from physion.scenes.scene import Cloth
-from physion.scenes.shapes.primitives import shape
-from physion.trials.official.axes import rotation_matrices, swap_axes, to_official_euler
+from physion.trials.official.axes import swap_axes, to_official_euler
 from physion.trials.official.names import RAMPS, ROOMS, TRIAL_FILE, segmentation_colors, split_name
 from physion.trials.official.write_flex import flex_groups
 from physion.trials.official.write_frames import PASSES, FrameWriter, put
@@ -30,20 +30,20 @@ from physion.trials.official.write_objects import OfficialObjects, model_name
 from physion.trials.trial_file import Trial, TrialWriter
 
 NONE = -1
-"""Id of an object that a trial does not have."""
+"""Id that stands for an object that a trial does not have."""
 _UNSET_CONTACT = (0.5, 0.5, 0.0)
 _SEED_BITS = 2**63
 
 
 def official_file(trial: Trial) -> tuple[bytes, dict[str, Any]]:
-    """The bytes of the trial's official file in its own look, and its record for metadata.json.
+    """Return the bytes of a trial's official file and its record for metadata.json.
 
-    Pictures are rendered again from the state, frame by frame; the file is built in memory, some
-    0.3 MB a frame at 256 x 256 pixels.
+    Pictures are rendered from the state in the trial's own look. The file is built in memory and
+    has about 0.3 MB per frame at 256 x 256 pixels.
     """
     meta, scene = trial.metadata, trial.shown()
     objects = OfficialObjects(scene, trial.trajectory)
-    # In memory, as a full disk would crash the HDF5 library.
+    # In memory, because a full disk would crash the HDF5 library.
     file = h5py.File("official", "w", driver="core", backing_store=False, block_size=2**22)
     with file:
         static = _static(trial, objects)
@@ -73,14 +73,14 @@ def official_file(trial: Trial) -> tuple[bytes, dict[str, Any]]:
         for name, text in texts.items():
             put(extra, name, np.array(text.encode()))
         whole = TrialWriter(meta, trial.scene, trial.trajectory, trial.labels, trial.ids).finish()
-        # It is packed already.
+        # Without compression: its arrays are compressed already.
         file.create_dataset(TRIAL_FILE, data=np.frombuffer(whole, np.uint8))
         file.flush()
         return bytes(file.id.get_file_image()), record
 
 
 def _static(trial: Trial, objects: OfficialObjects) -> dict[str, Any]:
-    """Scalars and small lists of the static group, common ones first, by name."""
+    """Return scalars and lists of the static group by name."""
     scene, meta = objects.scene, trial.metadata
     ids, roles = objects.ids, scene.roles
     config, number = split_name(meta.trial)
@@ -114,7 +114,7 @@ def _static(trial: Trial, objects: OfficialObjects) -> dict[str, Any]:
 
 
 def _trial_seed(trial: Trial) -> int:
-    """The low 63 bits of the trial's seed; an imported trial keeps the seed it came with."""
+    """Return the low 63 bits of the trial's seed, or the seed that an imported scene had."""
     if trial.metadata.seed is not None:
         return int(trial.metadata.seed, 16) % _SEED_BITS
     seed = trial.scene.parameters.get("trial_seed")
@@ -122,7 +122,7 @@ def _trial_seed(trial: Trial) -> int:
 
 
 def _push(objects: OfficialObjects) -> dict[str, Any]:
-    """The first push: impulse, point, frame; zeros where nothing is pushed."""
+    """Return impulse, point and frame of the first push; zeros without push."""
     scene = objects.scene
     if not scene.pushes:
         return {
@@ -132,10 +132,8 @@ def _push(objects: OfficialObjects) -> dict[str, Any]:
     push = scene.pushes[0]
     point = push.point
     if point is None:
-        body = scene.bodies[scene.index(push.body)]
-        center = np.asarray(shape(body.shape).mass_properties().center) * np.asarray(body.scale)
-        turned = rotation_matrices(body.rotation) @ center + np.asarray(body.position)
-        point = (float(turned[0]), float(turned[1]), float(turned[2]))
+        center = center_of_mass(scene, push.body)
+        point = (float(center[0]), float(center[1]), float(center[2]))
     return {
         "push_force": swap_axes(push.impulse).astype(np.float32),
         "push_position": swap_axes(point).astype(np.float32),
@@ -144,7 +142,7 @@ def _push(objects: OfficialObjects) -> dict[str, Any]:
 
 
 def _of_scenario(objects: OfficialObjects) -> dict[str, Any]:
-    """What the files of one scenario have and those of others have not."""
+    """Return the fields that only the files of the trial's scenario have."""
     scene, ids = objects.scene, objects.ids
     agent = objects.things[ids[scene.roles.agent] - 1]
     middle = [body.shape for body in objects.middle]
@@ -169,7 +167,7 @@ def _of_scenario(objects: OfficialObjects) -> dict[str, Any]:
 
 
 def _of_stack(objects: OfficialObjects) -> dict[str, Any]:
-    """Base, attachment and links of Contain and Link; ``attachent_type`` is spelt as there."""
+    """Return the fields of Contain and Link; ``attachent_type`` has the official spelling."""
     scene, ids = objects.scene, objects.ids
     parts = {}
     for part in ("base", "attachment"):
@@ -178,7 +176,7 @@ def _of_stack(objects: OfficialObjects) -> dict[str, Any]:
     base, attachment = parts["base"], parts["attachment"]
     taken = {part.name for part in (base, attachment) if part is not None}
     taken |= {scene.roles.patient, scene.roles.probe or ""}
-    # From the lowest to the highest, as they are stacked.
+    # From the lowest to the highest.
     links = sorted(
         (body for body in scene.bodies if body.name not in taken and not body.scenery),
         key=lambda body: body.position[2],
@@ -227,7 +225,7 @@ def _write_static(group: h5py.Group, static: dict[str, Any], objects: OfficialOb
         "initial_position": swap_axes([t.position for t in things]).astype(np.float32),
         "initial_rotation": to_official_euler([t.rotation for t in things]).astype(np.float32),
         "scale": scale,
-        **{f"scale_{axis}": scale[:, place] for place, axis in enumerate("xyz")},
+        **{f"scale_{axis}": scale[:, index] for index, axis in enumerate("xyz")},
         "color": np.array([thing.look.color for thing in things], np.float32),
         "mass": np.array([thing.mass for thing in things], np.float32),
         "static_friction": contacts[:, 0].astype(np.float32),
@@ -241,14 +239,14 @@ def _write_static(group: h5py.Group, static: dict[str, Any], objects: OfficialOb
         for key, value in values.items():
             put(actors, key, value)
     mesh = group.create_group("mesh")
-    for place in range(count):
-        vertices, faces = objects.mesh(place)
-        put(mesh, f"vertices_{place}", vertices.astype(np.float32))
-        put(mesh, f"faces_{place}", faces.astype(np.int32))
+    for index in range(count):
+        vertices, faces = objects.mesh(index)
+        put(mesh, f"vertices_{index}", vertices.astype(np.float32))
+        put(mesh, f"faces_{index}", faces.astype(np.int32))
 
 
 def _plain(value: Any) -> Any:
-    """A value as HDF5 has it: texts as bytes, lists of texts as arrays of bytes."""
+    """Return a value for HDF5: texts as bytes, lists of texts as arrays of bytes."""
     if isinstance(value, str):
         return np.array(value.encode() or b"\0")
     if isinstance(value, list):
