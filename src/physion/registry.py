@@ -32,7 +32,7 @@ class Registry(Generic[T]):
         self._plugins_read = False
 
     def register(self, name: str) -> Callable[[T], T]:
-        """Return a decorator that registers a value as ``name``; `PhysionError` if the name is used."""
+        """Return a decorator that registers a value as ``name``, which must be unused."""
 
         def add(value: T) -> T:
             if name in self._values and self._values[name] is not value:
@@ -43,7 +43,10 @@ class Registry(Generic[T]):
         return add
 
     def get(self, name: str) -> T:
-        """Return the value called ``name``, importing it if needed; `UnknownNameError` if unknown."""
+        """Return the value called ``name``, importing it if it is lazy.
+
+        Raises `UnknownNameError`, with the closest names, if there is none.
+        """
         if name not in self._values:
             self._read_plugins()
             if name not in self._lazy:

@@ -1,4 +1,4 @@
-"""Executors: every task ends in one outcome, whatever its worker does."""
+"""Executors: every task ends in exactly one outcome, even if its worker dies."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""State outputs: what a trial file says about motion, contacts, looks, camera and roles."""
+"""State of a trial: motion, contacts, meshes, camera, masks and tables."""
 
 from __future__ import annotations
 

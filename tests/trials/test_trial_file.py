@@ -1,4 +1,4 @@
-"""Trial files: everything comes back, and nothing that is broken or hostile gets in."""
+"""Trial files: round trips, and errors for damaged and hostile files."""
 
 from __future__ import annotations
 

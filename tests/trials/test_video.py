@@ -1,4 +1,4 @@
-"""Movies: written whole, read exactly, refused when damaged."""
+"""Movies: encoding, exact reading, errors for damaged files."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_missing_and_foreign_files_are_refused(tmp_path: Path) -> None:
 
 
 def test_asking_past_the_end_is_an_error_not_a_shorter_clip(movie: Path) -> None:
-    with pytest.raises(BadInputError, match="gave 60"):
+    with pytest.raises(BadInputError, match="it has 60"):
         read_frames(movie, count=61)
 
 

@@ -92,7 +92,7 @@ class LocalExecutor:
                 worker.stop()
 
     def _wait(self, workers: list[_Worker]) -> list[_Worker]:
-        """Wait until a worker sends a message, dies, or exceeds the timeout; return such workers."""
+        """Wait until workers send a message, die or exceed the timeout; return these workers."""
         things: list[Any] = [worker.pipe for worker in workers]
         things += [worker.process.sentinel for worker in workers]
         pause = None

@@ -20,7 +20,7 @@ class Track(Protocol):
 
 
 class Progress(Protocol):
-    """Callback for functions whose loops are nested: it is told the state after each step.
+    """Callback for functions with nested loops, called after each step.
 
     `physion.cli.output.Stages` is the one of the command line.
     """

@@ -1,4 +1,4 @@
-"""A folder of trials, opened for reading."""
+"""Reading of a dataset: a folder of trials with its index."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from physion.trials.video import read_frames
 
 
 class ObservedDataset:
-    """What may be seen by who predicts: the observed movies of a dataset and nothing else.
+    """Access to the observed movies of a dataset and to nothing else.
 
-    The future is not hidden here but absent: only files that end with the observed part are
-    opened.
+    For code that must not see the outcome of a trial: only files that end with the observed part
+    are opened, so the future cannot be read by mistake.
     """
 
     def __init__(self, folder: Path, index: pd.DataFrame) -> None:
@@ -45,7 +45,7 @@ class ObservedDataset:
         stride: int = 1,
         size: tuple[int, int] | None = None,
     ) -> NDArray[np.uint8]:
-        """Observed frames 0, ``stride``, ... (T, H, W, 3) in sRGB; see `video.read_frames`."""
+        """Return observed frames 0, ``stride``, ... (T, H, W, 3), sRGB; see `video.read_frames`."""
         if trial not in self._movies:
             raise UnknownNameError("trial", trial, self._movies)
         path = self._movies[trial]
@@ -58,23 +58,22 @@ class ObservedDataset:
 
 
 class Dataset:
-    """A folder of trials with its index.
+    """Dataset in a folder.
 
-    Opening it reads the index alone (`BadInputError` where there is none); trials and movies are
-    read when asked for. Methods that take a trial's name raise `UnknownNameError` for a wrong
-    one.
+    The index is read at once (`BadInputError` if there is none), trials and movies on request.
+    Methods that take the name of a trial raise `UnknownNameError` for an unknown one.
     """
 
     def __init__(self, folder: Path | str) -> None:
         self.folder = Path(folder)
         self.index: pd.DataFrame = read_index(self.folder)
-        """One row a trial; columns as in `physion.trials.index.COLUMNS`."""
+        """Index: one row per trial; columns as in `physion.trials.columns.INDEX_COLUMNS`."""
 
     def __len__(self) -> int:
         return len(self.index)
 
     def trials(self, split: str | None = None, scenario: str | None = None) -> list[str]:
-        """Names of the trials of a split and a scenario, or of all, in the order of the index."""
+        """Return the names of the trials of a split and a scenario, by default of all, in order."""
         table = self.index
         if split is not None:
             table = table[table["split"] == split]
@@ -84,18 +83,18 @@ class Dataset:
 
     @cached_property
     def observed(self) -> ObservedDataset:
-        """The same trials as seen by who must predict."""
+        """Access to the observed movies alone, for code that must not see the outcome."""
         return ObservedDataset(self.folder, self.index)
 
     def paths(self, trial: str) -> TrialPaths:
-        """Where the files of a trial are."""
+        """Return the paths of the files of a trial."""
         if trial not in self._rows:
             raise UnknownNameError("trial", trial, self._rows)
         row = self.index.iloc[self._rows[trial]]
         return TrialPaths(self.folder, row["split"], row["scenario"], trial)
 
     def trial(self, trial: str) -> Trial:
-        """The trial file, opened and checked."""
+        """Open and check a trial file."""
         return Trial.open(self.paths(trial).trial_file)
 
     def frames(
@@ -107,7 +106,7 @@ class Dataset:
         stride: int = 1,
         size: tuple[int, int] | None = None,
     ) -> NDArray[np.uint8]:
-        """Frames of the full movie (T, H, W, 3) in sRGB; see `video.read_frames`."""
+        """Return frames of the full movie (T, H, W, 3) in sRGB; see `video.read_frames`."""
         path = self.paths(trial).movie
         return read_frames(path, start=start, count=count, stride=stride, size=size)
 
@@ -119,7 +118,7 @@ class Dataset:
         stride: int = 1,
         size: tuple[int, int] | None = None,
     ) -> NDArray[np.uint8]:
-        """Frames of the observed movie alone (T, H, W, 3) in sRGB."""
+        """Return frames of the observed movie (T, H, W, 3) in sRGB; see `video.read_frames`."""
         return self.observed.frames(trial, count=count, stride=stride, size=size)
 
     @cached_property

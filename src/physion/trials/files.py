@@ -1,4 +1,4 @@
-"""The files of a trial as bytes, and how they reach the disk."""
+"""Encoding of pictures as PNG, and writing of the files of a trial."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def encode_png(picture: NDArray[np.uint8], compress_level: int = 6) -> bytes:
 
 
 def write_files(paths: TrialPaths, files: Mapping[str, bytes]) -> None:
-    """Write the files of a trial, named as in `TrialPaths.all`; the trial file last of all."""
+    """Write the files of a trial, by names as in `TrialPaths.all`, the trial file last."""
     paths.trial_file.parent.mkdir(parents=True, exist_ok=True)
     for name, path in paths.all(free=True).items():
         if name in files:

@@ -1,4 +1,4 @@
-"""The index of a dataset: one row a trial, made from the files that are there."""
+"""Index of a dataset, a table with one row per trial: building, reading and writing."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ COLUMNS = {name: column.dtype for name, column in INDEX_COLUMNS.items()}
 
 
 def index_row(paths: TrialPaths) -> dict[str, Any]:
-    """The row of one trial, from its files; `BadInputError` where one is missing or broken."""
+    """Return the index row of one trial; `BadInputError` if a file is missing or damaged."""
     row: dict[str, Any] = dict.fromkeys(COLUMNS)
     trial = Trial.open(paths.trial_file)
     meta, labels, scene = trial.metadata, trial.labels, trial.scene
@@ -54,9 +54,9 @@ def index_row(paths: TrialPaths) -> dict[str, Any]:
 
 
 def _elements(scene: Scene, imported: bool) -> dict[str, int | None]:
-    """How many things take part besides the patient, and how much scenery of each kind there is.
+    """Count the objects that take part, without the patient, and the scenery of each kind.
 
-    Which scenery stands before and which behind is known of sampled scenes alone.
+    The kind of scenery (distractor or occluder) is known for sampled scenes only.
     """
     part = [b for b in scene.bodies if not b.scenery and b.name != scene.roles.patient]
     counts: dict[str, int | None] = {"elements": len(part) + len(scene.cloths)}
@@ -69,17 +69,31 @@ def _elements(scene: Scene, imported: bool) -> dict[str, int | None]:
 def build_index(
     folder: Path, known: pd.DataFrame | None = None
 ) -> tuple[pd.DataFrame, dict[str, str]]:
-    """The index of all trials under ``folder``, and what is wrong with the others, by name.
+    """Return the index of all readable trials under ``folder``, and the problems of the others.
 
-    ``known`` is an older index: its rows are taken over where all their files still have the size
-    that they say, so that a large dataset need not be read again for one more trial.
+    Parameters
+    ----------
+    folder
+        Folder of the dataset.
+    known
+        Older index. A row is copied from it if all files of the trial still have the stored
+        sizes, so that adding a trial does not require reading the whole dataset again.
+
+    Returns
+    -------
+    table, problems
+        The index, and messages by name of the trial.
     """
     old = {} if known is None else {row["trial"]: row for row in known.to_dict("records")}
     rows: dict[str, dict[str, Any]] = {}
     problems = {}
     for paths in find_trials(folder):
         try:
-            if paths.trial in old and paths.trial not in rows and _holds(old[paths.trial], paths):
+            if (
+                paths.trial in old
+                and paths.trial not in rows
+                and _is_unchanged(old[paths.trial], paths)
+            ):
                 rows[paths.trial] = old[paths.trial]
                 continue
             if paths.trial in rows:
@@ -90,8 +104,8 @@ def build_index(
     return as_table(list(rows.values())), problems
 
 
-def _holds(row: dict[str, Any], paths: TrialPaths) -> bool:
-    """Whether the files that a row lists are those of ``paths`` and have their sizes."""
+def _is_unchanged(row: dict[str, Any], paths: TrialPaths) -> bool:
+    """Return whether a row describes the files of ``paths`` and they have the stored sizes."""
     if (row["split"], row["scenario"]) != (paths.split, paths.scenario):
         return False
     sizes = {name: row[f"{name}_bytes"] for name in FILES if not pd.isna(row[name])}
@@ -103,32 +117,32 @@ def _holds(row: dict[str, Any], paths: TrialPaths) -> bool:
 
 
 def as_table(rows: list[dict[str, Any]]) -> pd.DataFrame:
-    """Rows as a table with the columns and types of `COLUMNS`, sorted by split and trial."""
+    """Return rows as a table with the columns and types of `COLUMNS`, sorted by split and trial."""
     table = pd.DataFrame(rows, columns=list(COLUMNS)).astype(COLUMNS)
     return table.sort_values(["split", "scenario", "trial"], ignore_index=True)
 
 
 def write_index(folder: Path, table: pd.DataFrame) -> Path:
-    """Write the index of ``folder``, atomically; the same table gives the same bytes."""
+    """Write the index of ``folder`` atomically; equal tables give equal bytes."""
     path = folder / INDEX
     write_atomic(path, index_bytes(table))
     return path
 
 
 def index_bytes(table: pd.DataFrame) -> bytes:
-    """The bytes of the file of an index."""
+    """Return the bytes of the parquet file of an index."""
     buffer = io.BytesIO()
     table.to_parquet(buffer, engine="pyarrow", compression="zstd", index=False)
     return buffer.getvalue()
 
 
 def read_index(folder: Path) -> pd.DataFrame:
-    """The index of the dataset in ``folder``; `BadInputError` where there is no right one."""
+    """Read and check the index of the dataset in ``folder``; `BadInputError` if it is not valid."""
     path = folder / INDEX
     if not folder.is_dir():
         raise BadInputError(f"dataset folder {folder} does not exist")
     if not path.is_file():
-        raise BadInputError(f"{folder} has no {INDEX}: it is no dataset, or is not finished")
+        raise BadInputError(f"{folder} has no {INDEX}: it is not a dataset, or is not finished")
     try:
         table = pd.read_parquet(path, engine="pyarrow")
     except (pa.ArrowException, OSError, ValueError, KeyError, TypeError) as error:
@@ -141,5 +155,5 @@ def read_index(folder: Path) -> pd.DataFrame:
         if not safe.all():
             raise BadInputError(f"{path}: column {name!r} has {table[name][~safe].iloc[0]!r}")
     if table["trial"].duplicated().any():
-        raise BadInputError(f"{path}: column 'trial' has names twice")
+        raise BadInputError(f"{path}: column 'trial' has duplicate names")
     return table

@@ -1,4 +1,4 @@
-"""Which files a trial has, and where they lie in the folder of its dataset."""
+"""Names and paths of the files of a trial and of a dataset."""
 
 from __future__ import annotations
 
@@ -6,23 +6,23 @@ from dataclasses import dataclass
 from pathlib import Path
 
 INDEX = "index.parquet"
-"""One row a trial; written last."""
+"""File with one row per trial, written last."""
 SETTINGS = "dataset.json"
-"""How the trials of a folder were made; written first."""
+"""File with the settings that the trials of a folder are made with, written first."""
 CHOICES = "choices"
-"""Folder with the draws that were chosen for the trials of each split and scenario."""
+"""Folder with the sampled scenes chosen for the trials of each split and scenario."""
 FAILURES = "failures"
-"""Folder with one text file for each trial that could not be made."""
+"""Folder with one text file per trial that could not be made."""
 
 SAFE_NAME = r"[A-Za-z0-9][A-Za-z0-9._+-]{0,199}"
-"""Names become file names, so nothing in them may mean something to a file system."""
+"""Regular expression of names, which become file names: no separators, no special names."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrialPaths:
-    """The files of a trial, in ``folder/split/scenario``.
+    """Paths of the files of a trial, in ``folder/split/scenario``.
 
-    The trial file is written last, so that where it is, the others are.
+    The trial file is written last: if it exists, the others exist too.
     """
 
     folder: Path
@@ -32,38 +32,38 @@ class TrialPaths:
 
     @property
     def trial_file(self) -> Path:
-        """Scene, motion, labels (HDF5)."""
+        """File with scene, motion and labels (HDF5)."""
         return self._named(".h5")
 
     @property
     def movie(self) -> Path:
-        """All frames (MP4)."""
+        """Movie of all frames (MP4)."""
         return self._named("_img.mp4")
 
     @property
     def observed_movie(self) -> Path:
-        """The observed frames alone (MP4)."""
+        """Movie of the observed frames alone (MP4)."""
         return self._named("_observed.mp4")
 
     @property
     def map(self) -> Path:
-        """Agent red, patient yellow, the rest transparent (PNG)."""
+        """Map of the first frame: agent red, patient yellow, the rest transparent (PNG)."""
         return self._named("_map.png")
 
     @property
     def free_movie(self) -> Path:
-        """All frames in free colours (MP4), where the trial's own look is another."""
+        """Movie of all frames in free colours (MP4), if the trial's own look is another."""
         return self._named("_free_img.mp4")
 
     @property
     def free_observed_movie(self) -> Path:
-        """The observed frames alone in free colours (MP4)."""
+        """Movie of the observed frames alone in free colours (MP4)."""
         return self._named("_free_observed.mp4")
 
     def all(self, movies: bool = True, free: bool = False) -> dict[str, Path]:
-        """The files by the name of their columns in the index, the trial file last.
+        """Return the paths by column of the index, the trial file last.
 
-        Without ``movies`` the trial file alone; with ``free`` also the movies in free colours.
+        ``movies``: include movies and map. ``free``: include also the movies in free colours.
         """
         files = {}
         if movies:
@@ -78,7 +78,7 @@ class TrialPaths:
         return {**files, "trial_file": self.trial_file}
 
     def complete(self, movies: bool = True, free: bool = False) -> bool:
-        """All of them are there."""
+        """Return whether all these files exist."""
         return all(path.is_file() for path in self.all(movies, free).values())
 
     def _named(self, ending: str) -> Path:
@@ -86,7 +86,7 @@ class TrialPaths:
 
 
 def find_trials(folder: Path) -> list[TrialPaths]:
-    """Every trial file under ``folder``, in the order of their names."""
+    """Return the paths of every trial that has a trial file under ``folder``, sorted by name."""
     files = sorted(path.relative_to(folder).parts for path in folder.glob("*/*/*.h5"))
     return [
         TrialPaths(folder, split, scenario, name.removesuffix(".h5"))

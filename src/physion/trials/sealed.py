@@ -1,4 +1,4 @@
-"""Small JSON files that know when one of their bytes was changed."""
+"""JSON files that contain a SHA-256 of their content, so that any change is detected."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ _SEAL = "sha256"
 
 
 def write_sealed(path: Path, values: Mapping[str, Any]) -> None:
-    """Write ``values`` with a SHA-256 of themselves, whole or not at all; same values, same bytes.
+    """Write ``values`` and their SHA-256 atomically; equal values give equal bytes.
 
-    ``values`` has no key ``sha256`` of its own.
+    ``values`` must not have a key ``sha256``.
     """
     write_atomic(path, _text(values).encode())
 
 
 def read_sealed(path: Path) -> dict[str, Any]:
-    """Read what `write_sealed` wrote; `BadInputError` where the file was changed since."""
+    """Read a file of `write_sealed`; `BadInputError` if it was changed since it was written."""
     try:
         text = path.read_text(encoding="utf-8")
         values = json.loads(text)
@@ -33,7 +33,7 @@ def read_sealed(path: Path) -> dict[str, Any]:
         raise BadInputError(f"{path} is damaged: field 'sha256' is missing")
     del values[_SEAL]
     if _text(values) != text:
-        raise BadInputError(f"{path} was changed: its content does not fit its field 'sha256'")
+        raise BadInputError(f"{path} was changed: its content does not match its field 'sha256'")
     return values
 
 

@@ -1,9 +1,12 @@
-"""What the paper gives out as the state of a trial, each by one function of the `Trial`.
+"""State of a trial: the physical quantities that the original study offers for every stimulus.
 
-Metres, kilograms, seconds and radians; z up, right-handed axes, quaternions (w, x, y, z). F frames,
-N things in the order of `Scene.names` (rigid bodies, then cloths), B rigid bodies. Frame f shows
-the time f * `FRAME_TIME`. Everything here is worked out from the trial file alone, the future
-included: nothing of it may reach who predicts.
+Every function takes an open `Trial` and computes one quantity from the trial file alone. Units are
+metres, kilograms, seconds and radians; axes are right-handed with z up; quaternions are
+(w, x, y, z). In shapes, F counts frames, N all objects in the order of `Scene.names` (rigid bodies,
+then cloths), and B rigid bodies. Frame f shows the time f * `FRAME_TIME`.
+
+The results cover the whole trial, its outcome included: they must not be given to models or
+participants that predict. docs/trial-files.md has examples.
 """
 
 from __future__ import annotations
@@ -35,17 +38,17 @@ Matrix = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 FLOOR = "floor"
-"""What contacts call the environment."""
+"""Name of the environment in contacts."""
 
 
-class Poses(NamedTuple):
-    """``positions`` (F, B, 3) of the pivots and ``rotations`` (F, B, 4), unit quaternions."""
+class BodyPoses(NamedTuple):
+    """Poses of rigid bodies: ``positions`` (F, B, 3) of pivots, ``rotations`` (F, B, 4)."""
 
     positions: Floats
     rotations: Floats
 
 
-class Velocities(NamedTuple):
+class BodyVelocities(NamedTuple):
     """``linear`` (F, B, 3) of centres of mass, m/s; ``angular`` (F, B, 3), world axes, rad/s."""
 
     linear: Floats
@@ -54,10 +57,18 @@ class Velocities(NamedTuple):
 
 @dataclass(frozen=True)
 class PairContacts:
-    """Touches of two things, one row for each frame with a touch, at the deepest point.
+    """Contacts of two objects: one row per frame in which they touch, at the deepest point.
 
-    ``frame`` (C,); ``point`` (C, 3) metres, world; ``normal`` (C, 3) unit, from the first thing to
-    the second; ``impulse`` (C,) newton seconds along the normal during the frame.
+    Parameters
+    ----------
+    frame
+        (C,) frame numbers.
+    point
+        (C, 3) in metres, world coordinates.
+    normal
+        (C, 3) unit vectors from the first object to the second.
+    impulse
+        (C,) in newton seconds along the normal, during the frame.
     """
 
     frame: NDArray[np.int32]
@@ -68,12 +79,18 @@ class PairContacts:
 
 @dataclass(frozen=True)
 class ThingMesh:
-    """The drawn surface of a body or cloth.
+    """Rendered surface of a body or cloth.
 
-    ``vertices`` (V, 3) in the shape's frame at unit scale, metres; ``scaled`` (V, 3) the same
-    stretched by the body's scale, before its pose; ``faces`` (T, 3) indices of vertices,
-    counter-clockwise as seen from outside. A cloth's vertices are those of its undeformed sheet
-    about its centre, scaled or not; `world_vertices` has them as they move.
+    Parameters
+    ----------
+    vertices
+        (V, 3) in metres, in the frame of the shape at unit scale. For a cloth: the undeformed
+        sheet about its centre.
+    scaled
+        (V, 3): vertices multiplied by the body's scale, before the pose; for a cloth the same as
+        ``vertices``. `world_vertices` returns the vertices as they move.
+    faces
+        (T, 3) indices of vertices, counter-clockwise as seen from outside.
     """
 
     vertices: Matrix
@@ -82,36 +99,37 @@ class ThingMesh:
 
 
 def centroids(trial: Trial) -> Floats:
-    """Centres of mass (F, N, 3), metres, world: of cloths the mean of their vertices.
+    """Return the centres of mass (F, N, 3) in metres, world coordinates.
 
-    A body's is that of its collision pieces, as the engine moves it (`Velocities.linear`).
+    The centre of a body is that of its collision hulls, whose velocity is `BodyVelocities.linear`;
+    the centre of a cloth is the mean of its vertices.
     """
     scene, motion = trial.scene, trial.trajectory
     masses = [
         hull_mass([piece.corners for piece in collision_hulls(b.shape, b.scale)], b.mass)
         for b in scene.bodies
     ]
-    own = np.array([mass.center for mass in masses]).reshape(-1, 3)
-    arms = rotate_vectors(motion.rotations.astype(np.float64), own)
+    centers = np.array([mass.center for mass in masses]).reshape(-1, 3)
+    arms = rotate_vectors(motion.rotations.astype(np.float64), centers)
     rigid = motion.positions + arms
     sheets = [part.mean(axis=1, dtype=np.float64) for part in _cloth_parts(trial)]
     return np.concatenate([rigid, *(s[:, None] for s in sheets)], axis=1).astype(np.float32)
 
 
-def poses(trial: Trial) -> Poses:
-    """Where the rigid bodies are and how they are turned."""
-    return Poses(trial.trajectory.positions, trial.trajectory.rotations)
+def poses(trial: Trial) -> BodyPoses:
+    """Return positions and rotations of the rigid bodies."""
+    return BodyPoses(trial.trajectory.positions, trial.trajectory.rotations)
 
 
-def velocities(trial: Trial) -> Velocities:
-    """How fast the rigid bodies move and turn."""
-    return Velocities(trial.trajectory.velocities, trial.trajectory.angular_velocities)
+def velocities(trial: Trial) -> BodyVelocities:
+    """Return linear and angular velocities of the rigid bodies."""
+    return BodyVelocities(trial.trajectory.velocities, trial.trajectory.angular_velocities)
 
 
 def contacts_between(trial: Trial, a: str, b: str) -> PairContacts:
-    """Contact points and normals of the things called ``a`` and ``b``, normals from a to b.
+    """Return the contacts of the objects named ``a`` and ``b``, with normals from a to b.
 
-    `FLOOR` names the environment. `BadSceneError` for a name that the scene does not hold.
+    `FLOOR` names the environment. Raises `BadSceneError` for a name that is not in the scene.
     """
     first, second = (_number(trial.scene, name) for name in (a, b))
     contacts = trial.trajectory.contacts
@@ -126,9 +144,9 @@ def contacts_between(trial: Trial, a: str, b: str) -> PairContacts:
 
 
 def environment_contacts(trial: Trial) -> dict[str, PairContacts]:
-    """Touches of the floor by the name of the thing that touches it; normals point off the floor.
+    """Return the contacts with the floor by name of the object; normals point away from the floor.
 
-    Things that never touch it are left out.
+    Objects that never touch the floor are left out.
     """
     pairs = trial.trajectory.contacts.bodies
     touching = np.unique(pairs[(pairs == ENVIRONMENT).any(axis=1)].max(axis=1, initial=ENVIRONMENT))
@@ -137,10 +155,10 @@ def environment_contacts(trial: Trial) -> dict[str, PairContacts]:
 
 
 def contact_table(trial: Trial) -> pd.DataFrame:
-    """All contacts, one row each: frame, time (s), first, second, point_*, normal_*, impulse (N s).
+    """Return all contacts as a table with one row per contact.
 
-    ``first`` and ``second`` are names, the environment `FLOOR`; the normal goes from first to
-    second.
+    Columns: frame, time (s), first, second (names, `FLOOR` for the environment), point_x .. point_z
+    (m), normal_x .. normal_z (from first to second), impulse (N s).
     """
     contacts = trial.trajectory.contacts
     names = np.array([FLOOR, *trial.scene.names()], dtype=object)
@@ -157,7 +175,7 @@ def contact_table(trial: Trial) -> pd.DataFrame:
 
 
 def meshes(trial: Trial) -> dict[str, ThingMesh]:
-    """The drawn surface of every thing by name."""
+    """Return the rendered surface of every object by name."""
     found = {}
     for body in trial.scene.bodies:
         mesh = shape(body.shape).mesh
@@ -170,14 +188,14 @@ def meshes(trial: Trial) -> dict[str, ThingMesh]:
 
 
 def world_vertices(trial: Trial, frame: int) -> dict[str, Matrix]:
-    """Where the vertices (V, 3) of every thing's mesh are in one frame, metres, world."""
+    """Return the mesh vertices (V, 3) of every object in one frame, metres, world coordinates."""
     _check_frame(trial, frame)
     motion, shapes = trial.trajectory, meshes(trial)
     found = {}
     for i, body in enumerate(trial.scene.bodies):
-        turn = motion.rotations[frame, i].astype(np.float64)
+        rotation = motion.rotations[frame, i].astype(np.float64)
         found[body.name] = (
-            rotate_vectors(turn, shapes[body.name].scaled) + motion.positions[frame, i]
+            rotate_vectors(rotation, shapes[body.name].scaled) + motion.positions[frame, i]
         )
     for cloth, part in zip(trial.scene.cloths, _cloth_parts(trial), strict=True):
         found[cloth.name] = part[frame].astype(np.float64)
@@ -187,12 +205,12 @@ def world_vertices(trial: Trial, frame: int) -> dict[str, Matrix]:
 def particles(
     trial: Trial, spacing: float | None = None, frames: Sequence[int] | None = None
 ) -> Particles:
-    """Particles of all that moves or is touched; see `particles_over_time`."""
+    """Return all objects but scenery as particles over time; see `particles_over_time`."""
     return particles_over_time(trial.scene, trial.trajectory, spacing, frames)
 
 
 def object_table(trial: Trial, look: str | None = None) -> pd.DataFrame:
-    """One row a thing, by `Scene.names`: what it is, looks like, weighs, and how it rubs.
+    """Return the properties of all objects, one row each, in the order of `Scene.names`.
 
     Columns: name, kind (``body`` or ``cloth``), shape, scale_x, scale_y, scale_z (factors; a
     cloth's sides in metres), red, green, blue (sRGB, 0..1), texture, mass (kg), static_friction,
@@ -241,28 +259,30 @@ def _thing_row(thing: Body | Cloth, kind: str, shape_name: str, size: Vec3) -> d
 
 
 def camera_intrinsics(trial: Trial, width: int | None = None, height: int | None = None) -> Matrix:
-    """Camera coordinates to homogeneous pixels, (3, 3), as the renderer projects.
+    """Return the matrix (3, 3) from camera coordinates to homogeneous pixel coordinates.
 
-    ``[u w, v w, w] = K [x, y, z]`` with camera axes x right, y down, z forward (as OpenCV's), u to
-    the right and v down from the picture's upper left corner, w the depth in metres; the centre of
-    the first pixel is (0.5, 0.5). For pictures of the trial's own size, or of the given one.
+    ``[u w, v w, w] = K [x, y, z]`` with camera axes x right, y down, z forward, as in OpenCV. u
+    points right and v down from the upper left corner of the picture; the centre of the first pixel
+    is (0.5, 0.5); w is the depth in metres. ``width`` and ``height`` are the size of the picture in
+    pixels, by default the trial's own.
     """
     meta = trial.metadata
     return intrinsics(trial.scene.camera, width or meta.width, height or meta.height)
 
 
 def camera_extrinsics(trial: Trial) -> Matrix:
-    """World to camera coordinates, (4, 4), for column vectors (x, y, z, 1); the same in all frames.
+    """Return the matrix (4, 4) from world to camera coordinates, for columns (x, y, z, 1).
 
-    Camera axes are x right, y down, z forward. The inverse is the camera's pose in the world.
+    Camera axes are x right, y down, z forward. The inverse is the camera's pose in the world. The
+    camera does not move.
     """
     return view_matrix(trial.scene.camera)
 
 
 def role_masks(trial: Trial, frame: int) -> tuple[Mask, Mask]:
-    """Pixels (H, W) that show the agent, and those that show the patient, in one frame.
+    """Return the masks (H, W) of the pixels that show the agent and the patient in one frame.
 
-    One exact sample at each pixel's centre; what is hidden behind others is not in a mask.
+    Masks are sampled at pixel centres, without antialiasing; occluded parts are not included.
     """
     _check_frame(trial, frame)
     ids = trial.render(frame, ("ids",)).ids
@@ -272,9 +292,12 @@ def role_masks(trial: Trial, frame: int) -> tuple[Mask, Mask]:
 
 
 def pushes(trial: Trial) -> pd.DataFrame:
-    """One row a push: frame and time (s) just before whose step it acts, body, impulse_* (N s),
-    point_* (m, world; NaN for a push on the centre of mass), and speed (m/s) that it would give to
-    the free body."""
+    """Return the pushes as a table with one row per push.
+
+    Columns: frame and time (s) of the step before which it acts, body, impulse_x .. impulse_z
+    (N s), point_x .. point_z (m, world; NaN for the centre of mass), and speed (m/s) that it would
+    give to a free body.
+    """
     scene = trial.scene
     masses = {body.name: body.mass for body in scene.bodies}
     names = ["frame", "time", "body"]
@@ -294,12 +317,12 @@ def pushes(trial: Trial) -> pd.DataFrame:
 
 
 def scenario_parameters(trial: Trial) -> dict[str, Any]:
-    """What the sampler drew, or the importer found, for this trial: a copy, JSON values only."""
+    """Return a copy of the parameters that the sampler drew or the importer read; JSON values."""
     return copy.deepcopy(dict(trial.scene.parameters))
 
 
 def _cloth_parts(trial: Trial) -> list[Floats]:
-    """The vertices (F, V, 3) of each cloth."""
+    """Return the vertices (F, V, 3) of each cloth."""
     counts = [cloth.resolution**2 for cloth in trial.scene.cloths]
     ends = np.cumsum(counts)
     vertices = trial.trajectory.cloth_vertices

@@ -1,7 +1,8 @@
-"""One trial in one file: scene, motion, contacts, labels, first-frame ids, and passes if wanted.
+"""Writing and reading of trial files: scene, motion, contacts, labels, and image passes on request.
 
-The file is built in memory and written at once, because the HDF5 library crashes the process when
-the disk is full, and leaves files that look whole when it is killed.
+`physion.trials.schema` declares the arrays; docs/trial-files.md describes the format. A file is
+built in memory and then written atomically: written directly, a full disk would crash the HDF5
+library, and a killed process would leave incomplete files that look complete.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 LOOKS = ("redyellow", "free")
-"""Red agent and yellow patient, or the colours that the scene was drawn with."""
+"""Colours of a trial: agent red and patient yellow, or the sampled colours of the scene."""
 
 _STATE = ("positions", "rotations", "velocities", "angular_velocities")
 _CONTACTS = ("frame", "bodies", "point", "normal", "impulse")
@@ -52,21 +53,42 @@ _CONTACTS = ("frame", "bodies", "point", "normal", "impulse")
 
 @dataclass(frozen=True)
 class Metadata:
-    """Where a trial comes from and how it was made. Nothing of it depends on the clock.
+    """Origin and settings of a trial; nothing in it depends on the time of its making.
 
-    - ``trial``: its name, unique in the dataset. ``index``: its place in its split, from 0.
-    - ``preset``: name of the scenario's parameter set; None for an imported scene.
-    - ``seed``: entropy of its `SeedSequence` in hexadecimal; None for an imported scene.
-      ``attempt``: how many draws of this trial were refused before, None for an imported scene.
-    - ``scene_digest``: of all that decides the motion (`Scene.physics_digest`).
-    - ``look``: ``redyellow`` or ``free``. ``movies``: there are movies and a map, and
-      ``free_movies``: also movies in free colours.
-      ``width``, ``height``: pixels.
-    - ``frames``: of the whole trial; ``observed_frames``: those that may be seen by who predicts.
-    - ``frame_time``: seconds of physics in a frame. ``playback_rate``: movie frames a second.
-    - ``completed``: everything came to rest, rather than the time being over.
-    - ``engine``, ``renderer``, ``package``: names with versions. ``digest``: of the trajectory.
-    - ``recorded_contact``: the outcome that an imported scene came with, else None.
+    Parameters
+    ----------
+    trial, dataset, scenario, split
+        Names; that of the trial is unique in the dataset.
+    index
+        Position in the split of the scenario, from 0.
+    preset
+        Name of the scenario's parameter set; None for an imported scene.
+    seed
+        Entropy of the trial's `SeedSequence` in hexadecimal; None for an imported scene.
+    look
+        Colours of the trial's movies, one of `LOOKS`.
+    width, height
+        Size of the pictures in pixels.
+    frames, observed_frames
+        Number of frames of the whole trial, and of the part shown before the prediction.
+    frame_time
+        Seconds of physics per frame.
+    playback_rate
+        Frames per second of the movies.
+    completed
+        True if everything came to rest before the time limit.
+    engine, renderer, package
+        Names with versions.
+    digest
+        SHA-256 of the trajectory.
+    scene_digest
+        SHA-256 of everything that determines the motion (`Scene.physics_digest`).
+    attempt
+        Number of scenes sampled for this trial and rejected before; None for an imported scene.
+    movies, free_movies
+        Whether there are movies and a map, and further movies in free colours.
+    recorded_contact
+        Outcome that an imported scene was recorded with, else None.
     """
 
     trial: str
@@ -96,23 +118,30 @@ class Metadata:
 
     @property
     def physics_seconds(self) -> float:
-        """How long the trial lasts in the world."""
+        """Duration in the simulated world, in seconds."""
         return (self.frames - 1) * self.frame_time
 
     @property
     def playback_seconds(self) -> float:
-        """How long its movie lasts."""
+        """Duration of the movie, in seconds."""
         return self.frames / self.playback_rate
 
 
 class TrialWriter:
-    """Builds the bytes of a trial file; image passes come frame by frame, if there are any.
+    """Builder of the bytes of a trial file; equal input gives equal bytes.
 
-    ``scene`` comes in its free colours, whatever look the trial's movies have.
-
-    ``ids`` (H, W) says what each pixel of frame 0 shows: 0 the room, i + 1 the i-th of
-    `Scene.names`, as the renderer has it. ``passes`` are the names that every `add_frame` brings.
-    ``compatible`` packs with gzip, for readers without hdf5plugin. Same input, same bytes.
+    Parameters
+    ----------
+    metadata, trajectory, labels
+        Parts of the trial.
+    scene
+        The scene in its free colours, whatever the look of the trial's movies.
+    ids
+        Ids (H, W) of frame 0: 0 is the room, i + 1 the i-th object of `Scene.names`.
+    passes
+        Names of image passes that will be added by `add_frame` for every frame.
+    compatible
+        Compress with gzip instead of zstd, for readers without hdf5plugin.
     """
 
     def __init__(
@@ -130,7 +159,7 @@ class TrialWriter:
         if unknown:
             raise BadInputError(f"unknown passes {unknown}; known: {sorted(PASSES)}")
         self._buffer = io.BytesIO()
-        # Format 1.10 has checksums on its own structure, and is read by every HDF5 since 2016.
+        # Format 1.10 has checksums on its metadata; every HDF5 library since 2016 reads it.
         self._file = h5py.File(
             self._buffer, "w", libver=("v110", "v110"), userblock_size=SEAL_BYTES
         )
@@ -149,18 +178,18 @@ class TrialWriter:
 
     @property
     def passes(self) -> tuple[str, ...]:
-        """Names of the image passes that every `add_frame` brings."""
+        """Names of the image passes that `add_frame` expects."""
         return tuple(self._passes)
 
     def add_frame(self, images: Mapping[str, NDArray[Any]]) -> None:
-        """Append one frame of every pass; shapes as in `physion.trials.schema.PASSES`."""
+        """Append one frame of every pass, by name; shapes as in `physion.trials.schema.PASSES`."""
         for name, dataset in self._passes.items():
             image = np.asarray(images[name])
             if image.shape != dataset.shape[1:]:
                 raise BadInputError(
                     f"pass {name!r}, frame {self._added}: {image.shape}, not {dataset.shape[1:]}"
                 )
-            # A flow past 65504 pixels is as good as infinite, and becomes so.
+            # In half precision a flow of more than 65504 pixels becomes infinite.
             with np.errstate(over="ignore"):
                 dataset[self._added] = image.astype(dataset.dtype)
         self._added += 1
@@ -204,9 +233,9 @@ def write_trial(
     passes: Sequence[Mapping[str, NDArray[Any]]] = (),
     compatible: bool = False,
 ) -> None:
-    """Write a whole trial file to ``path``, atomically; arguments as `TrialWriter` takes them.
+    """Write a trial file to ``path`` atomically; parameters as for `TrialWriter`.
 
-    ``passes`` holds one mapping from pass name to image for each frame, or nothing.
+    ``passes`` has one mapping from pass name to image per frame, or is empty.
     """
     writer = TrialWriter(
         metadata,
@@ -223,10 +252,10 @@ def write_trial(
 
 
 class Trial:
-    """A trial file, opened for reading. `Trial.open` checks it; parts are read when asked for."""
+    """Reader of a trial file; `Trial.open` checks the file, and parts are read on first use."""
 
     def __init__(self, data: bytes, where: str) -> None:
-        """Open the bytes of a trial file; ``where`` names it in errors. See `Trial.open`."""
+        """Check the bytes of a trial file; ``where`` names the file in errors."""
         check_seal(data, where)
         self._where = where
         self._renderers: dict[tuple[int, int, str], Renderer] = {}
@@ -247,7 +276,7 @@ class Trial:
 
     @cached_property
     def metadata(self) -> Metadata:
-        """Where the trial comes from."""
+        """Origin and settings of the trial."""
         return self._read_json(Metadata, "metadata")
 
     @cached_property
@@ -257,7 +286,7 @@ class Trial:
 
     @cached_property
     def scene(self) -> Scene:
-        """What is in the trial, in its free colours."""
+        """The scene in its free colours."""
         try:
             return Scene.from_json(self._reader.text("scene"))
         except BadInputError as error:
@@ -268,12 +297,12 @@ class Trial:
         return read_dataclass(kind, parse_json(self._reader.text(name), where), where)
 
     def shown(self, look: str | None = None) -> Scene:
-        """The scene in the colours of a look: ``redyellow``, ``free``, or the trial's own."""
+        """Return the scene in the colours of ``look``, by default the trial's own."""
         return in_look(self.scene, self.metadata.look if look is None else look)
 
     @cached_property
     def trajectory(self) -> Trajectory:
-        """How it moved. `BadInputError` where it does not fit the scene."""
+        """Motion of the trial; `BadInputError` if it does not match the scene."""
         contacts = Contacts(**{name: self._reader.array(f"contacts/{name}") for name in _CONTACTS})
         arrays = {name: self._reader.array(f"trajectory/{name}") for name in _STATE}
         frames, bodies = arrays["positions"].shape[:2]
@@ -302,21 +331,21 @@ class Trial:
 
     @cached_property
     def ids(self) -> NDArray[np.int16]:
-        """What each pixel of frame 0 shows (H, W): 0 the room, i + 1 the i-th of `Scene.names`."""
+        """Ids (H, W) of frame 0: 0 is the room, i + 1 the i-th object of `Scene.names`."""
         return self._reader.array("first_frame/ids")
 
     @cached_property
     def shares(self) -> NDArray[np.float32]:
-        """Share of frame 0 that each thing of `Scene.names` covers: (N,), 0..1."""
+        """Fraction of the pixels of frame 0 that show each object of `Scene.names`: (N,), 0..1."""
         return self._reader.array("first_frame/shares")
 
     @cached_property
     def pass_names(self) -> tuple[str, ...]:
-        """Image passes that the file holds, often none."""
+        """Names of the image passes that the file stores, by default none."""
         return self._reader.passes()
 
     def passes(self, frame: int) -> dict[str, NDArray[Any]]:
-        """The stored image passes of one frame by name; `BadInputError` where there is no frame."""
+        """Return the stored image passes of one frame by name; `BadInputError` if it is absent."""
         if not 0 <= frame < self.metadata.frames:
             raise BadInputError(f"{self._where} has no frame {frame} of {self.metadata.frames}")
         return {name: self._reader.image(name, frame) for name in self.pass_names}
@@ -324,7 +353,7 @@ class Trial:
     def render(
         self, frame: int, passes: Sequence[str] = ("color",), look: str | None = None
     ) -> Frame:
-        """Any pass of any frame, rendered again from the stored state, stored or not.
+        """Render image passes of a frame from the stored state, whether they are stored or not.
 
         ``look`` is ``redyellow`` or ``free``, by default the trial's own.
         """
@@ -333,8 +362,8 @@ class Trial:
     def renderer(
         self, width: int | None = None, height: int | None = None, look: str | None = None
     ) -> Renderer:
-        """A renderer of the trial, by default in its own size and look; kept for the next call."""
-        # Compiled code, which readers of numbers do not need to wait for.
+        """Return a (cached) renderer of the trial, by default in the trial's own size and look."""
+        # Imported late: loading the compiled renderer takes time.
         from physion.rendering.renderer import Renderer
 
         meta = self.metadata
@@ -345,14 +374,14 @@ class Trial:
 
 
 def in_look(scene: Scene, look: str) -> Scene:
-    """The scene in the colours of a look; `BadInputError` for an unknown one."""
+    """Return ``scene`` in the colours of ``look``; `BadInputError` if it is not one of `LOOKS`."""
     if look not in LOOKS:
         raise BadInputError(f"unknown look {look!r}; known: {', '.join(LOOKS)}")
     return with_role_colors(scene) if look == "redyellow" else scene
 
 
 def _arrays(trajectory: Trajectory, ids: NDArray[Any], things: int) -> dict[str, NDArray[Any]]:
-    """The arrays of a trial by the path of their field."""
+    """Return the arrays of a trial by the path of their field."""
     if ids.ndim != 2 or not ids.size or ids.min() < 0 or ids.max() > things:
         raise BadInputError(f"ids of shape {ids.shape} are not pixels in 0..{things}")
     counts = np.bincount(ids.ravel(), minlength=things + 1)[1:]

@@ -1,7 +1,8 @@
-"""Movies of trials: H.264 in MP4, written and read without a temporary file.
+"""Writing and reading of movies: H.264 in MP4, in memory.
 
-Both movies of a trial are made here: the full one, and apart from it the observed one, which is
-encoded from its own frames alone, so that not even the encoder's look-ahead has seen the future.
+The full movie and the observed movie of a trial are encoded separately: the observed one from its
+own frames alone, so that the look-ahead of the encoder cannot carry over information of later
+frames.
 """
 
 from __future__ import annotations
@@ -20,31 +21,39 @@ from physion.errors import BadInputError
 from physion.scenes.scene import PLAYBACK_RATE
 
 CRF = 18
-"""x264's quality; below it yuv420p, not the codec, decides (reference: engines, section 6)."""
+"""Quality of x264; at lower values the chroma subsampling of yuv420p limits the quality."""
 GROUP = 15
-"""Frames from one key frame to the next, so that a seek decodes at most half a second."""
+"""Frames from one key frame to the next; a seek decodes at most half a second."""
 X264 = "cpu-independent=1"
-"""Without it one movie in a hundred came out a little different from the same frames."""
+"""Option of x264 without which the bytes of some movies depend on the processor."""
 _BT709 = 1
-"""Number of ITU-R BT.709 in the H.264 tables for matrix, primaries and transfer alike."""
+"""Code of ITU-R BT.709 in H.264, the same for matrix, primaries and transfer function."""
 _CONVERSION = int(
     Interpolation.AREA
     | Interpolation.FULL_CHR_H_INT
     | Interpolation.ACCURATE_RND
     | Interpolation.BITEXACT
 )
-"""How swscale scales pictures and converts their colours. Without exact rounding it darkens a flat
-grey by 2 of 255 when it scales; without ``BITEXACT`` its results depend on the processor."""
+"""Flags with which swscale scales pictures and converts colours. Without exact rounding, scaling
+darkens a uniform grey by 2 of 255; without ``BITEXACT``, results depend on the processor."""
 _INDEX_BYTES = (2048, 24)
-"""Room for the movie's index at its start: bytes for the header, and for each frame."""
+"""Bytes reserved for the index at the start of the file: for the header, and for each frame."""
 
 
 class MovieEncoder:
-    """Turns frames into the bytes of one MP4 file.
+    """Encoder of one MP4 file; equal frames give equal bytes.
 
-    ``width`` and ``height`` are pixels, both even. ``frames`` says how many will be added, so
-    that the index has its room before the pictures and a browser plays at once ("faststart").
-    The same frames give the same bytes: one thread, no clock.
+    Parameters
+    ----------
+    width, height
+        Size of the pictures in pixels, both even.
+    frames
+        Number of frames that will be added. It is needed in advance because the index is placed
+        before the pictures, so that a browser can play while it loads ("faststart").
+    rate
+        Frames per second.
+    crf
+        Quality of x264, lower is better.
     """
 
     def __init__(
@@ -57,8 +66,10 @@ class MovieEncoder:
         self._expected, self._added = frames, 0
         self._shape = (height, width, 3)
         self._buffer = io.BytesIO()
-        room = _INDEX_BYTES[0] + _INDEX_BYTES[1] * frames
-        self._container = av.open(self._buffer, "w", format="mp4", options={"moov_size": str(room)})
+        index_bytes = _INDEX_BYTES[0] + _INDEX_BYTES[1] * frames
+        self._container = av.open(
+            self._buffer, "w", format="mp4", options={"moov_size": str(index_bytes)}
+        )
         stream: Any = self._container.add_stream("libx264", rate=rate)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         stream.options = {
@@ -68,7 +79,7 @@ class MovieEncoder:
             "threads": "1",
             "x264-params": X264,
         }
-        # Without these tags players guess the matrix, and saturated red comes out orange.
+        # Without these tags players guess the matrix, which turns saturated red into orange.
         context = stream.codec_context
         context.colorspace = context.color_primaries = context.color_trc = _BT709
         context.color_range = int(ColorRange.MPEG)
@@ -103,7 +114,7 @@ class MovieEncoder:
 
 
 def encode_movie(frames: NDArray[np.uint8], *, rate: int = PLAYBACK_RATE, crf: int = CRF) -> bytes:
-    """The bytes of a movie of ``frames`` (F, height, width, 3) in sRGB at ``rate`` a second."""
+    """Return the bytes of a movie of ``frames`` (F, H, W, 3), sRGB, at ``rate`` per second."""
     encoder = MovieEncoder(frames.shape[2], frames.shape[1], len(frames), rate=rate, crf=crf)
     for frame in frames:
         encoder.add(frame)
@@ -118,11 +129,28 @@ def read_frames(
     stride: int = 1,
     size: tuple[int, int] | None = None,
 ) -> NDArray[np.uint8]:
-    """Frames ``start``, ``start + stride``, ... of a movie: (count, height, width, 3), sRGB.
+    """Read frames ``start``, ``start + stride``, ... of a movie.
 
-    ``count`` is how many frames to return, by default all to the end. ``size`` is (height,
-    width) in pixels to scale to, by averaging areas; by default that of the movie. A movie
-    that is missing, cut short, damaged, or shorter than asked raises `BadInputError`.
+    Parameters
+    ----------
+    path
+        Movie file.
+    start, stride
+        First frame, and distance between frames.
+    count
+        Number of frames to return; by default all to the end.
+    size
+        (height, width) in pixels to scale to by area averaging; by default the movie's own.
+
+    Returns
+    -------
+    frames
+        (count, height, width, 3) in sRGB, 0..255.
+
+    Raises
+    ------
+    BadInputError
+        If the movie is missing, damaged, cut short, or has fewer frames than requested.
     """
     if start < 0 or stride < 1 or (count is not None and count < 1):
         raise BadInputError(f"no frames at start {start}, stride {stride}, count {count}")
@@ -132,7 +160,7 @@ def read_frames(
         if index < start or (index - start) % stride:
             continue
         height, width = size or (picture.height, picture.width)
-        # Conversion costs three times the decoding, so it is done for kept frames alone.
+        # Conversion takes three times as long as decoding, so only the needed frames are converted.
         rgb = reformatter.reformat(
             picture,
             width=width,
@@ -147,16 +175,16 @@ def read_frames(
         if len(kept) == count:
             break
     if not kept or (count is not None and len(kept) < count):
-        asked = "all frames" if count is None else f"{count} frames"
+        wanted = "all frames" if count is None else f"{count} frames"
         raise BadInputError(
-            f"movie {path} has not the {asked} asked for from {start} in steps of {stride}: "
-            f"it gave {len(kept)}"
+            f"movie {path} does not have the {wanted} requested from {start} in steps of {stride}: "
+            f"it has {len(kept)}"
         )
     return np.stack(kept)
 
 
 def count_frames(path: Path) -> int:
-    """Frames that a movie's index promises, without decoding one."""
+    """Return the number of frames according to the movie's index, without decoding."""
     with _open(path) as container:
         return int(container.streams.video[0].frames)
 
@@ -168,7 +196,7 @@ def _open(path: Path) -> Any:
         container = av.open(str(path), metadata_errors="replace")
     except (av.FFmpegError, ValueError) as error:
         raise BadInputError(f"movie {path} cannot be read: {error}") from error
-    # A damaged header can leave a stream that names no codec.
+    # A stream whose header is damaged can lack a codec.
     if not container.streams.video or container.streams.video[0].codec_context is None:
         container.close()
         raise BadInputError(f"movie {path} holds no pictures")
@@ -176,11 +204,11 @@ def _open(path: Path) -> Any:
 
 
 def _decode(path: Path) -> Iterator[tuple[int, av.VideoFrame]]:
-    """Index and picture of every frame in order; `BadInputError` where the movie breaks off."""
+    """Yield index and picture of every frame in order; `BadInputError` at damage."""
     with _open(path) as container:
         stream = container.streams.video[0]
         stream.codec_context.thread_count = 1
-        promised, index = stream.frames, 0
+        expected, index = stream.frames, 0
         try:
             for picture in container.decode(stream):
                 if picture.is_corrupt:
@@ -189,5 +217,5 @@ def _decode(path: Path) -> Iterator[tuple[int, av.VideoFrame]]:
                 index += 1
         except av.FFmpegError as error:
             raise BadInputError(f"movie {path} is damaged at frame {index}: {error}") from error
-        if index != promised:
-            raise BadInputError(f"movie {path} is cut short: {index} of {promised} frames")
+        if index != expected:
+            raise BadInputError(f"movie {path} is cut short: {index} of {expected} frames")

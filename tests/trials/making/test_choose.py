@@ -1,4 +1,4 @@
-"""Which draws become trials: balanced, unseen, robust, visible, and never twice."""
+"""Choice of scenes: balance, no early contact, robustness, visibility, no duplicates."""
 
 from __future__ import annotations
 
@@ -152,7 +152,7 @@ def test_a_damaged_record_of_choices_is_named(tmp_path: Path) -> None:
     path = tmp_path / "c.json"
     for text in ("{", "[1]", '{"0": {"presets": 1}}', '{"a": {}}'):
         path.write_text(text)
-        with pytest.raises(BadInputError, match=r"c\.json is no record of choices"):
+        with pytest.raises(BadInputError, match=r"c\.json is not a record of chosen scenes"):
             ChoiceRecord(path)
     record = ChoiceRecord(tmp_path / "d.json")
     record.by_index = {0: ChosenScene("default", 3, "a" * 64, 0.5)}
@@ -176,7 +176,7 @@ def test_a_preset_that_cannot_be_placed_is_given_up(monkeypatch: pytest.MonkeyPa
         raise BadSceneError("ball could not be placed in 100 tries: it meets the wall (100)")
 
     monkeypatch.setattr(choosing, "sample_scene", refuse)
-    with pytest.raises(PhysionError, match=r"none of 20 draws .*it meets the wall \(100\): 20"):
+    with pytest.raises(PhysionError, match=r"none of 20 scenes .*it meets the wall \(100\): 20"):
         choose(Slot(slots("testing", 1)[0], QUICK))
 
 
@@ -184,7 +184,7 @@ def test_a_draw_that_comes_out_differently_is_refused(tmp_path: Path) -> None:
     task = slots("testing", 1)[0]
     choice = choose(Slot(task, QUICK))
     wrong = dataclasses.replace(choice, attempt=choice.attempt + 1)
-    with pytest.raises(PhysionError, match="comes out differently now"):
+    with pytest.raises(PhysionError, match="sampling gives another scene"):
         scene_of(wrong.fill(task))
 
 
@@ -205,7 +205,9 @@ def test_no_draw_says_why() -> None:
     slot = Slot(slots("testing", 1)[0], dataclasses.replace(QUICK, min_visible=0.99))
     original, choosing.MAX_TRIES = choosing.MAX_TRIES, 4
     try:
-        with pytest.raises(PhysionError, match=r"none of 4 draws of default can be taken \("):
+        with pytest.raises(
+            PhysionError, match=r"none of 4 scenes sampled from default is accepted \("
+        ):
             choose(slot)
     finally:
         choosing.MAX_TRIES = original

@@ -1,4 +1,4 @@
-"""Making many trials: whatever is killed or broken on the way, the folder stays right."""
+"""Generation of datasets: the folder stays consistent when runs are killed or trials fail."""
 
 from __future__ import annotations
 
@@ -328,7 +328,7 @@ def test_other_settings_and_foreign_folders_are_refused(finished: Path, tmp_path
     with pytest.raises(BadInputError, match="other settings"):
         run(finished, scenes_named("a"), settings=GenerateSettings(width=64))
     (tmp_path / "thesis.tex").write_text("precious")
-    with pytest.raises(BadInputError, match=r"holds 'thesis\.tex'"):
+    with pytest.raises(BadInputError, match=r"contains 'thesis\.tex'"):
         run(tmp_path, scenes_named("a"))
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
@@ -382,7 +382,7 @@ def test_missing_and_broken_indexes_are_refused(finished: Path, tmp_path: Path) 
     for message, wrong in (
         ("lacks the columns", table.drop(columns="digest")),
         ("column 'trial' has", table.assign(trial="../../etc/passwd")),
-        ("names twice", table.assign(trial="a")),
+        ("duplicate names", table.assign(trial="a")),
     ):
         wrong.to_parquet(tmp_path / "index.parquet")
         with pytest.raises(BadInputError, match=message):

@@ -1,4 +1,4 @@
-"""Real trials: drawn, simulated, labelled, rendered, written, and read back."""
+"""Complete trials: sampled, simulated, labelled, rendered, written, and read back."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The same seed gives the same bytes on other processors, libraries' code paths and threads."""
+"""Equal seeds give equal bytes on other processors, code paths of libraries and threads."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Verification finds whatever was changed."""
+"""Verification finds every change of a dataset."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_simulating_again_finds_another_motion(folder: Path, tmp_path: Path) -> 
     paths = Dataset(folder).paths("a")
     paths.trial_file.write_bytes(parts._replace(metadata=lie).pack())
     assert any(
-        "does not fit its digest" in fault for fault in verify_dataset(folder, again=0).faults
+        "does not match its digest" in fault for fault in verify_dataset(folder, again=0).faults
     )
 
 
@@ -154,9 +154,9 @@ def test_strangers_and_trials_of_other_splits_are_named(sampled: Path, tmp_path:
     index["scene_digest"] = "0" * 64
     write_index(folder, index)
     faults = "\n".join(verify_dataset(folder, again=0).faults)
-    assert "stray_img.mp4 belongs to no trial" in faults
+    assert "stray_img.mp4 is not a file of a trial" in faults
     assert "its physics belongs to training" in faults
-    assert "the balance of its split wants the other" in faults
+    assert "the balance of its split requires the opposite" in faults
     assert "nothing is left to predict" in faults
     assert "the same physics as" in faults
 

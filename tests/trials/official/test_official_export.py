@@ -1,4 +1,4 @@
-"""Our trials in the official layout, read by a small reader in the style of official ones."""
+"""Export to the official layouts, read by a small reader written like the official ones."""
 
 from __future__ import annotations
 
@@ -423,7 +423,7 @@ def test_choices_and_refusals(dataset: Path, tmp_path: Path) -> None:
         export_official(dataset, tmp_path / "out", split="training")
     with pytest.raises(BadInputError, match="outside"):
         export_official(dataset, dataset / "out")
-    with pytest.raises(BadInputError, match="it is no dataset"):
+    with pytest.raises(BadInputError, match="it is not a dataset"):
         export_official(tmp_path, tmp_path / "out")
 
 

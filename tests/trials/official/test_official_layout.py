@@ -1,4 +1,4 @@
-"""Official names and packings of pictures."""
+"""Official names, and encodings of pictures."""
 
 from __future__ import annotations
 

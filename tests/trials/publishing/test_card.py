@@ -1,4 +1,4 @@
-"""The card of a dataset says what the index says, and its metadata keeps the rules of Croissant."""
+"""Dataset cards: statements agree with the index, metadata follow the rules of Croissant."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def test_counts_and_rates_are_those_of_the_index(dataset: Path, tmp_path: Path) 
     assert "| testing | drop | 2 | 1.000 | 0 | 60 | 0.875 | redyellow |" in lines
     assert "6 simulated physical scenes, 6 of them with movies" in text
     assert "- Agent and patient touch in 0.250 of the 4 training trials." in lines
-    assert "5 scenes were drawn at random" in text and "1 scene was imported" in text
+    assert "5 scenes were sampled at random" in text and "1 scene was imported" in text
     assert "In 1 of 6 trials something still moved" in text
     assert "0.875 of cases, measured on 2 of 6 trials" in text
     assert "min_visible = 0.0005, robust = 0.5, observed_contact = False" in text
@@ -347,7 +347,7 @@ def test_files_of_others_are_not_written_over(
     dataset: Path, tmp_path: Path, name: str, text: str
 ) -> None:
     (tmp_path / name).write_text(text)
-    with pytest.raises(BadInputError, match=r"is not a card of ours.*move it away"):
+    with pytest.raises(BadInputError, match=r"is not a dataset card.*move it away"):
         write_card(dataset, tmp_path)
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, text)]
 
@@ -361,7 +361,7 @@ def test_a_card_takes_the_place_of_an_older_one(dataset: Path, tmp_path: Path) -
 
 def test_a_link_is_not_taken_for_a_card(dataset: Path, tmp_path: Path) -> None:
     (tmp_path / "README.md").symlink_to(tmp_path / "nowhere")
-    with pytest.raises(BadInputError, match="not a card of ours"):
+    with pytest.raises(BadInputError, match="not a dataset card"):
         write_card(dataset, tmp_path)
 
 

@@ -1,4 +1,4 @@
-"""Tar shards: their layout, that they are the same bytes each time, whole, bounded and resumed."""
+"""Tar shards: layout, equal bytes each time, completeness, size limit, resuming."""
 
 from __future__ import annotations
 
@@ -291,7 +291,7 @@ def test_a_manifest_cannot_name_files_elsewhere(dataset: Path, tmp_path: Path) -
     manifest = json.loads((out / "shards.json").read_text())
     manifest["shards"][0]["name"] = "../physion-victim"
     (out / "shards.json").write_text(json.dumps(manifest))
-    with pytest.raises(BadInputError, match="no shards"):
+    with pytest.raises(BadInputError, match="are not shards"):
         export_shards(dataset, out)
     assert victim.read_text() == "keep me"
 

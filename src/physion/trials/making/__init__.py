@@ -1,1 +1,1 @@
-"""From scenes to trials on disk: plan, choose, make, verify."""
+"""Generation of datasets: plan trials, choose scenes, make and write trials, verify a dataset."""

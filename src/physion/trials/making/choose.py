@@ -1,14 +1,14 @@
-"""Which draw becomes a trial: the first that its split can take.
+"""Rejection sampling: for each trial, take the first sampled scene that its split accepts.
 
-Each trial of a split is a slot. Its draws have seeds of their own and are tried in order, so that
-the same slot ends with the same scene in any process and any order. A draw is refused
+Each trial of a split is a slot. The scenes sampled for a slot have seeds of their own and are tried
+in order, so a slot gets the same scene in any process and any order. A scene is rejected if
 
-- unless its physics belongs to the split: the digest of everything that decides the motion says
-  to which, so that no two splits ever share a motion, wherever and whenever they are made;
-- where another slot of the split has the same physics;
-- where its outcome is not the one that the slot is to have (half of the slots of a balanced split
-  have contact), where agent and patient touch already in the observed part, where the outcome is
-  not robust enough, or where agent or patient cannot be seen in the first frame.
+- its physics belongs to another split. The split is computed from the digest of everything that
+  determines the motion, so two splits never share a motion, wherever and whenever they are made;
+- another slot of the split has the same physics;
+- it has not the outcome that the slot requires (half of the slots of a balanced split have
+  contact), agent and patient touch already in the observed part, the outcome is not robust enough,
+  or agent or patient are hardly visible in the first frame.
 """
 
 from __future__ import annotations
@@ -34,29 +34,38 @@ from physion.trials.making.plan import GenerateSettings, TrialTask
 from physion.trials.sealed import read_sealed, write_sealed
 
 BALANCED = ("readout", "testing", "familiarization")
-"""Splits of which half the trials end with contact, and where nothing may be seen too early."""
+"""Splits in which half of the trials have contact, and none of them in the observed part."""
 SPLIT_PARTS = {"training": range(0, 8), "readout": range(8, 12), "testing": range(12, 15)}
-"""Which sixteenths of all physics a split takes; the last one is for familiarization."""
+"""Sixteenths of the range of digests that belong to each split; familiarization has the last."""
 TRIES_EACH = 12
-"""Draws of a preset before the next one is tried: some presets hardly ever end the other way."""
+"""Scenes rejected with one preset before the next is tried: some rarely have the other outcome."""
 MAX_TRIES = 600
-"""Draws of the right split before a slot is given up."""
+"""Rejected scenes of the right split after which a slot fails."""
 MAX_ELSEWHERE = 600
-"""Draws in a row that belong to other splits before a preset counts as one that hardly varies: by
-chance that happens once in 10^16 to the rarest split."""
+"""Consecutive scenes of other splits after which a preset counts as one without variation; for a
+preset with variation, the probability is at most 10^-16."""
 MAX_UNPLACED = 20
-"""Draws in a row that could not be placed before a preset is given up."""
+"""Consecutive failures to place the objects of a scene after which a preset is abandoned."""
 SAVE_EVERY = 100
-"""Choices that a killed run may lose."""
+"""Outcomes after which the chosen scenes are saved; an interrupted run loses at most so many."""
 JITTER = 0.001
-"""Standard deviation in metres of the noise that measures robustness."""
+"""Standard deviation in metres of the position noise with which robustness is measured."""
 
 
 @dataclass(frozen=True)
 class ChosenScene:
-    """What a slot took: its preset and attempt, and how robust its outcome is.
+    """Scene that was chosen for a slot.
 
-    ``digest`` is the scene's, ``refused`` counts refused draws by reason.
+    Parameters
+    ----------
+    preset, attempt
+        Parameter set and number of the attempt, which determine the scene.
+    digest
+        Physics digest of the scene.
+    robust
+        Fraction of jittered simulations with the same outcome; None if not measured.
+    refused
+        Number of scenes rejected before, by reason.
     """
 
     preset: str
@@ -66,7 +75,7 @@ class ChosenScene:
     refused: Mapping[str, int] = field(default_factory=dict)
 
     def fill(self, task: TrialTask) -> TrialTask:
-        """The task with this choice in it."""
+        """Return ``task`` with this scene filled in."""
         return replace(
             task,
             preset=self.preset,
@@ -78,7 +87,7 @@ class ChosenScene:
 
 @dataclass(frozen=True)
 class Slot:
-    """A task whose draw is to be found; ``taken`` holds short digests of physics in use."""
+    """Task whose scene is to be chosen; ``taken`` are `short` digests of physics already in use."""
 
     task: TrialTask
     settings: GenerateSettings
@@ -86,17 +95,17 @@ class Slot:
 
 
 def split_of(digest: str) -> str:
-    """The split to which a motion belongs, from the digest of its scene."""
+    """Return the split that the physics with this digest belongs to."""
     part = int(digest[:8], 16) % 16
     return next((split for split, parts in SPLIT_PARTS.items() if part in parts), "familiarization")
 
 
 def wanted_contact(task: TrialTask) -> bool | None:
-    """The outcome that a slot is to have; None where any will do.
+    """Return the outcome that a slot requires; None if any outcome will do.
 
-    Slots come in pairs, one with contact and one without, in an order that chance decides. The
-    number of a trial alone does not give its answer away; who knows the answer to one of a pair
-    knows the other's.
+    Slots come in pairs, one with contact and one without, in pseudo-random order. The number of a
+    trial alone does not reveal its outcome, but the outcome of one trial of a pair reveals that of
+    the other.
     """
     if task.split not in BALANCED:
         return None
@@ -106,7 +115,7 @@ def wanted_contact(task: TrialTask) -> bool | None:
 
 
 def choose(slot: Slot) -> ChosenScene:
-    """Find the draw of a slot. A pure function; `PhysionError` says why there is none."""
+    """Return the scene of a slot, a pure function of it; `PhysionError` if none is accepted."""
     task, refused = slot.task, Counter[str]()
     params = {name: get_preset(task.scenario, name).params for name in task.presets}
     unplaced, elsewhere = Counter[str](), Counter[str]()
@@ -142,15 +151,15 @@ def choose(slot: Slot) -> ChosenScene:
         refused[reason] += 1
     counts = "; ".join(f"{reason}: {count}" for reason, count in refused.most_common(4))
     raise PhysionError(
-        f"none of {sum(refused.values())} draws of {', '.join(task.presets[:3])}"
-        f"{' ...' if len(task.presets) > 3 else ''} can be taken ({counts})"
+        f"none of {sum(refused.values())} scenes sampled from {', '.join(task.presets[:3])}"
+        f"{' ...' if len(task.presets) > 3 else ''} is accepted ({counts})"
     )
 
 
 def judge(
     scene: Scene, seed: Any, task: TrialTask, settings: GenerateSettings
 ) -> tuple[str | None, float | None]:
-    """Why a draw cannot be taken, or None; and its robustness, if it was measured."""
+    """Return the reason to reject a scene, or None, and its robustness if it was measured."""
     trajectory = simulate(scene, until_contact=True)
     labels = label_contact(scene, trajectory)
     wanted = wanted_contact(task)
@@ -167,7 +176,7 @@ def judge(
 
 
 def robustness(scene: Scene, contact: bool, seed: Any, runs: int) -> float:
-    """Share of ``runs`` simulations, each with `JITTER` of noise, that end as ``contact`` says."""
+    """Return the fraction of ``runs`` simulations with noise `JITTER` that end as ``contact``."""
     agree = 0
     for run in range(runs):
         moved = jitter_scene(scene, JITTER, child_generator(seed, f"robustness {run}"))
@@ -177,12 +186,13 @@ def robustness(scene: Scene, contact: bool, seed: Any, runs: int) -> float:
 
 
 def short(digest: str) -> int:
-    """64 bits of a digest: enough to tell trials apart, and small to send to workers."""
+    """Return 64 bits of a digest, enough to tell trials apart and small to send to workers."""
     return int(digest[:16], 16)
 
 
 def _visible(scene: Scene, trajectory: Trajectory, settings: GenerateSettings) -> bool:
-    # Compiled code, which is loaded by whoever renders.
+    """Return whether agent and patient cover enough of the first frame."""
+    # Imported late: loading the compiled renderer takes time.
     from physion.rendering.renderer import Renderer
 
     ids = Renderer(scene, trajectory, settings.width, settings.height).render(0, ("ids",)).ids
@@ -192,7 +202,7 @@ def _visible(scene: Scene, trajectory: Trajectory, settings: GenerateSettings) -
 
 
 class ChoiceRecord:
-    """The choices of one split of one scenario, kept in a file so that a killed run goes on."""
+    """Chosen scenes of one split of one scenario, saved so that interrupted runs can continue."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -203,17 +213,17 @@ class ChoiceRecord:
                 self.by_index = {int(index): ChosenScene(**row) for index, row in rows.items()}
             except (BadInputError, ValueError, TypeError) as error:
                 raise BadInputError(
-                    f"{path} is no record of choices ({error}); delete it to have it made again"
+                    f"{path} is not a record of chosen scenes ({error}); delete it to make it again"
                 ) from error
 
     def save(self) -> None:
-        """Write the file, whole."""
+        """Write the file atomically."""
         rows = {str(index): asdict(self.by_index[index]) for index in sorted(self.by_index)}
         self.path.parent.mkdir(exist_ok=True)
         write_sealed(self.path, rows)
 
     def missing(self, tasks: Collection[TrialTask]) -> list[TrialTask]:
-        """Tasks without a choice, and those whose physics a task of lower index has."""
+        """Return the tasks without a scene; drop scenes whose physics a lower index has too."""
         wanted = {task.index: task for task in tasks}
         first: dict[str, int] = {}
         for index in sorted(self.by_index):
@@ -223,7 +233,7 @@ class ChoiceRecord:
         return [task for index, task in sorted(wanted.items()) if index not in self.by_index]
 
     def taken(self, below: int) -> frozenset[int]:
-        """Short digests of the choices of all lower indices."""
+        """Return the `short` digests of the scenes of all lower indices."""
         return frozenset(
             short(choice.digest) for index, choice in self.by_index.items() if index < below
         )
@@ -235,11 +245,26 @@ def choose_all(
     executor: Executor,
     track: Track | None = None,
 ) -> tuple[dict[str, ChosenScene], dict[str, TaskOutcome[ChosenScene]]]:
-    """Choices by trial name, and failures by name, for tasks by the file of their choices.
+    """Choose the scenes of all tasks that have none yet.
 
-    Each group is one split of one scenario. Slots are searched side by side, and those that found
-    the physics of a slot before them search on, so that the result does not depend on who was
-    first.
+    Slots are searched in parallel. If two slots find the same physics, the one with the higher
+    index searches again, so that the result does not depend on the order of the work.
+
+    Parameters
+    ----------
+    groups
+        Tasks of one split of one scenario, by the file in which their scenes are recorded.
+    settings
+        Conditions for accepting a scene.
+    executor
+        Where to run.
+    track
+        Shows the progress.
+
+    Returns
+    -------
+    chosen, failed
+        Scenes and failed outcomes by name of the trial.
     """
     records = {path: ChoiceRecord(path) for path in groups}
     failed: dict[str, TaskOutcome[ChosenScene]] = {}
@@ -271,7 +296,7 @@ def _slots(
     settings: GenerateSettings,
     failed: Collection[str],
 ) -> dict[str, tuple[Path, Slot]]:
-    """What is still to be chosen, by trial name; choices that came twice are dropped before."""
+    """Return the open slots, with the files of their records, by name of the trial."""
     todo = {}
     for path, tasks in groups.items():
         for task in records[path].missing(tasks):

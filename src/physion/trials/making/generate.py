@@ -1,8 +1,8 @@
-"""From tasks to files: sample or take a scene, simulate it, label it, render it, write it.
+"""Generation of a dataset: choose scenes, then simulate, label, render and write every trial.
 
-A trial is a pure function of its task and of the settings, and its files appear whole or not at
-all. So nothing is remembered between runs: what is missing is made, in any order, by any number
-of processes, and a killed run goes on where it stopped.
+A trial is a pure function of its task and of the settings, and its files are written atomically.
+Therefore no state is kept between runs: a run makes whatever is missing, in any order and with any
+number of processes, and an interrupted run is continued by the same call.
 """
 
 from __future__ import annotations
@@ -37,22 +37,40 @@ def generate(
     track: Track | None = None,
     make: Callable[[GenerateJob], str] | None = None,
 ) -> RunReport:
-    """Make all trials of ``tasks`` that ``folder`` does not hold yet, then its index.
+    """Make all trials of ``tasks`` that are missing in ``folder``, then the index.
 
-    A trial that fails leaves its traceback in ``failures/`` and the others go on. Trials of
-    other tasks in the folder are left alone and stay in the index. ``executor`` is by default
-    one process a core; ``track`` shows progress; ``make`` replaces `make_trial`.
+    If a trial fails, its traceback is written to ``failures/`` and the others go on. Trials of
+    other tasks in the folder are not changed and stay in the index.
 
-    Raises `BadInputError` where the folder cannot be written, holds something else, or was made
-    with other settings, and `PhysionError` where the disk is full or another run is at work;
-    what was finished before stays and the same call goes on.
+    Parameters
+    ----------
+    folder
+        Folder of the dataset; made if it does not exist.
+    tasks
+        Trials to make, all of one dataset.
+    settings
+        How to choose, render and store trials; must be those of earlier runs in the folder.
+    executor
+        Where to run; by default one process per core.
+    track
+        Shows the progress.
+    make
+        Function that makes one trial; by default `make_trial`.
+
+    Raises
+    ------
+    BadInputError
+        If the folder cannot be written, is not a dataset, or was made with other settings.
+    PhysionError
+        If the disk is full or another process writes into the folder. Finished trials stay, and
+        the same call continues.
     """
     if executor is None:
         from physion.compute.local import LocalExecutor
 
         executor = LocalExecutor()
     if make is None:
-        # Engine and renderer are loaded by whoever makes trials, not by whoever plans them.
+        # Imported late: loading engine and renderer takes time.
         from physion.trials.making.make import make_trial
 
         make = make_trial
@@ -93,7 +111,7 @@ def _choose(
     executor: Executor,
     track: Track | None,
 ) -> tuple[dict[str, GenerateJob], dict[str, str]]:
-    """The missing jobs with their draws chosen, and why some could not be chosen."""
+    """Return the missing jobs with their scenes chosen, and the reasons of failures by name."""
     groups: dict[Path, list[TrialTask]] = {}
     for job in jobs.values():
         if job.task.presets:
@@ -139,9 +157,9 @@ def _note_outcome(folder: Path, outcome: TaskOutcome[Any], job: GenerateJob) -> 
 
 
 def _update_index(folder: Path, made: set[str]) -> dict[str, str]:
-    """Write the index unless it still holds; what is wrong with trials, by name.
+    """Write the index unless it is up to date; return problems by name of the trial.
 
-    It holds if it names exactly the trials that are there and none of them was ``made`` just now.
+    It is up to date if it lists exactly the trials of the folder and none of them is in ``made``.
     """
     there = {(paths.split, paths.trial) for paths in find_trials(folder)}
     try:
@@ -163,11 +181,11 @@ def _update_index(folder: Path, made: set[str]) -> dict[str, str]:
 def _fix_settings(
     folder: Path, dataset: str, settings: GenerateSettings, tasks: Sequence[TrialTask]
 ) -> None:
-    """Write how the folder's trials are made, or raise where it was made another way.
+    """Write the settings of the folder, or check that they are those of earlier runs.
 
-    Each split of a scenario keeps the presets, with all their values, that it began with.
+    Each split of a scenario must keep the presets, with all their values, of its first run.
     """
-    # Compiled code, which is loaded by whoever makes trials.
+    # Imported late: loading the compiled renderer takes time.
     from physion.trials.making.make import RENDERER
 
     path = folder / SETTINGS
@@ -191,17 +209,17 @@ def _fix_settings(
     if path.is_file():
         write_sealed(path, {**wanted, "presets": presets})
         return
-    strangers = [item.name for item in folder.iterdir() if not item.name.startswith(".")]
-    if strangers:
+    others = [item.name for item in folder.iterdir() if not item.name.startswith(".")]
+    if others:
         raise BadInputError(
-            f"{folder} is not empty and no dataset (it holds {sorted(strangers)[0]!r}); choose an "
-            "empty or new folder"
+            f"{folder} is not empty and not a dataset (it contains {sorted(others)[0]!r}); "
+            "choose an empty or new folder"
         )
     write_sealed(path, {**wanted, "presets": presets})
 
 
 def _presets_in_use(tasks: Sequence[TrialTask]) -> dict[str, dict[str, str]]:
-    """A digest of the values of every preset, by split and scenario."""
+    """Return digests of the values of all presets in use, by split and scenario, then name."""
     found: dict[str, dict[str, str]] = {}
     for key, names in {(f"{t.split}/{t.scenario}", t.presets): t for t in tasks if t.presets}:
         for name in names:

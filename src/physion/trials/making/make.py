@@ -1,4 +1,4 @@
-"""One trial: from its task to its files."""
+"""Making of one trial: sample, simulate, label, render and write it."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ RENDERER = (
     f"physion-{RENDERER_VERSION}.{version_digest(*PASSES)}, "
     f"av {version('av')}, pillow {version('pillow')}"
 )
-"""Versions of the renderer, with the digest of the golden pictures, and of what writes movies and
-maps; stored with every trial."""
+"""Version of the renderer, with the digest of the golden pictures, and of the libraries that encode
+movies and maps; stored with every trial."""
 
 
 def make_trial(job: GenerateJob) -> str:
-    """Make one trial and write its files; its name. A pure function of the job.
+    """Make one trial and write its files; return its name. A pure function of the job.
 
-    The trial file comes last, so that a trial with a trial file is complete.
+    The trial file is written last, so a trial with a trial file is complete.
     """
     task = job.task
     scene = scene_of(task)
@@ -53,14 +53,14 @@ def make_trial(job: GenerateJob) -> str:
 
 
 def scene_of(task: TrialTask) -> Scene:
-    """The scene of a task in its free colours: the imported one, or one drawn by its seed."""
+    """Return the scene of a task in its free colours: the imported or the sampled one."""
     if task.scene is not None:
         return task.scene
     params = None if task.preset is None else get_preset(task.scenario, task.preset).params
     scene = sample_scene(task.scenario, task.seed(), params)
     if task.scene_digest not in (None, scene.physics_digest()):
         raise PhysionError(
-            f"trial {task.trial!r}: the draw that was chosen for it comes out differently now; "
+            f"trial {task.trial!r}: sampling gives another scene than the one chosen for it; "
             "package or preset have changed since: choose another folder, or delete choices/ and "
             "the trials made from it"
         )
@@ -70,7 +70,7 @@ def scene_of(task: TrialTask) -> Scene:
 def _files(
     job: GenerateJob, scene: Scene, trajectory: Trajectory, labels: Labels
 ) -> dict[str, bytes]:
-    """The bytes of the trial's files, each frame of each look being rendered once."""
+    """Return the bytes of the trial's files; each frame is rendered once per look."""
     settings = job.settings
     size = settings.width, settings.height
     renderer = Renderer(in_look(scene, job.looks[0]), trajectory, *size)
@@ -100,9 +100,9 @@ def _files(
 def make_movies(
     renderer: Renderer, rate: int, writer: TrialWriter | None = None
 ) -> tuple[bytes, bytes]:
-    """The full and the observed movie at ``rate`` frames a second.
+    """Render and encode the full and the observed movie at ``rate`` frames per second.
 
-    ``writer`` gets the passes that it stores, frame by frame. The same trial, the same bytes.
+    If ``writer`` is given, the image passes that it stores are added to it frame by frame.
     """
     frames = len(renderer.trajectory)
     movie, observed = (

@@ -1,4 +1,4 @@
-"""What is to be made, and how: a task for each trial of a dataset, and the settings of all."""
+"""Plan of a dataset: a task for each trial, and the settings that all trials share."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from physion.trials.layout import SAFE_NAME, TrialPaths
 from physion.trials.schema import PASSES
 
 SPLITS = ("training", "readout", "testing", "familiarization")
-"""Trials for a model's own training, for its readout, for the test that people take too, and for
-people to practise on."""
+"""Splits: for a model's own training, for its readout, for the test that models and people take,
+and for people's practice."""
 
 SPLIT_LOOKS: Mapping[str, tuple[str, ...]] = {
     "training": ("free",),
@@ -28,22 +28,36 @@ SPLIT_LOOKS: Mapping[str, tuple[str, ...]] = {
     "testing": ("redyellow", "free"),
     "familiarization": ("redyellow", "free"),
 }
-"""Looks of each split: no cues to train on, cues to read out, and both for the tests that models
-and people take (people see free colours and a map of who is who)."""
+"""Looks of each split; the first is the trial's own. Training shows no colour cues, readout shows
+them, testing and familiarization have both (people see free colours and a map of the roles)."""
 FULL_COUNTS = {"training": 2000, "readout": 1000, "testing": 150, "familiarization": 10}
-"""Trials a scenario, as in the study."""
+"""Trials per scenario in each split, as in the original study."""
 PLAYBACK_RATES = {"slow": PLAYBACK_RATE, "real": round(1 / FRAME_TIME)}
 
 
 @dataclass(frozen=True)
 class TrialTask:
-    """One trial to make: what names it is all that decides it.
+    """One trial to make, fully determined by the fields of this class and the settings.
 
-    A task without ``scene`` draws its scene from its scenario and ``preset`` (None for the
-    scenario's own parameters) with a seed of (dataset, scenario, split, index, attempt).
-    ``presets`` are those that it may take: `physion.trials.making.choose` fills in ``preset``,
-    ``attempt``, ``robust`` and the ``scene_digest`` that the draw must have. A task with an
-    imported ``scene`` takes it as it is, and ``recorded_contact`` is the outcome that it came with.
+    Parameters
+    ----------
+    dataset, scenario, split, index
+        Name of the trial; with ``attempt`` they determine the seed of a sampled scene.
+    preset
+        Parameter set to sample from; None for the scenario's own parameters.
+    scene
+        Imported scene; None to sample one.
+    recorded_contact
+        Outcome recorded with an imported scene, if known.
+    presets
+        Parameter sets to choose from. `physion.trials.making.choose` then fills in ``preset``,
+        ``attempt``, ``robust`` and ``scene_digest``.
+    attempt
+        Number of scenes sampled for this trial and rejected before.
+    robust
+        Fraction of jittered simulations with the same outcome, if measured.
+    scene_digest
+        Physics digest that the sampled scene must have, if known.
     """
 
     dataset: str
@@ -77,39 +91,39 @@ class TrialTask:
         return f"{self.scenario}_{self.split}_{self.index:04d}"
 
     def seed(self) -> np.random.SeedSequence:
-        """Where all randomness of the trial comes from."""
+        """Return the seed of all random numbers of the trial."""
         return trial_seed(self.dataset, self.scenario, self.split, self.index, self.attempt)
 
 
 @dataclass(frozen=True)
 class GenerateSettings:
-    """How trials are chosen, rendered and stored. One folder has one of it."""
+    """Settings with which the trials of one folder are chosen, rendered and stored."""
 
     width: int = 256
     """Pixels, even."""
     height: int = 256
     """Pixels, even."""
     look: Literal["redyellow", "free", "split"] = "split"
-    """Red agent and yellow patient, or the free colours of the scene with a map of who is who.
-    By split: training free, readout red and yellow, testing and familiarization both."""
+    """Agent red and patient yellow, or the free colours of the scene with a map of the roles. With
+    'split', training is free, readout red and yellow, testing and familiarization both."""
     movies: bool = True
-    """Make movies and maps; without them trials are states alone."""
+    """Make movies and maps; otherwise trials have only trial files."""
     playback: Literal["slow", "real"] = "slow"
-    """Slow movies show 0.01 s of physics as one frame of 30 a second, as the official ones, 3.33
-    times slower than life. Real ones show 100 frames a second."""
+    """Slow movies show 0.01 s of physics per frame at 30 frames per second, as the official ones:
+    3.33 times slower than real time. Real ones show 100 frames per second."""
     passes: tuple[str, ...] = ()
-    """Image passes to store (color depth normals ids flow). Any can be rendered again later."""
+    """Image passes to store (color depth normals ids flow). All can also be rendered later."""
     compatible: bool = False
-    """Compress with gzip, which every HDF5 reader knows, in place of zstd."""
+    """Compress with gzip, which every HDF5 reader supports, instead of zstd."""
     jitters: int = 8
-    """Jittered simulations that measure how robust each label is; 0 for none."""
+    """Number of jittered simulations that measure how robust each label is; 0 for none."""
     robust: float = 0.0
-    """Least share of the jittered simulations that must end as the trial does."""
+    """Smallest accepted fraction of jittered simulations with the trial's outcome."""
     min_visible: float = 0.0005
-    """Least share of the first frame that agent and patient must each cover."""
+    """Smallest accepted fraction of the first frame that agent and patient each cover."""
     observed_contact: bool = False
-    """Take trials for readout, testing and familiarization also if agent and patient touch inside
-    the observed part, as the official sets do."""
+    """Accept trials for readout, testing and familiarization also if agent and patient touch in the
+    observed part, as the official sets do."""
 
     def __post_init__(self) -> None:
         if min(self.width, self.height) < 2 or self.width % 2 or self.height % 2:
@@ -126,7 +140,7 @@ class GenerateSettings:
         if self.jitters < 0 or not 0 <= self.robust <= 1 or not 0 <= self.min_visible < 1:
             raise BadInputError(
                 f"jitters {self.jitters} must not be below 0, robust {self.robust} and least "
-                f"visible share {self.min_visible} must lie in 0..1"
+                f"visible fraction {self.min_visible} must lie in 0..1"
             )
         if self.robust and not self.jitters:
             raise BadInputError("a least robustness needs jittered simulations; jitters is 0")
@@ -134,18 +148,18 @@ class GenerateSettings:
             raise BadInputError("image passes are stored with movies only; leave one of them out")
 
     def looks(self, split: str) -> tuple[str, ...]:
-        """Looks of the movies of a split; the first is the trial's own."""
+        """Return the looks of the movies of a split; the first is the trial's own."""
         return SPLIT_LOOKS[split] if self.look == "split" else (self.look,)
 
     @property
     def playback_rate(self) -> int:
-        """Movie frames a second."""
+        """Frames per second of the movies."""
         return PLAYBACK_RATES[self.playback]
 
 
 @dataclass(frozen=True)
 class GenerateJob:
-    """A task with where and how to do it: all that a worker needs."""
+    """A task with folder and settings: everything that a worker needs."""
 
     task: TrialTask
     folder: Path
@@ -153,7 +167,7 @@ class GenerateJob:
 
     @property
     def paths(self) -> TrialPaths:
-        """Where the files of the trial go."""
+        """Paths of the files of the trial."""
         return TrialPaths(self.folder, self.task.split, self.task.scenario, self.task.trial)
 
     @property
@@ -162,7 +176,7 @@ class GenerateJob:
         return self.settings.looks(self.task.split)
 
     def complete(self) -> bool:
-        """All files of the trial are there."""
+        """Return whether all files of the trial exist."""
         return self.paths.complete(self.settings.movies, free=len(self.looks) > 1)
 
 
@@ -172,11 +186,26 @@ def plan_dataset(
     counts: Mapping[str, int],
     presets: Mapping[str, Sequence[str]] | None = None,
 ) -> list[TrialTask]:
-    """Tasks for ``counts[split]`` trials of each scenario in each split.
+    """Return tasks for ``counts[split]`` trials of each scenario in each split.
 
-    ``presets`` names the presets of a scenario, which its trials take in turn, by default those
-    of `default_presets`. Raising a count later adds trials and changes none. `UnknownNameError`
-    for a scenario or a preset that there is not.
+    Raising a count later adds trials and changes none.
+
+    Parameters
+    ----------
+    dataset
+        Name of the dataset; another name gives other scenes.
+    scenarios
+        Names of scenarios.
+    counts
+        Trials per scenario, by split.
+    presets
+        Names of presets by scenario, which the trials take in turn; by default those of
+        `default_presets`.
+
+    Raises
+    ------
+    UnknownNameError
+        For an unknown scenario or preset.
     """
     wanted = list(scenarios)
     for name in wanted:
@@ -201,7 +230,7 @@ def plan_scenes(
     split: str = "testing",
     recorded: Mapping[str, bool] | None = None,
 ) -> list[TrialTask]:
-    """Tasks for imported scenes, in their order; ``recorded`` gives outcomes by scene name."""
+    """Return tasks for imported scenes; ``recorded`` has recorded outcomes by name of the scene."""
     outcomes = recorded or {}
     tasks = [
         TrialTask(dataset, scene.scenario, split, index, None, scene, outcomes.get(scene.name))
@@ -212,10 +241,10 @@ def plan_scenes(
 
 
 def check_names(tasks: Iterable[TrialTask]) -> None:
-    """Raise `BadInputError` where two tasks would write the same trial."""
+    """Raise `BadInputError` if two tasks have the same trial name, ignoring case."""
     seen: set[str] = set()
     for task in tasks:
-        # Some file systems take names that differ only in case for one.
+        # Some file systems do not distinguish upper and lower case.
         name = task.trial.lower()
         if name in seen:
             raise BadInputError(f"two trials are called {task.trial!r}; names must be unique")

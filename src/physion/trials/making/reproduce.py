@@ -1,4 +1,4 @@
-"""Does this machine make the same bytes? One known trial of each scenario, part by part."""
+"""Check that this machine reproduces the golden trials, one known trial of each scenario."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from physion.trials.making.choose import robustness
 
 DATASET = "golden"
 RUNS = 2
-"""Jittered simulations of the robustness."""
+"""Number of jittered simulations of the robustness."""
 SIZE = 96
-"""Pixels along the side of the rendered frame."""
+"""Width and height of the rendered frame in pixels."""
 MOTION_PARTS = ("scene", "motion", "label", "robust", "particles")
 
 
 def trial_digests(scenario: str) -> dict[str, str]:
     """Sample, simulate and render the golden trial of a scenario; return a digest of each part.
 
-    ``scene``; ``motion`` (poses, velocities, cloth, contacts); ``label``; ``robust``, the outcomes
-    of jittered simulations; ``particles``; and each pass of the frame half way through the trial.
+    Parts are ``scene``; ``motion`` (poses, velocities, cloth, contacts); ``label``; ``robust``
+    (outcomes of jittered simulations); ``particles``; and each image pass of the middle frame.
     """
     seed = trial_seed(DATASET, scenario, "testing", 0)
     scene = sample_scene(scenario, seed)
@@ -57,17 +57,17 @@ def _digest(array: Any) -> str:
 
 
 def differences(scenario: str) -> list[str]:
-    """Return the parts of a scenario's golden trial that come out differently on this machine."""
+    """Return the parts of a scenario's golden trial that this machine does not reproduce."""
     golden = golden_digests().get(scenario, {})
     found = trial_digests(scenario)
     return [name for name, digest in found.items() if golden.get(name) != digest]
 
 
 def main() -> None:
-    """Print all digests as JSON; with ``--write`` make them those of this version.
+    """Print all digests as JSON; with ``--write`` store them as those of this version.
 
-    They are written after a change that is meant to move a scene or to look different. Raise
-    `physion.physics.engine.VERSION` or `physion.rendering.renderer.VERSION` with them.
+    Store them only after a change that is meant to alter scenes, motions or pictures, and increase
+    `physion.physics.engine.VERSION` or `physion.rendering.renderer.VERSION` at the same time.
     """
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--write", action="store_true")

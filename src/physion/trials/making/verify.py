@@ -1,4 +1,4 @@
-"""Is a dataset still what its index says?"""
+"""Verification of a dataset: files against the index, trials against themselves, some remade."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ from physion.trials.trial_file import Trial
 from physion.trials.video import count_frames
 
 SAMPLE = 4
-"""Trials that are made again by default."""
+"""Number of trials that are made again by default."""
 
 
 @dataclass
 class Verification:
-    """What was found in a dataset, one line each.
+    """Result of a verification, one line per finding.
 
-    ``faults`` is empty where all is right. ``other_versions`` names what comes out differently
-    because another version of engine, renderer or encoder made it, which is no fault.
+    ``faults`` is empty if the dataset is intact. ``other_versions`` lists what cannot be reproduced
+    because another version of engine, renderer or encoder made it, which is not a fault.
     """
 
     faults: list[str] = field(default_factory=list)
     other_versions: list[str] = field(default_factory=list)
 
     def add(self, found: list[str], stored: str = "", here: str = "") -> None:
-        """Add what was found in something that the version ``stored`` made; ours is ``here``."""
+        """Add findings about a part that version ``stored`` made; this machine has ``here``."""
         if stored == here:
             self.faults += found
         else:
@@ -54,14 +54,27 @@ class Verification:
 def verify_dataset(
     folder: Path, *, again: int = SAMPLE, track: Track | None = None
 ) -> Verification:
-    """Compare a dataset with its index and with itself, and make a part of it again.
+    """Check a dataset against its index and for consistency, and make some trials again.
 
-    Every file is compared with the index byte for byte (by SHA-256), the index with the trial
-    files, the labels with the contacts, the movies' lengths with the trials', the trajectories
-    with their digests, and all physics with one another. ``again`` trials, chosen by the index
-    itself, are also simulated and rendered anew from their scenes: motion, map and movies must
-    come out the same to the bit under the same version of engine and renderer; -1 takes all.
-    `BadInputError` where there is no index.
+    Checked are: every file against its SHA-256 in the index, the index against the trial files,
+    labels against contacts, lengths of movies against those of trials, trajectories against their
+    digests, and that no two sampled trials have the same physics.
+
+    Parameters
+    ----------
+    folder
+        Folder of the dataset.
+    again
+        Number of trials (-1: all) that are also sampled, simulated and rendered again. Scene,
+        motion, map and movies must be identical under the same versions of engine and renderer.
+        Which trials depends on their names alone.
+    track
+        Shows the progress.
+
+    Raises
+    ------
+    BadInputError
+        If there is no valid index.
     """
     table = read_index(folder)
     listed = set(table["trial"])
@@ -73,9 +86,9 @@ def verify_dataset(
         ]
     )
     result.faults += _check_folder(folder, table)
-    result.faults += _copies(table)
+    result.faults += _duplicates(table)
     settings = _settings(folder)
-    remade = _sample(table, again)
+    remade = _choose_trials(table, again)
     rows = [row for _, row in table.iterrows()]
     for row in tracked(rows, "verifying", len(rows), track):
         paths = TrialPaths(folder, row["split"], row["scenario"], row["trial"])
@@ -91,7 +104,7 @@ def verify_dataset(
 
 
 def _settings(folder: Path) -> Mapping[str, Any]:
-    """The settings of `generate`, or none: imported datasets have no such file."""
+    """Return the settings of `generate`; empty for imported datasets, which have none."""
     try:
         return dict(read_sealed(folder / SETTINGS)["settings"])
     except (BadInputError, KeyError, TypeError, ValueError):
@@ -99,7 +112,7 @@ def _settings(folder: Path) -> Mapping[str, Any]:
 
 
 def _check_folder(folder: Path, table: pd.DataFrame) -> list[str]:
-    """What is wrong with the files beside the trials, and which files belong to no trial."""
+    """Return faults of the files that are not part of a trial, and files that should not exist."""
     faults = []
     records = [path for path in (folder / SETTINGS,) if path.is_file()]
     for path in (*records, *sorted((folder / CHOICES).glob("*.json"))):
@@ -108,21 +121,22 @@ def _check_folder(folder: Path, table: pd.DataFrame) -> list[str]:
         except BadInputError as error:
             faults.append(str(error))
     path = folder / INDEX
-    # Another version of the library that writes the file may write other bytes.
-    mine = index_bytes(table)
-    if path.read_bytes() != mine and _writer(path.read_bytes()) == _writer(mine):
-        faults.append(f"{path}: its bytes are not those of the table that it holds")
+    # Bytes are comparable only if the same version of the parquet library wrote them.
+    rewritten = index_bytes(table)
+    if path.read_bytes() != rewritten and _writer(path.read_bytes()) == _writer(rewritten):
+        faults.append(f"{path}: its bytes are not those of the table that it contains")
     listed = {folder / str(name) for file in FILES for name in table[file].dropna()}
-    strangers = {path for path in folder.glob("*/*/*") if path.is_file()} - listed
+    unknown = {path for path in folder.glob("*/*/*") if path.is_file()} - listed
     faults += [
-        f"{path} belongs to no trial of the index"
-        for path in sorted(strangers)
-        if path.suffix != ".h5"  # said already
+        f"{path} is not a file of a trial in the index"
+        for path in sorted(unknown)
+        if path.suffix != ".h5"  # trial files are compared with the index by the caller
     ]
     return faults
 
 
 def _writer(content: bytes) -> str:
+    """Return the name and version of the library that wrote a parquet file, or an empty text."""
     try:
         return str(pq.read_metadata(io.BytesIO(content)).created_by)
     except (pa.ArrowException, OSError, ValueError):
@@ -130,7 +144,7 @@ def _writer(content: bytes) -> str:
 
 
 def _check_split(row: pd.Series[Any], settings: Mapping[str, Any]) -> list[str]:
-    """What a sampled trial has that its split does not take."""
+    """Return the conditions of its split that a sampled trial violates."""
     if pd.isna(row["seed"]) or not settings:
         return []
     faults = []
@@ -138,20 +152,22 @@ def _check_split(row: pd.Series[Any], settings: Mapping[str, Any]) -> list[str]:
         faults.append(f"{row['trial']}: field 'scene_digest': its physics belongs to {belongs}")
     task = TrialTask(row["dataset"], row["scenario"], row["split"], int(row["index"]))
     if wanted_contact(task) not in (None, row["contact"]):
-        faults.append(f"{row['trial']}: field 'contact': the balance of its split wants the other")
+        faults.append(
+            f"{row['trial']}: field 'contact': the balance of its split requires the opposite"
+        )
     if task.split in BALANCED and row["observed_contact"] and not settings["observed_contact"]:
         faults.append(f"{row['trial']}: field 'observed_contact': nothing is left to predict")
     return faults
 
 
-def _sample(table: pd.DataFrame, count: int) -> set[str]:
-    """Names of ``count`` trials, or all for a negative count; the same index, the same names."""
+def _choose_trials(table: pd.DataFrame, count: int) -> set[str]:
+    """Return the names of ``count`` trials, all if negative; equal indices give equal names."""
     names = sorted(table["trial"], key=lambda name: stable_hash("verify", str(name)))
     return set(names if count < 0 else names[:count])
 
 
-def _copies(table: pd.DataFrame) -> list[str]:
-    """Sampled trials with the physics of another trial. Imported sets may hold such pairs."""
+def _duplicates(table: pd.DataFrame) -> list[str]:
+    """Return faults of sampled trials with equal physics; imported sets may contain such pairs."""
     sampled = table[table["seed"].notna()]
     groups = sampled.groupby("scene_digest")["trial"].apply(list)
     return [
@@ -162,7 +178,7 @@ def _copies(table: pd.DataFrame) -> list[str]:
 
 
 def _compare(stored: pd.Series[Any], paths: TrialPaths) -> list[str]:
-    """Columns of the index that the files contradict."""
+    """Return the cells of an index row that differ from the files."""
     found = as_table([index_row(paths)]).iloc[0]
     return [
         f"{paths.trial}: {name} is {found[name]!s}, the index says {stored[name]!s}"
@@ -178,7 +194,7 @@ def _same(one: Any, other: Any) -> bool:
 
 
 def _check_trial(paths: TrialPaths) -> list[str]:
-    """What a trial says of itself that is not so."""
+    """Return contradictions between the parts of a trial."""
     trial = Trial.open(paths.trial_file)
     meta, faults = trial.metadata, []
     lengths = {"movie": meta.frames, "observed_movie": meta.observed_frames}
@@ -187,23 +203,23 @@ def _check_trial(paths: TrialPaths) -> list[str]:
         if name in lengths and (found := count_frames(path)) != lengths[name]:
             faults.append(f"{path} has {found} frames, not {lengths[name]}")
     if trial.trajectory.digest() != meta.digest:
-        faults.append(f"{paths.trial_file}: field 'trajectory' does not fit its digest")
+        faults.append(f"{paths.trial_file}: field 'trajectory' does not match its digest")
     if trial.scene.physics_digest() != meta.scene_digest:
-        faults.append(f"{paths.trial_file}: field 'scene' does not fit its digest")
+        faults.append(f"{paths.trial_file}: field 'scene' does not match its digest")
     if meta.engine.startswith("imported"):
-        return faults  # labels and movies of other simulators are theirs
+        return faults  # labels and movies are those of another simulator
     labels = label_contact(trial.scene, trial.trajectory)
     for name in ("contact", "first_frame", "observed", "min_distance"):
-        is_now, stored = getattr(labels, name), getattr(trial.labels, name)
-        if is_now != stored:
+        computed, stored = getattr(labels, name), getattr(trial.labels, name)
+        if computed != stored:
             faults.append(
-                f"{paths.trial_file}: labels/{name} is {stored}, the contacts say {is_now}"
+                f"{paths.trial_file}: labels/{name} is {stored}, by its contacts it is {computed}"
             )
     return faults
 
 
 def _make_again(paths: TrialPaths, settings: Mapping[str, Any], result: Verification) -> None:
-    """Draw, simulate and render the trial again, and add to ``result`` what comes out otherwise."""
+    """Sample, simulate and render a trial again; add the differences to ``result``."""
     from physion.physics.engine import simulate
     from physion.trials.making.make import RENDERER
 
@@ -212,15 +228,15 @@ def _make_again(paths: TrialPaths, settings: Mapping[str, Any], result: Verifica
     if meta.engine.startswith("imported"):
         return
     motion = simulate(trial.scene)
-    found = _draw_again(paths, trial, settings)
+    found = _sample_again(paths, trial, settings)
     if motion.digest() != meta.digest:
-        found.append(f"{paths.trial_file}: field 'trajectory': the scene moves differently")
+        found.append(f"{paths.trial_file}: field 'trajectory': simulated again, the motion differs")
     result.add(found, meta.engine, motion.engine)
     result.add(_render_again(paths, trial), meta.renderer, RENDERER)
 
 
 def _render_again(paths: TrialPaths, trial: Trial) -> list[str]:
-    """What comes out differently when the trial is rendered again."""
+    """Return the differences between stored and newly rendered ids, passes, map and movies."""
     from physion.rendering.renderer import role_map
     from physion.trials.files import encode_png
     from physion.trials.making.make import make_movies
@@ -232,7 +248,7 @@ def _render_again(paths: TrialPaths, trial: Trial) -> list[str]:
         faults.append(f"{paths.trial_file}: field 'first_frame/ids' is rendered differently")
     counts = np.bincount(ids.ravel(), minlength=len(trial.scene.names()) + 1)[1:]
     if not np.array_equal((counts / ids.size).astype(np.float32), trial.shares):
-        faults.append(f"{paths.trial_file}: field 'first_frame/shares' does not fit the ids")
+        faults.append(f"{paths.trial_file}: field 'first_frame/shares' does not match the ids")
     for name in trial.pass_names:
         for frame in (0, meta.frames // 2, meta.frames - 1):
             stored = trial.passes(frame)[name]
@@ -254,10 +270,10 @@ def _render_again(paths: TrialPaths, trial: Trial) -> list[str]:
     return faults
 
 
-def _draw_again(paths: TrialPaths, trial: Trial, settings: Mapping[str, Any]) -> list[str]:
-    """What comes out differently when a sampled scene is drawn from its preset and seed.
+def _sample_again(paths: TrialPaths, trial: Trial, settings: Mapping[str, Any]) -> list[str]:
+    """Return the differences when a scene is sampled again from its preset and seed.
 
-    Presets of files of one's own are not known here, and their scenes taken as they are.
+    Scenes from presets in the user's own files cannot be sampled again and are not checked.
     """
     from physion.trials.making.make import scene_of
 
@@ -276,7 +292,7 @@ def _draw_again(paths: TrialPaths, trial: Trial, settings: Mapping[str, Any]) ->
     )
     faults = []
     if scene_of(task) != trial.scene:
-        faults.append(f"{paths.trial_file}: field 'scene' is not what preset and seed draw")
+        faults.append(f"{paths.trial_file}: field 'scene' is not the one that preset and seed give")
     if trial.labels.robust is not None and settings:
         found = robustness(trial.scene, trial.labels.contact, task.seed(), settings["jitters"])
         if found != trial.labels.robust:

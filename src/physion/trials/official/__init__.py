@@ -1,1 +1,1 @@
-"""The original study's files: export to them and import from them."""
+"""Export to and import from the file formats of the original study."""

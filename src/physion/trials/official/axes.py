@@ -1,9 +1,9 @@
-"""Between our axes and the official ones, for whole arrays, in both directions.
+"""Conversion of arrays between the axes of this package and those of the official files.
 
-Ours: z up, right-handed, quaternions (w, x, y, z). Official (Unity): y up, left-handed, quaternions
-(x, y, z, w). A point (x, y, z) of ours is (x, z, y) there. Swapping two axes mirrors space, so that
-directions of turning flip as well: that is the only difference between points and turns. Arrays
-may have any leading axes (docs/official-system.md, section 1).
+This package: z up, right-handed, quaternions (w, x, y, z). Official files (Unity): y up,
+left-handed, quaternions (x, y, z, w). A point (x, y, z) here is (x, z, y) there. Swapping two axes
+is a reflection, so the sign of rotations and angular velocities changes as well. Arrays may have
+any leading axes (docs/official-system.md, section 1).
 """
 
 from __future__ import annotations
@@ -18,37 +18,37 @@ from physion.scenes.scene import Camera
 Floats = NDArray[np.float64]
 
 SWAP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
-"""Takes a point from either system to the other, (3, 3)."""
+"""Matrix (3, 3) that converts a point from either system to the other."""
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Our camera axes (right, down, forward) as Unity's matrices have them (right, up, backward)."""
+"""Matrix from camera axes here (right, down, forward) to those of Unity (right, up, backward)."""
 _UPRIGHT = 1e-3
-"""Largest tilt of a camera's right axis out of the horizontal that is taken for rounding."""
+"""Largest vertical component of a camera's right axis that counts as a rounding error."""
 
 
 def swap_axes(points: ArrayLike) -> Floats:
-    """Points, directions or velocities (..., 3) in the other system; its own inverse."""
+    """Convert points, directions or velocities (..., 3) to the other system; its own inverse."""
     return np.asarray(points, np.float64)[..., [0, 2, 1]]
 
 
-def swap_spin(spins: ArrayLike) -> Floats:
-    """Angular velocities (..., 3) in the other system; its own inverse."""
-    return np.negative(swap_axes(spins))
+def swap_angular_velocity(angular_velocities: ArrayLike) -> Floats:
+    """Convert angular velocities (..., 3) to the other system; its own inverse."""
+    return np.negative(swap_axes(angular_velocities))
 
 
 def to_official_rotation(rotations: ArrayLike) -> Floats:
-    """Our quaternions (..., 4), (w, x, y, z), as official ones, (x, y, z, w)."""
+    """Convert quaternions (..., 4) from (w, x, y, z) here to official (x, y, z, w)."""
     q = np.asarray(rotations, np.float64)
     return np.stack([-q[..., 1], -q[..., 3], -q[..., 2], q[..., 0]], axis=-1)
 
 
 def from_official_rotation(rotations: ArrayLike) -> Floats:
-    """Official quaternions (..., 4), (x, y, z, w), as ours, (w, x, y, z)."""
+    """Convert official quaternions (..., 4), (x, y, z, w), to (w, x, y, z) here."""
     q = np.asarray(rotations, np.float64)
     return np.stack([q[..., 3], -q[..., 0], -q[..., 2], -q[..., 1]], axis=-1)
 
 
 def rotation_matrices(rotations: ArrayLike) -> Floats:
-    """Matrices (..., 3, 3) of our quaternions (..., 4), which need not be of unit length."""
+    """Return rotation matrices (..., 3, 3) of quaternions (..., 4), which are normalised first."""
     q = np.asarray(rotations, np.float64)
     w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
     rows = [
@@ -60,9 +60,9 @@ def rotation_matrices(rotations: ArrayLike) -> Floats:
 
 
 def to_official_euler(rotations: ArrayLike) -> Floats:
-    """Unity's Euler angles (..., 3) in degrees, about x, y, z, of our quaternions (..., 4).
+    """Convert quaternions (..., 4) to Unity's Euler angles (..., 3) in degrees, about x, y, z.
 
-    They are applied in the order z, x, y. Looking straight up or down, z is 0.
+    They are applied in the order z, x, y. In gimbal lock (x is 90 or -90 degrees), z is 0.
     """
     m = SWAP @ rotation_matrices(rotations) @ SWAP
     x = np.arcsin(np.clip(-m[..., 1, 2], -1.0, 1.0))
@@ -77,10 +77,10 @@ def to_official_euler(rotations: ArrayLike) -> Floats:
 
 
 def to_official_camera(camera: Camera, width: int, height: int) -> tuple[Floats, Floats]:
-    """``camera_matrix`` and ``projection_matrix`` (4, 4) as the official files have them.
+    """Return ``camera_matrix`` and ``projection_matrix`` (4, 4) of the official files.
 
-    The first takes official world points to camera axes x right, y up, z backward (its rotation
-    has determinant -1, as the real files have); the second those to OpenGL clip space.
+    The first maps official world points to camera axes x right, y up, z backward (the determinant
+    of its rotation is -1, as in the official files), the second maps these to OpenGL clip space.
     """
     swap = np.eye(4)
     swap[:3, :3] = SWAP
@@ -91,19 +91,36 @@ def to_official_camera(camera: Camera, width: int, height: int) -> tuple[Floats,
 def from_official_camera(
     world_to_camera: Floats, projection: Floats, look_at: ArrayLike
 ) -> tuple[Camera, bool]:
-    """Our camera of the official matrices (4, 4), and whether it stood upright in truth.
+    """Convert official camera matrices to a camera, and return whether it was upright.
 
-    ``look_at`` (3,), ours, decides how far along the view axis `Camera.target` lies, which changes
-    no picture. A tilted camera is set upright. `BadInputError` for matrices that are no camera's.
+    Parameters
+    ----------
+    world_to_camera, projection
+        Official matrices (4, 4).
+    look_at
+        Point (3,) in axes of this package near which `Camera.target` is put, on the view axis;
+        it does not change the picture.
+
+    Returns
+    -------
+    camera, upright
+        The camera, without roll, and False if the official one had roll.
+
+    Raises
+    ------
+    BadInputError
+        If the matrices are not those of a perspective camera.
     """
-    turn = world_to_camera[:3, :3]
-    if not np.isfinite(world_to_camera).all() or not np.allclose(turn @ turn.T, np.eye(3), 0, 1e-3):
-        raise BadInputError("the camera matrix is no rotation and shift")
+    rotation = world_to_camera[:3, :3]
+    if not np.isfinite(world_to_camera).all() or not np.allclose(
+        rotation @ rotation.T, np.eye(3), 0, 1e-3
+    ):
+        raise BadInputError("the camera matrix is not a rotation with a translation")
     scale, a, b = projection[1, 1], projection[2, 2], projection[2, 3]
     if not np.isfinite(projection).all() or scale <= 0 or a in (1.0, -1.0):
-        raise BadInputError("the projection matrix is none of a perspective camera")
-    eye = swap_axes(-turn.T @ world_to_camera[:3, 3])
-    forward, right = swap_axes(-turn[2]), swap_axes(turn[0])
+        raise BadInputError("the projection matrix is not that of a perspective camera")
+    eye = swap_axes(-rotation.T @ world_to_camera[:3, 3])
+    forward, right = swap_axes(-rotation[2]), swap_axes(rotation[0])
     distance = max(float((np.asarray(look_at) - eye) @ forward), 0.1)
     target = eye + distance * forward
     camera = Camera(
@@ -114,5 +131,7 @@ def from_official_camera(
         far=round(float(b / (a + 1)), 1),
     )
     if not 0 < camera.near < camera.far:
-        raise BadInputError(f"the camera sees from {camera.near} to {camera.far} m")
+        raise BadInputError(
+            f"the clipping planes of the camera are at {camera.near} and {camera.far} m"
+        )
     return camera, abs(float(right[2])) < _UPRIGHT

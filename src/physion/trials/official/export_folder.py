@@ -1,14 +1,14 @@
-"""A dataset in the layouts of the original study, so that code written for those reads ours.
+"""Export of a dataset in the folder layouts of the original study, for code written for those.
 
 ::
 
     OUT/labels.csv                          as in PhysionTest-Core: <stimulus>_img, True or False
-    OUT/stimulus_names_and_labels.csv       as published; addresses are paths below OUT, and what
-                                            people answered ("correct") is empty
+    OUT/stimulus_names_and_labels.csv       as published; URLs are paths below OUT, and the
+                                            responses of people ("correct") are empty
     OUT/Dominoes/maps/<stimulus>_map.png            PhysionTest-Core: the testing split
     OUT/Dominoes/mp4s/<stimulus>_img.mp4            free colours
     OUT/Dominoes/mp4s-redyellow/<config>-redyellow_0000_img.mp4
-    OUT/Dominoes/<config>/0000.hdf5         as the generator leaves a configuration, every split;
+    OUT/Dominoes/<config>/0000.hdf5         as the generator writes a configuration, every split;
                          /0000_img.mp4      in the trial's own look
                          /metadata.json
                          /trial_stats.json
@@ -46,21 +46,21 @@ from physion.trials.trial_file import Metadata, Trial
 from physion.trials.video import MovieEncoder, count_frames
 
 CORE_SPLIT = "testing"
-"""The split that PhysionTest-Core is."""
+"""Split that PhysionTest-Core consists of."""
 _SAME = ("digest", "look", "width", "height", "playback_rate", "package")
-"""Metadata that a file must share with its trial to be kept."""
+"""Metadata that an exported file must share with its trial to be kept."""
 
 
 @dataclass(frozen=True)
 class ExportJob:
-    """One trial to export: its files, and the folder to write into."""
+    """One trial to export: paths of its files, and the folder to write into."""
 
     paths: TrialPaths
     out: Path
 
     @property
     def stimulus(self) -> str:
-        """The official name: configuration and number."""
+        """Official name of the trial: configuration and number."""
         return "_".join(split_name(self.paths.trial))
 
     @property
@@ -70,12 +70,12 @@ class ExportJob:
 
     @property
     def hdf5(self) -> Path:
-        """The HDF5 file; its folder is that of the configuration."""
+        """Path of the HDF5 file, in the folder of the configuration."""
         config, number = split_name(self.paths.trial)
         return self.folder / config / f"{number}.hdf5"
 
     def movies(self) -> dict[Path, str | None]:
-        """Movies to write, with their look; None is the trial's own."""
+        """Return the looks of the movies to write by path; None is the trial's own look."""
         found: dict[Path, str | None] = {self.hdf5.with_name(f"{self.hdf5.stem}_img.mp4"): None}
         if self.paths.split == CORE_SPLIT:
             found[self.folder / "mp4s" / f"{self.stimulus}_img.mp4"] = "free"
@@ -84,7 +84,7 @@ class ExportJob:
         return found
 
     def map(self) -> Path | None:
-        """The map, where the trial belongs to PhysionTest-Core."""
+        """Return the path of the map; None if the trial is not in `CORE_SPLIT`."""
         if self.paths.split != CORE_SPLIT:
             return None
         return self.folder / "maps" / f"{self.stimulus}_map.png"
@@ -99,12 +99,27 @@ def export_official(
     executor: Executor | None = None,
     track: Track | None = None,
 ) -> RunReport:
-    """Write the trials of a split and a scenario, or all, into ``out``; see the module.
+    """Export trials of a dataset in the official layouts, as shown at the top of the module.
 
-    Trials that are there already, from the same motion in the same look, are kept; the lists and
-    statistics are then written over all that ``out`` holds. Raises `BadInputError` where
-    ``dataset`` is none, no trial fits the choice, two trials would share a name, or ``out``
-    cannot be written; a trial that fails leaves no file of its own and the others go on.
+    Exported trials with the same motion and look are kept. Lists and statistics are then written
+    for everything in ``out``. An error in one trial is reported and does not stop the others.
+
+    Parameters
+    ----------
+    dataset, out
+        Folder of the dataset, and folder to write into, outside the dataset.
+    split, scenario
+        Trials to export; by default all.
+    executor
+        Where to run; by default one process per core.
+    track
+        Shows the progress.
+
+    Raises
+    ------
+    BadInputError
+        If ``dataset`` is not a dataset, it has no such trials, two trials would have the same
+        name, or ``out`` cannot be written.
     """
     source = Dataset(dataset)
     names = source.trials(split, scenario)
@@ -136,8 +151,8 @@ def export_official(
 
 
 def export_trial(job: ExportJob) -> str:
-    """Write all files of one trial, the HDF5 file last; the name of its stimulus."""
-    # Engine and renderer are loaded by whoever exports, not by whoever lists.
+    """Write all files of one trial, the HDF5 file last; return the name of its stimulus."""
+    # Imported late: loading engine and renderer takes time.
     from physion.rendering.renderer import role_map
     from physion.trials.official.write_hdf5 import official_file
 
@@ -145,7 +160,7 @@ def export_trial(job: ExportJob) -> str:
     if not np.isfinite(trial.trajectory.positions).all():
         raise BadInputError(
             f"the motion of trial {job.paths.trial!r} is unknown (it was imported from a movie "
-            "alone): official files are full of it"
+            "alone), and official files require it"
         )
     data, _ = official_file(trial)
     map_path = job.map()
@@ -160,7 +175,7 @@ def export_trial(job: ExportJob) -> str:
 
 
 def _movie(paths: TrialPaths, trial: Trial, look: str) -> bytes:
-    """The movie of the trial in a look: its own, copied, or rendered where it has none."""
+    """Return the movie of the trial in a look: a copy if there is one, else rendered."""
     meta = trial.metadata
     own = paths.movie if look == meta.look else paths.free_movie
     if (meta.movies if look == meta.look else look == "free" and meta.free_movies) and (
@@ -176,12 +191,12 @@ def _movie(paths: TrialPaths, trial: Trial, look: str) -> bytes:
 
 
 def _check(jobs: Mapping[str, ExportJob], dataset: Path, out: Path) -> None:
-    """Refuse to write into the dataset itself, or two trials to one place."""
+    """Raise `BadInputError` if ``out`` is in the dataset or two trials would share a file."""
     if out.resolve().is_relative_to(dataset.resolve()):
         raise BadInputError(f"{out} lies in the dataset {dataset}; choose a folder outside it")
     seen: dict[str, str] = {}
     for name, job in jobs.items():
-        # Some file systems take names that differ only in case for one.
+        # Some file systems do not distinguish upper and lower case.
         other = seen.setdefault(str(job.hdf5).lower(), name)
         if other != name:
             raise BadInputError(
@@ -191,7 +206,7 @@ def _check(jobs: Mapping[str, ExportJob], dataset: Path, out: Path) -> None:
 
 
 def _is_done(job: ExportJob) -> bool:
-    """All files of the trial are there, and its HDF5 file shows this very motion and look."""
+    """Return whether all files of the trial exist and its HDF5 file has its motion and look."""
     map_path = job.map()
     files = [job.hdf5, *job.movies(), *([map_path] if map_path else [])]
     if not all(path.is_file() for path in files):
@@ -208,9 +223,9 @@ def _is_done(job: ExportJob) -> bool:
 
 
 def _write_lists(out: Path) -> tuple[Path, dict[str, str]]:
-    """Write metadata.json, trial_stats.json and the lists of all that ``out`` holds.
+    """Write metadata.json, trial_stats.json and the lists of all trials in ``out``.
 
-    Returns the path of ``labels.csv``, and what is wrong with files that cannot be read.
+    Returns the path of ``labels.csv``, and errors by path of unreadable files.
     """
     by_folder: dict[Path, list[dict[str, Any]]] = defaultdict(list)
     failed = {}
@@ -219,7 +234,7 @@ def _write_lists(out: Path) -> tuple[Path, dict[str, str]]:
             with OfficialFile.open(path) as file:
                 by_folder[path.parent].append(json.loads(file.text("physion/record")))
         except (BadInputError, ValueError) as error:
-            failed[str(path.relative_to(out))] = f"{error}; delete it to have it made again"
+            failed[str(path.relative_to(out))] = f"{error}; delete it to make it again"
     rows = []
     for folder, records in by_folder.items():
         write_atomic(folder / "metadata.json", _json(records))
@@ -239,7 +254,7 @@ def _files(out: Path) -> list[Path]:
 
 
 def _list_row(out: Path, folder: Path, record: Mapping[str, Any]) -> dict[str, str] | None:
-    """The row of a trial of PhysionTest-Core in the lists; None for other trials."""
+    """Return the row of a trial in the lists of PhysionTest-Core; None for other trials."""
     stimulus = str(record["stimulus_name"])
     movie = folder.parent / "mp4s" / f"{stimulus}_img.mp4"
     if not movie.is_file():

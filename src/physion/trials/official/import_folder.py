@@ -1,13 +1,13 @@
-"""Official files become a dataset of ours.
+"""Import of folders of official files into a dataset.
 
 Two kinds of folders are read, at any depth and mixed:
 
-- HDF5 files, as the generator leaves them (``<config>/0007.hdf5`` with ``0007_img.mp4`` and
-  ``metadata.json`` beside) or as they were published (``hdf5s/<stimulus>.hdf5``): scene, motion,
-  contacts, labels, camera; movies are those beside the file, or made of the pictures in it.
+- HDF5 files, as written by the generator (``<config>/0007.hdf5`` next to ``0007_img.mp4`` and
+  ``metadata.json``) or as published (``hdf5s/<stimulus>.hdf5``): scene, motion, contacts, labels
+  and camera. Movies are those next to the file, or are made from the pictures in it.
 - Movies without HDF5 files, as in PhysionTest-Core (``mp4s/<stimulus>_img.mp4`` with ``maps``,
-  ``mp4s-redyellow`` and ``labels.csv``) or in a configuration's folder: movies, map and label.
-  How things moved is not in them: see `physion.trials.official.import_movie`.
+  ``mp4s-redyellow`` and ``labels.csv``) or in the folder of a configuration: movies, map and label.
+  They have no motion; see `physion.trials.official.import_movie`.
 
 Versions with red agent and yellow patient keep ``-redyellow`` in their names.
 """
@@ -35,7 +35,7 @@ from physion.trials.official.job import ImportJob
 from physion.trials.official.names import redyellow_name, split_name
 
 MAX_LIST_BYTES = 2**28
-"""Largest metadata.json or labels.csv that is read."""
+"""Largest metadata.json or labels.csv that is read, in bytes."""
 
 
 def import_official(
@@ -48,14 +48,32 @@ def import_official(
     executor: Executor | None = None,
     track: Track | None = None,
 ) -> RunReport:
-    """Bring every official trial under ``folder`` into the dataset ``out``, then index it.
+    """Import every official trial under ``folder`` into the dataset ``out``, and index it.
 
-    ``name`` is the dataset's; ``split`` is where the trials go; by default both are those that
-    files of our own come from, else `IMPORTED` and ``testing``. ``scenario`` is that of trials
-    whose names do not say it. Files of our own become the trials that they were made of (see
-    `physion.trials.official.round_trip`). Trials that are there already are kept, and a bad
-    file fails alone. Raises `BadInputError` where there is no official file at all, or ``out``
-    holds something else or cannot be written.
+    Files that this package exported become the trials that they were made from (see
+    `physion.trials.official.round_trip`). Trials that exist are kept. A damaged file is reported
+    and does not stop the others.
+
+    Parameters
+    ----------
+    folder, out
+        Folder to read, and folder of the dataset to write into.
+    name, split
+        Dataset and split of the trials; by default those stored in files that this package
+        exported, and otherwise ``imported`` and ``testing``.
+    scenario
+        Scenario of trials whose scenario cannot be found from their names.
+    executor
+        Where to run; by default one process per core.
+    track
+        Shows the progress.
+
+    Raises
+    ------
+    BadInputError
+        If there are no official files, or ``out`` contains generated trials or cannot be written.
+    UnknownNameError
+        For an unknown split or scenario.
     """
     if split is not None and split not in SPLITS:
         raise UnknownNameError("split", split, SPLITS)
@@ -66,9 +84,11 @@ def import_official(
     if not folder.is_dir():
         raise BadInputError(f"folder {folder} does not exist")
     if (folder / INDEX).exists():
-        raise BadInputError(f"{folder} is a dataset of ours already: nothing is to be imported")
+        raise BadInputError(
+            f"{folder} is a dataset of this package already: there is nothing to import"
+        )
     if (out / SETTINGS).exists():
-        raise BadInputError(f"{out} holds generated trials; import into another folder")
+        raise BadInputError(f"{out} contains generated trials; import into another folder")
     jobs, failed = _plan(folder, out, name, split, scenario)
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -94,8 +114,8 @@ def import_official(
 
 
 def import_trial(job: ImportJob) -> tuple[str, ...]:
-    """Write the files of one trial; what one should know of it."""
-    # Engine and renderer are loaded by whoever imports, not by whoever lists.
+    """Write the files of one trial; return remarks about it."""
+    # Imported late: loading engine and renderer takes time.
     if job.source.suffix == ".hdf5":
         from physion.trials.official.import_hdf5 import import_state
 
@@ -108,11 +128,11 @@ def import_trial(job: ImportJob) -> tuple[str, ...]:
 def _plan(
     folder: Path, out: Path, dataset: str | None, split: str | None, scenario: str | None
 ) -> tuple[dict[str, ImportJob], dict[str, str]]:
-    """Jobs by trial name, and why other files cannot be one."""
+    """Return the jobs by name of the trial, and why other files cannot be imported."""
     sources = list(_sources(folder))
     if not sources:
-        raise BadInputError(f"{folder} holds no official HDF5 file and no official movie")
-    lists = _Lists()
+        raise BadInputError(f"{folder} has no official HDF5 file and no official movie")
+    lists = _FolderLists()
     jobs: dict[str, ImportJob] = {}
     failed: dict[str, str] = {}
     counts: Counter[tuple[str, str]] = Counter()
@@ -128,10 +148,10 @@ def _plan(
         )
         where = str(source.relative_to(folder))
         if found is None:
-            failed[where] = "no name says which scenario it is; say it with --scenario"
+            failed[where] = "its scenario cannot be found from names; give it with --scenario"
         elif not re.fullmatch(SAFE_NAME, trial):
             failed[where] = f"{trial!r} cannot be the name of a trial"
-        # Some file systems take names that differ only in case for one.
+        # Some file systems do not distinguish upper and lower case.
         elif (other := seen.setdefault(trial.lower(), source)) != source:
             failed[where] = f"there is a trial {trial!r} already: {other}"
         else:
@@ -145,7 +165,7 @@ def _plan(
 
 
 def _sources(folder: Path) -> Iterator[Path]:
-    """HDF5 files first, then movies of trials that have none; links are not followed."""
+    """Yield HDF5 files, then movies of trials without one; links are not followed."""
     files = sorted(path for path in folder.rglob("*") if path.is_file() and not path.is_symlink())
     files = [path for path in files if not path.name.startswith(".")]
     states = [path for path in files if path.suffix == ".hdf5"]
@@ -153,7 +173,7 @@ def _sources(folder: Path) -> Iterator[Path]:
     known = {plain_name(_trial_name(path)) for path in states}
     for path in files:
         trial = plain_name(_trial_name(path))
-        # The same stimulus in two looks is one trial: free colours are its own look.
+        # A stimulus in two looks is one trial, found by its movie in free colours.
         shown = path.name.endswith("_img.mp4") and "-redyellow" not in str(path)
         if shown and trial not in known:
             known.add(trial)
@@ -161,7 +181,7 @@ def _sources(folder: Path) -> Iterator[Path]:
 
 
 def _trial_name(source: Path) -> str:
-    """Stimulus name by place: ``config/0007.hdf5`` is ``config_0007``."""
+    """Return the name of the stimulus from its path: ``config/0007.hdf5`` is ``config_0007``."""
     stem = plain_name(source.name)
     if stem.isdecimal():
         return f"{source.parent.name}_{stem}"
@@ -169,19 +189,19 @@ def _trial_name(source: Path) -> str:
     return redyellow_name(stem) if marked else stem
 
 
-class _Lists:
-    """metadata.json and labels.csv of the folders, each read once."""
+class _FolderLists:
+    """Content of metadata.json and labels.csv of folders, each read once."""
 
     def __init__(self) -> None:
         self._metadata: dict[Path, dict[str, dict[str, Any]]] = {}
         self._labels: dict[Path, dict[str, bool]] = {}
 
     def record(self, source: Path, trial: str) -> dict[str, Any]:
-        """What the lists beside ``source`` and above it say of a trial."""
+        """Return the record of a trial from the lists in the folder of ``source`` and above."""
         name = plain_name(trial)
-        records = self._of_folder(source.parent)
+        records = self._metadata_in(source.parent)
         numbered = [key for key in records if split_name(key)[1] == plain_name(source.name)]
-        # A folder may be called otherwise than the configuration was when it was made.
+        # A folder may have been renamed since its configuration was made.
         key = name if name in records or len(numbered) != 1 else numbered[0]
         found = dict(records.get(key, {}))
         for folder in source.parents[:3]:
@@ -189,22 +209,22 @@ class _Lists:
                 found["contact"] = labels[name]
         return found
 
-    def _of_folder(self, folder: Path) -> dict[str, dict[str, Any]]:
+    def _metadata_in(self, folder: Path) -> dict[str, dict[str, Any]]:
         if folder not in self._metadata:
             self._metadata[folder] = {}
             try:
-                rows = json.loads(_small(folder / "metadata.json") or "[]")
+                rows = json.loads(_read_list(folder / "metadata.json") or "[]")
             except ValueError:
                 rows = []
             for row in rows if isinstance(rows, list) else []:
                 if isinstance(row, dict) and isinstance(row.get("stimulus_name"), str):
-                    known = _known(row)
+                    known = _read_record(row)
                     self._metadata[folder][plain_name(known["stimulus"])] = known
         return self._metadata[folder]
 
     def _labels_in(self, folder: Path) -> dict[str, bool]:
         if folder not in self._labels:
-            rows = csv.reader((_small(folder / "labels.csv") or "").splitlines())
+            rows = csv.reader((_read_list(folder / "labels.csv") or "").splitlines())
             self._labels[folder] = {
                 plain_name(row[0]): row[1] == "True"
                 for row in rows
@@ -213,9 +233,9 @@ class _Lists:
         return self._labels[folder]
 
 
-def _known(row: dict[str, Any]) -> dict[str, Any]:
-    """What we use of a record of metadata.json, as far as it has the right types."""
-    # Older files have it as "b'config/0007'".
+def _read_record(row: dict[str, Any]) -> dict[str, Any]:
+    """Return the needed values of a record of metadata.json, as far as their types are valid."""
+    # Older files contain "b'config/0007'".
     stimulus = row["stimulus_name"].removeprefix("b'").removesuffix("'").replace("/", "_")
     found: dict[str, Any] = {
         "stimulus": stimulus,
@@ -231,8 +251,8 @@ def _known(row: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
-def _small(path: Path) -> str | None:
-    """The text of a file of a reasonable size, None where there is none."""
+def _read_list(path: Path) -> str | None:
+    """Return the text of a file; None if it is absent or larger than `MAX_LIST_BYTES`."""
     if path.is_symlink() or not path.is_file() or path.stat().st_size > MAX_LIST_BYTES:
         return None
     return path.read_text(encoding="utf-8", errors="replace")

@@ -1,4 +1,4 @@
-"""One official HDF5 file becomes a trial: scene, motion, contacts, labels, movies."""
+"""Import of one official HDF5 file: scene, motion, contacts, labels and movies."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from physion.trials.files import encode_png, write_files
 from physion.trials.official.job import ImportJob, imported_metadata
 from physion.trials.official.movies import (
     PICTURES,
-    Movies,
+    EncodedMovies,
     make_movies,
     read_movie,
     stored_frames,
@@ -28,13 +28,13 @@ from physion.trials.official.round_trip import restored_files, stored_trial
 from physion.trials.trial_file import TrialWriter
 
 UNSEEN_SIZE = (256, 256)
-"""Width and height in pixels of the id map of a trial without any picture."""
+"""Width and height in pixels of the id map of a trial without pictures."""
 _CODE = np.array([1, 256, 65536])
-"""Makes one number of a colour."""
+"""Weights that turn a colour into one number."""
 
 
 def import_state(job: ImportJob) -> tuple[str, ...]:
-    """Write the files of the trial in an official HDF5 file; what was guessed or left out."""
+    """Write the files of the trial in an official HDF5 file; return remarks about guesses."""
     with OfficialFile.open(job.source) as file:
         reader = SceneReader(file, job.paths.trial, job.paths.scenario)
         motion = MotionReader(reader)
@@ -50,11 +50,13 @@ def import_state(job: ImportJob) -> tuple[str, ...]:
             return ()
         movies = _movies(job, file, reader, frames)
         ids = _ids(file, reader, scene, trajectory, movies.size if movies else UNSEEN_SIZE)
-        said = motion.said
-        labels = _labels(job, scene, trajectory, said)
-        recorded = job.contact if said is None else bool(said.any())
+        labelled = motion.labelled_contact
+        labels = _labels(job, scene, trajectory, labelled)
+        recorded = job.contact if labelled is None else bool(labelled.any())
         if recorded is not None and recorded != label_contact(scene, trajectory).contact:
-            reader.notes.append(f"the file says contact {recorded}, its contacts the opposite")
+            reader.notes.append(
+                f"the label of the file is contact {recorded}, but its contacts give the opposite"
+            )
         metadata = imported_metadata(
             job,
             scene,
@@ -75,36 +77,38 @@ def import_state(job: ImportJob) -> tuple[str, ...]:
 
 
 def _labels(
-    job: ImportJob, scene: Scene, trajectory: Trajectory, said: NDArray[np.bool_] | None
+    job: ImportJob, scene: Scene, trajectory: Trajectory, labelled: NDArray[np.bool_] | None
 ) -> Labels:
-    """The file's own labels; where it has none, metadata.json's, else those of its contacts."""
+    """Return the labels stored in the file, else those of metadata.json, else of its contacts."""
     labels = label_contact(scene, trajectory)
-    if said is None and job.contact is None:
+    if labelled is None and job.contact is None:
         return labels
-    touches = np.flatnonzero(said) if said is not None else np.zeros(0)
+    touches = np.flatnonzero(labelled) if labelled is not None else np.zeros(0)
     first = int(touches[0]) if len(touches) else None
     contact = first is not None
-    if said is None:
+    if labelled is None:
         contact, first = bool(job.contact), job.first_frame
     observed = first is not None and first < OBSERVED_FRAMES
     return replace(labels, contact=contact, first_frame=first, observed=observed)
 
 
-def _movies(job: ImportJob, file: OfficialFile, reader: SceneReader, frames: int) -> Movies | None:
-    """The movie beside the file, or, if it lacks frames, made of the pictures inside the file."""
+def _movies(
+    job: ImportJob, file: OfficialFile, reader: SceneReader, frames: int
+) -> EncodedMovies | None:
+    """Return the movie next to the file or, if that is damaged, one made from stored pictures."""
     beside = job.source.with_name(f"{job.source.stem}_img.mp4")
     try:
         return read_movie(beside, frames) if beside.is_file() else _stored(file, reader, frames)
     except BadInputError as error:
         if not file.has(f"{reader.frames[0]}/{PICTURES}"):
             raise
-        reader.notes.append(f"the pictures inside the file replace its movie: {error}")
+        reader.notes.append(f"the pictures in the file replace its movie: {error}")
         return _stored(file, reader, frames)
 
 
-def _stored(file: OfficialFile, reader: SceneReader, frames: int) -> Movies | None:
+def _stored(file: OfficialFile, reader: SceneReader, frames: int) -> EncodedMovies | None:
     if not file.has(f"{reader.frames[0]}/{PICTURES}"):
-        reader.notes.append("it has no pictures and gets no movies")
+        reader.notes.append("it has no pictures, so there are no movies")
         return None
     pictures = stored_frames(file, reader.frames)
     return make_movies(pictures, frames, PLAYBACK_RATE)
@@ -117,7 +121,7 @@ def _ids(
     trajectory: Trajectory,
     size: tuple[int, int],
 ) -> NDArray[np.int16]:
-    """What each pixel of frame 0 shows, by the file's own picture of ids; drawn if it has none.
+    """Return the ids (H, W) of frame 0 from the file's id picture; rendered if it has none.
 
     ``size`` is (width, height) in pixels.
     """
@@ -127,15 +131,15 @@ def _ids(
         rows = file.table(colors, 3)
         if len(rows) == len(reader.ids) and np.isfinite(rows).all():
             ids = np.zeros(codes.shape, np.int16)
-            for place in reader.kept:
-                color = rows[place].astype(np.int64) @ _CODE
-                ids[codes == color] = scene.index(reader.label(place)) + 1
+            for index in reader.kept:
+                color = rows[index].astype(np.int64) @ _CODE
+                ids[codes == color] = scene.index(reader.label(index)) + 1
             down, across = (
                 (np.arange(wanted) * have) // wanted
                 for wanted, have in zip(size[::-1], ids.shape, strict=True)
             )
             return np.asarray(ids[down][:, across])
-    reader.notes.append("it has no picture of ids; they are drawn from its state")
-    drawn = Renderer(scene, trajectory, *size).render(0, ("ids",)).ids
-    assert drawn is not None, "the renderer left out ids"
-    return drawn
+    reader.notes.append("it has no picture of ids; they are rendered from its state")
+    rendered = Renderer(scene, trajectory, *size).render(0, ("ids",)).ids
+    assert rendered is not None, "the renderer left out ids"
+    return rendered

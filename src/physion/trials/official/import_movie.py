@@ -1,10 +1,10 @@
-"""Official movies without state become trials that know what was shown and how it ended.
+"""Import of official movies without HDF5 files, which gives trials without motion.
 
-PhysionTest-Core, which most people have, holds movies, maps and labels, and no motion. Such a
-trial serves whoever looks at pictures; whoever asks for its state finds no numbers: all poses are
-NaN, its two bodies are place-holders called ``agent`` and ``patient``, its engine is
-``imported: movie alone``, and its frame of first contact is None unless metadata.json beside the
-movie says it.
+PhysionTest-Core, the most common download, has movies, maps and labels, but no motion. A trial
+imported from it can be used by models that see pictures. Its state is unknown: all poses are NaN,
+the two bodies are placeholders called ``agent`` and ``patient``, the engine is
+``imported: movie alone``, and the frame of first contact is None unless the metadata.json next to
+the movie has it.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ from physion.trials.official.names import decode_picture, redyellow_name
 from physion.trials.trial_file import TrialWriter
 
 ENGINE = "imported: movie alone"
-NOTE = "no state: bodies are place-holders and poses unknown"
+NOTE = "no state: bodies are placeholders and poses are unknown"
 
 
 def import_movie(job: ImportJob) -> tuple[str, ...]:
-    """Write the files of a trial that is a movie, a map and a label; what is missing of it."""
+    """Write the files of a trial from a movie, a map and a label; return what is missing."""
     if job.contact is None:
         raise BadInputError(
-            f"no labels.csv or metadata.json near {job.source} says whether {job.paths.trial!r} "
-            "ends with contact"
+            f"no labels.csv or metadata.json near {job.source} has the outcome of "
+            f"{job.paths.trial!r}"
         )
     notes = [NOTE]
     free = read_movie(job.source)
     marked = beside(job.source, "mp4s-redyellow", f"{redyellow_name(job.paths.trial)}_img.mp4")
     own = read_movie(marked, free.frames) if marked is not None else free
     ids = _ids(job, own.size, notes)
-    scene, trajectory = _scene(job), _unknown(own.frames)
+    scene, trajectory = _scene(job), _unknown_motion(own.frames)
     first = job.first_frame if job.contact else None
     labels = Labels(job.contact, first, first is not None and first < OBSERVED_FRAMES)
     metadata = imported_metadata(
@@ -65,11 +65,11 @@ def import_movie(job: ImportJob) -> tuple[str, ...]:
 
 
 def _ids(job: ImportJob, size: tuple[int, int], notes: list[str]) -> NDArray[np.int16]:
-    """1 where the map is red, 2 where it is yellow, else 0: (H, W)."""
+    """Return ids (H, W) from the map: 1 where it is red, 2 where it is yellow, else 0."""
     name = f"{plain_name(job.paths.trial)}_map.png"
     path = beside(job.source, "maps", name)
     if path is None:
-        notes.append("no map: agent and patient are not pointed out")
+        notes.append("no map: the pixels of agent and patient are unknown")
         return np.zeros(size[::-1], np.int16)
     try:
         data = np.frombuffer(path.read_bytes(), np.uint8)
@@ -84,6 +84,7 @@ def _ids(job: ImportJob, size: tuple[int, int], notes: list[str]) -> NDArray[np.
 
 
 def _scene(job: ImportJob) -> Scene:
+    """Return a scene of two placeholders."""
     return Scene(
         name=job.paths.trial,
         scenario=job.paths.scenario,
@@ -95,14 +96,14 @@ def _scene(job: ImportJob) -> Scene:
     )
 
 
-def _unknown(frames: int) -> Trajectory:
-    """The motion of two bodies of which nothing is known."""
-    nowhere = np.full((frames, 2, 3), np.nan, np.float32)
+def _unknown_motion(frames: int) -> Trajectory:
+    """Return the motion of two bodies with unknown poses."""
+    unknown = np.full((frames, 2, 3), np.nan, np.float32)
     return Trajectory(
-        positions=nowhere,
+        positions=unknown,
         rotations=np.full((frames, 2, 4), np.nan, np.float32),
-        velocities=nowhere,
-        angular_velocities=nowhere,
+        velocities=unknown,
+        angular_velocities=unknown,
         cloth_vertices=np.zeros((frames, 0, 3), np.float32),
         cloth_distance=np.full(frames, np.nan, np.float32),
         contacts=Contacts.empty(),

@@ -1,9 +1,9 @@
-"""Movies of official trials, brought over: copied as they are, or encoded again.
+"""Import of official movies: copied without change if possible, otherwise encoded again.
 
-The published movies do not say how their colours are coded; players, and ffmpeg which made them,
-take such small ones for ITU-R BT.601. Ours are BT.709 and say so, and all our readers rely on it.
-So a movie that says so is copied byte by byte, and any other is encoded again. The observed part
-is always encoded from its own frames alone: nothing in it has seen the future.
+The published movies have no tag for the coding of their colours; players, and ffmpeg which made
+them, assume ITU-R BT.601 for movies of this size. Movies of this package are BT.709 and tagged so,
+and its readers rely on it. Therefore a movie with this tag is copied byte by byte, and any other is
+encoded again. The observed part is always encoded from its own frames alone.
 """
 
 from __future__ import annotations
@@ -26,24 +26,24 @@ from physion.trials.video import MovieEncoder
 
 _BT709 = 1
 _MPEG_RANGES = (0, 1)
-"""Unsaid, or said to be the usual one of movies."""
+"""Codes of the colour range: not specified, and limited range."""
 _MATRICES = {_BT709: Colorspace.ITU709}
 PICTURES = "images/_img"
 
 
 def beside(path: Path, folder: str, name: str) -> Path | None:
-    """A file of PhysionTest-Core that belongs to one in a folder beside its own, if it is there."""
+    """Return the file ``name`` in ``folder`` next to the folder of ``path``, or None if absent."""
     found = path.parent.parent / folder / name
     return found if found.is_file() and not found.is_symlink() else None
 
 
 class SourceMovie:
-    """An official movie file: what it says of itself, and its frames. `BadInputError` if broken."""
+    """Reader of an official movie file; `BadInputError` if it is damaged."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         if path.is_symlink() or not path.is_file():
-            raise BadInputError(f"movie {path} is no plain file")
+            raise BadInputError(f"movie {path} is not a regular file")
         with self._open() as container:
             stream: Any = container.streams.video[0]
             context = stream.codec_context
@@ -61,7 +61,7 @@ class SourceMovie:
             raise BadInputError(f"movie {path} is {self.width} x {self.height} pixels large")
 
     def frames(self) -> Iterator[NDArray[np.uint8]]:
-        """All frames (H, W, 3) in sRGB, one by one."""
+        """Yield all frames (H, W, 3) in sRGB."""
         reformatter = VideoReformatter()
         with self._open() as container:
             stream = container.streams.video[0]
@@ -90,11 +90,11 @@ class SourceMovie:
 
 
 @dataclass(frozen=True)
-class Movies:
-    """The bytes of a trial's movies: all frames, and the observed ones alone.
+class EncodedMovies:
+    """Bytes of the two movies of a trial: ``full`` and ``observed``.
 
-    ``size`` is (width, height) in pixels, ``frames`` how many there are in all, ``rate`` frames a
-    second.
+    ``size`` is (width, height) in pixels, ``frames`` the number of frames of the full movie,
+    ``rate`` frames per second.
     """
 
     full: bytes
@@ -104,8 +104,8 @@ class Movies:
     rate: int
 
 
-def read_movie(path: Path, frames: int | None = None) -> Movies:
-    """A movie file as ours; `BadInputError` unless it has as many frames as asked for, if any."""
+def read_movie(path: Path, frames: int | None = None) -> EncodedMovies:
+    """Read and convert a movie file; `BadInputError` unless it has ``frames`` frames, if given."""
     source = SourceMovie(path)
     if frames is None:
         frames = sum(1 for _ in source.frames())
@@ -114,15 +114,15 @@ def read_movie(path: Path, frames: int | None = None) -> Movies:
 
 
 def stored_frames(file: OfficialFile, frames: list[str]) -> Iterator[NDArray[np.uint8]]:
-    """The colour pictures (H, W, 3) inside an official HDF5 file, one by one."""
+    """Yield the colour pictures (H, W, 3) stored in an official HDF5 file."""
     for frame in frames:
         yield file.picture(f"{frame}/{PICTURES}")
 
 
-def make_movies(pictures: Iterable[NDArray[np.uint8]], frames: int, rate: int) -> Movies:
-    """Movies of ``frames`` pictures (H, W, 3) at ``rate`` a second.
+def make_movies(pictures: Iterable[NDArray[np.uint8]], frames: int, rate: int) -> EncodedMovies:
+    """Encode ``frames`` pictures (H, W, 3) as movies at ``rate`` frames per second.
 
-    Pictures of another number or of changing size raise `BadInputError`.
+    Raises `BadInputError` if the number of pictures differs or their size changes.
     """
     if not OBSERVED_FRAMES < frames <= MAX_FRAMES:
         raise BadInputError(
@@ -143,4 +143,4 @@ def make_movies(pictures: Iterable[NDArray[np.uint8]], frames: int, rate: int) -
             observed.add(picture)
     if full is None or observed is None:
         raise BadInputError("there is no picture")
-    return Movies(full.finish(), observed.finish(), size, frames, rate)
+    return EncodedMovies(full.finish(), observed.finish(), size, frames, rate)

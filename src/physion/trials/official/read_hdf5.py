@@ -1,10 +1,10 @@
-"""Reads official HDF5 files without trusting them.
+"""Safe reading of official HDF5 files.
 
-Files of several makers differ (docs/official-system.md, sections 4 and 9): names may end in
-``_cam0``, frames may be counted from 0 or 1, labels may be missing, physics arrays may be shorter
-than the list of objects, pictures may be PNG or JPEG. All of that is read. Not read are links out
-of the file or across it, arrays stored elsewhere, packed with unknown filters, of types that point
-or run code, or of sizes that no trial has: those raise `BadInputError` with file and field.
+Files of different origin differ (docs/official-system.md, section 4): names may end with ``_cam0``,
+frames may be counted from 0 or 1, labels may be missing, physics arrays may be shorter than the
+list of objects, pictures may be PNG or JPEG. All of these are read. Links, arrays stored in other
+files, unknown filters, types that are neither numbers nor text, and arrays that are too large
+raise `BadInputError` with file and field.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from physion.trials.official.names import decode_picture
 
 MAX_FRAMES = 10_000
 MAX_BYTES = 2**27
-"""Largest array of one frame or object that is read, in memory."""
+"""Largest array that is read, in bytes of memory."""
 MAX_TEXT = 2**20
 _SUFFIXES = ("", "_cam0")
 _FILTERS = {
@@ -45,10 +45,10 @@ class OfficialFile(GuardedHdf5, AbstractContextManager["OfficialFile"]):
 
     @classmethod
     def open(cls, path: Path) -> OfficialFile:
-        """Open ``path``; `BadInputError` if it is no HDF5 file."""
+        """Open ``path``; `BadInputError` if it is not a regular HDF5 file."""
         where = f"official file {path}"
         if path.is_symlink() or not path.is_file():
-            raise BadInputError(f"{where} is no plain file")
+            raise BadInputError(f"{where} is not a regular file")
         return cls(open_hdf5(path, where), where)
 
     def __exit__(
@@ -60,7 +60,7 @@ class OfficialFile(GuardedHdf5, AbstractContextManager["OfficialFile"]):
         self._file.close()
 
     def frames(self) -> list[str]:
-        """Names of the frames, in their order, whatever they are counted from."""
+        """Return the names of the frames in order, whether counted from 0 or 1."""
         names = [name for name in self.names("frames") if name.isdecimal()]
         if not 1 <= len(names) <= MAX_FRAMES:
             raise self.bad("frames", f"holds {len(names)} frames, not 1 to {MAX_FRAMES}")
@@ -70,20 +70,20 @@ class OfficialFile(GuardedHdf5, AbstractContextManager["OfficialFile"]):
         return sorted(names, key=int)
 
     def names(self, path: str) -> list[str]:
-        """Names in the group at ``path``; none where there is no group."""
+        """Return the names in the group at ``path``; none if there is no group."""
         group = self.find(path)
         if not isinstance(group, h5py.Group):
             return []
         if self.guard(path, lambda: len(group)) > 100 * MAX_FRAMES:
-            raise self.bad(path, "has too many entries to be true")
+            raise self.bad(path, "has too many entries")
         return list(self.guard(path, lambda: list(group)))
 
     def has(self, path: str) -> bool:
-        """Whether there is an array at ``path``, with or without the ending of a camera."""
+        """Return whether there is an array at ``path``, with or without a camera suffix."""
         return any(self.find(path + suffix) is not None for suffix in _SUFFIXES)
 
     def numbers(self, path: str, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
-        """Finite or not, the numbers at ``path``; None in ``shape`` stands for any length."""
+        """Return the numbers, finite or not, at ``path``; None in ``shape`` allows any length."""
         dataset = self._dataset(path)
         if dataset.dtype.kind not in "fiub":
             raise self.bad(path, f"has type {dataset.dtype}, not numbers")
@@ -97,7 +97,7 @@ class OfficialFile(GuardedHdf5, AbstractContextManager["OfficialFile"]):
         return np.asarray(values, np.float64)
 
     def table(self, path: str, *row: int) -> NDArray[np.float64]:
-        """The numbers at ``path`` as rows of shape ``row``, however they lie in the file."""
+        """Return the numbers at ``path`` reshaped to rows of shape ``row``."""
         dataset = self._dataset(path)
         values = self.numbers(path, tuple(None for _ in dataset.shape))
         if values.size % int(np.prod(row)):
@@ -105,7 +105,7 @@ class OfficialFile(GuardedHdf5, AbstractContextManager["OfficialFile"]):
         return values.reshape(-1, *row)
 
     def number(self, path: str, default: float | None = None) -> float:
-        """One number; ``default``, if any, where there is none."""
+        """Return the number at ``path``, or ``default`` if it is absent and a default is given."""
         if default is not None and not self.has(path):
             return default
         dataset = self._dataset(path)
@@ -115,7 +115,7 @@ class OfficialFile(GuardedHdf5, AbstractContextManager["OfficialFile"]):
         return float(values[0])
 
     def text(self, path: str, default: str | None = None) -> str:
-        """One text; ``default``, if any, where there is none."""
+        """Return the text at ``path``, or ``default`` if it is absent and a default is given."""
         if default is not None and not self.has(path):
             return default
         found = self.texts(path)
@@ -124,25 +124,25 @@ class OfficialFile(GuardedHdf5, AbstractContextManager["OfficialFile"]):
         return found[0]
 
     def texts(self, path: str) -> list[str]:
-        """The texts of an array, or the one text of a scalar."""
+        """Return the texts of an array, or the one text of a scalar."""
         dataset = self._dataset(path)
         if h5py.check_string_dtype(dataset.dtype) is None:
             raise self.bad(path, f"has type {dataset.dtype}, not text")
         values = np.ravel(np.asarray(self.guard(path, lambda: dataset[()]), object))
         texts = [value if isinstance(value, bytes) else str(value).encode() for value in values]
         if sum(len(text) for text in texts) > 100 * MAX_TEXT:
-            raise self.bad(path, "holds more text than can be true")
+            raise self.bad(path, "holds too much text")
         return [text.rstrip(b"\0").decode("utf-8", "replace") for text in texts]
 
     def data(self, path: str) -> bytes:
-        """The bytes at ``path``, an array of them."""
+        """Return the bytes stored as an array at ``path``."""
         dataset = self._dataset(path)
         if dataset.dtype != np.uint8 or len(dataset.shape) != 1:
-            raise self.bad(path, f"is {dataset.dtype} {dataset.shape}, not a row of bytes")
+            raise self.bad(path, f"is {dataset.dtype} {dataset.shape}, not an array of bytes")
         return bytes(self.guard(path, lambda: dataset[()]))
 
     def picture(self, path: str) -> NDArray[np.uint8]:
-        """The PNG or JPEG picture (H, W, 3) whose bytes are at ``path``."""
+        """Return the picture (H, W, 3) whose PNG or JPEG bytes are at ``path``."""
         data = np.frombuffer(self.data(path), np.uint8)
         try:
             return decode_picture(data)

@@ -1,8 +1,8 @@
-"""How things moved in an official file: poses, contacts, cloth; as one of our trajectories.
+"""Motion of an official file (poses, contacts, cloth), read as a `Trajectory`.
 
-Official contact points are not tied to pairs (docs/official-system.md, section 9). Where
-there are as many points as pairs, they are taken in order, as our own export writes them;
-otherwise every pair gets the point that lies nearest to both of its boxes.
+In official files the number of contact points differs from that of pairs (docs/official-system.md,
+section 4.2). If the numbers are equal, points are assigned in order, as this package exports them;
+otherwise each pair gets the point that is nearest to both of its bounding boxes.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from physion.trials.official.read_scene import SceneReader
 
 Floats = NDArray[np.float64]
 Row = tuple[int, int, int, Floats, Floats]
-"""Frame, first and second body, point, normal from the first to the second."""
+"""Frame, first and second body, point, normal from first to second."""
 
 MAX_RESOLUTION = 101
 _UNKNOWN = np.full(3, np.nan)
@@ -31,18 +31,18 @@ _UNKNOWN = np.full(3, np.nan)
 
 @dataclass
 class MotionReader:
-    """Makes the scene and the trajectory of one official file."""
+    """Reader of the scene and the trajectory of one official file."""
 
     reader: SceneReader
 
     @cached_property
     def scene(self) -> Scene:
-        """What is in the trial."""
-        return self.reader.scene({place: self._resolution(place) for place in self.reader.cloths})
+        """Scene of the trial."""
+        return self.reader.scene({index: self._resolution(index) for index in self.reader.cloths})
 
     @cached_property
-    def said(self) -> NDArray[np.bool_] | None:
-        """Frames (F,) in which target and zone touch by the file's labels; None without labels."""
+    def labelled_contact(self) -> NDArray[np.bool_] | None:
+        """Whether target and zone touch in each frame (F,) by the file's labels; None without."""
         name = "labels/target_contacting_zone"
         paths = [f"{frame}/{name}" for frame in self.reader.frames]
         if not all(self.reader.file.has(path) for path in paths):
@@ -50,11 +50,13 @@ class MotionReader:
         return np.array([self.reader.file.number(path) != 0 for path in paths])
 
     def trajectory(self) -> Trajectory:
-        """How it moved; pivots are those of our bodies."""
+        """Return the motion, with the pivots of the bodies of this package."""
         reader, motion = self.reader, self.reader.motion
-        turns = rotation_matrices(motion.rotations[:, reader.bodies])
+        matrices = rotation_matrices(motion.rotations[:, reader.bodies])
         offsets = reader.offsets()[reader.bodies]
-        positions = motion.positions[:, reader.bodies] + np.einsum("fnij,nj->fni", turns, offsets)
+        positions = motion.positions[:, reader.bodies] + np.einsum(
+            "fnij,nj->fni", matrices, offsets
+        )
         rotations = motion.rotations[:, reader.bodies]
         rotations = rotations / np.linalg.norm(rotations, axis=-1, keepdims=True)
         complete = [f"{frame}/labels/trial_complete" for frame in reader.frames]
@@ -63,18 +65,19 @@ class MotionReader:
             positions=positions.astype(np.float32),
             rotations=rotations.astype(np.float32),
             velocities=motion.velocities[:, reader.bodies].astype(np.float32),
-            angular_velocities=motion.spins[:, reader.bodies].astype(np.float32),
+            angular_velocities=motion.angular_velocities[:, reader.bodies].astype(np.float32),
             cloth_vertices=self._cloth_vertices(),
             cloth_distance=self._cloth_distance(),
-            contacts=self._contacts(positions, turns),
+            contacts=self._contacts(positions, matrices),
             completed=any(reader.file.number(path, 0) != 0 for path in complete),
             engine=f"imported: {commit if commit.startswith('physion ') else 'TDW'}",
         )
 
-    def _contacts(self, positions: Floats, turns: Floats) -> Contacts:
-        """Pairs of every frame, each once; with labels, target and zone touch where those say so.
+    def _contacts(self, positions: Floats, matrices: Floats) -> Contacts:
+        """Return one contact per pair and frame.
 
-        A touch that the labels know and the records do not has an unknown point (NaN).
+        If the labels have a contact of target and zone that is not in the contact records, it is
+        added with an unknown point (NaN).
         """
         scene, reader = self.scene, self.reader
         names = scene.names()
@@ -82,11 +85,16 @@ class MotionReader:
         bounds = [shape(body.shape).bounds * np.asarray(body.scale) for body in scene.bodies]
         roles = scene.index(scene.roles.agent), scene.index(scene.roles.patient)
         asked = min(roles), max(roles)
-        said, rows = self.said, []
+        labelled_contact, rows = self.labelled_contact, []
         for frame in range(len(reader.frames)):
-            boxes = _Boxes(positions[frame], turns[frame], bounds)
+            boxes = _Boxes(positions[frame], matrices[frame], bounds)
             found = self._pairs(frame, indices, boxes)
-            if said is not None and said[frame] and not scene.cloths and asked not in found:
+            if (
+                labelled_contact is not None
+                and labelled_contact[frame]
+                and not scene.cloths
+                and asked not in found
+            ):
                 found[asked] = (_UNKNOWN, _UNKNOWN)
             rows += [(frame, *pair, *found[pair]) for pair in sorted(found)]
         count = len(rows)
@@ -95,14 +103,14 @@ class MotionReader:
             np.array([row[1:3] for row in rows], np.int32).reshape(count, 2),
             np.array([row[3] for row in rows], np.float32).reshape(count, 3),
             np.array([row[4] for row in rows], np.float32).reshape(count, 3),
-            # Official files hold no impulses.
+            # Official files have no impulses.
             np.full(count, np.nan, np.float32),
         )
 
     def _pairs(
         self, frame: int, indices: dict[int, int], boxes: _Boxes
     ) -> dict[tuple[int, int], tuple[Floats, Floats]]:
-        """Point and normal by pair of bodies, of one frame."""
+        """Return point and normal by pair of bodies in one frame."""
         file, at = self.reader.file, self.reader.frames[frame]
         found: dict[tuple[int, int], tuple[Floats, Floats]] = {}
         if file.has(f"{at}/collisions/object_ids"):
@@ -110,7 +118,9 @@ class MotionReader:
             contacts = file.table(f"{at}/collisions/contacts", 2, 3)
             states = file.texts(f"{at}/collisions/states") if len(pairs) else []
             if len(states) != len(pairs):
-                raise file.bad(f"{at}/collisions/states", f"has not the {len(pairs)} rows of ids")
+                raise file.bad(
+                    f"{at}/collisions/states", f"does not have the {len(pairs)} rows of ids"
+                )
             for row, (pair, state) in enumerate(zip(pairs, states, strict=True)):
                 a, b = (indices.get(int(id_)) if np.isfinite(id_) else None for id_ in pair)
                 if a is None or b is None or a == b or state.startswith("ex"):
@@ -118,7 +128,7 @@ class MotionReader:
                 chosen = row if len(contacts) == len(pairs) else boxes.nearest(contacts, (a, b))
                 if chosen is not None:
                     normal, point = swap_axes(contacts[chosen])
-                    # Theirs runs from the second to the first.
+                    # Official normals point from the second body to the first.
                     key, sign = ((a, b), -1.0) if a < b else ((b, a), 1.0)
                     found.setdefault(key, (point, sign * normal))
         if file.has(f"{at}/env_collisions/object_ids"):
@@ -145,49 +155,49 @@ class MotionReader:
         return (np.array(gaps, np.float64) - CLOTH_DISTANCE).astype(np.float32)
 
     def _cloth_vertices(self) -> NDArray[np.float32]:
-        """Vertices (F, V, 3) of our sheets, between the particles that lie round them at first."""
+        """Return the vertices (F, V, 3) of all sheets, interpolated between particles."""
         frames = len(self.reader.frames)
         parts = [np.zeros((frames, 0, 3), np.float32)]
-        for place in self.reader.cloths:
-            corners, weights = self._weights(place)
+        for index in self.reader.cloths:
+            corners, weights = self._weights(index)
             for_all = [
-                np.einsum("vk,vkj->vj", weights, self.particles(place, frame)[corners])
+                np.einsum("vk,vkj->vj", weights, self.particles(index, frame)[corners])
                 for frame in range(frames)
             ]
             parts.append(np.stack(for_all).astype(np.float32))
         return np.concatenate(parts, axis=1)
 
-    def particles(self, place: int, frame: int) -> Floats:
-        """Where the particles (P, 3) of a cloth are in a frame, ours."""
-        path = f"{self.reader.frames[frame]}/particles/{self.reader.ids[place]}"
+    def particles(self, index: int, frame: int) -> Floats:
+        """Return the particle positions (P, 3) of a cloth in a frame, in axes of this package."""
+        path = f"{self.reader.frames[frame]}/particles/{self.reader.ids[index]}"
         found = swap_axes(self.reader.file.numbers(path, (None, 4))[:, :3])
         if len(found) < 4 or not np.isfinite(found).all():
-            raise self.reader.file.bad(path, "holds no cloth of 4 finite particles or more")
+            raise self.reader.file.bad(path, "is not a cloth of at least 4 finite particles")
         return found
 
-    def _resolution(self, place: int) -> int:
-        """Vertices along a side of the sheet with about as many vertices as there are particles."""
-        count = len(self.particles(place, 0))
+    def _resolution(self, index: int) -> int:
+        """Return the vertices per side of a sheet with about as many vertices as particles."""
+        count = len(self.particles(index, 0))
         return int(np.clip(round(np.sqrt(count)), 2, MAX_RESOLUTION))
 
-    def _weights(self, place: int) -> tuple[NDArray[np.int64], Floats]:
-        """For each vertex of our sheet three particles (V, 3) and their weights (V, 3).
+    def _weights(self, index: int) -> tuple[NDArray[np.int64], Floats]:
+        """Return three particles (V, 3) and their weights (V, 3) for each vertex of the sheet.
 
-        At first the cloth is flat, so that every vertex lies in a triangle of particles, whatever
-        their order and number; it moves with them.
+        In frame 0 the cloth is flat, so every vertex lies in a triangle of a triangulation of the
+        particles, whatever their order and number. Its barycentric coordinates are the weights.
         """
         reader = self.reader
-        turn = rotation_matrices(reader.motion.rotations[0, place])
-        flat = (self.particles(place, 0) - reader.motion.positions[0, place]) @ turn
-        side = self._resolution(place)
-        along_x, along_y = (np.linspace(-s, s, side) for s in reader.scales[place][:2])
+        matrix = rotation_matrices(reader.motion.rotations[0, index])
+        flat = (self.particles(index, 0) - reader.motion.positions[0, index]) @ matrix
+        side = self._resolution(index)
+        along_x, along_y = (np.linspace(-s, s, side) for s in reader.scales[index][:2])
         grid = np.stack(np.meshgrid(along_x, along_y, indexing="ij"), axis=-1).reshape(-1, 2)
         try:
             mesh = Delaunay(flat[:, :2])
         except (QhullError, ValueError) as error:
-            path = f"{reader.frames[0]}/particles/{reader.ids[place]}"
+            path = f"{reader.frames[0]}/particles/{reader.ids[index]}"
             raise reader.file.bad(path, "does not begin as a flat sheet") from error
-        # Vertices on the rim may lie a rounding outside: they are drawn in a little.
+        # By rounding, vertices on the rim may lie outside: they follow the nearest particle.
         inside = mesh.find_simplex(grid, tol=1e-6)
         nearest = np.linalg.norm(flat[:, None, :2] - grid[inside < 0], axis=-1).argmin(axis=0)
         corners = mesh.simplices[np.maximum(inside, 0)].astype(np.int64)
@@ -202,21 +212,24 @@ class MotionReader:
 
 @dataclass(frozen=True)
 class _Boxes:
-    """Boxes of all bodies in one frame: pivots (N, 3), matrices (N, 3, 3), bounds (2, 3) each."""
+    """Bounding boxes of all bodies in one frame: pivots, rotation matrices, corners (2, 3)."""
 
     positions: Floats
-    turns: Floats
+    matrices: Floats
     bounds: list[Floats]
 
     def nearest(self, contacts: Floats, bodies: tuple[int, ...]) -> int | None:
-        """The contact (n, (normal, point), 3), official, whose point is nearest to all bodies."""
+        """Return the row of the official contacts whose point is nearest to ``bodies``.
+
+        ``contacts`` has shape (n, 2, 3): normal and point.
+        """
         if not len(contacts):
             return None
         points = swap_axes(contacts[:, 1])
         away = np.zeros(len(points))
         for body in bodies:
             if body < len(self.bounds):
-                local = (points - self.positions[body]) @ self.turns[body]
+                local = (points - self.positions[body]) @ self.matrices[body]
                 low, high = self.bounds[body]
                 away += np.linalg.norm(local - np.clip(local, low, high), axis=1)
         return int(np.nan_to_num(away, nan=np.inf).argmin())

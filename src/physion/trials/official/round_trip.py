@@ -1,9 +1,9 @@
-"""Our own trials come back whole from the official files that we wrote.
+"""Restoring of original trials from official files that this package exported.
 
-The official layout has no place for impulses, presets, seeds or how robust a label is, so an export
-keeps the trial file itself, without image passes, under ``physion/trial_file``. It is checked as
-every trial file is, and believed only where the official arrays of the same file tell the same:
-otherwise somebody has changed them, and they alone are read.
+The official layout cannot store impulses, presets, seeds or the robustness of a label, so an export
+embeds the trial file itself, without image passes, under ``physion/trial_file``. On import it is
+checked like every trial file, and used only if the official arrays of the same file agree with it:
+otherwise these were changed after the export, and only they are read.
 """
 
 from __future__ import annotations
@@ -34,17 +34,18 @@ from physion.trials.trial_file import Metadata, Trial, TrialWriter
 from physion.trials.video import MovieEncoder, count_frames
 
 _CLOSE = 1e-5
-"""Metres, and what else is compared: what single precision and the other axes may change."""
+"""Tolerance of comparisons, in metres and other units: rounding to single precision."""
 _BROKEN = (PhysionError, ArithmeticError, LookupError, ValueError)
-"""What a trial file that is none, or whose parts do not fit together, may raise."""
+"""Exceptions that a damaged or inconsistent trial file can raise."""
 
 Pictures = Iterator[NDArray[np.uint8]]
 
 
 def stored_trial(motion: MotionReader, trajectory: Trajectory) -> Trial | None:
-    """The trial that an official file was written from; None where it has none to be believed.
+    """Return the original trial embedded in an official file.
 
-    ``trajectory`` is what the official arrays tell. Why a trial was not believed is noted.
+    None if it is absent, damaged, or contradicts the official arrays, whose motion is
+    ``trajectory``; the reason is added to the notes.
     """
     file, notes = motion.reader.file, motion.reader.notes
     if not file.has(TRIAL_FILE):
@@ -54,10 +55,10 @@ def stored_trial(motion: MotionReader, trajectory: Trajectory) -> Trial | None:
         checks = _checks(trial, motion, trajectory)
         differs = next((name for name, same in checks if not same), None)
     except _BROKEN as error:
-        notes.append(f"the trial that is stored in it is damaged and was left out: {error}")
+        notes.append(f"the embedded trial is damaged and was ignored: {error}")
         return None
     if differs is not None:
-        notes.append(f"{differs} is not that of the trial stored in it, which was left out")
+        notes.append(f"{differs} differs from the embedded trial, which was ignored")
         return None
     return trial
 
@@ -65,15 +66,18 @@ def stored_trial(motion: MotionReader, trajectory: Trajectory) -> Trial | None:
 def _checks(
     trial: Trial, motion: MotionReader, trajectory: Trajectory
 ) -> Iterator[tuple[str, bool]]:
-    """Names of fields and whether they fit the trial; later ones take the earlier for granted."""
-    reader, meta, scene, own = motion.reader, trial.metadata, trial.scene, trial.trajectory
-    objects = OfficialObjects(trial.shown(), own)
+    """Yield names of fields and whether they agree with the trial; later checks rely on earlier."""
+    reader, meta, scene, stored = motion.reader, trial.metadata, trial.scene, trial.trajectory
+    objects = OfficialObjects(trial.shown(), stored)
     ids, roles, file = objects.ids, scene.roles, reader.file
     times = (OBSERVED_FRAMES, FRAME_TIME, reader.scenario)
     yield "the scenario", (meta.observed_frames, meta.frame_time, meta.scenario) == times
     origin = {value is None for value in (meta.seed, meta.preset, meta.attempt)}
     yield "the origin", len(origin) == 1
-    yield "the digest", (own.digest(), scene.physics_digest()) == (meta.digest, meta.scene_digest)
+    yield (
+        "the digest",
+        (stored.digest(), scene.physics_digest()) == (meta.digest, meta.scene_digest),
+    )
     yield "the picture's size", trial.ids.shape == (meta.height, meta.width)
     yield "static/object_ids", reader.ids == list(ids.values())
     yield "static/model_names", reader.models == objects.models
@@ -89,9 +93,9 @@ def _checks(
         yield f"static/{key}", file.number(f"static/{key}") == ids[name]
     yield "frames", len(reader.frames) == meta.frames
     poses = (reader.motion.positions, reader.motion.rotations)
-    moves = (reader.motion.velocities, reader.motion.spins)
-    for values, kept in zip((*poses, *moves), (*objects.poses, *objects.motions), strict=True):
-        yield "the motion", _close(values, kept)
+    moves = (reader.motion.velocities, reader.motion.angular_velocities)
+    for values, expected in zip((*poses, *moves), (*objects.poses, *objects.motions), strict=True):
+        yield "the motion", _close(values, expected)
     camera = f"{reader.frames[0]}/camera_matrices/"
     wanted = to_official_camera(scene.camera, meta.width, meta.height)
     for name, matrix in zip(("camera_matrix", "projection_matrix"), wanted, strict=True):
@@ -102,40 +106,43 @@ def _checks(
 def _contact_checks(
     trial: Trial, motion: MotionReader, trajectory: Trajectory, objects: OfficialObjects
 ) -> Iterator[tuple[str, bool]]:
-    reader, scene, own = motion.reader, trial.scene, trial.trajectory
+    reader, scene, stored = motion.reader, trial.scene, trial.trajectory
     sheets = sum(cloth.resolution**2 for cloth in scene.cloths)
-    yield "the cloth", own.cloth_vertices.shape[1] == sheets
-    for place, thing in enumerate(objects.things):
+    yield "the cloth", stored.cloth_vertices.shape[1] == sheets
+    for index, thing in enumerate(objects.things):
         if isinstance(thing, Cloth):
-            seen = [motion.particles(place, frame) for frame in range(len(own))]
-            kept = objects.cloth_vertices(objects.order[place])
-            yield "the cloth", all(_close(a, b) for a, b in zip(seen, kept, strict=True))
-    yield "the cloth's distance", _close(trajectory.cloth_distance, own.cloth_distance)
+            seen = [motion.particles(index, frame) for frame in range(len(stored))]
+            expected = objects.cloth_vertices(objects.order[index])
+            yield "the cloth", all(_close(a, b) for a, b in zip(seen, expected, strict=True))
+    yield "the cloth's distance", _close(trajectory.cloth_distance, stored.cloth_distance)
     names = motion.scene.names()
-    theirs = np.full(len(names) + 1, ENVIRONMENT)
-    for place in reader.kept:
-        theirs[names.index(reader.label(place)) + 1] = place
-    ours = np.full(len(objects) + 1, ENVIRONMENT)
-    ours[np.array(objects.order) + 1] = np.arange(len(objects))
-    rows = _rows(trajectory.contacts, theirs), _rows(own.contacts, ours)
+    read_indices = np.full(len(names) + 1, ENVIRONMENT)
+    for index in reader.kept:
+        read_indices[names.index(reader.label(index)) + 1] = index
+    stored_indices = np.full(len(objects) + 1, ENVIRONMENT)
+    stored_indices[np.array(objects.order) + 1] = np.arange(len(objects))
+    rows = _rows(trajectory.contacts, read_indices), _rows(stored.contacts, stored_indices)
     yield "the list of contacts", _close(*rows)
-    yield "labels/trial_complete", trajectory.completed == own.completed
-    if motion.said is not None:
-        said = np.flatnonzero(motion.said)
-        yield "labels/target_contacting_zone", np.array_equal(said, contact_frames(scene, own))
-        first = int(said[0]) if len(said) else None
+    yield "labels/trial_complete", trajectory.completed == stored.completed
+    if motion.labelled_contact is not None:
+        labelled = np.flatnonzero(motion.labelled_contact)
+        yield (
+            "labels/target_contacting_zone",
+            np.array_equal(labelled, contact_frames(scene, stored)),
+        )
+        first = int(labelled[0]) if len(labelled) else None
         yield (
             "the label",
-            (trial.labels.contact, trial.labels.first_frame) == (bool(len(said)), first),
+            (trial.labels.contact, trial.labels.first_frame) == (bool(len(labelled)), first),
         )
 
 
-def _rows(contacts: Contacts, places: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Contacts (C, 9) by frame and places of both things: those three, point, normal.
+def _rows(contacts: Contacts, indices: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return contacts as sorted rows (C, 9): frame, indices of both objects, point, normal.
 
-    ``places`` begins with that of the environment.
+    ``indices`` maps the objects of ``contacts`` to common indices, from the environment (-1) on.
     """
-    pairs = places[contacts.bodies + 1]
+    pairs = indices[contacts.bodies + 1]
     sign = np.where(pairs[:, :1] > pairs[:, 1:], -1.0, 1.0)
     pairs = np.sort(pairs, axis=1)
     rows = np.hstack([contacts.frame[:, None], pairs, contacts.point, sign * contacts.normal])
@@ -150,21 +157,22 @@ def _close(one: ArrayLike, other: ArrayLike) -> bool:
 def restored_files(
     job: ImportJob, file: OfficialFile, frames: list[str], trial: Trial
 ) -> dict[str, bytes]:
-    """The files of the trial as they were; name, split and dataset are those of the job.
+    """Return the files of an embedded trial, with name, split and dataset of the job.
 
-    Under another split or dataset a drawn scene becomes an imported one."""
-    kept = trial.metadata
-    dataset, split = job.dataset or kept.dataset, job.paths.split
-    meta = replace(kept, trial=job.paths.trial, split=split, dataset=dataset)
-    if (meta.split, meta.dataset) != (kept.split, kept.dataset):
-        # Seeds come from these names: under others the sampler draws another scene.
+    If split or dataset differ from the original ones, a sampled scene becomes an imported one.
+    """
+    original = trial.metadata
+    dataset, split = job.dataset or original.dataset, job.paths.split
+    meta = replace(original, trial=job.paths.trial, split=split, dataset=dataset)
+    if (meta.split, meta.dataset) != (original.split, original.dataset):
+        # Seeds are derived from these names; with others, the seed would give another scene.
         meta = replace(meta, seed=None, preset=None, attempt=None)
     files: dict[str, bytes] = {}
     if meta.movies:
-        own = job.source.with_name(f"{job.source.stem}_img.mp4")
+        path: Path | None = job.source.with_name(f"{job.source.stem}_img.mp4")
         drawn = file.has(f"{frames[0]}/{PICTURES}")
         pictures = stored_frames(file, frames) if drawn else _rendered(trial, meta.look)
-        files["movie"], files["observed_movie"] = _movies(meta, own, pictures)
+        files["movie"], files["observed_movie"] = _movies(meta, path, pictures)
         files["map"] = encode_png(role_map(trial.ids, trial.scene))
     if meta.movies and meta.free_movies:
         name = f"{plain_name(job.paths.trial)}_img.mp4"
@@ -184,12 +192,14 @@ def _rendered(trial: Trial, look: str) -> Iterator[NDArray[np.uint8]]:
 
 
 def _movies(meta: Metadata, path: Path | None, pictures: Pictures) -> tuple[bytes, bytes]:
-    """The full movie at ``path`` if it is one of the trial, and what is missing, of ``pictures``.
+    """Return the full and the observed movie.
 
-    The observed part is made of pictures: cut out of a movie it would be packed twice.
+    The full movie is that at ``path`` if it matches the trial, else it is encoded from
+    ``pictures``. The observed movie is always encoded from pictures, which gives better quality
+    than encoding a decoded movie again.
     """
     size = (meta.height, meta.width, 3)
-    if path is None or not _fits(meta, path):
+    if path is None or not _matches(meta, path):
         made = make_movies(pictures, meta.frames, meta.playback_rate)
         if made.size != (meta.width, meta.height):
             raise BadInputError(f"pictures of {made.size} pixels are not those of {meta.trial!r}")
@@ -202,8 +212,8 @@ def _movies(meta: Metadata, path: Path | None, pictures: Pictures) -> tuple[byte
     return path.read_bytes(), encoder.finish()
 
 
-def _fits(meta: Metadata, path: Path) -> bool:
-    """Whether a movie can be the trial's own as it is."""
+def _matches(meta: Metadata, path: Path) -> bool:
+    """Return whether a movie has the coding, size, rate and length of the trial's movie."""
     try:
         movie = SourceMovie(path)
         size = (movie.width, movie.height, movie.rate)

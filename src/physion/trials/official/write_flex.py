@@ -1,13 +1,13 @@
-"""Static groups of Drape: how cloth and solids were simulated, by the names of Flex's commands.
+"""Static groups of Drape: parameters of the cloth simulation, under the names of Flex commands.
 
-``container`` has one number for each parameter, the groups of actors one row for each object of
-their kind (``object_id``), all named as in the commands ``create_flex_container``,
+``container`` has one number per parameter, each group of actors one row per object of its kind
+(``object_id``), all named as in the commands ``create_flex_container``,
 ``set_flex_solid_actor`` and ``set_flex_cloth_actor`` (docs/official-system.md, sections 3.8
 and 4.1). ``soft_actors`` and ``fluid_actors`` are empty, as in the originals.
 
-Left out is what our solver has nothing of: of the container ``radius`` (Flex's reach between
-particles), ``max_particles``, ``max_neighbors``, drag, sleep, planes and all that is for fluids; of
-cloths ``mesh_tesselation``, as our sheets have vertices of their own.
+Parameters that the solver of this package does not have are left out: of the container ``radius``
+(interaction distance of particles), ``max_particles``, ``max_neighbors``, drag, sleep, planes and
+everything for fluids; of cloths ``mesh_tesselation``, as sheets have vertices of their own.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from physion.scenes.scene import Body, Cloth
 from physion.trials.official.write_objects import OfficialObjects
 
 EMPTY = ("soft_actors", "fluid_actors")
-"""Groups for things that no scene has."""
+"""Groups for kinds of objects that no scene has."""
 
 
 def flex_groups(objects: OfficialObjects) -> Mapping[str, Mapping[str, Any]]:
-    """Arrays by group and name; no group at all for a scene without cloth."""
+    """Return the arrays by group and name; empty for a scene without cloth."""
     if not objects.scene.cloths:
         return {}
     numbered = list(enumerate(objects.things, start=1))

@@ -1,11 +1,10 @@
-"""``frames/%04d/`` of an official file: objects, contacts, labels, camera, pictures of one instant.
+"""Groups ``frames/%04d/`` of an official file: objects, contacts, labels, camera and pictures.
 
-Better than the originals where nobody is disturbed by it: every contact record has exactly one
-contact point, its deepest, in the same place of the list, so that contacts belong to pairs (``m ==
-n``; the originals list several points a pair and none for pairs that part). A pair that parts
-("exit") repeats where it touched last. What an object's normal points at is Unity's rule: from the
-second object of the record to the first, and from the environment to the object
-(docs/official-system.md, sections 2.6, 4.2 and 9).
+Unlike in the originals, every contact record has exactly one contact point, the deepest one, at the
+same position in the list, so that points can be assigned to pairs (the originals have several
+points per pair, and none for pairs that separate). A pair that separates ("exit") repeats its last
+point. Normals point as in Unity: from the second object of the record to the first, and from the
+environment to the object (docs/official-system.md, sections 2.6 and 4.2).
 """
 
 from __future__ import annotations
@@ -27,8 +26,8 @@ from physion.scenes.scene import FRAME_TIME
 from physion.trials.files import encode_png
 from physion.trials.official.axes import (
     rotation_matrices,
+    swap_angular_velocity,
     swap_axes,
-    swap_spin,
     to_official_camera,
     to_official_rotation,
 )
@@ -43,15 +42,15 @@ from physion.trials.official.write_objects import OfficialObjects
 
 PASSES = ("color", "depth", "normals", "ids", "flow")
 MOVED = 0.01
-"""Metres from its place that a target has moved, to count as moved."""
+"""Displacement in metres from which a target counts as moved."""
 FALLEN = 0.5
-"""Share of its first height below which a tower's top has fallen."""
+"""Fraction of its initial height below which the top of a tower counts as fallen."""
 _SMALL = 1024
-"""Bytes below which compressing an array would make it larger."""
+"""Size in bytes up to which arrays are not compressed, because they would become larger."""
 
 
 def put(group: h5py.Group, name: str, values: Any) -> None:
-    """Write an array or a scalar; larger arrays packed with gzip, which every reader has."""
+    """Write an array or a scalar; compress larger arrays with gzip."""
     array = np.asarray(values)
     packed = (
         {"compression": "gzip", "compression_opts": 4}
@@ -63,7 +62,7 @@ def put(group: h5py.Group, name: str, values: Any) -> None:
 
 @dataclass
 class FrameWriter:
-    """Writes the frames of one trial in order; keeps what metadata.json wants to know of them."""
+    """Writer of the frames of one trial, in order; keeps what the record of the trial needs."""
 
     objects: OfficialObjects
     width: int
@@ -80,9 +79,9 @@ class FrameWriter:
         self._colors = np.concatenate(
             [np.zeros((1, 3), np.uint8), segmentation_colors(len(self.objects))]
         )
-        # From the renderer's ids, places in `Scene.names`, to places in the official order.
-        self._places = np.zeros(len(self.objects) + 1, np.int16)
-        self._places[np.array(self.objects.order) + 1] = np.arange(1, len(self.objects) + 1)
+        # Official object ids by id of the renderer (index in `Scene.names` plus 1).
+        self._official_ids = np.zeros(len(self.objects) + 1, np.int16)
+        self._official_ids[np.array(self.objects.order) + 1] = np.arange(1, len(self.objects) + 1)
         self._camera = to_official_camera(scene.camera, self.width, self.height)
 
     def add(self, frames: h5py.Group, frame: int, images: Frame) -> None:
@@ -104,13 +103,13 @@ class FrameWriter:
     def _write_images(self, group: h5py.Group, frame: int, images: Frame) -> None:
         assert images.color is not None and images.depth is not None and images.ids is not None
         assert images.normals is not None and images.flow is not None
-        places = self._places[images.ids]
+        ids = self._official_ids[images.ids]
         if frame in (0, len(self.objects.trajectory) - 1):
-            self.masks[frame] = places
+            self.masks[frame] = ids
         view = axes(self.objects.scene.camera)
         pictures = {
             "_img": images.color,
-            "_id": self._colors[places],
+            "_id": self._colors[ids],
             "_normals": encode_normals(images.normals, view),
             "_flow": encode_flow(images.flow),
         }
@@ -124,13 +123,13 @@ class FrameWriter:
 
     def _write_objects(self, group: h5py.Group, frame: int) -> None:
         positions, rotations = (values[frame] for values in self.objects.poses)
-        velocities, spins = (values[frame] for values in self.objects.motions)
+        velocities, angular_velocities = (values[frame] for values in self.objects.motions)
         arrays = {
             "positions": swap_axes(positions),
             "rotations": to_official_rotation(rotations),
             "forwards": swap_axes(rotation_matrices(rotations)[:, :, 1]),
             "velocities": swap_axes(velocities),
-            "angular_velocities": swap_spin(spins),
+            "angular_velocities": swap_angular_velocity(angular_velocities),
             **{side: swap_axes(at) for side, at in self.objects.boxes(frame).items()},
         }
         for name, values in arrays.items():
@@ -169,13 +168,13 @@ class FrameWriter:
 
     @cached_property
     def _ids(self) -> NDArray[np.int64]:
-        """Object ids by place in `Scene.names`."""
+        """Official object ids by index in `Scene.names`."""
         names = self.objects.scene.names()
         return np.array([self.objects.ids[name] for name in names])
 
     @cached_property
     def _contacts(self) -> list[dict[tuple[int, int], int]]:
-        """For each frame the pairs that touch, with their row of the contacts."""
+        """For each frame the rows of the contacts by touching pair."""
         found: list[dict[tuple[int, int], int]] = [{} for _ in range(len(self.objects.trajectory))]
         contacts = self.objects.trajectory.contacts
         for row, (frame, (a, b)) in enumerate(zip(contacts.frame, contacts.bodies, strict=True)):
@@ -209,27 +208,27 @@ class FrameWriter:
         return found
 
     def _tower_top(self, frame: int) -> float:
-        """Height in metres of the highest point of what stands on the zone, the probe aside."""
+        """Return the height in metres of the top of the tower on the zone, without the probe."""
         scene = self.objects.scene
         stack = [*self.objects.middle, *(b for b in scene.bodies if b.name == scene.roles.agent)]
-        places = [self.objects.ids[body.name] - 1 for body in stack]
+        rows = [self.objects.ids[body.name] - 1 for body in stack]
         boxes = self.objects.boxes(frame)
-        center = boxes["center"][places]
-        reach = sum(np.abs(boxes[side][places] - center)[:, 2] for side in ("front", "left", "top"))
-        return float((center[:, 2] + reach).max()) if places else 0.0
+        center = boxes["center"][rows]
+        reach = sum(np.abs(boxes[side][rows] - center)[:, 2] for side in ("front", "left", "top"))
+        return float((center[:, 2] + reach).max()) if rows else 0.0
 
     def _write_particles(self, frame_group: h5py.Group, frame: int) -> None:
-        """Particles of cloths and solids as Flex has them: place, inverse mass, and velocity."""
+        """Write particles of cloths and solids as in Flex: position, inverse mass, velocity."""
         scene, trajectory = self.objects.scene, self.objects.trajectory
         cloud = particles_over_time(scene, trajectory, frames=[max(frame - 1, 0), frame])
         before, now = swap_axes(cloud.positions)
         particles = frame_group.create_group("particles")
         velocities = frame_group.create_group("velocities")
-        for place, thing in enumerate(self.objects.things):
-            own = cloud.things == self.objects.order[place]
-            if own.any():
-                inverse = np.full((int(own.sum()), 1), own.sum() / thing.mass)
+        for index, thing in enumerate(self.objects.things):
+            mask = cloud.things == self.objects.order[index]
+            if mask.any():
+                inverse = np.full((int(mask.sum()), 1), mask.sum() / thing.mass)
                 id_ = str(self.objects.ids[thing.name])
-                put(particles, id_, np.hstack([now[own], inverse]).astype(np.float32))
-                speed = (now[own] - before[own]) / FRAME_TIME
+                put(particles, id_, np.hstack([now[mask], inverse]).astype(np.float32))
+                speed = (now[mask] - before[mask]) / FRAME_TIME
                 put(velocities, id_, speed.astype(np.float32))

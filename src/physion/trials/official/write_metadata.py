@@ -1,4 +1,4 @@
-"""What ``metadata.json`` and ``trial_stats.json`` say of trials, measured on their files.
+"""Records of trials for ``metadata.json`` and ``trial_stats.json``.
 
 Keys, definitions and roundings are the official ones (docs/official-system.md, section 4.3),
 except that a room is called by its name (``box``, not ``b'box'``) and that where an object is not
@@ -18,11 +18,11 @@ from physion.trials.official.names import ROOMS
 from physion.trials.official.write_frames import FrameWriter
 
 HIDDEN = 0.005
-"""Share of the picture below which an object counts as fully occluded."""
+"""Fraction of the picture below which an object counts as fully occluded."""
 
 
 def trial_record(written: FrameWriter, static: Mapping[str, Any]) -> dict[str, Any]:
-    """The record of one trial; ``static`` are the scalars of its static group."""
+    """Return the record of one trial; ``static`` has the scalars of its static group."""
     scene, labels = written.objects.scene, written.labels
     ids, roles = written.objects.ids, scene.roles
     first, last = written.masks[0], written.masks[len(written.objects.trajectory) - 1]
@@ -70,7 +70,7 @@ def trial_record(written: FrameWriter, static: Mapping[str, Any]) -> dict[str, A
 
 
 def trial_stats(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Means over the trials of a configuration, by ``<key>/avg_label``; names as first-last."""
+    """Return means over the trials of a configuration; of texts the first and the last value."""
     keys = dict.fromkeys(key for record in records for key in record if key != "trial_num")
     found: dict[str, Any] = {
         f"{key}/avg_label": _average([record.get(key) for record in records]) for key in keys
@@ -116,12 +116,12 @@ def _area(mask: NDArray[np.bool_]) -> float:
 
 
 def _shift(first: NDArray[np.bool_], last: NDArray[np.bool_]) -> list[float] | None:
-    """How far the middle of the target's pixels moves, (down, right), the picture being 2 wide."""
+    """Return the shift (down, right) of the centre of the target's pixels; pictures are 2 wide."""
     if not (first.any() and last.any()):
         return None
     height, width = first.shape
     middles = []
     for mask in (first, last):
-        row, column = (places.mean() for places in np.nonzero(mask))
+        row, column = (indices.mean() for indices in np.nonzero(mask))
         middles.append((2 * row / max(height - 1, 1) - 1, 2 * column / max(width - 1, 1) - 1))
     return [_round(after - before) for before, after in zip(*middles, strict=True)]

@@ -1,8 +1,7 @@
-"""The things of a scene as the official files list them: order, ids, names, sizes, meshes.
+"""Objects of a scene as listed in the official files: order, ids, names, sizes, meshes.
 
 Object ids count from 1. The zone comes first, then a ramp, the target and the probe, because
-official readers find target and zone by their places; then everything else as in the scene, and
-cloths last among their like.
+official readers find target and zone by their position; then all others in the order of the scene.
 """
 
 from __future__ import annotations
@@ -31,19 +30,19 @@ _SIDES = {
     "bottom": (0.0, 0.0, -1.0),
     "center": (0.0, 0.0, 0.0),
 }
-"""Face centres of a box about its centre in half sizes, along our axes of the object."""
+"""Face centres of a box relative to its centre, in half sizes, along the object's axes."""
 
 
 @dataclass(frozen=True)
 class OfficialObjects:
-    """The objects of a trial in the official order; ``order`` holds indices of `Scene.names`."""
+    """Objects of a trial in the official order."""
 
     scene: Scene
     trajectory: Trajectory
 
     @cached_property
     def order(self) -> list[int]:
-        """Indices of `Scene.names`, object by object."""
+        """Index of each object in `Scene.names`."""
         scene = self.scene
         roles = scene.roles
         first = [roles.patient]
@@ -54,45 +53,45 @@ class OfficialObjects:
 
     @cached_property
     def ids(self) -> dict[str, int]:
-        """Object ids by name, from 1."""
+        """Object ids, from 1, by name."""
         names = self.scene.names()
-        return {names[index]: place for place, index in enumerate(self.order, start=1)}
+        return {names[index]: id_ for id_, index in enumerate(self.order, start=1)}
 
     def __len__(self) -> int:
         return len(self.order)
 
     @cached_property
     def things(self) -> list[Body | Cloth]:
-        """Bodies and cloths, object by object."""
+        """Body or cloth of each object."""
         everything: list[Body | Cloth] = [*self.scene.bodies, *self.scene.cloths]
         return [everything[index] for index in self.order]
 
     @property
     def models(self) -> list[str]:
-        """Model names, object by object."""
+        """Model name of each object."""
         return [model_name(thing) for thing in self.things]
 
     @cached_property
     def scales(self) -> Floats:
-        """Scale factors (N, 3) along our axes of each object."""
+        """Scale factors (N, 3) along the axes of each object, in axes of this package."""
         return np.array([_scale(thing) for thing in self.things])
 
     @cached_property
     def poses(self) -> tuple[Floats, Floats]:
-        """Positions (F, N, 3) and rotations (F, N, 4), ours. A cloth is where its middle is."""
+        """Positions (F, N, 3) and rotations (F, N, 4); a cloth's position is that of its centre."""
         t = self.trajectory
         frames, bodies = t.positions.shape[:2]
         count = bodies + len(self.scene.cloths)
         positions, rotations = np.zeros((frames, count, 3)), np.zeros((frames, count, 4))
         positions[:, :bodies], rotations[:, :bodies] = t.positions, t.rotations
-        for place, cloth in enumerate(self.scene.cloths, start=bodies):
-            positions[:, place] = self.cloth_vertices(place).mean(axis=1)
-            rotations[:, place] = cloth.rotation
+        for index, cloth in enumerate(self.scene.cloths, start=bodies):
+            positions[:, index] = self.cloth_vertices(index).mean(axis=1)
+            rotations[:, index] = cloth.rotation
         return positions[:, self.order], rotations[:, self.order]
 
     @cached_property
     def motions(self) -> tuple[Floats, Floats]:
-        """Velocities and spins (F, N, 3), ours; those of a cloth are 0, as nobody gave any."""
+        """Linear and angular velocities (F, N, 3); zero for cloths, for which none are stored."""
         t = self.trajectory
         pad = ((0, 0), (0, len(self.scene.cloths)), (0, 0))
         return (
@@ -101,20 +100,20 @@ class OfficialObjects:
         )
 
     def cloth_vertices(self, index: int) -> Floats:
-        """Vertices (F, V, 3) of the cloth that is ``index`` in `Scene.names`."""
+        """Return the vertices (F, V, 3) of the cloth with this index in `Scene.names`."""
         sizes = [cloth.resolution**2 for cloth in self.scene.cloths]
-        place = index - len(self.scene.bodies)
-        start = sum(sizes[:place])
-        vertices = self.trajectory.cloth_vertices[:, start : start + sizes[place]]
+        cloth = index - len(self.scene.bodies)
+        start = sum(sizes[:cloth])
+        vertices = self.trajectory.cloth_vertices[:, start : start + sizes[cloth]]
         return np.asarray(vertices, np.float64)
 
-    def mesh(self, place: int) -> tuple[Floats, NDArray[np.int32]]:
-        """Vertices (V, 3) and triangles (T, 3) of an object as the official files have them.
+    def mesh(self, index: int) -> tuple[Floats, NDArray[np.int32]]:
+        """Return vertices (V, 3) and triangles (T, 3) of an object for the official files.
 
-        In its own frame and their axes, to be multiplied by its scale; clockwise from outside, as
-        Unity's, so that a cross product of the numbers points outwards.
+        Vertices are in the object's frame, official axes, at unit scale. Triangles are clockwise
+        as seen from outside, as in Unity, so the cross product of edges points outwards.
         """
-        thing = self.things[place]
+        thing = self.things[index]
         if isinstance(thing, Cloth):
             flat = Cloth(thing.name, (0.0, 0.0, 0.0), resolution=thing.resolution)
             vertices, faces = sheet_vertices(flat), sheet_triangles(thing.resolution)
@@ -124,21 +123,21 @@ class OfficialObjects:
         return swap_axes(vertices), faces[:, ::-1]
 
     def boxes(self, frame: int) -> dict[str, Floats]:
-        """Face centres and centre (N, 3), ours, of the boxes round all objects, by side."""
+        """Return face centres and centre (N, 3) of the bounding boxes of all objects, by side."""
         positions, rotations = self.poses
-        turns = rotation_matrices(rotations[frame])
+        matrices = rotation_matrices(rotations[frame])
         low, high = np.moveaxis(self._bounds, 1, 0) * self.scales
         found = {}
         for side, away in _SIDES.items():
             local = (low + high) / 2 + np.array(away) * (high - low) / 2
-            found[side] = positions[frame] + np.einsum("nij,nj->ni", turns, local)
-        for place, thing in enumerate(self.things):
+            found[side] = positions[frame] + np.einsum("nij,nj->ni", matrices, local)
+        for index, thing in enumerate(self.things):
             if isinstance(thing, Cloth):
-                points = self.cloth_vertices(self.order[place])[frame]
+                points = self.cloth_vertices(self.order[index])[frame]
                 low_, high_ = points.min(axis=0), points.max(axis=0)
                 for side, away in _SIDES.items():
                     middle = (low_ + high_) / 2
-                    found[side][place] = middle + np.array(away) * (high_ - low_) / 2
+                    found[side][index] = middle + np.array(away) * (high_ - low_) / 2
         return found
 
     @cached_property
@@ -152,7 +151,7 @@ class OfficialObjects:
 
     @cached_property
     def scenery(self) -> dict[str, list[str]]:
-        """Names of the scenery: ``occluders`` before the scene and ``distractors`` behind it."""
+        """Names of the scenery: ``occluders`` in front of the scene, ``distractors`` behind it."""
         eye, middle = np.array(self.scene.camera.position), np.array(self.scene.camera.target)
         found: dict[str, list[str]] = {"distractors": [], "occluders": []}
         for body in self.scene.bodies:
@@ -166,7 +165,7 @@ class OfficialObjects:
 
     @cached_property
     def middle(self) -> list[Body]:
-        """Bodies that move and have no role: dominoes, blocks, links."""
+        """Bodies that can move and have no role: dominoes, blocks, links."""
         roles = self.scene.roles
         taken = {roles.agent, roles.patient, roles.probe}
         return [
@@ -177,7 +176,7 @@ class OfficialObjects:
 
 
 def model_name(thing: Body | Cloth) -> str:
-    """Official name of a model; props, which no official library holds, keep ours."""
+    """Return the official name of a model; props keep the names of this package."""
     return CLOTH_MODEL if isinstance(thing, Cloth) else thing.shape
 
 

@@ -1,4 +1,4 @@
-"""The card of a dataset: a README for people and `croissant.json` for machines, side by side."""
+"""Card of a dataset: a README for people, and `croissant.json` for machines."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from physion.atomic import write_atomic
 from physion.errors import BadInputError
 from physion.trials.columns import INDEX_COLUMNS
 from physion.trials.layout import INDEX
-from physion.trials.publishing.croissant import Terms, croissant
+from physion.trials.publishing.croissant import PublicationTerms, croissant
 from physion.trials.publishing.facts import (
     SCENARIO_MEANINGS,
     SPLIT_MEANINGS,
-    Facts,
+    DatasetFacts,
     read_facts,
 )
 
 CARD = "README.md"
 METADATA = "croissant.json"
 TITLE = "Physion: "
-"""How the name of every dataset begins in a card of ours."""
+"""Prefix of the name of the dataset in every card."""
 MADE_BY = "Made with the package physion after the study of Bear et al. (2021)."
-"""Sentence in every description of ours, by which a file is known to be one."""
+"""Sentence in every description, by which existing files are recognised as cards."""
 CITATION = """@inproceedings{bear2021physion,
   title = {Physion: Evaluating Physical Prediction from Vision in Humans and Machines},
   author = {Bear, Daniel M. and Wang, Elias and Mrowca, Damian and Binder, Felix J. and
@@ -38,16 +38,16 @@ CITATION = """@inproceedings{bear2021physion,
   booktitle = {Advances in Neural Information Processing Systems, Datasets and Benchmarks},
   year = {2021}
 }"""
-"""The study whose system is built here (BibTeX)."""
+"""The original study (BibTeX)."""
 
 
 @dataclass(frozen=True)
 class Card:
-    """Paths of the two files, and the ``facts`` that they tell."""
+    """Paths of the two files, and the ``facts`` that they are made from."""
 
     readme: Path
     metadata: Path
-    facts: Facts
+    facts: DatasetFacts
 
 
 def write_card(
@@ -60,19 +60,30 @@ def write_card(
     url: str | None = None,
     published: str | None = None,
 ) -> Card:
-    """Describe the dataset in ``folder`` by `README.md` and `croissant.json`, beside its index.
+    """Write `README.md` and `croissant.json` for the dataset in ``folder``.
 
-    With ``out`` they are written there, to be put beside the index later. Arguments are as in
-    `Terms`; the day is by default today's. All counts come from the index as it is now: write the
-    card anew when the dataset changes; it takes the place of an older card and of nothing else.
-    `BadInputError` where there is no index or no trial, another file has one of the two names, or
-    an argument is not what it should be.
+    All counts come from the current index: write the card again after the dataset has changed.
+
+    Parameters
+    ----------
+    folder
+        Folder of the dataset.
+    out
+        Folder to write into; by default ``folder``. An older card is replaced.
+    license, version, creator, url, published
+        See `PublicationTerms`; the day of publication is by default today.
+
+    Raises
+    ------
+    BadInputError
+        If there is no index or no trial, a file that is not a card has one of the two names, or an
+        argument is not valid.
     """
     day = published or datetime.date.today().isoformat()
-    terms = _checked(Terms(day, license, version, creator, url))
+    terms = _checked(PublicationTerms(day, license, version, creator, url))
     facts = read_facts(folder)
     target = folder if out is None else out
-    _refuse_strangers(target)
+    _check_target(target)
     metadata = croissant(facts, terms, description(facts), CITATION)
     text = json.dumps(metadata, indent=1, ensure_ascii=False) + "\n"
     try:
@@ -84,21 +95,21 @@ def write_card(
     return Card(target / CARD, target / METADATA, facts)
 
 
-def _refuse_strangers(target: Path) -> None:
-    """Raise `BadInputError` where somebody else's file would be written over."""
+def _check_target(target: Path) -> None:
+    """Raise `BadInputError` if a file that is not a card would be overwritten."""
     for name, is_ours in ((CARD, _is_readme), (METADATA, _is_metadata)):
         path = target / name
         if not path.exists() and not path.is_symlink():
             continue
         if not (path.is_file() and is_ours(path)):
             raise BadInputError(
-                f"{path} is not a card of ours and would be lost; move it away, or write the card "
+                f"{path} is not a dataset card and would be lost; move it away, or write the card "
                 "into another folder (`physion export DATASET FOLDER --layout card`)"
             )
 
 
 def _is_readme(path: Path) -> bool:
-    """Whether the front matter is that of a card."""
+    """Return whether a README has the front matter of a card."""
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     if not lines or lines[0] != "---" or "---" not in lines[1:]:
         return False
@@ -106,6 +117,7 @@ def _is_readme(path: Path) -> bool:
 
 
 def _is_metadata(path: Path) -> bool:
+    """Return whether a JSON file has the description of a card."""
     try:
         data = json.loads(path.read_bytes())
     except (ValueError, RecursionError):
@@ -113,17 +125,17 @@ def _is_metadata(path: Path) -> bool:
     return isinstance(data, dict) and str(data.get("description")).endswith(MADE_BY)
 
 
-def description(facts: Facts) -> str:
-    """What the dataset is, in a few sentences."""
+def description(facts: DatasetFacts) -> str:
+    """Return a short description of the dataset."""
     return (
         f"{len(facts.index)} simulated physical scenes, {facts.movies or 'none'} of them with "
-        "movies. Who predicts sees the first part of a trial; the question is whether one thing, "
-        f"the agent, touches another, the patient, at any time of it. {MADE_BY}"
+        "movies. The first part of a trial is shown; the question is whether one object, the "
+        f"agent, touches another, the patient, at any time of the trial. {MADE_BY}"
     )
 
 
-def card_text(facts: Facts, terms: Terms) -> str:
-    """The README: YAML front matter as on the Hugging Face hub, then Markdown."""
+def card_text(facts: DatasetFacts, terms: PublicationTerms) -> str:
+    """Return the README: YAML front matter as on the Hugging Face hub, then Markdown."""
     name = terms.creator or "not named"
     sections = [
         _front_matter(facts, terms),
@@ -135,9 +147,9 @@ def card_text(facts: Facts, terms: Terms) -> str:
         f"## Scenarios\n{_meanings('scenario', SCENARIO_MEANINGS, facts)}",
         f"## Files\nOne folder for each split, in it one for each scenario. `{INDEX}` has one row "
         "for each trial, with the path, size and SHA-256 of its files; together they have "
-        f"{facts.total_bytes() / 1e6:.1f} MB. `{METADATA}` says the same for machines. Who "
-        "predicts may have the observed movies and the maps, and nothing else: the index, the "
-        "trial files and the full movies hold the answers.",
+        f"{facts.total_bytes() / 1e6:.1f} MB. `{METADATA}` is the machine-readable form. A model "
+        "or participant that predicts may use the observed movies and the maps, and nothing "
+        "else: the index, the trial files and the full movies contain the answers.",
         f"## Columns of the index\n{_table(_columns(facts))}",
         "## Biases\n" + _list(facts.biases()),
         "## Known limits\n" + _list(facts.limitations()),
@@ -146,8 +158,8 @@ def card_text(facts: Facts, terms: Terms) -> str:
     return "\n\n".join(sections) + "\n"
 
 
-def _front_matter(facts: Facts, terms: Terms) -> str:
-    """Metadata of the hub. Values are JSON, which YAML reads as it is."""
+def _front_matter(facts: DatasetFacts, terms: PublicationTerms) -> str:
+    """Return the front matter of the hub; values are JSON, which is valid YAML."""
     values: dict[str, Any] = {
         "license": terms.license.lower(),
         "pretty_name": f"{TITLE}{facts.name}",
@@ -162,14 +174,14 @@ def _front_matter(facts: Facts, terms: Terms) -> str:
 
 
 def _size_category(count: int) -> str:
-    """The hub's name for a number of records."""
+    """Return the hub's category for a number of records."""
     bounds = (1_000, 10_000, 100_000, 1_000_000)
     names = ("n<1K", "1K<n<10K", "10K<n<100K", "100K<n<1M", "1M<n<10M")
     return names[sum(count >= bound for bound in bounds)]
 
 
 def _counts(index: pd.DataFrame) -> pd.DataFrame:
-    """One row for each split and scenario: trials, contact rate, length, robustness."""
+    """Return counts and rates of each split and scenario, one row each."""
     rows = []
     for (split, scenario), part in index.groupby(["split", "scenario"], observed=True):
         robust = part["robust"].dropna()
@@ -188,7 +200,7 @@ def _counts(index: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _columns(facts: Facts) -> pd.DataFrame:
+def _columns(facts: DatasetFacts) -> pd.DataFrame:
     rows = [
         {"column": f"`{name}`", "meaning": column.meaning}
         for name, column in INDEX_COLUMNS.items()
@@ -200,7 +212,7 @@ def _columns(facts: Facts) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _meanings(column: str, meanings: dict[str, str], facts: Facts) -> str:
+def _meanings(column: str, meanings: dict[str, str], facts: DatasetFacts) -> str:
     found = sorted(set(facts.index[column]))
     return _table(
         pd.DataFrame([{column: f"`{name}`", "meaning": meanings.get(name, "-")} for name in found])
@@ -208,7 +220,7 @@ def _meanings(column: str, meanings: dict[str, str], facts: Facts) -> str:
 
 
 def _table(table: pd.DataFrame) -> str:
-    """A Markdown table."""
+    """Return a Markdown table."""
     rows = [list(table.columns), ["---"] * len(table.columns), *table.astype(str).values.tolist()]
     return "\n".join("| " + " | ".join(c.replace("|", "\\|") for c in row) + " |" for row in rows)
 
@@ -217,18 +229,18 @@ def _list(items: list[str]) -> str:
     return "\n".join(f"- {item}" for item in items)
 
 
-def _checked(terms: Terms) -> Terms:
-    """The terms, or `BadInputError` for what the formats would not take."""
+def _checked(terms: PublicationTerms) -> PublicationTerms:
+    """Return ``terms``; `BadInputError` for values that the formats do not allow."""
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9.+-]*", terms.license):
         raise BadInputError(
-            f"licence {terms.license!r} is not an identifier of spdx.org, like MIT or CC-BY-4.0"
+            f"licence {terms.license!r} is not an identifier of spdx.org, such as MIT or CC-BY-4.0"
         )
     if not re.fullmatch(r"\d+\.\d+\.\d+", terms.version):
-        raise BadInputError(f"version {terms.version!r} is not three numbers, like 1.0.0")
+        raise BadInputError(f"version {terms.version!r} is not three numbers, such as 1.0.0")
     if terms.url is not None and not re.fullmatch(r"https?://\S+|urn:\S+", terms.url):
         raise BadInputError(f"{terms.url!r} is not an address that begins with http:// or https://")
     try:
         datetime.date.fromisoformat(terms.published)
     except ValueError:
-        raise BadInputError(f"day {terms.published!r} is not like 2026-01-31") from None
+        raise BadInputError(f"day {terms.published!r} does not have the form 2026-01-31") from None
     return terms

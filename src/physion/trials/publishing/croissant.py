@@ -1,7 +1,7 @@
-"""A dataset described for machines: Croissant 1.0 with the responsible-AI vocabulary 1.0 (JSON-LD).
+"""Machine-readable metadata of a dataset: Croissant 1.0 with responsible-AI vocabulary (JSON-LD).
 
-Words of both vocabularies are those of their specifications (docs.mlcommons.org/croissant); the
-context stands in the file, so that nothing has to be fetched to read it.
+Terms are those of the specifications (docs.mlcommons.org/croissant). The JSON-LD context is
+included in the file, so that reading it requires no network access.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 
 from physion.trials.columns import FILES, INDEX_COLUMNS, IndexColumn
 from physion.trials.layout import INDEX
-from physion.trials.publishing.facts import SCENARIO_MEANINGS, SPLIT_MEANINGS, Facts
+from physion.trials.publishing.facts import SCENARIO_MEANINGS, SPLIT_MEANINGS, DatasetFacts
 
 CROISSANT = "http://mlcommons.org/croissant/1.0"
 RAI = "http://mlcommons.org/croissant/RAI/1.0"
@@ -46,13 +46,21 @@ CONTEXT: dict[str, Any] = {
 
 
 @dataclass(frozen=True)
-class Terms:
-    """What a dataset cannot say of itself, for who publishes it.
+class PublicationTerms:
+    """Information that the publisher of a dataset provides.
 
-    - ``license``: an identifier of spdx.org. By default that of this package, and of the official
-      command logs. ``version``: of the dataset, three numbers with dots.
-    - ``creator``: who made it. ``url``: its page; by default a name made of its index's hash.
-    - ``published``: the day, ``YYYY-MM-DD``.
+    Parameters
+    ----------
+    published
+        Day of publication, ``YYYY-MM-DD``.
+    license
+        Identifier of spdx.org; by default that of this package and of the official command logs.
+    version
+        Version of the dataset, three numbers with dots.
+    creator
+        Name of the person or group.
+    url
+        Page of the dataset; by default a URN with the SHA-256 of its index.
     """
 
     published: str
@@ -62,8 +70,10 @@ class Terms:
     url: str | None = None
 
 
-def croissant(facts: Facts, terms: Terms, description: str, citation: str) -> dict[str, Any]:
-    """The metadata as JSON-LD; ``citation`` is BibTeX."""
+def croissant(
+    facts: DatasetFacts, terms: PublicationTerms, description: str, citation: str
+) -> dict[str, Any]:
+    """Return the metadata as JSON-LD; ``citation`` is BibTeX."""
     package = facts.versions("package")
     creator = terms.creator or f"An unnamed user of {package}"
     return {
@@ -85,32 +95,32 @@ def croissant(facts: Facts, terms: Terms, description: str, citation: str) -> di
     }
 
 
-def responsible(facts: Facts) -> dict[str, Any]:
-    """Properties of the responsible-AI vocabulary."""
+def responsible(facts: DatasetFacts) -> dict[str, Any]:
+    """Return the properties of the responsible-AI vocabulary."""
     n = len(facts.index)
     return {
         "rai:dataCollection": facts.collection(),
         "rai:dataCollectionType": ["Software Collection"]
         + (["Secondary Data analysis"] if facts.imported else []),
         "rai:dataCollectionRawData": "Scenes (bodies, poses, pushes, camera) and their simulated "
-        "motion are kept in every trial file; pictures can be rendered from them again.",
+        "motion are stored in every trial file; pictures can be rendered again from them.",
         "rai:dataCollectionMissingData": facts.missing(),
-        "rai:dataAnnotationProtocol": "Labels are computed, not judged: whether the simulation "
-        "made agent and patient touch, at any time of the trial, the unseen part included.",
+        "rai:dataAnnotationProtocol": "Labels are computed, not judged by people: whether agent "
+        "and patient touch at any time of the simulated trial, including its hidden part.",
         "rai:machineAnnotationTools": [facts.versions("engine"), facts.versions("package")],
         "rai:annotationsPerItem": "0 by people; one label is computed",
         "rai:dataBiases": facts.biases(),
         "rai:dataLimitations": facts.limitations(),
         "rai:dataUseCases": [
             "Training models that predict what happens next from video or from physical state.",
-            "Testing whether such models foresee contacts, and comparing them with people who "
+            "Testing whether such models predict contacts, and comparing them with people who "
             "judge the same movies.",
-            "Not meant for decisions about real objects: nothing here was measured on any.",
+            "Not intended for decisions about real objects: nothing was measured on real objects.",
         ],
         "rai:dataSocialImpact": "None is known beyond that of research on physical prediction.",
         "rai:personalSensitiveInformation": [
-            "None. All pictures are rendered from made scenes; no person was filmed, and nobody's "
-            "answers are part of the dataset."
+            "None. All pictures are rendered from synthetic scenes; no person was filmed, and no "
+            "responses of people are part of the dataset."
         ],
         "rai:dataReleaseMaintenancePlan": f"The {n - facts.imported} trials with a seed can be "
         f"made again by {facts.versions('package')}; every file's SHA-256 is in the index, and "
@@ -119,22 +129,22 @@ def responsible(facts: Facts) -> dict[str, Any]:
     }
 
 
-def preprocessing(facts: Facts) -> list[str]:
-    """What became of the simulation before it was stored."""
+def preprocessing(facts: DatasetFacts) -> list[str]:
+    """Return how simulations were processed before they were stored."""
     sizes = facts.index[["width", "height"]].drop_duplicates().sort_values(["width", "height"])
     text = ", ".join(f"{row.width} x {row.height}" for row in sizes.itertuples())
-    said = ["States are stored as the engine computed them, in single precision."]
+    steps = ["States are stored as the engine computed them, in single precision."]
     if facts.movies:
-        said.append(f"Movies are H.264 ({text} pixels); the observed part is a file of its own.")
-    return said
+        steps.append(f"Movies are H.264 ({text} pixels); the observed part is a file of its own.")
+    return steps
 
 
-def _distribution(facts: Facts) -> list[dict[str, Any]]:
+def _distribution(facts: DatasetFacts) -> list[dict[str, Any]]:
     index_file = {
         "@type": "cr:FileObject",
         "@id": INDEX,
         "name": INDEX,
-        "description": "One row a trial, with label, hashes and paths. Holds the answers.",
+        "description": "One row per trial, with label, hashes and paths. Contains the answers.",
         "contentUrl": INDEX,
         "contentSize": f"{facts.index_bytes} B",
         "encodingFormat": "application/x-parquet",
@@ -156,8 +166,8 @@ def _distribution(facts: Facts) -> list[dict[str, Any]]:
     return [index_file, *sets]
 
 
-def _enumerations(facts: Facts) -> list[dict[str, Any]]:
-    """Splits and scenarios that occur, with what they mean."""
+def _enumerations(facts: DatasetFacts) -> list[dict[str, Any]]:
+    """Return record sets of the splits and scenarios that occur, with their meanings."""
     sets = []
     for column, meanings, kind in (
         ("split", SPLIT_MEANINGS, "cr:Split"),
@@ -187,12 +197,12 @@ def _enumerations(facts: Facts) -> list[dict[str, Any]]:
 
 
 def _trials() -> dict[str, Any]:
-    """The index, column by column."""
+    """Return the record set of the index, with one field per column."""
     return {
         "@type": "cr:RecordSet",
         "@id": "trials",
         "name": "trials",
-        "description": "One record a trial.",
+        "description": "One record per trial.",
         "key": {"@id": "trials/trial"},
         "field": [_field(name, column) for name, column in INDEX_COLUMNS.items()],
     }

@@ -1,7 +1,7 @@
-"""What is true of a dataset, for its card and its metadata.
+"""DatasetFacts about a dataset, for its card and its metadata.
 
-Every statement is counted from the index, read from the settings that lie beside it, or holds for
-all datasets that this package makes.
+Every statement is computed from the index, read from the settings of the dataset, or true of all
+datasets that this package makes.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ SCENARIO_MEANINGS = {
 
 
 @dataclass(frozen=True)
-class Facts:
-    """What is known of the dataset in a folder: its index, and the settings that it was made with.
+class DatasetFacts:
+    """Index of a dataset with size and SHA-256 of its file, and the settings of the dataset.
 
-    ``settings`` is empty where the folder has none.
+    ``settings`` is empty if the folder has none.
     """
 
     index: pd.DataFrame
@@ -51,35 +51,34 @@ class Facts:
 
     @property
     def name(self) -> str:
-        """Name of the dataset; several are joined by ``+``."""
+        """Name of the dataset; several names are joined by ``+``."""
         return "+".join(sorted(set(self.index["dataset"])))
 
     @property
     def imported(self) -> int:
-        """Trials whose scenes were not drawn by a seed but came from outside."""
+        """Number of trials whose scenes were imported, not sampled."""
         return int(self.index["seed"].isna().sum())
 
     @property
     def movies(self) -> int:
-        """Trials with movies; the others are states alone."""
+        """Number of trials with movies."""
         return int(self.index["movie"].notna().sum())
 
     def versions(self, column: str) -> str:
-        """The different values of a column as one text."""
+        """Return the distinct values of a column as one text."""
         return ", ".join(sorted({str(value) for value in self.index[column].dropna()}))
 
     def total_bytes(self) -> int:
-        """Size of all files that the index lists."""
+        """Return the total size in bytes of all files in the index."""
         return int(self.index[[f"{name}_bytes" for name in FILES]].sum().sum())
 
     def collection(self) -> str:
-        """How the trials came to be."""
+        """Return how the trials were made."""
         drawn = len(self.index) - self.imported
         parts = []
         if drawn:
             parts.append(
-                f"{drawn} {_scenes(drawn)} drawn at random by the samplers of "
-                f"{self.versions('package')}."
+                f"{drawn} {_scenes(drawn)} sampled at random by {self.versions('package')}."
             )
         if self.imported:
             parts.append(
@@ -92,17 +91,17 @@ class Facts:
         return " ".join(parts)
 
     def missing(self) -> str:
-        """Cells of the index without a value, by column."""
+        """Return the numbers of missing cells of the index, by column."""
         columns = [name for name in INDEX_COLUMNS if not name.endswith(("_bytes", "_sha256"))]
         counts = self.index[columns].isna().sum()
         gaps = [f"{name} ({count})" for name, count in counts.items() if count]
         return f"Missing cells by column, of {len(self.index)}: {', '.join(gaps) or 'none'}."
 
     def biases(self) -> list[str]:
-        """Imbalances, counted."""
+        """Return the known biases, with counts."""
         index = self.index
         rates = index.groupby("split", observed=True)["contact"].agg(["mean", "size"])
-        said = [
+        statements = [
             f"Agent and patient touch in {row['mean']:.3f} of the {row['size']:.0f} {split} trials."
             for split, row in rates.iterrows()
         ]
@@ -112,44 +111,46 @@ class Facts:
             if name in self.settings
         }
         if chosen and self.imported < len(index):
-            told = ", ".join(f"{name} = {value}" for name, value in chosen.items())
-            said.append(
-                f"Drawn trials were chosen with these settings of `physion generate`: {told}."
+            text = ", ".join(f"{name} = {value}" for name, value in chosen.items())
+            statements.append(
+                f"Sampled trials were chosen with these settings of `physion generate`: {text}."
             )
-        said.append(
+        statements.append(
             "Shapes, sizes, colours, rooms and cameras follow the package's samplers or the "
             "imported scenes, not the statistics of any real place."
         )
-        return said
+        return statements
 
     def limitations(self) -> list[str]:
-        """What the data cannot show, with counts where something was counted."""
+        """Return the known limitations, with counts."""
         index, n = self.index, len(self.index)
-        said = [
-            "Rigid bodies and cloth are simulated; another engine may decide some trials "
-            "otherwise.",
+        statements = [
+            "Rigid bodies and cloth are simulated; another engine may give some trials another "
+            "outcome.",
             "The camera never moves, and there is no sound.",
             f"In {int(index['observed_contact'].sum())} of {n} trials agent and patient touch "
             "already in the observed part.",
         ]
         robust = index["robust"].dropna()
         if len(robust):
-            said.append(
+            statements.append(
                 "Jittered simulations agree with the label in "
                 f"{float(robust.mean()):.3f} of cases, measured on {len(robust)} of {n} trials."
             )
         else:
-            said.append("How far labels depend on tiny changes of the scene was not measured.")
+            statements.append(
+                "How much labels depend on tiny changes of the scene was not measured."
+            )
         unfinished = int((~index["completed"]).sum())
-        said.append(f"In {unfinished} of {n} trials something still moved when the time was over.")
-        return said
+        statements.append(f"In {unfinished} of {n} trials something still moved at the time limit.")
+        return statements
 
 
-def read_facts(folder: Path) -> Facts:
-    """The facts of a dataset; `BadInputError` where there is no index, or not one trial in it."""
+def read_facts(folder: Path) -> DatasetFacts:
+    """Read the facts of a dataset; `BadInputError` if it has no index or no trial."""
     index = read_index(folder)
     if index.empty:
-        raise BadInputError(f"{folder} holds no trial to describe")
+        raise BadInputError(f"{folder} has no trial to describe")
     data = (folder / INDEX).read_bytes()
     path, settings = folder / SETTINGS, {}
     if path.is_file():
@@ -157,7 +158,7 @@ def read_facts(folder: Path) -> Facts:
             settings = dict(json.loads(path.read_text(encoding="utf-8"))["settings"])
         except (ValueError, KeyError, TypeError) as error:
             raise BadInputError(f"{path} is damaged: {error}") from error
-    return Facts(index, len(data), hashlib.sha256(data).hexdigest(), settings)
+    return DatasetFacts(index, len(data), hashlib.sha256(data).hexdigest(), settings)
 
 
 def _scenes(count: int) -> str:

@@ -1,15 +1,16 @@
-"""A dataset as tar shards that webdataset reads, for training over a network or from object stores.
+"""Export of a dataset as tar shards for webdataset: training over a network or from object stores.
 
-A sample is one trial: files of one key in one shard, told apart by what follows the first dot.
-What may be seen by who predicts, and what may not, never share a file:
+A sample is one trial: the files of one shard that share a key, distinguished by what follows the
+first dot. Keys are trial names with dots replaced by underscores. Information that a predictor may
+use and information about the outcome are in separate files:
 
 - ``json``: name, scenario, look, picture size, length of the observed part.
 - ``observed.mp4``, ``free_observed.mp4``: the observed frames alone, in the trial's look and free.
 - ``map.png``: agent and patient in the first frame.
-- ``outcome.json``: label, length, seed and all else of the index: the answer.
+- ``outcome.json``: label, length, seed and all other columns of the index: the answer.
 - ``full.mp4``, ``free_full.mp4``, ``trial.h5``: the future.
 
-The same dataset and options give the same bytes. Keys are trial names with dots as underscores.
+Equal datasets and options give equal bytes.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from physion.trials.index import COLUMNS, read_index
 from physion.trials.layout import TrialPaths
 
 MANIFEST = "shards.json"
-"""What the shards of a folder are: written anew with every shard, ``complete`` with the last."""
+"""File that lists the shards of a folder; rewritten with every shard, ``complete`` at the end."""
 SHARD_BYTES = 2**28
 LAYOUT = 1
 """Version of names and contents of the files in a sample."""
@@ -44,23 +45,23 @@ FILE_PARTS: Mapping[str, str] = {
     "observed.mp4": "observed_movie",
     "trial.h5": "trial_file",
 }
-"""Extension in a sample, and the index column of the file that it is."""
+"""Columns of the index that name the files of a sample, by the extension in the sample."""
 _NAMES, _PICTURE = ("trial", "dataset", "scenario", "split"), ("look", "width", "height")
 SEEN_COLUMNS = (*_NAMES, *_PICTURE, "observed_frames")
-"""Columns of the index that tell nothing of what happens."""
+"""Columns of the index that reveal nothing about the outcome."""
 SEEN_PARTS = ("free_observed.mp4", "json", "map.png", "observed.mp4")
-"""Parts that may be given to who predicts."""
+"""Parts that may be given to a model or participant that predicts."""
 PARTS = tuple(sorted((*FILE_PARTS, "json", "outcome.json")))
-"""All parts, in their order within a sample."""
+"""All parts, in their order in a sample."""
 
 _BLOCK = tarfile.BLOCKSIZE
 
 
 @dataclass(frozen=True)
 class Shard:
-    """One tar file: ``split`` and count of ``samples``, ``bytes`` and ``sha256`` of the file.
+    """One tar file: its ``split``, number of ``samples``, size in ``bytes`` and ``sha256``.
 
-    ``contents`` is a digest of what went in, known before the file is made.
+    ``contents`` is a digest of the content, which is known before the file is made.
     """
 
     name: str
@@ -73,7 +74,7 @@ class Shard:
 
 @dataclass(frozen=True)
 class ShardReport:
-    """The ``shards`` of a folder, which of them were ``made`` now, and the ``manifest``'s path."""
+    """All ``shards`` of a folder, names of those ``made`` now, and path of the ``manifest``."""
 
     shards: tuple[Shard, ...]
     made: tuple[str, ...]
@@ -81,18 +82,18 @@ class ShardReport:
 
     @property
     def samples(self) -> int:
-        """Trials in all shards."""
+        """Number of trials in all shards."""
         return sum(shard.samples for shard in self.shards)
 
     @property
     def bytes(self) -> int:
-        """Size of all shards."""
+        """Size of all shards in bytes."""
         return sum(shard.bytes for shard in self.shards)
 
 
 @dataclass(frozen=True)
 class _Sample:
-    """One trial to be: its texts by extension; its files with the sizes and hashes to find."""
+    """One planned sample: texts, and files with expected size and SHA-256, by extension."""
 
     key: str
     split: str
@@ -100,11 +101,11 @@ class _Sample:
     files: Mapping[str, tuple[Path, int, str]]
 
     def sizes(self) -> list[int]:
-        """Bytes of every file in the sample."""
+        """Return the sizes in bytes of the files of the sample."""
         return [len(text) for text in self.texts.values()] + [f[1] for f in self.files.values()]
 
     def digest(self) -> str:
-        """Of all that will be in the sample."""
+        """Return a digest of the content of the sample."""
         known = {ending: hashlib.sha256(text).hexdigest() for ending, text in self.texts.items()}
         known |= {ending: sha for ending, (_, _, sha) in self.files.items()}
         return hashlib.sha256(json.dumps([self.key, known], sort_keys=True).encode()).hexdigest()
@@ -119,23 +120,39 @@ def export_shards(
     parts: Sequence[str] = PARTS,
     shard_bytes: int = SHARD_BYTES,
 ) -> ShardReport:
-    """Write the trials of ``folder``, or of one split and scenario, as tar shards into ``out``.
+    """Write trials of the dataset in ``folder`` as tar shards into ``out``.
 
-    Shards are called ``physion-<split>-000000.tar`` and hold trials in the order of the index, up
-    to ``shard_bytes`` (a trial larger than that has a shard of its own). ``parts`` says which files
-    a sample has: `SEEN_PARTS` gives shards that hold no answer and no future. Files that a trial
-    does not have are left out.
+    Shards are called ``physion-<split>-000000.tar`` and contain trials in the order of the index.
+    Every file is compared with its SHA-256 in the index. An interrupted export is continued by the
+    same call; shards whose trials have changed are made again.
 
-    Every file is compared with its hash in the index on the way. A stopped call goes on where it
-    stopped; shards of trials that have changed are made anew. Raises `BadInputError` where a file
-    is not what the index says, or ``out`` holds something else or shards of other options, and
-    `UnknownNameError` for an unknown split, scenario or part.
+    Parameters
+    ----------
+    folder, out
+        Folder of the dataset, and folder to write into.
+    split, scenario
+        Trials to export; by default all.
+    parts
+        Files of a sample; `SEEN_PARTS` gives shards without answer and future. Files that a trial
+        does not have are left out.
+    shard_bytes
+        Largest size of a shard; a trial that is larger has a shard of its own.
+
+    Raises
+    ------
+    BadInputError
+        If a file is not the one in the index, or ``out`` contains other files or shards of other
+        options.
+    UnknownNameError
+        For an unknown split, scenario or part.
     """
     for part in parts:
         if part not in PARTS:
             raise UnknownNameError("part", part, PARTS)
     if shard_bytes < 1 or not parts:
-        raise BadInputError(f"shards need a part and a size above 0, not {shard_bytes} bytes")
+        raise BadInputError(
+            f"shards need at least one part and a size above 0, not {shard_bytes} bytes"
+        )
     table = _select(read_index(folder), split, scenario)
     plan = _plan(_samples(folder, table, sorted(set(parts))), shard_bytes)
     options = {"layout": LAYOUT, "dataset": sorted(set(table["dataset"])), "split": split}
@@ -156,7 +173,9 @@ def _select(table: pd.DataFrame, split: str | None, scenario: str | None) -> pd.
                 raise UnknownNameError(column, wanted, set(table[column]))
             table = table[table[column] == wanted]
     if table.empty:
-        raise BadInputError("there is no trial to export: the index is empty, or its choice is")
+        raise BadInputError(
+            "there is no trial to export: the index has none of this split and scenario"
+        )
     return table
 
 
@@ -164,7 +183,7 @@ def _samples(folder: Path, table: pd.DataFrame, parts: Sequence[str]) -> list[_S
     keys = table["trial"].str.replace(".", "_", regex=False)
     if keys.duplicated().any():
         twice = sorted(table["trial"][keys.duplicated(keep=False)])
-        raise BadInputError(f"trials {twice[:2]} differ in dots alone, which keys may not have")
+        raise BadInputError(f"trials {twice[:2]} differ in dots only, which keys cannot contain")
     return [
         _sample(folder, key, row, parts)
         for key, row in zip(keys, table.to_dict("records"), strict=True)
@@ -174,39 +193,39 @@ def _samples(folder: Path, table: pd.DataFrame, parts: Sequence[str]) -> list[_S
 def _sample(folder: Path, key: str, row: Mapping[str, Any], parts: Sequence[str]) -> _Sample:
     paths = TrialPaths(folder, row["split"], row["scenario"], row["trial"])
     files = {
-        # The paths of the index may point anywhere; those of the layout stay in the folder.
+        # Paths in the index could point outside the folder; those of the layout cannot.
         part: (getattr(paths, column), int(row[f"{column}_bytes"]), str(row[f"{column}_sha256"]))
         for part, column in FILE_PARTS.items()
         if part in parts and not pd.isna(row[column])
     }
-    told = {"json": SEEN_COLUMNS, "outcome.json": COLUMNS}
+    columns_of = {"json": SEEN_COLUMNS, "outcome.json": COLUMNS}
     texts = {
         part: json.dumps({name: _plain(row[name]) for name in columns}, sort_keys=True).encode()
-        for part, columns in told.items()
+        for part, columns in columns_of.items()
         if part in parts
     }
     return _Sample(key, row["split"], texts, files)
 
 
 def _plain(value: Any) -> Any:
-    """A cell of the index as JSON has it."""
+    """Return a cell of the index as a JSON value."""
     if pd.isna(value):
         return None
     return value.item() if hasattr(value, "item") else value
 
 
 def _plan(samples: Iterable[_Sample], shard_bytes: int) -> dict[str, list[_Sample]]:
-    """Samples by the name of their shard."""
+    """Return the samples by the name of their shard."""
     plan: dict[str, list[_Sample]] = {}
     counts: dict[str, int] = {}
-    room = 0
+    capacity = 0
     for sample in samples:
         size = sum(_BLOCK * (4 + -(-bytes_ // _BLOCK)) for bytes_ in sample.sizes())
-        if sample.split not in counts or size > room:
+        if sample.split not in counts or size > capacity:
             counts[sample.split] = counts.get(sample.split, -1) + 1
             # The end of an archive is padded to a whole record.
-            room = shard_bytes - tarfile.RECORDSIZE
-        room -= size
+            capacity = shard_bytes - tarfile.RECORDSIZE
+        capacity -= size
         name = f"physion-{sample.split}-{counts[sample.split]:06d}.tar"
         plan.setdefault(name, []).append(sample)
     return plan
@@ -229,7 +248,7 @@ def _write_all(
             made.append(name)
         done[name] = known
         if made:
-            # What is left of another plan stays listed until its file is gone.
+            # Shards of an earlier plan stay listed until their files are deleted.
             _write_manifest(out, options, {**before, **done}, complete=False)
     for name in before.keys() - done.keys():
         (out / name).unlink(missing_ok=True)
@@ -238,13 +257,13 @@ def _write_all(
 
 
 def _archive(samples: Sequence[_Sample]) -> bytes:
-    """The bytes of one shard."""
+    """Return the bytes of one shard."""
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w", format=tarfile.PAX_FORMAT) as archive:
         for sample in samples:
             for part in sorted((*sample.texts, *sample.files)):
                 data = sample.texts[part] if part in sample.texts else _read(*sample.files[part])
-                # Owner, time and mode are tarfile's constants, so that they say nothing.
+                # Owner, time and mode are the constant defaults of tarfile.
                 member = tarfile.TarInfo(f"{sample.key}.{part}")
                 member.size = len(data)
                 archive.addfile(member, io.BytesIO(data))
@@ -252,7 +271,7 @@ def _archive(samples: Sequence[_Sample]) -> bytes:
 
 
 def _read(path: Path, size: int, sha: str) -> bytes:
-    """The bytes of a file, which must be those that the index promises."""
+    """Return the bytes of a file; `BadInputError` unless they match size and SHA-256."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -263,7 +282,7 @@ def _read(path: Path, size: int, sha: str) -> bytes:
 
 
 def _is_whole(path: Path, shard: Shard) -> bool:
-    """The file of a shard is there, unchanged."""
+    """Return whether the file of a shard exists and is unchanged."""
     if not path.is_file() or path.stat().st_size != shard.bytes:
         return False
     with path.open("rb") as file:
@@ -271,28 +290,30 @@ def _is_whole(path: Path, shard: Shard) -> bool:
 
 
 def _known_shards(out: Path, options: Mapping[str, Any]) -> dict[str, Shard]:
-    """The shards that the manifest of ``out`` lists; none where the folder is new and empty."""
+    """Return the shards listed in the manifest of ``out``; none for a new or empty folder."""
     path = out / MANIFEST
     if not path.is_file():
-        strangers = sorted(item.name for item in out.iterdir() if not item.name.startswith("."))
-        # A call that was killed early leaves one shard and no manifest.
-        if strangers and not all(name.startswith("physion-") for name in strangers):
+        others = sorted(item.name for item in out.iterdir() if not item.name.startswith("."))
+        # An export that was killed early leaves one shard and no manifest.
+        if others and not all(name.startswith("physion-") for name in others):
             raise BadInputError(
-                f"{out} holds {strangers[0]!r} and no {MANIFEST}; choose an empty or new folder"
+                f"{out} contains {others[0]!r} and no {MANIFEST}; choose an empty or new folder"
             )
         return {}
     try:
         known = json.loads(path.read_text(encoding="utf-8", errors="replace"))
         before = {item["name"]: Shard(**item) for item in known["shards"]}
-        theirs = known["options"]
+        stored_options = known["options"]
     except (ValueError, KeyError, TypeError) as error:
-        raise BadInputError(f"{path} is damaged ({error}); delete it to make all anew") from error
-    if theirs != options:
         raise BadInputError(
-            f"{out} holds shards of other options, see {path}; choose another folder"
+            f"{path} is damaged ({error}); delete it to export everything again"
+        ) from error
+    if stored_options != options:
+        raise BadInputError(
+            f"{out} contains shards of other options, see {path}; choose another folder"
         )
     if not all(name.startswith("physion-") and Path(name).name == name for name in before):
-        raise BadInputError(f"{path} names files that are no shards; choose another folder")
+        raise BadInputError(f"{path} lists files that are not shards; choose another folder")
     return before
 
 
