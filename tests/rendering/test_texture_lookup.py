@@ -31,7 +31,7 @@ def test_a_pixel_that_covers_the_whole_texture_takes_the_last_level() -> None:
 
 
 def two_by_two() -> Atlas:
-    """Return two levels: four texels of stored red 0, 100, 200, 40, then one of 60; other colours 255."""
+    """Return two levels: texels of stored red 0, 100, 200, 40, then 60; other colours are 255."""
     red = [0, 100, 200, 40, 60]
     slope = int(SLOPE_ZERO + 0.5 * SLOPE_SCALE)
     texels = np.array([[r, 255, 255, slope, int(SLOPE_ZERO)] for r in red], np.uint8)

@@ -16,12 +16,13 @@ References
 Blinn, J. (1977). Models of light reflection for computer synthesized pictures. SIGGRAPH.
 Schlick, C. (1994). An inexpensive BRDF model for physically-based rendering. Computer Graphics
     Forum 13(3).
+Holbert, D. (2011). Saying "goodbye" to shadow acne. Game Developers Conference, poster.
 Heckbert, P. (1989). Fundamentals of texture mapping and image warping. MSc thesis, UC Berkeley.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,11 +70,10 @@ CORNER_OCCLUSION = 0.22
 CORNER_RANGE = 0.6
 """Metres from that edge at which the loss has fallen to 1/e."""
 SHADOW_OFFSET = 0.03
-"""Metres along the normal from a point to where it is looked up in the shadow map, so that a
-surface does not shadow itself."""
+"""Metres along the normal from a point to where it is looked up in the shadow map, so that the
+texels of the map do not shadow their own surface (normal offset, Holbert 2011)."""
 LEVEL_COSINE = 0.5
-"""Vertical component of the normal below which things under it or near it do not occlude."""
-
+"""Vertical component of the normal up to which objects near a surface do not occlude it."""
 
 CAMERA = np.dtype([("position", "f8", 3), ("rays", "f8", (3, 3))], align=True)
 """The camera: its position in metres; the matrix from a pixel (x, y, 1) to the world vector from
@@ -196,6 +196,17 @@ def _scaled(a: Vector, factor: float) -> Vector:
 
 
 @kernel
+def _pixel_ray(camera: Any, x: float, y: float) -> Vector:
+    """Return the world vector from a camera, a `CAMERA`, to depth 1 at a pixel."""
+    rays = camera.rays
+    return (
+        rays[0, 0] * x + rays[0, 1] * y + rays[0, 2],
+        rays[1, 0] * x + rays[1, 1] * y + rays[1, 2],
+        rays[2, 0] * x + rays[2, 1] * y + rays[2, 2],
+    )
+
+
+@kernel
 def texture_footprint(
     edges: F64, surfaces: Records, t: int, weights: Vector, depth: float
 ) -> tuple[float, float, float]:
@@ -294,6 +305,17 @@ def fresnel(reflectance: float, metalness: float, cosine: float) -> float:
 
 
 @kernel
+def _mirrored(normal: Vector, to_eye: Vector, cosine: float) -> Vector:
+    """Return the mirrored viewing ray r = 2 (n . v) n - v; ``cosine`` is n . v."""
+    twice = 2.0 * cosine
+    return (
+        twice * normal[0] - to_eye[0],
+        twice * normal[1] - to_eye[1],
+        twice * normal[2] - to_eye[2],
+    )
+
+
+@kernel
 def window_fraction(position: Vector, ray: Vector, low: F64, high: F64) -> float:
     """Return how much of the window a rough reflection along ``ray`` shows, 0..1.
 
@@ -361,12 +383,9 @@ def _shade_point(
     # The point: camera + depth * ray, and the direction back to the camera.
     depth, b0, b1, b2 = barycentric(edges, t, x, y)
     weights = (b0, b1, b2)
-    rays, eye = camera.rays, camera.position
-    vx = rays[0, 0] * x + rays[0, 1] * y + rays[0, 2]
-    vy = rays[1, 0] * x + rays[1, 1] * y + rays[1, 2]
-    vz = rays[2, 0] * x + rays[2, 1] * y + rays[2, 2]
-    position = (eye[0] + depth * vx, eye[1] + depth * vy, eye[2] + depth * vz)
-    to_eye = _scaled((vx, vy, vz), -1.0 / np.sqrt(vx * vx + vy * vy + vz * vz))
+    ray, eye = _pixel_ray(camera, x, y), camera.position
+    position = (eye[0] + depth * ray[0], eye[1] + depth * ray[1], eye[2] + depth * ray[2])
+    to_eye = _scaled(ray, -1.0 / np.sqrt(_dot(ray, ray)))
 
     # Albedo: colour times texture at the level of the pixel's footprint.
     u, v, footprint = texture_footprint(edges, surfaces, t, weights, depth)
@@ -390,21 +409,19 @@ def _shade_point(
     # Directional light: Lambert and Blinn-Phong.
     to_light = (light.direction[0], light.direction[1], light.direction[2])
     diffuse = lambert(normal, to_light)
-    shine = 0.0
+    specular = 0.0
     if diffuse > 0.0 and material.specular > 0.0:
-        shine = material.specular * highlight(normal, to_light, to_eye, material.exponent)
+        specular = material.specular * highlight(normal, to_light, to_eye, material.exponent)
 
-    # Environment: seen along the mirrored ray r = 2 (n . v) n - v, as far as Fresnel reflects it.
+    # Environment: what the mirrored ray meets, as far as Fresnel reflects it.
     metal = material.metalness
     cosine = max(_dot(normal, to_eye), 0.0)
     mirror = fresnel(material.reflectance, metal, cosine)
     window, height = 0.0, 0.0
     if mirror > 0.0:
-        twice = 2.0 * cosine
-        rx, ry = twice * normal[0] - to_eye[0], twice * normal[1] - to_eye[1]
-        rz = twice * normal[2] - to_eye[2]
-        window = window_fraction(position, (rx, ry, rz), light.window_low, light.window_high)
-        height = min(max(ENVIRONMENT_SLOPE * rz, -1.0), 1.0)
+        ray = _mirrored(normal, to_eye, cosine)
+        window = window_fraction(position, ray, light.window_low, light.window_high)
+        height = min(max(ENVIRONMENT_SLOPE * ray[2], -1.0), 1.0)
     room = 1.0
     if material.occluded:
         room = corner_occlusion(position, normal, light.room_low, light.room_high)
@@ -422,7 +439,7 @@ def _shade_point(
         matte = a * (1.0 - METAL_DIFFUSE_LOST * metal)
         sent = room * (matte * ambient + mirror * tint * seen)
         point.ambient[k] = sent + material.emission * a
-        point.direct[k] = room * light.color[k] * (matte * diffuse + tint * shine)
+        point.direct[k] = room * light.color[k] * (matte * diffuse + tint * specular)
 
 
 @kernel
@@ -470,8 +487,8 @@ def shade(
     static
         Triangles before this index never move. Where the centre of a pixel shows one of them, its
         shading is read from ``points``; that gives the same numbers as shading it again.
-    inputs
-        The scene. ``maps``: its depth maps in this frame.
+    inputs, maps
+        The scene, and its depth maps in this frame.
     points
         (H * W + 1,) of `POINT`, filled by `shade_static_points`. The last one is overwritten.
     colors
@@ -483,7 +500,7 @@ def shade(
     for row in range(height):
         for column in range(width):
             red, green, blue = 0.0, 0.0, 0.0
-            todo = (1 << samples) - 1
+            todo = (1 << samples) - 1  # bit mask of the samples not yet shaded
             for s in range(samples):
                 if not todo >> s & 1:
                     continue
