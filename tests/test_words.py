@@ -21,7 +21,6 @@ LEFT: dict[str, int] = {
     "analysis": 14,
     "cli": 2,
     "experiment": 1,
-    "physics": 2,
     "report": 18,
     "scenes": 3,
     "trials": 5,
