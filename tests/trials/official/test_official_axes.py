@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -68,6 +68,7 @@ def test_a_spinning_point_moves_the_same_way(spin: np.ndarray, arm: np.ndarray) 
     )
 
 
+@settings(deadline=None)  # the first example imports the reader of logs
 @given(quaternions)
 def test_euler_angles_are_those_the_importer_of_logs_reads(q: np.ndarray) -> None:
     x, y, z = to_official_euler(q)

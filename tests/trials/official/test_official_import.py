@@ -607,8 +607,8 @@ def test_hostile_files_are_refused_by_file_and_field(
 
 
 BROKEN: dict[str, tuple[str, object]] = {
-    "static/target_id": ("names no object", 77),
-    "static/object_ids": ("lists no 2 to 255", np.array([1, 1, 2, 3])),
+    "static/target_id": ("does not name", 77),
+    "static/object_ids": ("does not list 2 to 255", np.array([1, 1, 2, 3])),
     "static/model_names": ("3 names for 4", np.array([b"cube", b"cone", b"cone"])),
     "static/scale": ("rows", np.zeros((9, 3))),
     "static/zone_id": ("not one number", np.array([1, 2])),
