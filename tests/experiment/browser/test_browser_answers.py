@@ -65,7 +65,9 @@ FOREIGN: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("who", sorted(FOREIGN))
-def test_what_others_answer_is_no_refusal(chromium: Any, site: tuple[Study, str], who: str) -> None:
+def test_responses_of_others_are_not_refusals(
+    chromium: Any, site: tuple[Study, str], who: str
+) -> None:
     study, url = site
     with Visit(chromium, url) as visit:
         to_the_test(visit, f"?participant={who}")
@@ -91,7 +93,7 @@ def test_what_others_answer_is_no_refusal(chromium: Any, site: tuple[Study, str]
     assert "answer_refused" not in {event.kind for event in rows_of(study, who)[2]}
 
 
-def test_a_token_that_is_gone(chromium: Any, site: tuple[Study, str]) -> None:
+def test_a_lost_token(chromium: Any, site: tuple[Study, str]) -> None:
     """The answer waits in the browser and is sent with the token of the next entry."""
     study, url = site
     with Visit(chromium, url, "token") as visit:
@@ -106,7 +108,7 @@ def test_a_token_that_is_gone(chromium: Any, site: tuple[Study, str]) -> None:
         visit.page.get_by_text("open the link of your invitation once more").wait_for()
         visit.picture("told")
         assert visit.page.evaluate(KEPT) == [1]
-        # Who else takes part here neither sends it nor loses it.
+        # Another person at this browser neither sends nor loses it.
         visit.go("?participant=Other")
         visit.heading("Taking part in this study")
         assert visit.page.evaluate(KEPT) == [1]
@@ -119,7 +121,7 @@ def test_a_token_that_is_gone(chromium: Any, site: tuple[Study, str]) -> None:
     assert [row[:2] for row in of_test(study, "Gone")] == [(0, "no"), (1, "yes"), (2, "yes")]
 
 
-def test_a_refused_answer_is_noted_before_it_is_forgotten(
+def test_a_refused_answer_is_stored_as_event_before_removal(
     chromium: Any, site: tuple[Study, str]
 ) -> None:
     """The event about it is stored even if the browser is closed at that moment."""

@@ -46,7 +46,7 @@ def check_complete(study: Study, name: str, responses: list[str]) -> list[Any]:
     return test
 
 
-def test_a_reload_goes_on_at_the_same_trial(chromium: Any, site: tuple[Study, str]) -> None:
+def test_a_reload_continues_at_the_same_trial(chromium: Any, site: tuple[Study, str]) -> None:
     study, url = site
     with Visit(chromium, url) as visit:
         to_the_test(visit, "Reload")
@@ -71,14 +71,14 @@ def test_a_reload_goes_on_at_the_same_trial(chromium: Any, site: tuple[Study, st
         visit.answer("no")
         visit.finish()
         assert visit.unexpected() == []
-        # Who has finished finds the result again, in this browser ...
+        # A person who has finished finds the result again in this browser ...
         for query in ("", "?participant=Reload"):
             visit.go(query)
             visit.heading("Thank you!")
             assert visit.page.inner_text("#code") == "TINY-CODE"
     test = check_complete(study, "Reload", ["yes", "no", "yes", "no"])
     assert [row.resumed for row in test] == [False, True, True, False]
-    # ... and elsewhere is told that once is all.
+    # ... and elsewhere reads that one can take part only once.
     with Visit(chromium, url, "twice") as visit:
         visit.go("?participant=Reload")
         visit.page.get_by_text("You have already taken part").wait_for()
@@ -86,7 +86,7 @@ def test_a_reload_goes_on_at_the_same_trial(chromium: Any, site: tuple[Study, st
         assert visit.page.locator("#code").count() == 0
 
 
-def test_a_reload_where_the_browser_keeps_nothing(chromium: Any, site: tuple[Study, str]) -> None:
+def test_a_reload_without_browser_storage(chromium: Any, site: tuple[Study, str]) -> None:
     """The URL still identifies the participant, so that no second session begins."""
     study, url = site
     with Visit(chromium, url) as visit:
@@ -206,7 +206,7 @@ def test_the_second_tab_takes_over(chromium: Any, site: tuple[Study, str]) -> No
         second, visit.page = visit.page, first
         visit.page.bring_to_front()
         visit.picture("first")
-        visit.main_button().click()  # go on here
+        visit.main_button().click()  # continue here
         second.get_by_text("The study goes on in another tab").wait_for()
         visit.page.get_by_text("Trial 3 of 4").wait_for()
         visit.answer("no")

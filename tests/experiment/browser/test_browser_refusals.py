@@ -77,7 +77,7 @@ TABLET = {"viewport": SMALL, "screen": SMALL, "has_touch": True}
         ("?language=de", {}, "", "Ihre Nummer fehlt"),
     ],
 )
-def test_turned_away(
+def test_refused_visitors(
     chromium: Any, site: tuple[Study, str], query: str, context: Any, script: str, told: str
 ) -> None:
     study, url = site
@@ -103,7 +103,7 @@ def test_without_script_the_page_says_so(chromium: Any, site: tuple[Study, str])
             assert study.texts[language]["refusal.no_script"] in said
 
 
-def test_old_browsers_are_told_without_modules(chromium: Any, site: tuple[Study, str]) -> None:
+def test_old_browsers_get_a_message_without_modules(chromium: Any, site: tuple[Study, str]) -> None:
     """A browser without modules only runs the script marked nomodule."""
     study, url = site
     with Visit(chromium, url) as visit:
@@ -118,9 +118,9 @@ def test_old_browsers_are_told_without_modules(chromium: Any, site: tuple[Study,
             visit.page.get_by_text(study.texts[language]["refusal.browser"]).wait_for()
 
 
-def test_small_windows_wait_and_go_on(chromium: Any, site: tuple[Study, str]) -> None:
+def test_trials_wait_while_the_window_is_too_small(chromium: Any, site: tuple[Study, str]) -> None:
     study, url = site
-    # As on a laptop with scaling or zoom: all but the trials can be done.
+    # As on a laptop with scaling or zoom: everything but the trials is possible.
     with Visit(chromium, url, "window", viewport=SMALL, screen=SMALL) as visit:
         visit.begin("?participant=Window")
         visit.heading("Please make the window larger")
@@ -188,7 +188,7 @@ HIDE = (
 )
 
 
-def test_a_page_that_is_hidden_is_noted(chromium: Any, site: tuple[Study, str]) -> None:
+def test_hiding_the_page_is_recorded(chromium: Any, site: tuple[Study, str]) -> None:
     study, url = site
     with Visit(chromium, url) as visit:
         visit.begin("?participant=Hidden")
@@ -224,7 +224,7 @@ def test_a_trial_that_was_hidden_is_shown_again(chromium: Any, site: tuple[Study
         visit.page.evaluate(HIDE, True)
         visit.page.evaluate(HIDE, False)
         visit.answer("yes")
-        for time in range(6):  # the last time it goes on
+        for time in range(6):  # the last time the trial continues
             visit.page.locator(".fixation").wait_for(state="attached")
             visit.page.evaluate(HIDE, True)
             visit.page.wait_for_timeout(100)
@@ -244,7 +244,9 @@ def test_a_trial_that_was_hidden_is_shown_again(chromium: Any, site: tuple[Study
         assert row.frames_shown > 30
 
 
-def test_a_press_that_began_before_is_no_answer(chromium: Any, site: tuple[Study, str]) -> None:
+def test_a_press_that_began_earlier_is_not_an_answer(
+    chromium: Any, site: tuple[Study, str]
+) -> None:
     study, url = site
     with Visit(chromium, url) as visit:
         visit.begin("?participant=Press")
@@ -257,7 +259,7 @@ def test_a_press_that_began_before_is_no_answer(chromium: Any, site: tuple[Study
         visit.page.mouse.up()
         visit.page.wait_for_timeout(300)
         assert visit.page.locator(".answer:enabled").count() == 2
-        # The press counts, not the release.
+        # The time of the press counts, not that of the release.
         visit.page.mouse.down()
         visit.page.wait_for_timeout(1500)
         visit.page.mouse.up()

@@ -20,7 +20,7 @@ __all__ = ["chromium"]
 pytestmark = pytest.mark.slow
 
 
-def test_who_comes_in_a_crowd_waits(chromium: Any, tmp_path: Path) -> None:
+def test_many_visitors_at_once_wait(chromium: Any, tmp_path: Path) -> None:
     limits = replace(Limits(), sessions_per_minute=8.0, sessions_at_once=1)
     with served(tmp_path, test=1, familiarization=1, limits=limits) as (study, server):
         with Visit(chromium, server.url) as first, Visit(chromium, server.url, "crowd") as visit:
@@ -36,7 +36,7 @@ def test_who_comes_in_a_crowd_waits(chromium: Any, tmp_path: Path) -> None:
         assert rows_of(study, "Two")[0].finished_at is None
 
 
-def test_movies_whose_addresses_changed(chromium: Any, tmp_path: Path) -> None:
+def test_movies_with_changed_urls(chromium: Any, tmp_path: Path) -> None:
     """The media URLs of the page have become invalid: it requests new ones."""
     with (
         served(tmp_path, test=3, familiarization=1, preload=1) as (study, server),
@@ -45,7 +45,7 @@ def test_movies_whose_addresses_changed(chromium: Any, tmp_path: Path) -> None:
         visit.begin("?participant=Restart")
         visit.wait_for_answer()
         change_addresses(study.folder, server)
-        # The whole movie of practice comes with its own address, which changes on its way.
+        # The full movie of practice has its own URL, which becomes invalid meanwhile.
         spoilt: list[str] = []
 
         def spoil(route: Any) -> None:
@@ -92,7 +92,7 @@ def test_the_language_of_the_session_decides(chromium: Any, tmp_path: Path) -> N
     ):
         visit.go("?participant=Words&language=de")
         visit.heading("Teilnahme an dieser Studie")
-        # The browser remembers a language that the study has no more.
+        # The browser remembers a language that the study no longer has.
         visit.page.evaluate("localStorage.setItem('physion:language', '\"fr\"')")
         visit.go("?participant=Words")
         visit.heading("Teilnahme an dieser Studie")
@@ -108,7 +108,7 @@ def test_the_language_of_the_session_decides(chromium: Any, tmp_path: Path) -> N
         visit.main_button().click()
         visit.heading("What you will do")
         visit.context.unroute("**/api/page")
-        # ... and words that cannot be had stop nobody.
+        # ... and texts that cannot be loaded stop nobody.
         visit.context.route("**/api/session**", other_language("fr"))
         visit.page.reload()
         visit.heading("What you will do")

@@ -52,7 +52,7 @@ def correct(study: Study, name: str) -> int:
     return sum((row.response == "yes") == labels[row.stimulus] for row in answers)
 
 
-def test_the_percentile_is_what_its_words_say(chromium: Any, site: tuple[Study, str]) -> None:
+def test_the_percentile_agrees_with_its_text(chromium: Any, site: tuple[Study, str]) -> None:
     """Of two people with equal scores, the second has the percentile 50."""
     study, url = site
     with Visit(chromium, url) as visit:
@@ -86,7 +86,7 @@ def test_the_form_of_mturk_stays_in_its_frame(chromium: Any, site: tuple[Study, 
         visit.context.add_init_script(SCREEN)
         top = visit.page
         top.goto(task)
-        # All steps are taken in the frame.
+        # All steps happen within the frame.
         visit.page = top.main_frame.child_frames[0]
         take_part(visit, f"?workerId=W1&assignmentId=A1&hitId=H1&turkSubmitTo={MTURK}")
         form = visit.page.locator("form")
@@ -106,7 +106,7 @@ def test_the_form_of_mturk_stays_in_its_frame(chromium: Any, site: tuple[Study, 
         "https://www.mturk.com/other",
     ],
 )
-def test_no_form_goes_to_anybody_else(chromium: Any, site: tuple[Study, str], address: str) -> None:
+def test_forms_go_to_no_other_host(chromium: Any, site: tuple[Study, str], address: str) -> None:
     """Forms are not sent to other hosts, even if the server's result names one."""
     _, url = site
     with Visit(chromium, url) as visit:

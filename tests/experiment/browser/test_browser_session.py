@@ -43,7 +43,7 @@ def test_a_whole_session_by_mouse(chromium: Any, site: tuple[Study, str]) -> Non
             visit.page.locator(".trial:not(.has-verdict)").wait_for()
             visit.picture("cue")
             assert visit.page.locator(".answer:enabled").count() == 0
-            # The whole movie is asked for after the answer, and not before.
+            # The full movie is requested only after the answer.
             assert sum("-full-" in address for address in visit.requests) == trial
             visit.answer("yes")
             visit.page.locator(".verdict-correct, .verdict-incorrect").wait_for()
@@ -102,7 +102,7 @@ def test_a_whole_session_by_keyboard_in_german(chromium: Any, site: tuple[Study,
                 visit.heading("Es kann losgehen")
                 visit.picture("ready")
                 visit.press("Tab", "Enter")
-            # Keys before their time are no answers.
+            # Keys pressed too early are not answers.
             page.locator(".trial:not(.has-verdict)").wait_for()
             visit.press("f", "j")
             visit.wait_for_answer()
@@ -148,7 +148,7 @@ def test_timing_of_the_paper(chromium: Any, tmp_path: Path) -> None:
         visit.begin_test()
         for trial in range(4):
             visit.page.get_by_text(f"Trial {trial + 1} of 4").wait_for()
-            # Two trials are loaded ahead, and no more.
+            # Exactly two trials are loaded ahead.
             assert loaded_of_test(visit) == set(range(min(trial + 2, 4)))
             visit.answer("yes")
         visit.heading("About you")
@@ -160,7 +160,7 @@ def test_timing_of_the_paper(chromium: Any, tmp_path: Path) -> None:
         details = json.loads(row.details)
         assert max(frames) <= 44 and frames[0] == 0
         assert row.frames_expected == 45
-        # A machine that does other work at the same time may drop some; none may be made up.
+        # A busy machine may drop frames, but none may be invented.
         assert 38 <= row.frames_shown <= 45
         assert len(set(frames)) <= row.frames_shown
         assert row.frames_shown + row.frames_dropped >= 44

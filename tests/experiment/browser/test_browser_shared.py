@@ -75,12 +75,12 @@ def test_nobody_gets_the_result_of_another(
         assert visit.page.locator("#code").count() == 0
         assert reference not in visit.page.inner_text("main")
         assert visit.page.get_by_text(NEXT).count() == 0
-        # B still finds the own result, and so does who reloads.
+        # B still finds their own result, also after a reload.
         for query in (f"?participant={b}", ""):
             visit.go(query)
             visit.page.get_by_text(reference).wait_for()
         assert visit.page.get_by_text(NEXT).count() == 0
-        # A third one begins, and B, in the middle of that, goes on as B.
+        # A third person begins; B, who opens their link meanwhile, continues as B.
         visit.go(f"?participant={a}-third")
         visit.heading("Taking part in this study")
         visit.go()
@@ -126,7 +126,7 @@ def test_the_next_person_at_this_computer(chromium: Any, site: tuple[Study, str]
         visit.page.get_by_text(NEXT).click()
         visit.heading("Taking part in this study")
         assert visit.page.get_by_text(NEXT).count() == 0
-        # What the link named is named again.
+        # The parameters of the link are kept.
         link = f"{url}/?scenario=collide&language=en"
         assert visit.requests.count(link) == 2
         assert len(references(study)) == before + 2
@@ -138,7 +138,7 @@ def test_the_next_person_at_this_computer(chromium: Any, site: tuple[Study, str]
     assert len(references(study)) == before + 3
 
 
-def test_a_finished_visit_whose_token_is_lost(chromium: Any, site: tuple[Study, str]) -> None:
+def test_a_finished_session_with_a_lost_token(chromium: Any, site: tuple[Study, str]) -> None:
     _, url = site
     with Visit(chromium, url) as visit:
         take_part(visit, "", ("yes", "no"))

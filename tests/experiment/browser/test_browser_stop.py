@@ -34,7 +34,7 @@ def to_the_test(visit: Visit, name: str) -> None:
     visit.begin_test()
 
 
-def test_the_trial_goes_on_below_the_question(chromium: Any, site: tuple[Study, str]) -> None:
+def test_the_trial_continues_behind_the_question(chromium: Any, site: tuple[Study, str]) -> None:
     study, url = site
     with Visit(chromium, url, "question") as visit:
         visit.context.add_init_script(COUNT_PLAYS)
@@ -46,7 +46,7 @@ def test_the_trial_goes_on_below_the_question(chromium: Any, site: tuple[Study, 
             visit.heading("Do you want to stop?")
             visit.page.wait_for_timeout(400)
             visit.picture("asked")
-            # Keys are no answers while something else is asked.
+            # Keys are not answers while the question is open.
             visit.press("f", "j")
             if close == "Escape":
                 visit.press("Escape")

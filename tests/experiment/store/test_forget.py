@@ -102,7 +102,7 @@ def test_ids_are_forgotten_while_the_study_is_served(
     assert len(rows(store, RAW_IDS)) == 3
     assert run(forget_raw_ids(store)) == 3
     assert rows(store, RAW_IDS) == []
-    assert not give(store, tokens[0], 0).duplicate  # and the session goes on
+    assert not give(store, tokens[0], 0).duplicate  # and the session continues
     if database_url.startswith("sqlite"):
         folder = Path(database_url.removeprefix("sqlite:///")).parent
         assert b"5f1eada" not in bytes_of(folder)
@@ -172,7 +172,7 @@ def test_all_of_a_session_is_forgotten(
     for table in (ANSWERS, EVENTS, TOKENS):
         sessions = {row.session for row in rows(store, table)}
         assert gone.session not in sessions and (table is EVENTS or len(sessions) == 2)
-    assert len(rows(store, RAW_IDS)) == 2  # the id is that of the other session, too
+    assert len(rows(store, RAW_IDS)) == 2  # the other session still needs the id
     again = Enter(source="sona", id=raw_id(1), scenario="drop")
     assert refusal(store.enter(again)).code == "already_took_part"
     assert run(store.state(other)).stage == "demographics"

@@ -48,7 +48,7 @@ def test_an_answer_is_stored_as_it_was_sent(store: Store, small_study: Study) ->
     assert session.answered_test == 1 and session.last_seen == row.answered_at
 
 
-def test_familiarization_alone_gives_feedback(store: Store, small_study: Study) -> None:
+def test_only_familiarization_gives_feedback(store: Store, small_study: Study) -> None:
     token = walk(store, enter(store, "Ada", scenario="drop"), "familiarization")
     for trial, stimulus in enumerate(small_study.phase("drop", "familiarization")):
         response = "yes" if trial != 1 else "no"
@@ -59,7 +59,7 @@ def test_familiarization_alone_gives_feedback(store: Store, small_study: Study) 
         assert stored.feedback.frames == 60
         found = read_media_path(store.study, store.secrets, stored.feedback.movie)
         assert found == small_study.folder / stimulus.full
-        # The same answer again, with another response: what is stored counts.
+        # The same key with another response: the stored response counts.
         again = give(store, token, trial, "familiarization", response="no")
         assert again.duplicate and again.feedback == stored.feedback
     page(store, token, "ready")
@@ -80,7 +80,7 @@ def test_the_same_answer_again_is_known_even_much_later(store: Store) -> None:
     assert rows(store) == before
 
 
-def test_answers_out_of_turn_are_refused_with_the_state(store: Store) -> None:
+def test_answers_out_of_order_are_refused_with_the_state(store: Store) -> None:
     token = enter(store, "Ada")
     cases = [
         ("consent", answer(0, "familiarization"), "wrong_stage"),
@@ -102,10 +102,10 @@ def test_answers_out_of_turn_are_refused_with_the_state(store: Store) -> None:
         assert refused.code == code, (stage, sent)
         assert refused.state == run(store.state(token))
         assert (rows(store), rows(store, SESSIONS)) == before
-    give(store, token, 0, "familiarization")  # and nothing got in the way of what is right
+    give(store, token, 0, "familiarization")  # the refused requests do not block the right one
 
 
-def test_tokens_open_their_own_session_alone(store: Store) -> None:
+def test_a_token_opens_only_its_session(store: Store) -> None:
     ada, bob = (walk(store, enter(store, name, scenario="drop"), "test") for name in ("Ada", "Bob"))
     give(store, ada, 0)
     assert not give(store, bob, 0).duplicate  # the same key in another session is another answer
@@ -208,7 +208,9 @@ POSTS = st.lists(
 
 @settings(max_examples=150, deadline=None)
 @given(POSTS)
-def test_whatever_is_sent_rows_are_the_first_trials_once(machine: Machine, posts: Any) -> None:
+def test_any_sequence_of_requests_stores_the_first_trials_once(
+    machine: Machine, posts: Any
+) -> None:
     store, token = machine.store, machine.session()
     model: dict[str, list[str]] = {"familiarization": [], "test": []}
 

@@ -47,7 +47,7 @@ def test_a_whole_session(store: Store, small_study: Study) -> None:
     in_phase = {"familiarization", "test"}
     assert seen == [(stage, 0 if stage in in_phase else None) for stage in STAGES]
     result = store.result(token)
-    # Half of the four test trials end with contact, and the walk says yes to all.
+    # Half of the four test trials end with contact; the walk answers "yes" to all.
     assert (result.correct, result.trials, result.accuracy, result.percentile) == (2, 4, 0.5, None)
     (session,) = rows(store, SESSIONS)
     assert (session.age, session.gender, session.education) == (31, "woman", "master")
@@ -58,7 +58,7 @@ def test_a_whole_session(store: Store, small_study: Study) -> None:
     assert session.kind == "person" and session.study == small_study.digest
 
 
-def test_ids_are_kept_apart_from_the_data(store: Store, small_secrets: Secrets) -> None:
+def test_ids_are_stored_apart_from_the_data(store: Store, small_secrets: Secrets) -> None:
     recruiter = {"STUDY_ID": "s1", "SESSION_ID": HOSTILE}
     enter(store, "Ada-5f1e", source="prolific", recruiter=recruiter)
     enter(store, "Ada-5f1e", source="prolific", recruiter={"STUDY_ID": "s2"})
@@ -95,19 +95,19 @@ def test_unknown_tokens_open_nothing(sqlite_store: Store, token: str) -> None:
         assert caught.value.code == "unknown_token"
 
 
-def test_who_finished_or_withdrew_may_not_begin_again(store: Store) -> None:
+def test_finished_and_withdrawn_people_may_not_begin_again(store: Store) -> None:
     walk(store, enter(store, "Ada", scenario="drop"), "done")
     page(store, enter(store, "Bob", scenario="drop"), "withdraw")
     for person in ("Ada", "Bob"):
         assert refusal(store.enter(Enter(id=person, scenario="drop"))).code == "already_took_part"
-        # The other scenario is open to them, asked for or not.
+        # They may still take part in the other scenario, requested or not.
         assert run(store.enter(Enter(id=person))).state.scenario == "collide"
     walk(store, enter(store, "Ada"), "done")
     assert refusal(store.enter(Enter(id="Ada"))).code == "already_took_part"
     assert len(rows(store, SESSIONS)) == 4
 
 
-def test_the_unfinished_session_goes_on_before_another_begins(store: Store) -> None:
+def test_an_unfinished_session_continues_before_another_begins(store: Store) -> None:
     walk(store, enter(store, "Ada", scenario="drop"), "test")
     state = run(store.enter(Enter(id="Ada"))).state
     assert (state.scenario, state.stage) == ("drop", "test")
@@ -120,7 +120,9 @@ def test_sources_keep_ids_apart(store: Store) -> None:
     assert len({row.participant for row in rows(store, SESSIONS)}) == 4
 
 
-def test_least_filled_scenario_first_until_the_study_is_full(store: Store) -> None:
+def test_the_scenario_with_fewest_sessions_comes_first_until_the_study_is_full(
+    store: Store,
+) -> None:
     # participants=3: one of drop has finished, one of collide withdrew, one left a while ago.
     walk(store, enter(store, "done", scenario="drop"), "done")
     page(store, enter(store, "gone", scenario="collide"), "withdraw")
@@ -129,13 +131,13 @@ def test_least_filled_scenario_first_until_the_study_is_full(store: Store) -> No
     tokens = [enter(store, f"p{i}") for i in range(5)]
     given = [run(store.state(token)).scenario for token in tokens]
     assert given == ["collide", "collide", "drop", "collide", "drop"]
-    # Who only opened the page takes no place.
+    # A session without consent does not count as a participant.
     early = enter(store, "early", scenario="drop")
     for token in tokens:
         page(store, token, "consent")
     assert refusal(store.enter(Enter(id="late"))).code == "study_full"
     assert refusal(store.enter(Enter(id="late", scenario="drop"))).code == "study_full"
-    # Whoever has begun may finish, even one more than there are places for.
+    # A person who has begun may finish, even if the scenario is full by then.
     assert run(store.enter(Enter(id="asleep"))).state.scenario == "collide"
     assert run(store.enter(Enter(id="early"))).state.stage == "consent"
     for token in (early, *tokens, enter(store, "asleep")):
@@ -144,7 +146,7 @@ def test_least_filled_scenario_first_until_the_study_is_full(store: Store) -> No
     assert finished == {"drop": 4, "collide": 4}
 
 
-def test_who_leaves_gives_the_place_back_and_may_return(store: Store) -> None:
+def test_an_abandoned_session_is_not_counted_and_may_be_continued(store: Store) -> None:
     tokens = [enter(store, f"p{i}", scenario="drop") for i in range(3)]
     for token in tokens:
         walk(store, token, "test")
@@ -166,7 +168,9 @@ def _let_time_pass(store: Store, person: str, seconds: float = ACTIVE_WITHIN + 1
         connection.execute(update(SESSIONS).where(own).values(last_seen=earlier))
 
 
-def test_previews_and_programs_take_nobodys_place(store: Store, small_secrets: Secrets) -> None:
+def test_previews_and_simulations_do_not_count_as_participants(
+    store: Store, small_secrets: Secrets
+) -> None:
     for kind in ("preview", "simulated"):
         word = make_pass(small_secrets, kind)
         for number in range(4):
@@ -181,7 +185,7 @@ def test_previews_and_programs_take_nobodys_place(store: Store, small_secrets: S
 
 
 @pytest.mark.parametrize("word", ["", "preview", "preview-", "person-{0}", "preview-{0}", HOSTILE])
-def test_words_that_we_never_gave_are_refused(
+def test_invalid_keys_of_links_are_refused(
     sqlite_store: Store, small_secrets: Secrets, word: str
 ) -> None:
     signature = make_pass(small_secrets, "simulated").partition("-")[2]
@@ -197,9 +201,7 @@ def test_words_that_we_never_gave_are_refused(
         "%SURVEY_CODE%", "%25SURVEY_CODE%25", "%2525SURVEY_CODE%2525", " {{id}} ", "${workerId}",
     ],
 )  # fmt: skip
-def test_placeholders_that_the_recruiter_left_are_nobodys_id(
-    sqlite_store: Store, value: str
-) -> None:
+def test_unfilled_placeholders_are_not_ids(sqlite_store: Store, value: str) -> None:
     for asked in (
         Enter(source="prolific", id=value),
         Enter(source="prolific", id="5f1e", recruiter={"SESSION_ID": value}),
@@ -215,14 +217,14 @@ def test_ids_that_only_resemble_placeholders_are_ids(sqlite_store: Store) -> Non
     assert len(rows(sqlite_store, SESSIONS)) == 4
 
 
-def test_what_a_session_is_never_changes(store: Store, small_secrets: Secrets) -> None:
+def test_the_kind_of_a_session_never_changes(store: Store, small_secrets: Secrets) -> None:
     token = enter(store, "Ada", scenario="drop", **{"pass": make_pass(small_secrets, "simulated")})
     walk(store, token, "done")
     (session,) = rows(store, SESSIONS)
     assert session.kind == "simulated"
 
 
-def test_ids_where_they_are_needed(
+def test_required_ids(
     store: Store, small_study: Study, small_secrets: Secrets, tmp_path: Path
 ) -> None:
     assert enter(store) != enter(store)
@@ -242,7 +244,7 @@ def test_ids_where_they_are_needed(
 WORD = "3f6c1d2e-0000-4000-8000-abcdefABCDEF"
 
 
-def test_a_visits_word_gives_the_same_session_again(
+def test_a_visit_key_gives_the_same_session_again(
     store: Store, small_study: Study, small_secrets: Secrets, tmp_path: Path
 ) -> None:
     tokens = [enter(store, visit=WORD) for _ in range(3)]
@@ -250,7 +252,7 @@ def test_a_visits_word_gives_the_same_session_again(
     assert len(rows(store, SESSIONS)) == 1
     walk(store, tokens[0], "test")
     assert {run(store.state(token)).stage for token in tokens} == {"test"}
-    # Another word, an id beside it, another way to come: somebody else each.
+    # Another key, an additional id and another source are different people.
     simulated = {"pass": make_pass(small_secrets, "simulated")}
     preview = {"pass": make_pass(small_secrets, "preview")}
     for _ in range(2):
@@ -262,7 +264,7 @@ def test_a_visits_word_gives_the_same_session_again(
     found = rows(store, SESSIONS)
     assert len(found) == 6 == len({row.participant for row in found})
     assert enter(store, "Ada") and len(rows(store, SESSIONS)) == 6
-    # The word is not kept, and is no id.
+    # The key is not stored and is not an id.
     assert {row.raw_id for row in rows(store, RAW_IDS)} == {"Ada", WORD}
     for table in (SESSIONS, TOKENS, EVENTS, PARTICIPANTS):
         assert WORD not in repr(rows(store, table))
@@ -273,7 +275,7 @@ def test_a_visits_word_gives_the_same_session_again(
     strict.close()
 
 
-def test_without_id_and_word_everybody_is_new(store: Store) -> None:
+def test_without_id_and_visit_key_everybody_is_new(store: Store) -> None:
     for _ in range(3):
         enter(store)
     assert len({row.participant for row in rows(store, SESSIONS)}) == 3
@@ -282,12 +284,12 @@ def test_without_id_and_word_everybody_is_new(store: Store) -> None:
 @pytest.mark.parametrize(
     "word", ["", "a" * 15, "a" * 65, "a" * 16 + "_", "ä" * 20, "a" * 20 + "\n"]
 )
-def test_other_words_are_no_visit(word: str) -> None:
+def test_malformed_visit_keys_are_refused(word: str) -> None:
     with pytest.raises(ValidationError):
         Enter(visit=word)
 
 
-def test_a_language_that_is_gone_locks_nobody_out(
+def test_a_removed_language_locks_nobody_out(
     small_study: Study, small_secrets: Secrets, database_url: str
 ) -> None:
     store = Store.open(small_study, small_secrets, database_url)
@@ -304,7 +306,7 @@ def test_a_language_that_is_gone_locks_nobody_out(
     ]
     assert [state.language for state in states if state is not None] == ["en"] * 6
     (session,) = rows(store, SESSIONS)
-    assert session.language == "de"  # what it began in stays known
+    assert session.language == "de"  # the language in which it began is kept
     store.close()
 
 
@@ -337,7 +339,7 @@ def test_prepared_orders_are_used_evenly(
             found[participant_hash(small_secrets, "link", f"p{number}")].order_number
             for number in range(7)
         ]
-        # The order of who withdrew is free again.
+        # The order of a withdrawn session is available again.
         assert numbers == [1, 2, 3, 1, 2, 3, 2]
         seeds = {(row.scenario, row.order_number, row.order_seed) for row in found.values()}
         assert len(seeds) == 4
@@ -354,7 +356,7 @@ def test_buttons_stay_with_the_participant(store: Store) -> None:
         assert len(buttons) == 1
 
 
-def test_many_at_once_make_one_session_each(store: Store) -> None:
+def test_concurrent_visitors_get_one_session_each(store: Store) -> None:
     async def all_at_once() -> list[Any]:
         visits = [Enter(id=f"p{number % 3}", scenario="drop") for number in range(30)]
         return await asyncio.gather(*(store.enter(visit) for visit in visits))
@@ -365,7 +367,7 @@ def test_many_at_once_make_one_session_each(store: Store) -> None:
     assert len({each.state.reference for each in entered}) == 3
 
 
-def test_pages_come_in_their_order_and_twice_is_once(store: Store) -> None:
+def test_pages_are_accepted_in_order_and_stored_once(store: Store) -> None:
     token = enter(store, "Ada")
     for stage in STAGES[:-1]:
         walk(store, token, stage)
@@ -386,7 +388,7 @@ def test_pages_come_in_their_order_and_twice_is_once(store: Store) -> None:
 
 
 @pytest.mark.parametrize("how", ["withdraw", "consent"])
-def test_who_does_not_agree_leaves_nothing_behind(store: Store, how: str) -> None:
+def test_declining_leaves_no_data(store: Store, how: str) -> None:
     data = {} if how == "withdraw" else {"agreed": False}
     device = Device(user_agent="Mozilla", screen_width=1920)
     more: dict[str, Any] = {"source": "prolific", "device": device, "recruiter": {"STUDY_ID": "s"}}
@@ -397,7 +399,7 @@ def test_who_does_not_agree_leaves_nothing_behind(store: Store, how: str) -> Non
         if person == "Bob":
             page(store, token, "consent")
         page(store, token, how, **data)
-    # Ada has another session, and Bob withdrew: they may have to be paid.
+    # Ada has another session, and Bob withdrew later: both may have to be paid.
     assert {row.raw_id for row in rows(store, RAW_IDS)} == {"Ada", "Bob"}
     by_participant = {(row.participant, row.scenario): row.device for row in rows(store, SESSIONS)}
     kept = device.model_dump()
@@ -414,7 +416,7 @@ def test_who_does_not_agree_leaves_nothing_behind(store: Store, how: str) -> Non
 
 @pytest.mark.parametrize("stage", STAGES[:-1])
 @pytest.mark.parametrize("how", ["withdraw", "consent"])
-def test_who_withdraws_is_left_alone(sqlite_store: Store, stage: str, how: str) -> None:
+def test_a_withdrawn_session_stays_withdrawn(sqlite_store: Store, stage: str, how: str) -> None:
     token = walk(sqlite_store, enter(sqlite_store, "Ada"), stage)
     data = {} if how == "withdraw" else {"agreed": False}
     for _ in range(2):
@@ -471,7 +473,7 @@ def test_bad_pages_name_the_field(
     assert run(sqlite_store.state(token)).stage == name
 
 
-def test_nobody_has_to_say_anything(store: Store) -> None:
+def test_all_demographics_are_optional(store: Store) -> None:
     token = walk(store, enter(store), "demographics")
     page(store, token, "demographics", age=None, gender=None, education=" ")
     page(store, token, "feedback", difficulty=5.0, technical_problems=True, text="")
@@ -525,7 +527,7 @@ def test_trials_come_after_the_consent_in_the_sessions_order(store: Store) -> No
     assert sorted(given, key=lambda name: shown[name]) == given
 
 
-def test_results_come_at_the_end_alone(store: Store) -> None:
+def test_results_are_given_only_at_the_end(store: Store) -> None:
     token = enter(store, "Ada")
     for stage in STAGES[:-1]:
         walk(store, token, stage)
@@ -560,7 +562,7 @@ def test_percentiles_are_among_finished_people_of_the_scenario(
     best = finish("d", 4)
     found = [store.result(token) for token in (first, second, third, best)]
     assert [each.correct for each in found] == [1, 3, 3, 4]
-    # Among three others: none had fewer; one had, and one as many; all had.
+    # Among three others: none has fewer; one has fewer and one equally many; all have fewer.
     assert [each.percentile for each in found] == pytest.approx([0, 50, 50, 100])
     store.close()
 
@@ -611,7 +613,7 @@ def test_previews_of_other_stimuli_are_in_no_result(
         store.close()
 
 
-def test_loads_are_counted_and_say_where(store: Store) -> None:
+def test_page_loads_are_counted_with_their_trial(store: Store) -> None:
     token = enter(store, "Ada")
     run(store.state(token, True))
     (session,) = rows(store, SESSIONS)
@@ -666,7 +668,7 @@ def test_events_too_large_are_refused(sqlite_store: Store, value: Any, said: str
     assert rows(sqlite_store, EVENTS) == []
 
 
-def test_everything_is_there_after_a_restart(
+def test_everything_is_stored_after_a_restart(
     small_study: Study, small_secrets: Secrets, database_url: str
 ) -> None:
     store = Store.open(small_study, small_secrets, database_url)
@@ -707,13 +709,13 @@ def test_other_stimuli_are_refused_where_sessions_exist(
     store = reopen(small_study)
     preview = enter(store, **{"pass": make_pass(small_secrets, "preview")})
     store.close()
-    store = reopen(other)  # a preview is nobody's data
+    store = reopen(other)  # previews are not data
     assert run(store.state(preview)).stage == "withdrawn"
     enter(store, "Ada")
     store.close()
     with pytest.raises(BadInputError, match=r"1 sessions.*new study folder"):
         reopen(small_study)
-    # Words and settings may change.
+    # Texts and settings may change.
     reworded = replace(other, digest="2" * 64, participants=50)
     store = reopen(reworded)
     assert [row.participants for row in map(_settings, rows(store, STUDIES))] == [3, 3, 50]
@@ -721,7 +723,7 @@ def test_other_stimuli_are_refused_where_sessions_exist(
     store.close()
 
 
-def test_a_scenario_with_sessions_cannot_be_taken_out(
+def test_a_scenario_with_sessions_cannot_be_removed(
     small_study: Study, small_secrets: Secrets, database_url: str
 ) -> None:
     def reopen(study: Study) -> Store:
@@ -738,7 +740,7 @@ def test_a_scenario_with_sessions_cannot_be_taken_out(
     going = walk(store, enter(store, "P1", **preview), "test")
     done = walk(store, enter(store, "P2", **preview), "done")
     store.close()
-    store = reopen(fewer)  # previews are nobody's data, and end
+    store = reopen(fewer)  # previews are not data, and are ended
     for token in (going, done):
         for asked in (store.state(token), store.state(token, True), store.answer(token, answer(0))):
             assert refusal(asked).code == "unknown_token"
@@ -756,7 +758,7 @@ def test_a_scenario_with_sessions_cannot_be_taken_out(
         reopen(fewer)
     store = reopen(small_study)
     assert run(store.state(token)).trial == 1
-    # A program's session is data, too; and the other one may go where it has none.
+    # A simulated session is data, too; a scenario without sessions may be removed.
     store.close()
     with pytest.raises(BadInputError, match="scenario drop"):
         reopen(replace(fewer, digest="4" * 64))

@@ -84,7 +84,7 @@ def gather(writer: Writer, commands: list[Callable[[Connection], Any]]) -> list[
     return futures
 
 
-def test_what_waits_shares_a_commit(engine: Engine) -> None:
+def test_waiting_commands_share_a_commit(engine: Engine) -> None:
     commits = []
     event.listen(engine, "commit", lambda connection: commits.append(1))
     with writing(engine, group=50) as writer:
@@ -134,7 +134,7 @@ def test_refusals_and_faults_leave_the_others_alone(engine: Engine) -> None:
     assert kept(engine) == {1, 2, 3, 4}
 
 
-def test_too_much_waiting_is_refused(engine: Engine) -> None:
+def test_commands_beyond_the_queue_limit_are_refused(engine: Engine) -> None:
     gate = Gate()
     with writing(engine, waiting=5) as writer:
         writer.submit(gate)
@@ -148,7 +148,7 @@ def test_too_much_waiting_is_refused(engine: Engine) -> None:
     assert kept(engine) == {0, 1, 2, 3, 4}
 
 
-def test_closing_writes_what_waits_and_takes_no_more(engine: Engine) -> None:
+def test_closing_runs_waiting_commands_and_refuses_new_ones(engine: Engine) -> None:
     writer = Writer(lambda: connect_writer(engine), group=2)
     gate = Gate()
     writer.submit(gate)
@@ -162,7 +162,7 @@ def test_closing_writes_what_waits_and_takes_no_more(engine: Engine) -> None:
     assert kept(engine) == set(range(7))
 
 
-def test_who_went_away_stops_nobody(engine: Engine) -> None:
+def test_cancelled_callers_do_not_stop_others(engine: Engine) -> None:
     async def ask(writer: Writer) -> int:
         gate = Gate()
         held = asyncio.ensure_future(writer.run(gate))
@@ -176,7 +176,7 @@ def test_who_went_away_stops_nobody(engine: Engine) -> None:
 
     with writing(engine) as writer:
         assert asyncio.run(ask(writer)) == 2
-        # A loop that ended while its command waited, and a future that was given up.
+        # An event loop that ended while its command waited, and a cancelled future.
         gate = Gate()
         writer.submit(gate)
         given_up = writer.submit(put(3))
@@ -186,7 +186,7 @@ def test_who_went_away_stops_nobody(engine: Engine) -> None:
     assert kept(engine) == {1, 2, 3, 4}
 
 
-def test_a_file_that_is_locked_for_a_while_is_waited_for(tmp_path: Path) -> None:
+def test_the_writer_waits_for_a_locked_file(tmp_path: Path) -> None:
     path = tmp_path / "a.sqlite"
     engine = open_database(f"sqlite:///{path}")
     with engine.begin() as connection:
@@ -212,7 +212,7 @@ def test_a_file_that_is_locked_for_a_while_is_waited_for(tmp_path: Path) -> None
     engine.dispose()
 
 
-def test_a_connection_lost_in_the_middle_is_made_again(fresh_postgres: str) -> None:
+def test_a_lost_connection_is_reopened(fresh_postgres: str) -> None:
     engine = open_database(fresh_postgres)
     with engine.begin() as connection:
         connection.execute(text("CREATE TABLE numbers (number INTEGER PRIMARY KEY)"))
@@ -228,14 +228,14 @@ def test_a_connection_lost_in_the_middle_is_made_again(fresh_postgres: str) -> N
     with writing(engine) as writer:
         futures = gather(writer, [put(1), cut_off, put(2)])
         assert [future.result() for future in futures] == [1, "there", 2]
-        # Nobody else may write: the lock was taken again with the new connection.
+        # No other server may write: the new connection holds the lock again.
         with pytest.raises(Exception, match="another server"):
             connect_writer(engine)
     assert kept(engine) == {1, 2}
     engine.dispose()
 
 
-def test_a_commit_whose_answer_was_lost_is_not_done_twice(
+def test_a_commit_without_confirmation_is_not_repeated(
     fresh_postgres: str, small_study: Study, small_secrets: Secrets
 ) -> None:
     store = Store.open(small_study, small_secrets, fresh_postgres)
@@ -251,11 +251,11 @@ def test_a_commit_whose_answer_was_lost_is_not_done_twice(
             raw.commit()
             with store.engine.connect() as other:
                 other.execute(text(f"SELECT pg_terminate_backend({pid})"))
-            connection.execute(text("SELECT 'no answer'"))  # as COMMIT itself would fail
+            connection.execute(text("SELECT 'no answer'"))  # as if COMMIT itself failed
 
     lose.append(True)
     stored = give(store, token, 0)
-    assert not lose and stored.duplicate  # found again by its key
+    assert not lose and stored.duplicate  # recognised by its key
     lose.append(True)
     bob = enter(store, "Bob")
     assert not lose and run(store.state(bob)).stage == "consent"

@@ -53,14 +53,14 @@ class TestWithoutASession:
         assert answer.headers["content-type"] == "text/html; charset=utf-8"
         assert answer.text.startswith("<!doctype html>")
 
-    def test_a_file_that_the_browser_has_is_not_sent_again(self, site: Served) -> None:
+    def test_an_unchanged_file_is_not_sent_again(self, site: Served) -> None:
         first = site.client.get("/static/main.js")
         headers = {"if-none-match": first.headers["etag"]}
         again = site.client.get("/static/main.js", headers=headers)
         assert (again.status_code, again.content) == (304, b"")
         assert again.headers["content-security-policy"]
 
-    def test_files_are_packed_for_who_can_unpack_them(self, site: Served) -> None:
+    def test_files_are_compressed_for_browsers_that_accept_it(self, site: Served) -> None:
         path = "/static/vendor/jspsych.min.js"
         plain = site.client.get(path, headers={"accept-encoding": "identity"})
         packed = site.client.get(path, headers={"accept-encoding": "gzip"})
@@ -69,7 +69,7 @@ class TestWithoutASession:
         assert int(packed.headers["content-length"]) < len(plain.content) / 2
         assert packed.content == plain.content
 
-    def test_what_anyone_may_know(self, site: Served) -> None:
+    def test_public_settings(self, site: Served) -> None:
         study = wire.PublicStudy.model_validate_json(site.client.get("/api/study").content)
         assert study.scenarios == ["collide", "drop"]
         assert set(study.example) == {"collide", "drop"}
@@ -98,7 +98,7 @@ class TestWithoutASession:
         None, "", "Bearer", "Bearer ", "Bearer nobody", "Basic eDp5", "Bearer " + "x" * 300,
         "Bearer ' OR 1=1 --",
     ])  # fmt: skip
-    def test_nothing_without_a_token(
+    def test_session_endpoints_need_a_token(
         self, site: Served, method: str, path: str, body: Any, header: str | None
     ) -> None:
         headers = {} if header is None else {"authorization": header}
@@ -107,7 +107,7 @@ class TestWithoutASession:
         if answer.status_code == 401:
             refused(answer, 401, "unknown_token")
 
-    def test_nobody_needs_a_token_for_the_rest(self, site: Served) -> None:
+    def test_other_endpoints_need_no_token(self, site: Served) -> None:
         for name in ("study", "texts/en", "health"):
             assert site.client.get(f"/api/{name}").status_code == 200
         for path in ("/docs", "/redoc", "/openapi.json"):
@@ -156,7 +156,11 @@ class TestSession:
         person.page("demographics")
         person.page("feedback")
         result = wire.Result.model_validate(person.ask("GET", "/api/result"))
-        assert (result.trials, result.correct, result.percentile) == (3, 2, None)  # nobody else
+        assert (result.trials, result.correct, result.percentile) == (
+            3,
+            2,
+            None,
+        )  # no other participants
         site.person(id="p-other", scenario="collide").walk("done")
         result = wire.Result.model_validate(person.ask("GET", "/api/result"))
         assert result.percentile == 50
@@ -177,7 +181,7 @@ class TestSession:
         assert refusal["error"] == "out_of_order"
         assert refusal["state"]["trial"] == 1
 
-    def test_a_second_browser_goes_on(self, site: Served) -> None:
+    def test_a_second_browser_continues(self, site: Served) -> None:
         first = site.person(source="sona", id="1234", scenario="drop").walk("test")
         first.answer(0)
         second = site.person(source="sona", id="1234", scenario="drop")
@@ -185,7 +189,7 @@ class TestSession:
         assert second.token != first.token
         assert second.answer(1)["state"]["trial"] == first.state()["trial"] == 2
 
-    def test_one_token_opens_one_session_alone(self, site: Served) -> None:
+    def test_a_token_opens_only_its_session(self, site: Served) -> None:
         one, two = site.person().walk("test"), site.person().walk("test")
         one.answer(0)
         assert two.state()["trial"] == 0
@@ -203,7 +207,7 @@ class TestSession:
         person.ask("GET", "/api/trials/test", status=409)
         person.ask("GET", "/api/result", status=409)
 
-    def test_ids_are_kept_apart(self, site: Served) -> None:
+    def test_ids_are_stored_apart(self, site: Served) -> None:
         person = site.person(source="prolific", id="raw-id-1", recruiter={"STUDY_ID": "st"})
         with site.store.engine.connect() as connection:
             sessions = connection.execute(sa.select(SESSIONS)).all()
@@ -223,7 +227,7 @@ class TestSession:
             after = connection.scalar(sa.select(sa.func.count()).select_from(SESSIONS))
         assert before == after
 
-    def test_what_is_stored_is_what_was_sent(self, site: Served) -> None:
+    def test_answers_are_stored_as_sent(self, site: Served) -> None:
         person = site.person(source="link", id="stored").walk("test")
         person.answer(0, response="no", rt_ms=1234.5, input="touch", frames_shown=44)
         with site.store.engine.connect() as connection:
@@ -234,7 +238,7 @@ class TestSession:
             ).one()  # fmt: skip
         assert (row.response, row.rt_ms, row.input, row.frames_shown) == ("no", 1234.5, "touch", 44)
 
-    def test_entering_takes_no_other_names(self, site: Served) -> None:
+    def test_entering_refuses_unknown_fields(self, site: Served) -> None:
         person = Person(site.client)
         assert person.ask("POST", "/api/enter", {"kind": "preview"}, 422)["error"] == "bad_request"
         assert person.ask("POST", "/api/enter", {"pass": "preview-0"}, 403)["error"] == "bad_link"

@@ -122,7 +122,7 @@ class Trickle:
 
 
 class TestBodies:
-    def test_up_to_the_limit_is_taken(self, port: int) -> None:
+    def test_a_body_of_the_limit_is_accepted(self, port: int) -> None:
         body = b"x" * MAX_BODY
         answer = exchange(port, head("/echo", f"Content-Length: {len(body)}"), body)
         assert read(answer)[2] == str(MAX_BODY).encode()
@@ -137,7 +137,7 @@ class TestBodies:
         start = head(path, "Content-Length: 10000000")
         trickle = Trickle(port, start, b"x" * 65536)
         assert_refused(trickle.answer, 413, "too_large")
-        # What the system's buffers take on the way is not what the server reads.
+        # Data in the system's buffers have not been read by the server.
         assert trickle.sent < 9_000_000
 
     @pytest.mark.parametrize("path", ["/echo", "/swallow"])
@@ -148,7 +148,7 @@ class TestBodies:
         assert trickle.sent < 9_000_000
 
     @pytest.mark.parametrize("length", ["-1", "1e9", "99999999999999999999", "0x10", "abc", "5, 6"])
-    def test_lengths_that_are_none_are_refused(self, port: int, length: str) -> None:
+    def test_invalid_lengths_are_refused(self, port: int, length: str) -> None:
         answer = exchange(port, head("/echo", f"Content-Length: {length}"), b"xxxxx")
         assert read(answer)[0] in (400, 413)
 
@@ -158,7 +158,7 @@ class TestBodies:
         assert answer.count(b"HTTP/1.1 400") == 1
         assert answer.count(b"HTTP/1.1 ") <= 2
 
-    def test_a_body_that_does_not_come_is_given_up(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_a_body_that_does_not_arrive_is_refused(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(guards, "BODY_SECONDS", 0.2)
         monkeypatch.setattr(guards, "LINGER_SECONDS", 0.1)
         with running(make_app()) as port:
@@ -195,28 +195,28 @@ class TestHeads:
         assert trickle.answer.startswith((b"HTTP/1.1 431", b"HTTP/1.1 400"))
         assert trickle.sent < 9_000_000
 
-    def test_who_says_nothing_is_let_go(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_silent_connections_are_closed(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(connections, "HEAD_SECONDS", 0.3)
         with running(make_app()) as port:
             for start in (b"", b"GET /echo HT"):
                 with socket.create_connection((HOST, port), timeout=5) as connection:
                     connection.sendall(start)
                     assert connection.recv(10) == b""
-            # Neither a request in work nor one that has been answered ends by this.
+            # This does not end a running request or one that was answered.
             with socket.create_connection((HOST, port), timeout=5) as connection:
                 for _ in range(3):
                     connection.sendall(head("/echo", method="GET"))
                     assert connection.recv(65536).startswith(b"HTTP/1.1 200")
                     time.sleep(0.5)
 
-    def test_websockets_are_not_spoken(self, port: int) -> None:
+    def test_websockets_are_refused(self, port: int) -> None:
         lines = ["Connection: Upgrade", "Upgrade: websocket", "Sec-WebSocket-Version: 13",
                  "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ=="]  # fmt: skip
         assert read(exchange(port, head("/echo", *lines, method="GET")))[0] == 200
 
 
 class TestHeaders:
-    def test_every_answer_has_them(self) -> None:
+    def test_every_response_has_them(self) -> None:
         client = TestClient(make_app(), raise_server_exceptions=False)
         large = b"x" * (MAX_BODY + 1)
         answers = [client.get("/echo"), client.get("/nowhere"), client.delete("/echo"),
@@ -233,13 +233,13 @@ class TestHeaders:
         client = TestClient(make_app(), base_url="https://lab.example.org")
         assert client.get("/echo").headers["strict-transport-security"] == "max-age=31536000"
 
-    def test_what_an_answer_says_itself_stays(self) -> None:
+    def test_headers_of_the_application_are_kept(self) -> None:
         headers = TestClient(make_app()).get("/own").headers
         assert headers["cache-control"] == "private"
         assert headers["x-own"] == "1"
         assert headers["x-content-type-options"] == "nosniff"
 
-    def test_frames_are_for_those_whom_the_study_names(self) -> None:
+    def test_only_named_sites_may_embed_the_pages(self) -> None:
         sites = ("https://www.mturk.com", "https://workersandbox.mturk.com")
         app = make_app(embed_from=sites)
         headers = TestClient(app).get("/echo").headers
@@ -254,7 +254,7 @@ class TestHeaders:
 
 
 class TestErrors:
-    def test_a_fault_tells_nothing(self, caplog: pytest.LogCaptureFixture) -> None:
+    def test_an_internal_error_reveals_nothing(self, caplog: pytest.LogCaptureFixture) -> None:
         client = TestClient(make_app())
         with caplog.at_level(logging.ERROR, logger="physion.experiment"):
             answer = client.get("/fail?id=5f9c-prolific", headers={"authorization": "Bearer good"})
@@ -262,13 +262,13 @@ class TestErrors:
         assert set(answer.json()) == {"error", "message", "state"}
         assert answer.json()["error"] == "server_error"
         assert SECRET not in answer.text and "Traceback" not in answer.text
-        # The log has the trace, but neither who asked nor with which token.
+        # The log has the traceback, but neither the participant nor the token.
         assert SECRET in caplog.text
         assert "prolific" not in caplog.text and "good" not in caplog.text
 
 
 class TestRates:
-    def test_a_bucket_fills_steadily(self) -> None:
+    def test_a_bucket_refills_at_a_steady_rate(self) -> None:
         buckets = Buckets(rate=2.0, burst=3.0)
         assert [buckets.take("a", 0.0) for _ in range(4)] == [0.0, 0.0, 0.0, 0.5]
         assert buckets.take("b", 0.0) == 0.0
@@ -309,7 +309,7 @@ class TestRates:
         assert statuses.index(True) == 60 and all(statuses[60:])
         assert len(limits._tokens) == 0
         assert limits.wait_time("GET", "/api/session", "wrong", "5.6.7.8", 0.0) == 0
-        # Those of the same address who have a session go on.
+        # Known tokens of the same address are not limited.
         limits.record_status(200, "/api/session", "good", "1.2.3.4", 0.0)
         assert limits.wait_time("GET", "/api/session", "good", "1.2.3.4", 0.0) == 0
 
@@ -318,7 +318,7 @@ class TestRates:
         assert [client.post("/api/enter").status_code for _ in range(4)] == [200] * 3 + [429]
         assert client.get("/echo").status_code == 200
 
-    def test_a_refused_body_is_taken_so_that_the_connection_goes_on(self) -> None:
+    def test_a_refused_body_is_read_so_that_the_connection_stays_open(self) -> None:
         with running(make_app(limits=Limits(sessions_at_once=1))) as port:
             one = head("/api/enter", "Content-Length: 60000") + b"x" * 60000
             answer = exchange(port, one, one, head("/echo", method="GET"))

@@ -149,13 +149,13 @@ VALUES: dict[str, dict[str, Any]] = {
 
 class TestAnswers:
     @pytest.mark.parametrize("name", BODIES)
-    def test_what_is_no_message(self, site: Served, tester: Person, name: str) -> None:
+    def test_bodies_that_are_not_messages(self, site: Served, tester: Person, name: str) -> None:
         before = counts(site)
         assert_refused(post(tester, "/api/answers", BODIES[name]))
         assert counts(site) == before and tester.state()["trial"] == 0
 
     @pytest.mark.parametrize("name", VALUES)
-    def test_what_no_answer_holds(self, site: Served, tester: Person, name: str) -> None:
+    def test_invalid_answers(self, site: Served, tester: Person, name: str) -> None:
         before = counts(site)
         message = assert_refused(post(tester, "/api/answers", changed(**VALUES[name])))
         field = next(iter(VALUES[name]))
@@ -172,19 +172,19 @@ class TestAnswers:
         assert tester.state()["trial"] == 0
 
     @pytest.mark.parametrize("trial", [1, 2, 3, 99_999])
-    def test_trials_that_do_not_come_now(self, tester: Person, trial: int) -> None:
+    def test_trials_that_are_not_next(self, tester: Person, trial: int) -> None:
         refusal = tester.answer(trial, status=409)
         assert refusal["error"] == "out_of_order" and refusal["state"]["trial"] == 0
         refusal = tester.answer(trial, "familiarization", status=409)
         assert refusal["error"] == "out_of_order"
 
-    def test_no_value_comes_back(self, tester: Person) -> None:
+    def test_refusals_repeat_no_value(self, tester: Person) -> None:
         marker = "<b>marker</b>" + "m" * 10_000
         for field in ("response", "key", "rt_ms", "phase", "details"):
             answer = post(tester, "/api/answers", changed(**{field: marker}))
             assert "marker" not in answer.text and "mmm" not in answer.text
 
-    def test_another_persons_token_answers_for_that_person_alone(self, site: Served) -> None:
+    def test_a_token_answers_only_for_its_session(self, site: Served) -> None:
         one, two = site.person().walk("test"), site.person().walk("test")
         key = "the-very-same-key"
         one.answer(0, key=key, response="yes")
@@ -208,7 +208,7 @@ class TestEverythingElse:
         {"recruiter": {"a": {"b": 1}}}, {"device": {"refresh_hz": -60}}, {"kind": "simulated"},
         {"device": {"user_agent": "x" * 1001}}, {"device": {"screen_width": 1e9}},
     ])  # fmt: skip
-    def test_who_enters(self, site: Served, body: Any) -> None:
+    def test_entering(self, site: Served, body: Any) -> None:
         before = counts(site)
         assert_refused(site.client.post("/api/enter", json=body))
         assert counts(site) == before
@@ -232,7 +232,7 @@ class TestEverythingElse:
         assert tester.state() == before
 
     @pytest.mark.parametrize("page", ["demographics", "feedback"])
-    def test_pages_that_do_not_come_now(self, tester: Person, page: str) -> None:
+    def test_pages_that_are_not_next(self, tester: Person, page: str) -> None:
         assert tester.page(page, status=409)["error"] == "wrong_stage"
 
     @pytest.mark.parametrize("event", [
@@ -301,7 +301,7 @@ class TestTexts:
 
 
 class TestSignatures:
-    def test_another_studys_signature_is_none_here(self, site: Served, tmp_path: Path) -> None:
+    def test_signatures_of_another_study_are_refused(self, site: Served, tmp_path: Path) -> None:
         other = make_tiny_study(tmp_path / "other", familiarization=1, test=3, size=64)
         keys = Secrets.load(other.folder)
         path = sign_media(other, keys, "collide", 1, "test", 0, "movie")
@@ -338,7 +338,7 @@ class TestRawRequests:
     """Raw requests that no client library sends, on a real server."""
 
     @pytest.mark.parametrize("path", TRAVERSALS)
-    def test_no_path_leads_out(self, port: int, path: str) -> None:
+    def test_no_path_leaves_the_folders(self, port: int, path: str) -> None:
         rest = b" HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n"
         answer = exchange(port, b"GET " + path.encode() + rest)
         assert answer.startswith((b"HTTP/1.1 404", b"HTTP/1.1 400", b"HTTP/1.1 303"))
@@ -354,7 +354,7 @@ class TestRawRequests:
         b"POST /api/enter HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n\r\n",
         b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n",
     ])  # fmt: skip
-    def test_what_is_no_http(self, site: Served, port: int, words: bytes) -> None:
+    def test_malformed_http(self, site: Served, port: int, words: bytes) -> None:
         before = counts(site)
         answer = exchange(port, words)
         assert b"Traceback" not in answer and not answer.startswith(b"HTTP/1.1 200")
@@ -362,12 +362,12 @@ class TestRawRequests:
         alive = exchange(port, b"GET /api/health HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n")
         assert alive.endswith(b'{"ok":true}')
 
-    def test_a_name_cannot_begin_a_header(self, port: int) -> None:
+    def test_a_name_cannot_inject_a_header(self, port: int) -> None:
         start = b"GET /api/texts/x%0d%0aSet-Cookie:%20a=b HTTP/1.1\r\nHost: x\r\n"
         answer = exchange(port, start + b"Connection: close\r\n\r\n")
         assert answer.startswith(b"HTTP/1.1 404") and b"a=b" not in answer
 
-    def test_a_host_of_ones_own_choice_appears_nowhere(self, port: int) -> None:
+    def test_a_forged_host_appears_nowhere(self, port: int) -> None:
         for path in (b"/", b"/api/session/", b"/static", b"/experimenter"):
             answer = exchange(
                 port, b"GET " + path + b" HTTP/1.1\r\nHost: evil.example\r\nConnection: close\r\n"
@@ -375,7 +375,7 @@ class TestRawRequests:
             )  # fmt: skip
             assert b"evil.example" not in answer
 
-    def test_a_whole_address_is_taken_as_its_path(self, port: int) -> None:
+    def test_an_absolute_url_is_read_as_its_path(self, port: int) -> None:
         answer = exchange(port, b"GET http://evil.example/static/../wire.py HTTP/1.1\r\n"
                                 b"Host: x\r\nConnection: close\r\n\r\n")  # fmt: skip
         assert answer.startswith((b"HTTP/1.1 404", b"HTTP/1.1 400"))
@@ -398,7 +398,7 @@ def test_any_json_is_a_message_or_refused(values: dict[str, Any], whole: bool) -
         message = parse_message(json.dumps(body).encode(), wire.Answer)
     except BadBodyError:
         return
-    # What was taken is plain JSON that every database can store.
+    # Accepted data are plain JSON that every database can store.
     json.dumps(message.model_dump(), allow_nan=False).encode()
     assert 0 <= message.rt_ms <= wire.DAY_MS
 

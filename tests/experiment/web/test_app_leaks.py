@@ -84,7 +84,7 @@ def watch(site: Served, person: Person, phase: str, trial: int) -> None:
     assert picture.headers["content-type"] == "image/png"
 
 
-def test_a_whole_session_tells_no_end_before_its_trial_is_answered(site: Served) -> None:
+def test_a_session_reveals_no_outcome_before_the_answer(site: Served) -> None:
     person = Person(site.client)
     for path in ("/", "/api/study", "/api/texts/en", "/api/texts/de", "/api/health"):
         person.heard.append((path, site.client.get(path)))
@@ -130,19 +130,19 @@ def test_a_whole_session_tells_no_end_before_its_trial_is_answered(site: Served)
     assert_silent(site, person.heard[-1][1])
 
 
-def test_files_of_the_pages_know_nothing_of_stimuli(site: Served) -> None:
+def test_static_files_contain_nothing_about_stimuli(site: Served) -> None:
     folder = PACKAGE / "static"
     served = []
     for path in (path for path in folder.rglob("*") if path.is_file()):
         answer = site.client.get(f"/static/{path.relative_to(folder).as_posix()}")
-        # Scripts and notes beside the vendored files are not for browsers.
+        # Scripts and notes next to the vendored files are not served.
         assert answer.status_code == (200 if path.suffix in MEDIA_TYPES else 404), path
         assert_silent(site, answer)
         served += [path.name] * (answer.status_code == 200)
     assert {"main.js", "pages.css", "icon.svg"} <= set(served)
 
 
-def test_right_and_wrong_answers_of_the_test_get_the_same_words(site: Served) -> None:
+def test_right_and_wrong_test_answers_get_the_same_response(site: Served) -> None:
     said = []
     for choice in ("yes", "no"):
         person = site.person(id=f"choice-{choice}").walk("test")
@@ -156,7 +156,7 @@ def test_right_and_wrong_answers_of_the_test_get_the_same_words(site: Served) ->
     assert [one[1:] for one in said[:half]] == [one[1:] for one in said[half:]]
 
 
-def test_trials_differ_by_nothing_that_follows_from_their_ends(site: Served) -> None:
+def test_trial_lists_do_not_depend_on_outcomes(site: Served) -> None:
     person = site.person(id="lists").walk("test")
     listed = person.ask("GET", "/api/trials/test")["trials"]
     without = [{k: v for k, v in one.items() if k not in ("trial", "movie", "map", "fixation_ms")}
@@ -167,7 +167,7 @@ def test_trials_differ_by_nothing_that_follows_from_their_ends(site: Served) -> 
     assert len({match[3] for match in found if match}) == len(found)
 
 
-def test_nothing_tells_the_seed_of_the_order(site: Served) -> None:
+def test_nothing_reveals_the_seed_of_the_order(site: Served) -> None:
     """With a public list of stimuli and this package, the seed would reveal every outcome."""
     person = site.person(id="seed").walk("test")
     person.ask("GET", "/api/session")
@@ -192,7 +192,7 @@ def test_nothing_tells_the_seed_of_the_order(site: Served) -> None:
     assert all(name not in said for name in order)
 
 
-def test_media_have_no_headers_of_their_files(site: Served) -> None:
+def test_media_have_no_file_headers(site: Served) -> None:
     person = site.person(id="headers").walk("test")
     listed = person.ask("GET", "/api/trials/test")["trials"]
     headers = [dict(site.client.get(one["movie"]).headers) for one in listed]
@@ -214,7 +214,7 @@ class TestWholeMovies:
         return {phase: person.ask("GET", f"/api/trials/{phase}")["trials"] for phase in PHASES}
 
     @pytest.mark.parametrize("phase", PHASES)
-    def test_no_path_becomes_one_by_renaming(
+    def test_no_path_becomes_one_by_changing_its_kind(
         self, site: Served, listed: dict[str, list[Any]], phase: str
     ) -> None:
         for one in listed[phase]:
@@ -247,13 +247,13 @@ class TestWholeMovies:
         with pytest.raises(ValueError, match="test trial"):
             sign_media(site.study, site.secrets, "collide", 1, "test", 0, "full")
 
-    def test_it_comes_with_the_answer(self, site: Served) -> None:
+    def test_it_comes_with_the_feedback(self, site: Served) -> None:
         person = site.person().walk("familiarization")
         feedback = person.answer(0, "familiarization")["feedback"]
         movie = site.client.get(feedback["movie"]).content
         assert numbers(movie) == list(range(FULL))
 
-    def test_movies_of_another_person_are_the_same_pictures_only(self, site: Served) -> None:
+    def test_a_shared_path_shows_only_the_observed_movie(self, site: Served) -> None:
         """A shared path shows only observed frames and reveals nothing about a session."""
         person = site.person().walk("test")
         movie = person.ask("GET", "/api/trials/test")["trials"][0]["movie"]

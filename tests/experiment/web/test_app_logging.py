@@ -29,7 +29,7 @@ def test_a_request_is_one_line_without_its_query(
     ]  # fmt: skip
 
 
-def test_a_movie_that_is_gone_is_named_in_the_log_alone(
+def test_a_missing_movie_is_named_only_in_the_log(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     with served(tmp_path / "s", familiarization=1, test=1) as site:

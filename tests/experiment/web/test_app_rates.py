@@ -22,18 +22,18 @@ TINY = {"familiarization": 1, "test": 1}
     b"Bearer T0k-en_,", b"Bearer T0k-en_\n", b"BearerT0k-en_", b"Basic T0k-en_", b"Bearer ", b"",
     "Bearer T0k-en_\xa0".encode("latin-1"), "Bearer T0k-en_é".encode(), b"Bearer " + b"x" * 201,
 ])  # fmt: skip
-def test_what_is_malformed_is_no_token(written: bytes) -> None:
+def test_malformed_headers_are_not_tokens(written: bytes) -> None:
     assert read_token([(b"authorization", written)]) == ""
 
 
-def test_one_header_with_a_token_is_one() -> None:
+def test_a_single_valid_header_is_a_token() -> None:
     for scheme in (b"Bearer", b"bearer"):
         assert read_token([(b"host", b"x"), (b"authorization", scheme + b" T0k-en_")]) == "T0k-en_"
     assert read_token([]) == ""
     assert read_token([(b"authorization", b"Bearer a"), (b"authorization", b"Bearer a")]) == ""
 
 
-def test_a_token_written_otherwise_avoids_no_limit(tmp_path: Path) -> None:
+def test_a_differently_written_token_evades_no_limit(tmp_path: Path) -> None:
     limits = Limits(requests_per_second=0.1, burst=3)
     with served(tmp_path / "s", limits=limits, **TINY) as site:
         token = site.person(id="hasty").token
@@ -52,10 +52,10 @@ def test_a_token_written_otherwise_avoids_no_limit(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("request_", "refusal"), [
     ({"method": "GET", "url": "/api/session"}, 401),
-    # What is no message is refused before its token is looked up.
+    # An invalid body is refused before its token is looked up.
     ({"method": "POST", "url": "/api/page", "content": b"{}"}, 422),
 ])  # fmt: skip
-def test_unknown_tokens_hold_up_nobody_who_entered(
+def test_unknown_tokens_do_not_slow_down_known_ones(
     tmp_path: Path, request_: dict[str, Any], refusal: int
 ) -> None:
     with served(tmp_path / "s", **TINY) as site:
@@ -75,5 +75,5 @@ def test_a_class_behind_one_address_enters_at_once() -> None:
 
     assert [enter(0.0) for _ in range(200)] == [0.0] * 200
     assert enter(0.0) == 1.0
-    # A script that goes on gets one a second.
+    # A script that continues gets one request per second.
     assert [enter(1.0), enter(1.0), enter(2.0), enter(2.5)] == [0.0, 1.0, 0.0, 0.5]

@@ -55,7 +55,7 @@ def raw(raw_id: str = "1234", **recruiter: str) -> Any:
 
 
 class TestLinks:
-    def test_each_recruiter_and_scenario_has_one(self, study: Study, secrets: Secrets) -> None:
+    def test_each_recruiter_and_scenario_has_a_link(self, study: Study, secrets: Secrets) -> None:
         found = links(study, secrets, "https://lab.example.org/")
         assert [(one.name, one.scenario) for one in found] == [
             (name, scenario)
@@ -65,7 +65,7 @@ class TestLinks:
         for one in found:
             assert one.address.startswith(f"https://lab.example.org/?scenario={one.scenario}")
 
-    def test_placeholders_are_as_recruiters_want_them(self, study: Study, secrets: Secrets) -> None:
+    def test_placeholders_have_the_recruiters_syntax(self, study: Study, secrets: Secrets) -> None:
         found = {one.name: one.address for one in links(study, secrets, "http://x:8000")}
         assert found["prolific"].endswith(
             "&PROLIFIC_PID={{%PROLIFIC_PID%}}&STUDY_ID={{%STUDY_ID%}}&SESSION_ID={{%SESSION_ID%}}"
@@ -76,7 +76,7 @@ class TestLinks:
             given = set(parse_qs(urlsplit(found[name]).query)) - {"scenario"}
             assert given == {by_source[name].id, *by_source[name].others}
 
-    def test_what_the_study_lacks_is_said(self, study: Study, secrets: Secrets) -> None:
+    def test_missing_settings_are_reported(self, study: Study, secrets: Secrets) -> None:
         found = {one.name: one.lacks for one in links(study, secrets, "http://x")}
         assert found["prolific"] == found["sona"] == found["link"] == ""
         assert "embed_from" in found["mturk"]
@@ -89,9 +89,7 @@ class TestLinks:
         "", "lab.example.org", "ftp://lab.example.org", "https://", "https://x/deeper",
         "https://x/?a=b", "https://x/#a", "https://user@x", "https://x:99999", "javascript:x",
     ])  # fmt: skip
-    def test_a_base_that_is_no_site_is_refused(
-        self, study: Study, secrets: Secrets, base: str
-    ) -> None:
+    def test_invalid_base_urls_are_refused(self, study: Study, secrets: Secrets, base: str) -> None:
         with pytest.raises(BadInputError, match="base-url"):
             links(study, secrets, base)
 
@@ -110,7 +108,7 @@ class TestLinks:
 
 
 class TestPasses:
-    def test_a_word_stands_for_its_kind_alone(self, secrets: Secrets) -> None:
+    def test_a_key_is_valid_only_for_its_kind(self, secrets: Secrets) -> None:
         for kind in ("preview", "simulated"):
             word = make_pass(secrets, kind)  # type: ignore[arg-type]
             assert read_pass(secrets, word) == kind
@@ -139,7 +137,7 @@ class TestCompletion:
         # Ids are not needed for it.
         assert completion(study, secrets, session("prolific")) == found
 
-    def test_sona_gets_the_survey_code_and_keeps_its_own_words(
+    def test_sona_gets_the_survey_code_and_keeps_its_parameters(
         self, study: Study, secrets: Secrets
     ) -> None:
         found = completion(study, secrets, session("sona"), raw("77&x=1"))
@@ -153,7 +151,7 @@ class TestCompletion:
         assert again.url == found.url
         assert completion(study, secrets, session("sona")).url is None
 
-    def test_mturk_takes_a_form_of_its_own_host_alone(self, study: Study, secrets: Secrets) -> None:
+    def test_mturk_forms_go_only_to_its_hosts(self, study: Study, secrets: Secrets) -> None:
         own = session_code(secrets, "5e55")
         assert len(own) == 10 and own != session_code(secrets, "5e56")
         for host in MTURK_HOSTS:

@@ -92,7 +92,7 @@ def ask(port: int, method: str, path: str, body: Any = None, token: str = "") ->
 
 
 @pytest.mark.slow
-def test_a_stop_ends_requests_in_work_and_keeps_every_answer(study: Study) -> None:
+def test_stopping_finishes_requests_and_keeps_every_answer(study: Study) -> None:
     with started(study.folder) as server:
         entered = ask(server.port, "POST", "/api/enter", {})
         token = entered["token"]
@@ -122,13 +122,13 @@ def test_a_stop_ends_requests_in_work_and_keeps_every_answer(study: Study) -> No
             thread.join(30)
     assert answer.startswith(b"HTTP/1.1 200") and b'"duplicate":false' in answer
     assert ended == [(0, "")]
-    # Nothing is left that a second server would have to clear away, and the answer is there.
+    # A second server finds no stale files, and the answer is stored.
     with started(study.folder) as server:
         assert ask(server.port, "GET", "/api/session", token=token)["stage"] == "ready"
         assert server.end(signal.SIGINT) == (0, "")
 
 
-def test_https_and_what_is_said(study: Study, certificate: tuple[Path, Path]) -> None:
+def test_https_and_printed_url(study: Study, certificate: tuple[Path, Path]) -> None:
     words = ("--https-cert", str(certificate[0]), "--https-key", str(certificate[1]),
              "--log-requests", "--host", "127.0.0.1")  # fmt: skip
     with started(study.folder, *words) as server:
@@ -148,7 +148,7 @@ def test_https_and_what_is_said(study: Study, certificate: tuple[Path, Path]) ->
 
 
 @pytest.mark.parametrize("trusted", [True, False])
-def test_a_proxys_word_counts_only_where_it_is_named(tmp_path: Path, trusted: bool) -> None:
+def test_only_named_proxies_are_trusted(tmp_path: Path, trusted: bool) -> None:
     limits = Limits(sessions_per_minute=1, sessions_at_once=1)
     proxies = ["127.0.0.1"] if trusted else ["10.0.0.1"]
     settings = {"proxy_headers": True, "forwarded_allow_ips": proxies}
@@ -189,7 +189,7 @@ class TestFaults:
         assert f"cannot listen on 127.0.0.1 port {port}: Address already in use;" in error
 
     @pytest.mark.parametrize("host", ["no.such.host.invalid", "256.1.1.1", "203.0.113.7"])
-    def test_a_host_that_is_not_ours(
+    def test_a_host_of_another_machine(
         self, study: Study, capsys: pytest.CaptureFixture[str], host: str
     ) -> None:
         words = (str(study.folder), "--host", host, "--port", "0", "--behind-proxy", "10.0.0.1")
@@ -230,12 +230,12 @@ class TestFaults:
     (Address("0.0.0.0", proxies=("10.0.0.1",)), False),
     (Address("0.0.0.0", certificate=Path("c"), key=Path("k")), False),
 ])  # fmt: skip
-def test_who_could_read_along(address: Address, readable: bool) -> None:
+def test_unencrypted_addresses(address: Address, readable: bool) -> None:
     assert address.is_readable_on_the_way() == readable
 
 
 @pytest.mark.parametrize("port", ["80000", "65536", "-1"])
-def test_ports_that_there_are_not_are_refused(
+def test_invalid_ports_are_refused(
     study: Study, capsys: pytest.CaptureFixture[str], port: str
 ) -> None:
     assert main(["experiment", "serve", str(study.folder), f"--port={port}"]) == 2
@@ -243,7 +243,7 @@ def test_ports_that_there_are_not_are_refused(
     assert f"--port must be from 0 to 65535, not {port}" in said and said.count("\n") == 1
 
 
-def test_a_folder_without_a_study_is_none(
+def test_a_folder_without_a_study_is_refused(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     assert main(["experiment", "serve", str(tmp_path)]) == 2
@@ -252,13 +252,13 @@ def test_a_folder_without_a_study_is_none(
     assert said.count("\n") == 1
 
 
-def test_what_is_not_filled_in_is_said_when_it_is_served(
+def test_missing_settings_are_reported_when_serving(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def said(**settings: Any) -> str:
         folder = tmp_path / str(len(list(tmp_path.iterdir())))
         make_tiny_study(folder, test=2, familiarization=1, size=64, **settings)
-        (folder / "secret.json").unlink()  # so that it ends after the study was read
+        (folder / "secret.json").unlink()  # so that it ends after the study was loaded
         assert main(["experiment", "serve", str(folder)]) == 2
         return capsys.readouterr().err
 

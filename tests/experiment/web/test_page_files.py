@@ -40,7 +40,7 @@ def test_shipped_files_are_those_of_the_lock() -> None:
     assert list(VENDOR.glob("*.css")) == []
 
 
-def test_the_page_asks_no_other_host_and_has_nothing_inline() -> None:
+def test_the_page_uses_no_other_host_and_nothing_inline() -> None:
     """The pages contain nothing that the content security policy would block."""
     page = Tags((PACKAGE / "pages" / "index.html").read_text(encoding="utf-8"))
     addresses = [
@@ -71,7 +71,7 @@ def test_types_of_messages_are_those_of_the_server() -> None:
         assert re.findall(r"^  (\w+)\??:", body, re.MULTILINE) == expected, name
 
 
-def test_refusals_are_known_by_the_words_of_the_server() -> None:
+def test_refusal_codes_are_those_of_the_server() -> None:
     (listed,) = re.findall(r"const CODES = new Set\(\[(.*?)\]\)", CODE["api.js"], re.DOTALL)
     staying = {code for code, status in REFUSALS.items() if status < 500 and status != 429}
     assert set(re.findall(r"\w+", listed)) == staying
@@ -86,7 +86,7 @@ def test_no_value_can_become_markup() -> None:
     }
 
 
-def test_modules_import_what_is_there() -> None:
+def test_imported_names_exist() -> None:
     for name, code in CODE.items():
         for names, other in re.findall(r'import (?:\{([^}]*)\}|\* as \w+) from "\./(.+?)";', code):
             for word in filter(None, re.split(r"[,\s]+", names)):
@@ -94,7 +94,7 @@ def test_modules_import_what_is_there() -> None:
                 assert re.search(exported, CODE[other]), f"{name}: {word} of {other}"
 
 
-def test_every_text_is_there_and_used() -> None:
+def test_every_text_exists_and_is_used() -> None:
     code = "\n".join(CODE.values())
     tables = {key.split(".")[0] for key in TEXTS["en"]}
     literal = {
@@ -102,7 +102,7 @@ def test_every_text_is_there_and_used() -> None:
         if key.split(".")[0] in tables and not key.endswith(".js")
     }  # fmt: skip
     assert literal - set(TEXTS["en"]) == set()
-    # Some keys are put together: `feedback.difficulty_${value}`, or words of a table by name.
+    # Some keys are composed: `feedback.difficulty_${value}`, or texts of a table by name.
     composed = [
         re.sub(r"\\\$\\\{.*?\\\}", r"\\w+", re.escape(template))
         for template in re.findall(r"t\(`([^`]*\.[^`]*)`", code)
@@ -117,7 +117,7 @@ def test_every_text_is_there_and_used() -> None:
 
 
 @pytest.mark.parametrize("language", sorted(TEXTS))
-def test_words_that_the_page_itself_holds(language: str) -> None:
+def test_texts_within_the_page(language: str) -> None:
     """The page itself has two texts in all languages, for browsers without script or modules."""
     page = " ".join((PACKAGE / "pages" / "index.html").read_text(encoding="utf-8").split())
     for key in ("refusal.no_script", "refusal.browser"):

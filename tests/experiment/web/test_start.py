@@ -40,7 +40,7 @@ def test_serving_imports_nothing_slow() -> None:
     assert done.stdout.strip() == "[]"
 
 
-def test_requests_are_logged_without_what_tells_who_comes(tmp_path: Path) -> None:
+def test_requests_are_logged_without_personal_data(tmp_path: Path) -> None:
     folder = make_tiny_study(tmp_path / "study", test=2, familiarization=1).folder
     with ServerProcess(folder, options=["--log-requests"]) as server:
         asked = httpx2.get(f"{server.url}/?PROLIFIC_PID=SECRET", trust_env=False)
