@@ -1,4 +1,4 @@
-"""The experimenter's pages in a real browser: nothing is blocked, cut off or left standing."""
+"""The experimenter's pages in a real browser."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def log_in(page: Any, url: str, password: str = PASSWORD) -> None:
 
 
 def picture(page: Any, name: str) -> None:
-    """Writes the page to $PHYSION_SCREENSHOTS, if that is given."""
+    """Write a screenshot to $PHYSION_SCREENSHOTS, if it is set."""
     folder = os.environ.get("PHYSION_SCREENSHOTS")
     if folder:
         page.screenshot(path=Path(folder) / f"experimenter-{name}.png", full_page=True)

@@ -1,4 +1,4 @@
-"""Who gets to see the experimenter's pages, and who does not."""
+"""Access control of the experimenter's pages."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """The gate's time, in a list of one; it stands still."""
+    """Replace the clock of the access control by a list with one constant time."""
     now = [1000.0]
     original = access_control.AccessControl.__init__
     monkeypatch.setattr(

@@ -1,4 +1,4 @@
-"""Rates, funnels and figures of the experimenter's overview, apart from any server."""
+"""Rates, funnels, histograms and summaries of the overview, without a server."""
 
 from __future__ import annotations
 

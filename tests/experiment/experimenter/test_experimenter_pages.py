@@ -1,4 +1,4 @@
-"""What the experimenter's pages show, with no session, one, and hundreds."""
+"""Content of the experimenter's pages, with no session, one, and hundreds."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ PEOPLE, SIMULATED, PREVIEWS = 300, 12, 3
 
 @pytest.fixture(scope="module")
 def busy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Lab, Visitor]]:
-    """Three hundred people, some simulated ones and previews."""
+    """Serve a study with 300 people, some simulated participants and previews."""
     with lab(tmp_path_factory.mktemp("study"), participants=80) as found:
         engine = found.store.engine
         insert_sessions(engine, found.study, found.secrets, PEOPLE)
@@ -51,7 +51,7 @@ def busy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Lab, Visito
 
 
 def table_after(text: str, heading: str) -> list[list[str]]:
-    """Words of the cells, row by row, of the first table after a heading."""
+    """Return the texts of the cells, by row, of the first table after a heading."""
     part = text[text.index(f"<h2>{heading}</h2>") :]
     part = part[: part.index("</table>")]
     rows = re.findall(r"<tr.*?</tr>", part, re.S)
@@ -287,7 +287,7 @@ def test_pages_of_one_hostile_session(tmp_path: Path, database_url: str) -> None
 
 
 def with_flags(visitor: Visitor) -> str:
-    """The overview once flags are computed, which it does not wait for."""
+    """Return the overview as soon as the flags are computed."""
     until = time.monotonic() + 60
     while "being computed" in (text := visitor.see().text):
         assert time.monotonic() < until

@@ -1,4 +1,4 @@
-"""The tables of a study: what the analysis reads, from SQLite and PostgreSQL alike."""
+"""The tables of trials and sessions, from SQLite and PostgreSQL alike."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Study:
 
 @pytest.fixture
 def engine(study: Study, database_url: str) -> sa.Engine:
-    """A database of people, simulated participants and previews, in every state."""
+    """Yield a database of people, simulated participants and previews, in every state."""
     engine = open_database(database_url)
     upgrade(engine)
     secrets = Secrets.load(study.folder)

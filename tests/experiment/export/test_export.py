@@ -1,4 +1,4 @@
-"""The exported folder: what the analysis reads, whole or not at all, and nothing that is secret."""
+"""The export folder: tables, atomic replacement, and no secrets in it."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ Fill = Callable[[str], sa.Engine]
 
 @pytest.fixture
 def fill(study: Study, monkeypatch: pytest.MonkeyPatch) -> Fill:
-    """Fills a database with people, simulated participants and previews; always the same rows."""
+    """Fill a database with people, simulated participants and previews; always the same rows."""
 
     def filled(url: str) -> sa.Engine:
         numbers = iter(range(1000))
@@ -83,7 +83,7 @@ def engine(fill: Fill, database_url: str) -> sa.Engine:
 
 @pytest.fixture
 def small(fill: Fill, tmp_path: Path) -> sa.Engine:
-    """The same on SQLite alone, for what does not depend on the database."""
+    """Yield the same on SQLite only, for tests that do not depend on the database."""
     return fill(f"sqlite:///{tmp_path / 'small.sqlite'}")
 
 

@@ -1,4 +1,4 @@
-"""The exported folders follow Psych-DS and BIDS: by their rules, and by a validator if there."""
+"""The exports follow Psych-DS and BIDS, checked by rules and, if installed, by a validator."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def test_bids_lists_each_participant_once_with_texts_that_come_back(exported: Ex
 
 
 def read_text(cell: str) -> str:
-    """A cell of text as the README says that it is read."""
+    """Return the text of a cell, read as the README describes."""
     return str(json.loads(f'"{restore_cell(cell)}"'))
 
 

@@ -1,4 +1,4 @@
-"""Free text in CSV: no spreadsheet runs it, and it comes back letter by letter."""
+"""Protection of free text in CSV against spreadsheet formulas, and its reversal."""
 
 from __future__ import annotations
 

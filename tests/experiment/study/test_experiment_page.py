@@ -1,4 +1,4 @@
-"""The page about the experiment names what there is: verbs, options, settings, tables."""
+"""The page docs/experiment.md names all verbs, valid options and settings, and all tables."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PAGE = (Path(__file__).parents[3] / "docs" / "experiment.md").read_text()
 
 
 def _commands() -> list[list[str]]:
-    """Words of every command of the experiment, in blocks and in the text."""
+    """Return the words of every `physion experiment` command on the page."""
     joined = PAGE.replace("\\\n", " ")
     found = re.findall(r"physion (experiment [a-z]+[^\n`#]*)", joined)
     return [shlex.split(line) for line in found]

@@ -1,4 +1,4 @@
-"""Keys, hashes, signatures, orders and addresses of media."""
+"""Keys, hashes, signatures, trial orders and signed media URLs."""
 
 from __future__ import annotations
 
@@ -216,7 +216,7 @@ def test_an_address_never_means_another_movie(small_study: Study) -> None:
 
 
 def test_addresses_tell_nothing_of_the_seed(small_study: Study) -> None:
-    """What is hidden must look random, and differ where seed, place or key differ."""
+    """Check that the hidden part looks random and depends on seed, position and key."""
     hidden: dict[tuple[int, int, str], int] = {}
     for seed in range(200):
         for trial in range(4):

@@ -1,4 +1,4 @@
-"""physion experiment init: balanced choices, cut movies, and a killed making that goes on."""
+"""physion experiment init: balanced selection, cut movies, and resuming an interrupted run."""
 
 from __future__ import annotations
 
@@ -354,7 +354,7 @@ def test_a_killed_command_is_taken_up_again(tmp_path: Path) -> None:
 
 
 def _changed(dataset: Path, folder: Path, keep: Any) -> Any:
-    """A copy of a dataset with only those rows of its index; the table."""
+    """Copy a dataset with only these rows of its index; return the rows."""
     shutil.copytree(dataset, folder, dirs_exist_ok=True)
     from physion.trials.index import read_index
 

@@ -1,4 +1,4 @@
-"""A study from really generated trials: what is served is the beginning of what happens."""
+"""A study from generated trials: the served movie is the beginning of the full one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Studies from official lists of stimuli: their names, labels, looks, movies and maps."""
+"""Studies from official stimulus lists: names, labels, looks, movies and maps."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def _ids(count: int, config: str = "pilot_it2_collision_yeet_box") -> list[str]:
 
 
 def _columns(ids: list[str]) -> dict[str, dict[str, Any]]:
-    """A list as published: one object per column, keyed by row."""
+    """Write a list as published: one object per column, keyed by row."""
     base = "https://bucket.s3.amazonaws.com"
     columns = {
         "stim_ID": ids,

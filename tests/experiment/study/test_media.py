@@ -1,4 +1,4 @@
-"""Movies are cut to the observed frames, maps are clean, names tell nothing, links lead nowhere."""
+"""Media of a study: cut movies, clean maps, content hashes as names, links refused."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SIZE = 64
 
 @pytest.fixture
 def source(tmp_path: Path) -> StimulusSource:
-    """A stimulus to practise on, in a folder of its own."""
+    """Return a familiarization stimulus in its own folder."""
     folder = tmp_path / "dataset"
     folder.mkdir()
     frames = draw(1, True, SIZE)
@@ -218,7 +218,7 @@ def test_maps_that_point_out_nothing_are_refused(case: str, message: str) -> Non
 
 
 def _foreign(what: str) -> bytes:
-    """The observed frames in a movie that is none of ours: with sound, other colours, no tag."""
+    """Write the observed frames as a foreign movie: with sound, other colours, no tag."""
     buffer = io.BytesIO()
     with av.open(buffer, "w", format="mp4") as container:
         stream = container.add_stream("libx264", rate=30)

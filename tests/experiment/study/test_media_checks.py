@@ -1,4 +1,4 @@
-"""A study whose media are not what stimuli.csv says is not served."""
+"""A study whose media differ from stimuli.csv is not served."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""stimuli.csv: read back as written; every row that could mislead people is refused by number."""
+"""stimuli.csv: round trip, and refusal of invalid rows with their row number."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ def test_names_that_are_one_to_the_analysis_are_refused(
 
 
 def _stimuli() -> list[Stimulus]:
-    """Two to practise on, two for the test."""
+    """Return two familiarization and two test stimuli."""
     found = []
     for number in range(4):
         practice = number < 2

@@ -1,4 +1,4 @@
-"""study.toml: what is written is read back, and whatever is wrong is named."""
+"""study.toml: round trip, and refusal of invalid values with file, key and allowed values."""
 
 from __future__ import annotations
 

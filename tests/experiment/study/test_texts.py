@@ -1,4 +1,4 @@
-"""Words of the pages: every language has all of them, and puts in what the pages know."""
+"""Texts of the pages: all languages have all keys and only known placeholders."""
 
 from __future__ import annotations
 

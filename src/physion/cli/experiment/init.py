@@ -184,9 +184,9 @@ def _print(options: Options, study: Study, chosen: StimulusSelection, password: 
         return
     for note in chosen.notes:
         console.print(f"note: {note}", markup=False, soft_wrap=True)
-    for scenario, found in counts.items():
+    for scenario, phases in counts.items():
         console.print(
-            f"{scenario}: {found['test']} test and {found['familiarization']} familiarization "
+            f"{scenario}: {phases['test']} test and {phases['familiarization']} familiarization "
             "trials", markup=False, soft_wrap=True,
         )  # fmt: skip
     lines = [f"study: {study.folder}"]

@@ -32,13 +32,13 @@ def main(options: Options) -> int:
     from physion.experiment.study.study import load_study
 
     study = load_study(options.study)
-    found = links(study, Secrets.load(options.study), options.base_url)
+    all_links = links(study, Secrets.load(options.study), options.base_url)
     if options.json:
-        print(json_module.dumps({"links": [asdict(link) for link in found]}, indent=1))
+        print(json_module.dumps({"links": [asdict(link) for link in all_links]}, indent=1))
         return 0
     for scenario in study.scenarios:
         print(scenario)
-        for link in found:
+        for link in all_links:
             if link.scenario == scenario:
                 print(f"  {link.name}: {link.goes_to}\n    {link.address}")
                 if link.lacks:

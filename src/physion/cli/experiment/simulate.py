@@ -136,19 +136,19 @@ def _progress(options: Options) -> Iterator[Any]:
         yield visited
 
 
-def _print(found: dict[str, Any], json: bool) -> None:
+def _print(values: dict[str, Any], json: bool) -> None:
     """Print the summary as text or JSON."""
     from physion.cli.output import console
 
     if json:
-        print(json_module.dumps(found))
+        print(json_module.dumps(values))
         return
     outcomes = ("done", "done_before", "left", "refused", "failed")
-    counts = [f"{found[name]} {name.replace('_', ' ')}" for name in outcomes if name in found]
-    repeated = f"{found['asked_again']} requests repeated"
-    line = f"{', '.join(counts)}; {found['answers']} answers, {repeated}"
-    if found["mean_accuracy"] is not None:
-        line += f", mean accuracy {found['mean_accuracy']:.3f}"
+    counts = [f"{values[name]} {name.replace('_', ' ')}" for name in outcomes if name in values]
+    repeated = f"{values['asked_again']} requests repeated"
+    line = f"{', '.join(counts)}; {values['answers']} answers, {repeated}"
+    if values["mean_accuracy"] is not None:
+        line += f", mean accuracy {values['mean_accuracy']:.3f}"
     console.print(line, markup=False, soft_wrap=True)
-    for reason, count in found["reasons"].items():
+    for reason, count in values["reasons"].items():
         console.print(f"{count} times: {reason}", markup=False, soft_wrap=True)

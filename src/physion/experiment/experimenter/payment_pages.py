@@ -78,12 +78,12 @@ class PaymentPages:
         query = request.query_params
         source = query.get("source", "")[:20]
         finished = query.get("who", "finished") != "all"
-        found = await run_in_threadpool(
+        payments = await run_in_threadpool(
             read_payments, self._context.study, self._context.secrets, self._store.engine,
             source=source, finished=finished, page=page_number(query.get("page", "")),
         )  # fmt: skip
         return await self._context.render_in_thread(
-            request, "payments.html", status, here="payments", payments=found, source=source,
+            request, "payments.html", status, here="payments", payments=payments, source=source,
             finished=finished, message=message,
         )  # fmt: skip
 

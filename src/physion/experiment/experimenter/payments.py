@@ -42,7 +42,7 @@ class Payments:
     ----------
     rows
         Payments on this page.
-    found
+    total
         Number of selected sessions, on all pages.
     page, pages
         This page, and number of pages.
@@ -55,7 +55,7 @@ class Payments:
     """
 
     rows: tuple[Payment, ...]
-    found: int
+    total: int
     page: int
     pages: int
     ids: tuple[str, ...]

@@ -116,10 +116,10 @@ class _Pages:
             return redirect("/login")
         kind = request.query_params.get("kind", "")
         kind = kind if kind in KINDS else "person"
-        found = await self._context.query_statistics(request, "overview", kind=kind)
-        if isinstance(found, Response):
-            return found
-        overview, flags = found
+        result = await self._context.query_statistics(request, "overview", kind=kind)
+        if isinstance(result, Response):
+            return result
+        overview, flags = result
         return await self._context.render_in_thread(
             request, "overview.html", here="overview", overview=overview, flags=flags
         )
@@ -129,10 +129,10 @@ class _Pages:
         if self._context.access.login(request) is None:
             return redirect("/login")
         choice = SessionFilter.from_query(request.query_params, self._context.study.scenarios)
-        found = await self._context.query_statistics(request, "sessions", choice=choice)
-        if isinstance(found, Response):
-            return found
-        listed, flags = found
+        result = await self._context.query_statistics(request, "sessions", choice=choice)
+        if isinstance(result, Response):
+            return result
+        listed, flags = result
         return await self._context.render_in_thread(
             request, "sessions.html", here="sessions", listed=listed, choice=listed.choice,
             flags=flags,
@@ -142,20 +142,20 @@ class _Pages:
         """Show one session."""
         if self._context.access.login(request) is None:
             return redirect("/login")
-        found = await self._context.query_statistics(
+        result = await self._context.query_statistics(
             request, "session", session=request.path_params["session"][:100]
         )
-        if isinstance(found, Response):
-            return found
-        if found is None:
+        if isinstance(result, Response):
+            return result
+        if result is None:
             return self._context.render_problem(request, "There is no such session.", 404)
         return await self._context.render_in_thread(
-            request, "session.html", here="sessions", page=found
+            request, "session.html", here="sessions", page=result
         )
 
     async def static(self, request: Request) -> Response:
         """Send a style sheet, script or icon."""
-        found = self._files.get(request.path_params["name"])
-        if found is None:
+        file = self._files.get(request.path_params["name"])
+        if file is None:
             return self._context.render_problem(request, "There is nothing at this address.", 404)
-        return found.response(request)
+        return file.response(request)

@@ -100,11 +100,11 @@ class SessionLine:
 
 @dataclass(frozen=True)
 class SessionList:
-    """One page of the table; ``found`` counts the selected sessions on all pages."""
+    """One page of the table; ``total`` counts the selected sessions on all pages."""
 
     choice: SessionFilter
     lines: tuple[SessionLine, ...]
-    found: int
+    total: int
     pages: int
     kinds: Mapping[str, int]
     rules: tuple[str, ...]

@@ -68,15 +68,15 @@ Participants without any answer have no file and are not listed."""
 
 def readme(
     study: Study,
-    place: Literal["export", "psych-ds", "bids"],
+    layout: Literal["export", "psych-ds", "bids"],
     facts: Mapping[str, Any] | None = None,
 ) -> str:
     """Return the README.md of the export, or of its Psych-DS or BIDS folder.
 
     ``facts``, if given, are the counts of `ExportReport.facts`, which are appended.
     """
-    special = {"export": _FILES, "psych-ds": _PSYCH_DS, "bids": _BIDS}[place]
-    rule = RULE if place != "bids" else f"{TEXT_RULE}. {RULE}"
+    special = {"export": _FILES, "psych-ds": _PSYCH_DS, "bids": _BIDS}[layout]
+    rule = RULE if layout != "bids" else f"{TEXT_RULE}. {RULE}"
     parts = [
         f"# {study.title}",
         f"Study {study.name}, version {study.version}. Contact: {study.contact}",

@@ -115,7 +115,7 @@ def read_list(path: Path) -> list[ListedStimulus]:
         rows = csv_rows(path, content, (ID, LABEL))
     else:
         rows = enumerate(_json_rows(path, content), start=1)
-    found: dict[str, ListedStimulus] = {}
+    by_name: dict[str, ListedStimulus] = {}
     for number, row in rows:
         name = str(row[ID]).strip()
         label = _LABELS.get(str(row[LABEL]).strip().lower())
@@ -131,12 +131,12 @@ def read_list(path: Path) -> list[ListedStimulus]:
         # URLs are never opened; only their last part is used, as a name in a local folder.
         map_name = str(row.get(MAP) or "").strip().rpartition("/")[2]
         listed = ListedStimulus(name, label, map_name if is_name(map_name) else "")
-        if listed.stimulus in found:
+        if listed.stimulus in by_name:
             raise BadInputError(f"{path}, row {number}: {name} is there already")
-        found[listed.stimulus] = listed
-    if not found:
+        by_name[listed.stimulus] = listed
+    if not by_name:
         raise BadInputError(f"{path} lists no stimulus")
-    return list(found.values())
+    return list(by_name.values())
 
 
 def list_scenario(path: Path, rows: Iterable[ListedStimulus]) -> str:

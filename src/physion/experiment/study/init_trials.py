@@ -37,8 +37,8 @@ class StimulusSelection:
     @property
     def scenarios(self) -> tuple[str, ...]:
         """Scenarios of the stimuli, in the order of the paper, then any others by name."""
-        found = {source.scenario for source in self.sources}
-        return tuple(in_paper_order(found))
+        names = {source.scenario for source in self.sources}
+        return tuple(in_paper_order(names))
 
 
 def choose_trials(
@@ -70,8 +70,8 @@ def choose_trials(
     BadInputError
         A scenario has no trial with (or without) contact, or trials have no movies in this look.
     """
-    found = Dataset(dataset)
-    tested = set(found.index["scenario"][found.index["split"] == SPLITS["test"]])
+    opened = Dataset(dataset)
+    tested = set(opened.index["scenario"][opened.index["split"] == SPLITS["test"]])
     if not tested:
         raise BadInputError(f"{dataset} has no testing trials; physion generate makes them")
     for name in scenarios:
@@ -81,8 +81,8 @@ def choose_trials(
     sources, notes = [], []
     for name in scenarios or in_paper_order(tested):
         for phase, count in counts.items():
-            rows, note = _draw(found, name, phase, count, seed)
-            sources += [_source(found, row, phase, i, look) for i, row in enumerate(rows)]
+            rows, note = _draw(opened, name, phase, count, seed)
+            sources += [_source(opened, row, phase, i, look) for i, row in enumerate(rows)]
             notes += [note] if note else []
     return StimulusSelection(tuple(sources), tuple(notes))
 
@@ -91,9 +91,9 @@ def choose_familiarization(
     dataset: Path, scenario: str, *, count: int = PRACTICE, look: Look = "free", seed: int = 0
 ) -> StimulusSelection:
     """Select the familiarization trials of one scenario only, as `choose_trials` does."""
-    found = Dataset(dataset)
-    rows, note = _draw(found, scenario, "familiarization", count, seed)
-    sources = [_source(found, row, "familiarization", i, look) for i, row in enumerate(rows)]
+    opened = Dataset(dataset)
+    rows, note = _draw(opened, scenario, "familiarization", count, seed)
+    sources = [_source(opened, row, "familiarization", i, look) for i, row in enumerate(rows)]
     return StimulusSelection(tuple(sources), (note,) if note else ())
 
 

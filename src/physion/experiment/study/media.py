@@ -67,12 +67,12 @@ class StimulusSource:
     @property
     def files(self) -> dict[str, Path]:
         """Files that will be read, by attribute name; the full movie only if it is needed."""
-        found = {"map": self.map}
+        files = {"map": self.map}
         if self.observed is not None:
-            found["observed"] = self.observed
+            files["observed"] = self.observed
         if self.observed is None or self.phase == "familiarization":
-            found["movie"] = self.movie
-        return found
+            files["movie"] = self.movie
+        return files
 
 
 def import_stimulus(source: StimulusSource, folder: Path) -> Stimulus:
@@ -120,31 +120,31 @@ def _observed(source: StimulusSource) -> _Movie:
     """Return a movie of the observed frames only."""
     path = source.movie if source.observed is None else source.observed
     content = _read(source, "movie" if source.observed is None else "observed")
-    found = _open(path)
+    movie = _open(path)
     if source.observed is None:
-        content = _encode(path, found, source.frames)
+        content = _encode(path, movie, source.frames)
     else:
         _count(path, source.frames)
-        if not _playable(found):
-            content = _encode(path, found, source.frames)
-    return _Movie(content, found.width, found.height, found.rate)
+        if not _playable(movie):
+            content = _encode(path, movie, source.frames)
+    return _Movie(content, movie.width, movie.height, movie.rate)
 
 
 def _whole(source: StimulusSource, shown: _Movie) -> tuple[bytes, int]:
     """Return the full movie, which is shown after the answer, and its number of frames."""
     content = _read(source, "movie")
-    found = _open(source.movie)
-    if (found.width, found.height, found.rate) != (shown.width, shown.height, shown.rate):
+    movie = _open(source.movie)
+    if (movie.width, movie.height, movie.rate) != (shown.width, shown.height, shown.rate):
         raise BadInputError(
-            f"movie {source.movie} is {found.width} x {found.height} at {found.rate} frames/s, its "
+            f"movie {source.movie} is {movie.width} x {movie.height} at {movie.rate} frames/s, its "
             f"observed part {shown.width} x {shown.height} at {shown.rate}"
         )
-    frames = sum(1 for _ in found.frames())
+    frames = sum(1 for _ in movie.frames())
     if frames <= source.frames:
         raise BadInputError(
             f"movie {source.movie} has {frames} frames, none after the {source.frames} observed"
         )
-    return content if _playable(found) else _encode(source.movie, found, frames), frames
+    return content if _playable(movie) else _encode(source.movie, movie, frames), frames
 
 
 def _read(source: StimulusSource, name: str) -> bytes:
@@ -188,10 +188,10 @@ def _encode(path: Path, movie: SourceMovie, frames: int) -> bytes:
 
 def _count(path: Path, frames: int) -> None:
     """Decode a movie completely and check that it has exactly ``frames`` frames."""
-    found = len(read_frames(path, size=(16, 16)))
-    if found != frames:
+    counted = len(read_frames(path, size=(16, 16)))
+    if counted != frames:
         raise BadInputError(
-            f"movie {path} has {found} frames, not the {frames} that participants may observe"
+            f"movie {path} has {counted} frames, not the {frames} that participants may observe"
         )
 
 
@@ -224,11 +224,11 @@ def clean_map(content: bytes, size: tuple[int, int], path: Path) -> bytes:
         raise BadInputError(f"map {path} is not a readable PNG image: {error}") from error
     covered = pixels[..., 3] > 0
     red, green, blue = (pixels[..., channel] > 127 for channel in range(3))
-    for role, found in (
+    for role, mask in (
         ("red for the agent", red & ~green & ~blue),
         ("yellow for the patient", red & green & ~blue),
     ):
-        if not (found & covered).any():
+        if not (mask & covered).any():
             raise BadInputError(f"map {path} has no {role}")
     if covered.all():
         raise BadInputError(f"map {path} has no transparent pixel: it would hide the movie")

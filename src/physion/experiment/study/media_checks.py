@@ -49,7 +49,7 @@ def _check_movie(path: Path, frames: int, s: Stimulus) -> None:
                 raise BadInputError(f"movie {path} must have one video stream and no other stream")
             stream = container.streams.video[0]
             context = stream.codec_context
-            found = (context.width, context.height)
+            size = (context.width, context.height)
             rate, codec = float(stream.average_rate or 0), context.name
             counted = sum(1 for packet in container.demux(stream) if packet.size)
     except (av.FFmpegError, ValueError, AttributeError) as error:
@@ -58,9 +58,9 @@ def _check_movie(path: Path, frames: int, s: Stimulus) -> None:
         raise BadInputError(
             f"movie {path} has {counted} frames; stimuli.csv says {frames} of {s.stimulus}"
         )
-    if found != (s.width, s.height) or abs(rate - s.rate) > 0.01:
+    if size != (s.width, s.height) or abs(rate - s.rate) > 0.01:
         raise BadInputError(
-            f"movie {path} is {found[0]} x {found[1]} at {rate:g} frames/s; stimuli.csv says "
+            f"movie {path} is {size[0]} x {size[1]} at {rate:g} frames/s; stimuli.csv says "
             f"{s.width} x {s.height} at {s.rate:g} of {s.stimulus}"
         )
     if codec != "h264":
@@ -72,11 +72,11 @@ def _check_map(path: Path, s: Stimulus) -> None:
     check_plain(path)
     try:
         with Image.open(path, formats=["PNG"]) as picture:
-            found = picture.size
+            size = picture.size
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise BadInputError(f"map {path} is not a readable PNG image: {error}") from error
-    if found != (s.width, s.height):
+    if size != (s.width, s.height):
         raise BadInputError(
-            f"map {path} is {found[0]} x {found[1]} pixels; stimuli.csv says "
+            f"map {path} is {size[0]} x {size[1]} pixels; stimuli.csv says "
             f"{s.width} x {s.height} of {s.stimulus}"
         )

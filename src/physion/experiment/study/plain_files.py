@@ -24,11 +24,11 @@ def read_plain(path: Path, limit: int) -> bytes:
     except OSError as error:
         raise BadInputError(_describe_error(path, error)) from error
     try:
-        found = os.fstat(descriptor)
-        if not stat.S_ISREG(found.st_mode):
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode):
             raise BadInputError(f"{path} is not a regular file")
-        if found.st_size > limit:
-            raise BadInputError(f"{path} has {found.st_size} bytes, more than {limit}")
+        if status.st_size > limit:
+            raise BadInputError(f"{path} has {status.st_size} bytes, more than {limit}")
         with os.fdopen(descriptor, "rb", closefd=False) as file:
             content = file.read(limit + 1)
     finally:
@@ -41,10 +41,10 @@ def read_plain(path: Path, limit: int) -> bytes:
 def check_plain(path: Path) -> None:
     """Raise `BadInputError` unless ``path`` is a regular file and not a link."""
     try:
-        found = path.lstat()
+        status = path.lstat()
     except OSError as error:
         raise BadInputError(_describe_error(path, error)) from error
-    if not stat.S_ISREG(found.st_mode):
+    if not stat.S_ISREG(status.st_mode):
         raise BadInputError(f"{path} is not a regular file; links are not followed")
 
 

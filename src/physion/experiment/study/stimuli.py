@@ -96,13 +96,13 @@ def read_stimuli(path: Path) -> tuple[Stimulus, ...]:
 
 def parse_stimuli(path: Path, content: bytes) -> tuple[Stimulus, ...]:
     """Parse and check the content of a stimuli file that was read from ``path``."""
-    found = []
+    rows = []
     for row, cells in csv_rows(path, content, COLUMNS):
         if unknown := set(cells) - set(COLUMNS):
             raise BadInputError(f"{path}: {UnknownNameError('column', min(unknown), COLUMNS)}")
-        found.append((row, _parse(path, row, cells)))
-    check_stimuli(found, path)
-    return tuple(stimulus for _, stimulus in found)
+        rows.append((row, _parse(path, row, cells)))
+    check_stimuli(rows, path)
+    return tuple(stimulus for _, stimulus in rows)
 
 
 def write_stimuli(path: Path, stimuli: Iterable[Stimulus]) -> None:

@@ -178,8 +178,8 @@ class Study:
 
     def phase(self, scenario: str, phase: str) -> tuple[Stimulus, ...]:
         """Return the stimuli of one phase of a scenario, sorted by place."""
-        found = [s for s in self.stimuli if (s.scenario, s.phase) == (scenario, phase)]
-        return tuple(sorted(found, key=lambda stimulus: stimulus.place))
+        chosen = [s for s in self.stimuli if (s.scenario, s.phase) == (scenario, phase)]
+        return tuple(sorted(chosen, key=lambda stimulus: stimulus.place))
 
 
 _PARTS = {"timing": Timing, "screen": Screen, "recruitment": Recruitment, "limits": Limits}

@@ -102,24 +102,24 @@ def _check_folder(folder: Path) -> None:
         raise BadInputError(f"{folder} already exists and is a link or not a folder")
     if not folder.exists():
         return
-    found = {path.name for path in folder.iterdir()} - {".lock"}
-    if JOURNAL in found:
+    names = {path.name for path in folder.iterdir()} - {".lock"}
+    if JOURNAL in names:
         # Other files may be keys or answers from serving the folder; they must not be lost.
-        strange = found - {JOURNAL, MEDIA_FOLDER, TEXTS_FOLDER, STIMULI_FILE, STUDY_FILE,
+        strange = names - {JOURNAL, MEDIA_FOLDER, TEXTS_FOLDER, STIMULI_FILE, STUDY_FILE,
                            SECRET_FILE}  # fmt: skip
         strange = {name for name in strange if not name.endswith(".part")}
         if strange:
             raise BadInputError(
                 f"{folder} was left unfinished but contains {min(strange)}; choose another folder"
             )
-    elif STUDY_FILE in found:
+    elif STUDY_FILE in names:
         raise BadInputError(
             f"there is a study in {folder} already: physion experiment serve {folder}; "
             "choose another folder for a new one"
         )
-    elif found - {MEDIA_FOLDER} or any((folder / MEDIA_FOLDER).glob("*")):
+    elif names - {MEDIA_FOLDER} or any((folder / MEDIA_FOLDER).glob("*")):
         raise BadInputError(
-            f"{folder} is not empty (it contains {min(found)}); choose a new folder"
+            f"{folder} is not empty (it contains {min(names)}); choose a new folder"
         )
 
 
@@ -186,5 +186,5 @@ def _key(source: StimulusSource) -> str:
     """Return a key of all that a stimulus is made from, with size and time of its files."""
     values: dict[str, Any] = dataclasses.asdict(source)
     stats = [path.stat() for path in source.files.values()]
-    values["stats"] = [(found.st_size, found.st_mtime_ns) for found in stats]
+    values["stats"] = [(status.st_size, status.st_mtime_ns) for status in stats]
     return json.dumps(values, default=str, sort_keys=True)

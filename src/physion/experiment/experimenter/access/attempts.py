@@ -64,27 +64,27 @@ class LoginAttempts:
 
     def begin(self, address: str, now: float) -> float:
         """Start an attempt: return 0 if it is allowed now, otherwise the seconds to wait."""
-        who = network_of(address)
-        own = self._by_address.get(who, _Failures())
-        wait = own.wait(BY_ADDRESS, now)
-        if who not in self._trusted:
+        network = network_of(address)
+        failures = self._by_address.get(network, _Failures())
+        wait = failures.wait(BY_ADDRESS, now)
+        if network not in self._trusted:
             wait = max(wait, self._overall.wait(OVERALL, now))
         if wait > 0:
             return wait
-        own.add(now)
+        failures.add(now)
         self._overall.add(now)
-        self._by_address[who] = own
-        self._by_address.move_to_end(who)
+        self._by_address[network] = failures
+        self._by_address.move_to_end(network)
         while len(self._by_address) > MAX_ADDRESSES:
             self._by_address.popitem(last=False)
         return 0.0
 
     def succeeded(self, address: str) -> None:
         """Record that the password was right: the failures of the address are forgotten."""
-        who = network_of(address)
-        self._by_address.pop(who, None)
+        network = network_of(address)
+        self._by_address.pop(network, None)
         self._overall.count = max(0, self._overall.count - 1)
-        self._trusted[who] = None
-        self._trusted.move_to_end(who)
+        self._trusted[network] = None
+        self._trusted.move_to_end(network)
         while len(self._trusted) > MAX_ADDRESSES:
             self._trusted.popitem(last=False)

@@ -76,7 +76,7 @@ class StatisticsProcess:
         for _ in range(ATTEMPTS):
             with self._lock:
                 try:
-                    kind, found = self._exchange(request, arguments)
+                    kind, result = self._exchange(request, arguments)
                     break
                 except (EOFError, OSError):
                     # The process may just have ended after its idle time: retry with a new one.
@@ -84,11 +84,11 @@ class StatisticsProcess:
         else:
             raise StatisticsError("the statistics process ended without a result")
         if kind == "refused":
-            raise PhysionError(found)
+            raise PhysionError(result)
         if kind == "failed":
-            LOG.error("the request %r failed:\n%s", request, found)
+            LOG.error("the request %r failed:\n%s", request, result)
             raise StatisticsError("the statistics could not be computed; see the server's log")
-        return found
+        return result
 
     def _exchange(self, request: str, arguments: dict[str, Any]) -> tuple[str, Any]:
         """Send one request over the pipe and wait for the reply."""
@@ -100,8 +100,8 @@ class StatisticsProcess:
             if time.monotonic() > deadline or not threading.main_thread().is_alive():
                 self._end()
                 raise StatisticsError(f"no result within {self._timeout:g} s; try again later")
-        kind, found = pipe.recv()
-        return kind, found
+        kind, result = pipe.recv()
+        return kind, result
 
     def _begin(self) -> Connection:
         """Start the process; return the connection to it."""

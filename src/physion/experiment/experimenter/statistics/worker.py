@@ -28,7 +28,7 @@ CACHE_SECONDS = 3.0
 IDLE_TIMEOUT = 900.0
 """Seconds without a request after which the process ends, which frees its memory."""
 
-Reply = tuple[Literal["found", "refused", "failed"], Any]
+Reply = tuple[Literal["result", "refused", "failed"], Any]
 """Reply to a request: its result, an error message, or a traceback."""
 
 
@@ -109,7 +109,7 @@ def _reply(worker: StatisticsWorker, question: str, arguments: Mapping[str, Any]
         "export": worker.export,
     }
     try:
-        return "found", questions[question](**arguments)
+        return "result", questions[question](**arguments)
     except PhysionError as error:
         return "refused", str(error)
     except Exception:  # the process continues: other requests may succeed
