@@ -28,7 +28,7 @@ from sklearn.metrics import cohen_kappa_score
 
 from physion.analysis.models.model_people import Models, compare_with_people
 from physion.analysis.models.people_comparison import compare_everywhere
-from physion.analysis.people.answers import Answers
+from physion.analysis.people.answers import ScenarioAnswers
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.statistics.kappa import pair_values, pairwise_kappa, resampled_mean_kappa
 from physion.stimulus_names import SCENARIOS
@@ -38,7 +38,7 @@ PEOPLE, STIMULI, MODELS, RESAMPLES = 100, 150, 20, 1000
 TARGETS = {"times_faster": 1000.0, "largest_difference": 1e-12, "bootstrap_seconds": 0.5}
 
 
-def people(seed: int = 0) -> Answers:
+def people(seed: int = 0) -> ScenarioAnswers:
     """People who answer stimuli of different difficulty."""
     generator = np.random.default_rng(seed)
     label = (np.arange(STIMULI) % 2).astype(float)
@@ -47,7 +47,7 @@ def people(seed: int = 0) -> Answers:
     yes = np.where(correct, label, 1 - label)
     names = tuple(f"p{k:03d}" for k in range(PEOPLE))
     stimuli = tuple(f"s{k:03d}" for k in range(STIMULI))
-    return Answers("drop", names, names, stimuli, yes, label, np.full_like(yes, np.nan))
+    return ScenarioAnswers("drop", names, names, stimuli, yes, label, np.full_like(yes, np.nan))
 
 
 def everywhere() -> Callable[[], object]:

@@ -262,7 +262,7 @@ def test_columns_of_simulated_outcomes_stand_only_where_these_differ(
 
 
 def test_counts_and_gaps_are_written_in_one_way(make_comparison: Maker) -> None:
-    column = blocks.Column("rows", "rows", "count")
+    column = blocks.PageColumn("rows", "rows", "count")
     assert column.cell(pd.Series({"rows": 120000})) == "120000"
     comparison = make_comparison()
     assert "–" not in blocks.people(comparison) + blocks.matrix(comparison, "r")

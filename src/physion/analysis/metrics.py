@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from physion.analysis.people.answers import Answers, mean_over_people
+from physion.analysis.people.answers import ScenarioAnswers, mean_over_people
 from physion.analysis.statistics.correlation import correlation_from_sums
 from physion.analysis.statistics.kappa import (
     correctness,
@@ -83,7 +83,7 @@ class Sample:
     p_yes: Array
     human_accuracy: Array
     stimuli: Array
-    answers: Answers | None = None
+    answers: ScenarioAnswers | None = None
     people: Array | None = None
     drawn: Resampled | None = None
     _parts: tuple[Sample, ...] = field(default=(), repr=False)
@@ -117,8 +117,8 @@ class Sample:
         square = xx - 2 * xy + yy
         if len(self.p_yes) == 1:
             # The same people in every resample: sum the squares themselves, which is more exact.
-            apart = np.where(known & answered, self.p_contact - self.p_yes, 0.0) * mask
-            square = w @ (apart * apart).T
+            gap = np.where(known & answered, self.p_contact - self.p_yes, 0.0) * mask
+            square = w @ (gap * gap).T
         return Sums(
             n=self.stimuli @ has.T,
             correct=self.stimuli @ right.T,
@@ -163,7 +163,7 @@ class Sample:
         return np.stack(means, axis=1)
 
     @property
-    def _answers(self) -> Answers:
+    def _answers(self) -> ScenarioAnswers:
         assert self.answers is not None, "this metric needs the answers of single participants"
         return self.answers
 

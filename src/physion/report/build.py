@@ -200,8 +200,10 @@ def _with_averages(
     if labels is None and rows["recorded"].isna().all():
         raise BadInputError(f"no {LABELS_FILE} lies near {humans}; give the file with the labels")
     known = read_labels(labels) if isinstance(labels, Path) else labels
-    found = None if zone is None else read_human_zone(zone)
+    zone_table = None if zone is None else read_human_zone(zone)
     origin = labels.name if isinstance(labels, Path) else "those recorded with the trials"
     words = {"Official outcomes": origin, "People for Dominoes": _LOOKS[dominoes]}
-    told = "" if zone is None else f"official table {zone.name}"
-    return compare(rows, averages, known, zone=found, zone_origin=told, **settings), words
+    zone_source = "" if zone is None else f"official table {zone.name}"
+    return compare(
+        rows, averages, known, zone=zone_table, zone_origin=zone_source, **settings
+    ), words

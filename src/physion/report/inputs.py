@@ -45,13 +45,13 @@ class ReportInputs(ComparisonResults):
 
     def tables(self) -> dict[str, pd.DataFrame]:
         """Every table by the name of its file."""
-        own = self.comparison
+        comparison = self.comparison
         found: dict[str, pd.DataFrame | None] = {
-            "comparison": own.scores,
-            "people": own.people,
-            "stimuli": own.stimuli,
-            "changed_outcomes": own.changed,
-            "left_out": own.dropped,
+            "comparison": comparison.scores,
+            "people": comparison.people,
+            "stimuli": comparison.stimuli,
+            "changed_outcomes": comparison.changed,
+            "left_out": comparison.dropped,
             "paired_tests": self.paired,
             "calibration_scores": self.calibration,
             "comparison_with_flagged": None

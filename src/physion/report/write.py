@@ -17,8 +17,8 @@ def prepare_folder(folder: Path) -> Path:
     """Make ``folder`` with its ``tables`` and ``figures``, and return the path of the latter."""
     if folder.exists() and not folder.is_dir():
         raise BadInputError(f"{folder} is a file; give a folder for the report")
-    for place in ("tables", "figures"):
-        (folder / place).mkdir(parents=True, exist_ok=True)
+    for name in ("tables", "figures"):
+        (folder / name).mkdir(parents=True, exist_ok=True)
     return folder / "figures"
 
 

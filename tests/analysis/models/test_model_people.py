@@ -25,7 +25,7 @@ from physion.analysis.models.model_people import (
 )
 from physion.analysis.models.people_comparison import PeopleComparison, compare_everywhere
 from physion.analysis.models.zones import RELEASED_R, human_zones, released_r_zone, released_zone
-from physion.analysis.people.answers import Answers, answers_of
+from physion.analysis.people.answers import ScenarioAnswers, answers_of
 from physion.analysis.people.difficulty import difficulty_third, r_by_third
 from physion.analysis.people.people import draws_of_people, split_halves
 from physion.analysis.statistics import agreement
@@ -54,26 +54,26 @@ MEASURES = [metric.name for metric in measure_metrics()]
 
 
 @pytest.fixture(scope="module")
-def answers() -> Answers:
+def answers() -> ScenarioAnswers:
     test = study(people=12, stimuli=25, scenarios=("collide",), seed=1).test
     return answers_of(test.drop(index=test.index[[5, 60, 61]]), "collide")
 
 
 @pytest.fixture(scope="module")
-def models(answers: Answers) -> Models:
+def models(answers: ScenarioAnswers) -> Models:
     generator = np.random.default_rng(0)
-    p = np.vstack([answers.shares(), generator.random(25), np.full(25, 0.8), generator.random(25)])
+    p = np.vstack([answers.p_yes(), generator.random(25), np.full(25, 0.8), generator.random(25)])
     p[3, [0, 7]] = np.nan
     predicted = np.where(np.isnan(p), np.nan, p > 0.5)
     return Models(("people", "chance", "always", "gaps"), p, predicted)
 
 
-def measures(models: Models, answers: Answers, bootstrap: Bootstrap) -> pd.DataFrame:
+def measures(models: Models, answers: ScenarioAnswers, bootstrap: Bootstrap) -> pd.DataFrame:
     return measure_table(measure_models(models, answers, bootstrap), bootstrap)
 
 
 def plain(
-    k: int, models: Models, answers: Answers, people: npt.ArrayLike, stimuli: npt.ArrayLike
+    k: int, models: Models, answers: ScenarioAnswers, people: npt.ArrayLike, stimuli: npt.ArrayLike
 ) -> dict[str, float]:
     """Every measure of model ``k`` by definition, on people and stimuli drawn by their numbers."""
     who, what = np.asarray(people), np.asarray(stimuli)
@@ -110,7 +110,7 @@ def plain(
 
 
 @pytest.mark.filterwarnings("ignore:Mean of empty slice")
-def test_every_measure_is_what_it_says(models: Models, answers: Answers) -> None:
+def test_every_measure_is_what_it_says(models: Models, answers: ScenarioAnswers) -> None:
     table = measures(models, answers, FEW)
     assert len(table) == 4 * len(MEASURES)
     for k, name in enumerate(models.names):
@@ -127,7 +127,7 @@ def test_every_measure_is_what_it_says(models: Models, answers: Answers) -> None
 
 
 def test_intervals_are_those_of_drawing_people_stimuli_or_both(
-    models: Models, answers: Answers
+    models: Models, answers: ScenarioAnswers
 ) -> None:
     draws = Bootstrap(resamples=12, seed=3)
     table = measures(models, answers, draws).set_index(["model", "measure"])
@@ -149,8 +149,8 @@ def test_intervals_are_those_of_drawing_people_stimuli_or_both(
             assert found == pytest.approx(draws.interval(drawn), abs=1e-9), (what, measure)
 
 
-def test_a_model_that_knows_people_is_best_and_noise_adds_up(answers: Answers) -> None:
-    p = np.vstack([answers.shares(), np.random.default_rng(1).random(25)])
+def test_a_model_that_knows_people_is_best_and_noise_adds_up(answers: ScenarioAnswers) -> None:
+    p = np.vstack([answers.p_yes(), np.random.default_rng(1).random(25)])
     models = Models(("people", "chance"), p, (p > 0.5).astype(float))
     table = measures(models, answers, Bootstrap(resamples=300))
     table = table.set_index(["model", "measure"])
@@ -163,10 +163,10 @@ def test_a_model_that_knows_people_is_best_and_noise_adds_up(answers: Answers) -
     assert width["both"] >= 0.95 * max(width["people"], width["stimuli"])
 
 
-def test_a_person_as_a_model_stands_in_the_zone_of_people(answers: Answers) -> None:
+def test_a_person_as_a_model_stands_in_the_zone_of_people(answers: ScenarioAnswers) -> None:
     zones = human_zones(answers, split_halves(answers.yes, 50)).set_index(["measure", "of"])
     others = np.arange(12) != 4
-    rest = Answers(answers.scenario, answers.sessions[:11], answers.participants[:11],
+    rest = ScenarioAnswers(answers.scenario, answers.sessions[:11], answers.participants[:11],
                    answers.stimuli, answers.yes[others], answers.label,
                    answers.log_rt[others])  # fmt: skip
     as_model = Models(("person",), answers.yes[4:5], answers.yes[4:5])
@@ -202,7 +202,7 @@ def test_the_released_zone_is_another_thing(official: Path) -> None:
         released_zone([0.7, np.nan])
 
 
-def test_the_band_of_r_is_undefined_where_a_scenario_has_none(answers: Answers) -> None:
+def test_the_band_of_r_is_undefined_where_a_scenario_has_none(answers: ScenarioAnswers) -> None:
     one = human_zones(answers, split_halves(answers.yes, 50))
     other = human_zones(answers, np.full(50, np.nan))
     assert released_r_zone(pd.concat([one, one]))["low"].notna().all()
@@ -213,7 +213,9 @@ def test_the_band_of_r_is_undefined_where_a_scenario_has_none(answers: Answers) 
 # --- tables in, models out ----------------------------------------------------------------------
 
 
-def test_tables_become_models_and_what_has_no_counterpart_is_counted(answers: Answers) -> None:
+def test_tables_become_models_and_what_has_no_counterpart_is_counted(
+    answers: ScenarioAnswers,
+) -> None:
     rows = pd.DataFrame(
         [(agent, stimulus, 0.7, True) for agent in ("b", "a") for stimulus in answers.stimuli],
         columns=["agent", "stimulus", "p_contact", "predicted"],
@@ -251,7 +253,7 @@ def test_models_that_are_none_are_refused(
         Models(names, np.array(p), np.array(predicted, dtype=float))
 
 
-def test_models_among_themselves(models: Models, answers: Answers) -> None:
+def test_models_among_themselves(models: Models, answers: ScenarioAnswers) -> None:
     found = model_pairs(models, answers).set_index(["first", "second"])
     assert len(found) == 6
     row = found.loc[("people", "chance")]
@@ -339,9 +341,9 @@ def test_thirds_are_parted_at_their_edges() -> None:
     assert np.isnan(found[6])
 
 
-def test_r_within_thirds_is_that_of_their_stimuli(answers: Answers, models: Models) -> None:
+def test_r_within_thirds_is_that_of_their_stimuli(answers: ScenarioAnswers, models: Models) -> None:
     table = r_by_third(models.p_contact, answers.yes, answers.label, halves=30)
-    shares = answers.shares()
+    shares = answers.p_yes()
     third = difficulty_third(np.where(answers.label == 1, shares, 1 - shares)).to_numpy()
     for row in table[table["model"] >= 0].itertuples():
         own = (third == row.third) & np.isfinite(models.p_contact[row.model])

@@ -289,7 +289,7 @@ def test_answers_as_arrays_hold_what_the_rows_say() -> None:
         assert answers.yes[cell] == row.yes and answers.correct[cell] == row.correct
         assert answers.log_rt[cell] == row.log_rt
     by_hand = rows.groupby("stimulus")["yes"].mean()
-    np.testing.assert_allclose(answers.shares(), by_hand.loc[list(answers.stimuli)])
+    np.testing.assert_allclose(answers.p_yes(), by_hand.loc[list(answers.stimuli)])
     weights = np.array([[2.0, 0, 1, 1]])
     drawn = np.repeat(answers.yes, weights[0].astype(int), axis=0)
     np.testing.assert_allclose(mean_over_people(answers.yes, weights)[0], np.nanmean(drawn, axis=0))

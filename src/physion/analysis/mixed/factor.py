@@ -51,13 +51,13 @@ class Factor:
 
     def solve(self, right: Array) -> Array:
         """Return H^-1 times ``right``, of shape (q,) or (q, p)."""
-        found = np.empty_like(right)
+        result = np.empty_like(right)
         for (wide, narrow), ratio, lower in self._parts():
             below = right[narrow] - ratio.T @ right[wide]
             solved = cho_solve((lower, True), below, check_finite=False) if len(lower) else below
-            found[narrow] = solved
-            found[wide] = (right[wide].T / self._wide[wide]).T - ratio @ solved
-        return found
+            result[narrow] = solved
+            result[wide] = (right[wide].T / self._wide[wide]).T - ratio @ solved
+        return result
 
     def inverse(self) -> Inverse:
         """Return the parts of H^-1 for the cells that rows can fill."""
@@ -93,17 +93,17 @@ class Factor:
     def at_rows(self, inverse: Inverse) -> Array:
         """Return z'Lambda H^-1 Lambda z for each row's indicators z, shape (n,)."""
         scale, groupings = self._scale, self._groupings
-        found = groupings.spread(inverse.diagonal * scale**2)
+        result = groupings.spread(inverse.diagonal * scale**2)
         cross = np.concatenate([block.ravel() for block in inverse.cross])
         wide = scale[groupings.rows[groupings.wide]]
         for k, cells in groupings.cells.items():
-            found += 2 * wide * scale[groupings.rows[k]] * cross[cells]
+            result += 2 * wide * scale[groupings.rows[k]] * cross[cells]
         square = np.concatenate([block.ravel() for block in inverse.narrow])
         for (k, m), pairs in groupings.pairs.items():
             if k != m:
                 product = scale[groupings.rows[k]] * scale[groupings.rows[m]]
-                found += 2 * product * square[pairs]
-        return found
+                result += 2 * product * square[pairs]
+        return result
 
     def _parts(self) -> Iterator[tuple[tuple[slice, slice], Array, Array]]:
         return zip(self._places, self._ratio, self._lower, strict=True)

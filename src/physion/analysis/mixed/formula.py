@@ -69,12 +69,12 @@ def _summands(text: str, formula: str) -> list[str]:
 def _nested(group: str, piece: str) -> list[tuple[str, tuple[str, ...]]]:
     if "/" in group:
         names = [_plain(part.strip()) for part in group.split("/")]
-        found = [tuple(names[: k + 1]) for k in range(len(names))]
+        result = [tuple(names[: k + 1]) for k in range(len(names))]
     else:
-        found = [tuple(_plain(part.strip()) for part in group.split(":"))]
-    if not all(all(names) for names in found):
+        result = [tuple(_plain(part.strip()) for part in group.split(":"))]
+    if not all(all(names) for names in result):
         raise BadInputError(f"{piece!r} lacks the name of a group")
-    return [(":".join(names), names) for names in found]
+    return [(":".join(names), names) for names in result]
 
 
 def _plain(name: str) -> str:
@@ -85,7 +85,7 @@ def columns_of(
     response: str, fixed: str, random: Sequence[tuple[str, tuple[str, ...]]], known: list[str]
 ) -> list[str]:
     """Return all columns that are needed; refuse unknown names and characters."""
-    found = [response]
+    result = [response]
     tokens = _TOKEN.findall(fixed)
     for token, after in zip(tokens, [*tokens[1:], ""], strict=True):
         if token[0] in "\"'" or token in _SIGNS or re.fullmatch(r"\d+(\.\d+)?|\.\d+", token):
@@ -96,10 +96,10 @@ def columns_of(
             raise BadInputError(f"{token!r} in {fixed!r} is not understood in a formula")
         if after == "=":
             continue
-        found.append(_plain(token))
-    found.extend(name for _, columns in random for name in columns)
-    for name in found:
+        result.append(_plain(token))
+    result.extend(name for _, columns in random for name in columns)
+    for name in result:
         if name not in known:
             close = difflib.get_close_matches(name, known, n=3, cutoff=0.4) or known[:8]
             raise BadInputError(f"the table has no column {name!r}; it has: {', '.join(close)}")
-    return list(dict.fromkeys(found))
+    return list(dict.fromkeys(result))

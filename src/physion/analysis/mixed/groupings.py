@@ -173,15 +173,15 @@ class Groupings:
         """Return for each block its slots (wide, narrow) and its two tables."""
         wide = [slice(a, b) for a, b in _pairs(self._wide_bounds)]
         narrow = [slice(self.q_wide + a, self.q_wide + b) for a, b in _pairs(self._narrow_bounds)]
-        places = list(zip(wide, narrow, strict=True))
-        return list(zip(places, counts.cross, counts.narrow, strict=True))
+        slots_of_blocks = list(zip(wide, narrow, strict=True))
+        return list(zip(slots_of_blocks, counts.cross, counts.narrow, strict=True))
 
 
 def _rank(block: Codes) -> Codes:
     """Return the position of each level when levels are sorted by block."""
-    place = np.empty(len(block), dtype=np.int64)
-    place[np.argsort(block, kind="stable")] = np.arange(len(block))
-    return place
+    position = np.empty(len(block), dtype=np.int64)
+    position[np.argsort(block, kind="stable")] = np.arange(len(block))
+    return position
 
 
 def _pairs(bounds: Codes) -> list[tuple[int, int]]:

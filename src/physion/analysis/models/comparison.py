@@ -197,8 +197,8 @@ def _unmatched(
     extra = rows[~rows["stimulus"].isin(people["stimulus"])]
     reason = _purpose(extra["stimulus"], unwanted, exclude_ledge)
     parts = [_count(extra.assign(reason=reason.mask(reason == "", NOT_SEEN)))]
-    for agent, own in rows.groupby("agent", sort=False):
-        missing = people[~people["stimulus"].isin(own["stimulus"])]
+    for agent, subset in rows.groupby("agent", sort=False):
+        missing = people[~people["stimulus"].isin(subset["stimulus"])]
         parts.append(_count(missing.assign(reason=NOT_PREDICTED, agent=agent)))
     return parts
 

@@ -61,7 +61,7 @@ def fits_of_people(people: PeopleResults) -> list[MixedTable]:
     stimuli = with_attributes(people.tables["by_stimulus"], people.tables["attributes"])
     rows = answer_rows(people.kept.test, stimuli)
     scenario = "scenario + " if rows["scenario"].nunique() > 1 else ""
-    found = [
+    fits = [
         _fitted(
             "scenarios",
             "Do people differ between scenarios? Log odds of being right, logistic",
@@ -75,15 +75,15 @@ def fits_of_people(people: PeopleResults) -> list[MixedTable]:
         fitter = fit_logistic if hypothesis.family == "logistic" else fit_linear
         formula = hypothesis.formula if scenario else hypothesis.formula.replace("scenario + ", "")
         about = f"{key}, preregistered: {hypothesis.about} ({hypothesis.family})"
-        found.append(_fitted(key.lower(), about, formula, fitter, rows))
+        fits.append(_fitted(key.lower(), about, formula, fitter, rows))
     flagged = people.tables["flags"].set_index("session")["flagged"]
     whole = people.whole.test
     whole = whole.assign(flagged=whole["session"].map(flagged).astype(float))
     about = "Effect of a session's flag on being right, all complete sessions, logistic"
-    found.append(
+    fits.append(
         _fitted("flagged", about, f"correct ~ flagged + {scenario}{CROSSED}", fit_logistic, whole)
     )
-    return found
+    return fits
 
 
 def fits_of_models(comparison: Comparison) -> list[MixedTable]:
@@ -102,7 +102,7 @@ def fits_of_models(comparison: Comparison) -> list[MixedTable]:
         agent=pd.Categorical(rows["agent"], categories=comparison.agents),
         readout=pd.Categorical(rows["readout"], categories=rows["readout"].unique()),
     )
-    found = [
+    fits = [
         _fitted(
             "models",
             f"Do models differ in accuracy? Linear, each against {comparison.agents[0]}, "
@@ -115,7 +115,7 @@ def fits_of_models(comparison: Comparison) -> list[MixedTable]:
     ]
     if rows["readout"].nunique() > 1 and rows["model"].nunique() > 1:
         first = rows["readout"].cat.categories[0]
-        found.append(
+        fits.append(
             _fitted(
                 "readouts",
                 f"Does the readout matter? Linear, against {first}, the first in the files",
@@ -125,4 +125,4 @@ def fits_of_models(comparison: Comparison) -> list[MixedTable]:
                 "readout",
             )
         )
-    return found
+    return fits

@@ -16,7 +16,7 @@ import numpy.typing as npt
 import pandas as pd
 
 from physion.analysis.metrics import RESAMPLED, Resampled, Sample, measure_metrics
-from physion.analysis.people.answers import Answers, mean_over_people
+from physion.analysis.people.answers import ScenarioAnswers, mean_over_people
 from physion.analysis.people.people import draws_of_people
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.statistics.calibration import check_probabilities
@@ -60,7 +60,7 @@ class Models:
 
 
 def models_of(
-    rows: pd.DataFrame, answers: Answers, agents: Sequence[str] | None = None
+    rows: pd.DataFrame, answers: ScenarioAnswers, agents: Sequence[str] | None = None
 ) -> tuple[Models, pd.DataFrame]:
     """Return the models of a table, and a table of what has no counterpart.
 
@@ -92,11 +92,11 @@ def models_of(
         for column in ("p_contact", "predicted")
     ]
     unseen = rows[~rows["stimulus"].isin(answers.stimuli)].groupby("agent", sort=False).size()
-    lost = [(agent, "people did not see it", int(n)) for agent, n in unseen.items()]
+    unmatched = [(agent, "people did not see it", int(n)) for agent, n in unseen.items()]
     gaps = np.isnan(grids[0]).sum(axis=1)
-    lost += [(name, "the model does not predict it", int(n))
+    unmatched += [(name, "the model does not predict it", int(n))
              for name, n in zip(names, gaps, strict=True) if n]  # fmt: skip
-    dropped = pd.DataFrame(lost, columns=["agent", "reason", "stimuli"])
+    dropped = pd.DataFrame(unmatched, columns=["agent", "reason", "stimuli"])
     return Models(names, grids[0], grids[1]), dropped
 
 
@@ -113,13 +113,13 @@ class Measured:
     """
 
     models: Models
-    answers: Answers
+    answers: ScenarioAnswers
     values: dict[str, Array]
     pairs: dict[str, Array]
     draws: dict[Resampled, dict[str, Array]]
 
 
-def measure_models(models: Models, answers: Answers, bootstrap: Bootstrap) -> Measured:
+def measure_models(models: Models, answers: ScenarioAnswers, bootstrap: Bootstrap) -> Measured:
     """Compute every measure of every model, and its resamples."""
     sample = sample_of_models(models, answers)
     values, pairs = {}, {}
@@ -147,8 +147,10 @@ def measure_table(measured: Measured, bootstrap: Bootstrap) -> pd.DataFrame:
         for measure in measured.values:
             value = float(measured.values[measure][k])
             draws = {what: measured.draws[what].get(measure) for what in RESAMPLED}
-            own = {what: None if drawn is None else drawn[:, k] for what, drawn in draws.items()}
-            record, reasons = interval_columns(value, own, bootstrap)
+            of_model = {
+                what: None if drawn is None else drawn[:, k] for what, drawn in draws.items()
+            }
+            record, reasons = interval_columns(value, of_model, bootstrap)
             if not np.isfinite(value):
                 reasons.insert(0, _why(measure, k, models, measured.answers))
             if measure in measured.pairs:
@@ -187,7 +189,7 @@ def interval_columns(
     return record, reasons
 
 
-def _samples(models: Models, answers: Answers, draws: Bootstrap) -> dict[Resampled, Sample]:
+def _samples(models: Models, answers: ScenarioAnswers, draws: Bootstrap) -> dict[Resampled, Sample]:
     """Return the resamples for the intervals, by what is drawn."""
     people = draws_of_people(answers, draws)
     stimuli = draws.weights(answers.scenario, len(answers.stimuli))
@@ -200,7 +202,7 @@ def _samples(models: Models, answers: Answers, draws: Bootstrap) -> dict[Resampl
 
 def sample_of_models(
     models: Models,
-    answers: Answers,
+    answers: ScenarioAnswers,
     stimuli: Array | None = None,
     people: Array | None = None,
     drawn: Resampled | None = None,
@@ -235,7 +237,7 @@ def _over_people(values: Array) -> dict[str, float]:
             "undefined": len(values) - len(known)}  # fmt: skip
 
 
-def _why(measure: str, k: int, models: Models, answers: Answers) -> str:
+def _why(measure: str, k: int, models: Models, answers: ScenarioAnswers) -> str:
     known = ~np.isnan(models.p_contact[k])
     if not known.any():
         return "the model predicts none of the stimuli"
@@ -250,7 +252,7 @@ def _why(measure: str, k: int, models: Models, answers: Answers) -> str:
 # --- models among themselves --------------------------------------------------------------------
 
 
-def model_pairs(models: Models, answers: Answers) -> pd.DataFrame:
+def model_pairs(models: Models, answers: ScenarioAnswers) -> pd.DataFrame:
     """Return kappa and error consistency of every two models.
 
     Columns: ``first``, ``second``, ``stimuli``, ``kappa``, ``error_consistency``; NaN if undefined.

@@ -55,7 +55,7 @@ def pool_measured(measured: Sequence[Measured]) -> PooledStimuli:
             [correctness(one.models.predicted, one.answers.label) for one in measured], axis=1
         ),
         label=np.concatenate([one.answers.label for one in measured]),
-        p_yes=np.concatenate([one.answers.shares() for one in measured]),
+        p_yes=np.concatenate([one.answers.p_yes() for one in measured]),
         scenario=tuple(one.answers.scenario for one in measured for _ in one.answers.stimuli),
     )
 

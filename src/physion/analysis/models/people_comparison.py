@@ -75,15 +75,15 @@ def compare_everywhere(
     columns = ["agent", "stimulus", "p_contact", "predicted"]
     require_columns(predictions, columns, "the predictions")
     draws = bootstrap or Bootstrap()
-    home = test.drop_duplicates("stimulus").set_index("stimulus")["scenario"]
-    rows = predictions[columns].assign(scenario=predictions["stimulus"].map(home))
+    scenario_by_stimulus = test.drop_duplicates("stimulus").set_index("stimulus")["scenario"]
+    rows = predictions[columns].assign(scenario=predictions["stimulus"].map(scenario_by_stimulus))
     agents = list(rows["agent"].unique())
     dropped = [_unseen(rows)]
     measured, zones, pairs = [], [], []
     for answers in all_answers(test):
-        own = rows[rows["scenario"] == answers.scenario]
-        models, lost = models_of(own, answers, agents)
-        dropped.append(lost.assign(scenario=answers.scenario))
+        subset = rows[rows["scenario"] == answers.scenario]
+        models, unmatched = models_of(subset, answers, agents)
+        dropped.append(unmatched.assign(scenario=answers.scenario))
         measured.append(measure_models(models, answers, draws))
         zones.append(human_zones(answers, split_halves(answers.yes, halves, draws.seed)))
         pairs.append(model_pairs(models, answers).assign(scenario=answers.scenario))
@@ -141,9 +141,9 @@ def _mean_table(measured: Sequence[Measured], bootstrap: Bootstrap) -> pd.DataFr
 
 
 def _with_zone(scores: pd.DataFrame, zones: pd.DataFrame) -> pd.DataFrame:
-    own = zones.loc[zones["of"] == "participants", ["scenario", "measure", "low", "high"]]
-    own = own.rename(columns={"low": "zone_low", "high": "zone_high"})
-    joined = scores.merge(own, on=["scenario", "measure"], how="left")
+    subset = zones.loc[zones["of"] == "participants", ["scenario", "measure", "low", "high"]]
+    subset = subset.rename(columns={"low": "zone_low", "high": "zone_high"})
+    joined = scores.merge(subset, on=["scenario", "measure"], how="left")
     known = joined[["value", "zone_low", "zone_high"]].notna().all(axis=1)
     inside = joined["value"].between(joined["zone_low"], joined["zone_high"])
     words = inside.map({True: "yes", False: "no"})

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from physion.analysis.people.answers import Answers, mean_over_people
+from physion.analysis.people.answers import ScenarioAnswers, mean_over_people
 from physion.analysis.statistics.agreement import rmsd
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.statistics.correlation import correlate_rows
@@ -22,7 +22,7 @@ RELEASED_R = "halves, mean of scenarios (the paper's band)"
 """Whose values the paper's grey band for r is made of; see `released_r_zone`."""
 
 
-def human_zones(answers: Answers, halves: Array | None = None) -> pd.DataFrame:
+def human_zones(answers: ScenarioAnswers, halves: Array | None = None) -> pd.DataFrame:
     """Return the range of each measure among single people.
 
     Columns: ``scenario``, ``measure``, ``of``, ``values`` (their number), ``mean``, ``low``,
@@ -41,32 +41,32 @@ def human_zones(answers: Answers, halves: Array | None = None) -> pd.DataFrame:
     kappa, errors = cross_kappa(yes, yes), cross_kappa(right, right)
     for matrix in (kappa, errors):
         np.fill_diagonal(matrix, np.nan)
-    apart = [rmsd_of(own, rest) for own, rest in zip(yes, others, strict=True)]
+    distances = [rmsd_of(first, second) for first, second in zip(yes, others, strict=True)]
     upper = np.triu_indices(n, 1)
-    found: list[tuple[str, str, npt.ArrayLike]] = [
+    ranges: list[tuple[str, str, npt.ArrayLike]] = [
         ("accuracy", "participants", mean_over_people(right.T)),
         ("r", "participants", correlate_rows(yes, others)),
-        ("rmsd", "participants", apart),
-        ("euclid_over_n", "participants", apart / np.sqrt(np.sum(~np.isnan(yes), axis=1))),
+        ("rmsd", "participants", distances),
+        ("euclid_over_n", "participants", distances / np.sqrt(np.sum(~np.isnan(yes), axis=1))),
         ("kappa", "participants", mean_over_people(kappa)),
         ("error_consistency", "participants", mean_over_people(errors)),
         ("kappa", "pairs", kappa[upper]),
         ("error_consistency", "pairs", errors[upper]),
     ]
     if halves is not None:
-        found.append(("r", "halves", halves))
+        ranges.append(("r", "halves", halves))
     return pd.DataFrame(
         [
             {"scenario": answers.scenario, "measure": measure, "of": of, **_zone(values)}
-            for measure, of, values in found
+            for measure, of, values in ranges
         ]
     )
 
 
-def rmsd_of(own: Array, rest: Array) -> float:
+def rmsd_of(first: Array, second: Array) -> float:
     """Return the RMSD of two vectors where both are finite."""
-    known = np.isfinite(own) & np.isfinite(rest)
-    return rmsd(own[known], rest[known])
+    known = np.isfinite(first) & np.isfinite(second)
+    return rmsd(first[known], second[known])
 
 
 def _zone(values: npt.ArrayLike) -> dict[str, float]:

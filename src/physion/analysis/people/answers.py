@@ -14,7 +14,7 @@ Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Answers:
+class ScenarioAnswers:
     """Answers of all participants to one scenario.
 
     - ``sessions`` and ``participants``: names, length n, in the order of the rows of ``yes``;
@@ -37,7 +37,7 @@ class Answers:
         """Correctness of the answers (n, s): 1 right, 0 wrong, NaN without an answer."""
         return np.where(np.isnan(self.yes), np.nan, self.yes == self.label)
 
-    def shares(self) -> Array:
+    def p_yes(self) -> Array:
         """Return the fraction of people who say yes, by stimulus, (s,)."""
         return mean_over_people(self.yes)
 
@@ -54,7 +54,7 @@ def mean_over_people(values: Array, weights: npt.ArrayLike | None = None) -> Arr
         return np.where(count > 0, total / count, np.nan)
 
 
-def answers_of(test: pd.DataFrame, scenario: str) -> Answers:
+def answers_of(test: pd.DataFrame, scenario: str) -> ScenarioAnswers:
     """Return the answers to one scenario from the test rows of `participants.Responses`.
 
     Raises `BadInputError` if the scenario has no answer, or a session two answers to one stimulus.
@@ -70,13 +70,13 @@ def answers_of(test: pd.DataFrame, scenario: str) -> Answers:
         raise BadInputError(f"scenario {scenario!r}: a session answered one stimulus twice")
 
     def grid(values: npt.ArrayLike) -> Array:
-        found = np.full(shape[0] * shape[1], np.nan)
-        found[cells] = np.asarray(values, dtype=np.float64)
-        return found.reshape(shape)
+        values_by_cell = np.full(shape[0] * shape[1], np.nan)
+        values_by_cell[cells] = np.asarray(values, dtype=np.float64)
+        return values_by_cell.reshape(shape)
 
     owner = rows.drop_duplicates("session").set_index("session")["participant"]
     label = rows.drop_duplicates("stimulus").set_index("stimulus")["label"]
-    return Answers(
+    return ScenarioAnswers(
         scenario,
         tuple(map(str, people)),
         tuple(map(str, owner.loc[people])),

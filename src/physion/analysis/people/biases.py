@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pandas as pd
 from scipy import stats
 
-from physion.analysis.people.answers import Answers, mean_over_people
+from physion.analysis.people.answers import ScenarioAnswers, mean_over_people
 from physion.analysis.people.people import accuracy_by_participant, all_answers, draws_of_people
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.statistics.clustered_logit import clustered_logit
@@ -49,20 +49,20 @@ def yes_bias(test: pd.DataFrame, bootstrap: Bootstrap | None = None) -> pd.DataF
             "yes": float(np.mean(own_yes)),
         }
         values = {"bias": own_yes - own_base, "d_prime": d_prime, "criterion": criterion}
-        for name, own in values.items():
-            record |= _mean_with_interval(name, own, weights, draws)
+        for name, by_person in values.items():
+            record |= _mean_with_interval(name, by_person, weights, draws)
         records.append({**record, "reason": reason})
     return pd.DataFrame(records)
 
 
-def _signal_detection(answers: Answers) -> tuple[Array, Array, str]:
+def _signal_detection(answers: ScenarioAnswers) -> tuple[Array, Array, str]:
     """Return d' and criterion of each person; NaN if all stimuli seen have the same outcome."""
     given = ~np.isnan(answers.yes)
     touch = given & (answers.label == 1)
     miss = given & (answers.label == 0)
-    said = np.where(given, answers.yes, 0.0)
-    hits, of_hits = np.sum(said * touch, axis=1), touch.sum(axis=1)
-    alarms, of_alarms = np.sum(said * miss, axis=1), miss.sum(axis=1)
+    yes = np.where(given, answers.yes, 0.0)
+    hits, of_hits = np.sum(yes * touch, axis=1), touch.sum(axis=1)
+    alarms, of_alarms = np.sum(yes * miss, axis=1), miss.sum(axis=1)
     z_hit = stats.norm.ppf((hits + 0.5) / (of_hits + 1))
     z_alarm = stats.norm.ppf((alarms + 0.5) / (of_alarms + 1))
     undefined = (of_hits == 0) | (of_alarms == 0)
@@ -73,12 +73,12 @@ def _signal_detection(answers: Answers) -> tuple[Array, Array, str]:
 
 
 def _mean_with_interval(
-    name: str, own: Array, weights: Array, draws: Bootstrap
+    name: str, by_person: Array, weights: Array, draws: Bootstrap
 ) -> dict[str, float]:
-    known = np.isfinite(own)
-    drawn = mean_over_people(own[:, None], weights)[:, 0]
+    known = np.isfinite(by_person)
+    drawn = mean_over_people(by_person[:, None], weights)[:, 0]
     low, high = draws.interval(drawn) if known.sum() > 1 else (np.nan, np.nan)
-    mean = float(np.mean(own[known])) if known.any() else np.nan
+    mean = float(np.mean(by_person[known])) if known.any() else np.nan
     return {name: mean, f"{name}_low": low, f"{name}_high": high}
 
 
@@ -99,14 +99,14 @@ def side_bias(test: pd.DataFrame, bootstrap: Bootstrap | None = None) -> pd.Data
     for scenario in in_order(test["scenario"]):
         rows = test[test["scenario"] == scenario]
         order = rows["buttons"] if "buttons" in rows else pd.Series("", index=rows.index)
-        own = rows.assign(order=order).groupby("session")[["yes", "order"]].agg(
+        by_person = rows.assign(order=order).groupby("session")[["yes", "order"]].agg(
             {"yes": "mean", "order": "first"}
         )  # fmt: skip
-        groups = {name: own.loc[own["order"] == name, "yes"].to_numpy(dtype=np.float64)
+        groups = {name: by_person.loc[by_person["order"] == name, "yes"].to_numpy(dtype=np.float64)
                   for name in ("yes-no", "no-yes")}  # fmt: skip
         record = {"scenario": scenario} | _side_record(groups, scenario, draws)
         known = len(groups["yes-no"]) + len(groups["no-yes"])
-        records.append({**record, "unknown": len(own) - known})
+        records.append({**record, "unknown": len(by_person) - known})
     return pd.DataFrame(records)
 
 
@@ -118,8 +118,8 @@ def _side_record(groups: dict[str, Array], scenario: str, draws: Bootstrap) -> d
         return {**record, **nothing, "reason": "fewer than two people of one order of buttons"}
     # Left presses are the yes of one group and the no of the other.
     drawn = [
-        draws.weights(f"{name} of {scenario}", len(own)) @ own / len(own)
-        for name, own in groups.items()
+        draws.weights(f"{name} of {scenario}", len(by_person)) @ by_person / len(by_person)
+        for name, by_person in groups.items()
     ]
     low, high = draws.interval((drawn[0] + 1 - drawn[1]) / 2)
     constant = np.std(first) == 0 and np.std(second) == 0
@@ -199,9 +199,11 @@ def accuracy_by_background(test: pd.DataFrame, sessions: pd.DataFrame) -> pd.Dat
     tests as questions, p not corrected.
     """
     require_columns(sessions, ["session"], "the table of sessions")
-    own = accuracy_by_participant(test)
-    own["relative"] = own["accuracy"] - own.groupby("scenario")["accuracy"].transform("mean")
-    joined = own.merge(sessions.drop(columns=["participant", "scenario"], errors="ignore"),
+    by_person = accuracy_by_participant(test)
+    by_person["relative"] = by_person["accuracy"] - by_person.groupby("scenario")[
+        "accuracy"
+    ].transform("mean")
+    joined = by_person.merge(sessions.drop(columns=["participant", "scenario"], errors="ignore"),
                        on="session", how="left")  # fmt: skip
     asked = [column for column in BACKGROUND if column in joined]
     return pd.DataFrame([_association(joined, column) for column in asked])
@@ -217,12 +219,12 @@ def _association(joined: pd.DataFrame, column: str) -> dict[str, Any]:
         numbers = rows[column].astype(np.float64)
         if len(rows) < 3 or numbers.nunique() < 2 or rows["relative"].nunique() < 2:
             return {**record, "reason": "too few answers, or all alike"}
-        found = stats.spearmanr(numbers, rows["relative"])
-        return {**record, "statistic": float(found.statistic), "p": float(found.pvalue)}
+        test_result = stats.spearmanr(numbers, rows["relative"])
+        return {**record, "statistic": float(test_result.statistic), "p": float(test_result.pvalue)}
     record["test"] = "kruskal-wallis"
     groups = [part["relative"] for _, part in rows.groupby(column) if len(part) >= 2]
     if len(groups) < 2 or rows["relative"].nunique() < 2:
         return {**record, "reason": "fewer than two groups of two, or all accuracies alike"}
-    found = stats.kruskal(*groups)
-    return {**record, "df": len(groups) - 1, "statistic": float(found.statistic),
-            "p": float(found.pvalue)}  # fmt: skip
+    test_result = stats.kruskal(*groups)
+    return {**record, "df": len(groups) - 1, "statistic": float(test_result.statistic),
+            "p": float(test_result.pvalue)}  # fmt: skip

@@ -94,18 +94,20 @@ def r_by_third(
     """
     answers, truth = np.asarray(yes, np.float64), np.asarray(label, np.float64)
     models = np.atleast_2d(np.asarray(p_contact, np.float64))
-    shares = mean_over_people(answers)
-    third = difficulty_third(np.where(truth == 1, shares, 1 - shares)).to_numpy()
+    p_yes = mean_over_people(answers)
+    third = difficulty_third(np.where(truth == 1, p_yes, 1 - p_yes)).to_numpy()
     rows: list[tuple[str, int, int, float, float, float]] = []
     for name in THIRDS:
-        own = np.flatnonzero(third == name)
-        r = correlate_rows(models[:, own], np.broadcast_to(shares[own], (len(models), len(own))))
-        rows += [(name, len(own), k, float(value), np.nan, np.nan) for k, value in enumerate(r)]
-        among = split_halves(answers[:, own], halves, seed) if len(own) else np.empty(0)
+        members = np.flatnonzero(third == name)
+        r = correlate_rows(
+            models[:, members], np.broadcast_to(p_yes[members], (len(models), len(members)))
+        )
+        rows += [(name, len(members), k, float(value), np.nan, np.nan) for k, value in enumerate(r)]
+        among = split_halves(answers[:, members], halves, seed) if len(members) else np.empty(0)
         among = among[np.isfinite(among)]
         low, high = np.percentile(among, [2.5, 97.5]) if len(among) else (np.nan, np.nan)
         mean = float(np.mean(among)) if len(among) else np.nan
-        rows.append((name, len(own), -1, mean, float(low), float(high)))
+        rows.append((name, len(members), -1, mean, float(low), float(high)))
     return pd.DataFrame(rows, columns=["third", "stimuli", "model", "r", "low", "high"])
 
 

@@ -127,8 +127,8 @@ def flag_alternation(measures: pd.DataFrame, rules: ExclusionRules) -> pd.Series
 def flag_familiarization(measures: pd.DataFrame, rules: ExclusionRules) -> pd.Series:
     """Flag too few correct practice trials; without recorded practice a session is not flagged."""
     limit = -np.inf if rules.familiarization_share is None else rules.familiarization_share
-    share = measures["familiarization_correct"] / measures["familiarization_trials"]
-    return share <= limit + 1e-9  # 3 of 10 is 0.3
+    fraction = measures["familiarization_correct"] / measures["familiarization_trials"]
+    return fraction <= limit + 1e-9  # 3 of 10 is 0.3
 
 
 def flag_low_accuracy(measures: pd.DataFrame, rules: ExclusionRules) -> pd.Series:
@@ -165,11 +165,11 @@ def flag_repeated(measures: pd.DataFrame) -> pd.Series:
 
 def _reference(measures: pd.DataFrame, column: str, centre: str, ddof: int) -> pd.DataFrame:
     """Return centre and standard deviation of the complete sessions of each session's scenario."""
-    whole = measures[~flag_incomplete(measures)]
-    groups = whole.groupby("scenario")[column]
+    complete = measures[~flag_incomplete(measures)]
+    groups = complete.groupby("scenario")[column]
     table = pd.DataFrame({"centre": groups.agg(centre), "sd": groups.std(ddof=ddof)})
-    found = table.reindex(measures["scenario"])
-    return found.set_axis(measures.index)
+    result = table.reindex(measures["scenario"])
+    return result.set_axis(measures.index)
 
 
 # --- the table of flags ------------------------------------------------------------------------
@@ -230,11 +230,11 @@ def count_flags(flags: pd.DataFrame) -> pd.DataFrame:
             (scenario, rule, int(part[rule].sum()), int((part[rule] & alone).sum()))
             for rule in RULES
         ]
-        blind = {
+        not_assessed = {
             "familiarization": part["familiarization_trials"] == 0,
             "slow": part["mean_log_rt"].isna(),
         }
-        for rule, unknown in blind.items():
+        for rule, unknown in not_assessed.items():
             if unknown.any():
                 rows.append((scenario, f"{rule} not assessed", int(unknown.sum()), 0))
         flagged = int(part["flagged"].sum())
@@ -254,8 +254,8 @@ def with_and_without(
     ``analyse`` maps `Responses` to a table. The first column of the result, ``sessions``, is
     ``unflagged`` (the main analysis) or ``complete`` (all complete first sessions).
     """
-    whole = set(flags.loc[~flags["incomplete"] & ~flags["repeated"], "session"])
-    sets = {"unflagged": set(flags.loc[~flags["flagged"], "session"]), "complete": whole}
+    complete = set(flags.loc[~flags["incomplete"] & ~flags["repeated"], "session"])
+    sets = {"unflagged": set(flags.loc[~flags["flagged"], "session"]), "complete": complete}
     parts = []
     for name, sessions in sets.items():
         if not sessions:
@@ -283,8 +283,8 @@ def flag_effect(
     value = test["session"].map(flags.set_index("session")[column]).astype(np.float64)
     table = test.assign(**{column: value})
     fit = clustered_logit(table, "correct", [column], fixed="scenario", level=level)
-    found = fit[fit["term"] == column].reset_index(drop=True)
+    result = fit[fit["term"] == column].reset_index(drop=True)
     if column in ("low_accuracy", "flagged") and flags["low_accuracy"].any():
-        known = found["reason"] != ""
-        found["reason"] = (found["reason"] + "; ").where(known, "") + BY_CONSTRUCTION
-    return found
+        known = result["reason"] != ""
+        result["reason"] = (result["reason"] + "; ").where(known, "") + BY_CONSTRUCTION
+    return result

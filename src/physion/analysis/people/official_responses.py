@@ -67,7 +67,7 @@ def _file(path: Path, scenario: str | None, offset: float) -> pd.DataFrame:
         is_practice |= True
     # Where the number is missing, the order of the rows is the order of the answers.
     order = raw.groupby(["gameID", is_practice], sort=False).cumcount().astype(str)
-    place = raw["trialNum"].where(~raw["trialNum"].str.lower().isin(("", "nan")), order)
+    position = raw["trialNum"].where(~raw["trialNum"].str.lower().isin(("", "nan")), order)
     table = pd.DataFrame(
         {
             "participant": _participant(raw),
@@ -75,7 +75,7 @@ def _file(path: Path, scenario: str | None, offset: float) -> pd.DataFrame:
             "scenario": scenario or _scenario(path, raw["stim_ID"]),
             "stimulus": raw["stim_ID"].map(canonical_name),
             "phase": np.where(is_practice, "familiarization", "test"),
-            "trial": place,
+            "trial": position,
             "response": raw["response"].str.lower().where(raw["response"].str.lower() != "nan", ""),
             "label": raw["target_hit_zone_label"],
             "simulated": False,
@@ -100,12 +100,12 @@ def _scenario(path: Path, stimuli: pd.Series) -> str:
     match = _STUDY.search(path.name)
     if match and match["study"].lower() in OFFICIAL_SCENARIOS:
         return OFFICIAL_SCENARIOS[match["study"].lower()]
-    found = {scenario_of(canonical_name(name)) for name in stimuli.unique()} - {None}
-    if len(found) != 1:
+    scenarios = {scenario_of(canonical_name(name)) for name in stimuli.unique()} - {None}
+    if len(scenarios) != 1:
         raise BadInputError(
             f"{path}: neither its name nor its stimuli say which scenario it is; name the scenario"
         )
-    return str(found.pop())
+    return str(scenarios.pop())
 
 
 def _response_time(rt: pd.Series, offset: float, path: Path) -> pd.Series:

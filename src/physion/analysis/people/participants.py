@@ -61,9 +61,9 @@ class Responses:
 
     def keep_sessions(self, sessions: Collection[str], reason: str) -> Responses:
         """Return these sessions only; the others are counted as dropped for ``reason``."""
-        gone = ~self.trials["session"].isin(sessions)
+        is_dropped = ~self.trials["session"].isin(sessions)
         kept = self.sessions[self.sessions["session"].isin(sessions)].reset_index(drop=True)
-        return replace(_without(self, gone, "sessions", reason), sessions=kept)
+        return replace(_without(self, is_dropped, "sessions", reason), sessions=kept)
 
     def drop_stimuli(self, exclude: Iterable[str] = (), ledge: bool = True) -> Responses:
         """Return the responses without the stimuli of a list and, as in the study, without Roll's
@@ -74,8 +74,8 @@ class Responses:
         unwanted = {canonical_name(name) for name in exclude}
         stimuli = self.trials["stimulus"]
         is_gone = stimuli.map(is_ledge).astype(bool) if ledge else stimuli.isna()
-        found = _without(self, is_gone, "stimuli", LEDGE)
-        return _without(found, found.trials["stimulus"].isin(unwanted), "stimuli", EXCLUDED)
+        cleaned = _without(self, is_gone, "stimuli", LEDGE)
+        return _without(cleaned, cleaned.trials["stimulus"].isin(unwanted), "stimuli", EXCLUDED)
 
 
 def read_responses(
@@ -111,15 +111,15 @@ def read_responses(
     people = None
     if sessions is not None:
         people = check_table(read_table(sessions, ()), SESSION_COLUMNS, str(sessions))
-    found = clean(
+    cleaned = clean(
         table, people, where=str(trials), known=known, unknown=unknown, conflicts=conflicts
     )
-    made = set(found.trials.loc[found.trials["simulated"], "session"])
-    if "simulated" in found.sessions:
-        made |= set(found.sessions.loc[found.sessions["simulated"], "session"])
-    if simulated or not made:
-        return found
-    return found.keep_sessions(set(found.sessions["session"]) - made, SIMULATED)
+    simulated_sessions = set(cleaned.trials.loc[cleaned.trials["simulated"], "session"])
+    if "simulated" in cleaned.sessions:
+        simulated_sessions |= set(cleaned.sessions.loc[cleaned.sessions["simulated"], "session"])
+    if simulated or not simulated_sessions:
+        return cleaned
+    return cleaned.keep_sessions(set(cleaned.sessions["session"]) - simulated_sessions, SIMULATED)
 
 
 def clean(
@@ -144,14 +144,14 @@ def clean(
     )
     people = _sessions(table, sessions, where)
     nothing = pd.DataFrame(columns=list(DROPPED_COLUMNS))
-    found = Responses(table.reset_index(drop=True), people, nothing)
-    found = _without(found, found.trials["response"] == "", "reading", NO_ANSWER)
-    if found.trials.empty:
+    cleaned = Responses(table.reset_index(drop=True), people, nothing)
+    cleaned = _without(cleaned, cleaned.trials["response"] == "", "reading", NO_ANSWER)
+    if cleaned.trials.empty:
         raise BadInputError(f"{where} holds no answer")
-    found = _without(found, found.trials.duplicated(), "reading", COPY)
-    found = _known(found, known, unknown, where)
-    found = _one_answer_each(found, conflicts, where)
-    return replace(found, trials=_derived(found.trials, where))
+    cleaned = _without(cleaned, cleaned.trials.duplicated(), "reading", COPY)
+    cleaned = _known(cleaned, known, unknown, where)
+    cleaned = _one_answer_each(cleaned, conflicts, where)
+    return replace(cleaned, trials=_derived(cleaned.trials, where))
 
 
 def _scenarios(names: pd.Series) -> pd.Series:
@@ -166,18 +166,18 @@ def _ours(name: str) -> str:
 def _sessions(trials: pd.DataFrame, given: pd.DataFrame | None, where: str) -> pd.DataFrame:
     """Return the table of sessions, checked against the trials."""
     keys = ["session", "participant", "scenario"]
-    found = trials[keys].drop_duplicates().reset_index(drop=True)
-    twice = found[found["session"].duplicated()]
+    cleaned = trials[keys].drop_duplicates().reset_index(drop=True)
+    twice = cleaned[cleaned["session"].duplicated()]
     if len(twice):
         raise BadInputError(
             f"{where}: session {twice['session'].iloc[0]!r} belongs to two participants or to "
             "two scenarios"
         )
     if given is None:
-        return found
+        return cleaned
     refuse_duplicates(given["session"], "table of sessions")
     given = given.assign(scenario=_scenarios(given["scenario"]))
-    joined = found.merge(given[keys], on="session", how="left", suffixes=("", "_given"))
+    joined = cleaned.merge(given[keys], on="session", how="left", suffixes=("", "_given"))
     wrong = (joined["participant"] != joined["participant_given"]) | (
         joined["scenario"] != joined["scenario_given"]
     )
@@ -193,32 +193,33 @@ def _sessions(trials: pd.DataFrame, given: pd.DataFrame | None, where: str) -> p
 
 
 def _known(
-    found: Responses, known: Collection[str] | None, unknown: Refuse, where: str
+    cleaned: Responses, known: Collection[str] | None, unknown: Refuse, where: str
 ) -> Responses:
     if known is None:
-        return found
+        return cleaned
     names = {canonical_name(name) for name in known}
-    strange = ~found.trials["stimulus"].isin(names)
-    if strange.any() and unknown == "refuse":
+    is_unknown = ~cleaned.trials["stimulus"].isin(names)
+    if is_unknown.any() and unknown == "refuse":
+        first = cleaned.trials.loc[is_unknown, "stimulus"].iloc[0]
         raise BadInputError(
-            f"{where}: stimulus {found.trials.loc[strange, 'stimulus'].iloc[0]!r} is not known "
-            f"({int(strange.sum())} such rows); give all stimuli, or ask to drop unknown ones"
+            f"{where}: stimulus {first!r} is not known "
+            f"({int(is_unknown.sum())} such rows); give all stimuli, or ask to drop unknown ones"
         )
-    return _without(found, strange, "reading", UNKNOWN)
+    return _without(cleaned, is_unknown, "reading", UNKNOWN)
 
 
-def _one_answer_each(found: Responses, conflicts: Refuse, where: str) -> Responses:
-    rows = found.trials.sort_values("trial", kind="stable")
+def _one_answer_each(cleaned: Responses, conflicts: Refuse, where: str) -> Responses:
+    rows = cleaned.trials.sort_values("trial", kind="stable")
     second = rows.duplicated(["session", "phase", "stimulus"])
     second |= rows.duplicated(["session", "phase", "trial"])
-    second = second.reindex(found.trials.index)
+    second = second.reindex(cleaned.trials.index)
     if second.any() and conflicts == "refuse":
-        row = found.trials[second].iloc[0]
+        row = cleaned.trials[second].iloc[0]
         raise BadInputError(
             f"{where}: session {row['session']!r} has two answers to trial {row['trial']} "
             f"({row['stimulus']!r}, {row['phase']}); clean the file, or ask to keep the first"
         )
-    return _without(found, second, "reading", CONFLICT)
+    return _without(cleaned, second, "reading", CONFLICT)
 
 
 def _derived(trials: pd.DataFrame, where: str) -> pd.DataFrame:
@@ -251,15 +252,15 @@ def log_ms(rt_ms: npt.ArrayLike) -> npt.NDArray[np.float64]:
     return np.log(values, out=np.full_like(values, np.nan), where=values > 0)
 
 
-def _without(found: Responses, gone: pd.Series, step: str, reason: str) -> Responses:
+def _without(cleaned: Responses, is_dropped: pd.Series, step: str, reason: str) -> Responses:
     """Return the responses without the rows where ``gone`` is True, and count these."""
-    if not gone.any():
-        return found
-    counts = _counted(found.trials[gone], step, reason)
-    parts = [part for part in (found.dropped, counts) if len(part)]
+    if not is_dropped.any():
+        return cleaned
+    counts = _counted(cleaned.trials[is_dropped], step, reason)
+    parts = [part for part in (cleaned.dropped, counts) if len(part)]
     return replace(
-        found,
-        trials=found.trials[~gone].reset_index(drop=True),
+        cleaned,
+        trials=cleaned.trials[~is_dropped].reset_index(drop=True),
         dropped=pd.concat(parts, ignore_index=True),
     )
 
@@ -281,11 +282,11 @@ def missing_times(responses: Responses) -> pd.DataFrame:
 
 def check_labels(responses: Responses, labels: Mapping[str, bool]) -> None:
     """Raise `BadInputError` with the first stimulus whose label contradicts the official one."""
-    own = responses.trials.drop_duplicates("stimulus").set_index("stimulus")["label"]
-    official = own.index.map({canonical_name(name): value for name, value in labels.items()})
-    wrong = pd.Series(official, index=own.index).notna() & (official != own.to_numpy())
+    label_of = responses.trials.drop_duplicates("stimulus").set_index("stimulus")["label"]
+    official = label_of.index.map({canonical_name(name): value for name, value in labels.items()})
+    wrong = pd.Series(official, index=label_of.index).notna() & (official != label_of.to_numpy())
     if wrong.any():
         raise BadInputError(
-            f"the responses say that {own.index[wrong.to_numpy()][0]!r} ends otherwise than the "
-            f"labels say ({int(wrong.sum())} such stimuli)"
+            f"the responses say that {label_of.index[wrong.to_numpy()][0]!r} ends otherwise than "
+            f"the labels say ({int(wrong.sum())} such stimuli)"
         )

@@ -14,7 +14,7 @@ import numpy.typing as npt
 import pandas as pd
 from scipy import stats
 
-from physion.analysis.people.answers import Answers, answers_of, mean_over_people
+from physion.analysis.people.answers import ScenarioAnswers, answers_of, mean_over_people
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.statistics.correlation import correlate_rows
 from physion.analysis.statistics.kappa import (
@@ -32,14 +32,14 @@ Array = npt.NDArray[np.float64]
 HALVES = 1000
 
 
-def all_answers(test: pd.DataFrame) -> list[Answers]:
+def all_answers(test: pd.DataFrame) -> list[ScenarioAnswers]:
     """Return the answers to every scenario that occurs, in the order of the paper."""
     if test.empty:
         raise BadInputError("there is no test answer of people; was every session left out?")
     return [answers_of(test, name) for name in in_order(test["scenario"])]
 
 
-def draws_of_people(answers: Answers, bootstrap: Bootstrap) -> Array:
+def draws_of_people(answers: ScenarioAnswers, bootstrap: Bootstrap) -> Array:
     """Return how often each person is drawn, (resamples, n): the same draws for every statistic."""
     return bootstrap.weights(f"people of {answers.scenario}", len(answers.sessions))
 
@@ -56,7 +56,7 @@ def accuracy_by_stimulus(test: pd.DataFrame, bootstrap: Bootstrap | None = None)
     draws = bootstrap or Bootstrap()
     parts = []
     for answers in all_answers(test):
-        p_yes, accuracy = answers.shares(), mean_over_people(answers.correct)
+        p_yes, accuracy = answers.p_yes(), mean_over_people(answers.correct)
         drawn = mean_over_people(answers.correct, draws_of_people(answers, draws))
         bounds = [draws.interval(column) for column in drawn.T]
         table = pd.DataFrame({"scenario": answers.scenario, "stimulus": answers.stimuli})
@@ -106,9 +106,9 @@ def accuracy_by_scenario(test: pd.DataFrame, bootstrap: Bootstrap | None = None)
     draws = bootstrap or Bootstrap()
     records, resampled = [], []
     for answers in all_answers(test):
-        own = np.nanmean(answers.correct, axis=1)
-        resampled.append(draws_of_people(answers, draws) @ own / len(own))
-        records.append(_scenario_record(answers, own, resampled[-1], draws))
+        by_person = np.nanmean(answers.correct, axis=1)
+        resampled.append(draws_of_people(answers, draws) @ by_person / len(by_person))
+        records.append(_scenario_record(answers, by_person, resampled[-1], draws))
     table = pd.DataFrame(records)
     low, high = draws.interval(np.mean(resampled, axis=0))
     mean: dict[str, Any] = {
@@ -122,25 +122,25 @@ def accuracy_by_scenario(test: pd.DataFrame, bootstrap: Bootstrap | None = None)
 
 
 def _scenario_record(
-    answers: Answers, own: Array, resampled: Array, draws: Bootstrap
+    answers: ScenarioAnswers, by_person: Array, resampled: Array, draws: Bootstrap
 ) -> dict[str, Any]:
-    n = len(own)
+    n = len(by_person)
     low, high = draws.interval(resampled) if n > 1 else (np.nan, np.nan)
-    spread = float(np.std(own, ddof=1)) if n > 1 else np.nan
+    sd = float(np.std(by_person, ddof=1)) if n > 1 else np.nan
     reasons = ["one person alone: no interval, no zone"] if n == 1 else []
-    if spread == 0:
+    if sd == 0:
         reasons.append("all people have the same accuracy: t is undefined")
-    t = (float(np.mean(own)) - 0.5) / (spread / np.sqrt(n)) if spread > 0 else np.nan
-    zone = np.percentile(own, [2.5, 97.5]) if n > 1 else (np.nan, np.nan)
-    p_yes = answers.shares()
+    t = (float(np.mean(by_person)) - 0.5) / (sd / np.sqrt(n)) if sd > 0 else np.nan
+    zone = np.percentile(by_person, [2.5, 97.5]) if n > 1 else (np.nan, np.nan)
+    p_yes = answers.p_yes()
     return {
         "scenario": answers.scenario,
         "people": n,
         "stimuli": len(answers.stimuli),
-        "accuracy": float(np.mean(own)),
+        "accuracy": float(np.mean(by_person)),
         "accuracy_low": low,
         "accuracy_high": high,
-        "sd": spread,
+        "sd": sd,
         "t": t,
         "df": n - 1,
         "p": float(2 * stats.t.sf(abs(t), n - 1)) if n > 1 else np.nan,

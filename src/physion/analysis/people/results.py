@@ -221,8 +221,8 @@ def _sets(shown: Responses, flags: pd.DataFrame) -> tuple[Responses, Responses]:
 
 
 def _flag_effects(responses: Responses, flags: pd.DataFrame) -> pd.DataFrame:
-    asked = [rule for rule in (*RULES, "flagged") if 0 < flags[rule].sum() < len(flags)]
-    parts = [flag_effect(responses, flags, rule) for rule in asked]
+    rules_asked = [rule for rule in (*RULES, "flagged") if 0 < flags[rule].sum() < len(flags)]
+    parts = [flag_effect(responses, flags, rule) for rule in rules_asked]
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
 
 
@@ -232,14 +232,14 @@ def _attributes(stimuli: pd.Series, given: pd.DataFrame | None) -> pd.DataFrame:
     by_name = (
         attributes_from_names(named) if named else pd.DataFrame(columns=list(ATTRIBUTE_COLUMNS))
     )
-    found = by_name
+    result = by_name
     if given is not None:
-        own = given[given["stimulus"].isin(stimuli)]
-        if own.empty:
+        given_rows = given[given["stimulus"].isin(stimuli)]
+        if given_rows.empty:
             raise BadInputError(
                 f"the table of attributes names none of the stimuli that people answered: they "
                 f"answered {stimuli.iloc[0]!r}, it has {given['stimulus'].iloc[0]!r}"
             )
-        found = better_attributes(own, by_name) if len(by_name) else own
+        result = better_attributes(given_rows, by_name) if len(by_name) else given_rows
     # Counts of parquet may be whole numbers with gaps, which regressions do not take.
-    return found.astype(dict.fromkeys(ATTRIBUTES, "float64")).reset_index(drop=True)
+    return result.astype(dict.fromkeys(ATTRIBUTES, "float64")).reset_index(drop=True)

@@ -59,8 +59,8 @@ def session_measures(
             f"{len(responses.sessions)} session(s) hold practice alone and no test answer: "
             "give responses with test trials"
         )
-    found = test.groupby("scenario")["stimulus"].nunique().to_dict()
-    found |= dict(expected or {})
+    counts_by_scenario = test.groupby("scenario")["stimulus"].nunique().to_dict()
+    counts_by_scenario |= dict(expected or {})
     by_session = {
         str(session): rows.sort_values("trial", kind="stable")
         for session, rows in test.groupby("session", sort=False)
@@ -78,8 +78,10 @@ def session_measures(
     keys = responses.sessions[["session", "participant", "scenario"]]
     measures = pd.DataFrame([records.get(session, nothing) for session in keys["session"]])
     measures = pd.concat([keys.reset_index(drop=True), measures], axis=1)
-    own = measures["session"].map(dict(expected or {}))
-    measures["expected"] = own.fillna(measures["scenario"].map(found)).fillna(1).astype(int)
+    by_session_count = measures["session"].map(dict(expected or {}))
+    measures["expected"] = (
+        by_session_count.fillna(measures["scenario"].map(counts_by_scenario)).fillna(1).astype(int)
+    )
     practice = responses.trials[responses.trials["phase"] == "familiarization"]
     counts = practice.groupby("session")["correct"].agg(["size", "sum"])
     counts = counts.reindex(measures["session"])

@@ -115,13 +115,13 @@ def read_published(folder: Path) -> PublishedTables:
 def in_paper_order(table: pd.DataFrame, columns: Sequence[str]) -> pd.DataFrame:
     """Sort ``table`` by ``columns``, models and scenarios in the order of the paper."""
     ranks = {"model": list(MODELS.values()), "scenario": [*SCENARIOS]}
-    place = {
+    rank = {
         name: table[name].map({value: at for at, value in enumerate(order)}).fillna(len(order))
         for name, order in ranks.items()
         if name in columns
     }
-    ordered = table.assign(**{f"_{name}": values for name, values in place.items()})
-    keys = [f"_{name}" if name in place else name for name in columns]
+    ordered = table.assign(**{f"_{name}": values for name, values in rank.items()})
+    keys = [f"_{name}" if name in rank else name for name in columns]
     return ordered.sort_values(keys, kind="stable")[list(table.columns)].reset_index(drop=True)
 
 
@@ -149,11 +149,11 @@ def _read_runs(results: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
     )
     agreed = _kappas(right, str(kappas))
     joined = runs.merge(agreed, on="key", how="inner", validate="one_to_one")
-    lost = [
+    unmatched = [
         (path.name, "no row of the same run in the other table", len(table) - len(joined))
         for path, table in ((accuracies, left), (kappas, right))
     ]
-    dropped = pd.DataFrame(lost, columns=["table", "reason", "rows"])
+    dropped = pd.DataFrame(unmatched, columns=["table", "reason", "rows"])
     if joined.empty:
         raise BadInputError(f"{accuracies} and {kappas} have no run in common")
     table = joined.drop(columns="key")
@@ -173,19 +173,19 @@ def _kappas(table: pd.DataFrame, where: str) -> pd.DataFrame:
 
 
 def _named(values: pd.Series, names: dict[str, str], where: str) -> pd.Series:
-    found = values.map(names)
-    if found.isna().any():
-        row = int(np.flatnonzero(found.isna())[0])
+    result = values.map(names)
+    if result.isna().any():
+        row = int(np.flatnonzero(result.isna())[0])
         unknown = UnknownNameError(str(values.name), str(values.iloc[row]), names)
         raise BadInputError(f"{where}: row {row + 1} of column {values.name!r}: {unknown}")
-    return found
+    return result
 
 
 def _seeds(table: pd.DataFrame, where: str) -> pd.Series:
     """Return the seed of the encoder, or of the dynamics if the encoder was not trained."""
-    own = table["Encoder Training Seed"]
-    words = own.where(own.str.strip() != "", table["Dynamics Training Seed"])
-    numbers = as_numbers(words.rename("Encoder Training Seed"), 0, 1e9, where)
+    encoder_seed = table["Encoder Training Seed"]
+    texts = encoder_seed.where(encoder_seed.str.strip() != "", table["Dynamics Training Seed"])
+    numbers = as_numbers(texts.rename("Encoder Training Seed"), 0, 1e9, where)
     return pd.Series(numbers.astype(int), index=table.index)
 
 

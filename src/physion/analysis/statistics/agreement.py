@@ -24,10 +24,10 @@ def pearson(x: npt.ArrayLike, y: npt.ArrayLike) -> float:
     if len(a) < FEWEST:
         return float("nan")
     a, b = a - a.mean(), b - b.mean()
-    spread = np.sqrt(np.mean(a**2)), np.sqrt(np.mean(b**2))
-    if min(spread) < CONSTANT:
+    sd = np.sqrt(np.mean(a**2)), np.sqrt(np.mean(b**2))
+    if min(sd) < CONSTANT:
         return float("nan")
-    return float(np.mean(a * b) / (spread[0] * spread[1]))
+    return float(np.mean(a * b) / (sd[0] * sd[1]))
 
 
 def rmsd(x: npt.ArrayLike, y: npt.ArrayLike) -> float:
@@ -46,9 +46,9 @@ def sampling_variance(y: npt.ArrayLike, count: npt.ArrayLike) -> Array:
     A fraction of 0 or 1 gives 0, so it can be too small for single stimuli, but not in the mean
     over stimuli, for which alone it is used.
     """
-    share, people = np.asarray(y, dtype=np.float64), np.asarray(count, dtype=np.float64)
+    fraction, people = np.asarray(y, dtype=np.float64), np.asarray(count, dtype=np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(people > 1, share * (1 - share) / (people - 1), np.nan)
+        return np.where(people > 1, fraction * (1 - fraction) / (people - 1), np.nan)
 
 
 def reliability(y: npt.ArrayLike, count: npt.ArrayLike, people: float | None = None) -> float:
@@ -61,11 +61,11 @@ def reliability(y: npt.ArrayLike, count: npt.ArrayLike, people: float | None = N
     given the stimulus. NaN if people's answers are constant, only one person answered, or the
     binomial variance exceeds the total.
     """
-    share = np.asarray(y, dtype=np.float64)
-    if len(share) < FEWEST:
+    fraction = np.asarray(y, dtype=np.float64)
+    if len(fraction) < FEWEST:
         return float("nan")
-    noise = float(np.mean(sampling_variance(share, count)))
-    total = float(np.var(share, ddof=1))
+    noise = float(np.mean(sampling_variance(fraction, count)))
+    total = float(np.var(fraction, ddof=1))
     true = total - noise
     if not true > CONSTANT**2:
         return float("nan")

@@ -58,24 +58,24 @@ def decompose(p: npt.ArrayLike, label: npt.ArrayLike, bins: int = BINS) -> Decom
     if not len(values):
         nan = float("nan")
         return Decomposition(nan, nan, nan, nan, nan, nan, nan, "no stimulus")
-    at = _bin(values, bins)
-    n = np.bincount(at, minlength=bins).astype(np.float64)
+    bin_of = _bin(values, bins)
+    n = np.bincount(bin_of, minlength=bins).astype(np.float64)
     full = n > 0
-    mean_p = np.bincount(at, values, bins)[full] / n[full]
-    share = np.bincount(at, truth, bins)[full] / n[full]
+    mean_p = np.bincount(bin_of, values, bins)[full] / n[full]
+    fraction = np.bincount(bin_of, truth, bins)[full] / n[full]
     weight, base = n[full] / len(values), float(np.mean(truth))
-    place = np.cumsum(full)[at] - 1
-    off_p, off_y = values - mean_p[place], truth - share[place]
+    index = np.cumsum(full)[bin_of] - 1
+    off_p, off_y = values - mean_p[index], truth - fraction[index]
     score, uncertainty = brier(values, truth), base * (1 - base)
     one = uncertainty == 0
     return Decomposition(
         brier=score,
-        reliability=float(np.sum(weight * (mean_p - share) ** 2)),
-        resolution=float(np.sum(weight * (share - base) ** 2)),
+        reliability=float(np.sum(weight * (mean_p - fraction) ** 2)),
+        resolution=float(np.sum(weight * (fraction - base) ** 2)),
         uncertainty=uncertainty,
         within=float(np.mean(off_p**2) - 2 * np.mean(off_p * off_y)),
         skill=float("nan") if one else 1 - score / uncertainty,
-        calibration_error=float(np.sum(weight * np.abs(mean_p - share))),
+        calibration_error=float(np.sum(weight * np.abs(mean_p - fraction))),
         reason="skill: all stimuli have one outcome" if one else "",
     )
 
@@ -90,13 +90,16 @@ def reliability_curve(
     bins.
     """
     values, truth = _checked(p, label)
-    at = _bin(values, bins)
-    n = np.bincount(at, minlength=bins).astype(np.float64)
+    bin_of = _bin(values, bins)
+    n = np.bincount(bin_of, minlength=bins).astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
-        mean_p, share = np.bincount(at, values, bins) / n, np.bincount(at, truth, bins) / n
+        mean_p, fraction = (
+            np.bincount(bin_of, values, bins) / n,
+            np.bincount(bin_of, truth, bins) / n,
+        )
         z = float(stats.norm.ppf(0.5 + level / 2))
-        centre = (share + z * z / (2 * n)) / (1 + z * z / n)
-        half = z / (1 + z * z / n) * np.sqrt(share * (1 - share) / n + (z / (2 * n)) ** 2)
+        centre = (fraction + z * z / (2 * n)) / (1 + z * z / n)
+        half = z / (1 + z * z / n) * np.sqrt(fraction * (1 - fraction) / n + (z / (2 * n)) ** 2)
     edges = np.linspace(0, 1, bins + 1)
     return pd.DataFrame(
         {
@@ -104,7 +107,7 @@ def reliability_curve(
             "to": edges[1:],
             "stimuli": n.astype(int),
             "mean_p": mean_p,
-            "share": share,
+            "share": fraction,
             "low": centre - half,
             "high": centre + half,
         }
@@ -117,10 +120,10 @@ def calibration_table(
     """Apply `decompose` to each model: ``p_contact`` (m, s), NaN for stimuli that a model lacks."""
     values, truth = np.asarray(p_contact, np.float64), np.asarray(label, np.float64)
     rows = []
-    for name, own in zip(names, values, strict=True):
-        known = ~np.isnan(own)
-        found = decompose(own[known], truth[known], bins)
-        rows.append({"model": name, "stimuli": int(known.sum()), **vars(found)})
+    for name, p_of_model in zip(names, values, strict=True):
+        known = ~np.isnan(p_of_model)
+        parts = decompose(p_of_model[known], truth[known], bins)
+        rows.append({"model": name, "stimuli": int(known.sum()), **vars(parts)})
     return pd.DataFrame(rows)
 
 
@@ -145,5 +148,5 @@ def check_probabilities(p: npt.ArrayLike, gaps: bool = False) -> None:
     values = np.asarray(p, dtype=np.float64)
     good = (values >= 0) & (values <= 1) | (np.isnan(values) & gaps)
     if not good.all():
-        place = tuple(int(i) for i in np.argwhere(~good)[0])
-        raise BadInputError(f"probability {values[place]} at {place} does not lie in 0..1")
+        index = tuple(int(i) for i in np.argwhere(~good)[0])
+        raise BadInputError(f"probability {values[index]} at {index} does not lie in 0..1")

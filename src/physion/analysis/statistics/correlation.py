@@ -45,7 +45,7 @@ def correlate_resampled(x: npt.ArrayLike, y: npt.ArrayLike, weights: npt.ArrayLi
 def correlation_from_sums(n: Array, x: Array, y: Array, xx: Array, yy: Array, xy: Array) -> Array:
     """Return r from sums of values, their squares and products; centre the values near 0."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        spread_x, spread_y = xx / n - (x / n) ** 2, yy / n - (y / n) ** 2
-        defined = (n >= FEWEST) & (np.minimum(spread_x, spread_y) >= CONSTANT**2)
-        product = np.where(defined, spread_x * spread_y, np.nan)
+        variance_x, variance_y = xx / n - (x / n) ** 2, yy / n - (y / n) ** 2
+        defined = (n >= FEWEST) & (np.minimum(variance_x, variance_y) >= CONSTANT**2)
+        product = np.where(defined, variance_x * variance_y, np.nan)
         return np.asarray((xy / n - (x / n) * (y / n)) / np.sqrt(product))

@@ -75,12 +75,12 @@ def pairwise_correlation(answers: npt.ArrayLike) -> Array:
     given = (~np.isnan(values)).astype(np.float64)
     zeros = np.where(given > 0, values, 0.0)
     n, both = given @ given.T, zeros @ zeros.T
-    mine = zeros @ given.T
+    yes_first = zeros @ given.T
     with np.errstate(divide="ignore", invalid="ignore"):
-        covariance = both / n - (mine / n) * (mine.T / n)
-        spread = (mine / n) * (1 - mine / n)
-        r = covariance / np.sqrt(spread * spread.T)
-    return np.where((n >= 3) & (spread > 0) & (spread.T > 0), r, np.nan)
+        covariance = both / n - (yes_first / n) * (yes_first.T / n)
+        variance = (yes_first / n) * (1 - yes_first / n)
+        r = covariance / np.sqrt(variance * variance.T)
+    return np.where((n >= 3) & (variance > 0) & (variance.T > 0), r, np.nan)
 
 
 def pair_values(matrix: Array) -> Array:
@@ -114,13 +114,13 @@ def resampled_kappa(answers: npt.ArrayLike, other: npt.ArrayLike, weights: npt.A
     both = drawn @ (yes_a * yes_b).T
     if given_a is None and given_b is None:
         n = drawn.sum(axis=1)[:, None]
-        mine, yours = drawn @ yes_a.T, drawn @ yes_b.T
+        yes_first, yes_second = drawn @ yes_a.T, drawn @ yes_b.T
     else:
         mask_a = np.ones_like(yes_a) if given_a is None else given_a
         mask_b = np.ones_like(yes_b) if given_b is None else given_b
-        n, mine = drawn @ (mask_a * mask_b).T, drawn @ (yes_a * mask_b).T
-        yours = drawn @ (mask_a * yes_b).T
-    return _from_counts(n, mine, yours, both)
+        n, yes_first = drawn @ (mask_a * mask_b).T, drawn @ (yes_a * mask_b).T
+        yes_second = drawn @ (mask_a * yes_b).T
+    return _from_counts(n, yes_first, yes_second, both)
 
 
 def resampled_mean_kappa(
@@ -163,22 +163,22 @@ def _kappa(a: tuple[Array, Array | None], b: tuple[Array, Array | None], weights
     both = yes_a @ yes_b.T
     if a[1] is None and b[1] is None:
         n = np.asarray(weights.sum())
-        mine, yours = yes_a.sum(axis=1)[:, None], (yes_b @ weights)[None, :]
+        yes_first, yes_second = yes_a.sum(axis=1)[:, None], (yes_b @ weights)[None, :]
     else:
         given_a = (np.ones_like(yes_a) if a[1] is None else a[1]) * weights
         given_b = np.ones_like(yes_b) if b[1] is None else b[1]
-        n, mine, yours = given_a @ given_b.T, yes_a @ given_b.T, given_a @ yes_b.T
-    return _from_counts(n, mine, yours, both)
+        n, yes_first, yes_second = given_a @ given_b.T, yes_a @ given_b.T, given_a @ yes_b.T
+    return _from_counts(n, yes_first, yes_second, both)
 
 
-def _from_counts(n: Array, mine: Array, yours: Array, both: Array) -> Array:
+def _from_counts(n: Array, yes_first: Array, yes_second: Array, both: Array) -> Array:
     """Return kappa from counts: shared stimuli, yes of either rater, yes of both.
 
     Numerator and denominator are multiplied by n squared, so that they are whole numbers and 1 -
     chance is exactly 0 where it should be.
     """
-    chance = mine * yours + (n - mine) * (n - yours)
-    agree = n * (n - mine - yours + 2 * both)
-    rest = n * n - chance
+    expected = yes_first * yes_second + (n - yes_first) * (n - yes_second)
+    agree = n * (n - yes_first - yes_second + 2 * both)
+    rest = n * n - expected
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(rest > 0, (agree - chance) / rest, np.nan)
+        return np.where(rest > 0, (agree - expected) / rest, np.nan)

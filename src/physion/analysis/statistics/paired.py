@@ -54,8 +54,8 @@ def r_difference_draws(
     """Return r(first, people) - r(second, people) in each resample of the stimuli, (resamples,)."""
     pair = np.stack([np.asarray(first, np.float64), np.asarray(second, np.float64)])
     drawn = np.asarray(weights, dtype=np.float64)
-    shares = np.broadcast_to(np.asarray(people, dtype=np.float64), drawn.shape)
-    r = correlate_resampled(pair, shares, drawn)
+    p_yes = np.broadcast_to(np.asarray(people, dtype=np.float64), drawn.shape)
+    r = correlate_resampled(pair, p_yes, drawn)
     return np.asarray(r[:, 0] - r[:, 1])
 
 
@@ -229,8 +229,8 @@ def _stratified(bootstrap: Bootstrap, strata: list[str]) -> Array:
     names = np.array(strata, dtype=object)
     weights = np.zeros((bootstrap.resamples, len(names)))
     for name in dict.fromkeys(strata):
-        own = np.flatnonzero(names == name)
-        weights[:, own] = bootstrap.weights(name, len(own))
+        members = np.flatnonzero(names == name)
+        weights[:, members] = bootstrap.weights(name, len(members))
     return weights
 
 

@@ -60,19 +60,19 @@ def _from_name(stimulus: str) -> dict[str, Any]:
     if scenario is None:
         raise BadInputError(f"{stimulus!r} is no official name; give a table of attributes instead")
     configuration = _NUMBERED.sub("", stimulus)
-    found = {name: _first(patterns, configuration) for name, patterns in _PATTERNS.items()}
+    result = {name: _first(patterns, configuration) for name, patterns in _PATTERNS.items()}
     if scenario in _ALWAYS_ONE_EACH:
-        found |= {"distractors": 1.0, "occluders": 1.0}
+        result |= {"distractors": 1.0, "occluders": 1.0}
     for name in ("distractors", "occluders"):
-        if np.isnan(found[name]):
-            found[name] = 0.0
+        if np.isnan(result[name]):
+            result[name] = 0.0
     if "midRM1" in configuration:
-        found["elements"] -= 1
+        result["elements"] -= 1
     if scenario in ("link", "contain"):
-        found["elements"] = np.nan
-    found |= MISLABELLED.get(configuration, {})
+        result["elements"] = np.nan
+    result |= MISLABELLED.get(configuration, {})
     room = "tdw" if "tdw" in configuration else "box"
-    return {"stimulus": stimulus, "scenario": scenario, "configuration": configuration, **found,
+    return {"stimulus": stimulus, "scenario": scenario, "configuration": configuration, **result,
             "room": room, "source": "name"}  # fmt: skip
 
 
@@ -89,16 +89,16 @@ def attributes_from_table(table: pd.DataFrame, where: str = "table of attributes
     given = [name for name in ATTRIBUTES if name in table]
     if not given:
         raise BadInputError(f"{where} has none of the columns {', '.join(ATTRIBUTES)}")
-    found = table[["stimulus", "scenario"]].assign(configuration="", room="", source="table")
-    found["stimulus"] = found["stimulus"].map(canonical_name)
+    result = table[["stimulus", "scenario"]].assign(configuration="", room="", source="table")
+    result["stimulus"] = result["stimulus"].map(canonical_name)
     for name in ("configuration", "room"):
         if name in table:
-            found[name] = table[name]
+            result[name] = table[name]
     for name in ATTRIBUTES:
         numbers = pd.to_numeric(table[name], errors="coerce") if name in table else np.nan
-        found[name] = numbers
-    refuse_duplicates(found["stimulus"], where)
-    return found[list(COLUMNS)].reset_index(drop=True)
+        result[name] = numbers
+    refuse_duplicates(result["stimulus"], where)
+    return result[list(COLUMNS)].reset_index(drop=True)
 
 
 def better_attributes(first: pd.DataFrame, second: pd.DataFrame) -> pd.DataFrame:

@@ -50,8 +50,8 @@ def require_columns(table: pd.DataFrame, columns: Iterable[str], where: str) -> 
     """Raise `BadInputError` unless ``table`` has every one of ``columns``."""
     missing = [column for column in columns if column not in table.columns]
     if missing:
-        found = ", ".join(map(str, table.columns[:12]))
-        raise BadInputError(f"{where} lacks the column(s) {', '.join(missing)}; it has: {found}")
+        result = ", ".join(map(str, table.columns[:12]))
+        raise BadInputError(f"{where} lacks the column(s) {', '.join(missing)}; it has: {result}")
 
 
 def as_numbers(values: pd.Series, low: float, high: float, where: str) -> Array:
@@ -73,16 +73,16 @@ def as_booleans(values: pd.Series, where: str) -> npt.NDArray[np.bool_]:
     """Return ``values`` as bool: True/False, 1/0 or yes/no in any case; else raise
     `BadInputError`.
     """
-    words = {"true": True, "1": True, "1.0": True, "yes": True}
-    words |= {"false": False, "0": False, "0.0": False, "no": False}
-    found = [words.get(str(value).strip().lower()) for value in values]
-    for row, value in enumerate(found):
+    meaning = {"true": True, "1": True, "1.0": True, "yes": True}
+    meaning |= {"false": False, "0": False, "0.0": False, "no": False}
+    result = [meaning.get(str(value).strip().lower()) for value in values]
+    for row, value in enumerate(result):
         if value is None:
             raise BadInputError(
                 f"{where}: row {row + 1} of column {values.name!r} holds {values.iloc[row]!r}; "
                 "expected True or False"
             )
-    return np.array(found, dtype=bool)
+    return np.array(result, dtype=bool)
 
 
 def refuse_duplicates(names: pd.Series, where: str) -> None:

@@ -125,12 +125,12 @@ def leaderboard(
     test = None if kept is None else kept.test
     people, outcomes = _people(humans, labels, test)
     answers = {} if test is None else {each.scenario: each for each in all_answers(test)}
-    tables, dropped, refused, rested = [], [], [], []
+    tables, dropped, refused, answered = [], [], [], []
     settings: Mapping[str, str] = {}
     for path in files:
         try:
             rows, versions = read_submission(path)
-            found = compare(
+            comparison = compare(
                 rows,
                 people,
                 outcomes,
@@ -138,19 +138,21 @@ def leaderboard(
                 exclude_ledge=exclude_ledge,
                 bootstrap=draws,
             )
-            own = score_models(found, rows, answers, scenario, draws)
+            scored = score_models(comparison, rows, answers, scenario, draws)
         except BadInputError as error:
             refused.append({"file": str(path), "reason": str(error)})
             continue
-        tables.append(own.assign(file=str(path), versions=own["agent"].map(versions)))
-        dropped.append(found.dropped.assign(file=str(path)))
-        rested.append(found.stimuli[["agent", "scenario", "stimulus"]].assign(file=str(path)))
-        settings = found.settings
+        tables.append(scored.assign(file=str(path), versions=scored["agent"].map(versions)))
+        dropped.append(comparison.dropped.assign(file=str(path)))
+        answered.append(
+            comparison.stimuli[["agent", "scenario", "stimulus"]].assign(file=str(path))
+        )
+        settings = comparison.settings
     if not tables:
         raise BadInputError(f"no file can be compared: {refused[0]['reason']}")
     left_out = pd.concat(dropped, ignore_index=True)
-    asked = _asked(pd.concat(rested, ignore_index=True), left_out)
-    table = _with_asked(pd.concat(tables, ignore_index=True), asked, scenario)
+    required = _required_stimuli(pd.concat(answered, ignore_index=True), left_out)
+    table = _with_required(pd.concat(tables, ignore_index=True), required, scenario)
     order = ["file", "agent", "scenario", "reason", "stimuli"]
     return Leaderboard(
         sort_leaderboard(table.reindex(columns=columns())),
@@ -180,7 +182,7 @@ def _unflagged(
     return without_flagged(responses, flags), {"Exclusions": words}
 
 
-def _asked(rested: pd.DataFrame, dropped: pd.DataFrame) -> pd.Series:
+def _required_stimuli(answered: pd.DataFrame, dropped: pd.DataFrame) -> pd.Series:
     """Return the number of stimuli of a complete submission, by scenario.
 
     With people, what they saw: what a model predicted of it and what it lacks. Without people, what
@@ -188,24 +190,24 @@ def _asked(rested: pd.DataFrame, dropped: pd.DataFrame) -> pd.Series:
     """
     keys = ["file", "agent", "scenario"]
     lacking = dropped[dropped["reason"] == NOT_PREDICTED].groupby(keys)["stimuli"].sum()
-    seen = rested.groupby(keys)["stimulus"].nunique().add(lacking, fill_value=0)
-    named = rested.groupby("scenario")["stimulus"].nunique()
+    seen = answered.groupby(keys)["stimulus"].nunique().add(lacking, fill_value=0)
+    named = answered.groupby("scenario")["stimulus"].nunique()
     most = pd.concat([seen.groupby("scenario").max(), named], axis=1).max(axis=1)
     return most.astype(int)
 
 
-def _with_asked(table: pd.DataFrame, asked: pd.Series, scenario: str) -> pd.DataFrame:
+def _with_required(table: pd.DataFrame, required: pd.Series, scenario: str) -> pd.DataFrame:
     """Add ``of_scenarios`` and ``of_stimuli``, and a reason if a model lacks some of them."""
-    whole = asked if scenario in (MEAN, POOLED) else asked[[scenario]]
+    whole = required if scenario in (MEAN, POOLED) else required[[scenario]]
     table = table.assign(of_scenarios=len(whole), of_stimuli=int(whole.sum()))
-    for place, row in table.iterrows():
+    for index, row in table.iterrows():
         if not _is_partial(row):
             continue
         over = "mean over" if scenario == MEAN else "over"
         why = f"{over} {row['scenarios']} of {len(whole)} scenarios"
         if row["scenarios"] == len(whole):
             why = f"over {row['stimuli']} of {row['of_stimuli']} stimuli"
-        table.loc[place, "reason"] = "; ".join(filter(None, [why, row["reason"]]))
+        table.loc[index, "reason"] = "; ".join(filter(None, [why, row["reason"]]))
     return table
 
 

@@ -12,7 +12,7 @@ import pandas as pd
 from physion.analysis.metrics import Metric, leaderboard_metrics
 from physion.analysis.models.comparison import Comparison
 from physion.analysis.models.model_people import models_of, sample_of_models
-from physion.analysis.people.answers import Answers
+from physion.analysis.people.answers import ScenarioAnswers
 from physion.analysis.people.people import draws_of_people
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.tables.csv_table import read_csv
@@ -25,13 +25,13 @@ def read_submission(path: Path) -> tuple[pd.DataFrame, dict[str, str]]:
     """Read the checked rows of a file, and for each of its models the versions that made it."""
     raw = read_csv(path, REQUIRED)
     rows = name_models(check_predictions(raw, str(path)))
-    beside = sidecar_versions(path)
+    sidecar = sidecar_versions(path)
     if "Versions" not in raw.columns:
-        return rows, dict.fromkeys(rows["agent"].unique(), beside)
+        return rows, dict.fromkeys(rows["agent"].unique(), sidecar)
     # The rows are still in the order of the file.
     words = raw["Versions"].fillna("").str.strip().reset_index(drop=True)
     found = words.groupby(rows["agent"].to_numpy()).agg(lambda each: "; ".join(sorted({*each})))
-    return rows, {str(agent): text or beside for agent, text in found.items()}
+    return rows, {str(agent): text or sidecar for agent, text in found.items()}
 
 
 def sidecar_versions(path: Path) -> str:
@@ -41,18 +41,18 @@ def sidecar_versions(path: Path) -> str:
     The file has the name of the table, with ``.json`` for or after its ending; ``versions`` is
     text, or an object of names and versions. Raises `BadInputError` for anything else.
     """
-    for beside in (path.with_suffix(".json"), path.with_name(path.name + ".json")):
-        if not beside.is_file():
+    for sidecar in (path.with_suffix(".json"), path.with_name(path.name + ".json")):
+        if not sidecar.is_file():
             continue
         try:
-            content = json.loads(beside.read_text(encoding="utf-8"))
+            content = json.loads(sidecar.read_text(encoding="utf-8"))
         except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-            raise BadInputError(f"{beside} is not a JSON file: {error}") from error
+            raise BadInputError(f"{sidecar} is not a JSON file: {error}") from error
         versions = content.get("versions", "") if isinstance(content, dict) else None
         if isinstance(versions, dict):
             return ", ".join(f"{name} {version}" for name, version in versions.items())
         if not isinstance(versions, str):
-            raise BadInputError(f"{beside}: 'versions' must be text or an object of versions")
+            raise BadInputError(f"{sidecar}: 'versions' must be text or an object of versions")
         return versions
     return ""
 
@@ -60,7 +60,7 @@ def sidecar_versions(path: Path) -> str:
 def score_models(
     found: Comparison,
     rows: pd.DataFrame,
-    answers: Mapping[str, Answers],
+    answers: Mapping[str, ScenarioAnswers],
     scenario: str,
     draws: Bootstrap,
 ) -> pd.DataFrame:
@@ -97,15 +97,15 @@ def _add_metric(
     table: pd.DataFrame,
     metric: Metric,
     comparison: Comparison,
-    answers: Mapping[str, Answers],
+    answers: Mapping[str, ScenarioAnswers],
     scenario: str,
     draws: Bootstrap,
 ) -> None:
     """Add a metric with participants: mean over scenarios, interval by drawing participants."""
     key = metric.name
     for index, agent in table["agent"].items():
-        own = comparison.stimuli[comparison.stimuli["agent"] == agent]
-        names = own["scenario"].unique() if scenario in (MEAN, POOLED) else [scenario]
+        subset = comparison.stimuli[comparison.stimuli["agent"] == agent]
+        names = subset["scenario"].unique() if scenario in (MEAN, POOLED) else [scenario]
         if scenario == POOLED or any(name not in answers for name in names):
             why = f"{key}: pooled over scenarios nobody answered all stimuli"
             if scenario != POOLED:
@@ -114,7 +114,7 @@ def _add_metric(
             continue
         values, resampled = [], []
         for name in names:
-            models, _ = models_of(own[own["scenario"] == name], answers[name])
+            models, _ = models_of(subset[subset["scenario"] == name], answers[name])
             values.append(float(metric(sample_of_models(models, answers[name]))[0, 0]))
             people = draws_of_people(answers[name], draws)
             sample = sample_of_models(models, answers[name], None, people, "people")

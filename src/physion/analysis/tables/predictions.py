@@ -137,21 +137,21 @@ def _scenarios(table: pd.DataFrame, stimulus: pd.Series) -> pd.Series:
     """Return the scenario of each row by its stimulus, else by *Readout Test Data*, else None."""
     known = {*SCENARIOS, *OFFICIAL_SCENARIOS}
     tested = table.get("Readout Test Data", pd.Series("", index=table.index)).astype(str)
-    found = [
+    result = [
         scenario_of(name) or (scenario_name(test) if test.lower() in known else None)
         for name, test in zip(stimulus, tested, strict=True)
     ]
-    return pd.Series(found, index=table.index, dtype=object)
+    return pd.Series(result, index=table.index, dtype=object)
 
 
 def _recorded(table: pd.DataFrame, where: str) -> pd.Series:
-    found = pd.Series(None, index=table.index, dtype=object)
+    result = pd.Series(None, index=table.index, dtype=object)
     if "Recorded Outcome" not in table.columns:
-        return found
+        return result
     words = _text(table["Recorded Outcome"])
     given = words != ""
-    found[given] = as_booleans(words[given], where).tolist()
-    return found
+    result[given] = as_booleans(words[given], where).tolist()
+    return result
 
 
 def _relative(trained: pd.Series, scenario: pd.Series) -> pd.Series:

@@ -128,8 +128,8 @@ def find_beside(humans: Path, sibling: str, name: str) -> Path | None:
     It may also be in the folder ``sibling`` next to that folder. None if it is in none of these.
     """
     parent = humans.resolve().parent
-    places = (humans / name, parent / name, parent / sibling / name)
-    return next((place for place in places if place.is_file()), None)
+    paths = (humans / name, parent / name, parent / sibling / name)
+    return next((place for place in paths if place.is_file()), None)
 
 
 def with_labels(humans: pd.DataFrame, labels: Mapping[str, bool]) -> pd.DataFrame:

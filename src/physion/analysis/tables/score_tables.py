@@ -38,7 +38,7 @@ def score_table(stimuli: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
     ordered = stimuli.sort_values("stimulus", kind="stable")
     parts = [_agent_rows(rows, bootstrap) for _, rows in ordered.groupby("agent", sort=False)]
     table = pd.concat(parts, ignore_index=True)
-    rank = {agent: place for place, agent in enumerate(stimuli["agent"].unique())}
+    rank = {agent: position for position, agent in enumerate(stimuli["agent"].unique())}
     return table.sort_values("agent", key=lambda a: a.map(rank), kind="stable").reset_index(
         drop=True
     )
@@ -51,11 +51,15 @@ def _agent_rows(rows: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
     by_scenario = [_scores(sample) for sample in samples]
     mean = {key: np.mean([values[key] for values in by_scenario], axis=0) for key in by_scenario[0]}
     records = [
-        _record(name, part, found, bootstrap, agreement.why_no_r(part["p_contact"], part["p_yes"]))
-        for name, part, found in zip(names, parts, by_scenario, strict=True)
+        _record(
+            name, part, values_of, bootstrap, agreement.why_no_r(part["p_contact"], part["p_yes"])
+        )
+        for name, part, values_of in zip(names, parts, by_scenario, strict=True)
     ]
     undefined = [
-        name for name, found in zip(names, by_scenario, strict=True) if np.isnan(found["r"][0])
+        name
+        for name, values_of in zip(names, by_scenario, strict=True)
+        if np.isnan(values_of["r"][0])
     ]
     one_class = [name for name, part in zip(names, parts, strict=True) if _one_class(part)]
     whys = [f"r: undefined in {', '.join(undefined)}"] if undefined else []
@@ -67,8 +71,8 @@ def _agent_rows(rows: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
     why = agreement.why_no_r(rows["p_contact"], rows["p_yes"])
     records.append(_record(POOLED, rows, pooled, bootstrap, why))
     table = pd.DataFrame(records)
-    for place, column in enumerate(("agent", "model", "readout")):
-        table.insert(place, column, rows[column].iloc[0])
+    for position, column in enumerate(("agent", "model", "readout")):
+        table.insert(position, column, rows[column].iloc[0])
     return table
 
 
@@ -89,7 +93,7 @@ def _one_class(rows: pd.DataFrame) -> bool:
 
 
 def _record(
-    name: str, rows: pd.DataFrame, found: dict[str, Array], bootstrap: Bootstrap, why: str
+    name: str, rows: pd.DataFrame, values_of: dict[str, Array], bootstrap: Bootstrap, why: str
 ) -> dict[str, Any]:
     reasons = [why] if why else []
     if name != MEAN and _one_class(rows):
@@ -100,7 +104,7 @@ def _record(
         "stimuli": len(rows),
         "changed": int((rows["label"] != rows["simulated"]).sum()),
     }
-    for key, values in found.items():
+    for key, values in values_of.items():
         value = float(values[0])
         # One stimulus, drawn again and again, would seem to be known without error.
         known = np.isfinite(value) and len(rows) > 1
@@ -112,11 +116,11 @@ def _record(
         reasons.append("accuracy: all answers alike, so the bootstrap interval has no width")
     if len(rows) == 1:
         reasons.append("intervals: one stimulus")
-    if np.isfinite(found["r"][0]) and np.isnan(found["r_same"][0]):
+    if np.isfinite(values_of["r"][0]) and np.isnan(values_of["r_same"][0]):
         reasons.append("r_same: too few or constant where the outcomes agree")
     record["ceiling"] = agreement.ceiling(rows["p_yes"], rows["count"])
     record["floor"] = agreement.rmsd_floor(rows["p_yes"], rows["count"])
-    if np.isfinite(found["r"][0]) and np.isnan(record["ceiling"]):
+    if np.isfinite(values_of["r"][0]) and np.isnan(record["ceiling"]):
         reasons.append("ceiling: people too few or too alike to estimate it")
     record["reason"] = "; ".join(reasons)
     return record

@@ -42,9 +42,9 @@ class Fault:
     level: str = "error"
 
     def __str__(self) -> str:
-        place = "" if self.row is None else f"row {self.row}"
-        place += f" ({self.stimulus})" if self.stimulus else ""
-        return f"{self.level}: {place + ': ' if place else ''}{self.message}"
+        position = "" if self.row is None else f"row {self.row}"
+        position += f" ({self.stimulus})" if self.stimulus else ""
+        return f"{self.level}: {position + ': ' if position else ''}{self.message}"
 
 
 def columns(table: pd.DataFrame) -> list[Fault]:
@@ -125,12 +125,12 @@ def outcomes(table: pd.DataFrame, stimulus: pd.Series) -> list[Fault]:
         bad = booleans(table[column]).isna()
         faults += each(bad, table, stimulus, "outcome", column, "True or False")
     p = pd.to_numeric(table["Predicted Prob_true"], errors="coerce")
-    said = booleans(table["Predicted Outcome"])
-    against = said.notna() & (p != 0.5) & p.between(0, 1) & ((p > 0.5) != (said == True))  # noqa: E712
+    predicted = booleans(table["Predicted Outcome"])
+    against = predicted.notna() & (p != 0.5) & p.between(0, 1) & ((p > 0.5) != (predicted == True))  # noqa: E712
     faults += [
         Fault(
             "outcome",
-            f"predicts {said.iloc[row]} with a probability of contact of {p.iloc[row]:g}",
+            f"predicts {predicted.iloc[row]} with a probability of contact of {p.iloc[row]:g}",
             int(row) + 1,
             str(stimulus.iloc[row]),
             "Predicted Outcome",
@@ -144,7 +144,7 @@ def outcomes(table: pd.DataFrame, stimulus: pd.Series) -> list[Fault]:
 def readouts(table: pd.DataFrame) -> list[Fault]:
     """Warn of readouts with other than the official names."""
     known = {*READOUTS, *READOUTS.values(), "D"}
-    odd = sorted({*table["Readout Type"].str.strip()} - known - {""})
+    unknown = sorted({*table["Readout Type"].str.strip()} - known - {""})
     return [
         Fault(
             "readout",
@@ -153,7 +153,7 @@ def readouts(table: pd.DataFrame) -> list[Fault]:
             column="Readout Type",
             level="warning",
         )
-        for name in odd
+        for name in unknown
     ]
 
 
@@ -196,9 +196,9 @@ def alike(table: pd.DataFrame, stimulus: pd.Series) -> list[Fault]:
             if len(given) > 1 and given.nunique() == 1:
                 readout = READOUTS.get(of[1], of[1])
                 where = " · ".join([of[0], readout, *(word for word in of[2:-1] if word)])
-                told = f"{column} is {given.iloc[0]} in all {len(given)} rows of {where}, {of[-1]}"
+                text = f"{column} is {given.iloc[0]} in all {len(given)} rows of {where}, {of[-1]}"
                 found.append(
-                    Fault("alike", f"{told}: {consequence}", column=column, level="warning")
+                    Fault("alike", f"{text}: {consequence}", column=column, level="warning")
                 )
     return found
 

@@ -97,10 +97,10 @@ def _missing(
         absent: dict[str, list[str]] = {}
         for name in sorted(wanted - given):
             absent.setdefault(scenario[name], []).append(name)
-        for place, names in absent.items():
-            whole = not any(scenario.get(name) == place for name in given)
+        for where, names in absent.items():
+            whole = not any(scenario.get(name) == where for name in given)
             ledges = all(map(is_ledge, names))
-            what = f"no stimulus of {place}" if whole else f"{len(names)} stimuli of {place} lack"
+            what = f"no stimulus of {where}" if whole else f"{len(names)} stimuli of {where} lack"
             what += "" if whole else f" a prediction, the first is {names[0]}"
             what += " (Roll's ledges, which are not compared)" if ledges else ""
             level = "warning" if whole or ledges else "error"
@@ -110,11 +110,11 @@ def _missing(
 
 
 def _scenario_by_name(names: set[str], against: Reference) -> dict[str, str]:
-    found: dict[str, str] = {}
+    result: dict[str, str] = {}
     if against.index is not None and "scenario" in against.index.columns:
         trials = against.index["trial"].map(canonical_name)
-        found = dict(zip(trials, against.index["scenario"].astype(str), strict=True))
-    return {name: found.get(name) or scenario_of(name) or "no known scenario" for name in names}
+        result = dict(zip(trials, against.index["scenario"].astype(str), strict=True))
+    return {name: result.get(name) or scenario_of(name) or "no known scenario" for name in names}
 
 
 def leaks(table: pd.DataFrame, stimulus: pd.Series, against: Reference) -> list[Fault]:
@@ -126,19 +126,19 @@ def leaks(table: pd.DataFrame, stimulus: pd.Series, against: Reference) -> list[
     if against.fitted is not None:
         on = stimulus.isin({canonical_name(name) for name in against.fitted})
         reason = reason.mask(on, "the readout was fitted on it")
-    twins: list[Fault] = []
+    copies: list[Fault] = []
     if against.index is not None:
         names = against.index.assign(name=against.index["trial"].map(canonical_name))
         of = stimulus.map(names.drop_duplicates("name").set_index("name")["split"].astype(str))
         other = of.notna() & ~of.isin(TESTING)
         reason = reason.mask(other, "in the dataset it is a trial of the split " + of.fillna(""))
-        twins = _twins(stimulus, against.index)
+        copies = _twins(stimulus, against.index)
     reason = reason.mask(_cross_fitted(table), "")
-    found = [
+    result = [
         _leak(str(reason.iloc[row]), int(row), stimulus)
         for row in np.flatnonzero((reason != "").to_numpy())
     ]
-    return found + twins
+    return result + copies
 
 
 def _leak(message: str, row: int, stimulus: pd.Series) -> Fault:

@@ -101,12 +101,14 @@ def _people(options: Options) -> dict[str, Any]:
         if options.sessions or options.rules or options.expected:
             raise BadInputError("--sessions, --rules and --expected are about --responses")
         return {}
-    found: dict[str, Any] = {"responses": read_any_responses(options.responses, options.sessions)}
+    settings: dict[str, Any] = {
+        "responses": read_any_responses(options.responses, options.sessions)
+    }
     if options.rules is not None:
-        found["rules"] = rules_called(options.rules)
+        settings["rules"] = rules_called(options.rules)
     if options.expected is not None:
-        found["expected"] = read_expected(options.expected)
-    return found
+        settings["expected"] = read_expected(options.expected)
+    return settings
 
 
 def _record(board: Leaderboard) -> dict[str, Any]:

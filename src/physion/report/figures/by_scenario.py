@@ -106,13 +106,13 @@ def _dots(
 
 
 def _human_marks(axis: Axes, rows: pd.DataFrame, theme: Theme) -> None:
-    own = rows.iloc[0]
-    if np.isfinite(own["zone_low"]):
+    subset = rows.iloc[0]
+    if np.isfinite(subset["zone_low"]):
         # A hatch marks the zones that are not of participants, as the legend says.
-        plain = own["zone"] not in RELEASED_ZONES
-        axis.axvspan(own["zone_low"], own["zone_high"], **_zone(plain, theme), zorder=0)
-    if np.isfinite(own["people"]):
-        axis.axvline(own["people"], color=theme.ink, linestyle="--", linewidth=1.3, zorder=1)
+        plain = subset["zone"] not in RELEASED_ZONES
+        axis.axvspan(subset["zone_low"], subset["zone_high"], **_zone(plain, theme), zorder=0)
+    if np.isfinite(subset["people"]):
+        axis.axvline(subset["people"], color=theme.ink, linestyle="--", linewidth=1.3, zorder=1)
 
 
 def _zone(plain: bool, theme: Theme) -> dict[str, Any]:
@@ -159,9 +159,9 @@ def grouped_figure(table: pd.DataFrame, words: str, chance: float, theme: Theme 
             rows = table[table["panel"] == name]
             groups = list(rows["group"].unique())
             for place, group in enumerate(groups):
-                own = rows[rows["group"] == group]
-                at = own["agent"].map(agents.index) + (place - (len(groups) - 1) / 2) * 0.24
-                _group_marks(axis, own, at.to_numpy(dtype=np.float64), theme.mark(place), theme)
+                subset = rows[rows["group"] == group]
+                at = subset["agent"].map(agents.index) + (place - (len(groups) - 1) / 2) * 0.24
+                _group_marks(axis, subset, at.to_numpy(dtype=np.float64), theme.mark(place), theme)
             axis.axvline(chance, color=theme.faint, linestyle=":", linewidth=1, zorder=0)
             people = rows["people"].iloc[0]
             if np.isfinite(people):

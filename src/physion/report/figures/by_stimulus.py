@@ -75,10 +75,10 @@ def _squares(axis: Axes, rows: pd.DataFrame, scenarios: Sequence[str], theme: Th
             # Markers of a line are one drawing each in SVG and quick to make.
             axis.plot(x[changed == hollow], rows["p_contact"][changed == hollow],
                       **_point(hollow, theme))  # fmt: skip
-    for place, scenario in zip(left, scenarios, strict=True):
-        own = rows[rows["scenario"] == scenario]
-        words = f"{scenario}, {_r_words(own['p_contact'], own['p_yes'])}"
-        axis.text(place, 1.05, words, fontsize=7.5, va="bottom")
+    for index, scenario in zip(left, scenarios, strict=True):
+        subset = rows[rows["scenario"] == scenario]
+        words = f"{scenario}, {_r_words(subset['p_contact'], subset['p_yes'])}"
+        axis.text(index, 1.05, words, fontsize=7.5, va="bottom")
     pooled = f"{_r_words(rows['p_contact'], rows['p_yes'])} pooled, {len(rows)} stimuli"
     join = ", " if len(scenarios) > 3 else "\n"
     axis.set_title(f"{label(rows['agent'].iloc[0], 90)}{join}{pooled}", fontsize=8.5, loc="left",
@@ -97,10 +97,10 @@ def _r_words(x: pd.Series, y: pd.Series) -> str:
 
 def _point(hollow: bool, theme: Theme) -> dict[str, Any]:
     colour = theme.palette[0]
-    look = {"linestyle": "", "marker": "o", "markersize": 3.2, "color": colour}
+    style_of_point = {"linestyle": "", "marker": "o", "markersize": 3.2, "color": colour}
     if hollow:
-        return look | {"markerfacecolor": "none", "markeredgewidth": 0.9}
-    return look | {"alpha": 0.55, "markeredgewidth": 0}
+        return style_of_point | {"markerfacecolor": "none", "markeredgewidth": 0.9}
+    return style_of_point | {"alpha": 0.55, "markeredgewidth": 0}
 
 
 def _scatter_handles(theme: Theme) -> list[Line2D]:
@@ -134,9 +134,9 @@ def difficulty_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
         figure.supxlabel("accuracy of people on a stimulus", fontsize=10)
         figure.supylabel("stimuli", fontsize=10)
         handles: list[Patch | Line2D] = [
-            Patch(facecolor=_tail_colour(place, theme), hatch=_tail_hatch(place),
+            Patch(facecolor=_tail_colour(index, theme), hatch=_tail_hatch(index),
                   edgecolor=theme.paper, label=words)
-            for words, place in TAIL
+            for words, index in TAIL
         ]  # fmt: skip
         handles.append(Line2D([], [], color=theme.ink, linestyle="--", label="mean"))
         handles.append(Line2D([], [], color=theme.ink, linestyle=":", label="chance"))
@@ -149,21 +149,21 @@ def _tail_bars(axis: Axes, rows: pd.DataFrame, theme: Theme) -> None:
     corrected = rows["exact"].to_numpy(dtype=bool)
     alone = rows["released"].to_numpy(dtype=bool) & ~corrected
     below = np.zeros(len(BINS) - 1)
-    for (_, place), own in zip(TAIL, (~(alone | corrected), alone, corrected), strict=True):
-        count, _ = np.histogram(rows["accuracy"][own], BINS)
-        there = count > 0
-        axis.bar(BINS[:-1][there], count[there], np.diff(BINS)[there], below[there], align="edge",
-                 facecolor=_tail_colour(place, theme), edgecolor=theme.paper,
-                 hatch=_tail_hatch(place), linewidth=0.6)  # fmt: skip
+    for (_, index), subset in zip(TAIL, (~(alone | corrected), alone, corrected), strict=True):
+        count, _ = np.histogram(rows["accuracy"][subset], BINS)
+        some = count > 0
+        axis.bar(BINS[:-1][some], count[some], np.diff(BINS)[some], below[some], align="edge",
+                 facecolor=_tail_colour(index, theme), edgecolor=theme.paper,
+                 hatch=_tail_hatch(index), linewidth=0.6)  # fmt: skip
         below += count
 
 
-def _tail_colour(place: int, theme: Theme) -> str:
-    return theme.palette[place]
+def _tail_colour(index: int, theme: Theme) -> str:
+    return theme.palette[index]
 
 
-def _tail_hatch(place: int) -> str:
-    return {0: "", 4: HATCHES[1], 5: HATCHES[3]}[place]
+def _tail_hatch(index: int) -> str:
+    return {0: "", 4: HATCHES[1], 5: HATCHES[3]}[index]
 
 
 def response_time_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
@@ -175,11 +175,11 @@ def response_time_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
     with matplotlib.rc_context(style(theme)):
         size = (11 / 4, 2.5)
         figure, axes = panels(len(scenarios), 4, size, above=0.3, sharex=True, sharey=True)
-        for place, (axis, scenario) in enumerate(zip(axes, scenarios, strict=True)):
+        for index, (axis, scenario) in enumerate(zip(axes, scenarios, strict=True)):
             rows = table[(table["scenario"] == scenario) & table["mean_log_rt"].notna()]
             x = rows["accuracy"].to_numpy(dtype=np.float64)
             y = rows["mean_log_rt"].to_numpy(dtype=np.float64)
-            colour, marker = theme.mark(place)
+            colour, marker = theme.mark(index)
             axis.plot(x, y, linestyle="", marker=marker, color=colour, markersize=3.6, alpha=0.7,
                       markeredgewidth=0)  # fmt: skip
             r = pearson(x, y)
@@ -214,8 +214,8 @@ def calibration_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
             axis.vlines(rows["mean_p"], rows["low"], rows["high"], color=theme.palette[0],
                         linewidth=1.1)  # fmt: skip
             axis.plot(rows["mean_p"], rows["share"], color=theme.palette[0], linewidth=0.8)
-            share = rows["stimuli"] / rows["stimuli"].sum()
-            axis.scatter(rows["mean_p"], rows["share"], s=8 + 160 * share, zorder=3,
+            fraction = rows["stimuli"] / rows["stimuli"].sum()
+            axis.scatter(rows["mean_p"], rows["share"], s=8 + 160 * fraction, zorder=3,
                          color=theme.palette[0], edgecolors=theme.ink, linewidths=0.6)  # fmt: skip
             words = label(agent, 30 if columns == 5 else 44)
             brier = table.loc[table["agent"] == agent, "brier"].iloc[0]

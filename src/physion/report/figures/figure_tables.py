@@ -73,8 +73,8 @@ def kappa_table(comparison: Comparison, beside: PeopleComparison) -> pd.DataFram
     kinds = comparison.scores.drop_duplicates("agent").set_index("agent")["readout"]
     rows["kind"] = rows["agent"].map(kinds)
     zones = beside.zones
-    own = zones[(zones["measure"] == "kappa") & (zones["of"] == "participants")]
-    people = own.set_index("scenario")[["mean"]].set_axis(["people"], axis=1)
+    subset = zones[(zones["measure"] == "kappa") & (zones["of"] == "participants")]
+    people = subset.set_index("scenario")[["mean"]].set_axis(["people"], axis=1)
     if len(people) > 1:
         people.loc[MEAN] = people["people"].mean()
     people = _with_zone(people, zones, "kappa", released=True)
@@ -113,8 +113,8 @@ def _with_zone(
     people = people.assign(zone_low=np.nan, zone_high=np.nan, zone="")
     if zones is None:
         return people
-    own = zones[(zones["measure"] == measure) & (zones["of"] == "participants")]
-    for _, row in own.iterrows():
+    subset = zones[(zones["measure"] == measure) & (zones["of"] == "participants")]
+    for _, row in subset.iterrows():
         if row["scenario"] in people.index and np.isfinite(row["low"]):
             people.loc[row["scenario"], ["zone_low", "zone_high"]] = row["low"], row["high"]
             people.loc[row["scenario"], "zone"] = PARTICIPANTS
@@ -128,7 +128,7 @@ def _measure(rows: pd.DataFrame, people: pd.DataFrame, people_is: str) -> pd.Dat
     if len(names) == 2:
         names = names[:1]  # the mean over one scenario is that scenario
     table = table[table["panel"].isin(names)]
-    order = table["panel"].map({name: place for place, name in enumerate(names)})
+    order = table["panel"].map({name: rank for rank, name in enumerate(names)})
     table = table.assign(order=order).sort_values("order", kind="stable")
     return table.reset_index(drop=True)[list(MEASURE_COLUMNS)]
 
@@ -191,8 +191,8 @@ def thirds_table(
     parts = []
     for name, words in THIRD_WORDS.items():
         rows = [
-            {"agent": agent, "kind": own["readout"].iloc[0]} | _third(own, name, draws)
-            for agent, own in comparison.stimuli.groupby("agent", sort=False)
+            {"agent": agent, "kind": subset["readout"].iloc[0]} | _third(subset, name, draws)
+            for agent, subset in comparison.stimuli.groupby("agent", sort=False)
         ]
         parts.append(pd.DataFrame(rows).assign(panel=words, **people[name]))
     table = pd.concat(parts, ignore_index=True)
@@ -202,19 +202,19 @@ def thirds_table(
 THIRD_WORDS = dict(zip(THIRDS, ("hard (up to 1/3)", "chance", "easy (from 2/3)"), strict=True))
 
 
-def _third(own: pd.DataFrame, name: str, draws: Bootstrap) -> dict[str, float | str]:
+def _third(subset: pd.DataFrame, name: str, draws: Bootstrap) -> dict[str, float | str]:
     """Return r of one model within one third, with its interval."""
-    rows = own.sort_values("stimulus", kind="stable")
+    rows = subset.sort_values("stimulus", kind="stable")
     part = rows[(difficulty_third(rows["human_accuracy"]) == name).to_numpy()]
     x, y = (part[[key]].to_numpy(np.float64).T for key in ("p_contact", "p_yes"))
-    found: dict[str, float | str] = {"stimuli": len(part), "low": np.nan, "high": np.nan}
+    result: dict[str, float | str] = {"stimuli": len(part), "low": np.nan, "high": np.nan}
     r = float(correlate_rows(x, y)[0]) if len(part) else np.nan
     if not np.isfinite(r):
-        return found | {"value": np.nan, "reason": "fewer than 3 stimuli, or constant answers"}
+        return result | {"value": np.nan, "reason": "fewer than 3 stimuli, or constant answers"}
     weights = draws.weights(f"third {name}", len(part))
     drawn = correlate_resampled(x, np.broadcast_to(y, weights.shape), weights)
-    found["low"], found["high"] = draws.interval(drawn[:, 0])
-    return found | {"value": r, "reason": ""}
+    result["low"], result["high"] = draws.interval(drawn[:, 0])
+    return result | {"value": r, "reason": ""}
 
 
 def _halves_by_third(
@@ -282,12 +282,12 @@ def _with_training(comparison: Comparison, predictions: pd.DataFrame) -> pd.Data
     """Return the stimuli of a comparison with ``trained`` (as in the predictions) and
     ``training``.
     """
-    found = pd.Series("", index=predictions.index, dtype=object)
+    result = pd.Series("", index=predictions.index, dtype=object)
     for column in reversed(DATASETS[1:3]):
         if column in predictions:
-            found = found.where(found != "", predictions[column])
-    own = predictions[["agent", "stimulus"]].assign(trained=found)
-    rows = comparison.stimuli.merge(own, on=["agent", "stimulus"], how="left")
+            result = result.where(result != "", predictions[column])
+    subset = predictions[["agent", "stimulus"]].assign(trained=result)
+    rows = comparison.stimuli.merge(subset, on=["agent", "stimulus"], how="left")
     ours = rows["trained"].map(lambda name: OFFICIAL_SCENARIOS.get(str(name).lower(), name))
     rows["trained"] = ours.where(ours != "same", rows["scenario"]).replace("all but this", ALL_BUT)
     rows["training"] = rows["trained"].where(~rows["trained"].isin(SCENARIOS), ANOTHER)
@@ -306,19 +306,19 @@ def _effect(
         return pd.DataFrame(columns=list(GROUPED_COLUMNS))
     right = rows.assign(right=(rows["predicted"] == rows["label"]).astype(np.float64))
     records = []
-    for (model, group), own in right.groupby(["model", column], sort=False):
+    for (model, group), subset in right.groupby(["model", column], sort=False):
         values, drawn = [], []
-        for scenario, part in own.groupby("scenario"):
+        for scenario, part in subset.groupby("scenario"):
             mean = part.groupby("stimulus")["right"].mean().sort_index().to_numpy(np.float64)
             values.append(mean.mean())
             drawn.append(draws.weights(str(scenario), len(mean)) @ mean / len(mean))
         low, high = draws.interval(np.mean(drawn, axis=0))
         records.append((panel, model, group, float(np.mean(values)), low, high, np.nan,
-                        own["stimulus"].nunique(), ""))  # fmt: skip
+                        subset["stimulus"].nunique(), ""))  # fmt: skip
     table = pd.DataFrame(records, columns=list(GROUPED_COLUMNS))
-    place = {name: at for at, name in enumerate(groups)}
+    rank = {name: at for at, name in enumerate(groups)}
     models = {name: at for at, name in enumerate(rows["model"].unique())}
-    keys = {"group": place, "agent": models}
+    keys = {"group": rank, "agent": models}
     return table.sort_values(
         ["group", "agent"], key=lambda values: values.map(keys[str(values.name)]), kind="stable"
     )
@@ -351,14 +351,14 @@ def generalization_table(comparison: Comparison, predictions: pd.DataFrame) -> p
     table["difference"] = table["accuracy"] - base
     first = ["all", ALL_BUT, ONLY, *SCENARIOS]
     order = {name: at for at, name in enumerate(first)}
-    place = {
+    rank = {
         "agent": {name: at for at, name in enumerate(table["agent"].unique())},
         "trained": order,
         "tested": order,
     }
     ordered = table.sort_values(
         ["agent", "trained", "tested"],
-        key=lambda values: values.map(place[str(values.name)]).fillna(len(first)),
+        key=lambda values: values.map(rank[str(values.name)]).fillna(len(first)),
         kind="stable",
     )
     return ordered[list(GENERALIZATION_COLUMNS)].reset_index(drop=True)

@@ -29,9 +29,9 @@ class Theme:
     zone: str
     palette: tuple[str, ...]
 
-    def mark(self, place: int) -> tuple[str, str]:
+    def mark(self, index: int) -> tuple[str, str]:
         """Return colour and marker of the ``place``-th of things to distinguish."""
-        return self.palette[place % len(self.palette)], MARKERS[place % len(MARKERS)]
+        return self.palette[index % len(self.palette)], MARKERS[index % len(MARKERS)]
 
 
 _OKABE_ITO = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#B8A800")
@@ -72,18 +72,18 @@ def panels(
     axes = list(figure.subplots(rows, columns, squeeze=False, **shared).flat)
     for axis in axes[count:]:
         axis.set_visible(False)
-    for place, axis in enumerate(axes[:count]):
-        outer(axis, place, count, columns, shared)
+    for index, axis in enumerate(axes[:count]):
+        outer(axis, index, count, columns, shared)
     return figure, axes[:count]
 
 
-def outer(axis: Axes, place: int, count: int, columns: int, shared: Mapping[str, Any]) -> None:
+def outer(axis: Axes, index: int, count: int, columns: int, shared: Mapping[str, Any]) -> None:
     """Remove ticks without numbers, and add them to a panel with no panel below."""
     if shared.get("sharex"):
-        last = place + columns >= count
+        last = index + columns >= count
         axis.tick_params(axis="x", bottom=last, labelbottom=last)
     if shared.get("sharey"):
-        first = place % columns == 0
+        first = index % columns == 0
         axis.tick_params(axis="y", left=first, labelleft=first)
 
 

@@ -51,7 +51,7 @@ def interval(row: pd.Series, key: str, low: str = "", high: str = "", digits: in
 
 
 @dataclass(frozen=True)
-class Column:
+class PageColumn:
     """Column of a table of the page: its heading, and the format of the value of ``key``."""
 
     heading: str
@@ -77,7 +77,7 @@ class Column:
         return percent(float(value)) if self.kind == "percent" else number(value, self.digits)
 
 
-def rows_table(rows: pd.DataFrame, columns: Sequence[Column], caption: str = "") -> str:
+def rows_table(rows: pd.DataFrame, columns: Sequence[PageColumn], caption: str = "") -> str:
     """Return a table of some columns of ``rows``, with reasons of undefined numbers listed below
     it.
     """
@@ -85,14 +85,14 @@ def rows_table(rows: pd.DataFrame, columns: Sequence[Column], caption: str = "")
     return table([column.heading for column in columns], cells, caption) + notes(rows, columns)
 
 
-def notes(rows: pd.DataFrame, columns: Sequence[Column]) -> str:
+def notes(rows: pd.DataFrame, columns: Sequence[PageColumn]) -> str:
     """Return the values of ``reason`` once each, with the rows that they are about."""
     if "reason" not in rows:
         return ""
     given = rows[rows["reason"].astype(str).str.len() > 0]
     items = []
-    for reason, own in given.groupby("reason", sort=False):
-        named = [str(row[columns[0].key]) for _, row in own.iterrows()]
+    for reason, subset in given.groupby("reason", sort=False):
+        named = [str(row[columns[0].key]) for _, row in subset.iterrows()]
         who = ", ".join(dict.fromkeys(named)) if len(set(named)) <= 8 else f"{len(named)} rows"
         items.append(f"<li>{escape(who)}: {escape(str(reason))}</li>")
     return f'<ul class="notes">{"".join(items)}</ul>' if items else ""
@@ -177,9 +177,9 @@ def matrix(comparison: Comparison, key: str) -> str:
     if comparison.has_people:
         rows.append([f"<em>{_people_title(key)}</em>", *_people_cells(comparison, key, columns)])
     for agent in comparison.agents:
-        own = scores[scores["agent"] == agent].set_index("scenario")
+        subset = scores[scores["agent"] == agent].set_index("scenario")
         cells = [
-            interval(own.loc[name], key) if name in own.index else undefined("no predictions")
+            interval(subset.loc[name], key) if name in subset.index else undefined("no predictions")
             for name in columns
         ]
         rows.append([escape(agent), *cells])
@@ -283,16 +283,16 @@ def dropped(comparison: Comparison) -> str:
 
 def card(comparison: Comparison, row: pd.Series, movie: str) -> str:
     """Return one stimulus: its movie (HTML), outcome, and the answers of people and every model."""
-    own = comparison.stimuli[comparison.stimuli["stimulus"] == row["stimulus"]]
+    subset = comparison.stimuli[comparison.stimuli["stimulus"] == row["stimulus"]]
     bars = [_bar("people say yes", row["p_yes"], "human")]
-    named = own["agent"] == row["agent"]
-    if len(own) <= MOST_BARS:
-        for _, answer in own.iterrows():
+    named = subset["agent"] == row["agent"]
+    if len(subset) <= MOST_BARS:
+        for _, answer in subset.iterrows():
             kind = "model named" if answer["agent"] == row["agent"] else "model"
             bars.append(_bar(str(answer["agent"]), answer["p_contact"], kind))
     else:
         bars.append(_bar(str(row["agent"]), row["p_contact"], "model named"))
-        others = own.loc[~named, "p_contact"]
+        others = subset.loc[~named, "p_contact"]
         bars.append(_bar(f"mean of {len(others)} other models", others.mean(), "model"))
     return (
         f"<article>{movie}<h3>{escape(row['scenario'])}: {_outcome(row['label'])}</h3>"

@@ -49,7 +49,7 @@ def widest_gaps(comparison: Comparison, count: int) -> pd.DataFrame:
     rows = rows[(rows["label"] == rows["simulated"]) & rows["gap"].notna()]
     rows = rows.assign(size=rows["gap"].abs())
     ranked = rows.sort_values(["size", "stimulus"], ascending=[False, True], kind="stable")
-    queues = [list(own.index) for _, own in ranked.groupby("agent", sort=False)]
+    queues = [list(subset.index) for _, subset in ranked.groupby("agent", sort=False)]
     queues.sort(key=lambda queue: comparison.agents.index(rows.loc[queue[0], "agent"]))
     chosen: list[int] = []
     seen: set[str] = set()

@@ -13,7 +13,14 @@ from physion.analysis.people.difficulty import below_chance
 from physion.analysis.people.hypotheses import HYPOTHESES
 from physion.analysis.tables.stimuli import MEAN, in_order
 from physion.report.inputs import ReportInputs
-from physion.report.page.blocks import Column, details, paragraph, rows_table, stimulus_link, table
+from physion.report.page.blocks import (
+    PageColumn,
+    details,
+    paragraph,
+    rows_table,
+    stimulus_link,
+    table,
+)
 from physion.report.page.blocks import people as averages
 from physion.report.words import number
 
@@ -27,38 +34,41 @@ def people(inputs: ReportInputs, shown: Mapping[str, str]) -> str:
     parts = [averages(inputs.comparison)]
     if inputs.people is None:
         return "".join(parts)
-    found = inputs.people.tables
+    tables = inputs.people.tables
     parts = [
-        _accuracy(found),
-        _agreement(found),
+        _accuracy(tables),
+        _agreement(tables),
     ]
     if inputs.beside is not None:
         parts.append(details("What single people reach", _zones(inputs.beside.zones)))
-    parts += ["<h3>Inclinations, practice, background</h3>", _biases(found)]
-    parts += ["<h3>What makes a stimulus hard</h3>", _hypotheses(found)]
+    parts += ["<h3>Inclinations, practice, background</h3>", _biases(tables)]
+    parts += ["<h3>What makes a stimulus hard</h3>", _hypotheses(tables)]
     parts.append(
         details("People on the stimuli that any model predicts", averages(inputs.comparison))
     )
     return "\n".join(parts)
 
 
-def _accuracy(found: Mapping[str, pd.DataFrame]) -> str:
+def _accuracy(tables: Mapping[str, pd.DataFrame]) -> str:
     columns = [
-        Column("scenario", "scenario", "text"), Column("people", "people", "count"),
-        Column("stimuli", "stimuli", "count"),
-        Column("accuracy", "accuracy", "interval", 3),
-        Column("sd over people", "sd", digits=3), Column("t", "t", digits=1),
-        Column("df", "df", "count"), Column("p", "p", "p"),
-        Column("lowest 2.5 %", "zone_low", digits=3),
-        Column("highest 2.5 %", "zone_high", digits=3),
-        Column("consistency", "consistency", digits=3),
-    ]  # fmt: skip
+        PageColumn("scenario", "scenario", "text"),
+        PageColumn("people", "people", "count"),
+        PageColumn("stimuli", "stimuli", "count"),
+        PageColumn("accuracy", "accuracy", "interval", 3),
+        PageColumn("sd over people", "sd", digits=3),
+        PageColumn("t", "t", digits=1),
+        PageColumn("df", "df", "count"),
+        PageColumn("p", "p", "p"),
+        PageColumn("lowest 2.5 %", "zone_low", digits=3),
+        PageColumn("highest 2.5 %", "zone_high", digits=3),
+        PageColumn("consistency", "consistency", digits=3),
+    ]
     words = (
         "Accuracy of people, flagged sessions left out: mean over people, interval by drawing "
         "people; t against 0.5; consistency is the mean share of people who give a stimulus' "
         "more frequent answer"
     )
-    return rows_table(found["by_scenario"], columns, words)
+    return rows_table(tables["by_scenario"], columns, words)
 
 
 _ALIKE = {
@@ -69,25 +79,32 @@ _ALIKE = {
 }
 
 
-def _agreement(found: Mapping[str, pd.DataFrame]) -> str:
+def _agreement(tables: Mapping[str, pd.DataFrame]) -> str:
     """Return a row a scenario: mean over pairs or halves, their middle 95 %, the interval of the
     mean.
     """
-    rows = found["agreement"]
+    rows = tables["agreement"]
     cells, reasons = [], []
     for name in in_order(rows["scenario"]):
         line = [escape(name)]
         for measure in _ALIKE:
             row = rows[(rows["scenario"] == name) & (rows["measure"] == measure)].iloc[0]
-            line.append(Column("", "mean", "interval", 3, "low", "high").cell(row))
+            line.append(PageColumn("", "mean", "interval", 3, "low", "high").cell(row))
             if measure in ("kappa", "correlation"):
-                line.append(Column("", "mean", "interval", 3).cell(row).split(" ", 1)[-1])
+                line.append(PageColumn("", "mean", "interval", 3).cell(row).split(" ", 1)[-1])
             if row["reason"]:
                 why = f"{name}, {_ALIKE[measure]}: {row['reason']}"
                 reasons.append(f"<li>{escape(why)}</li>")
         cells.append(line)
-    header = ["scenario", "kappa, pairs", "interval of the mean", "r, pairs",
-              "interval of the mean", "r, halves", "r, halves, Spearman-Brown"]  # fmt: skip
+    header = [
+        "scenario",
+        "kappa, pairs",
+        "interval of the mean",
+        "r, pairs",
+        "interval of the mean",
+        "r, halves",
+        "r, halves, Spearman-Brown",
+    ]
     words = (
         "How alike people answer: mean and middle 95 % over all pairs of participants and over "
         "1000 random halves of them; the interval of the mean draws people"
@@ -98,63 +115,87 @@ def _agreement(found: Mapping[str, pd.DataFrame]) -> str:
 
 def _zones(rows: pd.DataFrame) -> str:
     columns = [
-        Column("scenario", "scenario", "text"), Column("measure", "measure", "text"),
-        Column("of", "of", "text"), Column("values", "values", "count"),
-        Column("mean", "mean", digits=3), Column("2.5 %", "low", digits=3),
-        Column("97.5 %", "high", digits=3), Column("undefined", "undefined", "count"),
-    ]  # fmt: skip
+        PageColumn("scenario", "scenario", "text"),
+        PageColumn("measure", "measure", "text"),
+        PageColumn("of", "of", "text"),
+        PageColumn("values", "values", "count"),
+        PageColumn("mean", "mean", digits=3),
+        PageColumn("2.5 %", "low", digits=3),
+        PageColumn("97.5 %", "high", digits=3),
+        PageColumn("undefined", "undefined", "count"),
+    ]
     return rows_table(rows, columns)
 
 
-def _biases(found: Mapping[str, pd.DataFrame]) -> str:
+def _biases(tables: Mapping[str, pd.DataFrame]) -> str:
     yes = [
-        Column("scenario", "scenario", "text"), Column("people", "people", "count"),
-        Column("contact", "base_rate", digits=3), Column("say yes", "yes", digits=3),
-        Column("yes less contact", "bias", "interval", 3), Column("d′", "d_prime", "interval"),
-        Column("criterion", "criterion", "interval"),
-    ]  # fmt: skip
+        PageColumn("scenario", "scenario", "text"),
+        PageColumn("people", "people", "count"),
+        PageColumn("contact", "base_rate", digits=3),
+        PageColumn("say yes", "yes", digits=3),
+        PageColumn("yes less contact", "bias", "interval", 3),
+        PageColumn("d′", "d_prime", "interval"),
+        PageColumn("criterion", "criterion", "interval"),
+    ]
     side = [
-        Column("scenario", "scenario", "text"), Column("yes on the left", "yes_left", "count"),
-        Column("yes on the right", "yes_right", "count"),
-        Column("order unknown", "unknown", "count"),
-        Column("left presses", "left", "interval", 3), Column("p", "p", "p"),
-    ]  # fmt: skip
+        PageColumn("scenario", "scenario", "text"),
+        PageColumn("yes on the left", "yes_left", "count"),
+        PageColumn("yes on the right", "yes_right", "count"),
+        PageColumn("order unknown", "unknown", "count"),
+        PageColumn("left presses", "left", "interval", 3),
+        PageColumn("p", "p", "p"),
+    ]
     practice = [
-        Column("scenario", "scenario", "text"), Column("answers", "rows", "count"),
-        Column("first half", "first_half", digits=3),
-        Column("second half", "second_half", digits=3),
-        Column("log odds per 100 trials", "b", "interval", 3, "low", "high"),
-        Column("z", "z"), Column("p", "p", "p"),
-    ]  # fmt: skip
-    asked = [
-        Column("question", "question", "text"), Column("sessions", "sessions", "count"),
-        Column("test", "test", "text"), Column("statistic", "statistic"), Column("p", "p", "p"),
-    ]  # fmt: skip
-    who = [
-        Column("question", "question", "text"), Column("answer", "answer", "text"),
-        Column("sessions", "sessions", "count"), Column("share", "share", "percent"),
-    ]  # fmt: skip
+        PageColumn("scenario", "scenario", "text"),
+        PageColumn("answers", "rows", "count"),
+        PageColumn("first half", "first_half", digits=3),
+        PageColumn("second half", "second_half", digits=3),
+        PageColumn("log odds per 100 trials", "b", "interval", 3, "low", "high"),
+        PageColumn("z", "z"),
+        PageColumn("p", "p", "p"),
+    ]
+    questions = [
+        PageColumn("question", "question", "text"),
+        PageColumn("sessions", "sessions", "count"),
+        PageColumn("test", "test", "text"),
+        PageColumn("statistic", "statistic"),
+        PageColumn("p", "p", "p"),
+    ]
+    background = [
+        PageColumn("question", "question", "text"),
+        PageColumn("answer", "answer", "text"),
+        PageColumn("sessions", "sessions", "count"),
+        PageColumn("share", "share", "percent"),
+    ]
     return (
-        rows_table(found["yes_bias"], yes, "Saying yes; a criterion below 0 leans to it")
-        + rows_table(found["side_bias"], side, "Pressing the left button")
-        + rows_table(found["learning"], practice, "Practice: being right, over the test trials")
-        + rows_table(found["background_tests"], asked,
-                     "Accuracy by who people are: exploratory, p not corrected")
-        + details("Who took part", rows_table(found["background"], who))
-    )  # fmt: skip
+        rows_table(tables["yes_bias"], yes, "Saying yes; a criterion below 0 leans to it")
+        + rows_table(tables["side_bias"], side, "Pressing the left button")
+        + rows_table(tables["learning"], practice, "Practice: being right, over the test trials")
+        + rows_table(
+            tables["background_tests"],
+            questions,
+            "Accuracy by who people are: exploratory, p not corrected",
+        )
+        + details("Who took part", rows_table(tables["background"], background))
+    )
 
 
-def _hypotheses(found: Mapping[str, pd.DataFrame]) -> str:
-    rows = found["hypotheses"].assign(
-        about=found["hypotheses"]["hypothesis"].map({k: v.about for k, v in HYPOTHESES.items()})
+def _hypotheses(tables: Mapping[str, pd.DataFrame]) -> str:
+    rows = tables["hypotheses"].assign(
+        about=tables["hypotheses"]["hypothesis"].map({k: v.about for k, v in HYPOTHESES.items()})
     )
     columns = [
-        Column("hypothesis", "hypothesis", "text"), Column("scenario", "scenario", "text"),
-        Column("stimuli", "stimuli", "count"), Column("left out", "left_out", "count"),
-        Column("b", "b", "interval", 3, "low", "high"), Column("t", "t"),
-        Column("df", "df", "count"), Column("p", "p", "p"), Column("r", "r"),
-        Column("as predicted", "as_predicted", "text"),
-    ]  # fmt: skip
+        PageColumn("hypothesis", "hypothesis", "text"),
+        PageColumn("scenario", "scenario", "text"),
+        PageColumn("stimuli", "stimuli", "count"),
+        PageColumn("left out", "left_out", "count"),
+        PageColumn("b", "b", "interval", 3, "low", "high"),
+        PageColumn("t", "t"),
+        PageColumn("df", "df", "count"),
+        PageColumn("p", "p", "p"),
+        PageColumn("r", "r"),
+        PageColumn("as predicted", "as_predicted", "text"),
+    ]
     names = "; ".join(f"{name}: {h.about.lower()}" for name, h in HYPOTHESES.items())
     words = (
         f"The preregistered hypotheses by stimulus ({names}). Linear regression with an intercept "
@@ -174,14 +215,19 @@ def measures(inputs: ReportInputs) -> str:
     rows = scores.assign(measure=scores["measure"].map(labels))
     rows = rows[rows["measure"] != ""]
     columns = [
-        Column("model", "model", "text"), Column("scenario", "scenario", "text"),
-        Column("measure", "measure", "text"), Column("stimuli", "stimuli", "count"),
-        Column("value (people and stimuli drawn)", "value", "interval", 3, "low_both", "high_both"),
-        Column("people drawn", "value", "interval", 3, "low_people", "high_people"),
-        Column("stimuli drawn", "value", "interval", 3, "low_stimuli", "high_stimuli"),
-        Column("lowest 2.5 % of people", "zone_low", digits=3),
-        Column("highest 2.5 %", "zone_high", digits=3), Column("in zone", "in_zone", "text"),
-    ]  # fmt: skip
+        PageColumn("model", "model", "text"),
+        PageColumn("scenario", "scenario", "text"),
+        PageColumn("measure", "measure", "text"),
+        PageColumn("stimuli", "stimuli", "count"),
+        PageColumn(
+            "value (people and stimuli drawn)", "value", "interval", 3, "low_both", "high_both"
+        ),
+        PageColumn("people drawn", "value", "interval", 3, "low_people", "high_people"),
+        PageColumn("stimuli drawn", "value", "interval", 3, "low_stimuli", "high_stimuli"),
+        PageColumn("lowest 2.5 % of people", "zone_low", digits=3),
+        PageColumn("highest 2.5 %", "zone_high", digits=3),
+        PageColumn("in zone", "in_zone", "text"),
+    ]
     last = rows["scenario"].iloc[-1]
     shown = rows[rows["scenario"] == last].drop(columns="reason")
     words = "Measures with single participants: "
@@ -224,19 +270,31 @@ def fooled(inputs: ReportInputs, links: Mapping[str, str]) -> str:
         rows = rows.rename(columns={"human_accuracy": "accuracy"})
     tail = below_chance(rows.reset_index(drop=True))
     counts = [
-        [escape(name), str(len(own)), str(int(own["released"].sum())), str(int(own["exact"].sum()))]
+        [
+            escape(name),
+            str(len(subset)),
+            str(int(subset["released"].sum())),
+            str(int(subset["exact"].sum())),
+        ]
         for name in in_order(tail["scenario"])
-        if len(own := tail[tail["scenario"] == name])
+        if len(subset := tail[tail["scenario"] == name])
     ]
-    counts.append(["all", str(len(tail)), str(int(tail["released"].sum())),
-                   str(int(tail["exact"].sum()))])  # fmt: skip
+    counts.append(
+        ["all", str(len(tail)), str(int(tail["released"].sum())), str(int(tail["exact"].sum()))]
+    )
     header = ["scenario", "stimuli", "below chance, study's rule", "below chance, corrected"]
     low = tail[tail["released"] | tail["exact"]].sort_values(["accuracy", "stimulus"])
     cells = []
     for _, row in low.iterrows():
-        cells.append([stimulus_link(row["stimulus"], links), escape(row["scenario"]),
-                      number(row["accuracy"]), str(int(row["count"])),
-                      "yes" if row["exact"] else "no"])  # fmt: skip
+        cells.append(
+            [
+                stimulus_link(row["stimulus"], links),
+                escape(row["scenario"]),
+                number(row["accuracy"]),
+                str(int(row["count"])),
+                "yes" if row["exact"] else "no",
+            ]
+        )
     listing = table(["stimulus", "scenario", "accuracy", "people", "after correction"], cells)
     one_by_one = details(f"The {len(cells)} stimuli one by one", listing) if cells else ""
     return table(header, counts) + one_by_one

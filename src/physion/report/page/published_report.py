@@ -22,7 +22,7 @@ from physion.report.figures.by_scenario import (
 )
 from physion.report.figures.figure_tables import GROUPED_COLUMNS, MEASURE_COLUMNS
 from physion.report.figures.theme import Plot, Theme
-from physion.report.page.blocks import Column, details, p_value, paragraph, rows_table, table
+from physion.report.page.blocks import PageColumn, details, p_value, paragraph, rows_table, table
 from physion.report.page.document import Section, figure, render_document
 from physion.report.words import number
 from physion.report.write import prepare_folder, write_csv, write_plot
@@ -65,18 +65,33 @@ def published_plots(results: PublishedResults) -> list[Plot]:
     rows = tables["panel_a"]
     people = float(rows.loc[rows["scenario"] == MEAN, "people"].iloc[0])
     return [
-        Plot("panel_a", f"{TITLES['panel_a']}. {_ACCURACY}",
-             _measure(tables["panel_a"], "accuracy", PARTICIPANTS), partial(_draw, "accuracy")),
-        Plot("panel_c", f"{TITLES['panel_c']}. {_KAPPA}",
-             _measure(tables["panel_c"], "kappa", "95 % of pairs of participants"),
-             partial(_draw, "kappa")),
-        Plot("panel_d", f"{TITLES['panel_d']}. {words}",
-             _grouped(tables["panel_d"], "readout", "by readout (trained on all)", people),
-             _draw_grouped),
-        Plot("panel_e", f"{TITLES['panel_e']}. Readout observed+simulated.",
-             _grouped(tables["panel_e"], "training", "by training (readout observed+simulated)",
-                      people), _draw_grouped),
-    ]  # fmt: skip
+        Plot(
+            "panel_a",
+            f"{TITLES['panel_a']}. {_ACCURACY}",
+            _measure(tables["panel_a"], "accuracy", PARTICIPANTS),
+            partial(_draw, "accuracy"),
+        ),
+        Plot(
+            "panel_c",
+            f"{TITLES['panel_c']}. {_KAPPA}",
+            _measure(tables["panel_c"], "kappa", "95 % of pairs of participants"),
+            partial(_draw, "kappa"),
+        ),
+        Plot(
+            "panel_d",
+            f"{TITLES['panel_d']}. {words}",
+            _grouped(tables["panel_d"], "readout", "by readout (trained on all)", people),
+            _draw_grouped,
+        ),
+        Plot(
+            "panel_e",
+            f"{TITLES['panel_e']}. Readout observed+simulated.",
+            _grouped(
+                tables["panel_e"], "training", "by training (readout observed+simulated)", people
+            ),
+            _draw_grouped,
+        ),
+    ]
 
 
 _SHOWN = (
@@ -96,8 +111,8 @@ def _measure(panel: pd.DataFrame, measure: str, zone: str) -> pd.DataFrame:
     rows = rows.assign(kind="", people_is="people", reason="", zone=zone)
     rows["zone"] = rows["zone"].mask(is_mean, SCENARIO_ZONE)
     order = list(dict.fromkeys(rows.loc[~is_mean, "panel"]))
-    place = rows["panel"].map({name: at for at, name in enumerate(order)}).fillna(len(order))
-    return rows.assign(place=place).sort_values("place", kind="stable")[list(MEASURE_COLUMNS)]
+    rank = rows["panel"].map({name: at for at, name in enumerate(order)}).fillna(len(order))
+    return rows.assign(place=rank).sort_values("place", kind="stable")[list(MEASURE_COLUMNS)]
 
 
 def _grouped(panel: pd.DataFrame, column: str, name: str, people: float) -> pd.DataFrame:
@@ -125,8 +140,12 @@ def _page(results: PublishedResults, shown: dict[str, str]) -> str:
         f"{tables['accuracies']['scenario'].nunique()} scenarios: what was printed, "
         "what it averages or compares, and beside it what a reader expects.</p>"
     )
-    panels = [shown["panel_a"], _panel(tables["panel_a"], "accuracy"), shown["panel_c"],
-              _panel(tables["panel_c"], "kappa")]  # fmt: skip
+    panels = [
+        shown["panel_a"],
+        _panel(tables["panel_a"], "accuracy"),
+        shown["panel_c"],
+        _panel(tables["panel_c"], "kappa"),
+    ]
     sections = [
         Section("Accuracies by scenario", _accuracies(results)),
         Section("Panels A and C", "\n".join(panels)),
@@ -154,23 +173,28 @@ def _accuracies(results: PublishedResults) -> str:
         ]
         parts.append(table(["model", *names], cells, caption))
     columns = [
-        Column("model", "model", "text"), Column("scenario", "scenario", "text"),
-        Column("published", "published", "interval", 3), Column("rows", "rows", "count"),
-        Column("observed once", "without_copies", digits=3),
-        Column("expected", "expected", "interval", 3), Column("runs", "runs", "count"),
-        Column("stimuli", "stimuli", "count"), Column("difference", "difference", digits=3),
-    ]  # fmt: skip
+        PageColumn("model", "model", "text"),
+        PageColumn("scenario", "scenario", "text"),
+        PageColumn("published", "published", "interval", 3),
+        PageColumn("rows", "rows", "count"),
+        PageColumn("observed once", "without_copies", digits=3),
+        PageColumn("expected", "expected", "interval", 3),
+        PageColumn("runs", "runs", "count"),
+        PageColumn("stimuli", "stimuli", "count"),
+        PageColumn("difference", "difference", digits=3),
+    ]
     parts.append(details("Every value with its interval", rows_table(rows, columns)))
     return "\n".join(parts)
 
 
 def _panel(rows: pd.DataFrame, measure: str) -> str:
     columns = [
-        Column("model", "model", "text"), Column("scenario", "scenario", "text"),
-        Column(measure, measure, "interval", 3, "low", "high"),
-        Column("people", "people", "interval", 3, "zone_low", "zone_high"),
-        Column("in zone", "in_zone", "text"),
-    ]  # fmt: skip
+        PageColumn("model", "model", "text"),
+        PageColumn("scenario", "scenario", "text"),
+        PageColumn(measure, measure, "interval", 3, "low", "high"),
+        PageColumn("people", "people", "interval", 3, "zone_low", "zone_high"),
+        PageColumn("in zone", "in_zone", "text"),
+    ]
     words = rows.assign(in_zone=rows["in_zone"].map({True: "yes", False: "no"}))
     return details(f"{measure} as a table", rows_table(words, columns))
 
@@ -187,23 +211,35 @@ def _regressions(results: PublishedResults) -> str:
         about = f"{escape(row['claim'])}<small>{escape(row['sentence'])}</small>"
         differs = escape(f"Compares {row['compared']} ({row['state']}): {row['differs']}")
         cells.append([about, escape(printed), *fits, escape(row["met"]), differs])
-    header = ["claim", "printed", "as run", "each row once", "as the sentence asks", "figures met",
-              "what differs"]  # fmt: skip
+    header = [
+        "claim",
+        "printed",
+        "as run",
+        "each row once",
+        "as the sentence asks",
+        "figures met",
+        "what differs",
+    ]
     return paragraph(results.words["regressions"]) + table(header, cells)
 
 
 def _people(rows: pd.DataFrame, claims: pd.DataFrame, words: str) -> str:
     columns = [
-        Column("scenario", "scenario", "text"),
-        Column("accuracy", "accuracy", "interval", 3, "zone_low", "zone_high"),
-        Column("kappa", "kappa", "interval", 3, "kappa_low", "kappa_high"),
-        Column("r of halves", "half_r", "interval", 3),
-        Column("stepped up", "half_r_full", digits=3),
-        Column("participants", "participants", "count"), Column("stimuli", "stimuli", "count"),
-        Column("below chance", "below_chance", "count"),
-    ]  # fmt: skip
-    said = [Column("claim", "claim", "text"), Column("printed", "printed", "text"),
-            Column("here", "ours", "text"), Column("note", "note", "text")]  # fmt: skip
+        PageColumn("scenario", "scenario", "text"),
+        PageColumn("accuracy", "accuracy", "interval", 3, "zone_low", "zone_high"),
+        PageColumn("kappa", "kappa", "interval", 3, "kappa_low", "kappa_high"),
+        PageColumn("r of halves", "half_r", "interval", 3),
+        PageColumn("stepped up", "half_r_full", digits=3),
+        PageColumn("participants", "participants", "count"),
+        PageColumn("stimuli", "stimuli", "count"),
+        PageColumn("below chance", "below_chance", "count"),
+    ]
+    said = [
+        PageColumn("claim", "claim", "text"),
+        PageColumn("printed", "printed", "text"),
+        PageColumn("here", "ours", "text"),
+        PageColumn("note", "note", "text"),
+    ]
     return (
         paragraph(words)
         + rows_table(
@@ -216,5 +252,5 @@ def _people(rows: pd.DataFrame, claims: pd.DataFrame, words: str) -> str:
 def _left_out(rows: pd.DataFrame) -> str:
     if rows.empty:
         return paragraph("None.")
-    columns = [Column(name, name, "text") for name in rows.columns]
+    columns = [PageColumn(name, name, "text") for name in rows.columns]
     return rows_table(rows, columns)

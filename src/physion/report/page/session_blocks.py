@@ -10,30 +10,32 @@ from physion.analysis.people.exclusions import RULES, ExclusionRules
 from physion.analysis.people.results import PeopleResults
 from physion.analysis.tables.stimuli import MEAN, in_order
 from physion.report.inputs import ReportInputs
-from physion.report.page.blocks import Column, paragraph, rows_table, table, undefined
+from physion.report.page.blocks import PageColumn, paragraph, rows_table, table, undefined
 
 
 def sessions(inputs: ReportInputs) -> str:
     """Return which sessions were flagged, by which rule, and the effect of flagged sessions."""
     if inputs.people is None:
         return ""
-    found = inputs.people.tables
-    parts = [paragraph(rules_in_words(inputs.people.rules)), _flag_counts(found["flag_counts"])]
+    result = inputs.people.tables
+    parts = [paragraph(rules_in_words(inputs.people.rules)), _flag_counts(result["flag_counts"])]
     parts.append(_with_and_without(inputs))
-    if len(found["flag_effects"]):
+    if len(result["flag_effects"]):
         columns = [
-            Column("rule", "term", "text"),
-            Column("log odds of being right", "b", "interval", 3, "low", "high"),
-            Column("z", "z"), Column("p", "p", "p"), Column("answers", "rows", "count"),
-            Column("participants", "clusters", "count"),
-        ]  # fmt: skip
+            PageColumn("rule", "term", "text"),
+            PageColumn("log odds of being right", "b", "interval", 3, "low", "high"),
+            PageColumn("z", "z"),
+            PageColumn("p", "p", "p"),
+            PageColumn("answers", "rows", "count"),
+            PageColumn("participants", "clusters", "count"),
+        ]
         words = (
             "Effect of a flag on being right, over all sessions: logistic regression with an "
             "intercept for each scenario, standard errors clustered by participant. Low accuracy "
             "is itself a reason to be flagged, so its effect, and that of “flagged”, is there by "
             "construction"
         )
-        parts.append(rows_table(found["flag_effects"], columns, words))
+        parts.append(rows_table(result["flag_effects"], columns, words))
     return "\n".join(parts)
 
 
@@ -54,18 +56,25 @@ def _with_and_without(inputs: ReportInputs) -> str:
     """Return people's accuracy, and the models' scores, without and with the flagged sessions."""
     assert inputs.people is not None
     rows = inputs.people.tables["with_and_without"]
-    columns = [Column("people", "people", "count"), Column("accuracy", "accuracy", "interval", 3)]
+    columns = [
+        PageColumn("people", "people", "count"),
+        PageColumn("accuracy", "accuracy", "interval", 3),
+    ]
     cells = []
     for name in dict.fromkeys(rows["scenario"]):
         line = [escape(str(name))]
         for which in ("unflagged", "complete"):
-            own = rows[(rows["scenario"] == name) & (rows["sessions"] == which)]
-            line += [c.cell(own.iloc[0]) for c in columns] if len(own) else [undefined("none"), ""]
+            subset = rows[(rows["scenario"] == name) & (rows["sessions"] == which)]
+            line += (
+                [c.cell(subset.iloc[0]) for c in columns]
+                if len(subset)
+                else [undefined("none"), ""]
+            )
         cells.append(line)
     header = ["scenario", "people, unflagged", "accuracy", "people, all complete", "accuracy"]
-    found = table(header, cells, "Accuracy of people without flagged sessions and with them")
+    result = table(header, cells, "Accuracy of people without flagged sessions and with them")
     if inputs.comparison_all is None:
-        return found
+        return result
     with_all = inputs.comparison_all.scores
     cells = []
     for _, row in inputs.comparison.scores.iterrows():
@@ -74,12 +83,17 @@ def _with_and_without(inputs: ReportInputs) -> str:
         other = with_all[(with_all["agent"] == row["agent"]) & (with_all["scenario"] == MEAN)]
         line = [escape(str(row["agent"]))]
         for key in ("difference", "r"):
-            for own in (row, other.iloc[0]):
-                line.append(Column("", key, "interval").cell(own))
+            for subset in (row, other.iloc[0]):
+                line.append(PageColumn("", key, "interval").cell(subset))
         cells.append(line)
-    header = ["model", "less people, unflagged", "with all complete", "r, unflagged",
-              "with all complete"]  # fmt: skip
-    return found + table(
+    header = [
+        "model",
+        "less people, unflagged",
+        "with all complete",
+        "r, unflagged",
+        "with all complete",
+    ]
+    return result + table(
         header, cells, "Models, mean over scenarios: accuracy less people's, and r"
     )
 
@@ -109,16 +123,19 @@ def rules_in_words(rules: ExclusionRules) -> str:
     )
 
 
-def dropped(found: PeopleResults) -> str:
+def dropped(result: PeopleResults) -> str:
     """Return counts of excluded answers, by step and reason."""
-    rows = found.tables["left_out"]
+    rows = result.tables["left_out"]
     if rows.empty:
         return paragraph("Nothing.")
     keys = ["step", "reason"]
     totals = rows.groupby(keys, sort=False)[["sessions", "rows"]].sum().reset_index()
-    columns = [Column("step", "step", "text"), Column("reason", "reason", "text"),
-               Column("sessions", "sessions", "count"),
-               Column("answers", "rows", "count")]  # fmt: skip
+    columns = [
+        PageColumn("step", "step", "text"),
+        PageColumn("reason", "reason", "text"),
+        PageColumn("sessions", "sessions", "count"),
+        PageColumn("answers", "rows", "count"),
+    ]
     cells = [[column.cell(row) for column in columns] for _, row in totals.iterrows()]
     return table([column.heading for column in columns], cells)
 

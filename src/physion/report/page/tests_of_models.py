@@ -10,7 +10,7 @@ import pandas as pd
 from physion.analysis.models.mixed_fits import MixedTable
 from physion.analysis.models.model_tests import permutations_of
 from physion.report.inputs import ReportInputs
-from physion.report.page.blocks import Column, details, paragraph, rows_table
+from physion.report.page.blocks import PageColumn, details, paragraph, rows_table
 from physion.report.words import number
 
 
@@ -38,10 +38,13 @@ _MIXED = (
 def _paired(rows: pd.DataFrame) -> str:
     """A summary in words, and the table of all pairs."""
     counts = {
-        key: (int((rows[f"{key}_holm"] < 0.05).sum()), int((rows[f"{key}_bh"] < 0.05).sum()),
-              int(rows[key].notna().sum()))
+        key: (
+            int((rows[f"{key}_holm"] < 0.05).sum()),
+            int((rows[f"{key}_bh"] < 0.05).sum()),
+            int(rows[key].notna().sum()),
+        )
         for key in ("p_accuracy", "p_r")
-    }  # fmt: skip
+    }
     words = (
         "Every two models on the stimuli that both answered, all scenarios together. Accuracy: "
         "exact test of McNemar. r with the average person: permutation test that swaps the two "
@@ -53,16 +56,20 @@ def _paired(rows: pd.DataFrame) -> str:
         f"{counts['p_r'][2]}, {counts['p_r'][0]} and {counts['p_r'][1]} in r."
     )
     columns = [
-        Column("first", "first", "text"), Column("second", "second", "text"),
-        Column("stimuli", "stimuli", "count"),
-        Column("accuracy, first less second", "accuracy_difference", digits=3),
-        Column("only first right", "only_first", "count"),
-        Column("only second right", "only_second", "count"),
-        Column("p", "p_accuracy", "p"), Column("Holm", "p_accuracy_holm", "p"),
-        Column("B-H", "p_accuracy_bh", "p"),
-        Column("r, first less second", "r_difference", "interval"),
-        Column("p", "p_r", "p"), Column("Holm", "p_r_holm", "p"), Column("B-H", "p_r_bh", "p"),
-    ]  # fmt: skip
+        PageColumn("first", "first", "text"),
+        PageColumn("second", "second", "text"),
+        PageColumn("stimuli", "stimuli", "count"),
+        PageColumn("accuracy, first less second", "accuracy_difference", digits=3),
+        PageColumn("only first right", "only_first", "count"),
+        PageColumn("only second right", "only_second", "count"),
+        PageColumn("p", "p_accuracy", "p"),
+        PageColumn("Holm", "p_accuracy_holm", "p"),
+        PageColumn("B-H", "p_accuracy_bh", "p"),
+        PageColumn("r, first less second", "r_difference", "interval"),
+        PageColumn("p", "p_r", "p"),
+        PageColumn("Holm", "p_r_holm", "p"),
+        PageColumn("B-H", "p_r_bh", "p"),
+    ]
     if rows["r_difference"].isna().all():
         columns = columns[:9]
     listing = rows_table(rows, columns)
@@ -80,10 +87,14 @@ def _mixed(model: MixedTable) -> str:
         term=fit.table["term"].str.replace(r"(\w+)\[T\.(.*)\]", r"\1: \2", regex=True)
     )
     columns = [
-        Column("term", "term", "text"), Column("b", "b", "interval", 3, "low", "high"),
-        Column("SE", "se", digits=3), Column("z", "z"), Column("t", "t"),
-        Column("df", "df", digits=1), Column("p", "p", "p"),
-    ]  # fmt: skip
+        PageColumn("term", "term", "text"),
+        PageColumn("b", "b", "interval", 3, "low", "high"),
+        PageColumn("SE", "se", digits=3),
+        PageColumn("z", "z"),
+        PageColumn("t", "t"),
+        PageColumn("df", "df", digits=1),
+        PageColumn("p", "p", "p"),
+    ]
     logistic = "z" in rows
     known = [c for c in columns if c.key in rows and not (logistic and c.key == "df")]
     spreads = ", ".join(
@@ -113,13 +124,16 @@ def calibration(inputs: ReportInputs) -> str:
     if rows is None:
         return ""
     columns = [
-        Column("model", "model", "text"), Column("stimuli", "stimuli", "count"),
-        Column("Brier", "brier", digits=3), Column("reliability", "reliability", digits=3),
-        Column("resolution", "resolution", digits=3),
-        Column("uncertainty", "uncertainty", digits=3),
-        Column("within bins", "within", digits=3), Column("skill", "skill", digits=3),
-        Column("calibration error", "calibration_error", digits=3),
-    ]  # fmt: skip
+        PageColumn("model", "model", "text"),
+        PageColumn("stimuli", "stimuli", "count"),
+        PageColumn("Brier", "brier", digits=3),
+        PageColumn("reliability", "reliability", digits=3),
+        PageColumn("resolution", "resolution", digits=3),
+        PageColumn("uncertainty", "uncertainty", digits=3),
+        PageColumn("within bins", "within", digits=3),
+        PageColumn("skill", "skill", digits=3),
+        PageColumn("calibration error", "calibration_error", digits=3),
+    ]
     words = (
         "Brier score = reliability − resolution + uncertainty + within bins (ten of equal width); "
         "skill is 1 − Brier / uncertainty, above 0 where a model beats the base rate"

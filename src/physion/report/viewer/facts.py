@@ -89,7 +89,7 @@ def legend(scene: Scene) -> list[dict[str, Any]]:
 def tables(trial: Trial) -> list[Table]:
     """Return tables of the scene, the settings and the outcome of a trial."""
     scene = trial.scene
-    found = [
+    result = [
         _bodies_table(scene),
         _cloths_table(scene),
         _pushes_table(scene),
@@ -98,7 +98,7 @@ def tables(trial: Trial) -> list[Table]:
         _table("Parameters of the scenario", None, _flat("", scene.parameters)),
         _stage_table(scene),
     ]
-    return [table for table in found if table["rows"]]
+    return [table for table in result if table["rows"]]
 
 
 def _table(title: str, header: Sequence[str] | None, rows: Iterable[Sequence[object]]) -> Table:
