@@ -20,20 +20,22 @@ from physion.rendering.rasterizer import (
     barycentric,
     rasterize,
 )
-from physion.rendering.rooms import rooms
-from physion.rendering.shading import (
+from physion.rendering.records import (
     CAMERA,
-    CORNER_OCCLUSION,
-    CORNER_RANGE,
-    FOOTPRINT,
     LIGHT,
     MATERIAL,
     POINT,
     SURFACE,
-    TONES,
-    WHITEST,
     LightMaps,
     ShadingInputs,
+)
+from physion.rendering.rooms import rooms
+from physion.rendering.shading import (
+    CORNER_OCCLUSION,
+    CORNER_RANGE,
+    FOOTPRINT,
+    TONES,
+    WHITEST,
     corner_occlusion,
     fresnel,
     highlight,

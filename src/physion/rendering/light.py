@@ -10,8 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 from physion.numerics.elementary import exp, power
 from physion.numerics.linear_algebra import apply, norm, unit
 from physion.rendering.depth_maps import BLOCK, DepthMap
+from physion.rendering.records import LIGHT, Records
 from physion.rendering.rooms import Room
-from physion.rendering.shading import LIGHT, TONES, WHITEST, Records
+from physion.rendering.shading import TONES, WHITEST
 from physion.scenes.scene import Scene
 
 F32 = NDArray[np.float32]
@@ -60,7 +61,7 @@ def empty_maps(scene: Scene, room: Room) -> tuple[StaticDepthMap, StaticDepthMap
 
 
 def pack_light(room: Room) -> Records:
-    """Return the light of a room as one record of `physion.rendering.shading.LIGHT`, (1,)."""
+    """Return the light of a room as one record of `physion.rendering.records.LIGHT`, (1,)."""
     light = np.zeros(1, LIGHT)
     light["direction"] = unit(room.light_direction)
     light["color"] = room.light_color

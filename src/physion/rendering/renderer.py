@@ -30,17 +30,16 @@ from physion.rendering.rasterizer import (
     rasterize,
     rasterize_depth,
 )
-from physion.rendering.rooms import Room, rooms
-from physion.rendering.shading import (
+from physion.rendering.records import (
     CAMERA,
     POINT,
     SURFACE,
     LightMaps,
     Records,
     ShadingInputs,
-    shade,
-    shade_static_points,
 )
+from physion.rendering.rooms import Room, rooms
+from physion.rendering.shading import shade, shade_static_points
 from physion.rendering.triangles import Assembly, assemble, pose_meshes
 from physion.scenes.scene import Scene
 

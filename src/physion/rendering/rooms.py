@@ -58,7 +58,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Room:
-    """Panels and light; colours of light are linear, see `physion.rendering.shading.LIGHT`.
+    """Panels and light; colours of light are linear, see `physion.rendering.records.LIGHT`.
 
     - ``panels``: the first one is the floor.
     - ``low``, ``high``: corners of the box that the walls, floor and ceiling make.

@@ -22,22 +22,21 @@ Heckbert, P. (1989). Fundamentals of texture mapping and image warping. MSc thes
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from physion.numerics.elementary import coarse_log2_of, exp_of
 from physion.numerics.kernel import kernel
-from physion.rendering.depth_maps import DepthMap, lit_fraction, occluded_fraction
+from physion.rendering.depth_maps import lit_fraction, occluded_fraction
 from physion.rendering.rasterizer import SAMPLES, barycentric
-from physion.rendering.textures.lookup import Atlas, mip_level, sample_texture
+from physion.rendering.records import LightMaps, Records, ShadingInputs
+from physion.rendering.textures.lookup import mip_level, sample_texture
 
-F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 U8 = NDArray[np.uint8]
-Records = NDArray[np.void]
 Vector = tuple[float, float, float]
 
 LN2 = 0.6931471805599453
@@ -58,7 +57,7 @@ METAL_DIFFUSE_LOST = 0.8
 ENVIRONMENT_SLOPE = 2.0
 """Reflections with a vertical component of 1 / this or more show the ceiling or the floor alone."""
 SIDES, BELOW, ABOVE = 0, 1, 2
-"""Rows of the environment in `LIGHT`."""
+"""Rows of the environment in `physion.rendering.records.LIGHT`."""
 WINDOW_BLUR = 0.25
 """Width in metres of the window's soft edge in a reflection right next to it."""
 WINDOW_BLUR_GROWTH = 0.12
@@ -75,113 +74,6 @@ texels of the map do not shadow their own surface (normal offset, Holbert 2011).
 LEVEL_COSINE = 0.5
 """Vertical component of the normal up to which objects near a surface do not occlude it."""
 
-CAMERA = np.dtype([("position", "f8", 3), ("rays", "f8", (3, 3))], align=True)
-"""The camera: its position in metres; the matrix from a pixel (x, y, 1) to the world vector from
-the camera to depth 1 m."""
-SURFACE = np.dtype(
-    [
-        ("normals", "f4", (3, 3)),
-        ("uv", "f4", (3, 2)),
-        ("tangents", "f4", (2, 3)),
-        ("material", "i4"),
-    ],
-    align=True,
-)
-"""A triangle.
-
-- ``normals``: normal of each corner in the world. ``uv``: texture coordinates of each corner.
-- ``tangents``: world directions of growing u and v.
-- ``material``: index of its `MATERIAL`.
-"""
-MATERIAL = np.dtype(
-    [
-        *(("color", "f8", 3), ("texture", "i8"), ("specular", "f8"), ("exponent", "f8")),
-        *(("reflectance", "f8"), ("metalness", "f8"), ("normal_scale", "f8")),
-        *(("emission", "f8"), ("occluded", "?")),
-    ],
-    align=True,
-)
-"""A surface material.
-
-- ``color``: linear colour; the albedo is its product with the texture. ``texture``: index into the
-  atlas.
-- ``specular``, ``exponent``: strength and exponent of the highlight.
-- ``reflectance``: fraction of the environment that is reflected seen straight on.
-- ``metalness``: 0 dielectric .. 1 metal, whose reflections have the colour of its albedo.
-- ``normal_scale``: factor of the texture's slopes in the normal map; 0 is without.
-- ``emission``: light of its own, as a multiple of the albedo.
-- ``occluded``: whether the room's walls darken it near the edges between them.
-"""
-LIGHT = np.dtype(
-    [
-        *(("direction", "f8", 3), ("color", "f8", 3)),
-        *(("ambient", "f8", 3), ("ambient_slopes", "f8", (3, 3)), ("environment", "f8", (3, 3))),
-        *(("window_low", "f8", 3), ("window_high", "f8", 3), ("window_color", "f8", 3)),
-        *(("room_low", "f8", 3), ("room_high", "f8", 3), ("background", "f8", 3)),
-        *(("shadow_strength", "f8"), ("occlusion_strength", "f8")),
-    ],
-    align=True,
-)
-"""Light of a room; colours are linear.
-
-- ``direction``: unit vector towards the directional light. ``color``: its colour.
-- ``ambient``, ``ambient_slopes``: the ambient light of a normal n is
-  ``ambient + n @ ambient_slopes``, so that walls differ.
-- ``environment``: what reflections show at the sides, below and above (rows).
-- ``window_low``, ``window_high``, ``window_color``: corners of a bright rectangle in a plane of one
-  y, which reflections show too, and its colour.
-- ``room_low``, ``room_high``: corners of the room, for ambient occlusion near its edges.
-- ``background``: colour where nothing is seen.
-- ``shadow_strength``: fraction of the directional light that a full shadow takes.
-- ``occlusion_strength``: fraction of all light that full occlusion under objects takes.
-"""
-POINT = np.dtype(
-    [
-        *(("position", "f4", 3), ("normal", "f4", 3)),
-        *(("ambient", "f4", 3), ("direct", "f4", 3), ("levelness", "f4")),
-    ],
-    align=True,
-)
-"""A surface point with its light before shadows.
-
-- ``position``: metres in the world. ``normal``: unit, before normal mapping.
-- ``ambient``: ambient light, environment and emission that the point sends.
-- ``direct``: the directional light that it sends if lit.
-- ``levelness``: 1 for a horizontal surface that faces up, 0 from 60 degrees on; the weight of the
-  occlusion under objects.
-"""
-
-
-class ShadingInputs(NamedTuple):
-    """Everything about a scene that is the same for all its pixels.
-
-    Numba counts references to each array that a kernel takes apart from a tuple, so the fields of
-    one kind stand side by side in an array of records.
-
-    - ``camera`` (1,) of `CAMERA`; ``lights`` (1,) of `LIGHT`; ``materials`` (M,) of `MATERIAL`.
-    - ``edges`` (T, 3, 3): edge functions of the triangles, written by `rasterize`.
-    - ``surfaces`` (T,) of `SURFACE`; ``groups`` (T,): triangles of one number make one smooth
-      surface and are shaded as one.
-    - ``atlas``: the textures.
-    - ``tones`` (TONES,) uint8: the sRGB bytes of linear light 0..`WHITEST`.
-    """
-
-    camera: Records
-    edges: F64
-    surfaces: Records
-    groups: I32
-    materials: Records
-    atlas: Atlas
-    lights: Records
-    tones: U8
-
-
-class LightMaps(NamedTuple):
-    """Depth maps of one frame: of the directional light, and of what hangs low over the ground."""
-
-    shadow: DepthMap
-    occlusion: DepthMap
-
 
 @kernel
 def _dot(a: Vector, b: Vector) -> float:
@@ -197,7 +89,7 @@ def _scaled(a: Vector, factor: float) -> Vector:
 
 @kernel
 def _pixel_ray(camera: Any, x: float, y: float) -> Vector:
-    """Return the world vector from a camera, a `CAMERA`, to depth 1 at a pixel."""
+    """Return the world vector from a camera record to depth 1 at a pixel."""
     rays = camera.rays
     return (
         rays[0, 0] * x + rays[0, 1] * y + rays[0, 2],
@@ -457,7 +349,7 @@ def shade_static_points(
 ) -> None:
     """Shade the centres of all pixels that show one of the first ``static`` triangles.
 
-    Entry i * W + j of ``points``, of `POINT`, is the pixel in row i and column j of
+    Entry i * W + j of ``points`` is the pixel in row i and column j of
     ``triangle_ids`` (H, W, S); the entries of other pixels stay as they are.
     """
     height, width, _ = triangle_ids.shape
@@ -490,7 +382,8 @@ def shade(
     inputs, maps
         The scene, and its depth maps in this frame.
     points
-        (H * W + 1,) of `POINT`, filled by `shade_static_points`. The last one is overwritten.
+        (H * W + 1,) of `physion.rendering.records.POINT`, filled by `shade_static_points`. The
+        last one is overwritten.
     colors
         (H, W, 3) uint8, written: sRGB.
     """
