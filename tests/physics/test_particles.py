@@ -93,7 +93,7 @@ def test_bad_arguments_say_so() -> None:
         sample_particles("cubes", (1.0, 1.0, 1.0))
     with pytest.raises(BadInputError, match="above 0"):
         sample_particles("cube", (1.0, 1.0, 1.0), 0.0)
-    with pytest.raises(BadInputError, match="widen"):
+    with pytest.raises(BadInputError, match="use a larger one"):
         sample_particles("cube", (1.0, 1.0, 1.0), 0.001)
 
 

@@ -1,11 +1,11 @@
-"""Sine, exponential, logarithm and their relatives, equal to the bit on every processor.
+"""Elementary functions (sine, exponential, logarithm, ...), with the same bits on every processor.
 
 IEEE 754 fixes the result of +, -, *, / and square root, but not of these functions: the C library
 and numpy choose other algorithms, with other last bits, on other processors. Here each function is
 a fixed sequence of those five operations: the argument is reduced to a short interval, and a Taylor
 series of fixed length is summed there by Horner's rule (J.-M. Muller, "Elementary Functions", 3rd
 edition, 2016). Sine, cosine, exponential and logarithm lie within 2 units in the last place of the
-true value, the others within 6; of `power` see there.
+true value, the others within 6; see `power_of` for powers.
 
 Kernels call the scalar functions (``sin_of``, ...); everyone else calls ``sin``, ..., which take
 numbers or arrays of any shape and return float64.
@@ -32,13 +32,13 @@ less than 2**20 is exact (reduction of Cody and Waite)."""
 LARGEST_ANGLE = 1.6e6
 """Radians up to which sine, cosine and tangent are computed; beyond, they are NaN."""
 LN2_HIGH, LN2_LOW = float.fromhex("0x1.62e42feep-1"), float.fromhex("0x1.a39ef35793c76p-33")
-"""The logarithm of 2; a multiple of the first by less than 2**21 is exact."""
+"""ln 2 as the sum of two doubles; a multiple of the first by less than 2**21 is exact."""
 LOG2_E = 1.4426950408889634
 LARGEST_EXPONENT, SMALLEST_EXPONENT = 709.782712893384, -745.1332191019412
 """Arguments beyond which the exponential overflows to infinity, or vanishes."""
 POWERS_BELOW = 540
 POWERS_OF_2 = np.array([2.0**k for k in range(-POWERS_BELOW, POWERS_BELOW + 1)])
-"""Exact powers; that of k stands at k + `POWERS_BELOW`."""
+"""Exact powers of 2; 2**k has the index k + `POWERS_BELOW`."""
 ROOT_HALF = 0.7071067811865476
 ARCTAN_EIGHTHS = np.array(
     [
@@ -57,7 +57,7 @@ ARCTAN_EIGHTHS = np.array(
 
 
 SINE = tuple((-1) ** k / math.factorial(2 * k + 1) for k in range(8, 0, -1))
-"""Coefficients of x^17, x^15, ..., x^3 of the sine; the term left out is below 1e-19."""
+"""Coefficients of x^17, x^15, ..., x^3 of the sine; the first term omitted is below 1e-19."""
 COSINE = tuple((-1) ** k / math.factorial(2 * k) for k in range(9, 1, -1))
 """Coefficients of x^18, x^16, ..., x^4 of the cosine."""
 EXPONENTIAL = tuple(1.0 / math.factorial(k) for k in range(14, 1, -1))
@@ -65,15 +65,15 @@ EXPONENTIAL = tuple(1.0 / math.factorial(k) for k in range(14, 1, -1))
 LOGARITHM = tuple(1.0 / (2 * k + 1) for k in range(11, 0, -1))
 """Coefficients of s^22, s^20, ..., s^2 of log((1 + s) / (1 - s)) / (2 s)."""
 COARSE_LOGARITHM = (-0.04514903, 0.14842661, -0.26717939, 0.44191704)
-"""Coefficients of t^3, ..., 1 of (log2(1 + t) - t) / (t (1 - t)) for 0 <= t <= 1: such that the
-largest error of log2(1 + t) is least."""
+"""Coefficients of t^3, ..., 1 of (log2(1 + t) - t) / (t (1 - t)) for 0 <= t <= 1: chosen so
+that the largest error of log2(1 + t) is smallest."""
 ARCTANGENT = tuple((-1) ** k / (2 * k + 1) for k in range(7, 0, -1))
 """Coefficients of t^15, t^13, ..., t^3 of the arc tangent."""
 
 
 @kernel
 def _horner(coefficients: tuple[float, ...], z: float) -> float:
-    """The polynomial with these coefficients, highest power first, at ``z``."""
+    """Return the value at ``z`` of a polynomial, given by its coefficients, highest power first."""
     total = 0.0
     for coefficient in coefficients:
         total = total * z + coefficient
@@ -95,24 +95,24 @@ def _quarter_turns(angle: float) -> tuple[int, float, float]:
 
 @kernel
 def _sine_of_rest(x: float, tail: float) -> float:
-    """sin(x + tail) = x - x^3/3! + x^5/5! - ... + tail cos(x), for |x| <= pi / 4."""
+    """Return sin(x + tail) = x - x^3/3! + x^5/5! - ... + tail cos(x), for |x| <= pi / 4."""
     z = x * x
     return x + (x * z * _horner(SINE, z) + tail * (1.0 - 0.5 * z))
 
 
 @kernel
 def _cosine_of_rest(x: float, tail: float) -> float:
-    """cos(x + tail) = 1 - x^2/2! + x^4/4! - ... - tail sin(x), for |x| <= pi / 4."""
+    """Return cos(x + tail) = 1 - x^2/2! + x^4/4! - ... - tail sin(x), for |x| <= pi / 4."""
     z = x * x
     half = 0.5 * z
     one = 1.0 - half
-    # What 1 - half lost by rounding is given back.
+    # (1 - one) - half is the rounding error of 1 - half.
     return one + (((1.0 - one) - half) + (z * z * _horner(COSINE, z) - x * tail))
 
 
 @kernel
 def sin_of(angle: float) -> float:
-    """Sine of an angle in radians; NaN beyond `LARGEST_ANGLE`."""
+    """Return the sine of an angle in radians; NaN beyond `LARGEST_ANGLE`."""
     if not abs(angle) <= LARGEST_ANGLE:
         return np.nan
     n, rest, tail = _quarter_turns(angle)
@@ -122,7 +122,7 @@ def sin_of(angle: float) -> float:
 
 @kernel
 def cos_of(angle: float) -> float:
-    """Cosine of an angle in radians; NaN beyond `LARGEST_ANGLE`."""
+    """Return the cosine of an angle in radians; NaN beyond `LARGEST_ANGLE`."""
     if not abs(angle) <= LARGEST_ANGLE:
         return np.nan
     n, rest, tail = _quarter_turns(angle)
@@ -132,13 +132,13 @@ def cos_of(angle: float) -> float:
 
 @kernel
 def tan_of(angle: float) -> float:
-    """Tangent of an angle in radians; NaN beyond `LARGEST_ANGLE`."""
+    """Return the tangent of an angle in radians; NaN beyond `LARGEST_ANGLE`."""
     return sin_of(angle) / cos_of(angle)
 
 
 @kernel
 def arctan_of(x: float) -> float:
-    """Arc tangent in radians, -pi/2 to pi/2.
+    """Return the arc tangent in radians, -pi/2 to pi/2.
 
     atan x = pi/2 - atan(1/x) for x > 1; atan x = atan c + atan((x - c) / (1 + x c)) with c the
     nearest eighth; then t - t^3/3 + t^5/5 - ... for |t| <= 1/16.
@@ -161,7 +161,7 @@ def arctan_of(x: float) -> float:
 
 @kernel
 def arctan2_of(y: float, x: float) -> float:
-    """Angle in radians, -pi to pi, of the vector (x, y) to the x axis; 0 for the zero vector."""
+    """Return the angle in radians, -pi to pi, of (x, y) to the x axis; 0 for the zero vector."""
     if np.isnan(x) or np.isnan(y):
         return np.nan
     if x == 0.0 and y == 0.0:
@@ -177,19 +177,19 @@ def arctan2_of(y: float, x: float) -> float:
 
 @kernel
 def arcsin_of(x: float) -> float:
-    """Arc sine in radians, -pi/2 to pi/2; NaN outside -1..1."""
+    """Return the arc sine in radians, -pi/2 to pi/2; NaN outside -1..1."""
     return arctan2_of(x, np.sqrt((1.0 - x) * (1.0 + x)))
 
 
 @kernel
 def arccos_of(x: float) -> float:
-    """Arc cosine in radians, 0 to pi; NaN outside -1..1."""
+    """Return the arc cosine in radians, 0 to pi; NaN outside -1..1."""
     return arctan2_of(np.sqrt((1.0 - x) * (1.0 + x)), x)
 
 
 @kernel
 def exp_of(x: float) -> float:
-    """The exponential function.
+    """Return the exponential function.
 
     exp x = 2^k exp r with k = round(x / ln 2) and |r| <= ln(2) / 2; then 1 + r + r^2/2! + ...
     """
@@ -212,7 +212,7 @@ def exp_of(x: float) -> float:
 
 @kernel
 def log_of(x: float) -> float:
-    """The natural logarithm; -infinity at 0, NaN below.
+    """Return the natural logarithm; -infinity at 0, NaN below.
 
     log x = e ln 2 + log m with sqrt(1/2) <= m < sqrt(2); log m = 2 (s + s^3/3 + s^5/5 + ...) with
     s = (m - 1) / (m + 1).
@@ -235,7 +235,7 @@ def log_of(x: float) -> float:
 
 @kernel
 def coarse_log2_of(x: float) -> float:
-    """The logarithm to base 2 of a positive number, cheaper than `log_of` but only to 2e-5.
+    """Return the logarithm to base 2 of a positive number, faster than `log_of`, within 2e-5.
 
     It is exact at powers of 2, and continuous.
     """
@@ -246,7 +246,7 @@ def coarse_log2_of(x: float) -> float:
 
 @kernel
 def tanh_of(x: float) -> float:
-    """The hyperbolic tangent, (e^2x - 1) / (e^2x + 1)."""
+    """Return the hyperbolic tangent, (e^2x - 1) / (e^2x + 1)."""
     size = abs(x)
     if size > 20.0:
         value = 1.0

@@ -1,4 +1,4 @@
-"""The inverse Fourier transform of real pictures, equal on every processor.
+"""Inverse Fourier transform of real images, with the same bytes on every processor.
 
 Libraries take the roots of unity from the C library and choose the order of sums by processor.
 """
@@ -17,7 +17,7 @@ C128 = NDArray[np.complex128]
 
 
 def inverse_real_transform(spectrum: C128) -> NDArray[np.float64]:
-    """Return the real picture (N, N) whose half spectrum is ``spectrum`` (N, N / 2 + 1).
+    """Return the real image (N, N) whose half spectrum is ``spectrum`` (N, N / 2 + 1).
 
     The convention is that of `numpy.fft.irfft2`; N is a power of 2.
 
@@ -43,15 +43,24 @@ def inverse_real_transform(spectrum: C128) -> NDArray[np.float64]:
 
 @kernel
 def _transform_rows(rows: C128, roots: C128) -> None:
-    """Replace every row (N,) by its unscaled inverse transform: Cooley and Tukey (1965), radix 2.
+    """Replace every row (N,) by its unscaled inverse transform.
 
-    ``roots`` (N / 2,) are exp(2 pi i k / N). Complex products are written out, since compilers may
-    evaluate them in more than one way.
+    Parameters
+    ----------
+    rows : (M, N)
+        Changed in place; N is a power of 2.
+    roots : (N / 2,)
+        exp(2 pi i k / N) for k = 0, 1, ...
+
+    Notes
+    -----
+    The algorithm is that of Cooley and Tukey (1965), radix 2. Complex products are written out,
+    because compilers may evaluate them in more than one way.
     """
     side = rows.shape[1]
     for r in range(len(rows)):
         row = rows[r]
-        # Put every entry at the place whose binary digits are its own in reverse.
+        # Bit reversal: swap every entry with the one whose index has its binary digits reversed.
         j = 0
         for i in range(1, side):
             bit = side >> 1

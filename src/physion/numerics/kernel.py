@@ -1,4 +1,4 @@
-"""How the numerical loops of this package are compiled."""
+"""Decorator that compiles the numerical loops of this package."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def kernel(function: Function) -> Function:
 def _files_called(
     function: Callable[..., Any], seen: frozenset[str] = frozenset()
 ) -> Iterator[str]:
-    """Files of all compiled functions that ``function`` calls, directly or through others."""
+    """Yield the files of all compiled functions that ``function`` calls, directly or indirectly."""
     for name in function.__code__.co_names:
         called = function.__globals__.get(name)
         if isinstance(called, Dispatcher) and called.py_func.__qualname__ not in seen:
@@ -47,4 +47,5 @@ def _files_called(
 
 @cache
 def _digest(file: str) -> str:
+    """Return the SHA-256 of a file."""
     return hashlib.sha256(Path(file).read_bytes()).hexdigest()

@@ -15,7 +15,7 @@ from physion.numerics.kernel import kernel
 
 F64 = NDArray[np.float64]
 SHORT = 8
-"""Entries up to which a loop over them is faster than running sums."""
+"""Length of an axis up to which a loop over it is faster than `numpy.add.accumulate`."""
 
 
 def ordered_sum(values: ArrayLike, axis: int = -1) -> F64:

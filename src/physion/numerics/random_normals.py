@@ -1,8 +1,8 @@
-"""Normally distributed numbers from numpy's generators, equal on every processor.
+"""Normally distributed random numbers, with the same bytes on every processor.
 
 `numpy.random.Generator.normal` takes its tails from the C library's logarithm and exponential.
-Here uniform numbers, which are made from integers alone, go through the transform of Box and
-Muller (1958): sqrt(-2 ln u) cos(2 pi v) and sqrt(-2 ln u) sin(2 pi v).
+Here uniform numbers, which depend on integers alone, are transformed as in Box and Muller (1958):
+sqrt(-2 ln u) cos(2 pi v) and sqrt(-2 ln u) sin(2 pi v).
 """
 
 from __future__ import annotations

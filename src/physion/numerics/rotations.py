@@ -1,6 +1,7 @@
-"""Rotations as unit quaternions (w, x, y, z) and as matrices: the one place for both.
+"""Rotations as unit quaternions (w, x, y, z) and as matrices.
 
-A rotation takes vectors in the frame of a body to the world. Products apply the right factor first.
+A rotation takes vectors from the frame of a body to the world. Products apply the right factor
+first.
 """
 
 from __future__ import annotations
@@ -53,6 +54,7 @@ def rotate_vector(q: Any, v: Any) -> Any:
 
 @kernel
 def _fill_matrices(q: Any, out: Any) -> None:
+    """Fill ``out`` (N, 3, 3) with the matrices of unit quaternions ``q`` (N, 4)."""
     for i in range(len(q)):
         out[i] = rotation_matrix(q[i])
 
@@ -81,7 +83,7 @@ def multiply_quaternions(a: ArrayLike, b: ArrayLike) -> F64:
 
 
 def conjugate(q: ArrayLike) -> F64:
-    """Return the opposite rotations (..., 4) of unit quaternions (..., 4)."""
+    """Return the inverse rotations (..., 4) of unit quaternions (..., 4)."""
     return np.asarray(np.asarray(q, np.float64) * np.array([1.0, -1.0, -1.0, -1.0]))
 
 

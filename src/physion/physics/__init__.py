@@ -1,1 +1,1 @@
-"""How a scene moves."""
+"""Simulation: a scene becomes a trajectory, a trajectory labels."""

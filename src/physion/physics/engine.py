@@ -1,4 +1,4 @@
-"""What an engine is: something that turns a scene into a trajectory."""
+"""Interface of engines, their registry, and `simulate`, which runs the default one."""
 
 from __future__ import annotations
 
@@ -10,11 +10,14 @@ from physion.scenes.scene import Scene
 
 
 class Engine(Protocol):
-    """Simulates scenes. The same scene gives the same bytes in any process and thread count."""
+    """Simulator of scenes.
+
+    The same scene gives the same bytes in every process and with any number of threads.
+    """
 
     @property
     def name(self) -> str:
-        """Name and version of the engine and of its settings, as stored with every trial."""
+        """Return name and version of the engine and its settings, as stored with every trial."""
         ...
 
     def simulate(
@@ -25,12 +28,20 @@ class Engine(Protocol):
         frames: int | None = None,
         until_contact: bool = False,
     ) -> Trajectory:
-        """Move ``scene`` until it ends.
+        """Simulate ``scene`` until it ends.
 
-        With ``start`` the motion goes on from that instant: frame 0 of the result is ``start``,
-        and pushes at later frames of the trial still come. ``frames`` replaces the scene's own
-        ending by a fixed number of frames, frame 0 counted. ``until_contact`` lets the engine
-        stop after the first frame in which agent and patient touch: the label is then known.
+        Parameters
+        ----------
+        scene : Scene
+            Bodies, cloths, joints, pushes and ending.
+        start : State, optional
+            Continue from this instant: it is frame 0 of the result, and pushes at later frames of
+            the trial still take place.
+        frames : int, optional
+            Number of frames, frame 0 included, in place of the scene's own ending.
+        until_contact : bool
+            Allow the engine to stop after the first frame in which agent and patient touch: the
+            label is then known.
         """
         ...
 
@@ -46,7 +57,10 @@ def simulate(
     frames: int | None = None,
     until_contact: bool = False,
 ) -> Trajectory:
-    """Simulate with ``engine``, or with MuJoCo in its default settings."""
+    """Simulate a scene with ``engine``, by default `RigidEngine` with its default settings.
+
+    See `Engine.simulate` for the other parameters.
+    """
     chosen = engine if engine is not None else engines.get("mujoco")()
     return chosen.simulate(  # type: ignore[no-any-return]
         scene, start=start, frames=frames, until_contact=until_contact

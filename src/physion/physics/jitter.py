@@ -1,4 +1,4 @@
-"""The same scene again, a hair's breadth elsewhere: how far is its outcome a matter of luck?"""
+"""Perturb the initial positions of a scene slightly, to test whether its outcome is robust."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from physion.numerics.random_normals import standard_normal
 from physion.scenes.scene import Scene, Vec3
 
 
-def jitter_scene(scene: Scene, distance: float, generator: np.random.Generator) -> Scene:
-    """Move every body that can move, and every cloth, sideways by normal noise.
+def jitter_scene(scene: Scene, distance: float, rng: np.random.Generator) -> Scene:
+    """Return the scene with movable bodies and cloths shifted horizontally by normal noise.
 
-    ``distance`` is the standard deviation in metres along x and along y. Bodies that a joint
-    holds together move together, and a push moves with its body.
+    ``distance`` is the standard deviation in metres along x and along y. Joined bodies are shifted
+    together, and the point of a push with its body.
     """
     leaders = {joint.child: joint.parent for joint in scene.joints}
     moving = [body.name for body in scene.bodies if not (body.kinematic or body.scenery)]
     moving += [cloth.name for cloth in scene.cloths]
-    draws = (distance * standard_normal(generator, (len(moving), 2))).tolist()
+    draws = (distance * standard_normal(rng, (len(moving), 2))).tolist()
     shifts = {name: (x, y, 0.0) for name, (x, y) in zip(moving, draws, strict=True)}
 
     def moved(name: str, position: Vec3) -> Vec3:
-        passed = {name}
-        # Joints may close a ring; then whoever comes first leads it.
-        while name in leaders and leaders[name] not in passed:
+        visited = {name}
+        # Joints may close a ring: stop before a body is met again.
+        while name in leaders and leaders[name] not in visited:
             name = leaders[name]
-            passed.add(name)
+            visited.add(name)
         dx, dy, dz = shifts.get(name, (0.0, 0.0, 0.0))
         return (position[0] + dx, position[1] + dy, position[2] + dz)
 
@@ -42,9 +42,10 @@ def jitter_scene(scene: Scene, distance: float, generator: np.random.Generator) 
 
 
 def pair_agreement(outcomes: np.ndarray) -> float:
-    """Chance that two different runs of one scene agree; ``outcomes`` is (runs,) of bool.
+    """Return the probability that two different runs of one scene have the same outcome.
 
-    NaN for fewer than two runs.
+    ``outcomes`` (R,) are bool, one for each run; NaN for fewer than two. With h of R runs True
+    it is (h (h - 1) + (R - h) (R - h - 1)) / (R (R - 1)).
     """
     runs, hits = len(outcomes), int(np.count_nonzero(outcomes))
     if runs < 2:

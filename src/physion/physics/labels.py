@@ -1,4 +1,4 @@
-"""The answer to the question of every trial: does the agent touch the patient?"""
+"""Labels of a trial: whether and when agent and patient touch."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from physion.scenes.scene import OBSERVED_FRAMES, Scene
 CLOTH_CONTACT_GAP = -0.0055
 """Metres between cloth and patient below which they touch, for every cloth trial alike.
 
-A gap of 0 is a touch without load: the cloth's felt thickness (`ClothSettings.rest_distance`) just
-reaches the patient. The official label is true when particles come closer than about 0.1222 m, 2.8
-mm less than the distance at which they rest: it asks whether the cloth presses on the patient, not
-whether it lies there. Our cushion is softer; 5.5 mm separates the official outcomes best.
+At a gap of 0 the rest distance of the particles (`ClothSettings.rest_distance`) just reaches the
+patient. The official label is true when particles come closer than about 0.1222 m, 2.8 mm less than
+the distance at which they rest: it asks whether the cloth presses on the patient, not whether it
+lies there. Our contacts are softer; 5.5 mm separates the official outcomes best.
 """
 
 
 @dataclass(frozen=True)
 class Labels:
-    """What happened between agent and patient.
+    """Contact between agent and patient in one trial.
 
     - ``contact``: they touch in some frame of the trial.
     - ``first_frame``: the first such frame, None without contact.
-    - ``observed``: they touch already inside the observed frames, so nothing is left to predict.
+    - ``observed``: they touch within the observed frames, so that nothing is left to predict.
     - ``min_distance``: smallest gap between cloth and patient in metres, None without cloth.
-    - ``robust``: share of jittered simulations with the same outcome, None if not measured.
+    - ``robust``: fraction of jittered simulations with the same outcome, None if not measured.
     """
 
     contact: bool
@@ -38,7 +38,11 @@ class Labels:
 
 
 def contact_frames(scene: Scene, trajectory: Trajectory) -> Ints:
-    """Sorted frames in which agent and patient touch: by contacts, or by the gap of the cloth."""
+    """Return the sorted frames in which agent and patient touch.
+
+    Between bodies, those with a contact; between a cloth and a body, those with a gap below
+    `CLOTH_CONTACT_GAP`.
+    """
     agent, patient = scene.index(scene.roles.agent), scene.index(scene.roles.patient)
     if max(agent, patient) < len(scene.bodies):
         return trajectory.contacts.frames_of(agent, patient)
@@ -46,7 +50,7 @@ def contact_frames(scene: Scene, trajectory: Trajectory) -> Ints:
 
 
 def label_contact(scene: Scene, trajectory: Trajectory) -> Labels:
-    """Label a trajectory by its contacts; by one physical gap where agent or patient is cloth."""
+    """Return the labels of a trajectory, from its `contact_frames`."""
     frames = contact_frames(scene, trajectory)
     agent, patient = scene.index(scene.roles.agent), scene.index(scene.roles.patient)
     gaps = trajectory.cloth_distance

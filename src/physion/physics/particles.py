@@ -1,7 +1,8 @@
-"""Bodies as clouds of particles, the way particle models see them.
+"""Sample bodies as particles, the input of particle-based models.
 
-Unlike `physion.physics.cloth.solids`, which packs the collision pieces as NVIDIA Flex does, this
-fills the drawn solid: bowls, tori, pipes and vases keep their hollows, and thin walls stay closed.
+Particles fill the drawn solid, so that bowls, tori, pipes and vases keep their hollows and thin
+walls stay closed. `physion.physics.cloth.solids` fills the collision pieces instead, as NVIDIA Flex
+does.
 """
 
 from __future__ import annotations
@@ -26,14 +27,14 @@ from physion.seeds import child_generator, named_seed
 SPACING, CLOTH_SPACING = 0.05, 0.035
 """Metres between particles, and those of scenes with cloth (docs/official-system.md, section 6)."""
 LIMIT = 3000
-"""Most particles of one object (docs/official-system.md, section 6)."""
+"""Largest number of particles of one object (docs/official-system.md, section 6)."""
 FINE = 4
-"""Each particle's cube is cut into this many cells a side to see how full it is."""
+"""Cells a side into which the cube of each particle is divided, to measure how full it is."""
 REACH = 1.12
-"""Spacings from any matter to the nearest particle, measured on cells: what sticks out of a full
-cube by less than half a cube is nearer than that."""
+"""Largest distance, in spacings, from a solid cell to the nearest particle. What extends beyond a
+full cube by less than half a cube is closer than that."""
 MAX_LATTICE = 2**21
-"""Most lattice points of one object, filled or not: 128 times as many cells fit into memory."""
+"""Largest number of lattice points of one object, filled or not: its cells must fit in memory."""
 
 Floats = NDArray[np.float32]
 Filled = NDArray[np.bool_]
@@ -44,8 +45,8 @@ class Particles:
     """Particles of a scene over time. T frames, P particles.
 
     - ``positions`` (T, P, 3): metres, world.
-    - ``things`` (P,): which of `Scene.names` a particle belongs to; each has its rows together.
-    - ``frames`` (T,): frames of the trial that the rows show.
+    - ``things`` (P,): index in `Scene.names` of the object of each particle, in blocks.
+    - ``frames`` (T,): frame of the trial of each row.
     """
 
     positions: Floats
@@ -54,22 +55,40 @@ class Particles:
 
 
 def default_spacing(scene: Scene) -> float:
-    """Metres between particles that the original study's particle models used for such a scene."""
+    """Return the particle spacing in metres that the original study used for such a scene."""
     return CLOTH_SPACING if scene.cloths else SPACING
 
 
 def sample_particles(
     shape_name: str, scale: Vec3, spacing: float = SPACING, limit: int | None = LIMIT
 ) -> Floats:
-    """Fill a shape with particles (P, 3): metres in the body's frame, scaled, pose not applied.
+    """Return particles (P, 3) that fill a shape: metres in the body's frame, pose not applied.
 
+    The same arguments give the same particles.
+
+    Parameters
+    ----------
+    shape_name, scale
+        Shape and its factors along x, y, z.
+    spacing : float
+        Metres between particles.
+    limit : int or None
+        Largest number of particles; a body with more keeps that many, drawn without replacement.
+        None keeps all.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such shape.
+    BadInputError
+        If the spacing is not above 0, or too small for the body.
+
+    Notes
+    -----
     Particles lie on a cubic lattice that is centred in the bounds. A lattice point is filled where
-    at least half of its cube is solid, so that volume is kept where bodies are thick; where matter
-    would still be far (`REACH`) from every particle, the fullest cubes are filled, so that thin
-    walls stay closed. Bodies with more than ``limit`` particles (None for all) keep that many,
-    drawn without replacement; the same arguments give the same particles. Raises
-    `UnknownNameError` for a shape that does not exist, and `BadInputError` for a spacing that is
-    not above zero or too fine for the body.
+    at least half of its cube is solid, so that volume is kept where bodies are thick. Where a solid
+    cell would still be farther than `REACH` from every particle, the fullest cubes are filled too,
+    so that thin walls stay closed.
     """
     if not spacing > 0:
         raise BadInputError(f"particle spacing {spacing} is not above 0 metres")
@@ -89,23 +108,33 @@ def particles_over_time(
     frames: Sequence[int] | None = None,
     limit: int | None = LIMIT,
 ) -> Particles:
-    """Particles of all bodies moved by their poses, then every cloth's vertices.
+    """Return the particles of all bodies at their poses, followed by the vertices of all cloths.
 
-    ``spacing`` is by default the study's (`default_spacing`), ``frames`` all of them; see
-    `sample_particles` for ``limit``. Scenery takes no part in the motion and is left out.
+    Scenery is left out, as it does not collide.
+
+    Parameters
+    ----------
+    scene, trajectory
+        Bodies, and their motion.
+    spacing : float, optional
+        Metres; by default that of the original study (`default_spacing`).
+    frames : sequence of int, optional
+        Frames to return; by default all. `BadInputError` for others than those of the trajectory.
+    limit : int or None
+        See `sample_particles`.
     """
     wanted = np.arange(len(trajectory)) if frames is None else np.asarray(frames, np.int64)
     if wanted.size and not (wanted.min() >= 0 and wanted.max() < len(trajectory)):
-        raise BadInputError(f"frames {wanted.tolist()} leave 0..{len(trajectory) - 1}")
+        raise BadInputError(f"frames {wanted.tolist()} are not within 0..{len(trajectory) - 1}")
     clouds, things = [], []
     for index, body in enumerate(scene.bodies):
         if body.scenery:
             continue
         step = default_spacing(scene) if spacing is None else spacing
         points = sample_particles(body.shape, body.scale, step, limit).astype(np.float64)
-        turns = trajectory.rotations[wanted, index].astype(np.float64)
-        turned = rotate_vectors(turns[:, None], points[None])
-        clouds.append(turned + trajectory.positions[wanted, index, None])
+        rotations = trajectory.rotations[wanted, index].astype(np.float64)
+        rotated = rotate_vectors(rotations[:, None], points[None])
+        clouds.append(rotated + trajectory.positions[wanted, index, None])
         things.append(np.full(len(points), index, np.int32))
     clouds.append(trajectory.cloth_vertices[wanted].astype(np.float64))
     things += [
@@ -118,6 +147,7 @@ def particles_over_time(
 
 @lru_cache(maxsize=256)
 def _fill(shape_name: str, scale: Vec3, spacing: float) -> Floats:
+    """Return all particles (P, 3) of a shape, without limit."""
     mesh = shape(shape_name).mesh.moved(scale)
     low, high = mesh.bounds
     # Rounded, so that on average the cubes fill the bounds; points stay inside them.
@@ -125,7 +155,7 @@ def _fill(shape_name: str, scale: Vec3, spacing: float) -> Floats:
     if math.prod(counts) > MAX_LATTICE:
         raise BadInputError(
             f"{shape_name!r} of {np.round(high - low, 3).tolist()} m needs {math.prod(counts):.0f} "
-            f"lattice points at a spacing of {spacing} m; at most {MAX_LATTICE}: widen it"
+            f"lattice points at a spacing of {spacing} m; at most {MAX_LATTICE}: use a larger one"
         )
     sizes = counts.astype(int)
     corner = (low + high) / 2 - sizes * spacing / 2
@@ -138,27 +168,28 @@ def _fill(shape_name: str, scale: Vec3, spacing: float) -> Floats:
 
 
 def _by_cube(fine: Filled) -> Filled:
-    """Cells of a grid, gathered by the particle's cube that they lie in: (I, J, K, cells)."""
+    """Return the cells of a grid grouped by the cube of each particle, (I, J, K, cells)."""
     i, j, k = (count // FINE for count in fine.shape)
     return fine.reshape(i, FINE, j, FINE, k, FINE).transpose(0, 2, 4, 1, 3, 5).reshape(i, j, k, -1)
 
 
 def _close_thin(solid: Filled, matter: Filled) -> Filled:
-    """Which cubes to fill, from their cells (I, J, K, cells).
+    """Return which cubes (I, J, K) to fill, from their cells (I, J, K, cells).
 
-    ``solid`` cells have their centre inside; ``matter`` also holds those that a surface crosses,
-    as walls thinner than a cell may miss all centres.
+    ``solid`` cells have their centre inside; ``matter`` also includes those that a surface crosses,
+    because walls thinner than a cell may miss all centres.
     """
-    share = np.count_nonzero(solid, axis=-1) / solid.shape[-1]
-    filled = np.pad(share >= 0.5, 1)
+    solid_fraction = np.count_nonzero(solid, axis=-1) / solid.shape[-1]
+    filled = np.pad(solid_fraction >= 0.5, 1)
     offsets = (np.indices((FINE,) * 3).reshape(3, -1).T + 0.5) / FINE - 0.5
     near = np.indices((3, 3, 3)).reshape(3, -1).T - 1
     covers = norm(offsets[:, None] - near) <= REACH
-    thin = np.argwhere(matter.any(axis=-1) & (share < 0.5))
-    fullness = (share + np.count_nonzero(matter, axis=-1) / matter.shape[-1])[tuple(thin.T)]
+    thin = np.argwhere(matter.any(axis=-1) & (solid_fraction < 0.5))
+    matter_fraction = np.count_nonzero(matter, axis=-1) / matter.shape[-1]
+    fullness = (solid_fraction + matter_fraction)[tuple(thin.T)]
     for i, j, k in thin[np.argsort(-fullness, kind="stable")]:
-        around = filled[i : i + 3, j : j + 3, k : k + 3].ravel()
-        if not covers[matter[i, j, k]][:, around].any(axis=1).all():
+        neighbours = filled[i : i + 3, j : j + 3, k : k + 3].ravel()
+        if not covers[matter[i, j, k]][:, neighbours].any(axis=1).all():
             filled[i + 1, j + 1, k + 1] = True
     return np.asarray(filled[1:-1, 1:-1, 1:-1])
 
@@ -166,7 +197,7 @@ def _close_thin(solid: Filled, matter: Filled) -> Filled:
 def _surface_cells(
     mesh: Mesh, corner: NDArray[np.float64], counts: tuple[int, int, int], size: float
 ) -> Filled:
-    """Which cells of a grid (see `inside_cells`) the surface passes through, by points on it."""
+    """Return the cells of a grid (see `inside_cells`) that the surface passes through."""
     cells = np.zeros(counts, np.bool_)
     points = (mesh.vertices - corner) / size
     for a, b, c in points[mesh.faces]:
@@ -181,14 +212,29 @@ def _surface_cells(
 def inside_cells(
     mesh: Mesh, corner: NDArray[np.float64], counts: tuple[int, int, int], size: float
 ) -> Filled:
-    """Which cells of a grid have their centre inside a closed mesh; parts of it may overlap.
+    """Return which cells of a grid have their centre inside a closed mesh.
 
-    ``counts`` cells of ``size`` metres along each axis, from ``corner`` on. A cell is inside where
-    the faces above it, up minus down, do not cancel: its winding number is above zero.
+    Parts of the mesh may overlap.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Closed, with outward faces.
+    corner : (3,)
+        Lowest corner of the grid, metres.
+    counts : (int, int, int)
+        Cells along x, y, z.
+    size : float
+        Metres a side of a cell.
+
+    Notes
+    -----
+    A centre is inside where the faces above it that face up outnumber those that face down, that
+    is where its winding number is above 0.
     """
     nx, ny, nz = counts
     changes = np.zeros((nx, ny, nz + 1), np.int32)
-    # In cells; the odd shift keeps columns off the corners and edges of well-made shapes.
+    # In units of cells; the shift keeps columns off the corners and edges of regular shapes.
     points = (mesh.vertices - corner) / size - 0.5 + np.array([1.1e-6, 1.7e-6, 0.0])
     for face in mesh.faces:
         a, b, c = points[face]
@@ -222,9 +268,9 @@ def _edge(
     x: NDArray[np.int64],
     y: NDArray[np.int64],
 ) -> NDArray[np.float64]:
-    """How far left of the edge from corner ``p`` to ``q`` the columns lie, times its length.
+    """Return the signed distance of columns from the edge p-q, times its length; left is positive.
 
-    Computed in one order of the corners, so that both faces of an edge get the same number.
+    It is computed in one order of the corners, so that both faces of an edge get the same number.
     """
     first, last, sign = (p, q, 1.0) if p < q else (q, p, -1.0)
     (ax, ay, _), (bx, by, _) = points[first], points[last]

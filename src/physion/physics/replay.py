@@ -1,4 +1,4 @@
-"""Official scenes simulated again: how often does our outcome equal the recorded one?"""
+"""Simulate official scenes again and compare the outcomes with the recorded ones."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from physion.seeds import child_generator, trial_seed
 
 @dataclass(frozen=True)
 class ReplayTask:
-    """One trial to replay, ``repeats`` more times with ``jitter`` metres of sideways noise."""
+    """One trial to replay, and ``repeats`` runs with ``jitter`` metres of horizontal noise."""
 
     trial: ImportedTrial
     jitter: float = 0.0
@@ -30,7 +30,9 @@ class ReplayTask:
 
 @dataclass(frozen=True)
 class Replay:
-    """One trial replayed. Frames count from 0; ``distance`` is the smallest cloth gap in metres.
+    """Result of one replayed trial. Frames count from 0.
+
+    ``distance`` is the smallest gap between cloth and body in metres, None without cloth.
 
     ``cpu_seconds`` is the processor time of one simulation, ``physics_seconds`` what it covers.
     ``jittered`` holds the outcomes of the runs with jitter.
@@ -50,12 +52,12 @@ class Replay:
 
     @property
     def agrees(self) -> bool:
-        """Our outcome is the recorded one."""
+        """Return whether our outcome is the recorded one."""
         return self.recorded == self.simulated
 
 
 def replay_trial(task: ReplayTask) -> Replay:
-    """Simulate one imported trial and set it beside what was recorded."""
+    """Simulate one imported trial, and return the outcome with the recorded one."""
     scene, outcome = task.trial.scene, task.trial.outcome
     # Compiled code is loaded outside the measured time.
     simulate(scene, frames=2)
@@ -87,14 +89,14 @@ def replay_trial(task: ReplayTask) -> Replay:
 class ReplayRow:
     """One line of the replay table: a scenario, or the mean over scenarios.
 
-    - ``base_rate``: share of the commoner recorded outcome.
-    - ``agreement``: share of trials whose simulated outcome is the recorded one.
+    - ``base_rate``: fraction of the more frequent recorded outcome.
+    - ``agreement``: fraction of trials whose simulated outcome is the recorded one.
     - ``frame_difference``: median of |simulated - recorded| first contact frame over the trials
       with contact in both; NaN without any.
     - ``auc``: area under the curve of the smallest cloth gap against the recorded outcome, 1 if
       every contact is closer than every miss; NaN without cloth.
     - ``milliseconds``: mean processor time of a trial; ``real_time``: physics time over it.
-    - ``ceiling``: chance that two jittered runs of a trial agree; NaN without jitter.
+    - ``ceiling``: probability that two jittered runs of a trial agree; NaN without jitter.
     """
 
     scenario: str
@@ -109,7 +111,7 @@ class ReplayRow:
 
 
 def summarise(replays: Iterable[Replay]) -> list[ReplayRow]:
-    """The table by scenario, in the order of first appearance."""
+    """Return one row for each scenario, in the order of first appearance."""
     groups: dict[str, list[Replay]] = {}
     for replay in replays:
         groups.setdefault(replay.scenario, []).append(replay)
@@ -117,6 +119,7 @@ def summarise(replays: Iterable[Replay]) -> list[ReplayRow]:
 
 
 def _row(scenario: str, group: list[Replay]) -> ReplayRow:
+    """Return the row of one scenario."""
     recorded = np.array([replay.recorded for replay in group])
     rate = fmean(recorded.tolist())
     both = [
@@ -143,9 +146,10 @@ def _row(scenario: str, group: list[Replay]) -> ReplayRow:
 
 
 def area_under_curve(scores: np.ndarray, truth: np.ndarray) -> float:
-    """Chance that a random positive scores above a random negative, ties counting half.
+    """Return the probability that a random positive scores above a random negative.
 
-    ``scores`` (n,) any real, ``truth`` (n,) bool. NaN if only one class is there.
+
+    ``scores`` (n,) are real, ``truth`` (n,) bool; ties count half. NaN without both classes.
     """
     positives = np.count_nonzero(truth)
     negatives = len(truth) - positives

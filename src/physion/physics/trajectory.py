@@ -1,4 +1,4 @@
-"""How a scene moved: pure arrays over frames, without engine or pixel."""
+"""Motion of a scene as arrays over frames, independent of the engine and of rendering."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
 
 ENVIRONMENT = -1
-"""Index that stands for the floor in contacts."""
+"""Body index of the floor in contacts."""
 
 
 @dataclass(frozen=True)
 class Contacts:
-    """One row for each pair that touches in a frame, at its deepest point.
+    """Contacts of a trajectory: one row for each touching pair in each frame, at its deepest point.
 
-    A pair touches when the engine's contact pushed (impulse > 0) or the surfaces met.
+    A pair touches where its impulse is above 0 or its surfaces meet.
 
-    - ``frame`` (C,): the frame that shows the touch.
+    - ``frame`` (C,): the frame that shows the contact.
     - ``bodies`` (C, 2): indices of `Scene.names`, the smaller first; `ENVIRONMENT` is the floor.
     - ``point`` (C, 3): metres, world. ``normal`` (C, 3): unit, from the first to the second body.
     - ``impulse`` (C,): newton seconds along the normal during the frame, all points summed.
@@ -38,7 +38,7 @@ class Contacts:
 
     @classmethod
     def empty(cls) -> Contacts:
-        """No contact at all."""
+        """Return a set without contacts."""
         return cls(
             np.zeros(0, np.int32),
             np.zeros((0, 2), np.int32),
@@ -48,17 +48,17 @@ class Contacts:
         )
 
     def frames_of(self, a: int, b: int) -> Ints:
-        """Sorted frames in which bodies ``a`` and ``b`` touch."""
+        """Return the sorted frames in which bodies ``a`` and ``b`` touch."""
         pair = np.array([min(a, b), max(a, b)])
         return np.unique(self.frame[(self.bodies == pair).all(axis=1)])
 
 
 @dataclass(frozen=True)
 class State:
-    """One instant: what an engine needs to go on from there.
+    """State of a scene at one instant, from which an engine can continue.
 
     Arrays are as in `Trajectory`, without the frame axis. ``frame`` counts from the start of the
-    trial, so that pushes that are still to come are given.
+    trial, so that later pushes still take place.
     """
 
     frame: int
@@ -72,15 +72,15 @@ class State:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """The motion of a scene. F frames, N rigid bodies, V cloth vertices.
+    """Motion of a scene: F frames, N rigid bodies, V cloth vertices.
 
-    - ``positions`` (F, N, 3): metres, of each body's pivot. Frame 0 is the start.
+    - ``positions`` (F, N, 3): metres, of each body's pivot. Frame 0 is the initial state.
     - ``rotations`` (F, N, 4): unit quaternions (w, x, y, z).
     - ``velocities`` (F, N, 3): metres per second, of the centre of mass.
     - ``angular_velocities`` (F, N, 3): radians per second, world axes.
     - ``cloth_vertices`` (F, V, 3): metres; the cloths of the scene one after the other, each
       row by row along x then y. V is 0 without cloth.
-    - ``completed``: all bodies came to rest, rather than the time being over.
+    - ``completed``: all bodies came to rest before the time was over.
     - ``cloth_distance`` (F,): smallest gap in metres between the cloth's surface and the other
       body of the question (agent or patient); NaN without cloth.
     """
@@ -99,13 +99,15 @@ class Trajectory:
         frames = len(self.positions)
         for name in ("rotations", "velocities", "angular_velocities", "cloth_vertices"):
             if len(getattr(self, name)) != frames:
-                raise BadInputError(f"trajectory: {name} has not the {frames} frames of positions")
+                raise BadInputError(
+                    f"trajectory: {name} must have the {frames} frames of positions"
+                )
 
     def __len__(self) -> int:
         return len(self.positions)
 
     def state(self, frame: int) -> State:
-        """The instant ``frame``, to start another simulation from."""
+        """Return the state at ``frame``, from which another simulation can start."""
         cloth = self.cloth_vertices.astype(np.float64)
         before = max(frame - 1, 0)
         return State(
@@ -119,7 +121,7 @@ class Trajectory:
         )
 
     def digest(self) -> str:
-        """Hexadecimal SHA-256 of all arrays: equal trajectories, equal digests."""
+        """Return the hexadecimal SHA-256 of all arrays: equal trajectories have equal digests."""
         sha = hashlib.sha256()
         contacts = self.contacts
         for array in (

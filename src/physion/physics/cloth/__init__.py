@@ -1,1 +1,1 @@
-"""Cloth: sheets of particles that fall on rigid bodies."""
+"""Cloth: sheets of particles that fall on rigid bodies whose motion is given."""

@@ -1,4 +1,4 @@
-"""A cloth at rest: where its vertices are, its triangles, and the springs along and across them."""
+"""Vertices, triangles and springs of an undeformed cloth."""
 
 from __future__ import annotations
 
@@ -18,12 +18,14 @@ Indices = NDArray[np.int32]
 
 
 def sheet_vertices(cloth: Cloth) -> Points:
-    """Where the vertices (V, 3) of an undeformed cloth are, in metres.
+    """Return the vertices (V, 3) of an undeformed cloth in metres, world.
 
-    Row by row along x, then y: the first ``resolution`` vertices share the lowest x.
+    They come row by row along x, then y: the first ``resolution`` vertices have the lowest x.
     """
     if cloth.resolution < 2:
-        raise BadInputError(f"cloth {cloth.name!r} needs 2 vertices a side, not {cloth.resolution}")
+        raise BadInputError(
+            f"cloth {cloth.name!r} needs at least 2 vertices a side, not {cloth.resolution}"
+        )
     along_x, along_y = (np.linspace(-s / 2, s / 2, cloth.resolution) for s in cloth.size[:2])
     x, y = np.meshgrid(along_x, along_y, indexing="ij")
     flat = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
@@ -32,7 +34,7 @@ def sheet_vertices(cloth: Cloth) -> Points:
 
 @lru_cache(maxsize=8)
 def sheet_triangles(resolution: int) -> Indices:
-    """Triangles (T, 3) of a sheet: two for each square, cut along the same diagonal."""
+    """Return the triangles (T, 3) of a sheet: two for each square, along the same diagonal."""
     index = np.arange(resolution**2, dtype=np.int32).reshape(resolution, resolution)
     a, b, c, d = (index[x, y].ravel() for x, y in _CORNERS)
     return np.stack([np.stack([a, b, d], 1), np.stack([a, d, c], 1)], 1).reshape(-1, 3)
@@ -47,10 +49,10 @@ _CORNERS = (
 
 
 def sheet_springs(cloth: Cloth) -> Springs:
-    """The springs of a cloth, as Flex makes them from its triangles.
+    """Return the springs of a cloth, as Flex makes them from its triangles.
 
-    Every edge resists with ``stretch``; the two corners across every inner edge with ``bend``.
-    ``tether`` acts on nothing: Flex ties tethers to particles that are held, and none is.
+    Every edge has the stiffness ``stretch``, the two corners opposite every inner edge ``bend``.
+    ``tether`` has no effect: Flex attaches tethers to fixed particles, and there are none.
     """
     edges, across = _spring_pairs(cloth.resolution)
     ends = np.concatenate([edges, across]) if cloth.bend > 0 else edges
@@ -63,7 +65,7 @@ def sheet_springs(cloth: Cloth) -> Springs:
 
 @lru_cache(maxsize=8)
 def _spring_pairs(resolution: int) -> tuple[Indices, Indices]:
-    """Edges (E, 2) of the sheet, and the corners (B, 2) across its inner edges."""
+    """Return the edges (E, 2) of the sheet, and the corners (B, 2) opposite its inner edges."""
     triangles = sheet_triangles(resolution)
     sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     corners = np.concatenate([triangles[:, 2], triangles[:, 0], triangles[:, 1]])

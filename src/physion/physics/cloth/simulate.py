@@ -1,12 +1,12 @@
-"""Cloth: sheets of particles that fall on rigid bodies whose motion is given.
+"""Simulate cloth: sheets of particles that fall on rigid bodies whose motion is given.
 
-The method is that of the official simulator, NVIDIA Flex (Macklin and others, "Unified Particle
-Physics for Real-Time Applications", 2014): particles move freely, then passes over all
-constraints bring them back, each particle by the mean of its corrections. Bodies are filled with
-particles too, and a cloth particle keeps ``rest_distance`` from each of them, so that cloth rides
-on a cushion of about that thickness which gives way under load. Few passes on a fine sheet leave
-it stretchy and the cushion soft. In the official trials both decide whether a sheet that is caught
-by its neighbours still presses on the patient, so that a stiffer solver would be further from them.
+The method is that of the official simulator, NVIDIA Flex (Macklin et al. 2014, see `solver`):
+particles move freely, then passes over all constraints correct them, each particle by the mean of
+its corrections. Bodies are filled with particles too, and a cloth particle keeps ``rest_distance``
+from each of them, so that cloth lies at about that distance from a body, and closer under load.
+With few passes on a fine sheet, springs and contacts stay soft. In the official trials both decide
+whether a sheet that hangs between other bodies still presses on the patient, so that a stiffer
+solver would agree less with them.
 
 Bodies are not moved by cloth: the official solids weigh 25 to 500 kg, the sheet half a kilogram.
 Cloth does not touch itself or other cloth (official: self-collision off).
@@ -41,24 +41,24 @@ Points = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class ClothSettings:
-    """How cloth moves. The defaults are those of the official cloth trials.
+    """Constants of the cloth simulation. The defaults are those of the official cloth trials.
 
     "official" means that the command logs set it, "default" a default of TDW's Flex container
     (docs/official-system.md, section 3.8).
 
     - ``substeps`` of a frame and ``iterations`` of each: passes over the constraints (default).
-    - ``rest_distance``: metres that cloth particles keep from solid particles: the cloth's
-      thickness as it is felt (default: solid rest distance).
+    - ``rest_distance``: metres that cloth particles keep from solid particles: the effective
+      thickness of the cloth (default: solid rest distance).
     - ``particle_spacing``: metres between the particles that fill a body (official).
     - ``floor_gap``: metres that cloth keeps from the floor (official: collision distance).
-    - ``particle_friction``: slip held back by a solid particle, by depth of contact (default). With
-      1 instead of 0.5 the official trials come out no better (area under the curve .845 and .842).
+    - ``particle_friction``: friction coefficient with solid particles (default). With 1 instead of
+      0.5 agreement with the official trials is the same (area under the curve .845 and .842).
     - ``floor_friction``: the same for the floor (official: static and dynamic friction).
-    - ``damping``: share of the velocity lost in a second (default; the first contact frames of the
-      official trials show it: without it cloth would be down three frames earlier).
+    - ``damping``: drag per second (default; confirmed by the first contact frames of the official
+      trials: without it cloth would land three frames earlier).
     - ``gravity``: metres per second squared, downwards (official).
-    - ``search_margin``: metres beyond the rest distance in which solid particles are minded, for
-      what a particle moves in the passes of one substep.
+    - ``search_margin``: metres beyond the rest distance in which solid particles are searched: how
+      far a particle may move in the passes of one substep.
     """
 
     substeps: int = 3
@@ -73,23 +73,22 @@ class ClothSettings:
     search_margin: float = 0.02
 
     def tag(self) -> str:
-        """Eight hexadecimal digits that change whenever a setting does."""
+        """Return eight hexadecimal digits that change whenever a setting does."""
         text = json.dumps(asdict(self), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:8]
 
 
 @dataclass(frozen=True)
 class ClothMotion:
-    """How the cloths of a scene moved. F frames, V vertices of all cloths.
+    """Motion of the cloths of a scene: F frames, V vertices of all cloths.
 
     - ``vertices`` (F, V, 3): metres; one cloth after the other, each row by row along x then y.
-    - ``distance`` (F,): metres between the cloth of the question and the other body of it: the
-      smallest distance of their particles less the rest distance. 0 is a touch without load,
-      below it the cushion is pressed in, above it there is air. NaN where the question (agent and
-      patient) is not between a cloth and a body.
-    - ``contacts``: a row for each cloth and body (or floor) in each frame in which the surfaces
-      met: the point on the cloth's underside, the normal from the body to the cloth, and the
-      impulse that the cloth got.
+    - ``distance`` (F,): gap in metres between agent and patient: the smallest distance of their
+      particles less the rest distance, negative where they press on each other. NaN unless one is a
+      cloth and the other a body.
+    - ``contacts``: a row for each cloth and body (or floor) in each frame in which they touch: the
+      point on the cloth's underside, the normal from the body to the cloth, and the impulse on the
+      cloth.
     """
 
     vertices: Floats
@@ -106,22 +105,38 @@ def simulate_cloth(
     vertices: NDArray[np.floating] | None = None,
     velocities: NDArray[np.floating] | None = None,
 ) -> ClothMotion:
-    """Let the cloths of ``scene`` fall on its bodies, which move as told.
+    """Simulate the cloths of ``scene`` on its bodies, whose motion is given.
 
-    ``rigid_positions`` (F, N, 3) are the pivots of the scene's bodies in metres and
-    ``rigid_rotations`` (F, N, 4) their quaternions (w, x, y, z), in the order of ``scene.bodies``;
-    a still body repeats its pose. ``vertices`` and ``velocities`` (V, 3), metres and metres per
-    second, start the cloth from another state than flat and at rest. `BadInputError` for arrays of
-    other shapes. A cloth that starts inside a body is pushed out at once.
+    A cloth that starts inside a body is pushed out at once.
+
+    Parameters
+    ----------
+    scene : Scene
+        Bodies, cloths, floor, agent and patient.
+    rigid_positions, rigid_rotations : (F, N, 3), (F, N, 4)
+        Pivots in metres and quaternions (w, x, y, z) of ``scene.bodies`` in every frame.
+    settings : ClothSettings, optional
+        By default those of the official trials.
+    vertices, velocities : (V, 3), optional
+        State from which the cloths start, in metres and m/s; by default flat and at rest.
+
+    Raises
+    ------
+    BadInputError
+        If arrays have other shapes.
     """
     rules = settings if settings is not None else ClothSettings()
     positions = np.ascontiguousarray(rigid_positions, np.float64)
     rotations = np.ascontiguousarray(rigid_rotations, np.float64)
     frames, bodies = len(positions), len(scene.bodies)
     if not frames or positions.shape != (frames, bodies, 3):
-        raise BadInputError(f"cloth: positions are {positions.shape}, not (frames, {bodies}, 3)")
+        raise BadInputError(
+            f"cloth: positions have the shape {positions.shape}, not (frames, {bodies}, 3)"
+        )
     if rotations.shape != (frames, bodies, 4):
-        raise BadInputError(f"cloth: rotations are {rotations.shape}, not {(frames, bodies, 4)}")
+        raise BadInputError(
+            f"cloth: rotations have the shape {rotations.shape}, not {(frames, bodies, 4)}"
+        )
     solids = fill_bodies(scene.bodies, rules.particle_spacing)
     flat = [sheet_vertices(cloth) for cloth in scene.cloths]
     at = _start(vertices, flat, "vertices")
@@ -141,12 +156,12 @@ def simulate_cloth(
 
 
 def settle_solids(scene: Scene, settings: ClothSettings | None = None) -> Scene:
-    """The scene with its still bodies standing on the floor, as particles of Flex stand on it.
+    """Return the scene with its kinematic bodies standing on the floor, as in Flex.
 
     The official cloth trials create solids above the floor and let them fall for
-    ``settle_frames`` before the cloth comes. Every kinematic body is moved straight up or down
-    until its lowest particle is ``floor_gap`` above the floor; it neither tips nor slides. Scenes
-    without cloth or without ``settle_frames`` are returned as they are.
+    ``settle_frames`` before they add the cloth. Every kinematic body is moved vertically until its
+    lowest particle is ``floor_gap`` above the floor; it neither tips nor slides. Scenes without
+    cloth or without ``settle_frames`` are returned unchanged.
     """
     rules = settings if settings is not None else ClothSettings()
     if not (scene.cloths and scene.settle_frames):
@@ -156,6 +171,7 @@ def settle_solids(scene: Scene, settings: ClothSettings | None = None) -> Scene:
 
 
 def _stand(body: Body, floor: float, settings: ClothSettings) -> Body:
+    """Return a kinematic body at the height at which it stands on the floor."""
     if body.scenery or not body.kinematic:
         return body
     particles = rotate_vectors(unit(body.rotation), particles_of(body, settings.particle_spacing))
@@ -171,20 +187,28 @@ def add_cloth(
     *,
     start: State | None = None,
 ) -> Trajectory:
-    """The trajectory ``rigid`` of the scene's bodies with its cloths laid over them.
+    """Return the trajectory of the scene's bodies with the motion of its cloths added.
 
-    Contacts of both are merged in the order of frames; ``start`` is the state that ``rigid``
-    began from, if it went on from one. The trajectory is never ``completed``: cloth does not
-    sleep. `BadInputError` where the bodies are not those of the scene.
+    Contacts of both are merged in the order of frames. The result is never ``completed``, because
+    cloth does not sleep. `BadInputError` if the bodies are not those of the scene.
+
+    Parameters
+    ----------
+    scene, rigid
+        The scene, and the trajectory of its bodies.
+    settings : ClothSettings, optional
+        By default those of the official trials.
+    start : State, optional
+        The state from which ``rigid`` started, if it was not the scene's.
     """
-    held = start is not None and len(start.cloth_vertices) > 0
+    with_state = start is not None and len(start.cloth_vertices) > 0
     motion = simulate_cloth(
         scene,
         rigid.positions,
         rigid.rotations,
         settings,
-        vertices=start.cloth_vertices if start is not None and held else None,
-        velocities=start.cloth_velocities if start is not None and held else None,
+        vertices=start.cloth_vertices if start is not None and with_state else None,
+        velocities=start.cloth_velocities if start is not None and with_state else None,
     )
     both = (rigid.contacts, motion.contacts)
     order = np.argsort(np.concatenate([c.frame for c in both]), kind="stable")
@@ -203,12 +227,12 @@ def add_cloth(
 
 
 def _start(given: NDArray[np.floating] | None, default: list[Points], what: str) -> list[Points]:
-    """Split a given state (V, 3) by cloth, or take the default; always fresh arrays."""
+    """Return a given state (V, 3) split by cloth, or the default; always as new arrays."""
     count = sum(len(sheet) for sheet in default)
     if given is None:
         return [sheet.copy() for sheet in default]
     if np.shape(given) != (count, 3):
-        raise BadInputError(f"cloth: {what} are {np.shape(given)}, not {(count, 3)}")
+        raise BadInputError(f"cloth: {what} have the shape {np.shape(given)}, not {(count, 3)}")
     ends = np.cumsum([len(sheet) for sheet in default])[:-1]
     return [part.astype(np.float64).copy() for part in np.split(np.asarray(given), ends)]
 
@@ -223,7 +247,7 @@ def _run(
     rotations: Points,
     settings: ClothSettings,
 ) -> ClothRecord:
-    """Simulate one cloth of the scene."""
+    """Simulate cloth ``number`` of the scene."""
     cloth, frames, bodies = scene.cloths[number], len(positions), len(scene.bodies)
     watched = _other_body(scene, cloth.name)
     record = ClothRecord(
@@ -258,7 +282,7 @@ def _run(
 
 
 def _other_body(scene: Scene, cloth: str) -> int:
-    """Index of the body that the question asks about besides ``cloth``; -1 if there is none."""
+    """Return the body that is agent or patient where ``cloth`` is the other one; -1 if none is."""
     roles = (scene.roles.agent, scene.roles.patient)
     if cloth not in roles:
         return -1
@@ -267,7 +291,7 @@ def _other_body(scene: Scene, cloth: str) -> int:
 
 
 def _contacts(scene: Scene, records: list[ClothRecord], settings: ClothSettings) -> Contacts:
-    """Rows of all cloths, sorted by frame, then by pair."""
+    """Return the contacts of all cloths, sorted by frame, then by pair."""
     rows = []
     for number, (cloth, record) in enumerate(zip(scene.cloths, records, strict=True)):
         # A correction by d metres within one step is a change of velocity by d / step.

@@ -1,4 +1,4 @@
-"""Rigid bodies as cubic lattices of particles, as NVIDIA Flex fills its solids."""
+"""Fill rigid bodies with cubic lattices of particles, as NVIDIA Flex does."""
 
 from __future__ import annotations
 
@@ -21,10 +21,16 @@ Filled = NDArray[np.bool_]
 def fill_shape(name: str, scale: Vec3, spacing: float) -> tuple[Points, Filled]:
     """Fill a shape at ``scale`` with a lattice of particles ``spacing`` metres apart.
 
-    Returns the lattice's first corner (3,) in the body's frame and its occupancy (I, J, K). The
-    lattice is centred in the bounds and holds as many whole spacings as fit, at least one point
-    a side. A shape too thin for every lattice point gets the one closest to its middle, so that
-    no body is without particles.
+    The lattice is centred in the bounds and holds as many whole spacings as fit, at least one point
+    a side. A shape that contains no lattice point gets the one closest to its middle, so that no
+    body is without particles.
+
+    Returns
+    -------
+    origin : (3,)
+        First corner of the lattice in the body's frame, metres.
+    filled : (I, J, K)
+        Lattice points inside a collision piece.
     """
     found = shape(name)
     low, high = found.bounds * np.asarray(scale)
@@ -42,7 +48,7 @@ def fill_shape(name: str, scale: Vec3, spacing: float) -> tuple[Points, Filled]:
 
 
 def _inside(piece: ConvexPiece, points: Points) -> Filled:
-    """Which ``points`` (P, 3) of the shape's frame at unit scale lie in a convex piece."""
+    """Return which ``points`` (P, 3), in the shape's frame at unit scale, lie in a piece."""
     if piece.kind == "convex":
         planes = ConvexHull(piece.vertices).equations
         return np.asarray((multiply(points, planes[:, :3].T) + planes[:, 3] <= 1e-9).all(axis=1))
@@ -51,18 +57,21 @@ def _inside(piece: ConvexPiece, points: Points) -> Filled:
         return np.asarray((np.abs(local) <= 1 + 1e-9).all(axis=1))
     if piece.kind == "sphere":
         return np.asarray(dot(local, local) <= 1 + 1e-9)
-    round_ = dot(local[:, :2], local[:, :2]) <= 1 + 1e-9
-    return np.asarray(round_ & (np.abs(local[:, 2]) <= 1 + 1e-9))
+    in_circle = dot(local[:, :2], local[:, :2]) <= 1 + 1e-9
+    return np.asarray(in_circle & (np.abs(local[:, 2]) <= 1 + 1e-9))
 
 
 def particles_of(body: Body, spacing: float) -> Points:
-    """Particles (P, 3) of a body in its own frame, metres, scaled; pose not applied."""
+    """Return the particles (P, 3) of a body in its own frame, metres; its pose is not applied."""
     origin, filled = fill_shape(body.shape, body.scale, spacing)
     return np.asarray(origin + spacing * np.argwhere(filled))
 
 
 def surface_particles(body: Body, spacing: float) -> Points:
-    """Those particles of a body that lack one of their six neighbours: enough for distances."""
+    """Return the particles (P, 3) of a body that lack one of their six neighbours.
+
+    They are enough to find the smallest distance to something outside.
+    """
     origin, filled = fill_shape(body.shape, body.scale, spacing)
     padded = np.pad(filled, 1)
     buried = filled.copy()
@@ -73,7 +82,7 @@ def surface_particles(body: Body, spacing: float) -> Points:
 
 
 def fill_bodies(bodies: tuple[Body, ...], spacing: float) -> Solids:
-    """All bodies as lattices, in their order; scenery is drawn only and stays empty."""
+    """Return the lattices of all bodies, in their order; those of scenery are empty."""
     lattices = [
         (np.zeros(3), np.zeros((0, 0, 0), np.bool_))
         if body.scenery

@@ -1,1 +1,1 @@
-"""Rigid bodies: contacts, the contact solver, sleep."""
+"""The rigid-body engine: model of a scene, contact search, contact solver, sleep."""
