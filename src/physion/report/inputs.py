@@ -12,7 +12,7 @@ import pandas as pd
 from physion.analysis.results import ComparisonResults
 
 EXPECTED_METHODS = ("Engine", "Renderer", "Readout", "Encoder weights", "Noise of the simulation")
-"""Choices that are made outside the analysis; the page says so where the caller names none."""
+"""Settings made outside the analysis; those that the caller omits are printed as not stated."""
 
 
 @dataclass(frozen=True)

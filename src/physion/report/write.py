@@ -27,7 +27,7 @@ def write_plot(plot: Plot, folder: Path) -> Picture:
     write_csv(folder / f"{plot.name}.csv", plot.table)
     figure = plot.draw(plot.table, theme.LIGHT)
     light = {kind: theme.figure_bytes(figure, kind) for kind in ("svg", "png")}
-    # The dark figure is for the page alone, so it is made in the one kind that goes there.
+    # The dark figure is for the page only, so it is made only in the format used there.
     kind = page_kind(light)
     dark = {kind: theme.figure_bytes(plot.draw(plot.table, theme.DARK), kind)}
     for ending, content in light.items():

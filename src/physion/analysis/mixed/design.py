@@ -18,7 +18,7 @@ from physion.errors import BadInputError
 Array = npt.NDArray[np.float64]
 
 ALIASED = 1e-9
-"""Share of a column of fixed effects that the others must leave unexplained, for each column."""
+"""Fraction of each column of fixed effects that the other columns must leave unexplained."""
 
 
 @dataclass(frozen=True)

@@ -81,7 +81,7 @@ class Solution:
         self.unit_covariance = np.linalg.inv(information)
         self.b = self.unit_covariance @ right
         self.u = solved[:, -1] - solved[:, :-1] @ self.b
-        # The fixed effects took their least squares part before: X'y is zero.
+        # The least-squares part of the fixed effects is already subtracted from y: X'y is zero.
         self.rest = model.yy - float(both[:, -1] @ solved[:, -1]) - float(right @ self.b)
         self.sigma2 = self.rest / (model.n - model.p)
         # Z'V^-1 X and Z'V^-1 (y - Xb), in units of the residual variance.

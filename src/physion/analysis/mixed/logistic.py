@@ -32,11 +32,11 @@ from physion.errors import BadInputError
 Array = npt.NDArray[np.float64]
 
 AT_MODE = 1e-17
-"""Gain of a Newton step for the random effects at which they are at their mode. The curvature there
-is part of the likelihood, and is differenced, so that the mode must be exact."""
+"""Decrease of the objective by a Newton step below which the mode of the random effects is found.
+The curvature there is part of the likelihood and is differenced, so the mode must be exact."""
 
 FAR = 30.0
-"""Standard deviation of random effects (logits) beyond which the likelihood is not looked at."""
+"""Largest standard deviation of random effects (logits) that the search considers."""
 
 
 def fit_logistic(formula: str, data: pd.DataFrame, level: float = 0.95) -> MixedFit:
@@ -98,7 +98,7 @@ class LogisticModel:
     def __init__(self, design: Design) -> None:
         self.y = design.y
         orthonormal, triangle = np.linalg.qr(design.x)
-        # Of the size of the columns themselves, so that coefficients are near 1.
+        # Scaled like standardised columns, so that coefficients are near 1.
         self.x = np.ascontiguousarray(orthonormal * np.sqrt(len(self.y)))
         self.triangle = triangle / np.sqrt(len(self.y))
         self.p = self.x.shape[1]
@@ -132,7 +132,7 @@ class LogisticModel:
         return np.concatenate([beta, spread]), steps
 
     def _joint_step(self, beta: Array, scale: Array) -> tuple[Array, Factor, Array]:
-        """One Newton step for fixed and random effects together; moves ``u``."""
+        """Take one Newton step for fixed and random effects together; changes ``u``."""
         groupings = self.groupings
         mean = expit(self._linear(beta, scale))
         weight, residual = mean * (1 - mean), self.y - mean
@@ -153,7 +153,9 @@ class LogisticModel:
         return float(self.y @ eta - np.logaddexp(0, eta).sum() - u @ u / 2)
 
     def find_mode(self, beta: Array, scale: Array) -> tuple[Array, Factor]:
-        """Move ``u`` to its mode; gives the logits there and H. Newton steps, halved at need."""
+        """Set ``u`` to its mode by Newton steps, halved if needed; return the logits there and
+        H.
+        """
         groupings = self.groupings
         eta = self._linear(beta, scale)
         height = self._penalised(eta, self.u)
@@ -176,7 +178,9 @@ class LogisticModel:
         return eta, factor
 
     def objective(self, at: Array) -> tuple[float, Array]:
-        """Negative log-likelihood and its gradient at (coefficients, standard deviations)."""
+        """Return the negative log-likelihood and its gradient at (coefficients, standard
+        deviations).
+        """
         beta, spread = at[: self.p], at[self.p :]
         if np.abs(spread).max() > FAR:
             return np.inf, np.zeros_like(at)
@@ -197,7 +201,7 @@ class LogisticModel:
         return -value, -np.concatenate([self.x.T @ felt, slope_spread])
 
     def effects(self, at: Array) -> list[Array]:
-        """Modes of the random effects (logits) of each grouping, by level."""
+        """Return the modes of the random effects (logits) of each grouping, by level."""
         scale = at[self.p :][self.groupings.owner]
         self.find_mode(at[: self.p], scale)
         return [(scale * self.u)[slot] for slot in self.groupings.slots]

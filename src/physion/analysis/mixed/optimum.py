@@ -23,12 +23,12 @@ CLOSE = 1e-6
 """Expected further decrease of the function below which the search has converged."""
 
 SMALL = 0.05
-"""Standard deviations below which it is tried whether zero is no worse."""
+"""Standard deviations below which zero is tried as well."""
 
 
 @dataclass(frozen=True)
 class Optimum:
-    """Where the search ended: ``left`` is the decrease that a further Newton step promises."""
+    """Result of the search; ``left`` is the expected decrease by a further Newton step."""
 
     at: Array
     value: float
@@ -38,7 +38,7 @@ class Optimum:
 
     @property
     def converged(self) -> bool:
-        """Whether the curvature is positive all around and nothing is left to gain."""
+        """Whether the curvature is positive definite and no further decrease is expected."""
         return bool(np.isfinite(self.left) and abs(self.left) < CLOSE)
 
 
@@ -76,7 +76,7 @@ def find_optimum(objective: Objective, start: Array, scale: Array, spreads: int)
 
 
 def _newton(hessian: Array, gradient: Array) -> tuple[Array, float]:
-    """The Newton step and half of gradient times step; infinite where the curvature is not up."""
+    """Return the Newton step and half of gradient times step; infinite if not positive definite."""
     if np.linalg.eigvalsh(hessian)[0] <= 0:
         return np.zeros_like(gradient), np.inf
     step = np.asarray(np.linalg.solve(hessian, gradient), dtype=np.float64)
@@ -86,7 +86,7 @@ def _newton(hessian: Array, gradient: Array) -> tuple[Array, float]:
 def _try_zero(
     objective: Objective, at: Array, best: tuple[float, Array], spreads: int
 ) -> tuple[Array, tuple[float, Array], npt.NDArray[np.bool_]]:
-    """Set small standard deviations to zero where that is no worse."""
+    """Set small standard deviations to zero if that does not increase the function."""
     zero = np.zeros(spreads, dtype=bool)
     first = len(at) - spreads
     for k in range(spreads):
@@ -100,7 +100,9 @@ def _try_zero(
 
 
 def difference_gradient(objective: Objective, at: Array, size: Array) -> Array:
-    """The Hessian (k, k) by central differences of the gradient with steps of STEP * ``size``."""
+    """Return the Hessian (k, k) by central differences of the gradient with steps of STEP *
+    ``size``.
+    """
     columns = []
     for k, step in enumerate(STEP * size):
         shift = np.zeros_like(at)

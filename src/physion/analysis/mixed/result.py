@@ -1,4 +1,4 @@
-"""What a fitted mixed model says: tables of fixed and random effects, tests, and warnings."""
+"""Results of a fitted mixed model: tables of fixed and random effects, tests, and warnings."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DegreesOfFreedom = Callable[[Array], float]
 
 @dataclass(frozen=True)
 class JointTest:
-    """That all coefficients of a term are zero: F with two degrees of freedom.
+    """Test that all coefficients of a term are zero: F with two degrees of freedom.
 
     Chi-square / df1 with infinite ``df2`` for logistic models.
     """
@@ -67,14 +67,14 @@ class MixedFit:
 
     @property
     def parameters(self) -> int:
-        """Fixed effects and variances, the residual one included."""
+        """Number of parameters: fixed effects and variances, including the residual one."""
         return len(self.table) + len(self.random)
 
     def joint_test(self, term: str) -> JointTest:
-        """Wald test that every coefficient of ``term`` is zero, others as in the model.
+        """Test that every coefficient of ``term`` is zero (Wald), others as in the model.
 
-        For a model without interactions that is the test of `anova` in lmerTest (degrees of freedom
-        combined as there); with interactions it depends on how categories are coded.
+        For a model without interactions it is the test of `anova` in lmerTest (degrees of freedom
+        combined as there); with interactions it depends on the coding of categories.
         """
         if term not in self.terms:
             raise UnknownNameError("term", term, self.terms)
@@ -97,7 +97,7 @@ class MixedFit:
         return JointTest(term, statistic, len(places), df2, p)
 
     def summary(self) -> str:
-        """A page of text: what was fitted on how many rows, both tables, and the warnings."""
+        """Return a page of text: formula, number of rows, both tables, and the warnings."""
         head = [
             f"{self.kind}: {self.formula}",
             f"{self.rows} rows ({self.left_out} left out), log-likelihood "
@@ -115,7 +115,9 @@ def _short(value: float) -> str:
 
 
 def _combine(each: Sequence[float]) -> float:
-    """The second degree of freedom of F from those of its independent parts (as lmerTest)."""
+    """Return the second degree of freedom of F from those of its independent parts (as
+    lmerTest).
+    """
     df = np.asarray(each, dtype=np.float64)
     if len(df) == 1 or np.ptp(df) < 1e-8:
         return float(df.mean())
@@ -140,9 +142,11 @@ def collect(
     residual: float | None = None,
     df: DegreesOfFreedom | None = None,
 ) -> MixedFit:
-    """Tables and warnings of a fit; ``spreads`` are the standard deviations of the groupings."""
+    """Collect tables and warnings of a fit; ``spreads`` are the standard deviations of the
+    groupings.
+    """
     variance = np.diag(covariance)
-    # Where the search failed, the curvature can be down: no standard error then.
+    # If the search failed, the curvature can be negative: no standard error then.
     se = np.sqrt(np.where(variance > 0, variance, np.nan))
     each = np.full(len(b), np.inf) if df is None else np.array([df(one) for one in np.eye(len(b))])
     statistic = b / se

@@ -19,7 +19,9 @@ Array = npt.NDArray[np.float64]
 
 
 def refuse_separation(design: Design) -> None:
-    """Raise `BadInputError`, naming the effects, where the fixed effects separate the answers."""
+    """Raise `BadInputError` with the names of the effects if the fixed effects separate the
+    answers.
+    """
     if _converges(design.x, design.y):
         return
     direction = _separating(design.x, design.y)
@@ -35,7 +37,7 @@ def refuse_separation(design: Design) -> None:
 
 
 def _converges(x: Array, y: Array) -> bool:
-    """Whether Newton's method for the ordinary logistic regression comes to rest."""
+    """Return whether Newton's method for the ordinary logistic regression converges."""
     basis = np.linalg.qr(x)[0] * np.sqrt(len(y))
     beta = np.zeros(basis.shape[1])
     for _ in range(25):
@@ -50,13 +52,13 @@ def _converges(x: Array, y: Array) -> bool:
         beta = beta + step
         if float(score @ step) < 1e-10 * len(y):
             mean = expit(basis @ beta)
-            # Where it crawls to infinity, a step stays near 1 though the gain vanishes.
+            # If a coefficient diverges, steps stay near 1 although the likelihood hardly changes.
             return bool(np.abs(basis @ step).max() < 1e-3)
     return False
 
 
 def _separating(x: Array, y: Array) -> Array | None:
-    """Coefficients that separate, or None: a linear programme over the distinct rows."""
+    """Return coefficients that separate, or None, by a linear programme over the distinct rows."""
     size = np.abs(x).max(axis=0)
     signed = np.unique((2 * y - 1)[:, None] * (x / size), axis=0)
     p = x.shape[1]

@@ -97,7 +97,7 @@ def fits_of_models(comparison: Comparison) -> list[MixedTable]:
     if len(comparison.agents) < 2 or rows["scenario"].nunique() < 2:
         return []
     rows = rows[["agent", "model", "readout", "scenario", "accuracy"]]
-    # The order of the files, not of the alphabet, says which one the others are held against.
+    # The first in the files, not in the alphabet, is the base level.
     rows = rows.assign(
         agent=pd.Categorical(rows["agent"], categories=comparison.agents),
         readout=pd.Categorical(rows["readout"], categories=rows["readout"].unique()),

@@ -19,7 +19,7 @@ from physion.errors import BadInputError
 Array = npt.NDArray[np.float64]
 
 RELEASED_R = "halves, mean of scenarios (the paper's band)"
-"""Whose values the paper's grey band for r is made of; see `released_r_zone`."""
+"""Name in ``of`` for the paper's grey band of r; see `released_r_zone`."""
 
 
 def human_zones(answers: ScenarioAnswers, halves: Array | None = None) -> pd.DataFrame:

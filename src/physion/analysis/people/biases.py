@@ -19,7 +19,7 @@ from physion.analysis.tables.stimuli import in_order
 Array = npt.NDArray[np.float64]
 
 BACKGROUND = ("age", "gender", "education", "difficulty", "technical_problems")
-"""Columns of the sessions that say who took part and how it went."""
+"""Columns of the sessions about the participant and about problems."""
 
 
 # --- yes or no ----------------------------------------------------------------------------------

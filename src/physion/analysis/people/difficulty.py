@@ -17,7 +17,7 @@ Array = npt.NDArray[np.float64]
 
 THIRDS = ("hard", "chance", "easy")
 EDGES = (1 / 3, 2 / 3)
-"""Accuracies that part the three; the paper says 33 and 67 %."""
+"""Accuracies that separate the three; 33 and 67 % in the paper."""
 
 
 def below_chance_released(accuracy: npt.ArrayLike, count: npt.ArrayLike) -> npt.NDArray[np.bool_]:

@@ -80,7 +80,7 @@ OFFICIAL_CODE = ExclusionRules(
     rt_summary="median",
     ddof=0,
 )
-"""As the released code had it. Its limit of a streak came from an unseeded simulation."""
+"""As in the released code. Its limit of a streak came from an unseeded simulation."""
 
 RULE_SETS: Mapping[str, ExclusionRules] = {
     rules.name: rules for rules in (PREREGISTERED, OFFICIAL_CODE)
@@ -128,7 +128,7 @@ def flag_familiarization(measures: pd.DataFrame, rules: ExclusionRules) -> pd.Se
     """Flag too few correct practice trials; without recorded practice a session is not flagged."""
     limit = -np.inf if rules.familiarization_share is None else rules.familiarization_share
     fraction = measures["familiarization_correct"] / measures["familiarization_trials"]
-    return fraction <= limit + 1e-9  # 3 of 10 is 0.3
+    return fraction <= limit + 1e-9  # so that 3 of 10 counts as 0.3
 
 
 def flag_low_accuracy(measures: pd.DataFrame, rules: ExclusionRules) -> pd.Series:

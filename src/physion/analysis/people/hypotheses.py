@@ -120,7 +120,7 @@ def _record(hypothesis: Hypothesis, name: str, rows: pd.DataFrame, level: float)
                 "reason": f"no column {missing[0]}"}  # fmt: skip
     known = rows[[hypothesis.predictor, hypothesis.outcome]].notna().all(axis=1)
     used = rows[known]
-    # A scenario of one stimulus, or of one value, says nothing about a slope within scenarios.
+    # A scenario with one stimulus, or one value, does not determine a slope within scenarios.
     varied = used.groupby("scenario")[hypothesis.predictor].transform("nunique") > 1
     used = used[varied]
     record |= {"stimuli": len(used), "left_out": len(rows) - len(used), "as_predicted": ""}

@@ -241,5 +241,5 @@ def _attributes(stimuli: pd.Series, given: pd.DataFrame | None) -> pd.DataFrame:
                 f"answered {stimuli.iloc[0]!r}, it has {given['stimulus'].iloc[0]!r}"
             )
         result = better_attributes(given_rows, by_name) if len(by_name) else given_rows
-    # Counts of parquet may be whole numbers with gaps, which regressions do not take.
+    # Counts in parquet may be nullable integers, which the regressions do not accept.
     return result.astype(dict.fromkeys(ATTRIBUTES, "float64")).reset_index(drop=True)

@@ -25,7 +25,7 @@ from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.stimulus_names import SCENARIOS
 
 EXPECTED = {"training": "all", "readout": "observed+simulated"}
-"""The cell that the paper's main figure shows."""
+"""The setting that the paper's main figure shows."""
 
 MOST_STIMULI = 400
 """No scenario of the study was tested on more."""

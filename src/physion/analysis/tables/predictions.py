@@ -31,8 +31,8 @@ DATASETS = (
     "Dynamics Training Dataset",
     "Readout Train Data",
 )
-"""Columns that say on which scenario(s) a part was trained: by itself this tells two models of one
-name apart only after it is put in relation to the scenario that is tested."""
+"""Columns of the scenario(s) on which a part was trained. They distinguish models of one name only
+in relation to the tested scenario."""
 
 DISTINGUISHING = (
     "Init",
@@ -46,7 +46,7 @@ DISTINGUISHING = (
     "Dynamics Training Seed",
     *DATASETS,
 )
-"""Further columns that tell two models of one name apart; all of them may be absent."""
+"""Further columns that distinguish models of one name; all of them may be absent."""
 
 
 def read_predictions(paths: list[Path]) -> pd.DataFrame:

@@ -60,7 +60,7 @@ def read_humans(folder: Path, dominoes: DominoesLook = "plain") -> pd.DataFrame:
 
 def _read_file(path: Path, scenario: str, redyellow: bool) -> pd.DataFrame:
     raw = read_csv(path, ("stim_ID", "correct", "c"))
-    # The rows of the old experiment can lie under either spelling, whatever the file is called.
+    # Either file can contain rows of the older experiment, so the names of the stimuli count too.
     red = raw["stim_ID"].str.contains("-redyellow") | redyellow
     table = pd.DataFrame(
         {

@@ -34,7 +34,7 @@ def score_table(stimuli: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
     ``_high``; ``ceiling`` of r and ``floor`` of the RMSD; ``reason``: why a score or an interval is
     NaN, or means less than it seems to (for example if all labels are of one class); else empty.
     """
-    # Sorted, so that a draw means the same stimulus whatever the order of the files.
+    # Sorted, so that the draws do not depend on the order of the files.
     ordered = stimuli.sort_values("stimulus", kind="stable")
     parts = [_agent_rows(rows, bootstrap) for _, rows in ordered.groupby("agent", sort=False)]
     table = pd.concat(parts, ignore_index=True)
@@ -106,7 +106,7 @@ def _record(
     }
     for key, values in values_of.items():
         value = float(values[0])
-        # One stimulus, drawn again and again, would seem to be known without error.
+        # With one stimulus all draws are equal: the interval would have no width.
         known = np.isfinite(value) and len(rows) > 1
         low, high = bootstrap.interval(values[1:]) if known else (np.nan, np.nan)
         if known and np.isnan(low):

@@ -59,7 +59,7 @@ def validate(path: Path, reference: Reference | None = None) -> Checked:
     table = read_csv(path, ()).reset_index(drop=True).fillna("")
     faults = columns(table)
     if faults:
-        # Without these columns there is nothing that the other checks could say.
+        # The other checks need these columns.
         return Checked(str(path), len(table), {}, tuple(faults), ("all but the columns",))
     stimulus = table["Stimulus Name"].map(canonical_name)
     for found in (

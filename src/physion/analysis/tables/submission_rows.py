@@ -11,7 +11,7 @@ from physion.analysis.tables.predictions import DISTINGUISHING, READOUTS, REQUIR
 from physion.stimulus_names import scenario_of
 
 SUM_TOLERANCE = 1e-3
-"""By how much the two probabilities may miss 1: what rounding to three decimals can cost."""
+"""Largest difference of the sum of the two probabilities from 1, for rounding to three decimals."""
 
 SHOWN = 20
 """Faults of one kind that are listed one by one; more are counted in one line."""
@@ -25,7 +25,7 @@ _ALIKE = {
     "Predicted Outcome": "kappa and accuracy say nothing about what the model sees",
     "Predicted Prob_true": "r is undefined",
 }
-"""Columns that should vary within a model and scenario, and what is lost where they do not."""
+"""Columns that should vary within a model and scenario, and the consequence if they do not."""
 
 
 @dataclass(frozen=True)

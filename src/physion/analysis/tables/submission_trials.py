@@ -18,7 +18,7 @@ from physion.analysis.tables.submission_rows import Fault, booleans, each
 from physion.stimulus_names import canonical_name, is_ledge, scenario_of
 
 TESTING = ("testing", "test")
-"""Words for the split that may be predicted."""
+"""Names of the split that may be predicted."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def coverage(table: pd.DataFrame, stimulus: pd.Series, against: Reference) -> li
     faults = []
     for row in np.flatnonzero(~stimulus.isin(wanted | trials).to_numpy()):
         name = str(stimulus.iloc[row])
-        # Models of the study were tested on trials that no person saw, too.
+        # Models of the study were also tested on trials that no person saw.
         official = against.labels is not None and scenario_of(name) is not None
         message = "people did not see it: it is not compared" if official else "no such stimulus"
         level = "warning" if official else "error"

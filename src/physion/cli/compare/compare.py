@@ -25,7 +25,7 @@ SUBVERBS = {
     "validate": "physion.cli.compare.validate",
     "leaderboard": "physion.cli.compare.leaderboard",
 }
-"""First words that stand for a verb of their own, and its module."""
+"""Sub-commands and their modules."""
 
 
 @dataclass(frozen=True)
@@ -37,13 +37,13 @@ class Options:
     humans: Path | None = None
     """Folder with human_accuracy-*.csv."""
     labels: Path | None = None
-    """Official outcomes (stim_ID, label); looked for beside the people when not given."""
+    """Official outcomes (stim_ID, label); if not given, looked for next to the folder of people."""
     responses: tuple[Path, ...] = ()
     """Answers of single participants, in place of --humans: our export or the study's raw files."""
     sessions: Path | None = None
     """Table of sessions of our export: demographics, order of sessions."""
     rules: str | None = None
-    """By which sessions are flagged: preregistered (if not given) or official-code."""
+    """Exclusion rules: preregistered (if not given) or official-code."""
     expected: Path | None = None
     """Table of the stimuli (stimulus) that each session, or each scenario, must have; if not given,
     those that anyone answered."""
@@ -53,13 +53,13 @@ class Options:
     movies: Path | None = None
     """Dataset whose testing trials' movies the page shows."""
     zone: Path | None = None
-    """Official percentiles of participants; looked for beside the people when not given."""
+    """Official percentiles of participants; if not given, looked for next to the people."""
     dominoes: Literal["plain", "redyellow", "pooled"] | None = None
-    """Who counts for Dominoes in --humans; plain if not given: free colours, as in the paper."""
+    """Which people count for Dominoes in --humans; default plain: free colours, as in the paper."""
     exclude: Path | None = None
-    """File of stimuli to leave out, one a line."""
+    """File of stimuli to exclude, one a line."""
     ledge: bool = False
-    """Keep the Roll stimuli with a ledge, which the study left out."""
+    """Keep the Roll stimuli with a ledge, which the study excluded."""
     resamples: int | None = None
     """Draws of the bootstrap; 1000 if not given."""
     seed: int | None = None

@@ -30,25 +30,25 @@ class Options:
     humans: Path | None = None
     """Folder with human_accuracy-*.csv."""
     labels: Path | None = None
-    """Official outcomes (stim_ID, label); looked for beside the people when not given."""
+    """Official outcomes (stim_ID, label); if not given, looked for next to the folder of people."""
     responses: tuple[Path, ...] = ()
     """Answers of single participants, which give kappa: our export or the study's raw files."""
     sessions: Path | None = None
     """Table of sessions of our export."""
     rules: str | None = None
-    """By which sessions are flagged and left out: preregistered (without this) or official-code."""
+    """Exclusion rules: preregistered (if not given) or official-code."""
     expected: Path | None = None
     """Table of the stimuli (stimulus) that each session, or each scenario, must have."""
     exclude: Path | None = None
-    """File of stimuli to leave out, one a line."""
+    """File of stimuli to exclude, one a line."""
     ledge: bool = False
-    """Keep the Roll stimuli with a ledge, which the study left out."""
+    """Keep the Roll stimuli with a ledge, which the study excluded."""
     scenario: str = "mean"
-    """One scenario, or mean (each counts the same), or pooled."""
+    """One scenario, or mean (with equal weights), or pooled."""
     sort: str = "accuracy"
     """Column to sort by."""
     ascending: bool = False
-    """Smallest first; without it the best is first."""
+    """Sort ascending; by default the best is first."""
     out: Path | None = None
     """Folder for leaderboard.csv and leaderboard.json."""
     json: bool = False

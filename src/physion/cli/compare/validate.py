@@ -23,7 +23,7 @@ class Options:
     predictions: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Prediction files with the official column names."""
     humans: Path | None = None
-    """Folder with human_accuracy-*.csv: the official outcomes are looked for beside it."""
+    """Folder with human_accuracy-*.csv; the official outcomes are looked for next to it."""
     labels: Path | None = None
     """Official outcomes (stim_ID, label): the stimuli that should be predicted."""
     index: Path | None = None

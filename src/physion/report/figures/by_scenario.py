@@ -29,7 +29,7 @@ def label(agent: str, width: int = 48) -> str:
 
 
 CHANCE = {"accuracy": 0.5, "r": 0.0, "kappa": 0.0}
-"""What a guesser has."""
+"""Value of guessing, by measure."""
 
 LABELS = {
     "accuracy": "accuracy",
@@ -62,10 +62,10 @@ def measure_figure(table: pd.DataFrame, measure: str, theme: Theme = LIGHT) -> F
             labels = [label(agent, 48) for agent in agents]
             small = 9 if row_height == 0.3 else 8
             axis.set_yticks(range(len(agents)), labels if place % 3 == 0 else [], fontsize=small)
-            # Without ticks the values of the panel to the left do not read as their numbers.
+            # No ticks here: they would look like labels of the values in the panel to the left.
             axis.tick_params(axis="y", left=place % 3 == 0)
             axis.set_ylim(len(agents) - 0.4, -0.6)
-            # The values stand in a column of their own, right of everything else.
+            # Space on the right for the column of values.
             axis.set_xlim(low, high + 0.16 * (high - low))
         figure.supxlabel(LABELS[measure], fontsize=10)
         legend(figure, _measure_handles(table, kinds, theme), 4)
@@ -108,7 +108,7 @@ def _dots(
 def _human_marks(axis: Axes, rows: pd.DataFrame, theme: Theme) -> None:
     subset = rows.iloc[0]
     if np.isfinite(subset["zone_low"]):
-        # A hatch marks the zones that are not of participants, as the legend says.
+        # Zones that are not of participants are hatched.
         plain = subset["zone"] not in RELEASED_ZONES
         axis.axvspan(subset["zone_low"], subset["zone_high"], **_zone(plain, theme), zorder=0)
     if np.isfinite(subset["people"]):
@@ -237,8 +237,8 @@ def _cells(axis: Axes, values: Any, widest: float) -> None:
     for row, column in np.ndindex(*values.shape):
         value = values[row, column]
         if not np.isfinite(value):
-            continue  # not tested so
-        # The map is light in its middle and dark at its ends, on any paper.
+            continue  # this combination was not tested
+        # The colour map is light in the middle and dark at its ends in both themes.
         colour = "#ffffff" if abs(value) > 0.6 * widest else "#1b1f24"
         words = number(value) if value < 0.005 else f"+{number(value)}"
         axis.text(column, row, words, ha="center", va="center", color=colour, fontsize=7)

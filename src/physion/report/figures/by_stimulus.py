@@ -30,7 +30,7 @@ TAIL = (
     ("below chance by the study's rule alone", 4),
     ("below chance also when corrected", 5),
 )
-"""What the bars of that distribution are made of, and their places in the palette."""
+"""Parts of these bars, and their positions in the palette."""
 
 
 SQUARE = 1.16
@@ -72,7 +72,7 @@ def _squares(axis: Axes, rows: pd.DataFrame, scenarios: Sequence[str], theme: Th
     changed = rows["label"] != rows["simulated"]
     for hollow in (False, True):
         if (changed == hollow).any():
-            # Markers of a line are one drawing each in SVG and quick to make.
+            # A line with markers is fast to draw and small in SVG.
             axis.plot(x[changed == hollow], rows["p_contact"][changed == hollow],
                       **_point(hollow, theme))  # fmt: skip
     for index, scenario in zip(left, scenarios, strict=True):

@@ -337,7 +337,7 @@ def generalization_table(comparison: Comparison, predictions: pd.DataFrame) -> p
     if not set(rows["trained"]) & parts or not several:
         return pd.DataFrame(columns=list(GENERALIZATION_COLUMNS))
     if not (rows["training"] == ANOTHER).any():
-        rows["trained"] = rows["training"]  # nothing off the diagonal: one row holds it
+        rows["trained"] = rows["training"]  # nothing off the diagonal: one row is enough
     rows = rows.assign(
         right=rows["predicted"] == rows["label"], agent=rows["model"] + " · " + rows["readout"]
     )

@@ -105,7 +105,7 @@ def figure_bytes(figure: Figure, kind: str) -> bytes:
     buffer = io.BytesIO()
     with matplotlib.rc_context({"svg.hashsalt": "physion", "svg.fonttype": "path"}):
         figure.savefig(buffer, format=kind, dpi=150, metadata=metadata)
-    # The layout is the same in every kind and takes long to find.
+    # The layout is the same for every format and slow to compute.
     figure.set_layout_engine("none")
     return buffer.getvalue()
 
@@ -127,7 +127,7 @@ def style(theme: Theme) -> Any:
         "axes.spines.right": False,
         "legend.frameon": False,
         "hatch.linewidth": 0.8,
-        # A person's own settings must not change what a report looks like.
+        # The user's matplotlib settings must not change the report.
         "text.usetex": False,
         "text.parse_math": False,
         "path.simplify": True,

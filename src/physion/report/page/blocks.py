@@ -16,7 +16,7 @@ from physion.analysis.tables.stimuli import MEAN, POOLED, in_order
 from physion.report.words import number, plural
 
 MOST_BARS = 8
-"""Models of which a card shows each; of more it shows the one it is about and the others' mean."""
+"""Largest number of models that a card shows singly; of more it shows one and the others' mean."""
 
 
 def details(title: str, content: str) -> str:

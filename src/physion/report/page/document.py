@@ -10,7 +10,7 @@ from html import escape
 from importlib.resources import files
 
 SVG_LIMIT = 500_000
-"""Bytes above which a figure is embedded as PNG, since thousands of points make a heavy drawing."""
+"""Bytes above which a figure is embedded as PNG: thousands of points are slow to draw as SVG."""
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ def render_page(
         Section("What was left out", _left_out(inputs)),
     ]
     page = render_document(inputs.title, _summary(inputs), [s for s in sections if s.content])
-    return protocol_names(page)  # here, so that no table or caption has names of its own
+    return protocol_names(page)  # here, so that all tables and captions use the same names
 
 
 def _links(inputs: ReportInputs, folder: Path | None) -> Mapping[str, str]:

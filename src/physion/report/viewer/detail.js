@@ -123,7 +123,7 @@ class Detail {
       };
       return make("label", {}, box, ` ${label}`);
     };
-    const boxes = [check("paths and contacts", "paths")];
+    const boxes = [check("paths and touch points", "paths")];
     if (detail.motion.bodies.some((body) => body.scenery)) boxes.push(check("scenery", "scenery"));
     const hint = make("span", {}, "drag to rotate, wheel to zoom");
     container.replaceChildren(canvas, make("div", { class: "under" }, camera, ...boxes, hint));

@@ -30,7 +30,7 @@ _NAMES = {
     "digest": "digest of the motion",
     "scene_digest": "digest of the scene",
 }
-"""What fields are called where their own names would not do."""
+"""Labels of fields whose names are not readable."""
 _OUTCOME = ("contact", "first_frame", "observed", "min_distance", "robust", "recorded_contact")
 
 

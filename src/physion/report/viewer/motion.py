@@ -21,9 +21,9 @@ from physion.scenes.scene import Scene
 from physion.scenes.shapes.primitives import shape
 
 CLOTH_SIDE = 26
-"""Vertices that a cloth keeps along a side at most: every second of the usual 51."""
+"""Largest number of vertices of a cloth along a side: every second of the usual 51."""
 CLOTH_INSTANTS = 76
-"""Instants of a cloth that are kept at most; the page draws straight lines between them."""
+"""Largest number of frames of a cloth; the page interpolates linearly between them."""
 STEPS = 65535
 """Steps of the grid on which coordinates are stored: a thirtieth of a millimetre over 2 m."""
 

@@ -16,7 +16,7 @@ from physion.scenes.scene import Scene
 Picture = NDArray[np.uint8]
 
 ROOM: tuple[int, int, int] = (38, 40, 44)
-"""What the ids show where no thing is."""
+"""Colour of ids where there is no body."""
 AGENT: tuple[int, int, int] = (230, 40, 40)
 PATIENT: tuple[int, int, int] = (245, 205, 30)
 OTHERS: tuple[tuple[int, int, int], ...] = (

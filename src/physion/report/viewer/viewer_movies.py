@@ -17,7 +17,7 @@ from physion.trials.trial_file import Trial
 from physion.trials.video import encode_movie, read_frames
 
 CRF = 25
-"""x264's quality: small movies that are looked at, not measured."""
+"""Quality setting of x264 for small movies."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Strip:
     rate: int
 
     def as_record(self) -> dict[str, Any]:
-        """As the page's script reads it."""
+        """Return the values for the page's script."""
         return {
             "data": base64.b64encode(self.data).decode("ascii"),
             "tiles": list(self.tiles),

@@ -73,7 +73,7 @@ def build_viewer(
         raise BadInputError(f"{out} is a folder; give a file for the page")
     if not out.parent.is_dir():
         raise BadInputError(f"folder {out.parent} does not exist; make it, or choose another")
-    # Rendering takes minutes: better said before.
+    # Checked first, since rendering takes minutes.
     if not os.access(out.parent, os.W_OK):
         raise _unwritable(out, "the folder is read-only")
     chosen, totals = choose_trials(dataset.index, options)
