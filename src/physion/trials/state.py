@@ -41,14 +41,14 @@ FLOOR = "floor"
 """Name of the environment in contacts."""
 
 
-class BodyPoses(NamedTuple):
+class RigidPoses(NamedTuple):
     """Poses of rigid bodies: ``positions`` (F, B, 3) of pivots, ``rotations`` (F, B, 4)."""
 
     positions: Floats
     rotations: Floats
 
 
-class BodyVelocities(NamedTuple):
+class RigidVelocities(NamedTuple):
     """``linear`` (F, B, 3) of centres of mass, m/s; ``angular`` (F, B, 3), world axes, rad/s."""
 
     linear: Floats
@@ -101,7 +101,7 @@ class ThingMesh:
 def centroids(trial: Trial) -> Floats:
     """Return the centres of mass (F, N, 3) in metres, world coordinates.
 
-    The centre of a body is that of its collision hulls, whose velocity is `BodyVelocities.linear`;
+    The centre of a body is that of its collision hulls, whose velocity is `RigidVelocities.linear`;
     the centre of a cloth is the mean of its vertices.
     """
     scene, motion = trial.scene, trial.trajectory
@@ -116,14 +116,14 @@ def centroids(trial: Trial) -> Floats:
     return np.concatenate([rigid, *(s[:, None] for s in sheets)], axis=1).astype(np.float32)
 
 
-def poses(trial: Trial) -> BodyPoses:
+def poses(trial: Trial) -> RigidPoses:
     """Return positions and rotations of the rigid bodies."""
-    return BodyPoses(trial.trajectory.positions, trial.trajectory.rotations)
+    return RigidPoses(trial.trajectory.positions, trial.trajectory.rotations)
 
 
-def velocities(trial: Trial) -> BodyVelocities:
+def velocities(trial: Trial) -> RigidVelocities:
     """Return linear and angular velocities of the rigid bodies."""
-    return BodyVelocities(trial.trajectory.velocities, trial.trajectory.angular_velocities)
+    return RigidVelocities(trial.trajectory.velocities, trial.trajectory.angular_velocities)
 
 
 def contacts_between(trial: Trial, a: str, b: str) -> PairContacts:
