@@ -141,7 +141,8 @@ class RigidRun:
         contacts, pairs = self.finder.find(bodies.x, bodies.q)
         self._push()
         island = find_islands(contacts.bodies, model.actors)
-        wake_touched(island, sleep, settings.wake_time)
+        if np.count_nonzero(sleep.asleep):
+            wake_touched(island, sleep, settings.wake_time)
         awake = ~sleep.asleep
         gravity, cap, dt = settings.gravity, settings.max_angular_velocity, settings.dt
         move_freely(bodies.v, bodies.w, awake, model.drag, gravity, cap, dt)
