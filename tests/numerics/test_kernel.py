@@ -46,3 +46,32 @@ def test_a_changed_callee_in_another_file_is_compiled_again(tmp_path: Path) -> N
         printed.append(done.stdout.strip())
     # (result, read from disk)
     assert printed == ["4 0", "4 1", "12 0"]
+
+
+RECORD = """
+from typing import NamedTuple
+from physion.numerics.kernel import kernel
+
+class {name}(NamedTuple):
+    x: float
+
+@kernel
+def read(record):
+    return record.x
+
+print(read({name}(3.0)))
+"""
+
+
+def test_an_index_that_names_a_renamed_class_is_compiled_again(tmp_path: Path) -> None:
+    env = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1", "PYTHONPATH": str(tmp_path)}
+    for name in ("Before", "After"):
+        (tmp_path / "record.py").write_text(RECORD.format(name=name))
+        done = subprocess.run(
+            [sys.executable, "-c", "import record"],
+            env=env,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.stdout.strip() == "3.0", done.stderr

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -40,6 +40,7 @@ def test_sums_run_in_order() -> None:
     assert algebra.ordered_mean(table[1]) == 2.5 and np.isnan(algebra.ordered_mean(np.zeros(0)))
 
 
+@settings(deadline=None)  # the first call compiles
 @given(arrays(np.float64, (2, 4), elements=st.floats(-1, 1)).filter(
     lambda q: bool((np.abs(q).max(axis=1) > 0.1).all())))  # fmt: skip
 def test_rotations_agree_with_each_other(pair: np.ndarray) -> None:
