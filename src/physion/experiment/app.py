@@ -15,10 +15,10 @@ from starlette.responses import Response
 from physion.errors import BadInputError
 from physion.experiment.experimenter.routes import build_router
 from physion.experiment.protocol.refused import Refused
+from physion.experiment.study.media_links import read_media_path
 from physion.experiment.web.api import build_api
 from physion.experiment.web.bodies import BadBodyError
 from physion.experiment.web.guards import Guards
-from physion.experiment.web.media_links import read_media_path
 from physion.experiment.web.media_serving import MediaFiles
 from physion.experiment.web.page_files import PACKAGE, read_page_file, read_page_files
 from physion.experiment.web.refusals import code_of, refuse

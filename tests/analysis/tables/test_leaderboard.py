@@ -12,15 +12,15 @@ import pytest
 from sklearn.metrics import cohen_kappa_score
 
 from physion.analysis import Bootstrap, compare, read_predictions
-from physion.analysis.people.exclusions import ExclusionRules
-from physion.analysis.people.participants import Responses, clean
-from physion.analysis.people.response_schema import TRIAL_COLUMNS, check_table
-from physion.analysis.tables.leaderboard import (
+from physion.analysis.models.leaderboard import (
     columns,
     leaderboard,
     sort_leaderboard,
 )
-from physion.analysis.tables.leaderboard_rows import sidecar_versions
+from physion.analysis.models.leaderboard_rows import sidecar_versions
+from physion.analysis.people.exclusions import ExclusionRules
+from physion.analysis.people.participants import Responses, clean
+from physion.analysis.people.response_schema import TRIAL_COLUMNS, check_table
 from physion.errors import BadInputError, UnknownNameError
 
 QUICK = Bootstrap(resamples=200)

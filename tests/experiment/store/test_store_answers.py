@@ -20,9 +20,9 @@ from physion.experiment.protocol.messages import Answer, Enter, PageDone
 from physion.experiment.store.store import Refused, Store
 from physion.experiment.store.tables import ANSWERS, METADATA, SESSIONS, STUDIES
 from physion.experiment.study.identity import Secrets
+from physion.experiment.study.media_links import read_media_path
 from physion.experiment.study.orders import trial_order
 from physion.experiment.study.study import Study
-from physion.experiment.web.media_links import read_media_path
 from support.experiment.store_walk import answer, enter, give, page, refusal, rows, run, walk
 
 HOSTILE = "'; DROP TABLE answers; -- \"<script>alert(1)</script>\\ %s {0} \0 é ☃ 🎲"

@@ -27,6 +27,7 @@ from physion.experiment.study.identity import (
     set_password,
     sign,
 )
+from physion.experiment.study.media_links import read_media_path, sign_media
 from physion.experiment.study.orders import (
     draw_buttons,
     fixations,
@@ -35,7 +36,6 @@ from physion.experiment.study.orders import (
     trial_order,
 )
 from physion.experiment.study.study import Study, Timing
-from physion.experiment.web.media_links import read_media_path, sign_media
 
 KEYS = Secrets(b"a" * 32, b"b" * 32)
 

@@ -18,9 +18,9 @@ from sqlalchemy import select
 
 from physion.experiment.store.tables import SESSIONS
 from physion.experiment.study.identity import sign
+from physion.experiment.study.media_links import sign_media
 from physion.experiment.study.orders import trial_order
 from physion.experiment.study.stimuli import Stimulus
-from physion.experiment.web.media_links import sign_media
 from physion.experiment.web.page_files import MEDIA_TYPES, PACKAGE
 from support.experiment.app_walk import Person, Served, served
 from support.experiment.tiny_study import FULL, OBSERVED, read_number

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
+from physion.analysis.models.score_tables import people_table, score_table
 from physion.analysis.people.participants import EXCLUDED, LEDGE
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.tables.predictions import check_predictions, name_models
 from physion.analysis.tables.responses import with_labels
-from physion.analysis.tables.score_tables import people_table, score_table
 from physion.errors import BadInputError
 from physion.stimulus_names import canonical_name, is_ledge
 

@@ -15,7 +15,7 @@ import tyro
 if TYPE_CHECKING:
     import pandas as pd
 
-    from physion.analysis.tables.leaderboard import Leaderboard
+    from physion.analysis.models.leaderboard import Leaderboard
 
 SHOWN = ("rank", "model", "readout", "training", "scenarios", "stimuli")
 """Columns on the console before the metrics, the versions and the file."""
@@ -72,7 +72,7 @@ def main(options: Options) -> int:
 def _board(options: Options) -> Leaderboard:
     from dataclasses import replace
 
-    from physion.analysis.tables.leaderboard import leaderboard, sort_leaderboard
+    from physion.analysis.models.leaderboard import leaderboard, sort_leaderboard
     from physion.analysis.tables.responses import LABELS_FILE, find_beside, read_humans, read_labels
     from physion.analysis.tables.stimuli import read_stimulus_list
 

@@ -22,10 +22,10 @@ from physion.experiment.protocol import messages as wire
 from physion.experiment.simulated.browser import RefusedError, SimulatedBrowser, state_after
 from physion.experiment.simulated.person import SimulatedPerson
 from physion.experiment.study.identity import Secrets
+from physion.experiment.study.media_links import read_media_path
 from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.stimuli import Stimulus
 from physion.experiment.study.study import Study
-from physion.experiment.web.media_links import read_media_path
 
 DEVICE = wire.Device(
     user_agent="physion simulate",

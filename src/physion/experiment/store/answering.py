@@ -13,10 +13,10 @@ from physion.experiment.protocol.refused import Refused
 from physion.experiment.store.sessions import Session, answered, insert_or_skip, stage_of, state_of
 from physion.experiment.store.tables import ANSWERS, SESSIONS
 from physion.experiment.study.identity import Secrets
+from physion.experiment.study.media_links import sign_media
 from physion.experiment.study.orders import trial_order
 from physion.experiment.study.stimuli import PHASES, Stimulus
 from physion.experiment.study.study import Study
-from physion.experiment.web.media_links import sign_media
 
 MAX_DETAILS = 16 * 1024
 _STORED = select(ANSWERS.c.key, ANSWERS.c.response).where(

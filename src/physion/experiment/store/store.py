@@ -48,14 +48,14 @@ from physion.experiment.store.sessions import (
     state_of,
     storable_values,
 )
+from physion.experiment.store.study_record import register
 from physion.experiment.store.tables import EVENTS, RAW_IDS, SESSIONS
 from physion.experiment.store.writer import Writer
 from physion.experiment.study.identity import Secrets, hash_token
+from physion.experiment.study.media_links import sign_media
 from physion.experiment.study.orders import fixations, trial_order
 from physion.experiment.study.recruitment import completion
 from physion.experiment.study.study import Study
-from physion.experiment.study.study_record import register
-from physion.experiment.web.media_links import sign_media
 
 __all__ = ["Refused", "Store"]
 T = TypeVar("T")

@@ -19,12 +19,12 @@ from physion.experiment.protocol.messages import (
     PublicStudy,
     TrialMedia,
 )
+from physion.experiment.study.media_links import sign_media
 from physion.experiment.study.recruitment import RECRUITERS, is_mturk_preview
 from physion.experiment.study.stimuli import PHASES
 from physion.experiment.web.bearer import read_token
 from physion.experiment.web.bodies import read_message
 from physion.experiment.web.guards import ISSUED_TOKEN
-from physion.experiment.web.media_links import sign_media
 from physion.experiment.web.refusals import Reply, refuse
 
 if TYPE_CHECKING:

@@ -18,6 +18,7 @@ import pandas as pd
 
 from physion.analysis.metrics import leaderboard_metrics
 from physion.analysis.models.comparison import NOT_PREDICTED, compare
+from physion.analysis.models.leaderboard_rows import read_submission, score_models
 from physion.analysis.people.exclusions import (
     PREREGISTERED,
     ExclusionRules,
@@ -27,7 +28,6 @@ from physion.analysis.people.exclusions import (
 from physion.analysis.people.participants import Responses, check_labels
 from physion.analysis.people.people import all_answers
 from physion.analysis.statistics.bootstrap import Bootstrap
-from physion.analysis.tables.leaderboard_rows import read_submission, score_models
 from physion.analysis.tables.stimuli import MEAN, POOLED
 from physion.errors import BadInputError, UnknownNameError
 from physion.stimulus_names import SCENARIOS
