@@ -12,7 +12,7 @@ import pytest
 
 from physion.analysis.published.summary import PublishedResults, published_results
 from physion.report.figures.by_scenario import SCENARIO_ZONE
-from physion.report.page.published_report import build_published_report, published_plots
+from physion.report.published_report import build_published_report, published_plots
 
 
 @pytest.fixture(scope="module")

@@ -36,7 +36,7 @@ def main(options: Options) -> int:
     """Print the tables, and write the page if asked."""
     from physion.analysis.published.summary import published_results
     from physion.cli.output import console
-    from physion.report.page.published_report import build_published_report, published_numbers
+    from physion.report.published_report import build_published_report, published_numbers
 
     results = published_results(options.folder)
     page = None if options.out is None else build_published_report(results, options.out)
