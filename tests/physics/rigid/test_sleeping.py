@@ -12,7 +12,7 @@ from physion.physics.rigid.sleeping import (
     update_sleep,
     wake_touched,
 )
-from physion.physics.rigid.solver import Bodies
+from physion.physics.rigid.solver_records import Bodies
 
 OPTIONS = SleepOptions(threshold=0.01, wake_time=0.4, dt=0.01)
 NONE = np.zeros((0, 2), np.int64)

@@ -9,24 +9,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from physion.physics.rigid.constraint_rows import build_constraints, first_tangent, solving_order
+from physion.physics.rigid.motion import move_freely, move_poses
+from physion.physics.rigid.patches import drop_patches_without_contact, find_patches, grow_anchors
 from physion.physics.rigid.settings import RigidSettings
-from physion.physics.rigid.solver import (
+from physion.physics.rigid.solver import solve_step, sweep
+from physion.physics.rigid.solver_records import (
     AnchorMemory,
     Bodies,
     ContactSet,
     SolverBodies,
     SolverOptions,
-    build_constraints,
-    drop_patches_without_contact,
-    find_patches,
-    first_tangent,
-    grow_anchors,
-    move_freely,
-    move_poses,
     no_anchors,
-    solve_step,
-    solving_order,
-    sweep,
 )
 
 DEFAULTS = RigidSettings()

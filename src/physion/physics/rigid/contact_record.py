@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.physics.rigid.solver import ContactSet
+from physion.physics.rigid.solver_records import ContactSet
 from physion.physics.trajectory import Contacts
 
 TOUCH_GAP = 0.0

@@ -25,6 +25,7 @@ from physion.physics.cloth.simulate import ClothSettings, add_cloth, settle_soli
 from physion.physics.rigid.contact_record import ContactRecord
 from physion.physics.rigid.find_contacts import ContactFinder
 from physion.physics.rigid.model import build_model
+from physion.physics.rigid.motion import move_freely, move_poses
 from physion.physics.rigid.settings import RigidSettings
 from physion.physics.rigid.sleeping import (
     SleepOptions,
@@ -33,15 +34,8 @@ from physion.physics.rigid.sleeping import (
     update_sleep,
     wake_touched,
 )
-from physion.physics.rigid.solver import (
-    AnchorMemory,
-    Bodies,
-    SolverOptions,
-    move_freely,
-    move_poses,
-    no_anchors,
-    solve_step,
-)
+from physion.physics.rigid.solver import solve_step
+from physion.physics.rigid.solver_records import AnchorMemory, Bodies, SolverOptions, no_anchors
 from physion.physics.trajectory import State, Trajectory
 from physion.scenes.scene import Scene
 

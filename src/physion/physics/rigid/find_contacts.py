@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from physion.physics.rigid.manifold import Candidates, Geoms, ManifoldOptions, collect_contacts
 from physion.physics.rigid.model import RigidModel
 from physion.physics.rigid.settings import RigidSettings
-from physion.physics.rigid.solver import ContactSet
+from physion.physics.rigid.solver_records import ContactSet
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

@@ -494,7 +494,7 @@ def collect_contacts(
     Returns
     -------
     contacts
-        The arrays of `physion.physics.rigid.solver.ContactSet`, in its order.
+        The arrays of `solver_records.ContactSet`, in its order.
     bodies : (C, 2)
         The two bodies of every contact, numbered as in the scene; -1 is the floor.
     """

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from physion.numerics.kernel import kernel
 from physion.numerics.linear_algebra import inverse
 from physion.numerics.rotations import rotate_vector
-from physion.physics.rigid.solver import Bodies
+from physion.physics.rigid.solver_records import Bodies
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

@@ -1,0 +1,89 @@
+"""Motion between contacts: gravity, drag, the cap of the spin, and the step of the poses."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from physion.numerics.elementary import cos_of, sin_of
+from physion.numerics.kernel import kernel
+from physion.physics.rigid.solver_records import F64, Flags
+
+MIN_SPIN = 1e-12
+"""Radians per second: keeps the cap of the angular velocity from dividing by zero."""
+
+# Free motion and integration: semi-implicit Euler, velocities first, then poses with the velocities
+# at the end of the step. PhysX: `bodyCoreComputeUnconstrainedVelocity` and `integrateCore`.
+
+
+@kernel
+def move_freely(
+    v: F64,
+    w: F64,
+    awake: Flags,
+    drag: F64,
+    gravity: float,
+    max_angular_velocity: float,
+    dt: float,
+) -> None:
+    """Change velocities by a step of gravity and drag, and cap the angular velocity.
+
+    Parameters
+    ----------
+    v, w : (B + 1, 3)
+        Velocities in m/s and rad/s, world axes; changed, but for the last row.
+    awake : (B,)
+        Where gravity acts.
+    drag : (B, 2)
+        Linear and angular drag c, d per second.
+    gravity, max_angular_velocity, dt : float
+        g in m/s^2 downwards, rad/s, seconds.
+
+    Notes
+    -----
+    v <- (v - g dt z) max(1 - c dt, 0), w <- w max(1 - d dt, 0), then w <- w min(1, cap / |w|).
+    """
+    for i in range(len(awake)):
+        if awake[i]:
+            v[i, 2] -= gravity * dt
+        keep_v, keep_w = max(1.0 - drag[i, 0] * dt, 0.0), max(1.0 - drag[i, 1] * dt, 0.0)
+        for j in range(3):
+            v[i, j] *= keep_v
+            w[i, j] *= keep_w
+        speed = np.sqrt(w[i, 0] * w[i, 0] + w[i, 1] * w[i, 1] + w[i, 2] * w[i, 2])
+        factor = min(1.0, max_angular_velocity / max(speed, MIN_SPIN))
+        for j in range(3):
+            w[i, j] *= factor
+
+
+@kernel
+def move_poses(x: F64, q: F64, v: F64, w: F64, dt: float) -> None:
+    """Move centres of mass ``x`` and orientations ``q`` by constant velocities over ``dt`` seconds.
+
+    Parameters
+    ----------
+    x, q : (B + 1, 3), (B + 1, 4)
+        Changed, but for the last row, which stands for the world.
+    v, w : (B + 1, 3)
+        Velocities in m/s and rad/s, world axes.
+    dt : float
+        Seconds.
+
+    Notes
+    -----
+    x <- x + v dt; q <- (cos(|w| dt / 2), sin(|w| dt / 2) w / |w|) q, then q <- q / |q|.
+    """
+    for i in range(len(x) - 1):
+        for j in range(3):
+            x[i, j] += v[i, j] * dt
+        speed = np.sqrt(w[i, 0] ** 2 + w[i, 1] ** 2 + w[i, 2] ** 2)
+        if speed == 0.0:
+            continue
+        half = 0.5 * speed * dt
+        c, s = cos_of(half), sin_of(half) / speed
+        dx, dy, dz = w[i, 0] * s, w[i, 1] * s, w[i, 2] * s
+        qw, qx, qy, qz = q[i, 0], q[i, 1], q[i, 2], q[i, 3]
+        q[i, 0] = c * qw - dx * qx - dy * qy - dz * qz
+        q[i, 1] = c * qx + dx * qw + dy * qz - dz * qy
+        q[i, 2] = c * qy - dx * qz + dy * qw + dz * qx
+        q[i, 3] = c * qz + dx * qy - dy * qx + dz * qw
+        q[i] /= np.sqrt(q[i, 0] ** 2 + q[i, 1] ** 2 + q[i, 2] ** 2 + q[i, 3] ** 2)
