@@ -25,17 +25,10 @@ from physion.physics.cloth.simulate import ClothSettings, add_cloth, settle_soli
 from physion.physics.rigid.contact_record import ContactRecord
 from physion.physics.rigid.find_contacts import ContactFinder
 from physion.physics.rigid.model import build_model
-from physion.physics.rigid.motion import move_freely, move_poses
 from physion.physics.rigid.settings import RigidSettings
-from physion.physics.rigid.sleeping import (
-    SleepOptions,
-    SleepState,
-    find_islands,
-    update_sleep,
-    wake_touched,
-)
-from physion.physics.rigid.solver import solve_step
+from physion.physics.rigid.sleeping import SleepOptions, SleepState
 from physion.physics.rigid.solver_records import AnchorMemory, Bodies, SolverOptions, no_anchors
+from physion.physics.rigid.step import StepOptions, advance
 from physion.physics.trajectory import State, Trajectory
 from physion.scenes.scene import Scene
 
@@ -119,14 +112,18 @@ class RigidRun:
             np.zeros((actors, 3)),
             np.zeros(actors, np.bool_),
         )
-        self.solver_options = _solver_options(settings)
-        self.sleep_options = SleepOptions(settings.sleep_threshold, settings.wake_time, settings.dt)
+        self.options = StepOptions(
+            _solver_options(settings),
+            SleepOptions(settings.sleep_threshold, settings.wake_time, settings.dt),
+            settings.gravity,
+            settings.max_angular_velocity,
+        )
         self.history: list[F64] = [self._state()]
         self.record = ContactRecord()
 
     def step(self) -> None:
         """Move by one frame."""
-        settings, model, bodies, sleep = self.settings, self.model, self.bodies, self.sleep
+        model, bodies, sleep = self.model, self.bodies, self.sleep
         all_asleep = np.count_nonzero(sleep.asleep) == model.actors
         if all_asleep and all(push.frame != self.frame for push in self.scene.pushes):
             self.frame += 1
@@ -134,23 +131,8 @@ class RigidRun:
             return
         contacts, pairs = self.finder.find(bodies.x, bodies.q)
         self._push()
-        island = find_islands(contacts.bodies, model.actors)
-        if np.count_nonzero(sleep.asleep):
-            wake_touched(island, sleep, settings.wake_time)
-        awake = ~sleep.asleep
-        gravity, cap, dt = settings.gravity, settings.max_angular_velocity, settings.dt
-        move_freely(bodies.v, bodies.w, awake, model.drag, gravity, cap, dt)
-        all_awake = np.count_nonzero(awake) == model.actors
-        solid = bodies if all_awake else self._with_sleepers_fixed(awake)
-        result = solve_step(solid, contacts, self.anchors, self.solver_options)
+        result = advance(bodies, contacts, self.anchors, sleep, model.drag, self.options)
         self.anchors = result.anchors
-        move_v, move_w = result.move_v, result.move_w
-        move_poses(bodies.x, bodies.q, move_v, move_w, dt)
-        moved = bodies._replace(v=move_v, w=move_w)
-        update_sleep(contacts.bodies, island, moved, sleep, self.sleep_options)
-        if np.count_nonzero(sleep.asleep):
-            bodies.v[:-1][sleep.asleep] = 0.0
-            bodies.w[:-1][sleep.asleep] = 0.0
         self.frame += 1
         self.record.add(len(self.history), contacts, pairs, result.normal_impulse)
         self.history.append(self._state())
@@ -189,14 +171,6 @@ class RigidRun:
         """Return position, orientation and velocities of all actors, (A + 1, 13)."""
         bodies = self.bodies
         return np.concatenate([bodies.x, bodies.q, bodies.v, bodies.w], axis=1)
-
-    def _with_sleepers_fixed(self, awake: NDArray[np.bool_]) -> Bodies:
-        """Return the bodies with infinite mass where they sleep, so that they do not give way."""
-        gives_way = np.append(awake, True)
-        return self.bodies._replace(
-            inv_mass=np.where(gives_way, self.model.inv_mass, 0.0),
-            inv_inertia=np.where(gives_way[:, None, None], self.model.inv_inertia, 0.0),
-        )
 
     def _push(self) -> None:
         """Apply the pushes of this frame, J: v += J / m, w += I^-1 (r x J); wake what is pushed."""
