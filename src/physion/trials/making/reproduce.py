@@ -67,7 +67,7 @@ def main() -> None:
     """Print all digests as JSON; with ``--write`` store them as those of this version.
 
     Store them only after a change that is meant to alter scenes, motions or pictures, and increase
-    `physion.physics.engine.VERSION` or `physion.rendering.renderer.VERSION` at the same time.
+    `physion.physics.rigid.engine.VERSION` or `physion.rendering.renderer.VERSION` at the same time.
     """
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--write", action="store_true")
