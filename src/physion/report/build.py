@@ -21,7 +21,7 @@ from physion.analysis.models.comparison import Comparison
 from physion.analysis.people.exclusions import PREREGISTERED
 from physion.analysis.people.results import read_attributes, read_expected
 from physion.analysis.results import results_with_averages, results_with_participants
-from physion.analysis.tables.responses import LABELS_FILE, DominoesLook, find_beside
+from physion.analysis.tables.responses import LABELS_FILE, DominoesLook, find_next_to
 from physion.analysis.tables.stimuli import read_stimulus_list
 from physion.atomic import write_atomic
 from physion.errors import BadInputError
@@ -30,10 +30,10 @@ from physion.report.inputs import ReportInputs
 from physion.report.page.movies import check_movies
 from physion.report.page.page import render_page
 from physion.report.settings_text import (
-    attributes_in_words,
-    expected_in_words,
+    describe_attributes,
+    describe_expected,
+    describe_people,
     people_from_files,
-    people_in_words,
 )
 from physion.report.write import prepare_folder, write_csv, write_plot
 
@@ -163,12 +163,12 @@ def compare_files(
             rows, people, exclude=excluded, exclude_ledge=exclude_ledge, bootstrap=draws
         )
         choices.setdefault("Official outcomes", "those recorded with the responses")
-        choices.setdefault("People", people_in_words(responses, people))
+        choices.setdefault("People", describe_people(responses, people))
         choices.setdefault(
-            "Trials of a whole session", expected_in_words(people, expected is not None)
+            "Trials of a whole session", describe_expected(people, expected is not None)
         )
         if attributes is not None:
-            choices.setdefault("Attributes of stimuli", attributes_in_words(people))
+            choices.setdefault("Attributes of stimuli", describe_attributes(people))
     else:
         if sessions is not None or expected is not None or attributes is not None:
             raise BadInputError("sessions, expected and attributes are about responses: give those")
@@ -195,8 +195,8 @@ def _with_averages(
         known = read_labels(labels) if isinstance(labels, Path) else labels
         return compare(rows, None, known, **settings), {}
     averages = read_humans(humans, dominoes)
-    labels = find_beside(humans, "stimuli", LABELS_FILE) if labels is None else labels
-    zone = find_beside(humans, "results", ZONE_FILE) if zone is None else zone
+    labels = find_next_to(humans, "stimuli", LABELS_FILE) if labels is None else labels
+    zone = find_next_to(humans, "results", ZONE_FILE) if zone is None else zone
     if labels is None and rows["recorded"].isna().all():
         raise BadInputError(f"no {LABELS_FILE} lies near {humans}; give the file with the labels")
     known = read_labels(labels) if isinstance(labels, Path) else labels

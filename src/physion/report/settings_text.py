@@ -46,7 +46,7 @@ def people_from_files(
     )
 
 
-def people_in_words(responses: Sequence[Path], people: PeopleResults) -> str:
+def describe_people(responses: Sequence[Path], people: PeopleResults) -> str:
     """Describe the responses and the flagged sessions."""
     flags = people.tables["flags"]
     return (
@@ -56,7 +56,7 @@ def people_in_words(responses: Sequence[Path], people: PeopleResults) -> str:
     )
 
 
-def expected_in_words(people: PeopleResults, given: bool) -> str:
+def describe_expected(people: PeopleResults, given: bool) -> str:
     """Describe how many trials a session must have, and how many sessions had fewer."""
     flags = people.tables["flags"]
     counts = flags.groupby("scenario")["expected"].agg(["min", "max"])
@@ -72,7 +72,7 @@ def expected_in_words(people: PeopleResults, given: bool) -> str:
     return f"{by}: {each}; {plural(int(flags['incomplete'].sum()), 'session')} had fewer"
 
 
-def attributes_in_words(people: PeopleResults) -> str:
+def describe_attributes(people: PeopleResults) -> str:
     """Describe where the attributes of the stimuli come from."""
     sources = people.tables["attributes"]["source"].value_counts()
     stimuli = len(people.tables["by_stimulus"])

@@ -10,9 +10,9 @@ import pandas as pd
 import pytest
 
 from physion.analysis.published.cells import (
-    averaged_in_words,
     copies_of_observed,
     count_tested,
+    describe_averages,
     grid,
     wilson,
 )
@@ -141,13 +141,13 @@ def test_wilson_against_scipy() -> None:
 
 
 def test_words_say_what_was_averaged(released: PublishedTables) -> None:
-    words = averaged_in_words(released)
+    words = describe_averages(released)
     for part in ("full", "every training", "RPIN 36", "SVG 48", "168 of 168", "SVG and RPIN",
                  "Seed 1 of SVG stands in 2", "trained on all scenarios"):  # fmt: skip
         assert part in words, part
     # Without the copies the words do not speak of them.
     own = PublishedTables(released.distinct, released.people, released.stimuli, released.dropped)
-    assert "twice" not in averaged_in_words(own)
+    assert "twice" not in describe_averages(own)
 
 
 # --- panels -------------------------------------------------------------------------------------

@@ -134,7 +134,7 @@ def compare(
         dropped=pd.concat(dropped, ignore_index=True),
         settings=_settings(humans is not None, unwanted, exclude_ledge, draws)
         | (_intervals_with_participants(draws) if participants else {})
-        | (_zone_in_words(zone, zone_origin) if humans is not None else {}),
+        | (_describe_zone(zone, zone_origin) if humans is not None else {}),
     )
 
 
@@ -259,7 +259,7 @@ def _intervals_with_participants(draws: Bootstrap) -> dict[str, str]:
     }
 
 
-def _zone_in_words(zone: pd.DataFrame | None, origin: str) -> dict[str, str]:
+def _describe_zone(zone: pd.DataFrame | None, origin: str) -> dict[str, str]:
     if zone is None:
         return {"Human zone": "not given: it needs the answers of single participants"}
     return {

@@ -26,13 +26,13 @@ def below_chance_released(accuracy: npt.ArrayLike, count: npt.ArrayLike) -> npt.
     The standard error is that of the normal approximation at the observed fraction, which is 0 for
     a fraction of 0; there is no correction for testing 150 stimuli.
     """
-    p, n = _shares(accuracy, count)
+    p, n = _fractions(accuracy, count)
     return np.asarray(p + 1.96 * np.sqrt(p * (1 - p) / n) < 0.5)
 
 
 def below_chance_p(accuracy: npt.ArrayLike, count: npt.ArrayLike) -> Array:
     """Return the exact binomial p of at most so many right answers of ``count`` by guessing."""
-    p, n = _shares(accuracy, count)
+    p, n = _fractions(accuracy, count)
     return np.asarray(stats.binom.cdf(np.rint(p * n), n, 0.5), dtype=np.float64)
 
 
@@ -111,7 +111,7 @@ def r_by_third(
     return pd.DataFrame(rows, columns=["third", "stimuli", "model", "r", "low", "high"])
 
 
-def _shares(accuracy: npt.ArrayLike, count: npt.ArrayLike) -> tuple[Array, Array]:
+def _fractions(accuracy: npt.ArrayLike, count: npt.ArrayLike) -> tuple[Array, Array]:
     p, n = np.asarray(accuracy, dtype=np.float64), np.asarray(count, dtype=np.float64)
     if not ((p >= 0) & (p <= 1)).all() or not (n >= 1).all():
         raise BadInputError("accuracies must lie in 0..1, with at least one person a stimulus")

@@ -104,17 +104,17 @@ def count_tested(runs: pd.DataFrame) -> dict[tuple[str, str], int]:
     }
 
 
-def _denominator(share: float) -> int:
-    return Fraction(share).limit_denominator(MOST_STIMULI).denominator
+def _denominator(fraction: float) -> int:
+    return Fraction(fraction).limit_denominator(MOST_STIMULI).denominator
 
 
-def wilson(share: float, n: float, level: float = 0.95) -> tuple[float, float]:
+def wilson(fraction: float, n: float, level: float = 0.95) -> tuple[float, float]:
     """Return Wilson's interval of a fraction of ``n`` independent trials; NaN, NaN if undefined."""
-    if not (np.isfinite(share) and n > 0):
+    if not (np.isfinite(fraction) and n > 0):
         return float("nan"), float("nan")
     z = float(stats.norm.ppf(0.5 + level / 2))
-    centre = share + z * z / (2 * n)
-    half = z * float(np.sqrt(share * (1 - share) / n + (z / (2 * n)) ** 2))
+    centre = fraction + z * z / (2 * n)
+    half = z * float(np.sqrt(fraction * (1 - fraction) / n + (z / (2 * n)) ** 2))
     return (centre - half) / (1 + z * z / n), (centre + half) / (1 + z * z / n)
 
 
@@ -127,7 +127,7 @@ def copies_of_observed(tables: PublishedTables) -> tuple[int, int]:
     return int((again == first.reindex(again.index)).sum()), len(again)
 
 
-def averaged_in_words(tables: PublishedTables) -> str:
+def describe_averages(tables: PublishedTables) -> str:
     """Return what a published value averages, counted in the tables at hand, as text."""
     equal, copies = copies_of_observed(tables)
     counts = tables.runs.groupby("model")["accuracy"].size() / tables.runs["scenario"].nunique()

@@ -92,7 +92,7 @@ def fit_contrast(contrast: Contrast, tables: PublishedTables, rows: Rows) -> dic
     """Return the `ESTIMATES` of one contrast on one state of the table."""
     table = contrast_rows(contrast, tables, rows)
     if not contrast.groups:
-        return _against_chance(table["accuracy"])
+        return _test_against_half(table["accuracy"])
     terms = ["x", *(name for name in table.columns if str(name).startswith("beside_"))]
     groups = [f"(1|{name})" for name in contrast.groups]
     fit = fit_linear(" ".join(["accuracy ~", " + ".join([*terms, *groups])]), table)
@@ -100,7 +100,7 @@ def fit_contrast(contrast: Contrast, tables: PublishedTables, rows: Rows) -> dic
     return {**{name: float(row[name]) for name in ESTIMATES[:-1]}, "rows": float(fit.rows)}
 
 
-def _against_chance(values: pd.Series) -> dict[str, float]:
+def _test_against_half(values: pd.Series) -> dict[str, float]:
     test = stats.ttest_1samp(values, CHANCE)
     mean = float(values.mean())
     return {"b": mean, "se": float(values.sem()), "t": float(test.statistic),

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from physion.analysis.published.cells import accuracy_table, averaged_in_words
+from physion.analysis.published.cells import accuracy_table, describe_averages
 from physion.analysis.published.panels import SELECTION, panel_a, panel_c, panel_d, panel_e
 from physion.analysis.published.people import people_by_scenario, people_claims
 from physion.analysis.published.regressions import published_regressions
@@ -40,7 +40,7 @@ REGRESSIONS = (
 
 @dataclass(frozen=True)
 class PublishedResults:
-    """Results: ``tables`` by the names of `TITLES`, and ``words``: descriptions of them."""
+    """Results: ``tables`` by the names of `TITLES`, and ``words``: their descriptions."""
 
     tables: Mapping[str, pd.DataFrame]
     words: Mapping[str, str]
@@ -69,7 +69,7 @@ def results_of(released: PublishedTables, bootstrap: Bootstrap | None = None) ->
         "left_out": released.dropped,
     }
     words = {
-        "accuracies": averaged_in_words(released)
+        "accuracies": describe_averages(released)
         + f" Intervals: {draws.level:.0%}, of a published value a bootstrap over the rows that it "
         "averages, of the expected cell Wilson's for the stimuli tested.",
         "panels": SELECTION,

@@ -122,7 +122,7 @@ def read_human_zone(path: Path) -> pd.DataFrame:
     return zone
 
 
-def find_beside(humans: Path, sibling: str, name: str) -> Path | None:
+def find_next_to(humans: Path, sibling: str, name: str) -> Path | None:
     """Return the official file ``name`` in or next to the folder of people's answers.
 
     It may also be in the folder ``sibling`` next to that folder. None if it is in none of these.

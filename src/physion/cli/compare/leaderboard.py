@@ -73,12 +73,17 @@ def _board(options: Options) -> Leaderboard:
     from dataclasses import replace
 
     from physion.analysis.models.leaderboard import leaderboard, sort_leaderboard
-    from physion.analysis.tables.responses import LABELS_FILE, find_beside, read_humans, read_labels
+    from physion.analysis.tables.responses import (
+        LABELS_FILE,
+        find_next_to,
+        read_humans,
+        read_labels,
+    )
     from physion.analysis.tables.stimuli import read_stimulus_list
 
     humans, labels = options.humans, options.labels
     if labels is None and humans is not None:
-        labels = find_beside(humans, "stimuli", LABELS_FILE)
+        labels = find_next_to(humans, "stimuli", LABELS_FILE)
     board = leaderboard(
         options.predictions,
         None if humans is None else read_humans(humans),

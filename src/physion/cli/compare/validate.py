@@ -52,14 +52,14 @@ def main(options: Options) -> int:
 
 
 def _reference(options: Options) -> Reference:
-    from physion.analysis.tables.responses import LABELS_FILE, find_beside, read_labels
+    from physion.analysis.tables.responses import LABELS_FILE, find_next_to, read_labels
     from physion.analysis.tables.stimuli import read_stimulus_list
     from physion.analysis.tables.submission import Reference, read_index
     from physion.errors import BadInputError
 
     labels = options.labels
     if labels is None and options.humans is not None:
-        labels = find_beside(options.humans, "stimuli", LABELS_FILE)
+        labels = find_next_to(options.humans, "stimuli", LABELS_FILE)
         if labels is None:
             raise BadInputError(f"no {LABELS_FILE} lies near {options.humans}; give --labels")
     return Reference(

@@ -77,9 +77,9 @@ def _squares(axis: Axes, rows: pd.DataFrame, scenarios: Sequence[str], theme: Th
                       **_point(hollow, theme))  # fmt: skip
     for index, scenario in zip(left, scenarios, strict=True):
         subset = rows[rows["scenario"] == scenario]
-        words = f"{scenario}, {_r_words(subset['p_contact'], subset['p_yes'])}"
+        words = f"{scenario}, {_describe_r(subset['p_contact'], subset['p_yes'])}"
         axis.text(index, 1.05, words, fontsize=7.5, va="bottom")
-    pooled = f"{_r_words(rows['p_contact'], rows['p_yes'])} pooled, {len(rows)} stimuli"
+    pooled = f"{_describe_r(rows['p_contact'], rows['p_yes'])} pooled, {len(rows)} stimuli"
     join = ", " if len(scenarios) > 3 else "\n"
     axis.set_title(f"{label(rows['agent'].iloc[0], 90)}{join}{pooled}", fontsize=8.5, loc="left",
                    pad=15)  # fmt: skip
@@ -91,7 +91,7 @@ def _squares(axis: Axes, rows: pd.DataFrame, scenarios: Sequence[str], theme: Th
     axis.spines[["left", "bottom"]].set_visible(False)
 
 
-def _r_words(x: pd.Series, y: pd.Series) -> str:
+def _describe_r(x: pd.Series, y: pd.Series) -> str:
     return f"r = {number(pearson(x, y))}"
 
 

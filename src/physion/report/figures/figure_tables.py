@@ -62,17 +62,17 @@ def r_table(comparison: Comparison, zones: pd.DataFrame | None = None) -> pd.Dat
     return _measure(_scores(comparison, "r"), people, "ceiling")
 
 
-def kappa_table(comparison: Comparison, beside: PeopleComparison) -> pd.DataFrame:
+def kappa_table(comparison: Comparison, with_people: PeopleComparison) -> pd.DataFrame:
     """Return mean kappa with participants, and the mean kappa of people with each other.
 
     Columns: `MEASURE_COLUMNS`. Intervals draw people and stimuli.
     """
-    rows = beside.scores[beside.scores["measure"] == "kappa"].rename(
+    rows = with_people.scores[with_people.scores["measure"] == "kappa"].rename(
         columns={"model": "agent", "scenario": "panel", "low_both": "low", "high_both": "high"}
     )[["panel", "agent", "value", "low", "high", "reason"]]
     kinds = comparison.scores.drop_duplicates("agent").set_index("agent")["readout"]
     rows["kind"] = rows["agent"].map(kinds)
-    zones = beside.zones
+    zones = with_people.zones
     subset = zones[(zones["measure"] == "kappa") & (zones["of"] == "participants")]
     people = subset.set_index("scenario")[["mean"]].set_axis(["people"], axis=1)
     if len(people) > 1:

@@ -98,7 +98,7 @@ def notes(rows: pd.DataFrame, columns: Sequence[PageColumn]) -> str:
     return f'<ul class="notes">{"".join(items)}</ul>' if items else ""
 
 
-def words_list(values: Mapping[str, str]) -> str:
+def definition_list(values: Mapping[str, str]) -> str:
     """Return names and their meanings as a list."""
     rows = "".join(f"<dt>{escape(k)}</dt><dd>{escape(v)}</dd>" for k, v in values.items())
     return f"<dl>{rows}</dl>"
@@ -149,7 +149,7 @@ def overall_table(comparison: Comparison, which: str, caption: str = "") -> str:
         header.insert(ceiling, "ceiling of r")
     cells = []
     for _, row in rows.iterrows():
-        line = [escape(_model_words(row)), escape(row["readout"]), str(row["stimuli"])]
+        line = [escape(_describe_model(row)), escape(row["readout"]), str(row["stimuli"])]
         line += [interval(row, metric.name) for metric in shown]
         if ceiling is not None:
             line.insert(ceiling, number(row["ceiling"]))
@@ -163,7 +163,7 @@ def overall_table(comparison: Comparison, which: str, caption: str = "") -> str:
     return table(header, cells, caption) + notes
 
 
-def _model_words(row: pd.Series) -> str:
+def _describe_model(row: pd.Series) -> str:
     """Return the model's name with what distinguishes it from others, but without the readout."""
     head = f"{row['model']} · {row['readout']}"
     return str(row["model"]) + str(row["agent"]).removeprefix(head)
@@ -230,7 +230,7 @@ def definitions(comparison: Comparison) -> str:
         "all, all-but, only": "a model's training: on all scenarios, on all but the tested one, on "
         "the tested one alone; in the files the last two are “all but this” and “same”",
     }
-    return f"<h3>What the numbers mean</h3>{words_list(meaning)}"
+    return f"<h3>What the numbers mean</h3>{definition_list(meaning)}"
 
 
 def changed(comparison: Comparison, links: Mapping[str, str] | None = None) -> str:

@@ -128,14 +128,14 @@ def _gaps(inputs: ReportInputs) -> str:
 def _methods(inputs: ReportInputs) -> str:
     stated = dict.fromkeys(EXPECTED_METHODS, "not stated") | dict(inputs.methods)
     choices = {**stated, **inputs.comparison.settings, **session_blocks.methods(inputs)}
-    return blocks.words_list(choices) + blocks.definitions(inputs.comparison)
+    return blocks.definition_list(choices) + blocks.definitions(inputs.comparison)
 
 
 def _left_out(inputs: ReportInputs) -> str:
     parts = ["<h3>Stimuli</h3>", blocks.dropped(inputs.comparison)]
     if inputs.people is not None:
         parts += ["<h3>Answers of people</h3>", session_blocks.dropped(inputs.people)]
-    missing = _cannot_be_said(inputs)
+    missing = _unanswered(inputs)
     if missing:
         items = "".join(f"<li>{escape(words)}</li>" for words in missing)
         parts += [
@@ -145,7 +145,7 @@ def _left_out(inputs: ReportInputs) -> str:
     return "\n".join(parts)
 
 
-def _cannot_be_said(inputs: ReportInputs) -> list[str]:
+def _unanswered(inputs: ReportInputs) -> list[str]:
     """Return what a complete report would contain and this one lacks, and why."""
     words = []
     if not inputs.comparison.has_people:

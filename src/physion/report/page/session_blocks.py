@@ -18,7 +18,7 @@ def sessions(inputs: ReportInputs) -> str:
     if inputs.people is None:
         return ""
     result = inputs.people.tables
-    parts = [paragraph(rules_in_words(inputs.people.rules)), _flag_counts(result["flag_counts"])]
+    parts = [paragraph(describe_rules(inputs.people.rules)), _flag_counts(result["flag_counts"])]
     parts.append(_with_and_without(inputs))
     if len(result["flag_effects"]):
         columns = [
@@ -98,7 +98,7 @@ def _with_and_without(inputs: ReportInputs) -> str:
     )
 
 
-def rules_in_words(rules: ExclusionRules) -> str:
+def describe_rules(rules: ExclusionRules) -> str:
     """Describe the rules of a set with their thresholds."""
     words = []
     if rules.streak_percentile is not None:
@@ -145,6 +145,6 @@ def methods(inputs: ReportInputs) -> dict[str, str]:
     if inputs.people is None:
         return {}
     return {
-        "Exclusions": rules_in_words(inputs.people.rules),
+        "Exclusions": describe_rules(inputs.people.rules),
         "Rules applied": ", ".join(name.replace("_", " ") for name in RULES),
     }
