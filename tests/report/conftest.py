@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from physion.analysis import Bootstrap, Comparison, compare
+from physion.analysis import Bootstrap, Comparison, compare_scores
 
 Maker = Callable[..., Comparison]
 
@@ -45,7 +45,7 @@ def make_comparison() -> Maker:
                 )
             )
         zone = pd.DataFrame({"scenario": ["collide"], "low": [0.6], "high": [0.8]})
-        return compare(
+        return compare_scores(
             pd.concat(tables),
             people if with_people else None,
             labels if with_people else None,

@@ -1,16 +1,32 @@
 """Comparison of models with people: tables in, tables out; no trial is opened."""
 
-from physion.analysis.models.comparison import Comparison, compare
+from typing import TYPE_CHECKING, Any
+
+from physion.analysis.models.comparison import Comparison, compare_scores
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.tables.predictions import read_predictions
 from physion.analysis.tables.responses import read_human_zone, read_humans, read_labels
 
+if TYPE_CHECKING:
+    from physion.analysis.results import ComparisonResults, compare
+
 __all__ = [
     "Bootstrap",
     "Comparison",
+    "ComparisonResults",
     "compare",
+    "compare_scores",
     "read_human_zone",
     "read_humans",
     "read_labels",
     "read_predictions",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Import what needs the mixed models, which take seconds to import, when it is asked for."""
+    if name in ("ComparisonResults", "compare"):
+        from physion.analysis import results
+
+        return getattr(results, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import pandas as pd
 
-from physion.analysis.models.comparison import Comparison, compare
+from physion.analysis.models.comparison import Comparison, compare_scores
 from physion.analysis.models.mixed_fits import MixedTable, fits_of_models, fits_of_people
 from physion.analysis.models.model_tests import (
     calibration_scores,
@@ -20,13 +20,14 @@ from physion.analysis.models.people_comparison import PeopleComparison, compare_
 from physion.analysis.people.people import accuracy_by_stimulus
 from physion.analysis.people.results import PeopleResults
 from physion.analysis.statistics.bootstrap import Bootstrap
+from physion.errors import BadInputError
 
 
 @dataclass(frozen=True)
 class ComparisonResults:
     """Results of a comparison of models with people.
 
-    - ``comparison``: from `compare`.
+    - ``comparison``: from `comparison.compare_scores`.
     - ``predictions``: from `predictions.read_predictions`, for what needs readout and training.
     - ``people``: results about single participants; None if only their averages are known.
     - ``beside``: models and single participants, from `people_comparison.compare_everywhere`.
@@ -46,7 +47,58 @@ class ComparisonResults:
     mixed: tuple[MixedTable, ...] = ()
 
 
-def results_with_averages(
+def compare(
+    predictions: pd.DataFrame,
+    humans: pd.DataFrame | None = None,
+    labels: Mapping[str, bool] | None = None,
+    *,
+    people: PeopleResults | None = None,
+    zone: pd.DataFrame | None = None,
+    zone_origin: str = "",
+    exclude: Iterable[str] = (),
+    exclude_ledge: bool = True,
+    bootstrap: Bootstrap | None = None,
+) -> ComparisonResults:
+    """Compare models with people, and compute all that a report shows.
+
+    Parameters
+    ----------
+    predictions
+        From `predictions.read_predictions`.
+    humans, labels, zone, zone_origin
+        Averages of people, recorded outcomes and the human zone, as in `compare_scores`.
+    people
+        From `people.results.analyse_people`, in place of ``humans``, ``labels`` and ``zone``.
+    exclude, exclude_ledge, bootstrap
+        As in `compare_scores`.
+
+    Raises
+    ------
+    BadInputError
+        For ``people`` beside averages, and as `compare_scores`.
+    """
+    draws = bootstrap or Bootstrap()
+    excluded = tuple(exclude)
+    if people is not None:
+        if humans is not None or labels is not None or zone is not None:
+            raise BadInputError("give averages of people or their single responses, not both")
+        return _with_participants(
+            predictions, people, exclude=excluded, exclude_ledge=exclude_ledge, bootstrap=draws
+        )
+    comparison = compare_scores(
+        predictions,
+        humans,
+        labels,
+        zone=zone,
+        zone_origin=zone_origin,
+        exclude=excluded,
+        exclude_ledge=exclude_ledge,
+        bootstrap=draws,
+    )
+    return _with_averages(comparison, predictions, draws)
+
+
+def _with_averages(
     comparison: Comparison, predictions: pd.DataFrame, bootstrap: Bootstrap | None = None
 ) -> ComparisonResults:
     """Complete a comparison with people's averages, or without people, by tests and fits."""
@@ -61,7 +113,7 @@ def results_with_averages(
     )
 
 
-def results_with_participants(
+def _with_participants(
     predictions: pd.DataFrame,
     people: PeopleResults,
     *,
@@ -78,7 +130,7 @@ def results_with_participants(
     people
         From `people.results.analyse_people`.
     exclude, exclude_ledge, bootstrap
-        As in `compare`.
+        As in `compare_scores`.
     """
     draws = bootstrap or Bootstrap()
     settings: dict[str, Any] = {
@@ -86,7 +138,7 @@ def results_with_participants(
         "exclude_ledge": exclude_ledge,
         "bootstrap": draws,
     }
-    main = compare(
+    main = compare_scores(
         predictions,
         people.tables["by_stimulus"],
         people.labels(),
@@ -96,7 +148,7 @@ def results_with_participants(
         **settings,
     )
     everybody = accuracy_by_stimulus(people.whole.test, draws)
-    whole = compare(predictions, everybody, people.labels(), **settings)
+    whole = compare_scores(predictions, everybody, people.labels(), **settings)
     agents = len(main.agents)
     permutations = permutations_of(agents * (agents - 1) // 2)
     beside = compare_everywhere(main.stimuli, people.kept.test, draws, permutations=permutations)

@@ -11,16 +11,14 @@ import pandas as pd
 
 from physion.analysis import (
     Bootstrap,
-    compare,
     read_human_zone,
     read_humans,
     read_labels,
     read_predictions,
 )
-from physion.analysis.models.comparison import Comparison
 from physion.analysis.people.exclusions import PREREGISTERED
 from physion.analysis.people.results import read_attributes, read_expected
-from physion.analysis.results import results_with_averages, results_with_participants
+from physion.analysis.results import ComparisonResults, compare
 from physion.analysis.tables.responses import LABELS_FILE, DominoesLook, find_next_to
 from physion.analysis.tables.stimuli import read_stimulus_list
 from physion.atomic import write_atomic
@@ -159,8 +157,8 @@ def compare_files(
             expected=read_expected(expected) if isinstance(expected, Path) else expected,
             attributes=read_attributes(attributes) if isinstance(attributes, Path) else attributes,
         )  # fmt: skip
-        results = results_with_participants(
-            rows, people, exclude=excluded, exclude_ledge=exclude_ledge, bootstrap=draws
+        results = compare(
+            rows, people=people, exclude=excluded, exclude_ledge=exclude_ledge, bootstrap=draws
         )
         choices.setdefault("Official outcomes", "those recorded with the responses")
         choices.setdefault("People", describe_people(responses, people))
@@ -173,10 +171,9 @@ def compare_files(
         if sessions is not None or expected is not None or attributes is not None:
             raise BadInputError("sessions, expected and attributes are about responses: give those")
         settings: dict[str, Any] = {"exclude": excluded, "exclude_ledge": exclude_ledge}
-        comparison, words = _with_averages(
+        results, words = _with_averages(
             rows, humans, labels, zone, dominoes, {**settings, "bootstrap": draws}
         )
-        results = results_with_averages(comparison, rows, draws)
         choices = {**words, **choices}
     inputs = ReportInputs.of(results, methods=choices, movies=movies or {})
     return build_report(inputs, folder)
@@ -189,7 +186,7 @@ def _with_averages(
     zone: Path | None,
     dominoes: DominoesLook,
     settings: Mapping[str, Any],
-) -> tuple[Comparison, dict[str, str]]:
+) -> tuple[ComparisonResults, dict[str, str]]:
     """Return the comparison with people's averages, if there are any, and its settings as text."""
     if humans is None:
         known = read_labels(labels) if isinstance(labels, Path) else labels

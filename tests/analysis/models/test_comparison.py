@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from physion.analysis import Bootstrap, compare, read_predictions
+from physion.analysis import Bootstrap, compare, compare_scores, read_predictions
 from physion.analysis.models.comparison import NO_LABEL, NOT_PREDICTED, NOT_SEEN
 from physion.analysis.people.participants import EXCLUDED, LEDGE
 from physion.analysis.tables.predictions import check_predictions, name_models
@@ -74,7 +74,7 @@ def score(table: pd.DataFrame, agent: str, scenario: str) -> pd.Series:
 def test_scores_are_those_of_the_joined_rows() -> None:
     people = humans()
     given = predictions(people)
-    found = compare(given, people, labels(people), bootstrap=QUICK)
+    found = compare_scores(given, people, labels(people), bootstrap=QUICK)
     truth = np.array(list(labels(people).values()))
     p_yes = np.where(truth, people["accuracy"], 1 - people["accuracy"])
     collide = (people["scenario"] == "collide").to_numpy()
@@ -102,7 +102,7 @@ def test_the_mean_counts_scenarios_and_the_pool_counts_stimuli() -> None:
     given = predictions(people)
     right = people["scenario"].eq("collide").to_numpy() == given["Actual Outcome"].to_numpy()
     given["Predicted Outcome"] = right  # accuracy 1 on collide, 0 on drop
-    found = compare(given, people, labels(people), bootstrap=QUICK).scores
+    found = compare_scores(given, people, labels(people), bootstrap=QUICK).scores
     assert score(found, "m · observed", MEAN)["accuracy"] == pytest.approx(0.5)
     assert score(found, "m · observed", POOLED)["accuracy"] == pytest.approx(30 / 36)
 
@@ -112,7 +112,7 @@ def test_trials_of_another_outcome_are_listed_and_scored_both_ways() -> None:
     odd = tuple(people["stimulus"].iloc[:3])
     given = predictions(people, changed=odd)
     given["Predicted Outcome"] = given["Actual Outcome"]
-    found = compare(given, people, labels(people), bootstrap=QUICK)
+    found = compare_scores(given, people, labels(people), bootstrap=QUICK)
     assert list(found.changed["stimulus"]) == list(odd)
     assert (found.changed["label"] != found.changed["simulated"]).all()
     row = score(found.scores, "m · observed", "collide")
@@ -127,9 +127,11 @@ def test_trials_of_another_outcome_are_listed_and_scored_both_ways() -> None:
 
 def test_the_official_label_and_not_the_simulation_turns_accuracy_into_yes() -> None:
     people = humans()
-    plain = compare(predictions(people), people, labels(people), bootstrap=QUICK)
+    plain = compare_scores(predictions(people), people, labels(people), bootstrap=QUICK)
     odd = tuple(people["stimulus"].iloc[:3])
-    other = compare(predictions(people, changed=odd), people, labels(people), bootstrap=QUICK)
+    other = compare_scores(
+        predictions(people, changed=odd), people, labels(people), bootstrap=QUICK
+    )
     assert plain.stimuli["p_yes"].equals(other.stimuli["p_yes"])
 
 
@@ -138,7 +140,7 @@ def test_people_as_their_own_model_agree_perfectly() -> None:
     truth = np.array(list(labels(people).values()))
     given = predictions(people)
     given["Predicted Prob_true"] = np.where(truth, people["accuracy"], 1 - people["accuracy"])
-    row = score(compare(given, people, labels(people)).scores, "m · observed", POOLED)
+    row = score(compare_scores(given, people, labels(people)).scores, "m · observed", POOLED)
     assert row["r"] == pytest.approx(1) and row["rmsd"] == pytest.approx(0, abs=1e-12)
     assert row["r_low"] == pytest.approx(1) and row["r_high"] == pytest.approx(1)
     assert row["r"] > row["ceiling"]  # it has the noise of these very people
@@ -150,8 +152,8 @@ def test_people_as_their_own_model_agree_perfectly() -> None:
 def test_the_order_of_rows_changes_nothing_but_their_order() -> None:
     people = humans()
     given = pd.concat([predictions(people), predictions(people, "other", "B", seed=2)])
-    plain = compare(given, people, labels(people), bootstrap=QUICK)
-    mixed = compare(
+    plain = compare_scores(given, people, labels(people), bootstrap=QUICK)
+    mixed = compare_scores(
         given.sample(frac=1, random_state=3),
         people.sample(frac=1, random_state=4),
         labels(people),
@@ -166,15 +168,15 @@ def test_the_order_of_rows_changes_nothing_but_their_order() -> None:
 def test_a_model_scores_the_same_alone_and_beside_others() -> None:
     people = humans()
     both = pd.concat([predictions(people), predictions(people.iloc[::2], "half", seed=2)])
-    together = compare(both, people, labels(people), bootstrap=QUICK).scores
-    alone = compare(predictions(people), people, labels(people), bootstrap=QUICK).scores
+    together = compare_scores(both, people, labels(people), bootstrap=QUICK).scores
+    alone = compare_scores(predictions(people), people, labels(people), bootstrap=QUICK).scores
     pd.testing.assert_frame_equal(together[together["model"] == "m"], alone)
 
 
 def test_either_look_of_a_stimulus_joins() -> None:
     people = humans()
     given = predictions(people)
-    plain = compare(given, people, labels(people), bootstrap=QUICK).scores
+    plain = compare_scores(given, people, labels(people), bootstrap=QUICK).scores
     red = given.assign(
         **{
             "Stimulus Name": given["Stimulus Name"].str[:-5]
@@ -183,7 +185,7 @@ def test_either_look_of_a_stimulus_joins() -> None:
         }
     )
     pd.testing.assert_frame_equal(
-        compare(red, people, labels(people), bootstrap=QUICK).scores, plain
+        compare_scores(red, people, labels(people), bootstrap=QUICK).scores, plain
     )
 
 
@@ -194,7 +196,7 @@ def test_constant_predictions_give_nan_with_a_reason() -> None:
     people = humans()
     given = predictions(people)
     given["Predicted Prob_true"] = 0.5
-    scores = compare(given, people, labels(people), bootstrap=QUICK).scores
+    scores = compare_scores(given, people, labels(people), bootstrap=QUICK).scores
     row = score(scores, "m · observed", "collide")
     assert np.isnan(row[["r", "r_low", "r_high"]].astype(float)).all()
     assert "P(contact) is constant" in row["reason"]
@@ -207,14 +209,16 @@ def test_constant_in_one_scenario_leaves_no_silent_mean_of_the_rest() -> None:
     people = humans()
     given = predictions(people)
     given.loc[people["scenario"] == "drop", "Predicted Prob_true"] = 0.5
-    scores = compare(given, people, labels(people), bootstrap=QUICK).scores
+    scores = compare_scores(given, people, labels(people), bootstrap=QUICK).scores
     assert np.isnan(score(scores, "m · observed", MEAN)["r"])
     assert np.isfinite(score(scores, "m · observed", POOLED)["r"])
 
 
 def test_one_stimulus_has_no_interval() -> None:
     people = humans(1)
-    row = score(compare(predictions(people), people, labels(people)).scores, "m · observed", "drop")
+    row = score(
+        compare_scores(predictions(people), people, labels(people)).scores, "m · observed", "drop"
+    )
     assert np.isnan(row["accuracy_low"]) and "one stimulus" in row["reason"]
     assert "fewer than 3" in row["reason"]
 
@@ -241,7 +245,7 @@ def test_everything_left_out_is_counted() -> None:
     given = pd.concat([given, unseen])
     known = labels(people) | {ledge: True}
     del known[people["stimulus"].iloc[3]]
-    found = compare(
+    found = compare_scores(
         given,
         pd.concat([people, extra]),
         known,
@@ -270,17 +274,17 @@ def test_ledges_can_be_kept() -> None:
         .replace("pilot_it2_collision_simple_box", "pilot_it2_rollingSliding_simple_ledge_box")
     )
     people.loc[0, ["stimulus", "scenario"]] = [ledge, "roll"]
-    kept = compare(
+    kept = compare_scores(
         predictions(people), people, labels(people), exclude_ledge=False, bootstrap=QUICK
     )
     assert "roll" in set(kept.scores["scenario"]) and kept.dropped.empty
-    left = compare(predictions(people), people, labels(people), bootstrap=QUICK)
+    left = compare_scores(predictions(people), people, labels(people), bootstrap=QUICK)
     assert "roll" not in set(left.scores["scenario"])
 
 
 def test_without_people_the_models_stand_alone() -> None:
     people = humans()
-    found = compare(predictions(people), None, bootstrap=QUICK)
+    found = compare_scores(predictions(people), None, bootstrap=QUICK)
     row = score(found.scores, "m · observed", "drop")
     assert row["accuracy"] == row["accuracy_simulated"]
     assert np.isnan(row["human_accuracy"]) and "no answers of people" in row["reason"]
@@ -292,19 +296,21 @@ def test_recorded_outcomes_stand_in_for_labels() -> None:
     odd = tuple(people["stimulus"].iloc[:2])
     given = predictions(people, changed=odd)
     given["Recorded Outcome"] = [str(value) for value in labels(people).values()]
-    with_labels = compare(predictions(people, changed=odd), people, labels(people), bootstrap=QUICK)
-    found = compare(given, people, bootstrap=QUICK)
+    with_labels = compare_scores(
+        predictions(people, changed=odd), people, labels(people), bootstrap=QUICK
+    )
+    found = compare_scores(given, people, bootstrap=QUICK)
     pd.testing.assert_frame_equal(found.scores, with_labels.scores)
     assert list(found.changed["stimulus"]) == list(odd)
     given.loc[0, "Recorded Outcome"] = ""
-    assert counts(compare(given, people, bootstrap=QUICK).dropped)["", NO_LABEL] == 1
+    assert counts(compare_scores(given, people, bootstrap=QUICK).dropped)["", NO_LABEL] == 1
 
 
 def test_the_zone_is_for_whole_scenarios_alone() -> None:
     people = humans()
     zone = pd.DataFrame({"scenario": ["collide", "drop"], "low": 0.6, "high": 0.8})
     given = predictions(people.iloc[:-1])
-    table = compare(given, people, labels(people), zone=zone, bootstrap=QUICK).people
+    table = compare_scores(given, people, labels(people), zone=zone, bootstrap=QUICK).people
     table = table.set_index("scenario")
     assert table.loc["collide", "zone_low"] == 0.6
     assert np.isnan(table.loc["drop", "zone_low"]) and np.isnan(table.loc[MEAN, "zone_low"])
@@ -313,13 +319,15 @@ def test_the_zone_is_for_whole_scenarios_alone() -> None:
 def test_labels_of_one_class_are_said() -> None:
     people = humans()
     known = {name: value or "drop" in name for name, value in labels(people).items()}
-    scores = compare(predictions(people), people, known, bootstrap=QUICK).scores
+    scores = compare_scores(predictions(people), people, known, bootstrap=QUICK).scores
     agent = "m · observed"
     assert "labels: all contact" in score(scores, agent, "drop")["reason"]
     assert "labels: of one class in drop" in score(scores, agent, MEAN)["reason"]
     for scenario in ("collide", POOLED):
         assert "labels" not in score(scores, agent, scenario)["reason"]
-    never = compare(predictions(people), people, dict.fromkeys(known, False), bootstrap=QUICK)
+    never = compare_scores(
+        predictions(people), people, dict.fromkeys(known, False), bootstrap=QUICK
+    )
     for scenario in ("collide", POOLED):
         assert "labels: all no contact" in score(never.scores, agent, scenario)["reason"]
 
@@ -328,24 +336,24 @@ def test_the_settings_say_where_the_zone_comes_from_and_what_is_drawn() -> None:
     people = humans()
     zone = pd.DataFrame({"scenario": ["collide", "drop"], "low": 0.6, "high": 0.8})
     given = (predictions(people), people, labels(people))
-    plain = compare(*given, zone=zone, bootstrap=QUICK).settings
+    plain = compare_scores(*given, zone=zone, bootstrap=QUICK).settings
     assert "official" not in plain["Human zone"] and "not resampled" not in plain["Intervals"]
     assert "Intervals with participants" not in plain
-    told = compare(
+    told = compare_scores(
         *given, zone=zone, zone_origin="from the responses", participants=True, bootstrap=QUICK
     ).settings
     assert "from the responses" in told["Human zone"]
     for word in ("participants", "stimuli", "both", "200 resamples"):
         assert word in told["Intervals with participants"]
-    assert "not given" in compare(*given, bootstrap=QUICK).settings["Human zone"]
-    assert "Human zone" not in compare(given[0], None, bootstrap=QUICK).settings
+    assert "not given" in compare_scores(*given, bootstrap=QUICK).settings["Human zone"]
+    assert "Human zone" not in compare_scores(given[0], None, bootstrap=QUICK).settings
 
 
 def test_an_interval_without_width_says_so() -> None:
     people = humans()
     given = predictions(people)
     given["Predicted Outcome"] = given["Actual Outcome"]
-    row = score(compare(given, people, labels(people)).scores, "m · observed", "drop")
+    row = score(compare_scores(given, people, labels(people)).scores, "m · observed", "drop")
     assert row["accuracy_low"] == row["accuracy_high"] == 1 and "no width" in row["reason"]
 
 
@@ -353,9 +361,9 @@ def test_nothing_in_common_is_an_error() -> None:
     people = humans()
     other = people.assign(stimulus=people["stimulus"] + "_x")
     with pytest.raises(BadInputError, match=r"people saw for instance .*_0000'.*_x'"):
-        compare(predictions(other), people, labels(people))
+        compare_scores(predictions(other), people, labels(people))
     with pytest.raises(BadInputError, match="give the labels"):
-        compare(predictions(people), people)
+        compare_scores(predictions(people), people)
 
 
 # --- predictions -------------------------------------------------------------------------------
@@ -382,7 +390,9 @@ def test_training_on_each_scenario_in_turn_is_one_model(spelling: str) -> None:
     same = predictions(people, **{"Dynamics Training Dataset": own})
     others = predictions(people, seed=2, **{"Dynamics Training Dataset": "no_" + own})
     everything = predictions(people, seed=3, **{"Dynamics Training Dataset": "all"})
-    found = compare(pd.concat([same, others, everything]), people, labels(people), bootstrap=QUICK)
+    found = compare_scores(
+        pd.concat([same, others, everything]), people, labels(people), bootstrap=QUICK
+    )
     suffixes = [agent.rsplit("dataset ")[1] for agent in found.agents]
     assert suffixes == ["same", "all but this", "all"]
 
@@ -391,7 +401,7 @@ def test_a_stray_stimulus_does_not_split_a_model() -> None:
     people = humans()
     given = predictions(people)
     stray = given.iloc[:1].assign(**{"Stimulus Name": "of_no_known_scenario_0001"})
-    found = compare(pd.concat([given, stray]), people, labels(people), bootstrap=QUICK)
+    found = compare_scores(pd.concat([given, stray]), people, labels(people), bootstrap=QUICK)
     assert found.agents == ["m · observed"]
     assert counts(found.dropped) == {("m · observed", NOT_SEEN): 1}
 
@@ -417,12 +427,12 @@ def test_contradictions_are_refused() -> None:
     people = humans()
     given = predictions(people)
     with pytest.raises(BadInputError, match="twice"):
-        compare(pd.concat([given, given]), people, labels(people))
+        compare_scores(pd.concat([given, given]), people, labels(people))
     other = predictions(people, "other", changed=(people["stimulus"].iloc[0],))
     with pytest.raises(BadInputError, match="different outcomes"):
-        compare(pd.concat([given, other]), people, labels(people))
+        compare_scores(pd.concat([given, other]), people, labels(people))
     with pytest.raises(BadInputError, match=r"lacks the column\(s\) Actual Outcome"):
-        compare(given.drop(columns="Actual Outcome"), people, labels(people))
+        compare_scores(given.drop(columns="Actual Outcome"), people, labels(people))
 
 
 def test_predictions_survive_their_files(tmp_path: Path) -> None:
@@ -431,8 +441,8 @@ def test_predictions_survive_their_files(tmp_path: Path) -> None:
     tables = [predictions(people), predictions(people, "other", "B", seed=2)]
     for path, table in zip(paths, tables, strict=True):
         table.to_csv(path, index=False)
-    direct = compare(pd.concat(tables), people, labels(people), bootstrap=QUICK).scores
-    read = compare(read_predictions(paths), people, labels(people), bootstrap=QUICK).scores
+    direct = compare_scores(pd.concat(tables), people, labels(people), bootstrap=QUICK).scores
+    read = compare_scores(read_predictions(paths), people, labels(people), bootstrap=QUICK).scores
     pd.testing.assert_frame_equal(direct, read)
     with pytest.raises(BadInputError, match="no file"):
         read_predictions([])
@@ -452,7 +462,7 @@ def test_official_people_as_a_model_reach_the_official_accuracies(official: Path
     given = given.assign(
         **{"Actual Outcome": truth, "Predicted Prob_true": p_yes, "Predicted Outcome": p_yes > 0.5}
     )
-    found = compare(given, people, known, bootstrap=QUICK)
+    found = compare_scores(given, people, known, bootstrap=QUICK)
     assert found.dropped.empty and found.changed.empty
     mean = score(found.scores, "m · observed", MEAN)
     # The study: .747 over scenarios, of people after the stricter exclusion.
@@ -460,3 +470,16 @@ def test_official_people_as_a_model_reach_the_official_accuracies(official: Path
     assert mean["r"] == pytest.approx(1)
     # The majority of people is right more often than a single person.
     assert mean["accuracy"] > mean["human_accuracy"] + 0.05
+
+
+def test_compare_computes_all_that_a_report_draws() -> None:
+    people = humans()
+    both = pd.concat([predictions(people), predictions(people, model="other", seed=5)])
+    found = compare(both, people, labels(people), bootstrap=QUICK)
+    direct = compare_scores(both, people, labels(people), bootstrap=QUICK)
+    pd.testing.assert_frame_equal(found.comparison.scores, direct.scores)
+    assert found.paired is not None and len(found.paired) == 1
+    assert found.calibration is not None and len(found.calibration) == 2
+    assert found.people is None and found.predictions is both
+    alone = compare(predictions(people), None, bootstrap=QUICK)
+    assert alone.paired is None and alone.comparison.people.empty

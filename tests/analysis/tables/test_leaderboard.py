@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 from sklearn.metrics import cohen_kappa_score
 
-from physion.analysis import Bootstrap, compare, read_predictions
+from physion.analysis import Bootstrap, compare_scores, read_predictions
 from physion.analysis.models.leaderboard import (
     columns,
     leaderboard,
@@ -98,7 +98,7 @@ def test_scores_are_those_of_a_comparison(files: list[Path]) -> None:
     assert list(board.table["model"]) == ["good", "middle", "poor"]
     assert list(board.table["rank"]) == [1, 2, 3]
     for row in board.table.to_dict("records"):
-        found = compare(
+        found = compare_scores(
             read_predictions([Path(row["file"])]), humans(), LABELS, bootstrap=QUICK
         ).scores
         one = found[found["scenario"] == "mean"].iloc[0]

@@ -56,7 +56,7 @@ class Comparison:
         return not self.people.empty
 
 
-def compare(
+def compare_scores(
     predictions: pd.DataFrame,
     humans: pd.DataFrame | None,
     labels: Mapping[str, bool] | None = None,

@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 
 from physion.analysis.metrics import leaderboard_metrics
-from physion.analysis.models.comparison import NOT_PREDICTED, compare
+from physion.analysis.models.comparison import NOT_PREDICTED, compare_scores
 from physion.analysis.models.leaderboard_rows import read_submission, score_models
 from physion.analysis.people.exclusions import (
     PREREGISTERED,
@@ -130,7 +130,7 @@ def leaderboard(
     for path in files:
         try:
             rows, versions = read_submission(path)
-            comparison = compare(
+            comparison = compare_scores(
                 rows,
                 people,
                 outcomes,
