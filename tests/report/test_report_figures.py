@@ -16,12 +16,13 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from physion.analysis import Comparison
+from physion.analysis.models import figure_tables
 from physion.analysis.models.mixed_fits import fits_of_models
 from physion.analysis.people.difficulty import below_chance
 from physion.analysis.tables.stimuli import MEAN
 from physion.report.figures import by_scenario as figures
 from physion.report.figures import by_stimulus as figures_stimuli
-from physion.report.figures import figure_tables, theme
+from physion.report.figures import theme
 from physion.report.figures.registry import make_plots
 from physion.report.inputs import ReportInputs
 from physion.report.page import blocks
@@ -58,7 +59,7 @@ def test_zones_of_participants_and_of_scenarios_look_different(make_comparison: 
     assert set(table.loc[table["zone_low"].notna(), "panel"]) == {"collide"}
     row = table.iloc[[0]].assign(zone_low=0.4, zone_high=0.6)
     hatches = []
-    for zone in (figures.PARTICIPANTS, figures.SCENARIO_ZONE):
+    for zone in (figure_tables.PARTICIPANTS, figure_tables.SCENARIO_ZONE):
         axis = figures.measure_figure(row.assign(zone=zone), "accuracy").axes[0]
         hatches.append(axis.patches[0].get_hatch())
     assert hatches[0] is None and hatches[1]

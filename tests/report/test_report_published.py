@@ -10,8 +10,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from physion.analysis.models.figure_tables import SCENARIO_ZONE
 from physion.analysis.published.summary import PublishedResults, published_results
-from physion.report.figures.by_scenario import SCENARIO_ZONE
 from physion.report.published_report import build_published_report, published_plots
 
 

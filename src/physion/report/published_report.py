@@ -10,17 +10,20 @@ from typing import Any
 
 import pandas as pd
 
+from physion.analysis.models.figure_tables import (
+    GROUPED_COLUMNS,
+    MEASURE_COLUMNS,
+    PARTICIPANTS,
+    SCENARIO_ZONE,
+)
 from physion.analysis.published.cells import grid
 from physion.analysis.published.summary import TITLES, PublishedResults
 from physion.analysis.tables.stimuli import MEAN
 from physion.atomic import write_atomic
 from physion.report.figures.by_scenario import (
-    PARTICIPANTS,
-    SCENARIO_ZONE,
     grouped_figure,
     measure_figure,
 )
-from physion.report.figures.figure_tables import GROUPED_COLUMNS, MEASURE_COLUMNS
 from physion.report.figures.theme import Plot, Theme
 from physion.report.page.blocks import PageColumn, details, p_value, paragraph, rows_table, table
 from physion.report.page.document import Section, figure, render_document

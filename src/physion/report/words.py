@@ -6,10 +6,7 @@ import re
 
 import pandas as pd
 
-from physion.analysis.tables.predictions import DATASETS
-
-PROTOCOLS = {"same": "only", "all but this": "all-but"}
-"""Name of a training protocol by the value that the tables of the analysis hold."""
+from physion.analysis.tables.predictions import DATASETS, PROTOCOLS
 
 _RELATIVE = re.compile(rf"( · (?:{'|'.join(DATASETS)}) )(same|all but this)\b", re.IGNORECASE)
 

@@ -25,6 +25,8 @@ REQUIRED = (
 READOUTS = {"A": "full", "B": "observed+simulated", "C": "observed"}
 """The letters of the official files and the protocols that they stand for."""
 
+PROTOCOLS = {"same": "only", "all but this": "all-but"}
+"""Name of a training protocol by the value that the tables hold."""
 DATASETS = (
     "Encoder Pre-training Dataset",
     "Encoder Training Dataset",

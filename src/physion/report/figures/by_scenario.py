@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from physion.analysis.models.figure_tables import HALVES_ZONE, SCENARIO_ZONE
 from physion.analysis.tables.stimuli import MEAN
 from physion.report.figures.theme import LIGHT, Theme, legend, panels, style, title
 from physion.report.words import number, protocol_names
@@ -121,10 +122,6 @@ def _zone(plain: bool, theme: Theme) -> dict[str, Any]:
     return {"facecolor": "none", "edgecolor": theme.faint, "hatch": "/////", "linewidth": 0}
 
 
-PARTICIPANTS = "95 % of participants"
-HALVES = "95 % of random halves"
-SCENARIO_ZONE = "paper's band: bootstrap of scenario means"
-HALVES_ZONE = "paper's band: r of halves, mean over scenarios"
 RELEASED_ZONES = (SCENARIO_ZONE, HALVES_ZONE)
 """Names of zones; those of the paper are hatched, as they say nothing about participants."""
 

@@ -7,7 +7,7 @@ from functools import partial
 import pandas as pd
 from matplotlib.figure import Figure
 
-from physion.report.figures import figure_tables as tables
+from physion.analysis.models import figure_tables as tables
 from physion.report.figures.by_scenario import generalization_figure, grouped_figure, measure_figure
 from physion.report.figures.by_stimulus import (
     calibration_figure,

@@ -11,20 +11,24 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from physion.analysis import Bootstrap
 from physion.analysis.models.comparison import Comparison
 from physion.analysis.models.people_comparison import PeopleComparison
 from physion.analysis.models.zones import released_zone
 from physion.analysis.people.difficulty import THIRDS, below_chance, difficulty_third, r_by_third
+from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.statistics.calibration import brier, reliability_curve
 from physion.analysis.statistics.correlation import correlate_resampled, correlate_rows
-from physion.analysis.tables.predictions import DATASETS, READOUTS
+from physion.analysis.tables.predictions import DATASETS, PROTOCOLS, READOUTS
 from physion.analysis.tables.stimuli import MEAN, POOLED, in_order
-from physion.report.figures.by_scenario import HALVES, HALVES_ZONE, PARTICIPANTS, SCENARIO_ZONE
-from physion.report.words import PROTOCOLS
 from physion.stimulus_names import OFFICIAL_SCENARIOS, SCENARIOS
 
 Array = npt.NDArray[np.float64]
+
+PARTICIPANTS = "95 % of participants"
+HALVES = "95 % of random halves"
+SCENARIO_ZONE = "paper's band: bootstrap of scenario means"
+HALVES_ZONE = "paper's band: r of halves, mean over scenarios"
+"""What the zone of a row is, in words of the figure's key."""
 
 MEASURE_COLUMNS = (
     "panel", "agent", "kind", "value", "low", "high", "people", "people_is", "zone_low",
