@@ -457,3 +457,12 @@ def test_writers_of_one_path_do_not_meet(tmp_path: Path) -> None:
     assert [item.name for item in tmp_path.iterdir()] == ["f"]
     with pytest.raises(FileNotFoundError):
         write_atomic(tmp_path / "no" / "f", b"")
+
+
+def test_a_folder_of_another_version_is_not_resumed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run(tmp_path / "s", scenes_named("a"))
+    monkeypatch.setattr("physion.trials.making.make.RENDERER", "physion-99")
+    with pytest.raises(BadInputError, match=r"made_by"):
+        run(tmp_path / "s", scenes_named("a", "b"))

@@ -173,3 +173,21 @@ def test_a_trial_made_again_is_indexed_again(sampled: Path, tmp_path: Path) -> N
     settings = GenerateSettings(width=64, height=64, jitters=2, passes=("depth", "flow"))
     report = generate(folder, tasks, settings, executor=SerialExecutor())
     assert len(report.made) == 1 and verify_dataset(folder, again=0).faults == []
+
+
+def test_trials_of_another_version_are_no_faults(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = make_scene("real", cloth=False)
+    task = TrialTask("t", "drop", "testing", 0, scene=scene)
+    make_trial(GenerateJob(task, tmp_path / "r", GenerateSettings(64, 64)))
+    paths = TrialPaths(tmp_path / "r", "testing", "drop", "real")
+    other = paths.map.read_bytes().replace(b"IEND", b"IENE")
+    paths.map.write_bytes(other)
+    write_index(tmp_path / "r", build_index(tmp_path / "r")[0])
+    same = verify_dataset(tmp_path / "r", again=-1)
+    assert len(same.faults) == 1 and not same.other_versions
+    monkeypatch.setattr("physion.trials.making.make.RENDERER", "physion-99")
+    newer = verify_dataset(tmp_path / "r", again=-1)
+    assert not newer.faults and len(newer.other_versions) == 1
+    assert "made by another version" in newer.other_versions[0]
