@@ -2,7 +2,7 @@
 
 `physion.trials.making.reproduce` computes them; `golden_digests.json` in this folder stores those
 of this version. A short hash of them is part of the version strings of engine and renderer, which
-every trial stores: equal version strings mean equal bytes.
+every trial stores: engines or renderers of one version string made the same golden trials.
 """
 
 from __future__ import annotations

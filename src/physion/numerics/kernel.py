@@ -28,11 +28,14 @@ def kernel(function: Function) -> Function:
     kernel that it calls, or of any module of this package that it imports has changed.
     """
     dispatcher: Any = numba.njit(cache=True, **OPTIONS)(function)
+    if not isinstance(dispatcher, Dispatcher):
+        return function  # NUMBA_DISABLE_JIT is set: nothing is compiled
     # Numba asks only the kernel's own file whether cached code is outdated. The files of the
     # kernels that it calls, and of the constants and records that it imports, are added to the
     # stamp that numba compares.
     files = set(_files_called(function)) | _files_imported(function.__code__.co_filename)
-    stored = dispatcher._cache._cache_file
+    compiled: Any = dispatcher
+    stored = compiled._cache._cache_file
     stored._source_stamp = (stored._source_stamp, tuple(_digest(file) for file in sorted(files)))
     load_index = stored._load_index
 

@@ -253,7 +253,8 @@ def inside_cells(
             left = value >= 0 if p < q else value > 0
             hit &= left if area > 0 else ~left
         at_x, at_y = np.nonzero(hit)
-        height = sum(w[hit] * z for w, z in zip(weights, (a[2], b[2], c[2]), strict=True)) / area
+        first, second, third = (weight[hit] for weight in weights)
+        height = (first * a[2] + second * b[2] + third * c[2]) / area
         below = np.clip(np.ceil(height), 0, nz).astype(int)
         np.add.at(changes, (at_x + low[0], at_y + low[1], below), 1 if area > 0 else -1)
     # A face counts for all cells below it: `below` of them.

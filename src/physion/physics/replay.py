@@ -129,7 +129,7 @@ def _row(scenario: str, group: list[Replay]) -> ReplayRow:
     ]
     distances = [replay.distance for replay in group if replay.distance is not None]
     ceilings = [pair_agreement(np.array(replay.jittered)) for replay in group]
-    spent = sum(replay.cpu_seconds for replay in group)
+    spent = math.fsum(replay.cpu_seconds for replay in group)
     return ReplayRow(
         scenario=scenario,
         trials=len(group),
@@ -140,7 +140,7 @@ def _row(scenario: str, group: list[Replay]) -> ReplayRow:
         if len(distances) == len(group)
         else float("nan"),
         milliseconds=1000 * spent / len(group),
-        real_time=sum(replay.physics_seconds for replay in group) / max(spent, 1e-9),
+        real_time=math.fsum(replay.physics_seconds for replay in group) / max(spent, 1e-9),
         ceiling=fmean(ceilings) if group[0].jittered else float("nan"),
     )
 

@@ -3,10 +3,13 @@
 MuJoCo is used for collision detection alone; its dynamics is not. One step of 0.01 s is one frame:
 
 1. contacts at the present poses (`find_contacts`, `manifold`);
-2. pushes, gravity, drag, cap of the angular velocity (`solver.move_freely`);
-3. contact impulses (`solver.solve_step`);
-4. poses move (`solver.move_poses`);
-5. bodies at rest fall asleep (`sleeping`).
+2. pushes;
+3. gravity, drag, cap of the angular velocity (`motion.move_freely`);
+4. contact impulses (`solver.solve_step`);
+5. poses move (`motion.move_poses`);
+6. bodies at rest fall asleep (`sleeping`).
+
+Steps 3 to 6 are one compiled call, `step.advance`.
 
 The same scene gives the same bytes: nothing here is random, parallel or dependent on time.
 """

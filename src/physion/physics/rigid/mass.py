@@ -56,7 +56,7 @@ def merge_masses(parts: list[MassProperties]) -> MassProperties:
     Inertias add by the parallel axis theorem: I = sum of I_i + m_i (|r_i|² 1 - r_i r_iᵀ), with r_i
     from the common centre to that of part i.
     """
-    mass = sum(part.mass for part in parts)
+    mass = float(ordered_sum([part.mass for part in parts]))
     center = sum((part.mass * part.center for part in parts), np.zeros(3)) / mass
     inertia = np.zeros((3, 3))
     for part in parts:

@@ -155,7 +155,7 @@ def _check_split(row: pd.Series[Any], settings: Mapping[str, Any]) -> list[str]:
         faults.append(
             f"{row['trial']}: field 'contact': the balance of its split requires the opposite"
         )
-    if task.split in BALANCED and row["observed_contact"] and not settings["observed_contact"]:
+    if task.split in BALANCED and row["observed_contact"] and not settings.get("observed_contact"):
         faults.append(f"{row['trial']}: field 'observed_contact': nothing is left to predict")
     return faults
 
@@ -294,7 +294,9 @@ def _sample_again(paths: TrialPaths, trial: Trial, settings: Mapping[str, Any]) 
     if scene_of(task) != trial.scene:
         faults.append(f"{paths.trial_file}: field 'scene' is not the one that preset and seed give")
     if trial.labels.robust is not None and settings:
-        found = robustness(trial.scene, trial.labels.contact, task.seed(), settings["jitters"])
+        found = robustness(
+            trial.scene, trial.labels.contact, task.seed(), settings.get("jitters", 0)
+        )
         if found != trial.labels.robust:
             faults.append(
                 f"{paths.trial_file}: labels/robust is {trial.labels.robust}, again it is {found}"
