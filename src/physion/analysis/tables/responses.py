@@ -133,7 +133,7 @@ def find_next_to(humans: Path, sibling: str, name: str) -> Path | None:
 
 
 def with_labels(humans: pd.DataFrame, labels: Mapping[str, bool]) -> pd.DataFrame:
-    """Return ``humans`` with ``label`` and ``p_yes``, the fraction of people who said yes.
+    """Return ``humans`` with ``label`` and ``p_yes``, the fraction of people who answered yes.
 
     ``p_yes`` is the accuracy if the label is True, else one minus it. Stimuli without a label get
     NaN in both (``label`` is then of dtype object).
