@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+# Numba's classes have no annotations of types.
+# mypy: allow-untyped-calls
+
+import contextlib
 import hashlib
 import pickle
 import re
@@ -12,6 +16,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.dispatcher import Dispatcher
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -27,27 +32,69 @@ def kernel(function: Function) -> Function:
     infinity or NaN. The cached machine code is discarded when the file of the kernel, of any
     kernel that it calls, or of any module of this package that it imports has changed.
     """
-    dispatcher: Any = numba.njit(cache=True, **OPTIONS)(function)
+    dispatcher: Any = numba.njit(**OPTIONS)(function)
     if not isinstance(dispatcher, Dispatcher):
         return function  # NUMBA_DISABLE_JIT is set: nothing is compiled
-    # Numba asks only the kernel's own file whether cached code is outdated. The files of the
-    # kernels that it calls, and of the constants and records that it imports, are added to the
-    # stamp that numba compares.
-    files = set(_files_called(function)) | _files_imported(function.__code__.co_filename)
     compiled: Any = dispatcher
-    stored = compiled._cache._cache_file
-    stored._source_stamp = (stored._source_stamp, tuple(_digest(file) for file in sorted(files)))
-    load_index = stored._load_index
+    compiled._cache = _KernelCache(function)
+    return cast(Function, dispatcher)
 
-    def load_readable_index() -> Any:
+
+class _KernelCache(FunctionCache):
+    """Cache of a kernel whose files are named after all sources of its machine code."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        # Numba asks only the kernel's own file whether cached code is outdated. The files of the
+        # kernels that it calls, and of the constants and records that it imports, are added.
+        files = set(_files_called(function)) | _files_imported(function.__code__.co_filename)
+        sources = (
+            numba.__version__,
+            self._impl.locator.get_source_stamp(),
+            *(_digest(file) for file in sorted(files)),
+        )
+        self._cache_file = _StampedFiles(self._cache_path, self._impl.filename_base, sources)
+
+
+class _StampedFiles(IndexDataCacheFile):
+    """Index and data files of one kernel, with a digest of its sources in their names.
+
+    Numba numbers the data files from 1 and writes the index first. After a kill between the two,
+    or with two workers, its new index can name a data file that holds machine code of an older
+    source or of other argument types. Here names contain the digests of sources and of the data,
+    and the index comes last, so an index can name nothing but the data that it was written for.
+    """
+
+    def __init__(self, folder: str, base: str, sources: tuple[object, ...]) -> None:
+        self._stamp = hashlib.sha256(repr(sources).encode()).hexdigest()[:16]
+        self._base = base
+        super().__init__(folder, f"{base}.{self._stamp}", self._stamp)
+
+    def save(self, key: Any, data: Any) -> None:
+        """Write ``data`` and then the index, and delete the files of other sources."""
+        digest = hashlib.sha256(self._dump((key, data))).hexdigest()[:16]
+        name = f"{self._base}.{self._stamp}.{digest}.nbc"
+        self._save_data(name, data)
+        self._save_index({**self._load_index(), key: name})
+        self._delete_outdated()
+
+    def _load_index(self) -> dict[Any, str]:
         # An index refers to the classes of arguments; one that was renamed since cannot be read.
         try:
-            return load_index()
+            return cast(dict[Any, str], super()._load_index())
         except (AttributeError, ImportError, EOFError, pickle.UnpicklingError):
             return {}
 
-    stored._load_index = load_readable_index
-    return cast(Function, dispatcher)
+    def _delete_outdated(self) -> None:
+        """Delete the files of this kernel that are not of these sources, at whatever line."""
+        kernel_name, _, rest = self._base.rpartition("-")
+        python = rest.partition(".")[2]
+        own = re.compile(rf"{re.escape(kernel_name)}-\w+\.{re.escape(python)}(\.\w+)*\.nb[ic]")
+        for path in Path(self._cache_path).iterdir():
+            if own.fullmatch(path.name) and f".{self._stamp}." not in path.name:
+                # Another worker may have deleted it, or on Windows have it open.
+                with contextlib.suppress(OSError):
+                    path.unlink()
 
 
 def _files_called(
