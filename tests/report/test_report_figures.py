@@ -18,7 +18,7 @@ from PIL import Image
 from physion.analysis import Comparison
 from physion.analysis.models import figure_tables
 from physion.analysis.models.mixed_fits import fits_of_models
-from physion.analysis.people.difficulty import below_chance
+from physion.analysis.people.difficulty import below_chance_level
 from physion.analysis.tables.stimuli import MEAN
 from physion.report.figures import by_scenario as figures
 from physion.report.figures import by_stimulus as figures_stimuli
@@ -94,7 +94,7 @@ def test_bars_hold_every_stimulus_and_mark_the_tail() -> None:
     accuracy = np.array([0.02, 0.1, 0.4, 0.55, 0.9, 1.0])
     rows = pd.DataFrame({"scenario": "drop", "stimulus": [f"s{i}" for i in range(6)],
                          "accuracy": accuracy, "count": 100})  # fmt: skip
-    figure = figures_stimuli.difficulty_figure(below_chance(rows))
+    figure = figures_stimuli.difficulty_figure(below_chance_level(rows))
     bars = {(round(p.get_x(), 3), p.get_hatch()): p.get_height() for p in figure.axes[0].patches}
     assert sum(bars.values()) == 6
     tail = {x for (x, hatch) in bars if hatch}

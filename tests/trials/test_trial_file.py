@@ -34,7 +34,7 @@ def read_all(data: bytes) -> None:
     """Touch every part of a trial."""
     trial = Trial(data, "trial file evil.h5")
     assert trial.scene and trial.labels and trial.metadata
-    assert len(trial.trajectory) == FRAMES and trial.ids.size and trial.shares.size
+    assert len(trial.trajectory) == FRAMES and trial.ids.size and trial.pixel_fractions.size
     for frame in range(FRAMES):
         trial.passes(frame)
 
@@ -62,7 +62,7 @@ def test_round_trip(cloth: bool, contact: int | None, compatible: bool, tmp_path
         elif field.name != "contacts":
             assert got == put
     np.testing.assert_array_equal(trial.ids, parts.ids)
-    assert trial.shares[:2].tolist() == [8 * 8 / 32**2, 16 * 32 / 32**2]
+    assert trial.pixel_fractions[:2].tolist() == [8 * 8 / 32**2, 16 * 32 / 32**2]
     assert trial.pass_names == () and trial.passes(0) == {}
     assert [p.name for p in tmp_path.iterdir()] == ["t.h5"]
 

@@ -20,11 +20,14 @@ EXTRAS = {
         *("fastapi", "uvicorn", "sqlalchemy", "alembic", "psycopg"),
         *("argon2-cffi", "jinja2", "python-multipart", "httpx2"),
     ),
-    "dev": ("pytest", "pytest-xdist", "hypothesis", "ruff", "mypy", "import-linter", "trimesh"),
+    "dev": (
+        *("pytest", "pytest-xdist", "hypothesis", "ruff", "mypy", "import-linter"),
+        *("playwright", "trimesh"),
+    ),
 }
 CORE = (
     *("numpy", "scipy", "mujoco", "numba", "h5py", "hdf5plugin", "av", "pillow"),
-    *("pandas", "pyarrow", "scikit-learn", "statsmodels", "matplotlib", "tyro", "rich"),
+    *("pandas", "pyarrow", "scikit-learn", "statsmodels", "formulaic", "matplotlib", "tyro", "rich"),
 )
 
 

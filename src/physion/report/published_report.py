@@ -56,7 +56,7 @@ def published_numbers(results: PublishedResults) -> dict[str, Any]:
         name: json.loads(rows.to_json(orient="records", double_precision=15))
         for name, rows in results.tables.items()
     }
-    return {"tables": tables, "words": dict(results.words)}
+    return {"tables": tables, "words": dict(results.descriptions)}
 
 
 # --- figures ------------------------------------------------------------------------------------
@@ -64,7 +64,7 @@ def published_numbers(results: PublishedResults) -> dict[str, Any]:
 
 def published_plots(results: PublishedResults) -> list[Plot]:
     """Return panels A, C, D and E of the paper's main figure."""
-    tables, words = results.tables, results.words["panels"]
+    tables, words = results.tables, results.descriptions["panels"]
     rows = tables["panel_a"]
     people = float(rows.loc[rows["scenario"] == MEAN, "people"].iloc[0])
     return [
@@ -136,7 +136,7 @@ def _draw_grouped(rows: pd.DataFrame, theme: Theme) -> Any:
 
 
 def _page(results: PublishedResults, shown: dict[str, str]) -> str:
-    tables, words = results.tables, results.words
+    tables, words = results.tables, results.descriptions
     models = tables["accuracies"]["model"].nunique()
     lead = (
         f'<p class="lead">{models} models and people on '
@@ -162,7 +162,7 @@ def _page(results: PublishedResults, shown: dict[str, str]) -> str:
 
 def _accuracies(results: PublishedResults) -> str:
     rows = results.tables["accuracies"]
-    parts = [paragraph(results.words["accuracies"])]
+    parts = [paragraph(results.descriptions["accuracies"])]
     for column, caption in (
         ("published", "As published: means of all released rows"),
         ("expected", "As a reader expects: trained on all, readout observed+simulated"),
@@ -223,10 +223,10 @@ def _regressions(results: PublishedResults) -> str:
         "figures met",
         "what differs",
     ]
-    return paragraph(results.words["regressions"]) + table(header, cells)
+    return paragraph(results.descriptions["regressions"]) + table(header, cells)
 
 
-def _people(rows: pd.DataFrame, claims: pd.DataFrame, words: str) -> str:
+def _people(rows: pd.DataFrame, claims: pd.DataFrame, description: str) -> str:
     columns = [
         PageColumn("scenario", "scenario", "text"),
         PageColumn("accuracy", "accuracy", "interval", 3, "zone_low", "zone_high"),
@@ -244,7 +244,7 @@ def _people(rows: pd.DataFrame, claims: pd.DataFrame, words: str) -> str:
         PageColumn("note", "note", "text"),
     ]
     return (
-        paragraph(words)
+        paragraph(description)
         + rows_table(
             rows, columns, "Small print: the zones (2.5 to 97.5 %); in the mean the paper's"
         )

@@ -47,8 +47,8 @@ def index_row(paths: TrialPaths) -> dict[str, Any]:
         "min_distance": labels.min_distance,
         "robust": labels.robust,
         **_elements(scene, imported=meta.seed is None),
-        "agent_share": float(trial.shares[scene.index(scene.roles.agent)]),
-        "patient_share": float(trial.shares[scene.index(scene.roles.patient)]),
+        "agent_share": float(trial.pixel_fractions[scene.index(scene.roles.agent)]),
+        "patient_share": float(trial.pixel_fractions[scene.index(scene.roles.patient)]),
     }
     return row
 

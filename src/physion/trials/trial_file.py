@@ -335,7 +335,7 @@ class Trial:
         return self._reader.array("first_frame/ids")
 
     @cached_property
-    def shares(self) -> NDArray[np.float32]:
+    def pixel_fractions(self) -> NDArray[np.float32]:
         """Fraction of the pixels of frame 0 that show each object of `Scene.names`: (N,), 0..1."""
         return self._reader.array("first_frame/shares")
 

@@ -23,7 +23,11 @@ from physion.analysis.people.biases import (
     side_bias,
     yes_bias,
 )
-from physion.analysis.people.difficulty import below_chance, below_chance_p, difficulty_third
+from physion.analysis.people.difficulty import (
+    below_chance_level,
+    below_chance_level_p,
+    difficulty_third,
+)
 from physion.analysis.people.hypotheses import (
     HYPOTHESES,
     answer_rows,
@@ -226,7 +230,7 @@ def test_hard_chance_and_easy_have_the_published_shares(official_people: pd.Data
 def test_every_scenario_has_stimuli_below_chance_as_the_paper_says(
     official_people: pd.DataFrame,
 ) -> None:
-    found = below_chance(official_people)
+    found = below_chance_level(official_people)
     by_scenario = found.groupby("scenario")[["released", "exact"]].sum()
     assert len(by_scenario) == 8 and (by_scenario > 0).all(axis=None)
     # A correction for 1144 looks makes the rule stricter: nothing new is found.
@@ -237,14 +241,14 @@ def test_below_chance_is_scipys_binomial_test_and_guards_against_many_looks() ->
     accuracy, count = np.array([0.3, 0.5, 0.0]), np.array([60, 40, 5])
     expected = [stats.binomtest(round(a * n), n, 0.5, "less").pvalue
                 for a, n in zip(accuracy, count, strict=True)]  # fmt: skip
-    np.testing.assert_allclose(below_chance_p(accuracy, count), expected)
+    np.testing.assert_allclose(below_chance_level_p(accuracy, count), expected)
     generator = np.random.default_rng(0)
     guessed = pd.DataFrame({"stimulus": np.arange(3000).astype(str), "scenario": "x", "count": 80,
                             "accuracy": generator.binomial(80, 0.5, 3000) / 80})  # fmt: skip
-    found = below_chance(guessed)
+    found = below_chance_level(guessed)
     assert 30 < found["released"].sum() < 150 and found["exact"].sum() <= 1
     with pytest.raises(BadInputError, match="must lie in"):
-        below_chance_p([1.2], [3])
+        below_chance_level_p([1.2], [3])
     assert difficulty_third([np.nan, 0.2, 0.5, 0.9]).tolist()[1:] == ["hard", "chance", "easy"]
     assert pd.isna(difficulty_third([np.nan]).iloc[0])
 

@@ -236,7 +236,7 @@ def test_people_beside_the_paper(results: PublishedResults) -> None:
 def test_every_table_has_a_title_and_nothing_is_empty(results: PublishedResults) -> None:
     assert set(results.tables) == set(TITLES)
     assert all(len(table) for name, table in results.tables.items() if name != "left_out")
-    assert {"accuracies", "panels", "regressions", "people"} == set(results.words)
+    assert {"accuracies", "panels", "regressions", "people"} == set(results.descriptions)
 
 
 # --- broken tables ------------------------------------------------------------------------------

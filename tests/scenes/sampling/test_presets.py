@@ -340,5 +340,7 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
 
 def test_parameters_of_another_scenario_are_refused() -> None:
     drop, seed = scenarios.get("drop").params(), trial_seed("test", "drop", "train", 0)
-    with pytest.raises(BadInputError, match=r"'collide' takes .*collide\.Params, not Params"):
+    with pytest.raises(
+        BadInputError, match=r"'collide' takes .*collide\.CollideParameters, not DropParameters"
+    ):
         sample_scene("collide", seed, drop)

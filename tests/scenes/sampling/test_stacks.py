@@ -19,7 +19,7 @@ from physion.scenes.sampling.clearance import GAP, is_clear_of, raise_above, req
 from physion.scenes.sampling.parameters import LEAST_MASS, Range, yaw
 from physion.scenes.sampling.placement import world_bounds
 from physion.scenes.sampling.preset import get_preset, load_presets, parse_presets
-from physion.scenes.sampling.registry import sample_scene
+from physion.scenes.sampling.registry import sample_scene, scenarios
 from physion.scenes.sampling.stacks import (
     SMALLEST,
     StackRule,
@@ -118,7 +118,7 @@ def test_masses_are_those_of_the_official_logs() -> None:
         ),
         capped=True,
     )
-    scene = draw(link, link.Params(stand=stand))
+    scene = draw(link, link.LinkParameters(stand=stand))
     assert body(scene, "base").mass == body(scene, "cap").mass == pytest.approx(0.864)
     assert body(scene, "attachment").mass == pytest.approx(0.4241, abs=1e-4)
 
@@ -126,7 +126,7 @@ def test_masses_are_those_of_the_official_logs() -> None:
 def test_no_body_is_lighter_than_the_least_mass() -> None:
     member = dataclasses.replace(link.LINKS.member, mass=(0.001, 0.001), scale=(0.005, 0.005))
     stack = dataclasses.replace(link.LINKS, member=member, count=(2, 2))
-    scene = draw(link, link.Params(stack=stack))
+    scene = draw(link, link.LinkParameters(stack=stack))
     assert {one.mass for one in (body(scene, "target"), *members(scene, "member"))} == {LEAST_MASS}
 
 
@@ -141,13 +141,14 @@ def test_the_agent_is_one_of_at_least_one(module: ModuleType, count: str) -> Non
         parse_presets(text + count, "own.toml")
     assert parse_presets(text + "1", "own.toml")["few"].params.stack.count == (1, 1)
     seed = trial_seed("test", name, "train", 0)
-    none = dataclasses.replace(module.Params().stack, count=(0, 1))
+    params = scenarios.get(name).params
+    none = dataclasses.replace(params().stack, count=(0, 1))
     with pytest.raises(BadInputError, match=f"parameters of {name}: stack: count is 0, allowed"):
-        sample_scene(name, seed, module.Params(stack=none))
+        sample_scene(name, seed, params(stack=none))
     with pytest.raises(BadInputError, match="stack must be a FilledStackRule, not a StackRule"):
-        sample_scene(name, seed, module.Params(stack=StackRule(count=(0, 1))))
+        sample_scene(name, seed, params(stack=StackRule(count=(0, 1))))
     # A tower may be nothing but what is on its top.
-    empty = support.Params(stack=dataclasses.replace(support.BLOCKS, count=(0, 0)))
+    empty = support.SupportParameters(stack=dataclasses.replace(support.BLOCKS, count=(0, 0)))
     assert not members(sample_scene("support", seed, empty), "block")
 
 
@@ -167,7 +168,7 @@ def test_choice_of_the_agent() -> None:
 def test_towers_stand_and_shrink() -> None:
     still = dataclasses.replace(support.BLOCKS, count=(4, 4), jitter=0.0, gradient=0.1)
     member = dataclasses.replace(still.member, scale=(0.5, 0.5), turn_deg=(0.0, 0.0))
-    params = support.Params(stack=dataclasses.replace(still, member=member))
+    params = support.SupportParameters(stack=dataclasses.replace(still, member=member))
     scene = draw(support, params)
     blocks, target = members(scene, "block"), body(scene, "target")
     assert [b.scale[0] for b in blocks] == pytest.approx([0.7, 0.6, 0.5, 0.4])
@@ -186,7 +187,7 @@ def test_towers_stand_and_shrink() -> None:
 def test_no_block_vanishes() -> None:
     shrinking = dataclasses.replace(support.BLOCKS, count=(6, 6), gradient=-0.3)
     for index in range(4):
-        scene = draw(support, support.Params(stack=shrinking, length=6.0), index)
+        scene = draw(support, support.SupportParameters(stack=shrinking, length=6.0), index)
         assert min(min(b.scale) for b in scene.bodies if b.name != "zone") == SMALLEST
         assert min(b.mass for b in scene.bodies) > 0.001
 
@@ -196,7 +197,7 @@ def test_jitter_is_a_fraction_of_the_size() -> None:
     shares = [
         abs(b.position[axis]) / b.scale[axis]
         for index in range(20)
-        for b in members(draw(support, support.Params(stack=wide), index), "block")
+        for b in members(draw(support, support.SupportParameters(stack=wide), index), "block")
         for axis in (0, 1)
     ]
     assert 0.28 < max(shares) <= 0.3
@@ -222,11 +223,11 @@ def test_what_cannot_be_placed_is_an_error_with_reason() -> None:
     short = dataclasses.replace(link.STAND.attachment, scale=((0.1, 0.1), (0.1, 0.1), (0.2, 0.2)))
     capped = dataclasses.replace(link.STAND, capped=True, attachment=short)
     with pytest.raises(BadSceneError, match=r"link .* 100 tries: the stack does not fit under"):
-        draw(link, link.Params(stack=tall, stand=capped))
+        draw(link, link.LinkParameters(stack=tall, stand=capped))
     with pytest.raises(BadSceneError, match="the probe would start inside the stand"):
-        draw(contain, contain.Params(length=0.3))
+        draw(contain, contain.ContainParameters(length=0.3))
     with pytest.raises(BadSceneError, match="the probe would start inside the tower"):
-        draw(support, support.Params(length=0.3))
+        draw(support, support.SupportParameters(length=0.3))
 
 
 def test_stands() -> None:

@@ -151,7 +151,7 @@ def test_roll_is_drawn_as_the_official_scenes(official: Path, preset: Preset) ->
 
 
 def test_roll_samples_and_records_each_template() -> None:
-    params = roll.Params(template=roll.TEMPLATES)
+    params = roll.RollParameters(template=roll.TEMPLATES)
     seen = set()
     for index in range(SAMPLES):
         scene = draw("roll", params, index)
@@ -188,7 +188,7 @@ def test_target_starts_outside_the_ramp(name: str) -> None:
     )
     raised = 0
     for index in range(SAMPLES):
-        scene = draw("roll", roll.Params(ramp=rule), index)
+        scene = draw("roll", roll.RollParameters(ramp=rule), index)
         target, ramp = body(scene, "target"), body(scene, "ramp")
         corners = world_corners(target)
         one, other = (
@@ -208,7 +208,7 @@ def test_target_starts_outside_the_ramp(name: str) -> None:
 
 def test_target_is_released_above_the_slope() -> None:
     for index in range(SAMPLES):
-        scene = draw("roll", roll.Params(), index)
+        scene = draw("roll", roll.RollParameters(), index)
         target, ramp = body(scene, "target"), body(scene, "ramp")
         low, high = world_bounds(ramp)
         assert low[0] < target.position[0] < high[0] < world_bounds(body(scene, "zone"))[0, 0]
@@ -216,7 +216,7 @@ def test_target_is_released_above_the_slope() -> None:
 
 
 def test_ledge_stands_on_the_floor_as_high_as_the_official_one_reaches() -> None:
-    scene = draw("roll", roll.Params(template=("ledge",)), 0)
+    scene = draw("roll", roll.RollParameters(template=("ledge",)), 0)
     low, high = world_bounds(body(scene, "ledge"))
     assert low[2] == 0 and high[2] == pytest.approx(0.025)
     assert high[0] - low[0] == pytest.approx(0.05) and high[1] - low[1] == pytest.approx(100)
@@ -230,7 +230,7 @@ def test_ledge_stands_on_the_floor_as_high_as_the_official_one_reaches() -> None
 
 
 def test_scenery_stands_on_both_sides_of_the_ledge() -> None:
-    params = roll.Params(template=("ledge",))
+    params = roll.RollParameters(template=("ledge",))
     rule = dataclasses.replace(params.scenery, distractors=2, occluders=2)
     scene = draw("roll", dataclasses.replace(params, scenery=rule), 1)
     scenery = [thing for thing in scene.bodies if thing.scenery]
@@ -239,7 +239,7 @@ def test_scenery_stands_on_both_sides_of_the_ledge() -> None:
 
 
 def test_probes_of_collisions_are_tumbled_and_start_above_the_floor() -> None:
-    params = roll.Params(template=("collision",))
+    params = roll.RollParameters(template=("collision",))
     raised = 0
     for index in range(100):
         scene = draw("roll", params, index)
@@ -314,26 +314,26 @@ def test_cloth_is_the_agent_and_nothing_meets_on_the_floor() -> None:
 
 
 def test_third_anchor_has_its_probability() -> None:
-    scenes = [draw("drape", drape.Params(), index) for index in range(300)]
+    scenes = [draw("drape", drape.DrapeParameters(), index) for index in range(300)]
     extra = [body(s, "anchor_extra") for s in scenes if "anchor_extra" in s.names()]
     assert abs(len(extra) / 300 - 0.7) < 0.1
     assert abs(sum(t.position[0] < 0 for t in extra) / len(extra) - 0.65) < 0.12
-    none = dataclasses.replace(drape.Params().anchors, extra=0.0)
-    bare = draw("drape", drape.Params(anchors=none), 0)
+    none = dataclasses.replace(drape.DrapeParameters().anchors, extra=0.0)
+    bare = draw("drape", drape.DrapeParameters(anchors=none), 0)
     assert "anchor_extra" not in bare.names()
 
 
 def test_larger_cloth_has_more_vertices() -> None:
     for size, vertices in ((2.0, 51), (1.4, 36), (3.0, 76)):
         rule = drape.ClothRule(size=(size, size))
-        (cloth,) = draw("drape", drape.Params(cloth=rule), 0).cloths
+        (cloth,) = draw("drape", drape.DrapeParameters(cloth=rule), 0).cloths
         assert cloth.size == (size, size, 0.0) and cloth.resolution == vertices
 
 
 def test_what_cannot_be_placed_is_an_error_with_reason() -> None:
     tight = drape.AnchorRule(between=(0.0, 0.0), jitter=0.0)
     with pytest.raises(BadSceneError, match=r"anchor_right .*100 tries.*anchor_left"):
-        draw("drape", drape.Params(anchors=tight), 0)
+        draw("drape", drape.DrapeParameters(anchors=tight), 0)
 
 
 @pytest.mark.parametrize("key", ["height", "extra_height"])
@@ -347,19 +347,19 @@ def test_anchors_have_a_minimum_height(key: str) -> None:
         parse_presets(text + ", ".join(f"{k} = {v}" for k, v in values.items()) + " }", "own.toml")
     low = drape.AnchorRule(height_jitter=0.7, **values)
     with pytest.raises(BadInputError, match=f"^parameters of drape: {said}"):
-        draw("drape", drape.Params(anchors=low), 0)
+        draw("drape", drape.DrapeParameters(anchors=low), 0)
 
 
 def test_natural_sizes_are_python_floats() -> None:
     """Numbers of numpy would be shown as np.float64(...) in messages."""
-    scene = draw("drape", drape.Params(), 0)
+    scene = draw("drape", drape.DrapeParameters(), 0)
     assert {type(side) for one in scene.bodies for side in one.scale} == {float}
 
 
 def test_cloth_over_the_zone_touches_it_and_cloth_beside_it_does_not() -> None:
     low = drape.AnchorRule(height=0.05, height_jitter=0.0, taller=0.0, extra=0.0)
     near = drape.ClothRule(size=(0.8, 0.8), x=(0.0, 0.0), y=(0.1, 0.1), height=(0.6, 0.6))
-    params = drape.Params(
+    params = drape.DrapeParameters(
         near,
         low,
         zone_share=(0.5, 0.5),

@@ -17,9 +17,9 @@ from physion.scenes.looks import RED, YELLOW, is_mistakable, with_role_colors
 from physion.scenes.sampling.placement import CameraRule, SceneryRule, place_camera, world_bounds
 from physion.scenes.sampling.preset import get_preset, parse_presets
 from physion.scenes.sampling.registry import Scenario, sample_scene, scenarios
-from physion.scenes.scenarios.collide import Params as Collide
-from physion.scenes.scenarios.dominoes import Params as Dominoes
-from physion.scenes.scenarios.drop import Params as Drop
+from physion.scenes.scenarios.collide import CollideParameters as Collide
+from physion.scenes.scenarios.dominoes import DominoesParameters as Dominoes
+from physion.scenes.scenarios.drop import DropParameters as Drop
 from physion.scenes.scene import Body, Scene
 from physion.scenes.shapes.primitives import shape
 from physion.scenes.shapes.prop_names import expand_props

@@ -83,7 +83,7 @@ def test_map_is_red_on_the_agent_and_yellow_on_the_patient(job: GenerateJob) -> 
         thing = trial.scene.index(name)
         shown = (picture == color).all(axis=2)
         np.testing.assert_array_equal(shown, ids == thing + 1)
-        assert trial.shares[thing] == pytest.approx(shown.mean()) and shown.any()
+        assert trial.pixel_fractions[thing] == pytest.approx(shown.mean()) and shown.any()
     others = ~np.isin(ids, [trial.scene.index(n) + 1 for n in (roles.agent, roles.patient)])
     assert not picture[others, 3].any()
 

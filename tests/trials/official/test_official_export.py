@@ -358,7 +358,7 @@ def test_metadata_is_measured(exported: Path, rigid: Trial) -> None:
     assert record["does_target_contact_zone"] and not record["does_target_miss_zone"]
     assert record["first_target_contact_zone_frame"] == TOUCH
     assert record["first_target_hit_ground_frame"] == 3
-    share = rigid.shares[scene.index("cone")]
+    share = rigid.pixel_fractions[scene.index("cone")]
     assert record["target_visible_area"] == pytest.approx(share, abs=5e-4)
     assert record["num_distractors"] == 1 and record["num_occluders"] == 0
     assert record["push_time"] == 4

@@ -14,7 +14,12 @@ import pandas as pd
 from physion.analysis.models.comparison import Comparison
 from physion.analysis.models.people_comparison import PeopleComparison
 from physion.analysis.models.zones import released_zone
-from physion.analysis.people.difficulty import THIRDS, below_chance, difficulty_third, r_by_third
+from physion.analysis.people.difficulty import (
+    THIRDS,
+    below_chance_level,
+    difficulty_third,
+    r_by_third,
+)
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.statistics.calibration import brier, reliability_curve
 from physion.analysis.statistics.correlation import correlate_resampled, correlate_rows
@@ -150,7 +155,7 @@ def scatter_table(comparison: Comparison, agents: Sequence[str]) -> pd.DataFrame
 
 
 def difficulty_table(comparison: Comparison, by_stimulus: pd.DataFrame | None) -> pd.DataFrame:
-    """Return the stimuli with people's accuracy and its tests; see `difficulty.below_chance`.
+    """Return the stimuli with people's accuracy and its tests; see `difficulty.below_chance_level`.
 
     ``by_stimulus``: all that people answered; without it those that any model predicts.
     """
@@ -158,7 +163,7 @@ def difficulty_table(comparison: Comparison, by_stimulus: pd.DataFrame | None) -
         by_stimulus = comparison.stimuli.drop_duplicates("stimulus")
         by_stimulus = by_stimulus.rename(columns={"human_accuracy": "accuracy"})
     rows = by_stimulus.sort_values(["scenario", "stimulus"], kind="stable").reset_index(drop=True)
-    return below_chance(rows)
+    return below_chance_level(rows)
 
 
 def response_time_table(by_stimulus: pd.DataFrame) -> pd.DataFrame:

@@ -159,7 +159,7 @@ def leaderboard(
         left_out[order],
         pd.DataFrame(refused, columns=["file", "reason"]),
         None if kept is None else kept.dropped,
-        {**settings, **_words(scenario, test is not None), **flagging},
+        {**settings, **_describe_scores(scenario, test is not None), **flagging},
     )
 
 
@@ -256,14 +256,14 @@ def _people(
     return humans, outcomes
 
 
-def _words(scenario: str, single: bool) -> dict[str, str]:
-    words = {
+def _describe_scores(scenario: str, single: bool) -> dict[str, str]:
+    descriptions = {
         "Leaderboard": "each file by itself, on the stimuli that it shares with people; scores of "
         + (scenario if scenario in SCENARIOS else f"the row “{scenario}” over scenarios")
     }
     if single:
-        words["Kappa"] = (
+        descriptions["Kappa"] = (
             "mean over participants of Cohen's kappa with the model, averaged over scenarios; its "
             "interval draws participants, those of the other scores draw stimuli"
         )
-    return words
+    return descriptions

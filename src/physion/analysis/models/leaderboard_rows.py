@@ -58,14 +58,14 @@ def sidecar_versions(path: Path) -> str:
 
 
 def score_models(
-    found: Comparison,
+    comparison: Comparison,
     rows: pd.DataFrame,
     answers: Mapping[str, ScenarioAnswers],
     scenario: str,
     draws: Bootstrap,
 ) -> pd.DataFrame:
     """Return one row for each model of one file."""
-    chosen = found.scores[found.scores["scenario"] == scenario]
+    chosen = comparison.scores[comparison.scores["scenario"] == scenario]
     if chosen.empty:
         raise BadInputError(f"nothing of scenario {scenario!r} can be compared")
     scored = [
@@ -75,18 +75,18 @@ def score_models(
         for end in ("", "_low", "_high")
     ]
     table = chosen[["agent", "model", "readout", "stimuli", "reason", *scored]].copy()
-    counts = found.stimuli.groupby("agent")["scenario"].nunique()
+    counts = comparison.stimuli.groupby("agent")["scenario"].nunique()
     table["scenarios"] = table["agent"].map(counts) if scenario in (MEAN, POOLED) else 1
     training = rows.drop_duplicates("agent").set_index("agent")["Dynamics Training Dataset"]
     table["training"] = table["agent"].map(training)
-    if not found.has_people:
+    if not comparison.has_people:
         return table
     for metric in leaderboard_metrics():
         if metric.in_scores:
             continue
         table[[metric.name, f"{metric.name}_low", f"{metric.name}_high"]] = np.nan
         if answers:
-            _add_metric(table, metric, found, answers, scenario, draws)
+            _add_metric(table, metric, comparison, answers, scenario, draws)
         else:
             why = f"{metric.name}: needs the answers of single participants"
             table["reason"] = _also(table["reason"], why)

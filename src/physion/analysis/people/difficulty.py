@@ -20,7 +20,9 @@ EDGES = (1 / 3, 2 / 3)
 """Accuracies that separate the three; 33 and 67 % in the paper."""
 
 
-def below_chance_released(accuracy: npt.ArrayLike, count: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+def below_chance_level_released(
+    accuracy: npt.ArrayLike, count: npt.ArrayLike
+) -> npt.NDArray[np.bool_]:
     """Return whether accuracy + 1.96 standard errors is below 0.5: the study's rule.
 
     The standard error is that of the normal approximation at the observed fraction, which is 0 for
@@ -30,24 +32,24 @@ def below_chance_released(accuracy: npt.ArrayLike, count: npt.ArrayLike) -> npt.
     return np.asarray(p + 1.96 * np.sqrt(p * (1 - p) / n) < 0.5)
 
 
-def below_chance_p(accuracy: npt.ArrayLike, count: npt.ArrayLike) -> Array:
+def below_chance_level_p(accuracy: npt.ArrayLike, count: npt.ArrayLike) -> Array:
     """Return the exact binomial p of at most so many right answers of ``count`` by guessing."""
     p, n = _fractions(accuracy, count)
     return np.asarray(stats.binom.cdf(np.rint(p * n), n, 0.5), dtype=np.float64)
 
 
-def below_chance(by_stimulus: pd.DataFrame, level: float = 0.05) -> pd.DataFrame:
+def below_chance_level(by_stimulus: pd.DataFrame, level: float = 0.05) -> pd.DataFrame:
     """Find the stimuli that people get wrong more often than by guessing, by two rules.
 
     ``by_stimulus`` has ``stimulus``, ``scenario``, ``accuracy`` and ``count``, from
     `people.accuracy_by_stimulus` or `responses.read_humans`. Added columns: ``released``
-    (`below_chance_released`), ``p`` (`below_chance_p`), ``p_adjusted`` (Benjamini and Hochberg over
-    all rows given), ``exact`` (p_adjusted < ``level``).
+    (`below_chance_level_released`), ``p`` (`below_chance_level_p`), ``p_adjusted`` (Benjamini and
+    Hochberg over all rows given), ``exact`` (p_adjusted < ``level``).
     """
-    p = below_chance_p(by_stimulus["accuracy"], by_stimulus["count"])
+    p = below_chance_level_p(by_stimulus["accuracy"], by_stimulus["count"])
     adjusted = benjamini_hochberg(p)
     return by_stimulus[["scenario", "stimulus", "accuracy", "count"]].assign(
-        released=below_chance_released(by_stimulus["accuracy"], by_stimulus["count"]),
+        released=below_chance_level_released(by_stimulus["accuracy"], by_stimulus["count"]),
         p=p,
         p_adjusted=adjusted,
         exact=adjusted < level,

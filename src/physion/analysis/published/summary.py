@@ -40,10 +40,10 @@ REGRESSIONS = (
 
 @dataclass(frozen=True)
 class PublishedResults:
-    """Results: ``tables`` by the names of `TITLES`, and ``words``: their descriptions."""
+    """Results: ``tables`` by the names of `TITLES`, and their ``descriptions``."""
 
     tables: Mapping[str, pd.DataFrame]
-    words: Mapping[str, str]
+    descriptions: Mapping[str, str]
 
 
 def published_results(folder: Path, bootstrap: Bootstrap | None = None) -> PublishedResults:
@@ -68,7 +68,7 @@ def results_of(released: PublishedTables, bootstrap: Bootstrap | None = None) ->
         "people_claims": people_claims(released),
         "left_out": released.dropped,
     }
-    words = {
+    descriptions = {
         "accuracies": describe_averages(released)
         + f" Intervals: {draws.level:.0%}, of a published value a bootstrap over the rows that it "
         "averages, of the expected cell Wilson's for the stimuli tested.",
@@ -79,4 +79,4 @@ def results_of(released: PublishedTables, bootstrap: Bootstrap | None = None) ->
         "Counts and accuracy_by_stimulus are from the tables by stimulus, whose exclusion is laxer "
         "by up to eight people.",
     }
-    return PublishedResults(tables, words)
+    return PublishedResults(tables, descriptions)

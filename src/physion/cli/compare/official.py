@@ -1,4 +1,4 @@
-"""The published numbers of the original study beside those recomputed from its released tables.
+"""The published numbers of the original study next to those recomputed from its released tables.
 
 Prints the accuracies by model and scenario as published (means over readouts, trainings and seeds)
 and as a reader expects them (trained on all scenarios, readout observed+simulated), the panels of
@@ -52,7 +52,7 @@ def main(options: Options) -> int:
 def _print(results: PublishedResults) -> None:
     from physion.analysis.published.cells import grid
 
-    tables, words = results.tables, results.words
+    tables, words = results.tables, results.descriptions
     accuracies = tables["accuracies"]
     _show("Accuracy as published (means of all released rows)", grid(accuracies, "published"))
     _show("Accuracy, trained on all, observed+simulated", grid(accuracies, "expected"))
@@ -124,7 +124,7 @@ def _show(title: str, table: pd.DataFrame) -> None:
     _say(text_table(table, title))
 
 
-def _say(words: str) -> None:
+def _say(text: str) -> None:
     from physion.cli.output import console
 
-    console.print(words + "\n", markup=False, soft_wrap=True)
+    console.print(text + "\n", markup=False, soft_wrap=True)

@@ -150,11 +150,11 @@ class Store:
         """Store a submitted page and return the new state."""
         values, now = check_page(done), time.time()
 
-        def turn(connection: Connection) -> SessionState:
+        def submit(connection: Connection) -> SessionState:
             session, trials = self._read_session(connection, token)
             return submit_page(connection, self.study, trials, session, done.page, values, now)
 
-        return await self._writer.run(turn)
+        return await self._writer.run(submit)
 
     async def answer(self, token: str, answer: Answer) -> AnswerStored:
         """Store one answer; repeating the request does not store it twice."""

@@ -74,10 +74,10 @@ def measure_figure(table: pd.DataFrame, measure: str, theme: Theme = LIGHT) -> F
     return figure
 
 
-def _limits(table: pd.DataFrame, chance: float) -> tuple[float, float]:
+def _limits(table: pd.DataFrame, chance_level: float) -> tuple[float, float]:
     columns = ["value", "low", "high", "people", "zone_low", "zone_high"]
     values = table[columns].to_numpy(dtype=np.float64)
-    values = np.append(values[np.isfinite(values)], chance)
+    values = np.append(values[np.isfinite(values)], chance_level)
     margin = 0.03 * (values.max() - values.min() + 0.1)
     return float(values.min() - margin), float(values.max() + margin)
 
@@ -142,7 +142,9 @@ def _measure_handles(
     return [*handles, Line2D([], [], color=theme.faint, linestyle=":", label="chance")]
 
 
-def grouped_figure(table: pd.DataFrame, words: str, chance: float, theme: Theme = LIGHT) -> Figure:
+def grouped_figure(
+    table: pd.DataFrame, measure: str, chance_level: float, theme: Theme = LIGHT
+) -> Figure:
     """Draw a measure by model (rows) and condition (marks).
 
     ``table``: see `figure_tables.GROUPED_COLUMNS`; one panel for each of its ``panel``.
@@ -159,12 +161,12 @@ def grouped_figure(table: pd.DataFrame, words: str, chance: float, theme: Theme 
                 subset = rows[rows["group"] == group]
                 at = subset["agent"].map(agents.index) + (place - (len(groups) - 1) / 2) * 0.24
                 _group_marks(axis, subset, at.to_numpy(dtype=np.float64), theme.mark(place), theme)
-            axis.axvline(chance, color=theme.faint, linestyle=":", linewidth=1, zorder=0)
+            axis.axvline(chance_level, color=theme.faint, linestyle=":", linewidth=1, zorder=0)
             people = rows["people"].iloc[0]
             if np.isfinite(people):
                 axis.axvline(people, color=theme.ink, linestyle="--", linewidth=1.3, zorder=0)
             title(axis, str(name))
-            axis.set_xlabel(words)
+            axis.set_xlabel(measure)
             axis.set_yticks(range(len(agents)), [label(agent) for agent in agents])
             axis.set_ylim(len(agents) - 0.5, -0.5)
             axis.grid(axis="y", color=theme.zone, linewidth=0.5)

@@ -94,9 +94,9 @@ def legend(figure: Figure, handles: Sequence[Any], columns: int) -> None:
     )
 
 
-def title(axis: Axes, words: str) -> None:
+def title(axis: Axes, text: str) -> None:
     """Set the heading of a panel."""
-    axis.set_title(words, fontsize=10, fontweight="bold", loc="left")
+    axis.set_title(text, fontsize=10, fontweight="bold", loc="left")
 
 
 def figure_bytes(figure: Figure, kind: str) -> bytes:

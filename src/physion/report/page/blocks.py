@@ -104,9 +104,9 @@ def definition_list(values: Mapping[str, str]) -> str:
     return f"<dl>{rows}</dl>"
 
 
-def paragraph(words: str) -> str:
+def paragraph(text: str) -> str:
     """Return text as a paragraph."""
-    return f"<p>{escape(words)}</p>"
+    return f"<p>{escape(text)}</p>"
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]], caption: str = "") -> str:

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from physion.analysis.metrics import measure_metrics
-from physion.analysis.people.difficulty import below_chance
+from physion.analysis.people.difficulty import below_chance_level
 from physion.analysis.people.hypotheses import HYPOTHESES
 from physion.analysis.tables.stimuli import MEAN, in_order
 from physion.report.inputs import ReportInputs
@@ -268,7 +268,7 @@ def fooled(inputs: ReportInputs, links: Mapping[str, str]) -> str:
     else:
         rows = inputs.comparison.stimuli.drop_duplicates("stimulus")
         rows = rows.rename(columns={"human_accuracy": "accuracy"})
-    tail = below_chance(rows.reset_index(drop=True))
+    tail = below_chance_level(rows.reset_index(drop=True))
     counts = [
         [
             escape(name),

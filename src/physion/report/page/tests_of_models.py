@@ -36,7 +36,7 @@ _MIXED = (
 
 
 def _paired(rows: pd.DataFrame) -> str:
-    """A summary in words, and the table of all pairs."""
+    """Return a summary as text, and the table of all pairs."""
     counts = {
         key: (
             int((rows[f"{key}_holm"] < 0.05).sum()),
@@ -108,7 +108,7 @@ def _mixed(model: MixedTable) -> str:
 
 
 def _together(model: MixedTable) -> str:
-    """The test that all coefficients of the model's term are zero, in words."""
+    """Return the test that all coefficients of the model's term are zero, as text."""
     if model.fit is None or not model.term:
         return ""
     test = model.fit.joint_test(model.term)

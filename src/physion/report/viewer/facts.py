@@ -51,11 +51,11 @@ def card(trial: Trial) -> dict[str, Any]:
         "observedFrames": meta.observed_frames,
         "rate": meta.playback_rate,
         "frameTime": meta.frame_time,
-        "words": _words(trial),
+        "words": _search_text(trial),
     }
 
 
-def _words(trial: Trial) -> str:
+def _search_text(trial: Trial) -> str:
     """Return the text that the search looks through, in lower case."""
     meta, scene = trial.metadata, trial.scene
     parts = [meta.trial, meta.dataset, meta.scenario, meta.split, meta.preset, meta.seed]

@@ -1,6 +1,6 @@
 """Types of scenario parameters with unit and limits, functions that read them and draw from them.
 
-Every field of a scenario's ``Params`` has one of the types below, so that a preset file can be
+Every field of a scenario's parameters has one of the types below, so that a preset file can be
 checked before any scene is sampled. In a file a range may be a single number (which is then the
 value), and a size or a rotation may be a number, a range, or one of either for each axis.
 """

@@ -8,7 +8,7 @@ A preset file is TOML:
   the preset that it changes (an earlier one of the file, or one that comes with the scenario).
   Published configurations also have ``official`` (name), ``seed`` and ``published`` (results).
 
-Keys and units of parameters are those of the scenario's ``Params``; ``physion ls presets SCENARIO
+Keys and units of parameters are those of the scenario's parameters; ``physion ls presets SCENARIO
 PRESET`` prints them.
 """
 

@@ -39,7 +39,7 @@ SCENERY = SceneryRule(
 
 
 @dataclass(frozen=True)
-class Params:
+class CollideParameters:
     """Parameters of the scenario collide (docs/official-system.md, 2.1, 3.0 and 3.3).
 
     Defaults are those of the official class, except the heading of the push: the class has 20
@@ -65,8 +65,8 @@ class Params:
     scenery: SceneryRule = SCENERY
 
 
-@scenario("collide", Params)
-def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
+@scenario("collide", CollideParameters)
+def sample(params: CollideParameters, seed: np.random.SeedSequence) -> Scene:
     """Sample a ball at -x that is pushed at a target at +x, with the zone behind the target."""
     rng, palette = child_generator(seed, "placement"), Palette.of(seed)
     aside = uniform(rng, (-params.zone_jitter, params.zone_jitter))

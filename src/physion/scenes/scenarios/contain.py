@@ -47,7 +47,7 @@ SCENERY = SceneryRule()
 
 
 @dataclass(frozen=True)
-class Params:
+class ContainParameters:
     """Parameters of the scenario contain (docs/official-system.md, 2.1, 3.0 and 3.4).
 
     - ``length``: metres; the probe starts at x = -length / 2, the container is at the centre.
@@ -72,7 +72,7 @@ class Params:
     scenery: SceneryRule = SCENERY
 
 
-@scenario("contain", Params)
-def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
+@scenario("contain", ContainParameters)
+def sample(params: ContainParameters, seed: np.random.SeedSequence) -> Scene:
     """Sample a container in the middle of a plate or ring, and a ball at -x pushed towards it."""
     return sample_standing("contain", params, seed, None, ATTACHMENT_COLOR)

@@ -43,7 +43,7 @@ CAMERA, SCENERY = CameraRule(), SceneryRule()
 
 
 @dataclass(frozen=True)
-class Params:
+class DominoesParameters:
     """Parameters of the scenario dominoes (docs/official-system.md, 2.1, 3.0 and 3.1).
 
     Defaults are the official configuration `pilot_dominoes_2mid_J025R30`, in which every second
@@ -74,8 +74,8 @@ class Params:
     scenery: SceneryRule = SCENERY
 
 
-@scenario("dominoes", Params)
-def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
+@scenario("dominoes", DominoesParameters)
+def sample(params: DominoesParameters, seed: np.random.SeedSequence) -> Scene:
     """Sample a row of dominoes along x with the probe at -x, and the zone behind the target."""
     rng, palette = child_generator(seed, "placement"), Palette.of(seed)
     half = params.length / 2
@@ -111,7 +111,11 @@ def heading(body: Body) -> float:
 
 
 def _row(
-    params: Params, rng: np.random.Generator, palette: Palette, probe: Body, target: Body
+    params: DominoesParameters,
+    rng: np.random.Generator,
+    palette: Palette,
+    probe: Body,
+    target: Body,
 ) -> list[Body]:
     """Draw the dominoes between probe and target, again until all of them fit."""
     removed = int(rng.integers(max(params.middles, 1))) if params.remove_middle else -1
@@ -130,7 +134,11 @@ def _row(
 
 
 def _draw_row(
-    params: Params, rng: np.random.Generator, looks: list[Look], start: float, end: float
+    params: DominoesParameters,
+    rng: np.random.Generator,
+    looks: list[Look],
+    start: float,
+    end: float,
 ) -> list[Body]:
     """Draw dominoes from ``start`` to ``end`` (x in metres), at most as many as fit."""
     spacing = params.length / (params.middles + 1)

@@ -148,7 +148,7 @@ class PropRule:
 
 
 @dataclass(frozen=True)
-class Params:
+class DrapeParameters:
     """Parameters of the scenario drape (docs/official-system.md, 2.1, 3.0 and 3.8).
 
     Defaults are the official rules, with average values of what differs between configurations.
@@ -170,8 +170,8 @@ class Params:
     scenery: SceneryRule = SCENERY
 
 
-@scenario("drape", Params)
-def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
+@scenario("drape", DrapeParameters)
+def sample(params: DrapeParameters, seed: np.random.SeedSequence) -> Scene:
     """Sample a cloth above anchors along x, with the zone between them and a prop behind."""
     palette = Palette.of(seed)
     cloth = _draw_cloth(params.cloth, child_generator(seed, "cloth"), palette)
@@ -268,7 +268,7 @@ def _anchor(
 
 
 def _draw_zone(
-    params: Params, rng: np.random.Generator, palette: Palette, others: Sequence[Body]
+    params: DrapeParameters, rng: np.random.Generator, palette: Palette, others: Sequence[Body]
 ) -> Body:
     left, right = params.anchors.between
     look = palette.look(params.zone.textures)

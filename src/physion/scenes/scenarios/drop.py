@@ -65,7 +65,7 @@ SCENERY = SceneryRule()
 
 
 @dataclass(frozen=True)
-class Params:
+class DropParameters:
     """Parameters of the scenario drop (docs/official-system.md, 2.1, 3.0 and 3.5).
 
     Defaults are those of the official `simple` configurations, except ``even_turn``. Masses are the
@@ -94,8 +94,8 @@ class Params:
     scenery: SceneryRule = SCENERY
 
 
-@scenario("drop", Params)
-def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
+@scenario("drop", DropParameters)
+def sample(params: DropParameters, seed: np.random.SeedSequence) -> Scene:
     """Sample a randomly rotated object in the air above one that stands at the origin."""
     rng, palette = child_generator(seed, "placement"), Palette.of(seed)
     zone = draw_zone(rng, params.zone, palette.look(params.zone.textures))
@@ -126,7 +126,9 @@ def _put_on_zone(lower: Body, zone: Body) -> Body:
     return lower if apart else replace(lower, position=(x, y, z + float(below[1, 2])))
 
 
-def _draw_dropped(params: Params, rng: np.random.Generator, palette: Palette, lower: Body) -> Body:
+def _draw_dropped(
+    params: DropParameters, rng: np.random.Generator, palette: Palette, lower: Body
+) -> Body:
     """Draw the falling object, high enough to fall at least `FALL` metres."""
     x, y = (uniform(rng, (-params.jitter, params.jitter)) for _ in range(2))
     position = (x, y, uniform(rng, params.height))

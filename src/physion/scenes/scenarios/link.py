@@ -52,7 +52,7 @@ SCENERY = SceneryRule()
 
 
 @dataclass(frozen=True)
-class Params:
+class LinkParameters:
     """Parameters of the scenario link (docs/official-system.md, 2.1, 3.0 and 3.6).
 
     - ``length``: metres; the probe starts at x = -length / 2, the pole is at the centre.
@@ -78,7 +78,7 @@ class Params:
     scenery: SceneryRule = SCENERY
 
 
-@scenario("link", Params)
-def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
+@scenario("link", LinkParameters)
+def sample(params: LinkParameters, seed: np.random.SeedSequence) -> Scene:
     """Sample rings on a pole in the middle of a ring or plate, and a ball at -x pushed at it."""
     return sample_standing("link", params, seed, STAND_COLOR, STAND_COLOR)

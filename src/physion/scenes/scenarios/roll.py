@@ -121,7 +121,7 @@ class LedgeRule:
 
 @dataclass(frozen=True)
 class CollisionRule:
-    """Template like `collide.Params`, with probes of any shape that start in the air."""
+    """Template like `collide.CollideParameters`, with probes of any shape that start in the air."""
 
     length: Length = 1.7
     target: BodyRule = KNOCKED
@@ -134,7 +134,7 @@ class CollisionRule:
 
 
 @dataclass(frozen=True)
-class Params:
+class RollParameters:
     """Parameters of the scenario roll (docs/official-system.md, 2.1, 3.0 and 3.7).
 
     ``template`` is one of `TEMPLATES`, or several of which one is drawn; only the rule of that name
@@ -151,8 +151,8 @@ class Params:
     scenery: SceneryRule = SCENERY
 
 
-@scenario("roll", Params)
-def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
+@scenario("roll", RollParameters)
+def sample(params: RollParameters, seed: np.random.SeedSequence) -> Scene:
     """Sample a scene of one template, with the zone at +x; the scene's parameters name it."""
     template = pick(child_generator(seed, "template"), params.template)
     chosen = replace(params, template=(template,))
@@ -161,7 +161,7 @@ def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
     return _sample_ramp(chosen, seed) if template == "ramp" else _sample_ledge(chosen, seed)
 
 
-def _sample_ramp(params: Params, seed: np.random.SeedSequence) -> Scene:
+def _sample_ramp(params: RollParameters, seed: np.random.SeedSequence) -> Scene:
     rule, rng, palette = params.ramp, child_generator(seed, "placement"), Palette.of(seed)
     zone = draw_zone(rng, rule.zone, palette.look(rule.zone.textures), (rule.length, 0.0))
     look = palette.agent_look(rule.target.textures)
@@ -206,7 +206,7 @@ def _above_ramp(target: Body, ramp: Body) -> Body:
     return replace(target, position=(x, y, z + missing + GAP)) if missing > 0 else target
 
 
-def _sample_ledge(params: Params, seed: np.random.SeedSequence) -> Scene:
+def _sample_ledge(params: RollParameters, seed: np.random.SeedSequence) -> Scene:
     rule, rng, palette = params.ledge, child_generator(seed, "placement"), Palette.of(seed)
     zone = draw_zone(rng, rule.zone, palette.look(rule.zone.textures), (rule.length, 0.0))
     look = palette.agent_look(rule.target.textures)
@@ -236,10 +236,12 @@ def _sample_ledge(params: Params, seed: np.random.SeedSequence) -> Scene:
     )
 
 
-def _sample_collision(params: Params, seed: np.random.SeedSequence) -> Scene:
+def _sample_collision(params: RollParameters, seed: np.random.SeedSequence) -> Scene:
     rule = params.collision
     values = {field.name: getattr(rule, field.name) for field in fields(rule)}
-    same = collide.Params(**values, room=params.room, camera=params.camera, scenery=params.scenery)
+    same = collide.CollideParameters(
+        **values, room=params.room, camera=params.camera, scenery=params.scenery
+    )
     return replace(
         collide.sample(same, seed),
         name=scene_name("roll", seed),

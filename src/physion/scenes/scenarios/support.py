@@ -54,7 +54,7 @@ SCENERY = SceneryRule()
 
 
 @dataclass(frozen=True)
-class Params:
+class SupportParameters:
     """Parameters of the scenario support (docs/official-system.md, 2.1, 3.0 and 3.2).
 
     - ``length``: metres; the probe starts at x = -length / 2, the tower is at the centre.
@@ -75,8 +75,8 @@ class Params:
     scenery: SceneryRule = SCENERY
 
 
-@scenario("support", Params)
-def sample(params: Params, seed: np.random.SeedSequence) -> Scene:
+@scenario("support", SupportParameters)
+def sample(params: SupportParameters, seed: np.random.SeedSequence) -> Scene:
     """Sample a tower in the middle of a plate, and a ball at -x pushed towards its foot."""
     rng, palette = child_generator(seed, "placement"), Palette.of(seed)
     target_look = palette.agent_look(params.cap.textures)

@@ -153,7 +153,7 @@ def _desk() -> Iterable[PropPart]:
 
 
 @prop("lamp", (0.4, 0.4, 0.62))
-def _lamp() -> Iterable[PropPart]:
+def _table_lamp() -> Iterable[PropPart]:
     """Model a table lamp: a turned foot under a cloth shade."""
     foot = [(0.1, 0.0), (0.1, 0.02), (0.06, 0.05), (0.09, 0.14), (0.1, 0.22), (0.05, 0.31)]
     yield lathe(outline([*foot, (0.018, 0.35)], 3), sides=20)

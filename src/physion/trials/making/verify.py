@@ -42,13 +42,13 @@ class Verification:
     faults: list[str] = field(default_factory=list)
     other_versions: list[str] = field(default_factory=list)
 
-    def add(self, found: list[str], stored: str = "", here: str = "") -> None:
+    def add(self, findings: list[str], stored: str = "", here: str = "") -> None:
         """Add findings about a part that version ``stored`` made; this machine has ``here``."""
         if stored == here:
-            self.faults += found
+            self.faults += findings
         else:
             note = f"made by another version, {stored}; this is {here}"
-            self.other_versions += [f"{line}: {note}" for line in found]
+            self.other_versions += [f"{line}: {note}" for line in findings]
 
 
 def verify_dataset(
@@ -247,7 +247,7 @@ def _render_again(paths: TrialPaths, trial: Trial) -> list[str]:
     if not np.array_equal(ids, trial.ids):
         faults.append(f"{paths.trial_file}: field 'first_frame/ids' is rendered differently")
     counts = np.bincount(ids.ravel(), minlength=len(trial.scene.names()) + 1)[1:]
-    if not np.array_equal((counts / ids.size).astype(np.float32), trial.shares):
+    if not np.array_equal((counts / ids.size).astype(np.float32), trial.pixel_fractions):
         faults.append(f"{paths.trial_file}: field 'first_frame/shares' does not match the ids")
     for name in trial.pass_names:
         for frame in (0, meta.frames // 2, meta.frames - 1):

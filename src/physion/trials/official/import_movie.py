@@ -21,7 +21,7 @@ from physion.scenes.scene import OBSERVED_FRAMES, Body, Camera, Roles, Scene
 from physion.stimulus_names import plain_name
 from physion.trials.files import encode_png, write_files
 from physion.trials.official.job import ImportJob, imported_metadata
-from physion.trials.official.movies import beside, read_movie
+from physion.trials.official.movies import neighbouring_file, read_movie
 from physion.trials.official.names import decode_picture, redyellow_name
 from physion.trials.trial_file import TrialWriter
 
@@ -38,7 +38,9 @@ def import_movie(job: ImportJob) -> tuple[str, ...]:
         )
     notes = [NOTE]
     free = read_movie(job.source)
-    marked = beside(job.source, "mp4s-redyellow", f"{redyellow_name(job.paths.trial)}_img.mp4")
+    marked = neighbouring_file(
+        job.source, "mp4s-redyellow", f"{redyellow_name(job.paths.trial)}_img.mp4"
+    )
     own = read_movie(marked, free.frames) if marked is not None else free
     ids = _ids(job, own.size, notes)
     scene, trajectory = _scene(job), _unknown_motion(own.frames)
@@ -67,7 +69,7 @@ def import_movie(job: ImportJob) -> tuple[str, ...]:
 def _ids(job: ImportJob, size: tuple[int, int], notes: list[str]) -> NDArray[np.int16]:
     """Return ids (H, W) from the map: 1 where it is red, 2 where it is yellow, else 0."""
     name = f"{plain_name(job.paths.trial)}_map.png"
-    path = beside(job.source, "maps", name)
+    path = neighbouring_file(job.source, "maps", name)
     if path is None:
         notes.append("no map: the pixels of agent and patient are unknown")
         return np.zeros(size[::-1], np.int16)

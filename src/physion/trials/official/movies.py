@@ -31,7 +31,7 @@ _MATRICES = {_BT709: Colorspace.ITU709}
 PICTURES = "images/_img"
 
 
-def beside(path: Path, folder: str, name: str) -> Path | None:
+def neighbouring_file(path: Path, folder: str, name: str) -> Path | None:
     """Return the file ``name`` in ``folder`` next to the folder of ``path``, or None if absent."""
     found = path.parent.parent / folder / name
     return found if found.is_file() and not found.is_symlink() else None

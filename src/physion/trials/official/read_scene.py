@@ -402,7 +402,7 @@ class SceneReader:
 
 
 def _substitute_prop(model: str) -> str:
-    """Return a prop for a library model by the words in its name, by default `FALLBACK`."""
+    """Return a prop for a library model by its name, by default `FALLBACK`."""
     for word in re.split(r"[^a-z]+", model.lower()):
         if word and (prop := prop_for(word)) != FALLBACK:
             return prop

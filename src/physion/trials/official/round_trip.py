@@ -25,7 +25,13 @@ from physion.stimulus_names import plain_name
 from physion.trials.files import encode_png
 from physion.trials.official.axes import to_official_camera
 from physion.trials.official.job import ImportJob
-from physion.trials.official.movies import PICTURES, SourceMovie, beside, make_movies, stored_frames
+from physion.trials.official.movies import (
+    PICTURES,
+    SourceMovie,
+    make_movies,
+    neighbouring_file,
+    stored_frames,
+)
 from physion.trials.official.names import TRIAL_FILE
 from physion.trials.official.read_hdf5 import OfficialFile
 from physion.trials.official.read_motion import MotionReader
@@ -176,7 +182,7 @@ def restored_files(
         files["map"] = encode_png(role_map(trial.ids, trial.scene))
     if meta.movies and meta.free_movies:
         name = f"{plain_name(job.paths.trial)}_img.mp4"
-        path = beside(job.source, "mp4s", name)
+        path = neighbouring_file(job.source, "mp4s", name)
         pictures = _rendered(trial, "free")
         files["free_movie"], files["free_observed_movie"] = _movies(meta, path, pictures)
     writer = TrialWriter(meta, trial.scene, trial.trajectory, trial.labels, trial.ids)

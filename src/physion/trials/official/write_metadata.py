@@ -85,13 +85,15 @@ def _average(values: Sequence[Any]) -> Any:
     if isinstance(known[0], str):
         return known[0] if len(set(known)) == 1 else f"{min(known)}-{max(known)}"
     if isinstance(known[0], dict):
-        return {axis: _round(np.mean([value[axis] for value in known])) for axis in known[0]}
+        return {
+            axis: _three_decimals(np.mean([value[axis] for value in known])) for axis in known[0]
+        }
     if isinstance(known[0], list):
-        return [_round(mean) for mean in np.mean(np.array(known, float), axis=0)]
-    return _round(np.mean(np.array(known, float)))
+        return [_three_decimals(mean) for mean in np.mean(np.array(known, float), axis=0)]
+    return _three_decimals(np.mean(np.array(known, float)))
 
 
-def _round(value: Any) -> float:
+def _three_decimals(value: Any) -> float:
     return round(float(value), 3)
 
 
@@ -108,11 +110,11 @@ def _displacement(labels: Mapping[str, list[Any]]) -> dict[str, float] | None:
     if "target_delta_position" not in labels:
         return None
     last = labels["target_delta_position"][-1]
-    return {axis: _round(value) for axis, value in zip("xyz", last, strict=True)}
+    return {axis: _three_decimals(value) for axis, value in zip("xyz", last, strict=True)}
 
 
 def _area(mask: NDArray[np.bool_]) -> float:
-    return _round(mask.mean())
+    return _three_decimals(mask.mean())
 
 
 def _shift(first: NDArray[np.bool_], last: NDArray[np.bool_]) -> list[float] | None:
@@ -124,4 +126,4 @@ def _shift(first: NDArray[np.bool_], last: NDArray[np.bool_]) -> list[float] | N
     for mask in (first, last):
         row, column = (indices.mean() for indices in np.nonzero(mask))
         middles.append((2 * row / max(height - 1, 1) - 1, 2 * column / max(width - 1, 1) - 1))
-    return [_round(after - before) for before, after in zip(*middles, strict=True)]
+    return [_three_decimals(after - before) for before, after in zip(*middles, strict=True)]
