@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 
+from physion.cli import doctor
 from physion.cli.main import VERBS, main
+
+PYPROJECT = Path(__file__).parents[2] / "pyproject.toml"
 
 
 def test_help_imports_nothing_heavy() -> None:
@@ -56,6 +61,28 @@ def test_doctor_says_what_is_here(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor"]) == 0
     out = capsys.readouterr().out
     assert "mujoco" in out and "H.264" in out and "write access" in out
+
+
+def test_doctor_checks_every_declared_dependency() -> None:
+    declared = tomllib.loads(PYPROJECT.read_text())["project"]
+
+    def packages(requirements: list[str]) -> set[str]:
+        return {re.split(r"[\[<>=]", requirement)[0] for requirement in requirements}
+
+    extras = {name: packages(value) for name, value in declared["optional-dependencies"].items()}
+    del extras["all"]
+    assert {name: set(value) for name, value in doctor.EXTRAS.items()} == extras
+    assert set(doctor.CORE) == packages(declared["dependencies"])
+
+
+def test_doctor_names_the_command_that_installs_playwright(monkeypatch: pytest.MonkeyPatch) -> None:
+    version = doctor._version
+    monkeypatch.setattr(
+        doctor, "_version", lambda name: None if name == "playwright" else version(name)
+    )
+    (check,) = (check for check in doctor.extras() if check.name == "extra dev")
+    assert not check.good and not check.needed
+    assert "playwright" in check.value and "'.[dev]'" in check.remedy
 
 
 def test_doctor_refuses_a_folder_that_is_not_there(

@@ -27,7 +27,16 @@ EXTRAS = {
 }
 CORE = (
     *("numpy", "scipy", "mujoco", "numba", "h5py", "hdf5plugin", "av", "pillow"),
-    *("pandas", "pyarrow", "scikit-learn", "statsmodels", "formulaic", "matplotlib", "tyro", "rich"),
+    *(
+        "pandas",
+        "pyarrow",
+        "scikit-learn",
+        "statsmodels",
+        "formulaic",
+        "matplotlib",
+        "tyro",
+        "rich",
+    ),
 )
 
 
@@ -115,7 +124,7 @@ def extras() -> list[Check]:
         missing = [package for package in packages if _version(package) is None]
         installed = [f"{package} {_version(package)}" for package in packages if _version(package)]
         value = ", ".join(installed) if not missing else f"without {', '.join(missing)}"
-        remedy = f"pip install -e '.[{extra}]'" if missing else ""
+        remedy = f"pip install -e '.[{extra}]' -c requirements.lock" if missing else ""
         checks.append(Check(f"extra {extra}", value, not missing, needed=False, remedy=remedy))
     return checks
 
@@ -152,7 +161,7 @@ def reproduction() -> list[Check]:
     for scenario in sorted(golden_digests()):
         parts = differences(scenario)
         value = f"different: {', '.join(parts)}" if parts else "as expected"
-        remedy = "pip install -c requirements.lock -e ." if parts else ""
+        remedy = "pip install -e . -c requirements.lock" if parts else ""
         checks.append(Check(f"bytes of {scenario}", value, not parts, remedy=remedy))
     return checks
 
