@@ -1,9 +1,9 @@
 """Decorator that compiles the numerical loops of this package."""
 
-from __future__ import annotations
-
 # Numba's classes have no annotations of types.
 # mypy: allow-untyped-calls
+
+from __future__ import annotations
 
 import contextlib
 import hashlib
