@@ -6,7 +6,11 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,28 +19,133 @@ from physion.golden import golden_digests
 from physion.scenes.sampling.registry import scenarios
 from physion.trials.making.reproduce import trial_digests
 
-AVX512 = (
-    "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR "
-    "AVX512_KNL AVX512_KNM X86_V4"
-)
+PROBE = """
+import hashlib, json, math
+import numba, numpy, scipy.linalg, threadpoolctl
+from numba.core.registry import cpu_target
+from numpy._core._multiarray_umath import __cpu_dispatch__, __cpu_features__
+pools = [pool for pool in threadpoolctl.threadpool_info() if pool["user_api"] == "blas"]
+values = [f(0.001 + 0.0004 * i) for f in (math.sin, math.exp, math.log) for i in range(20000)]
+print(json.dumps({
+    "blas": [pool.get("architecture", pool["internal_api"]) for pool in pools],
+    "threads": [numba.get_num_threads(), *(pool["num_threads"] for pool in pools)],
+    "numba": list(cpu_target.target_context.codegen().magic_tuple()[1:]),
+    "numpy": [name for name in __cpu_dispatch__ if __cpu_features__[name]],
+    "libm": hashlib.sha256(repr(values).encode()).hexdigest(),
+}))
+"""
+"""Prints the code paths that the libraries of the process have chosen."""
+FEATURES = np._core._multiarray_umath.__cpu_features__  # type: ignore[attr-defined]
+DISPATCHED = np._core._multiarray_umath.__cpu_dispatch__  # type: ignore[attr-defined]
+WITHOUT_AVX512 = tuple(name for name in DISPATCHED if "AVX512" in name or name == "X86_V4")
+WITHOUT_AVX2 = (*WITHOUT_AVX512, *(name for name in DISPATCHED if name in ("X86_V3", "AVX2")))
+
+
+@dataclass(frozen=True)
+class Environment:
+    """Environment variables that choose code paths of libraries.
+
+    Parameters
+    ----------
+    settings
+        The variables.
+    effective
+        Whether a result of `PROBE` shows that they took effect; the second argument is the result
+        without them.
+    needs
+        Features of the processor, by numpy's names, without which they cannot take effect.
+    """
+
+    settings: dict[str, str]
+    effective: Callable[[dict[str, Any], dict[str, Any]], bool]
+    needs: tuple[str, ...] = ()
+
+
+def _blas(core: str, *names: str, needs: tuple[str, ...] = ()) -> Environment:
+    """Return the environment with OpenBLAS's kernels for ``core``, reported as one of ``names``."""
+    return Environment(
+        {"OPENBLAS_CORETYPE": core},
+        lambda seen, _: bool(seen["blas"]) and set(seen["blas"]) <= set(names),
+        needs,
+    )
+
+
+def _without(names: tuple[str, ...]) -> Environment:
+    """Return the environment in which numpy does not use the features ``names``."""
+    here = tuple(name for name in names if FEATURES.get(name))
+    return Environment(
+        {"NPY_DISABLE_CPU_FEATURES": " ".join(here)},
+        lambda seen, default: (
+            not set(names) & set(seen["numpy"]) and seen["numpy"] != default["numpy"]
+        ),
+        needs=names[:1],
+    )
+
+
+def _threads(count: int) -> Environment:
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+    return Environment(
+        dict.fromkeys(names, str(count)), lambda seen, _: set(seen["threads"]) == {count}
+    )
+
+
 ENVIRONMENTS = {
-    "blas of prescott": {"OPENBLAS_CORETYPE": "Prescott"},
-    "blas of haswell": {"OPENBLAS_CORETYPE": "Haswell"},
-    "blas of zen": {"OPENBLAS_CORETYPE": "Zen"},
-    "blas of skylake": {"OPENBLAS_CORETYPE": "SkylakeX"},
-    "generic processor for numba": {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""},
-    "numpy without AVX-512": {"NPY_DISABLE_CPU_FEATURES": AVX512},
-    "numpy without AVX2": {"NPY_DISABLE_CPU_FEATURES": f"{AVX512} AVX2 FMA3 X86_V3"},
-    "C library without FMA": {
-        "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-FMA,-FMA4,-AVX2,-AVX2_Usable,-FMA_Usable"
-    },
-    "one thread": dict.fromkeys(
-        ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
+    # Where OpenBLAS is built without kernels for older processors, Prescott's go by Katmai's name.
+    # The builds in the wheels of numpy and scipy have no kernels for Zen.
+    "blas of prescott": _blas("Prescott", "Prescott", "Katmai"),
+    "blas of haswell": _blas("Haswell", "Haswell", needs=("AVX2", "FMA3")),
+    "blas of skylake": _blas("SkylakeX", "SkylakeX", needs=("AVX512F",)),
+    "generic processor for numba": Environment(
+        {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""},
+        lambda seen, _: seen["numba"] == ["generic", ""],
     ),
-    "two threads": dict.fromkeys(
-        ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "2"
+    "numpy without AVX-512": _without(WITHOUT_AVX512),
+    "numpy without AVX2": _without(WITHOUT_AVX2[::-1]),
+    "C library without FMA": Environment(
+        {"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-FMA,-FMA4,-AVX2,-AVX2_Usable,-FMA_Usable"},
+        lambda seen, default: seen["libm"] != default["libm"],
+        needs=("FMA3",),
     ),
+    "one thread": _threads(1),
+    "two threads": _threads(2),
 }
+
+
+def run_in(settings: dict[str, str], *command: str) -> str:
+    """Run Python in an environment without other choices of code paths; return what it prints."""
+    chosen = {name for environment in ENVIRONMENTS.values() for name in environment.settings}
+    kept = {name: value for name, value in os.environ.items() if name not in chosen}
+    process = subprocess.run(
+        [sys.executable, "-W", "ignore", *command],
+        env={**kept, **settings},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert process.returncode == 0, process.stderr
+    return process.stdout
+
+
+@cache
+def default_code_paths() -> dict[str, Any]:
+    return dict(json.loads(run_in({}, "-c", PROBE)))
+
+
+def require_effect(name: str) -> Environment:
+    """Return an environment after checking that its settings take effect.
+
+    The test is skipped where the processor lacks what the settings choose or switch off; elsewhere
+    settings without effect are a failure.
+    """
+    environment = ENVIRONMENTS[name]
+    lacking = [feature for feature in environment.needs if not FEATURES.get(feature)]
+    if lacking:
+        pytest.skip(f"{name}: this processor has no {', '.join(lacking)}")
+    if name.startswith("two") and (os.cpu_count() or 1) < 2:
+        pytest.skip(f"{name}: this machine has one core")
+    seen = json.loads(run_in(environment.settings, "-c", PROBE))
+    assert environment.effective(seen, default_code_paths()), seen
+    return environment
 
 
 @pytest.mark.parametrize("scenario", sorted(scenarios.names()))
@@ -48,44 +157,10 @@ def test_trials_are_those_of_this_version(scenario: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ENVIRONMENTS)
 def test_other_processors_give_the_same_bytes(name: str) -> None:
-    settings = _possible(ENVIRONMENTS[name])
-    process = subprocess.run(
-        [sys.executable, "-W", "ignore", "-m", "physion.trials.making.reproduce"],
-        env={**os.environ, **settings},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert process.returncode == 0, process.stderr
-    assert json.loads(process.stdout) == golden_digests()
-
-
-def _possible(settings: dict[str, str]) -> dict[str, str]:
-    """Leave out features that this build of numpy does not know or this processor lacks."""
-    name = "NPY_DISABLE_CPU_FEATURES"
-    if name not in settings:
-        return settings
-    features = np._core._multiarray_umath.__cpu_features__  # type: ignore[attr-defined]
-    dispatched = set(np._core._multiarray_umath.__cpu_dispatch__)  # type: ignore[attr-defined]
-    known = [f for f in settings[name].split() if features.get(f) and f in dispatched]
-    return {name: " ".join(known)} if known else {}
-
-
-@pytest.mark.slow
-def test_the_environments_do_change_what_libraries_compute() -> None:
-    """Else the test above could not fail."""
-    code = (
-        "import numpy as np, hashlib;"
-        "rng = np.random.default_rng(0); a = rng.normal(size=(200, 200));"
-        "print(hashlib.sha256((a @ a).tobytes() + np.exp(a).tobytes()).hexdigest())"
-    )
-    found = set()
-    for settings in ENVIRONMENTS.values():
-        env = {**os.environ, **_possible(settings)}
-        found.add(
-            subprocess.run([sys.executable, "-c", code], env=env, stdout=-1, check=True).stdout
-        )
-    assert len(found) > 1
+    """The effect of the settings is checked first: ignored ones would prove nothing."""
+    settings = require_effect(name).settings
+    printed = run_in(settings, "-m", "physion.trials.making.reproduce")
+    assert json.loads(printed) == golden_digests()
 
 
 def test_movies_do_not_depend_on_the_processor(tmp_path: Path) -> None:
@@ -93,18 +168,24 @@ def test_movies_do_not_depend_on_the_processor(tmp_path: Path) -> None:
     code = """
 import ctypes, glob, hashlib, sys
 from pathlib import Path
-import av, numpy as np
+import av, av.logging, numpy as np
 plain = sys.argv[1] == "plain"
 if plain:
     folder = Path(av.__file__).parent.parent / "av.libs"
     (library,) = glob.glob(str(folder / "libavutil*"))
-    ctypes.CDLL(library).av_force_cpu_flags(0)
+    flags = ctypes.CDLL(library)
+    flags.av_force_cpu_flags(0)
+    assert flags.av_get_cpu_flags() == 0
 from physion.trials import video
 if plain:
     video.X264 += ":asm=0"
 rng = np.random.default_rng(0)
 frames = rng.integers(0, 256, (10, 32, 40, 3)).repeat(6, 1).repeat(6, 2).astype(np.uint8)
-movie = video.encode_movie(frames)
+av.logging.set_level(av.logging.INFO)
+with av.logging.Capture(False) as messages:
+    movie = video.encode_movie(frames)
+(capabilities,) = [text for *_, text in messages if "cpu capabilities" in text]
+assert ("none!" in capabilities) == plain, capabilities
 Path(sys.argv[2]).write_bytes(movie)
 read = [video.read_frames(Path(sys.argv[2]), size=size) for size in (None, (24, 40))]
 print(hashlib.sha256(movie + b"".join(r.tobytes() for r in read)).hexdigest())
