@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -84,6 +85,11 @@ def test_untrusted_files_stay_data(path: Path) -> None:
 def test_modules_have_names_that_say_something() -> None:
     vague = {"utils", "util", "helpers", "helper", "common", "misc"}
     assert not [path for path in SOURCES if {path.stem, path.parent.name} & vague]
+
+
+def test_folders_can_be_read_at_a_glance() -> None:
+    counts = Counter(path.parent.relative_to(ROOT / "src") for path in SOURCES)
+    assert not {str(folder): count for folder, count in counts.items() if count > 16}
 
 
 SAME_BYTES = [

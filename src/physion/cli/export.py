@@ -107,7 +107,7 @@ def _webdataset(options: Options, out: Path) -> int:
 
 
 def _official(options: Options, out: Path) -> int:
-    from physion.trials.official.export_folder import export_official
+    from physion.trials.official.writing.export_folder import export_official
 
     report = export_official(
         options.folder,

@@ -18,7 +18,7 @@ from physion.errors import BadInputError
 from physion.experiment.study.study_checks import NO_CONTACT
 
 if TYPE_CHECKING:
-    from physion.experiment.study.init_trials import StimulusSelection
+    from physion.experiment.study.init.generated_trials import StimulusSelection
     from physion.experiment.study.study import Study
 
 
@@ -72,7 +72,7 @@ def main(options: Options) -> int:
 
     require_extra()
     from physion.cli.output import track
-    from physion.experiment.study.study_folder import make_study
+    from physion.experiment.study.init.study_folder import make_study
 
     password, chosen = _password(options.password_file), _choose(options)
     study = make_study(_study(options, chosen.scenarios), chosen.sources, password, track=track)
@@ -82,7 +82,7 @@ def main(options: Options) -> int:
 
 def _choose(options: Options) -> StimulusSelection:
     """Select the stimuli from the dataset or the lists."""
-    from physion.experiment.study.init_trials import TEST, choose_trials
+    from physion.experiment.study.init.generated_trials import TEST, choose_trials
 
     if (options.trials is None) == (not options.stimuli):
         raise BadInputError("give either --trials DATASET or --stimuli LISTS with --movies DIR")
@@ -104,8 +104,8 @@ def _choose(options: Options) -> StimulusSelection:
 
 def _choose_listed(options: Options) -> StimulusSelection:
     """Select the stimuli from official lists."""
-    from physion.experiment.study.init_official import choose_listed
-    from physion.experiment.study.init_trials import choose_familiarization
+    from physion.experiment.study.init.generated_trials import choose_familiarization
+    from physion.experiment.study.init.official_lists import choose_listed
 
     if options.movies is None:
         raise BadInputError("--stimuli needs --movies DIR, the folder with STIM_ID.mp4")

@@ -7,7 +7,7 @@ from textwrap import fill
 from typing import Any, Literal
 
 from physion.analysis.people.response_schema import PHASES, Column
-from physion.experiment.export.bids import TEXT_RULE
+from physion.experiment.export.conventions.bids import TEXT_RULE
 from physion.experiment.export.spreadsheet import RULE
 from physion.experiment.study.stimuli import LOOKS
 from physion.experiment.study.study import Study

@@ -34,11 +34,11 @@ from sqlalchemy import Connection, Engine, select
 import physion
 from physion.analysis.people.response_schema import data_dictionary
 from physion.experiment.export.answer_tables import snapshot
-from physion.experiment.export.bids import BidsWriter
+from physion.experiment.export.conventions.bids import BidsWriter
+from physion.experiment.export.conventions.psych_ds import write_psych_ds
 from physion.experiment.export.descriptions import STIMULI_COLUMNS, readme
 from physion.experiment.export.export_folder import atomic_folder, write_manifest
 from physion.experiment.export.iso_times import iso_times
-from physion.experiment.export.psych_ds import write_psych_ds
 from physion.experiment.export.session_rows import (
     EXPORTED_KINDS,
     SessionSelection,

@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 from sqlalchemy import Connection
 
 from physion.analysis.people.response_schema import SESSION_COLUMNS, TRIAL_COLUMNS
-from physion.experiment.export.bids import BidsWriter
+from physion.experiment.export.conventions.bids import BidsWriter
 from physion.experiment.export.descriptions import STIMULI_COLUMNS
 from physion.experiment.export.event_tables import (
     DETAIL_COLUMNS,

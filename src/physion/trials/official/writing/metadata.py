@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from physion.stimulus_names import CONTROLLERS
 from physion.trials.official.names import ROOMS
-from physion.trials.official.write_frames import FrameWriter
+from physion.trials.official.writing.frames import FrameWriter
 
 HIDDEN = 0.005
 """Fraction of the picture below which an object counts as fully occluded."""

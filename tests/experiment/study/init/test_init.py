@@ -19,12 +19,12 @@ import pytest
 from physion.cli.experiment.experiment import SUBVERBS
 from physion.cli.main import main
 from physion.errors import BadInputError, UnknownNameError
-from physion.experiment.study import study_folder
 from physion.experiment.study.identity import Secrets, check_password
-from physion.experiment.study.init_trials import choose_familiarization, choose_trials
-from physion.experiment.study.media import StimulusSource, import_stimulus
+from physion.experiment.study.init import study_folder
+from physion.experiment.study.init.generated_trials import choose_familiarization, choose_trials
+from physion.experiment.study.init.media import StimulusSource, import_stimulus
+from physion.experiment.study.init.study_folder import JOURNAL, make_study
 from physion.experiment.study.study import Study, load_study
-from physion.experiment.study.study_folder import JOURNAL, make_study
 from physion.trials.index import write_index
 from physion.trials.video import read_frames
 from support.experiment.tiny_dataset import is_marked, make_tiny_dataset

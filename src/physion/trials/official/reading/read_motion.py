@@ -19,7 +19,7 @@ from physion.scenes.scene import Scene
 from physion.scenes.shapes.primitives import shape
 from physion.trials.official.axes import rotation_matrices, swap_axes
 from physion.trials.official.names import CLOTH_DISTANCE
-from physion.trials.official.read_scene import SceneReader
+from physion.trials.official.reading.read_scene import SceneReader
 
 Floats = NDArray[np.float64]
 Row = tuple[int, int, int, Floats, Floats]

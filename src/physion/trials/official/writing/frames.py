@@ -38,7 +38,7 @@ from physion.trials.official.names import (
     encode_normals,
     segmentation_colors,
 )
-from physion.trials.official.write_objects import OfficialObjects
+from physion.trials.official.writing.objects import OfficialObjects
 
 PASSES = ("color", "depth", "normals", "ids", "flow")
 MOVED = 0.01

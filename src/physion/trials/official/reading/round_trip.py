@@ -24,7 +24,6 @@ from physion.scenes.scene import FRAME_TIME, OBSERVED_FRAMES, Cloth
 from physion.stimulus_names import plain_name
 from physion.trials.files import encode_png
 from physion.trials.official.axes import to_official_camera
-from physion.trials.official.job import ImportJob
 from physion.trials.official.movies import (
     PICTURES,
     SourceMovie,
@@ -34,8 +33,9 @@ from physion.trials.official.movies import (
 )
 from physion.trials.official.names import TRIAL_FILE
 from physion.trials.official.read_hdf5 import OfficialFile
-from physion.trials.official.read_motion import MotionReader
-from physion.trials.official.write_objects import OfficialObjects
+from physion.trials.official.reading.job import ImportJob
+from physion.trials.official.reading.read_motion import MotionReader
+from physion.trials.official.writing.objects import OfficialObjects
 from physion.trials.trial_file import Metadata, Trial, TrialWriter
 from physion.trials.video import MovieEncoder, count_frames
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from physion.physics.cloth.simulate import ClothSettings
 from physion.scenes.scene import Body, Cloth
-from physion.trials.official.write_objects import OfficialObjects
+from physion.trials.official.writing.objects import OfficialObjects
 
 EMPTY = ("soft_actors", "fluid_actors")
 """Groups for kinds of objects that no scene has."""

@@ -7,7 +7,7 @@ Two kinds of folders are read, at any depth and mixed:
   and camera. Movies are those next to the file, or are made from the pictures in it.
 - Movies without HDF5 files, as in PhysionTest-Core (``mp4s/<stimulus>_img.mp4`` with ``maps``,
   ``mp4s-redyellow`` and ``labels.csv``) or in the folder of a configuration: movies, map and label.
-  They have no motion; see `physion.trials.official.import_movie`.
+  They have no motion; see `physion.trials.official.reading.import_movie`.
 
 Versions with red agent and yellow patient keep ``-redyellow`` in their names.
 """
@@ -31,8 +31,8 @@ from physion.stimulus_names import FOLDERS, guess_scenario, plain_name
 from physion.trials.index import build_index, write_index
 from physion.trials.layout import INDEX, SAFE_NAME, SETTINGS, TrialPaths
 from physion.trials.making.plan import SPLITS
-from physion.trials.official.job import ImportJob
 from physion.trials.official.names import redyellow_name, split_name
+from physion.trials.official.reading.job import ImportJob
 
 MAX_LIST_BYTES = 2**28
 """Largest metadata.json or labels.csv that is read, in bytes."""
@@ -51,8 +51,8 @@ def import_official(
     """Import every official trial under ``folder`` into the dataset ``out``, and index it.
 
     Files that this package exported become the trials that they were made from (see
-    `physion.trials.official.round_trip`). Trials that exist are kept. A damaged file is reported
-    and does not stop the others.
+    `physion.trials.official.reading.round_trip`). Trials that exist are kept. A damaged file is
+    reported and does not stop the others.
 
     Parameters
     ----------
@@ -117,10 +117,10 @@ def import_trial(job: ImportJob) -> tuple[str, ...]:
     """Write the files of one trial; return remarks about it."""
     # Imported late: loading engine and renderer takes time.
     if job.source.suffix == ".hdf5":
-        from physion.trials.official.import_hdf5 import import_state
+        from physion.trials.official.reading.import_hdf5 import import_state
 
         return import_state(job)
-    from physion.trials.official.import_movie import import_movie
+    from physion.trials.official.reading.import_movie import import_movie
 
     return import_movie(job)
 

@@ -12,8 +12,8 @@ import pandas as pd
 import pytest
 
 from physion.experiment.export.answer_tables import read_tables
-from physion.experiment.export.bids import BEH_COLUMNS
-from physion.experiment.export.column_labels import unique_file_labels
+from physion.experiment.export.conventions.bids import BEH_COLUMNS
+from physion.experiment.export.conventions.column_labels import unique_file_labels
 from physion.experiment.export.export_study import export_study
 from physion.experiment.export.spreadsheet import restore_cell
 from physion.experiment.store.database import open_database, upgrade

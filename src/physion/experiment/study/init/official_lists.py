@@ -18,8 +18,8 @@ import numpy as np
 
 from physion.errors import BadInputError
 from physion.experiment.study.csv_rows import csv_rows
-from physion.experiment.study.init_trials import StimulusSelection, check_even
-from physion.experiment.study.media import StimulusSource
+from physion.experiment.study.init.generated_trials import StimulusSelection, check_even
+from physion.experiment.study.init.media import StimulusSource
 from physion.experiment.study.plain_files import read_plain
 from physion.experiment.study.stimuli import is_name
 from physion.seeds import generator

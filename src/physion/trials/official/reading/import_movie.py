@@ -20,9 +20,9 @@ from physion.rendering.renderer import role_map
 from physion.scenes.scene import OBSERVED_FRAMES, Body, Camera, Roles, Scene
 from physion.stimulus_names import plain_name
 from physion.trials.files import encode_png, write_files
-from physion.trials.official.job import ImportJob, imported_metadata
 from physion.trials.official.movies import neighbouring_file, read_movie
 from physion.trials.official.names import decode_picture, redyellow_name
+from physion.trials.official.reading.job import ImportJob, imported_metadata
 from physion.trials.trial_file import TrialWriter
 
 ENGINE = "imported: movie alone"

@@ -16,7 +16,7 @@ from physion.atomic import folder_lock, remove_leftovers, write_atomic
 from physion.compute.progress import Track
 from physion.errors import BadInputError
 from physion.experiment.study.identity import SECRET_FILE, Secrets, set_password
-from physion.experiment.study.media import StimulusSource, import_stimulus
+from physion.experiment.study.init.media import StimulusSource, import_stimulus
 from physion.experiment.study.stimuli import (
     MEDIA_FOLDER,
     STIMULI_FILE,

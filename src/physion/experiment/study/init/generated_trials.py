@@ -14,7 +14,7 @@ from typing import Any, Literal
 import pandas as pd
 
 from physion.errors import BadInputError, UnknownNameError
-from physion.experiment.study.media import StimulusSource
+from physion.experiment.study.init.media import StimulusSource
 from physion.seeds import generator
 from physion.stimulus_names import SCENARIOS
 from physion.trials.dataset import Dataset

@@ -23,10 +23,10 @@ from physion.physics.rigid.model import center_of_mass
 from physion.scenes.scene import Cloth
 from physion.trials.official.axes import swap_axes, to_official_euler
 from physion.trials.official.names import RAMPS, ROOMS, TRIAL_FILE, segmentation_colors, split_name
-from physion.trials.official.write_flex import flex_groups
-from physion.trials.official.write_frames import PASSES, FrameWriter, put
-from physion.trials.official.write_metadata import trial_record
-from physion.trials.official.write_objects import OfficialObjects, model_name
+from physion.trials.official.writing.flex import flex_groups
+from physion.trials.official.writing.frames import PASSES, FrameWriter, put
+from physion.trials.official.writing.metadata import trial_record
+from physion.trials.official.writing.objects import OfficialObjects, model_name
 from physion.trials.trial_file import Trial, TrialWriter
 
 NONE = -1

@@ -13,7 +13,6 @@ from physion.physics.trajectory import Trajectory
 from physion.rendering.renderer import Renderer, role_map
 from physion.scenes.scene import OBSERVED_FRAMES, PLAYBACK_RATE, Scene
 from physion.trials.files import encode_png, write_files
-from physion.trials.official.job import ImportJob, imported_metadata
 from physion.trials.official.movies import (
     PICTURES,
     EncodedMovies,
@@ -22,9 +21,10 @@ from physion.trials.official.movies import (
     stored_frames,
 )
 from physion.trials.official.read_hdf5 import OfficialFile
-from physion.trials.official.read_motion import MotionReader
-from physion.trials.official.read_scene import SceneReader
-from physion.trials.official.round_trip import restored_files, stored_trial
+from physion.trials.official.reading.job import ImportJob, imported_metadata
+from physion.trials.official.reading.read_motion import MotionReader
+from physion.trials.official.reading.read_scene import SceneReader
+from physion.trials.official.reading.round_trip import restored_files, stored_trial
 from physion.trials.trial_file import TrialWriter
 
 UNSEEN_SIZE = (256, 256)

@@ -12,7 +12,7 @@ import pytest
 
 from physion.cli.main import main
 from physion.errors import BadInputError
-from physion.experiment.study.init_official import choose_listed, list_scenario, read_list
+from physion.experiment.study.init.official_lists import choose_listed, list_scenario, read_list
 from physion.experiment.study.study import load_study
 from physion.stimulus_names import OFFICIAL_SCENARIOS, canonical_name
 from physion.trials.video import encode_movie, read_frames

@@ -14,7 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from physion.analysis.people.response_schema import Column
-from physion.experiment.export.column_labels import KIND_NAMES, column_levels, file_label
+from physion.experiment.export.conventions.column_labels import (
+    KIND_NAMES,
+    column_levels,
+    file_label,
+)
 
 VERSION = "Psych-DS 0.4.0"
 

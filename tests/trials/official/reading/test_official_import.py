@@ -28,8 +28,8 @@ from physion.trials.files import write_files
 from physion.trials.index import build_index, write_index
 from physion.trials.layout import TrialPaths
 from physion.trials.making.verify import verify_dataset
-from physion.trials.official.export_folder import export_official
-from physion.trials.official.import_folder import import_official
+from physion.trials.official.reading.import_folder import import_official
+from physion.trials.official.writing.export_folder import export_official
 from physion.trials.trial_file import Trial, TrialWriter
 from physion.trials.video import count_frames, encode_movie, read_frames
 from support.official_hand_made import (

@@ -41,7 +41,7 @@ from physion.trials.files import encode_png
 from physion.trials.layout import TrialPaths
 from physion.trials.official.names import TRIAL_FILE, redyellow_name, split_name
 from physion.trials.official.read_hdf5 import OfficialFile
-from physion.trials.official.write_metadata import trial_stats
+from physion.trials.official.writing.metadata import trial_stats
 from physion.trials.trial_file import Metadata, Trial
 from physion.trials.video import MovieEncoder, count_frames
 
@@ -154,7 +154,7 @@ def export_trial(job: ExportJob) -> str:
     """Write all files of one trial, the HDF5 file last; return the name of its stimulus."""
     # Imported late: loading engine and renderer takes time.
     from physion.rendering.renderer import role_map
-    from physion.trials.official.write_hdf5 import official_file
+    from physion.trials.official.writing.hdf5 import official_file
 
     trial = Trial.open(job.paths.trial_file)
     if not np.isfinite(trial.trajectory.positions).all():

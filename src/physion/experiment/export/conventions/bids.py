@@ -25,7 +25,7 @@ import pyarrow.compute as pc
 from pyarrow import csv
 
 from physion.analysis.people.response_schema import SESSION_COLUMNS, TRIAL_COLUMNS, Column
-from physion.experiment.export.column_labels import column_levels, unique_file_labels
+from physion.experiment.export.conventions.column_labels import column_levels, unique_file_labels
 from physion.experiment.export.spreadsheet import guard_cell
 from physion.experiment.export.trial_rows import TrialBatch
 from physion.experiment.study.study import Study

@@ -1,0 +1,1 @@
+"""Export in the layouts BIDS and Psych-DS."""

@@ -1,0 +1,1 @@
+"""Creation of a study folder: selection of stimuli, their movies and maps."""

@@ -1,0 +1,1 @@
+"""Import of official files: scenes, motions, labels and movies."""

@@ -1,0 +1,1 @@
+"""Export in the official file formats."""
