@@ -29,7 +29,7 @@ SPLIT_LOOKS: Mapping[str, tuple[str, ...]] = {
     "familiarization": ("redyellow", "free"),
 }
 """Looks of each split; the first is the trial's own. Training shows no colour cues, readout shows
-them, testing and familiarization have both (people see free colours and a map of the roles)."""
+them, testing and familiarization have both (people see the free colours)."""
 FULL_COUNTS = {"training": 2000, "readout": 1000, "testing": 150, "familiarization": 10}
 """Trials per scenario in each split, as in the original study."""
 PLAYBACK_RATES = {"slow": PLAYBACK_RATE, "real": round(1 / FRAME_TIME)}
@@ -104,8 +104,9 @@ class GenerateSettings:
     height: int = 256
     """Pixels, even."""
     look: Literal["redyellow", "free", "split"] = "split"
-    """Agent red and patient yellow, or the free colours of the scene with a map of the roles. With
-    'split', training is free, readout red and yellow, testing and familiarization both."""
+    """Colours of the movies: agent red and patient yellow, or the free colours of the scene. With
+    'split', training is free, readout red and yellow, testing and familiarization both. Every trial
+    with movies also has a map of agent and patient."""
     movies: bool = True
     """Make movies and maps; otherwise trials have only trial files."""
     playback: Literal["slow", "real"] = "slow"
