@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import os
+import subprocess
+import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -20,16 +24,19 @@ from physion.analysis.models import figure_tables
 from physion.analysis.models.mixed_fits import fits_of_models
 from physion.analysis.people.difficulty import below_chance_level
 from physion.analysis.tables.stimuli import MEAN
-from physion.report.figures import by_scenario as figures
-from physion.report.figures import by_stimulus as figures_stimuli
 from physion.report.figures import theme
-from physion.report.figures.registry import make_plots
+from physion.report.figures.by_stimulus.difficulty import difficulty_figure
+from physion.report.figures.by_stimulus.scatter import SQUARE, scatter_figure
+from physion.report.figures.measures import measure_figure
+from physion.report.figures.registry import all_figures, make_plots
+from physion.report.figures.training.generalization import generalization_figure
 from physion.report.inputs import ReportInputs
 from physion.report.page import blocks
 from physion.report.page.document import Picture
 from physion.report.page.page import render_page
 from physion.report.words import number, protocol_names
 from physion.stimulus_names import SCENARIOS
+from support.paths import ROOT
 
 Maker = Callable[..., Comparison]
 
@@ -44,7 +51,7 @@ def dots(figure: Figure, panel: int) -> list[float]:
 def test_dots_stand_at_the_accuracies(make_comparison: Maker) -> None:
     comparison = make_comparison()
     table = figure_tables.accuracy_table(comparison)
-    figure = figures.measure_figure(table, "accuracy")
+    figure = measure_figure(table, "accuracy")
     for place, scenario in enumerate(["collide", "drop", "mean"]):
         own = table[table["panel"] == scenario]
         assert dots(figure, place) == pytest.approx(own["value"].tolist())
@@ -60,7 +67,7 @@ def test_zones_of_participants_and_of_scenarios_look_different(make_comparison: 
     row = table.iloc[[0]].assign(zone_low=0.4, zone_high=0.6)
     hatches = []
     for zone in (figure_tables.PARTICIPANTS, figure_tables.SCENARIO_ZONE):
-        axis = figures.measure_figure(row.assign(zone=zone), "accuracy").axes[0]
+        axis = measure_figure(row.assign(zone=zone), "accuracy").axes[0]
         hatches.append(axis.patches[0].get_hatch())
     assert hatches[0] is None and hatches[1]
 
@@ -68,21 +75,21 @@ def test_zones_of_participants_and_of_scenarios_look_different(make_comparison: 
 def test_undefined_values_are_called_nan_in_the_figure(make_comparison: Maker) -> None:
     table = figure_tables.r_table(make_comparison(constant=True))
     assert table["value"].isna().all() and table["reason"].str.contains("undefined|constant").all()
-    words = [text.get_text() for text in figures.measure_figure(table, "r").axes[0].texts]
+    words = [text.get_text() for text in measure_figure(table, "r").axes[0].texts]
     assert words == ["NaN", "NaN"]
 
 
 def test_points_are_the_stimuli_in_the_square_of_their_scenario(make_comparison: Maker) -> None:
     comparison = make_comparison()
     table = figure_tables.scatter_table(comparison, comparison.agents)
-    figure = figures_stimuli.scatter_figure(table)
+    figure = scatter_figure(table)
     own = table[table["agent"] == comparison.agents[1]]
     changed = own["label"] != own["simulated"]
     assert changed.sum() == 1
     filled, hollow = figure.axes[1].lines[1:]
     assert hollow.get_markerfacecolor() == "none" and filled.get_markerfacecolor() != "none"
     for line, part in ((filled, own[~changed]), (hollow, own[changed])):
-        squares = (part["scenario"] == "drop") * figures_stimuli.SQUARE
+        squares = (part["scenario"] == "drop") * SQUARE
         expected = np.column_stack([part["p_yes"] + squares, part["p_contact"]])
         assert np.allclose(line.get_xydata(), expected)
     words = [text.get_text() for text in figure.axes[1].texts]
@@ -94,7 +101,7 @@ def test_bars_hold_every_stimulus_and_mark_the_tail() -> None:
     accuracy = np.array([0.02, 0.1, 0.4, 0.55, 0.9, 1.0])
     rows = pd.DataFrame({"scenario": "drop", "stimulus": [f"s{i}" for i in range(6)],
                          "accuracy": accuracy, "count": 100})  # fmt: skip
-    figure = figures_stimuli.difficulty_figure(below_chance_level(rows))
+    figure = difficulty_figure(below_chance_level(rows))
     bars = {(round(p.get_x(), 3), p.get_hatch()): p.get_height() for p in figure.axes[0].patches}
     assert sum(bars.values()) == 6
     tail = {x for (x, hatch) in bars if hatch}
@@ -144,7 +151,7 @@ def test_thirds_show_what_halves_of_people_reach(make_comparison: Maker) -> None
     assert row["people"] == pytest.approx(np.mean(r), abs=0.02)
     assert row["zone_low"] == pytest.approx(np.percentile(r, 2.5), abs=0.08)
     assert row["zone_low"] < row["people"] < row["zone_high"]
-    figure = figures.measure_figure(figure_tables.thirds_table(comparison, rows), "r")
+    figure = measure_figure(figure_tables.thirds_table(comparison, rows), "r")
     place = list(table["people"].notna()).index(True)
     value = table["people"].iloc[place]
     assert any(np.allclose(line.get_xdata(), value) for line in figure.axes[place].lines)
@@ -192,7 +199,7 @@ def test_generalization_is_relative_to_people(make_comparison: Maker) -> None:
     right = (own["predicted"] == own["label"]).mean()
     assert cell["difference"] == pytest.approx(right - own["human_accuracy"].mean())
     assert set(table["trained"]) == {"all", "collide"} and len(table) == 4
-    words = [t.get_text() for t in figures.generalization_figure(table).axes[0].texts]
+    words = [t.get_text() for t in generalization_figure(table).axes[0].texts]
     assert len(words) == 4 and all(word[0] in "+−0" for word in words)
 
 
@@ -206,7 +213,7 @@ def test_an_odd_number_of_models_leaves_no_column_without_scenarios() -> None:
     pairs = [(agent, trained, tested) for agent in "abc" for trained in ("all", "drop")
              for tested in SCENARIOS]  # fmt: skip
     table = pd.DataFrame(pairs, columns=["agent", "trained", "tested"])
-    figure = figures.generalization_figure(table.assign(difference=0.1, people=0.7))
+    figure = generalization_figure(table.assign(difference=0.1, people=0.7))
     figure.draw_without_rendering()
     first, right, lower = figure.axes[:3]
     for axis in (right, lower):
@@ -219,7 +226,7 @@ def test_an_odd_number_of_models_leaves_no_column_without_scenarios() -> None:
 def test_panels_inside_have_neither_ticks_nor_numbers(make_comparison: Maker) -> None:
     table = figure_tables.accuracy_table(make_comparison())
     table = pd.concat([table[table["panel"] == "drop"].assign(panel=name) for name in SCENARIOS])
-    axes = figures.measure_figure(table, "accuracy").axes
+    axes = measure_figure(table, "accuracy").axes
     ticks = [(numbered(axis, "x"), numbered(axis, "y")[0]) for axis in axes[: len(SCENARIOS)]]
     yes, no = (True, True), (False, False)
     assert [x for x, _ in ticks] == [no] * 5 + [yes] * 3
@@ -243,7 +250,7 @@ def test_page_and_figures_call_a_model_by_one_name(make_comparison: Maker) -> No
     inputs = ReportInputs(comparison, scatter_limit=0)
     page = render_page(inputs, pictures(inputs))
     assert "dynamics training" not in page
-    assert page.count(figures.label(long)) > 4  # tables, cards, caption of the scatter figure
+    assert page.count(theme.label(long)) > 4  # tables, cards, caption of the scatter figure
     assert protocol_names("m · readout train data all but this") == "m · readout train data all-but"
     assert protocol_names("the same dynamics") == "the same dynamics"
 
@@ -279,6 +286,38 @@ def test_models_are_held_against_the_first_in_the_files(make_comparison: Maker) 
     terms = models.fit.table["term"].tolist()
     assert len(terms) == 2 and comparison.agents[1] in terms[1]
     assert comparison.agents[0] in models.about
+
+
+# --- one file each ------------------------------------------------------------------------------
+
+
+def test_each_figure_is_one_module() -> None:
+    modules = [entry.make.__module__ for entry in all_figures()]
+    assert len(modules) == len(set(modules)) >= 10
+    assert all(name.startswith("physion.report.figures.") for name in modules)
+
+
+def test_a_figure_of_another_package_is_found(tmp_path: Path) -> None:
+    (tmp_path / "own_figure.py").write_text(
+        "from physion.report.figures.registry import BY_SCENARIO, register_figure\n"
+        "@register_figure('own', section=BY_SCENARIO, order=15)\n"
+        "def own(inputs): return None\n"
+    )
+    (tmp_path / "own-1.0.dist-info").mkdir()
+    (tmp_path / "own-1.0.dist-info" / "METADATA").write_text("Name: own\nVersion: 1.0\n")
+    (tmp_path / "own-1.0.dist-info" / "entry_points.txt").write_text(
+        "[physion.figures]\nown = own_figure:own\n"
+    )
+    code = (
+        "from physion.report.figures.registry import all_figures\n"
+        "print(*(entry.name for entry in all_figures()))"
+    )
+    paths = os.pathsep.join([str(tmp_path), str(ROOT / "src")])
+    environment = os.environ | {"PYTHONPATH": paths}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split()[:3] == ["accuracy", "own", "r"]
 
 
 # --- looks --------------------------------------------------------------------------------------
@@ -325,6 +364,6 @@ def test_bytes_repeat(make_comparison: Maker) -> None:
 
 def test_model_names_are_text_and_not_formulas(make_comparison: Maker) -> None:
     table = figure_tables.accuracy_table(make_comparison(model="$x_1$ <b> & co"))
-    figure = figures.measure_figure(table, "accuracy")
+    figure = measure_figure(table, "accuracy")
     assert figure.axes[0].get_yticklabels()[0].get_text().startswith("$x_1$ <b>")
     assert theme.figure_bytes(figure, "png")

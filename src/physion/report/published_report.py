@@ -20,10 +20,8 @@ from physion.analysis.published.cells import grid
 from physion.analysis.published.summary import TITLES, PublishedResults
 from physion.analysis.tables.stimuli import MEAN
 from physion.atomic import write_atomic
-from physion.report.figures.by_scenario import (
-    grouped_figure,
-    measure_figure,
-)
+from physion.report.figures.conditions import grouped_figure
+from physion.report.figures.measures import measure_figure
 from physion.report.figures.theme import Plot, Theme
 from physion.report.page.blocks import PageColumn, details, p_value, paragraph, rows_table, table
 from physion.report.page.document import Section, figure, render_document

@@ -1,1 +1,1 @@
-"""Figures of a report: one function each, listed in `registry`."""
+"""Figures of a report: one module each, in the folder of its section; see `registry`."""

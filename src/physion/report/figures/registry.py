@@ -1,8 +1,8 @@
-"""Registry of the figures of a report, so that a new figure is one new file in this folder.
+"""Registry of the figures of a report, so that a new figure is one new file below this folder.
 
 A figure is a function from `ReportInputs` to a `Plot`, decorated with `register_figure`. All
-modules of this folder are imported, and those that other packages name under the entry points
-``physion.figures``. ``docs/how-to/add-a-figure.md`` shows how to add one.
+modules of this folder and its sub-folders are imported, and those that other packages name under
+the entry points ``physion.figures``. ``docs/how-to/add-a-figure.md`` shows how to add one.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ def register_figure(
 def all_figures() -> list[FigureEntry]:
     """Return every figure, sorted by order and name."""
     package = importlib.import_module("physion.report.figures")
-    for module in pkgutil.iter_modules(package.__path__):
-        importlib.import_module(f"physion.report.figures.{module.name}")
+    for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+        importlib.import_module(module.name)
     entries = [figures.get(name) for name in figures.names()]
     return sorted(entries, key=lambda entry: (entry.order, entry.name))
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import math
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +17,8 @@ import matplotlib
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+
+from physion.report.words import protocol_names
 
 
 @dataclass(frozen=True)
@@ -92,6 +95,11 @@ def legend(figure: Figure, handles: Sequence[Any], columns: int) -> None:
     figure.legend(
         handles=list(handles), loc="outside upper center", ncols=min(columns, len(handles))
     )
+
+
+def label(agent: str, width: int = 48) -> str:
+    """Return the name of a model for an axis, as on the page, broken into lines."""
+    return textwrap.fill(protocol_names(str(agent)), width)
 
 
 def title(axis: Axes, text: str) -> None:

@@ -1,0 +1,1 @@
+"""Figures of the section stimulus by stimulus."""
