@@ -29,21 +29,23 @@ from physion.rendering.records import (
     LightMaps,
     ShadingInputs,
 )
-from physion.rendering.rooms import rooms
-from physion.rendering.shading import (
+from physion.rendering.reflection import (
     CORNER_OCCLUSION,
     CORNER_RANGE,
-    FOOTPRINT,
-    TONES,
-    WHITEST,
     corner_occlusion,
     fresnel,
     highlight,
     lambert,
+    window_fraction,
+)
+from physion.rendering.rooms import rooms
+from physion.rendering.shading import (
+    FOOTPRINT,
+    TONES,
+    WHITEST,
     shade,
     shade_static_points,
     texture_footprint,
-    window_fraction,
 )
 from physion.rendering.textures.lookup import Atlas
 from physion.scenes.scene import Camera

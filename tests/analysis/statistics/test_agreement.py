@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import stats
 
-from physion.analysis.metrics import sample_of_rows, score_metrics
+from physion.analysis.metrics import score_metrics
+from physion.analysis.sample import sample_of_rows
 from physion.analysis.statistics import agreement
 from physion.analysis.statistics.agreement import why_no_r
 from physion.analysis.statistics.bootstrap import Bootstrap

@@ -15,9 +15,10 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from physion.analysis.metrics import RESAMPLED, Resampled, Sample, measure_metrics
+from physion.analysis.metrics import measure_metrics
 from physion.analysis.people.answers import ScenarioAnswers, mean_over_people
 from physion.analysis.people.people import draws_of_people
+from physion.analysis.sample import RESAMPLED, Resampled, Sample
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.statistics.calibration import check_probabilities
 from physion.analysis.statistics.kappa import (
@@ -108,7 +109,7 @@ class Measured:
     """Measures of models in one scenario, with the resamples for their intervals.
 
     ``values[measure]`` (m,); ``pairs[measure]`` (people, m), for measures with a value for each
-    participant; ``draws[what][measure]`` (resamples, m) for each of `metrics.RESAMPLED`, absent if
+    participant; ``draws[what][measure]`` (resamples, m) for each of `sample.RESAMPLED`, absent if
     the measure does not depend on the draw.
     """
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from physion.analysis.metrics import RESAMPLED
 from physion.analysis.models.model_people import (
     Measured,
     interval_columns,
@@ -20,6 +19,7 @@ from physion.analysis.models.model_people import (
 from physion.analysis.models.model_tests import calibration_scores, paired_tests, pool_measured
 from physion.analysis.models.zones import human_zones, released_r_zone
 from physion.analysis.people.people import HALVES, all_answers, split_halves
+from physion.analysis.sample import RESAMPLED
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.tables.csv_table import require_columns
 from physion.analysis.tables.stimuli import MEAN

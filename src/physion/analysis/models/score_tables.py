@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from physion.analysis.metrics import Sample, pool, sample_of_rows, score_metrics
+from physion.analysis.metrics import score_metrics
+from physion.analysis.sample import Sample, pool, sample_of_rows
 from physion.analysis.statistics import agreement
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.tables.stimuli import MEAN, POOLED, in_order
