@@ -91,7 +91,7 @@ def test_page_holds_every_trial_with_its_label(page: Page) -> None:
     cards = {card["trial"]: card for card in page.json("cards")}
     assert list(cards) == ["drape_0", "drop_0", "drop_1", "drop_2"]
     assert [cards[n]["contact"] for n in cards] == [True, True, False, True]
-    assert [cards[n]["first"] for n in cards] == [55, 50, None, 20]
+    assert [cards[n]["firstContact"] for n in cards] == [55, 50, None, 20]
     assert [cards[n]["observed"] for n in cards] == [False, False, False, True]
     assert [cards[n]["robust"] for n in cards] == [1.0, 1.0, 0.5, None]
     assert page.json("totals") == {"drop": 3, "drape": 1}
@@ -319,7 +319,7 @@ def test_values_as_people_read_them() -> None:
 
 
 def test_search_knows_objects_but_not_outcomes(page: Page) -> None:
-    words = next(card for card in page.json("cards") if card["trial"] == "drop_0")["words"]
+    words = next(card for card in page.json("cards") if card["trial"] == "drop_0")["searchText"]
     assert {"drop_0", "ball", "sphere", "prop:vase", "plain", "ff01"} <= set(words.split())
     assert "contact" not in words and words == words.lower()
 
@@ -366,8 +366,8 @@ def test_motion_keeps_what_moves_frame_by_frame() -> None:
     np.testing.assert_allclose(turns, trajectory.rotations[:, :1], atol=2e-5)
     assert len(_unpack(motion["start"]["positions"], "<f4")) == 9
     assert [body["role"] for body in motion["bodies"]] == ["agent", "patient", None]
-    assert motion["touches"][0] == pytest.approx([50, 0.1, 0.2, 0.2])
-    assert [touch[0] for touch in motion["touches"]] == list(PLANS[0].touch)
+    assert motion["contactPoints"][0] == pytest.approx([50, 0.1, 0.2, 0.2])
+    assert [touch[0] for touch in motion["contactPoints"]] == list(PLANS[0].touch)
 
 
 def test_cloth_keeps_its_corners_and_its_ends() -> None:

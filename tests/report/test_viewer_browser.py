@@ -213,7 +213,7 @@ def click(browser: Browser, name: str) -> None:
 
 def seek(browser: Browser, frame: int) -> None:
     """Move the time line, and wait until the movie stands there."""
-    choose(browser, "scrub", str(frame))
+    choose(browser, "frame-slider", str(frame))
     browser.until(f"document.getElementById('now').textContent.startsWith('frame {frame} of')")
     browser.ask("new Promise(done => setTimeout(done, 300))")
 
@@ -269,7 +269,7 @@ def test_hidden_labels_tell_nothing(browser: Browser, page: Path) -> None:
     browser.ask("document.querySelectorAll('.card')[1].click()")
     text = browser.ask("document.getElementById('detail').innerText").lower()
     assert "contact" not in text and "touch in" not in text and "seed" in text
-    assert not browser.ask("document.querySelector('#track .first').checkVisibility()")
+    assert not browser.ask("document.querySelector('#track .first-contact').checkVisibility()")
     click(browser, "play")
     browser.key("End", 35)
     assert browser.ask("document.getElementById('now').textContent").startswith("frame 44 of 60")
@@ -314,7 +314,7 @@ def colored(picture: np.ndarray) -> tuple[float, float, int]:
 def test_scene_in_3d_moves_with_the_time_line_and_turns(browser: Browser, page: Path) -> None:
     browser.open(page, "#trial=drop_0")
     click(browser, "play")
-    browser.ask("document.querySelector('#solid input').click()")  # without ways and touches
+    browser.ask("document.querySelector('#view3d input').click()")  # hides paths
     seek(browser, 0)
     first = colored(browser.picture("#scene3d"))
     assert first[2] > 500
@@ -345,7 +345,7 @@ def test_scene_in_3d_moves_with_the_time_line_and_turns(browser: Browser, page: 
 def test_cloth_falls_in_3d(browser: Browser, page: Path) -> None:
     browser.open(page, "#trial=drape_0")
     click(browser, "play")
-    browser.ask("document.querySelector('#solid input').click()")
+    browser.ask("document.querySelector('#view3d input').click()")
     seek(browser, 2)
     first = colored(browser.picture("#scene3d"))
     seek(browser, 50)
@@ -359,7 +359,7 @@ def test_time_line_marks_observed_part_and_every_contact(browser: Browser, page:
         "parseFloat(i.style.left), parseFloat(i.style.width) || 0])"
     )
     shares = [(kind, left * 59 / 100, width * 59 / 100) for kind, left, width in marks]
-    assert [kind for kind, _, _ in shares] == ["seen", "touch", "touch", "first"]
+    assert [kind for kind, _, _ in shares] == ["observed", "contact", "contact", "first-contact"]
     expected = [(0, 44.5), (19.5, 2), (29.5, 1), (20, 0)]
     for (_, left, width), (at, length) in zip(shares, expected, strict=True):
         assert left == pytest.approx(at, abs=1e-3) and width == pytest.approx(length, abs=1e-3)
@@ -376,7 +376,7 @@ def test_keys_alone_are_enough(browser: Browser, page: Path) -> None:
     assert browser.ask("location.hash") == "#trial=drape_0"
     browser.until("document.getElementById('play').textContent === 'Pause'")
     browser.until("!document.getElementById('now').textContent.startsWith('frame 0 ')")
-    browser.ask("document.getElementById('scrub').focus()")
+    browser.ask("document.getElementById('frame-slider').focus()")
     browser.key(" ", 32, " ")
     assert browser.ask("document.getElementById('play').textContent") == "Play"
     browser.key("Home", 36)
@@ -385,7 +385,9 @@ def test_keys_alone_are_enough(browser: Browser, page: Path) -> None:
         ("End", 35, 0, 59),
     ):
         browser.key(key, code, modifiers=modifiers)
-        words = browser.ask("document.getElementById('scrub').getAttribute('aria-valuetext')")
+        words = browser.ask(
+            "document.getElementById('frame-slider').getAttribute('aria-valuetext')"
+        )
         assert words.startswith(f"frame {frame} of 60"), key
     browser.key("n", 78, "n")
     assert browser.ask("document.getElementById('detail-title').textContent") == "drop_0"

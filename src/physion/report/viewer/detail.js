@@ -18,7 +18,7 @@ class Detail {
     /** Meshes by name, parsed when first needed. @type {any} */
     this.shapes = undefined;
     this.dialog = byId("detail");
-    this.labelled = true;
+    this.labelsShown = true;
     this.dialog.addEventListener("close", () => {
       this.clear();
       onClose();
@@ -28,26 +28,26 @@ class Detail {
     byId("back").onclick = () => this.step(-1);
     byId("ahead").onclick = () => this.step(1);
     byId("speed").onchange = () => this.player.setSpeed(Number(byId("speed").value));
-    this.dialog.addEventListener("keydown", (event) => this.key(event));
+    this.dialog.addEventListener("keydown", (event) => this.onKey(event));
   }
 
   open(number) {
     this.clear();
     const card = this.cards[number];
-    const detail = block(`detail-${number}`);
+    const detail = readData(`detail-${number}`);
     this.card = card;
     byId("detail-title").textContent = card.trial;
     byId("detail-badges").replaceChildren(...badges(card));
-    const strip = detail.passes ?? block(`movie-${number}`);
-    this.buildPasses(strip, detail);
+    const movie = detail.passes ?? readData(`movie-${number}`);
+    this.buildPasses(movie, detail);
     this.buildScene(detail);
     this.buildTables(detail.tables);
-    this.line = new TimeLine(card, detail.runs, (frame) => this.player.seek(frame));
+    this.timeLine = new TimeLine(card, detail.runs, (frame) => this.player.seek(frame));
     this.player = new Player(
-      card.frames, card.rate, strip, (frame) => this.show(frame), (video) => this.paint(video),
+      card.frames, card.rate, movie, (frame) => this.show(frame), (video) => this.paint(video),
     );
     this.player.setSpeed(Number(byId("speed").value));
-    this.setLabelled(this.labelled);
+    this.showLabels(this.labelsShown);
     if (!this.dialog.open) this.dialog.showModal();
     this.dialog.scrollTop = 0;
     byId("play").focus();
@@ -61,15 +61,15 @@ class Detail {
     this.player = this.scene = null;
   }
 
-  buildPasses(strip, detail) {
-    this.tiles = strip.tiles.map((name, index) => {
-      const { width, height } = strip;
-      const canvas = make("canvas", { width, height, role: "img", "aria-label": `${name} pass` });
+  buildPasses(movie, detail) {
+    this.tiles = movie.tiles.map((name, index) => {
+      const { width, height } = movie;
+      const canvas = createElement("canvas", { width, height, role: "img", "aria-label": `${name} pass` });
       return { canvas, index, name, width, height };
     });
     const figures = this.tiles.map(({ canvas, name }) => {
       const [title, text] = CAPTIONS[name](detail.ranges ?? {});
-      return make("figure", {}, canvas, make("figcaption", {}, make("b", {}, title), " ", text));
+      return createElement("figure", {}, canvas, createElement("figcaption", {}, createElement("b", {}, title), " ", text));
     });
     const objects = detail.legend.map(({ name, role, color }) => {
       const swatch = document.createElementNS("http://www.w3.org/2000/svg", "svg");
@@ -81,73 +81,73 @@ class Detail {
       swatch.setAttribute("aria-hidden", "true");
       swatch.append(square);
       const label = role ? `${name} (${role})` : name;
-      return detail.passes ? make("li", {}, swatch, label) : make("li", {}, label);
+      return detail.passes ? createElement("li", {}, swatch, label) : createElement("li", {}, label);
     });
-    this.note = make("p", { class: "note", hidden: true, role: "status" });
-    const legend = make(
+    this.note = createElement("p", { class: "note", hidden: true, role: "status" });
+    const legend = createElement(
       "ul", { class: "legend", tabindex: 0, "aria-label": "Objects in the scene" }, ...objects,
     );
-    byId("passes").className = detail.passes ? "" : "alone";
+    byId("passes").className = detail.passes ? "" : "single";
     byId("passes").replaceChildren(...figures, legend, this.note);
   }
 
   buildScene(detail) {
-    const container = byId("solid");
+    const container = byId("view3d");
     container.hidden = false;
     if (!detail.motion) {
-      container.replaceChildren(make("p", { class: "note" },
+      container.replaceChildren(createElement("p", { class: "note" },
         "Other passes and the 3D view of this trial are not in the page. A page built with more " +
         "details (--details) has them."));
       return;
     }
-    const canvas = make("canvas", {
+    const canvas = createElement("canvas", {
       tabindex: 0, role: "application", id: "scene3d",
       "aria-label": "Scene in 3D. Arrow keys rotate it, with shift they move it, plus and minus zoom, 0 returns to the camera of the trial.",
     });
-    this.shapes ??= block("shapes");
+    this.shapes ??= readData("shapes");
     this.scene = new Scene3D(canvas, detail.motion, this.shapes);
     if (!this.scene.gl) {
       this.scene = null;
       container.replaceChildren(
-        make("p", { class: "note" }, "The 3D view needs WebGL 2, which this browser does not offer."),
+        createElement("p", { class: "note" }, "The 3D view needs WebGL 2, which this browser does not offer."),
       );
       return;
     }
-    const camera = make("button", { type: "button", title: "View of the trial's camera (0)" }, "Camera view");
+    const camera = createElement("button", { type: "button", title: "View of the trial's camera (0)" }, "Camera view");
     camera.onclick = () => this.scene.reset();
-    const check = (label, name) => {
-      const box = make("input", { type: "checkbox", checked: true });
-      box.onchange = () => {
-        this.scene[name] = box.checked;
+    const checkbox = (label, name) => {
+      const input = createElement("input", { type: "checkbox", checked: true });
+      input.onchange = () => {
+        this.scene[name] = input.checked;
         this.scene.draw();
       };
-      return make("label", {}, box, ` ${label}`);
+      return createElement("label", {}, input, ` ${label}`);
     };
-    const boxes = [check("paths and touch points", "paths")];
-    if (detail.motion.bodies.some((body) => body.scenery)) boxes.push(check("scenery", "scenery"));
-    const hint = make("span", {}, "drag to rotate, wheel to zoom");
-    container.replaceChildren(canvas, make("div", { class: "under" }, camera, ...boxes, hint));
+    const boxes = [checkbox("paths and touch points", "paths")];
+    if (detail.motion.bodies.some((body) => body.scenery)) boxes.push(checkbox("scenery", "scenery"));
+    const hint = createElement("span", {}, "drag to rotate, wheel to zoom");
+    container.replaceChildren(canvas, createElement("div", { class: "controls" }, camera, ...boxes, hint));
   }
 
   buildTables(tables) {
     byId("tables").replaceChildren(...tables.map(({ title, header, rows, outcome = [] }) => {
       const body = rows.map(([first, ...rest], number) => {
-        const cells = rest.map((cell) => make("td", {}, cell));
-        const hides = outcome.includes(number) ? "answer" : null;
-        return make("tr", { class: hides }, make("th", { scope: "row" }, first), ...cells);
+        const cells = rest.map((cell) => createElement("td", {}, cell));
+        const className = outcome.includes(number) ? "answer" : null;
+        return createElement("tr", { class: className }, createElement("th", { scope: "row" }, first), ...cells);
       });
-      const names = (header ?? []).map((name) => make("th", { scope: "col" }, name));
-      const head = header ? [make("thead", {}, make("tr", {}, ...names))] : [];
-      const table = make("table", { class: header ? null : "pairs" }, ...head, make("tbody", {}, ...body));
-      const wide = make("div", { class: "wide" }, table);
-      return make("div", { class: header ? "table broad" : "table" }, make("h3", {}, title), wide);
+      const names = (header ?? []).map((name) => createElement("th", { scope: "col" }, name));
+      const head = header ? [createElement("thead", {}, createElement("tr", {}, ...names))] : [];
+      const table = createElement("table", { class: header ? null : "pairs" }, ...head, createElement("tbody", {}, ...body));
+      const scrolling = createElement("div", { class: "scrolling" }, table);
+      return createElement("div", { class: header ? "table full-width" : "table" }, createElement("h3", {}, title), scrolling);
     }));
   }
 
-  setLabelled(labelled) {
-    this.labelled = labelled;
+  showLabels(labelsShown) {
+    this.labelsShown = labelsShown;
     if (!this.player) return;
-    const limit = labelled ? this.card.frames : this.card.observedFrames;
+    const limit = labelsShown ? this.card.frames : this.card.observedFrames;
     this.player.setLimit(limit);
     if (this.scene) this.scene.limit = limit;
   }
@@ -165,7 +165,7 @@ class Detail {
 
   show(frame) {
     if (!this.player) return;
-    this.line.show(frame, this.card.frameTime);
+    this.timeLine.show(frame, this.card.frameTime);
     this.scene?.show(frame);
     byId("play").textContent = this.player.playing ? "Pause" : "Play";
   }
@@ -183,16 +183,16 @@ class Detail {
     }
   }
 
-  key(event) {
+  onKey(event) {
     if (event.ctrlKey || event.metaKey || event.altKey || event.defaultPrevented) return;
-    const kind = event.target.tagName;
-    const busy = kind === "SELECT" || (kind === "INPUT" && event.target.type !== "range");
-    const pressed = kind === "BUTTON" && (event.key === " " || event.key === "Enter");
-    if (busy || pressed) return;
-    const far = event.shiftKey ? 10 : 1;
+    const tag = event.target.tagName;
+    const usesKeys = tag === "SELECT" || (tag === "INPUT" && event.target.type !== "range");
+    const activates = tag === "BUTTON" && (event.key === " " || event.key === "Enter");
+    if (usesKeys || activates) return;
+    const frames = event.shiftKey ? 10 : 1;
     if (event.key === " ") this.toggle();
-    else if (event.key === "ArrowLeft") this.step(-far);
-    else if (event.key === "ArrowRight") this.step(far);
+    else if (event.key === "ArrowLeft") this.step(-frames);
+    else if (event.key === "ArrowRight") this.step(frames);
     else if (event.key === "Home") this.player.seek(0);
     else if (event.key === "End") this.player.seek(this.player.limit - 1);
     else if (event.key === "n" || event.key === "N") byId("next").click();

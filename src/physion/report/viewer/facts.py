@@ -44,14 +44,14 @@ def card(trial: Trial) -> dict[str, Any]:
         "split": meta.split,
         "preset": meta.preset or "",
         "contact": labels.contact,
-        "first": labels.first_frame,
+        "firstContact": labels.first_frame,
         "observed": labels.observed,
         "robust": robust if robust is not None and math.isfinite(robust) else None,
         "frames": meta.frames,
         "observedFrames": meta.observed_frames,
         "rate": meta.playback_rate,
         "frameTime": meta.frame_time,
-        "words": _search_text(trial),
+        "searchText": _search_text(trial),
     }
 
 

@@ -11,44 +11,44 @@ class Grid {
     this.totals = totals;
     this.open = open;
     this.playing = !matchMedia("(prefers-reduced-motion: reduce)").matches;
-    this.labelled = true;
+    this.labelsShown = true;
     this.visible = new Set();
-    this.watcher = new IntersectionObserver((entries) => this.seen(entries), { rootMargin: "100px" });
+    this.observer = new IntersectionObserver((entries) => this.onVisibilityChange(entries), { rootMargin: "100px" });
     this.build();
     this.fillFilters();
     const form = byId("filters");
-    form.addEventListener("input", () => this.apply());
-    form.addEventListener("reset", () => setTimeout(() => this.apply()));
+    form.addEventListener("input", () => this.applyFilters());
+    form.addEventListener("reset", () => setTimeout(() => this.applyFilters()));
     form.addEventListener("submit", (event) => event.preventDefault());
     byId("movies").onclick = () => this.setPlaying(!this.playing);
     this.setPlaying(this.playing);
-    this.apply();
-    this.step = this.step.bind(this);
-    requestAnimationFrame(this.step);
+    this.applyFilters();
+    this.onAnimationFrame = this.onAnimationFrame.bind(this);
+    requestAnimationFrame(this.onAnimationFrame);
   }
 
   build() {
     this.items = this.cards.map((card, number) => this.item(card, number));
     const scenarios = [...new Set(this.cards.map((card) => card.scenario))];
     this.sections = scenarios.map((scenario) => {
-      const note = make("small");
-      const list = make("ul");
+      const note = createElement("small");
+      const list = createElement("ul");
       this.items.forEach(({ card, element }) => card.scenario === scenario && list.append(element));
-      const section = make("section", {}, make("h2", {}, scenario, note), list);
+      const section = createElement("section", {}, createElement("h2", {}, scenario, note), list);
       return { scenario, note, section };
     });
     byId("grid").replaceChildren(...this.sections.map(({ section }) => section));
   }
 
   item(card, number) {
-    const video = make("video", { playsinline: true, loop: true, "aria-hidden": true, tabindex: -1 });
+    const video = createElement("video", { playsinline: true, loop: true, "aria-hidden": true, tabindex: -1 });
     video.muted = true;
     Object.assign(video, { width: card.width, height: card.height });
-    const words = make("span", { class: "words" }, ...badges(card));
-    const button = make("button", { type: "button", class: "card" }, video, make("b", {}, card.trial), words);
+    const badgeRow = createElement("span", { class: "badges" }, ...badges(card));
+    const button = createElement("button", { type: "button", class: "card" }, video, createElement("b", {}, card.trial), badgeRow);
     button.onclick = () => this.open(number);
-    this.watcher.observe(video);
-    const item = { card, number, video, button, element: make("li", {}, button) };
+    this.observer.observe(video);
+    const item = { card, number, video, button, element: createElement("li", {}, button) };
     video.item = item;
     return item;
   }
@@ -56,8 +56,8 @@ class Grid {
   fillFilters() {
     for (const name of ["scenario", "split", "preset"]) {
       const values = [...new Set(this.cards.map((card) => card[name]))].filter(Boolean).sort();
-      const options = values.map((value) => make("option", { value }, value));
-      byId(name).replaceChildren(make("option", { value: "" }, "all"), ...options);
+      const options = values.map((value) => createElement("option", { value }, value));
+      byId(name).replaceChildren(createElement("option", { value: "" }, "all"), ...options);
       byId(name).disabled = values.length < 2;
     }
     if (this.cards.every((card) => card.robust === null)) {
@@ -68,72 +68,72 @@ class Grid {
 
   matches(card) {
     const value = (id) => byId(id).value;
-    const agrees = (wanted, fact) => !wanted || (wanted === "yes") === fact;
-    const words = value("search").toLowerCase().split(/\s+/).filter(Boolean);
-    const least = Number(value("robust"));
+    const outcomeIs = (wanted, fact) => !wanted || (wanted === "yes") === fact;
+    const terms = value("search").toLowerCase().split(/\s+/).filter(Boolean);
+    const minimum = Number(value("robust"));
     return (
       ["scenario", "split", "preset"].every((name) => !value(name) || card[name] === value(name)) &&
-      words.every((word) => card.words.includes(word)) &&
+      terms.every((term) => card.searchText.includes(term)) &&
       // Filters by the outcome would reveal it.
-      (!this.labelled ||
-        (agrees(value("contact"), card.contact) &&
-          agrees(value("observed"), card.observed) &&
-          (least === 0 || (card.robust !== null && card.robust >= least))))
+      (!this.labelsShown ||
+        (outcomeIs(value("contact"), card.contact) &&
+          outcomeIs(value("observed"), card.observed) &&
+          (minimum === 0 || (card.robust !== null && card.robust >= minimum))))
     );
   }
 
-  apply() {
+  applyFilters() {
     if (!byId("robust").disabled) {
-      const least = Number(byId("robust").value);
-      byId("robust-value").textContent = least === 0 ? "any" : `${least.toFixed(3)} or more`;
+      const minimum = Number(byId("robust").value);
+      byId("robust-value").textContent = minimum === 0 ? "any" : `${minimum.toFixed(3)} or more`;
     }
     for (const item of this.items) item.element.hidden = !this.matches(item.card);
-    this.chosen = this.items.filter((item) => !item.element.hidden);
+    this.shown = this.items.filter((item) => !item.element.hidden);
     for (const { scenario, note, section } of this.sections) {
-      const all = this.cards.filter((card) => card.scenario === scenario).length;
-      const here = this.chosen.filter((item) => item.card.scenario === scenario).length;
-      const left = this.totals[scenario] - all;
-      section.hidden = here === 0;
-      note.textContent = `${here === all ? here : `${here} of ${all}`} shown` +
-        (left > 0 ? `, ${left} more in the dataset but not in this page` : "");
+      const inPage = this.cards.filter((card) => card.scenario === scenario).length;
+      const matching = this.shown.filter((item) => item.card.scenario === scenario).length;
+      const notInPage = this.totals[scenario] - inPage;
+      section.hidden = matching === 0;
+      note.textContent = `${matching === inPage ? matching : `${matching} of ${inPage}`} shown` +
+        (notInPage > 0 ? `, ${notInPage} more in the dataset but not in this page` : "");
     }
     const total = Object.values(this.totals).reduce((sum, count) => sum + count, 0);
-    const left = total - this.cards.length;
+    const notInPage = total - this.cards.length;
     byId("count").textContent =
-      `${this.chosen.length} of ${plural(this.cards.length, "trial")} shown; ` +
-      (left > 0 ? `${plural(left, "trial")} of the dataset left out of this page.` : "nothing of the dataset left out.");
+      `${this.shown.length} of ${plural(this.cards.length, "trial")} shown; ` +
+      (notInPage > 0 ? `${plural(notInPage, "trial")} of the dataset left out of this page.` : "nothing of the dataset left out.");
   }
 
-  setLabelled(labelled) {
-    this.labelled = labelled;
-    this.apply();
+  showLabels(labelsShown) {
+    this.labelsShown = labelsShown;
+    this.applyFilters();
   }
 
   setPlaying(playing) {
     this.playing = playing;
-    byId("movies").textContent = playing ? "Movies play" : "Movies stand";
-    for (const video of this.visible) this.run(video);
+    byId("movies").textContent = playing ? "Movies play" : "Movies paused";
+    for (const video of this.visible) this.updatePlayback(video);
   }
 
   // Pause the movies while an open trial covers the grid.
   setCovered(covered) {
     this.covered = covered;
-    for (const video of this.visible) this.run(video);
+    for (const video of this.visible) this.updatePlayback(video);
   }
 
-  run(video) {
+  updatePlayback(video) {
     if (this.playing && !this.covered) video.play().catch(() => {});
     else video.pause();
   }
 
   // Load movies when they become visible, since browsers limit the number of loaded movies.
-  seen(entries) {
+  onVisibilityChange(entries) {
     for (const { target: video, isIntersecting } of entries) {
       if (isIntersecting && !this.visible.has(video)) {
         this.visible.add(video);
-        video.url ??= movieUrl(block(`movie-${video.item.number}`).data);
+        video.url ??= movieUrl(readData(`movie-${video.item.number}`).data);
         video.src = video.url;
-        this.run(video);
+        this.updatePlayback(video);
       } else if (!isIntersecting && this.visible.delete(video)) {
         video.removeAttribute("src");
         video.load();
@@ -144,9 +144,9 @@ class Grid {
   }
 
   // With hidden labels, restart movies at the end of the observed part.
-  step() {
-    requestAnimationFrame(this.step);
-    if (this.labelled) return;
+  onAnimationFrame() {
+    requestAnimationFrame(this.onAnimationFrame);
+    if (this.labelsShown) return;
     for (const video of this.visible) {
       const { observedFrames, rate } = video.item.card;
       if (video.currentTime > (observedFrames - 2) / rate) video.currentTime = 0;

@@ -1,6 +1,6 @@
 // The page: the grid, the open trial, and its name in the URL.
 
-const cards = block("cards");
+const cards = readData("cards");
 const title = document.title;
 
 // Return the number of the trial that the URL names, -1 for none.
@@ -34,11 +34,11 @@ const show = (number) => {
   detail.open(number);
   setHash(`#trial=${encodeURIComponent(cards[number].trial)}`);
 };
-const grid = new Grid(cards, block("totals"), show);
+const grid = new Grid(cards, readData("totals"), show);
 
 // Show the next (1) or previous (-1) of the trials that match the filters.
 const showNeighbour = (by) => {
-  const numbers = grid.chosen.map((item) => item.number);
+  const numbers = grid.shown.map((item) => item.number);
   const index = numbers.indexOf(openTrial);
   if (numbers.length) show(numbers[(index + by + numbers.length) % numbers.length]);
 };
@@ -46,11 +46,11 @@ byId("next").onclick = () => showNeighbour(1);
 byId("previous").onclick = () => showNeighbour(-1);
 
 byId("labels").onclick = () => {
-  const labelled = !grid.labelled;
-  document.body.classList.toggle("unlabelled", !labelled);
-  byId("labels").textContent = labelled ? "Labels shown" : "Labels hidden";
-  grid.setLabelled(labelled);
-  detail.setLabelled(labelled);
+  const labelsShown = !grid.labelsShown;
+  document.body.classList.toggle("unlabelled", !labelsShown);
+  byId("labels").textContent = labelsShown ? "Labels shown" : "Labels hidden";
+  grid.showLabels(labelsShown);
+  detail.showLabels(labelsShown);
 };
 
 addEventListener("hashchange", () => {

@@ -2,13 +2,13 @@
 class Motion {
   constructor(data, shapes) {
     this.data = data;
-    this.start = numbers(data.start.positions, Float32Array);
-    this.startRotations = numbers(data.start.rotations, Int16Array);
-    this.positions = numbers(data.positions, Float32Array);
-    this.rotations = numbers(data.rotations, Int16Array);
+    this.start = decodeArray(data.start.positions, Float32Array);
+    this.startRotations = decodeArray(data.start.rotations, Int16Array);
+    this.positions = decodeArray(data.positions, Float32Array);
+    this.rotations = decodeArray(data.rotations, Int16Array);
     this.movingIndex = new Map(data.moving.map((body, k) => [body, k]));
-    this.cloths = data.cloths.map((cloth) => ({ ...cloth, points: gridPoints(cloth.points) }));
-    this.middles = data.bodies.map((body) => {
+    this.cloths = data.cloths.map((cloth) => ({ ...cloth, points: decodePoints(cloth.points) }));
+    this.boxCentres = data.bodies.map((body) => {
       const { low, size } = shapes[body.shape].points;
       return low.map((v, i) => (v + size[i] / 2) * body.scale[i]);
     });
@@ -26,13 +26,13 @@ class Motion {
   }
 
   // Return the centre of a body's bounding box.
-  middle(body, frame) {
+  boxCentre(body, frame) {
     const { position, rotation } = this.pose(body, frame);
-    return add(position, rotate(rotation, this.middles[body]));
+    return add(position, rotate(rotation, this.boxCentres[body]));
   }
 
   // Return the vertices of a cloth, interpolated linearly between the stored instants.
-  sheet(cloth, frame) {
+  clothVertices(cloth, frame) {
     const { instants, points, side } = cloth;
     let k = 0;
     while (k < instants.length - 2 && instants[k + 1] <= frame) k++;
@@ -54,12 +54,12 @@ class Motion {
     const cloth = this.cloths.find((c) => c.role === role);
     if (!this.movingIndex.has(body) && !cloth) return null;
     for (let frame = 0; frame < this.data.frames; frame++) {
-      out.set(cloth ? this.mean(this.sheet(cloth, frame)) : this.middle(body, frame), 3 * frame);
+      out.set(cloth ? this.meanPoint(this.clothVertices(cloth, frame)) : this.boxCentre(body, frame), 3 * frame);
     }
     return out;
   }
 
-  mean(points) {
+  meanPoint(points) {
     const sum = [0, 0, 0];
     for (let i = 0; i < points.length; i++) sum[i % 3] += points[i];
     return times(sum, 3 / points.length);
@@ -67,7 +67,7 @@ class Motion {
 }
 
 // Return the triangles of a square grid of vertices.
-function sheetFaces(side) {
+function clothFaces(side) {
   const faces = [];
   for (let i = 0; i < side - 1; i++) {
     for (let j = 0; j < side - 1; j++) {
@@ -79,7 +79,7 @@ function sheetFaces(side) {
 }
 
 // Return vertex normals, weighted by the area of the faces and not normalised.
-function sheetNormals(points, faces) {
+function clothNormals(points, faces) {
   const out = new Float32Array(points.length);
   const at = (i) => [points[3 * i], points[3 * i + 1], points[3 * i + 2]];
   for (let t = 0; t < faces.length; t += 3) {

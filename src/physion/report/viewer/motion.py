@@ -85,10 +85,13 @@ def pack_motion(scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
     return {
         "frames": len(trajectory),
         "bodies": [_body(scene, i) for i in range(len(scene.bodies))],
-        "start": {"positions": pack(positions[0], "<f4"), "rotations": _turns(rotations[0])},
+        "start": {
+            "positions": pack(positions[0], "<f4"),
+            "rotations": _pack_rotations(rotations[0]),
+        },
         "moving": [int(i) for i in moving],
         "positions": pack(positions[:, moving], "<f4"),
-        "rotations": _turns(rotations[:, moving]),
+        "rotations": _pack_rotations(rotations[:, moving]),
         "cloths": _cloths(scene, trajectory),
         "camera": {
             "position": list(scene.camera.position),
@@ -96,7 +99,7 @@ def pack_motion(scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
             "fov": scene.camera.fov,
         },
         "floor": scene.floor,
-        "touches": _touches(scene, trajectory),
+        "contactPoints": _contact_points(scene, trajectory),
     }
 
 
@@ -117,8 +120,8 @@ def _body(scene: Scene, index: int) -> dict[str, Any]:
     }
 
 
-def _turns(rotations: NDArray[np.floating]) -> str:
-    """Quaternions as signed 16-bit numbers; the script makes them unit length again."""
+def _pack_rotations(rotations: NDArray[np.floating]) -> str:
+    """Pack quaternions as signed 16-bit numbers; the script makes them unit length again."""
     return pack(np.rint(np.clip(np.nan_to_num(rotations), -1.0, 1.0) * 32767), "<i2")
 
 
@@ -147,7 +150,7 @@ def _cloths(scene: Scene, trajectory: Trajectory) -> list[dict[str, Any]]:
     return packed
 
 
-def _touches(scene: Scene, trajectory: Trajectory) -> list[list[float]]:
+def _contact_points(scene: Scene, trajectory: Trajectory) -> list[list[float]]:
     """Return the contact points of agent and patient: rows of frame, x, y, z."""
     agent, patient = (scene.index(name) for name in (scene.roles.agent, scene.roles.patient))
     contacts = trajectory.contacts

@@ -5,33 +5,33 @@ class Player {
   /**
    * @param {number} frames Number of frames of the trial.
    * @param {number} baseRate Frames per second at speed 1.
-   * @param {any} strip The movie of all passes: data, rate, and stride in frames.
+   * @param {any} movie The movie of all passes: data, rate, and stride in frames.
    * @param {(frame: number) => void} onFrame Called when the frame changes.
-   * @param {(video: HTMLVideoElement|null) => void} onPicture Called with each new picture of the
+   * @param {(video: HTMLVideoElement|null) => void} onImage Called with each new image of the
    *   movie, or with null if the movie cannot be played.
    */
-  constructor(frames, baseRate, strip, onFrame, onPicture) {
+  constructor(frames, baseRate, movie, onFrame, onImage) {
     this.frames = frames;
     this.baseRate = baseRate;
-    this.strip = strip;
+    this.movie = movie;
     this.onFrame = onFrame;
-    this.onPicture = onPicture;
+    this.onImage = onImage;
     this.limit = frames;
     this.frame = 0;
     this.speed = 1;
     this.playing = false;
-    this.broken = false;
-    this.url = movieUrl(strip.data);
-    this.video = make("video", { playsinline: true, preload: "auto" });
+    this.failed = false;
+    this.url = movieUrl(movie.data);
+    this.video = createElement("video", { playsinline: true, preload: "auto" });
     this.video.muted = true;
     this.video.addEventListener("error", () => this.fail());
-    this.video.addEventListener("loadeddata", () => this.onPicture(this.video));
-    this.video.addEventListener("seeked", () => this.sought());
+    this.video.addEventListener("loadeddata", () => this.onImage(this.video));
+    this.video.addEventListener("seeked", () => this.onSeeked());
     this.video.src = this.url;
-    this.draw = this.draw.bind(this);
-    this.request = requestAnimationFrame(this.draw);
-    this.picture = this.picture.bind(this);
-    this.video.requestVideoFrameCallback?.(this.picture);
+    this.onAnimationFrame = this.onAnimationFrame.bind(this);
+    this.request = requestAnimationFrame(this.onAnimationFrame);
+    this.onVideoFrame = this.onVideoFrame.bind(this);
+    this.video.requestVideoFrameCallback?.(this.onVideoFrame);
   }
 
   close() {
@@ -46,8 +46,8 @@ class Player {
   fail() {
     // Removing the movie in `close` is not a failure.
     if (this.closed) return;
-    this.broken = true;
-    this.onPicture(null);
+    this.failed = true;
+    this.onImage(null);
     if (this.playing) this.play();
   }
 
@@ -64,10 +64,10 @@ class Player {
   play() {
     if (this.frame >= this.limit - 1) this.seek(0);
     this.playing = true;
-    this.since = performance.now();
-    this.from = this.frame;
-    if (this.broken) return;
-    this.video.playbackRate = (this.speed * this.baseRate) / (this.strip.rate * this.strip.stride);
+    this.startTime = performance.now();
+    this.startFrame = this.frame;
+    if (this.failed) return;
+    this.video.playbackRate = (this.speed * this.baseRate) / (this.movie.rate * this.movie.stride);
     this.video.play().catch((error) => {
       // An immediate pause also rejects `play`, which is harmless; only a blocked start is not.
       if (error.name === "NotAllowedError") this.pause();
@@ -77,61 +77,61 @@ class Player {
   pause() {
     this.playing = false;
     this.video.pause();
-    // The movie may have advanced by a picture before it paused.
+    // The movie may have advanced by an image before it paused.
     this.seek(this.frame);
   }
 
   seek(frame) {
     this.frame = clamp(Math.round(frame), 0, this.limit - 1);
     this.presented = undefined;
-    this.since = performance.now();
-    this.from = this.frame;
-    if (!this.broken) {
-      // Seek to the middle of the picture's interval, so that rounding cannot show its neighbour.
-      this.wanted = (Math.floor(this.frame / this.strip.stride) + 0.5) / this.strip.rate;
-      if (!this.video.seeking) this.video.currentTime = this.wanted;
+    this.startTime = performance.now();
+    this.startFrame = this.frame;
+    if (!this.failed) {
+      // Seek to the middle of the image's interval, so that rounding cannot show its neighbour.
+      this.seekTime = (Math.floor(this.frame / this.movie.stride) + 0.5) / this.movie.rate;
+      if (!this.video.seeking) this.video.currentTime = this.seekTime;
     }
     this.onFrame(this.frame);
   }
 
-  sought() {
-    if (this.wanted !== undefined && Math.abs(this.video.currentTime - this.wanted) > 1e-3) {
-      this.video.currentTime = this.wanted;
+  onSeeked() {
+    if (this.seekTime !== undefined && Math.abs(this.video.currentTime - this.seekTime) > 1e-3) {
+      this.video.currentTime = this.seekTime;
       return;
     }
-    this.wanted = undefined;
-    this.onPicture(this.video);
+    this.seekTime = undefined;
+    this.onImage(this.video);
   }
 
-  // Follow the picture on the screen, in browsers that report it.
-  picture(_, { mediaTime }) {
+  // Follow the image on the screen, in browsers that report it.
+  onVideoFrame(_, { mediaTime }) {
     if (this.closed) return;
-    this.video.requestVideoFrameCallback(this.picture);
+    this.video.requestVideoFrameCallback(this.onVideoFrame);
     this.presented = mediaTime;
-    // After a seek the picture may appear later than the event `seeked`.
-    this.onPicture(this.video);
+    // After a seek the image may appear later than the event `seeked`.
+    this.onImage(this.video);
   }
 
-  now() {
-    if (this.broken) {
-      return this.from + ((performance.now() - this.since) / 1000) * this.baseRate * this.speed;
+  currentFrame() {
+    if (this.failed) {
+      return this.startFrame + ((performance.now() - this.startTime) / 1000) * this.baseRate * this.speed;
     }
     if (this.video.ended) return this.frames;
     const time = this.presented === undefined ? this.video.currentTime : this.presented + 1e-4;
-    return Math.floor(time * this.strip.rate + 1e-6) * this.strip.stride;
+    return Math.floor(time * this.movie.rate + 1e-6) * this.movie.stride;
   }
 
-  draw() {
-    this.request = requestAnimationFrame(this.draw);
-    if (!this.playing || this.wanted !== undefined) return;
-    const frame = Math.floor(this.now());
+  onAnimationFrame() {
+    this.request = requestAnimationFrame(this.onAnimationFrame);
+    if (!this.playing || this.seekTime !== undefined) return;
+    const frame = Math.floor(this.currentFrame());
     if (frame >= this.limit) {
       this.seek(0);
       this.play();
       return;
     }
-    const reports = "requestVideoFrameCallback" in this.video;
-    if (!this.broken && !reports && this.video.readyState >= 2) this.onPicture(this.video);
+    const hasFrameCallback = "requestVideoFrameCallback" in this.video;
+    if (!this.failed && !hasFrameCallback && this.video.readyState >= 2) this.onImage(this.video);
     if (frame !== this.frame) {
       this.frame = frame;
       this.onFrame(frame);

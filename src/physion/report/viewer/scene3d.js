@@ -16,54 +16,54 @@ class Scene3D {
     this.reset();
     if (!this.gl) return;
     this.build(shapes);
-    this.listen();
-    this.watcher = new ResizeObserver(() => this.draw());
-    this.watcher.observe(canvas);
+    this.addListeners();
+    this.observer = new ResizeObserver(() => this.draw());
+    this.observer.observe(canvas);
   }
 
   close() {
     if (!this.gl) return;
-    this.watcher.disconnect();
+    this.observer.disconnect();
     this.gl.getExtension("WEBGL_lose_context")?.loseContext();
     this.gl = null;
   }
 
   reset() {
     const { position, target, fov } = this.data.camera;
-    const away = subtract(position, target);
+    const offset = subtract(position, target);
     this.target = [...target];
-    this.distance = norm(away) || 1;
-    this.azimuth = Math.atan2(away[1], away[0]);
-    this.elevation = Math.asin(clamp(away[2] / this.distance, -1, 1));
+    this.distance = norm(offset) || 1;
+    this.azimuth = Math.atan2(offset[1], offset[0]);
+    this.elevation = Math.asin(clamp(offset[2] / this.distance, -1, 1));
     this.fov = fov;
     this.draw();
   }
 
   build(shapes) {
     const { gl } = this;
-    this.solid = compile(gl, SOLID);
-    this.plain = compile(gl, PLAIN);
+    this.meshProgram = compile(gl, MESH_SHADERS);
+    this.lineProgram = compile(gl, LINE_SHADERS);
     this.meshes = {};
     for (const { shape } of this.data.bodies) {
       const { points, normals, faces } = shapes[shape];
       this.meshes[shape] ??= new Buffers(
-        gl, gridPoints(points), numbers(normals, Int8Array), numbers(faces, Uint16Array),
+        gl, decodePoints(points), decodeArray(normals, Int8Array), decodeArray(faces, Uint16Array),
       );
     }
-    this.sheets = this.motion.cloths.map((cloth) => {
-      const faces = sheetFaces(cloth.side);
-      const points = this.motion.sheet(cloth, 0);
+    this.clothMeshes = this.motion.cloths.map((cloth) => {
+      const faces = clothFaces(cloth.side);
+      const points = this.motion.clothVertices(cloth, 0);
       const usage = gl.DYNAMIC_DRAW;
       return { cloth, faces, buffers: new Buffers(gl, points, new Float32Array(points.length), faces, usage) };
     });
     this.floor = new Buffers(gl, floorLines(this.data.floor), null, null);
-    this.lines = Object.keys(PATH_COLORS).flatMap((role) => {
+    this.pathLines = Object.keys(PATH_COLORS).flatMap((role) => {
       const points = this.motion.path(role);
       return points ? [{ color: PATH_COLORS[role], buffers: new Buffers(gl, points, null, null) }] : [];
     });
-    this.touchFrames = this.data.touches.map((touch) => touch[0]);
-    this.touches = new Buffers(
-      gl, new Float32Array(this.data.touches.flatMap((touch) => touch.slice(1))), null, null,
+    this.contactFrames = this.data.contactPoints.map(([frame]) => frame);
+    this.contactPoints = new Buffers(
+      gl, new Float32Array(this.data.contactPoints.flatMap(([, ...point]) => point)), null, null,
     );
     gl.enable(gl.DEPTH_TEST);
     gl.enable(gl.BLEND);
@@ -71,11 +71,11 @@ class Scene3D {
   }
 
   eye() {
-    const flat = Math.cos(this.elevation);
-    const away = [
-      flat * Math.cos(this.azimuth), flat * Math.sin(this.azimuth), Math.sin(this.elevation),
+    const horizontal = Math.cos(this.elevation);
+    const offset = [
+      horizontal * Math.cos(this.azimuth), horizontal * Math.sin(this.azimuth), Math.sin(this.elevation),
     ];
-    return add(this.target, times(away, this.distance));
+    return add(this.target, times(offset, this.distance));
   }
 
   show(frame) {
@@ -85,17 +85,17 @@ class Scene3D {
 
   draw() {
     const { gl, canvas } = this;
-    if (!gl || !this.solid || this.waiting) return;
+    if (!gl || !this.meshProgram || this.request) return;
     // Draw several changes within one animation frame only once.
-    this.waiting = requestAnimationFrame(() => {
-      this.waiting = 0;
+    this.request = requestAnimationFrame(() => {
+      this.request = 0;
       if (this.gl) this.paint(gl, canvas);
     });
   }
 
   paint(gl, canvas) {
-    const sharp = Math.min(window.devicePixelRatio || 1, 2);
-    const [width, height] = [canvas.clientWidth, canvas.clientHeight].map((v) => Math.max(1, Math.round(v * sharp)));
+    const pixelRatio = Math.min(window.devicePixelRatio || 1, 2);
+    const [width, height] = [canvas.clientWidth, canvas.clientHeight].map((v) => Math.max(1, Math.round(v * pixelRatio)));
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
     gl.viewport(0, 0, width, height);
     const dark = matchMedia("(prefers-color-scheme: dark)").matches;
@@ -103,62 +103,62 @@ class Scene3D {
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     const eye = this.eye();
     const far = this.distance + 60;
-    const lens = perspective(this.fov, width / height, Math.max(0.02, far / 5000), far);
-    const view = multiply(lens, lookAt(eye, this.target));
-    this.paintSolids(gl, view, eye);
-    this.paintLines(gl, view, dark, sharp);
+    const projection = perspective(this.fov, width / height, Math.max(0.02, far / 5000), far);
+    const view = multiply(projection, lookAt(eye, this.target));
+    this.paintBodies(gl, view, eye);
+    this.paintLines(gl, view, dark, pixelRatio);
   }
 
-  paintSolids(gl, view, eye) {
-    const { at, program } = this.solid;
+  paintBodies(gl, view, eye) {
+    const { uniforms, program } = this.meshProgram;
     gl.useProgram(program);
-    gl.uniformMatrix4fv(at.view, false, view);
-    gl.uniform3fv(at.eye, eye);
+    gl.uniformMatrix4fv(uniforms.view, false, view);
+    gl.uniform3fv(uniforms.eye, eye);
     this.data.bodies.forEach((body, i) => {
       if (body.scenery && !this.scenery) return;
       const { position, rotation } = this.motion.pose(i, this.frame);
       this.paintMesh(gl, this.meshes[body.shape], body.color, body.scale, position, rotation);
     });
-    for (const { cloth, faces, buffers } of this.sheets) {
-      const points = this.motion.sheet(cloth, this.frame);
-      buffers.change(points, sheetNormals(points, faces));
+    for (const { cloth, faces, buffers } of this.clothMeshes) {
+      const points = this.motion.clothVertices(cloth, this.frame);
+      buffers.update(points, clothNormals(points, faces));
       this.paintMesh(gl, buffers, cloth.color, [1, 1, 1], [0, 0, 0], [1, 0, 0, 0]);
     }
   }
 
   paintMesh(gl, buffers, color, scale, position, rotation) {
-    const { at } = this.solid;
-    gl.uniform3fv(at.color, color);
-    gl.uniform3fv(at.scale, scale);
-    gl.uniform3fv(at.translation, position);
-    gl.uniform4fv(at.rotation, rotation);
-    gl.bindVertexArray(buffers.array);
+    const { uniforms } = this.meshProgram;
+    gl.uniform3fv(uniforms.color, color);
+    gl.uniform3fv(uniforms.scale, scale);
+    gl.uniform3fv(uniforms.translation, position);
+    gl.uniform4fv(uniforms.rotation, rotation);
+    gl.bindVertexArray(buffers.vertexArray);
     gl.drawElements(gl.TRIANGLES, buffers.count, gl.UNSIGNED_SHORT, 0);
   }
 
-  paintLines(gl, view, dark, sharp) {
-    const { at, program } = this.plain;
+  paintLines(gl, view, dark, pixelRatio) {
+    const { uniforms, program } = this.lineProgram;
     gl.useProgram(program);
-    gl.uniformMatrix4fv(at.view, false, view);
+    gl.uniformMatrix4fv(uniforms.view, false, view);
     const paint = (buffers, mode, color, size, first, count) => {
       if (count < 1) return;
-      gl.uniform4fv(at.color, color);
-      gl.uniform1f(at.size, size * sharp);
-      gl.bindVertexArray(buffers.array);
+      gl.uniform4fv(uniforms.color, color);
+      gl.uniform1f(uniforms.size, size * pixelRatio);
+      gl.bindVertexArray(buffers.vertexArray);
       gl.drawArrays(mode, first, count);
     };
     paint(this.floor, gl.LINES, dark ? [1, 1, 1, 0.14] : [0, 0, 0, 0.14], 1, 0, this.floor.count);
     if (!this.paths) return;
-    for (const { color, buffers } of this.lines) {
-      const done = this.frame + 1;
-      paint(buffers, gl.LINE_STRIP, [...color, 1], 1, 0, done);
-      paint(buffers, gl.POINTS, [...color, 1], 4, 0, done);
-      paint(buffers, gl.POINTS, [...color, 0.35], 2.5, done, this.limit - done);
+    for (const { color, buffers } of this.pathLines) {
+      const reached = this.frame + 1;
+      paint(buffers, gl.LINE_STRIP, [...color, 1], 1, 0, reached);
+      paint(buffers, gl.POINTS, [...color, 1], 4, 0, reached);
+      paint(buffers, gl.POINTS, [...color, 0.35], 2.5, reached, this.limit - reached);
     }
     // Contact points so far are drawn in front, since they are hidden between the bodies.
-    const touched = this.touchFrames.filter((frame) => frame <= this.frame).length;
+    const contacts = this.contactFrames.filter((frame) => frame <= this.frame).length;
     gl.disable(gl.DEPTH_TEST);
-    paint(this.touches, gl.POINTS, dark ? [1, 1, 1, 1] : [0, 0, 0, 1], 5, 0, touched);
+    paint(this.contactPoints, gl.POINTS, dark ? [1, 1, 1, 1] : [0, 0, 0, 1], 5, 0, contacts);
     gl.enable(gl.DEPTH_TEST);
   }
 
@@ -181,27 +181,27 @@ class Scene3D {
     this.draw();
   }
 
-  listen() {
+  addListeners() {
     const { canvas } = this;
-    const held = new Map();
-    const spread = () => {
-      const [a, b] = [...held.values()];
+    const pointers = new Map();
+    const pointerDistance = () => {
+      const [a, b] = [...pointers.values()];
       return Math.hypot(a.clientX - b.clientX, a.clientY - b.clientY);
     };
     canvas.onpointerdown = (event) => {
       canvas.setPointerCapture(event.pointerId);
-      held.set(event.pointerId, event);
+      pointers.set(event.pointerId, event);
       canvas.focus({ preventScroll: true });
     };
-    canvas.onpointerup = canvas.onpointercancel = (event) => held.delete(event.pointerId);
+    canvas.onpointerup = canvas.onpointercancel = (event) => pointers.delete(event.pointerId);
     canvas.onpointermove = (event) => {
-      const before = held.get(event.pointerId);
+      const before = pointers.get(event.pointerId);
       if (!before) return;
       const [dx, dy] = [event.clientX - before.clientX, event.clientY - before.clientY];
-      const apart = held.size === 2 ? spread() : 0;
-      held.set(event.pointerId, event);
+      const distanceBefore = pointers.size === 2 ? pointerDistance() : 0;
+      pointers.set(event.pointerId, event);
       const size = canvas.clientHeight;
-      if (apart > 0) this.zoom(apart / Math.max(spread(), 1));
+      if (distanceBefore > 0) this.zoom(distanceBefore / Math.max(pointerDistance(), 1));
       else if (event.shiftKey || event.buttons === 2) this.pan(dx / size, -dy / size);
       else this.orbit((3 * dx) / size, (3 * dy) / size);
     };
@@ -210,10 +210,10 @@ class Scene3D {
       event.preventDefault();
       this.zoom(Math.exp(clamp(event.deltaY, -100, 100) / 500));
     }, { passive: false });
-    canvas.onkeydown = (event) => this.key(event);
+    canvas.onkeydown = (event) => this.onKey(event);
   }
 
-  key(event) {
+  onKey(event) {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     const arrows = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
     const arrow = arrows[event.key];

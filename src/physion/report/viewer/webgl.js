@@ -1,6 +1,6 @@
 // WebGL 2 helpers of the 3D view: two shader programs and vertex buffers.
 
-const SOLID = [`#version 300 es
+const MESH_SHADERS = [`#version 300 es
   in vec3 point, normal;
   uniform mat4 view; uniform vec3 scale, translation; uniform vec4 rotation;
   out vec3 world_normal, world_position;
@@ -22,14 +22,14 @@ const SOLID = [`#version 300 es
     pixel = vec4(color * (0.28 + 0.24 * sky + 0.4 * directional + 0.16 * facing), 1.0);
   }`];
 
-const PLAIN = [`#version 300 es
+const LINE_SHADERS = [`#version 300 es
   in vec3 point; uniform mat4 view; uniform float size;
   void main() { gl_Position = view * vec4(point, 1.0); gl_PointSize = size; }`, `#version 300 es
   precision highp float;
   uniform vec4 color; out vec4 pixel; void main() { pixel = color; }`];
 
 /**
- * Compile a program; `at` are the locations of its uniforms.
+ * Compile a program; `uniforms` are the locations of its uniforms, by name.
  * @param {WebGL2RenderingContext} gl
  * @param {string[]} sources Vertex and fragment shader.
  */
@@ -46,25 +46,25 @@ function compile(gl, [vertex, fragment]) {
   gl.bindAttribLocation(program, 0, "point");
   gl.bindAttribLocation(program, 1, "normal");
   gl.linkProgram(program);
-  const at = {};
+  const uniforms = {};
   const count = gl.getProgramParameter(program, gl.ACTIVE_UNIFORMS);
   for (let i = 0; i < count; i++) {
     const { name } = gl.getActiveUniform(program, i);
-    at[name] = gl.getUniformLocation(program, name);
+    uniforms[name] = gl.getUniformLocation(program, name);
   }
-  return { program, at };
+  return { program, uniforms };
 }
 
 // Vertex buffers of a mesh; `normals` and `faces` are null for points and lines.
 class Buffers {
   constructor(gl, points, normals, faces, usage = gl.STATIC_DRAW) {
     this.gl = gl;
-    this.array = gl.createVertexArray();
-    gl.bindVertexArray(this.array);
-    this.points = this.fill(0, points, gl.FLOAT, usage);
+    this.vertexArray = gl.createVertexArray();
+    gl.bindVertexArray(this.vertexArray);
+    this.points = this.createBuffer(0, points, gl.FLOAT, usage);
     if (normals) {
       const kind = normals instanceof Int8Array ? gl.BYTE : gl.FLOAT;
-      this.normals = this.fill(1, normals, kind, usage);
+      this.normals = this.createBuffer(1, normals, kind, usage);
     }
     if (faces) {
       gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
@@ -73,7 +73,7 @@ class Buffers {
     this.count = faces ? faces.length : points.length / 3;
   }
 
-  fill(location, values, kind, usage) {
+  createBuffer(location, values, kind, usage) {
     const { gl } = this;
     const buffer = gl.createBuffer();
     gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
@@ -83,7 +83,7 @@ class Buffers {
     return buffer;
   }
 
-  change(points, normals) {
+  update(points, normals) {
     const { gl } = this;
     for (const [buffer, values] of [[this.points, points], [this.normals, normals]]) {
       gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
