@@ -22,7 +22,7 @@ from physion.rendering.renderer import (
 )
 from physion.rendering.rooms import rooms
 from physion.rendering.textures.atlas import FINISHES, SIZE, build_atlas, finish
-from physion.scenes.scene import Camera, Look
+from physion.scenes.scene import BodyEvent, Camera, Look
 from support.paths import FIND_TESTS
 from support.rendered_scenes import ALL, body, resting, scene_of, tumbling
 
@@ -85,6 +85,27 @@ def test_shading_static_surfaces_once_changes_no_byte() -> None:
     once = Renderer(scene, trajectory).render(1, ALL)
     always = Renderer(scene, trajectory, settings=RenderSettings(keep_static=False)).render(1, ALL)
     assert digest(once) == digest(always)
+
+
+@pytest.mark.parametrize("kinematic", [False, True])
+def test_absent_bodies_are_not_drawn_and_cast_no_shadow(kinematic: bool) -> None:
+    small = {"scale": (0.4, 0.4, 0.4)}
+    rest = (body("block", at=(-0.5, 0.0, 0.0), **small), body("zone", at=(0.6, 0.0, 0.0), **small))
+    late = body("late", "sphere", (0.0, 0.3, 0.2), kinematic=kinematic, **small)
+    always = scene_of(*rest, late, room="box")
+    events = (BodyEvent(1, "late", "appear"), BodyEvent(2, "late", "vanish"))
+    scene = dataclasses.replace(always, events=events)
+    renderer = Renderer(scene, resting(scene, 4), 64, 64)
+    away = resting(always)
+    away.positions[0, 2] = (0.0, 0.0, 500.0)
+    without = Renderer(always, away, 64, 64).render(0, ALL)
+    shown = [renderer.render(frame, ALL) for frame in range(4)]
+    assert [(frame.ids == 3).any() for frame in shown] == [False, True, True, False]
+    for frame in (shown[0], shown[3]):
+        np.testing.assert_array_equal(frame.color, without.color)
+        np.testing.assert_array_equal(frame.depth, without.depth)
+    assert not np.array_equal(shown[1].color, without.color)
+    assert np.nanmax(np.abs(shown[2].flow)) < 1e-3
 
 
 def test_a_fresh_process_gives_the_same_bytes() -> None:

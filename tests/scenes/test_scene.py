@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from physion.errors import BadSceneError
 from physion.scenes.scene import (
     Body,
+    BodyEvent,
     Camera,
     Cloth,
     Joint,
@@ -53,6 +54,7 @@ def test_json_round_trip_is_exact(
         cloths=(Cloth("sheet", point, stretch=0.25),),
         pushes=(Push("red", point, None, frame), Push("red", point, point)),
         joints=(Joint("zone", "red"),),
+        events=(BodyEvent(3, "red", "move", point, None), BodyEvent(9, "zone", "vanish")),
         parameters={"text": text, "list": [1, None, {"deep": True}]},
     )
     assert Scene.from_json(scene.to_json()) == scene
@@ -117,3 +119,49 @@ def test_looks_and_camera_do_not_change_the_physics_digest() -> None:
             replace(scene, bodies=(moved, scene.bodies[1])).physics_digest()
             != scene.physics_digest()
         )
+
+
+def with_events(*events: BodyEvent) -> Scene:
+    return replace(small_scene(), events=events)
+
+
+def test_a_scene_without_events_keeps_its_text_and_digest() -> None:
+    scene = small_scene()
+    assert "events" not in json.loads(scene.to_json())
+    later = with_events(BodyEvent(5, "red", "vanish"))
+    assert json.loads(later.to_json())["events"][0]["frame"] == 5
+    assert later.physics_digest() != scene.physics_digest()
+
+
+def test_events_of_scenery_do_not_change_the_motion() -> None:
+    tree = Body("tree", "cube", (5.0, 0.0, 0.0), scenery=True)
+    scene = replace(small_scene(), bodies=(*small_scene().bodies, tree))
+    later = replace(scene, events=(BodyEvent(5, "tree", "vanish"),))
+    assert later.physics_digest() == scene.physics_digest() == small_scene().physics_digest()
+
+
+def test_bodies_are_present_between_their_events() -> None:
+    scene = with_events(
+        BodyEvent(3, "red", "appear"), BodyEvent(5, "zone", "move"), BodyEvent(6, "red", "vanish")
+    )
+    # Taking part in the step that follows the frame, and shown in the frame.
+    assert [scene.active(f)[0] for f in range(9)] == [f in (3, 4, 5) for f in range(9)]
+    assert [scene.present(f)[0] for f in range(9)] == [f in (3, 4, 5, 6) for f in range(9)]
+    assert all(scene.active(f)[1] and scene.present(f)[1] for f in range(9))
+
+
+@pytest.mark.parametrize(
+    ("events", "complaint"),
+    [
+        ((BodyEvent(5, "ghost", "vanish"),), "no such body"),
+        ((BodyEvent(5, "red", "explode"),), "appear, vanish, move"),
+        ((BodyEvent(0, "red", "vanish"),), "frame 1 or later"),
+        ((BodyEvent(5, "red", "vanish"), BodyEvent(4, "zone", "vanish")), "sorted"),
+        ((BodyEvent(5, "red", "vanish"), BodyEvent(6, "red", "move")), "is absent"),
+        ((BodyEvent(4, "red", "vanish"), BodyEvent(5, "red", "vanish")), "is absent"),
+        ((BodyEvent(4, "red", "appear"), BodyEvent(5, "red", "appear")), "already there"),
+    ],
+)
+def test_impossible_events_are_refused(events: tuple[BodyEvent, ...], complaint: str) -> None:
+    with pytest.raises(BadSceneError, match=complaint):
+        with_events(*events)

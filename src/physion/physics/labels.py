@@ -41,12 +41,18 @@ def contact_frames(scene: Scene, trajectory: Trajectory) -> Ints:
     """Return the sorted frames in which agent and patient touch.
 
     Between bodies, those with a contact; between a cloth and a body, those with a gap below
-    `CLOTH_CONTACT_GAP`.
+    `CLOTH_CONTACT_GAP`. A body that is absent touches nothing.
     """
     agent, patient = scene.index(scene.roles.agent), scene.index(scene.roles.patient)
     if max(agent, patient) < len(scene.bodies):
-        return trajectory.contacts.frames_of(agent, patient)
-    return np.flatnonzero(trajectory.cloth_distance < CLOTH_CONTACT_GAP).astype(np.int32)
+        frames = trajectory.contacts.frames_of(agent, patient)
+    else:
+        gaps = trajectory.cloth_distance
+        frames = np.flatnonzero(gaps < CLOTH_CONTACT_GAP).astype(np.int32)
+    if not scene.events:
+        return frames
+    both = [scene.present(frame)[agent] and scene.present(frame)[patient] for frame in frames]
+    return frames[np.asarray(both, bool)]
 
 
 def label_contact(scene: Scene, trajectory: Trajectory) -> Labels:

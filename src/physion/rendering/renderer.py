@@ -40,7 +40,7 @@ from physion.rendering.records import (
 )
 from physion.rendering.rooms import Room, rooms
 from physion.rendering.shading import shade, shade_static_points
-from physion.rendering.triangles import Assembly, assemble, pose_meshes
+from physion.rendering.triangles import Assembly, assemble, hide_absent, pose_meshes
 from physion.scenes.scene import Scene
 
 F32 = NDArray[np.float32]
@@ -211,6 +211,7 @@ class Renderer:
         frame %= count
         assembly = self._assembly
         vertices, normals = pose_meshes(assembly, self.scene, self.trajectory, frame, True)
+        hide_absent(assembly, self.scene, frame, vertices)
         vertices += self._static_vertices
         normals += self._static_normals
         points = self._moved_points(vertices)

@@ -109,7 +109,12 @@ def assemble(scene: Scene, room: Room) -> Assembly:
     """Return the triangles of a scene in a room."""
     table = _MaterialTable()
     parts: list[tuple[MeshPart, int]] = [(_room_part(room.panels, table), ROOM)]
-    static = [i for i, body in enumerate(scene.bodies) if body.kinematic or body.scenery]
+    changing = {event.body for event in scene.events}
+    static = [
+        i
+        for i, body in enumerate(scene.bodies)
+        if (body.kinematic or body.scenery) and body.name not in changing
+    ]
     moving = [i for i in range(len(scene.bodies)) if i not in set(static)]
     for i in static + moving:
         body = scene.bodies[i]
@@ -188,7 +193,7 @@ def _room_part(panels: tuple[Panel, ...], table: _MaterialTable) -> MeshPart:
 def pose_meshes(
     assembly: Assembly, scene: Scene, trajectory: Trajectory, frame: int, moving: bool
 ) -> tuple[F64, F32]:
-    """Return the vertices and normals in the world in one frame.
+    """Return the vertices and normals in the world in one frame, also of absent bodies.
 
     Parameters
     ----------
@@ -226,6 +231,19 @@ def pose_meshes(
         if index >= bodies:
             offset += count
     return vertices, normals
+
+
+def hide_absent(assembly: Assembly, scene: Scene, frame: int, vertices: F64) -> None:
+    """Shrink bodies that are absent in a frame to a point, so that nothing of them is drawn.
+
+    ``vertices`` (V, 3) of `pose_meshes` are changed.
+    """
+    if not scene.events:
+        return
+    present = scene.present(frame)
+    for instance in assembly.instances:
+        if instance.index != ROOM and not present[instance.index]:
+            vertices[instance.vertices] = vertices[instance.vertices.start]
 
 
 def _sheet_normals(vertices: F64) -> F32:

@@ -29,6 +29,8 @@ PLAYBACK_RATE = 30
 """Frames per second of the official movies, which play 3.33 times slower than the physics."""
 OBSERVED_FRAMES = 45
 """Number of frames that people and models see: 1.5 s of movie, 0.45 s of physics."""
+EVENT_KINDS = ("appear", "vanish", "move")
+"""Kinds of `BodyEvent`."""
 GRAVITY = 9.81
 """Metres per second squared, downwards."""
 
@@ -114,6 +116,29 @@ class Push:
 
 
 @dataclass(frozen=True, slots=True)
+class BodyEvent:
+    """Body that appears, vanishes or moves, just before the step that follows ``frame``.
+
+    Events come before the pushes of the same frame, in the order of `Scene.events`.
+
+    - ``kind``: ``appear``: the body is absent in all frames before and stands at rest at its pose
+      in this frame; ``vanish``: it is absent in all later frames; ``move``: it is put at a pose, at
+      rest, which shows from the next frame on.
+    - ``position`` (metres, of the pivot), ``rotation``: the new pose; None keeps the present one.
+      A body that appears has the pose of `Body` unless the event gives another.
+
+    An absent body touches nothing, is not drawn and stays at rest: before it appears at the pose at
+    which it will, after it vanished at its last one. Joints hold between bodies that are there.
+    """
+
+    frame: int
+    body: str
+    kind: str
+    position: Vec3 | None = None
+    rotation: Quat | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Joint:
     """Rigid connection of two bodies from frame 0 on."""
 
@@ -167,6 +192,8 @@ class Scene:
       bodies come to rest (100 in the official cloth trials).
     - ``parameters``: the parameters that the scene was sampled or imported with, as JSON values;
       kept as a record, without effect.
+    - ``events``: bodies that appear, vanish or move later, sorted by frame. A trial does not end
+      before its last event.
     """
 
     name: str
@@ -182,6 +209,7 @@ class Scene:
     ending: Ending = Ending()
     settle_frames: int = 0
     parameters: Mapping[str, Any] = field(default_factory=dict)
+    events: tuple[BodyEvent, ...] = ()
 
     def __post_init__(self) -> None:
         names = self.names()
@@ -207,6 +235,54 @@ class Scene:
                     f"scene {self.name!r}: body {body.name!r} needs a mass and scales above zero, "
                     f"not {body.mass:g} kg and ({scale})"
                 )
+        self._check_events()
+
+    def _check_events(self) -> None:
+        """Raise `BadSceneError` for events out of order, or of a kind that makes no sense."""
+        bodies = {body.name for body in self.bodies}
+        absent = {name for name in bodies if not self._starts_present(name)}
+        before = 0
+        for event in self.events:
+            where = f"scene {self.name!r}: event {event.kind!r} of {event.body!r}"
+            if event.body not in bodies:
+                raise BadSceneError(f"{where}: there is no such body; its bodies: {shown(bodies)}")
+            if event.kind not in EVENT_KINDS:
+                raise BadSceneError(f"{where}: kinds are {', '.join(EVENT_KINDS)}")
+            if event.frame < max(before, 0 if event.kind == "move" else 1):
+                raise BadSceneError(
+                    f"{where} at frame {event.frame}: events are sorted by frame, "
+                    "and bodies appear and vanish at frame 1 or later"
+                )
+            if (event.kind == "appear") != (event.body in absent):
+                there = "is absent" if event.body in absent else "is already there"
+                raise BadSceneError(f"{where} at frame {event.frame}: the body {there}")
+            before = event.frame
+            if event.kind != "move":
+                absent ^= {event.body}
+
+    def _starts_present(self, name: str) -> bool:
+        """Return whether a body is there in frame 0, because it does not appear later."""
+        kinds = (e.kind for e in self.events if e.body == name and e.kind != "move")
+        return next(kinds, "vanish") != "appear"
+
+    def active(self, frame: int) -> tuple[bool, ...]:
+        """Return which bodies and cloths take part in the step that follows ``frame``.
+
+        In the order of `names`. Events at ``frame`` itself have taken place.
+        """
+        last = {e.body: e.kind for e in self.events if e.kind != "move" and e.frame <= frame}
+        return tuple(
+            last[name] == "appear" if name in last else self._starts_present(name)
+            for name in self.names()
+        )
+
+    def present(self, frame: int) -> tuple[bool, ...]:
+        """Return which bodies and cloths are there in ``frame``, in the order of `names`.
+
+        These are the ones that took part in the step before it or take part in the step after it.
+        """
+        before = self.active(max(frame - 1, 0))
+        return tuple(a or b for a, b in zip(before, self.active(frame), strict=True))
 
     def names(self) -> list[str]:
         """Return the names of all bodies, then of all cloths: the order of every per-body array."""
@@ -221,6 +297,7 @@ class Scene:
 
     def physics_digest(self) -> str:
         """Return the SHA-256 of all that affects the motion; appearance and names do not count."""
+        scenery = {body.name for body in self.bodies if body.scenery}
         plain = dataclasses.replace(
             self,
             name="",
@@ -231,12 +308,18 @@ class Scene:
                 dataclasses.replace(body, look=Look()) for body in self.bodies if not body.scenery
             ),
             cloths=tuple(dataclasses.replace(cloth, look=Look()) for cloth in self.cloths),
+            events=tuple(event for event in self.events if event.body not in scenery),
         )
         return hashlib.sha256(plain.to_json().encode()).hexdigest()
 
     def to_json(self) -> str:
         """Return the scene as one line of JSON, from which `from_json` builds an equal scene."""
-        return json.dumps(dataclasses.asdict(self), separators=(",", ":"), sort_keys=True)
+        values = dataclasses.asdict(self)
+        # Scenes without events keep the text that they had before events were known: it decides
+        # their digest, and thereby their split.
+        if not self.events:
+            del values["events"]
+        return json.dumps(values, separators=(",", ":"), sort_keys=True)
 
     @classmethod
     def from_json(cls, text: str) -> Scene:

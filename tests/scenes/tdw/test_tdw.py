@@ -14,7 +14,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from physion.errors import BadInputError
-from physion.scenes.scene import Scene
+from physion.scenes.scene import BodyEvent, Scene
 from physion.scenes.tdw.commands import quaternion_from_euler, vector
 from physion.scenes.tdw.read_logs import read_scenes
 
@@ -225,6 +225,75 @@ def test_bad_commands_name_line_and_trial(tmp_path: Path, command: Command, comp
     assert len(found.trials) == 1
     (failure,) = found.failures
     assert failure.trial == "1" and complaint in failure.message and "line 4" in failure.message
+
+
+def test_objects_may_appear_move_and_vanish_later(tmp_path: Path) -> None:
+    """Lists of the trial: creation, a late object, a teleport, a lone destruction, two more."""
+    late = thing(3, "sphere", xyz(1, 2, 3), scale=xyz(0.5, 0.5, 0.5), mass=4.0)
+    late += [{"$type": "teleport_object", "id": 3, "position": xyz(1, 2, 4)}]
+    move = [
+        {"$type": "teleport_object", "id": 1, "position": xyz(7, 0, 8)},
+        {"$type": "rotate_object_by", "id": 1, "axis": "yaw", "angle": 180},
+        {"$type": "teleport_object", "id": 2, "position": xyz(0, 5, 0)},
+    ]
+    push = {"$type": "apply_force_to_object", "force": xyz(1, 0, 0), "id": 3}
+    gone = [{"$type": "destroy_object", "id": 3}]
+    write_log(tmp_path / "config", [[two_cubes(), late, move, gone, [], [push | {"id": 2}]]])
+    scene = only_scene(tmp_path)
+    assert [body.name for body in scene.bodies] == ["cube_1", "cube_2", "sphere_3"]
+    assert scene.bodies[2].position == (1, 4, 2) and scene.bodies[2].mass == 4.0
+    appear, slab, cube, vanish = scene.events
+    assert appear == BodyEvent(1, "sphere_3", "appear")
+    assert (slab.frame, slab.body, slab.kind, slab.position) == (2, "cube_1", "move", (7, 8, 0))
+    assert slab.rotation == pytest.approx((0, 0, 0, -1), abs=1e-12)
+    assert cube == BodyEvent(2, "cube_2", "move", (0, 0, 5))
+    assert vanish == BodyEvent(3, "sphere_3", "vanish")
+    assert [push.frame for push in scene.pushes] == [5]
+    assert Scene.from_json(scene.to_json()) == scene
+
+
+def test_the_last_lists_that_destroy_objects_are_no_events(tmp_path: Path) -> None:
+    gone = [{"$type": "destroy_object", "id": 2}]
+    write_log(tmp_path / "config", [[two_cubes(), [], gone]])
+    assert only_scene(tmp_path).events == ()
+
+
+def test_a_later_object_may_take_the_place_of_the_target(tmp_path: Path) -> None:
+    red = (1, 0, 0)
+    start = [*thing(1, "cube", xyz(0, 0, 0)), *thing(2, "cube", xyz(1, 10, 10), color=red)]
+    later = [{"$type": "destroy_object", "id": 2}, *thing(3, "bowl", xyz(0, 1, 0), color=red)]
+    write_log(tmp_path / "config", [[start, later, []]])
+    scene = only_scene(tmp_path)
+    assert scene.roles.agent == "bowl_3"
+    assert [(e.frame, e.body, e.kind) for e in scene.events] == [
+        (1, "cube_2", "vanish"),
+        (1, "bowl_3", "appear"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("command", "complaint"),
+    [
+        ({"$type": "set_mass", "id": 2, "mass": 1}, "cube_2 was created at frame 0"),
+        ({"$type": "rotate_object_by", "id": 2, "angle": 9}, "give the rotation itself"),
+        ({"$type": "add_fixed_joint", "parent_id": 1, "id": 2}, "both were created before"),
+        ({**two_cubes()[0]}, "already created"),
+    ],
+)
+def test_what_a_scene_cannot_change_later_is_refused(
+    tmp_path: Path, command: Command, complaint: str
+) -> None:
+    write_log(tmp_path / "config", [[two_cubes(), [], [command]]])
+    (failure,) = read_scenes(tmp_path).failures
+    assert complaint in failure.message and "line 4" in failure.message
+
+
+def test_destroyed_objects_take_no_commands(tmp_path: Path) -> None:
+    gone = [{"$type": "destroy_object", "id": 2}]
+    push = {"$type": "apply_force_to_object", "force": xyz(1, 0, 0), "id": 2}
+    write_log(tmp_path / "config", [[two_cubes(), gone, [push]]])
+    (failure,) = read_scenes(tmp_path).failures
+    assert "object 2 was destroyed at frame 1" in failure.message
 
 
 def test_missing_metadata_fails_its_log_only(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from physion.dataclass_json import shown
 from physion.errors import BadInputError, PhysionError
 from physion.numerics.rotations import multiply_quaternions
 from physion.scenes.sampling.parameters import as_quaternion, euler_rotation
-from physion.scenes.scene import Push, Quat, SurfaceMaterial, Vec3
+from physion.scenes.scene import BodyEvent, Push, Quat, SurfaceMaterial, Vec3
 from physion.scenes.tdw.log_lines import Command
 
 IGNORED_COMMANDS = frozenset(
@@ -93,7 +93,13 @@ def _to_our_axes(unity: Quat) -> Quat:
 
 @dataclass
 class LoggedObject:
-    """Object of a command log, as changed by the commands read so far."""
+    """Object of a command log, as changed by the commands read so far.
+
+    ``position`` and ``rotation`` are those at its creation, in frame ``created``. ``gone``: it was
+    destroyed in that frame and never was in the trial; ``destroyed``: the later frame in which it
+    was. ``put``: the position and rotation that the log gave last, after which forces may have
+    moved it.
+    """
 
     id: int
     model: str
@@ -111,10 +117,18 @@ class LoggedObject:
     flex: bool = False
     cloth: tuple[float, float, float] | None = None
     gone: bool = False
+    created: int = 0
+    destroyed: int | None = None
+    put: tuple[Vec3, Quat] | None = None
 
     @property
     def name(self) -> str:
         return f"{self.model}_{self.id}"
+
+    @property
+    def free(self) -> bool:
+        """Return whether forces move it; if not, the pose that the log gave last is its pose."""
+        return not (self.kinematic or self.flex or self.mass is None)
 
     @property
     def vanishing(self) -> bool:
@@ -128,6 +142,7 @@ class CommandReader:
         self.unknown = unknown
         self.objects: dict[int, LoggedObject] = {}
         self.pushes: list[tuple[int, Push]] = []
+        self.events: list[tuple[int, BodyEvent]] = []
         self.joints: list[tuple[int, int]] = []
         self.eye: Vec3 = (0.0, -3.0, 1.0)
         self.target: Vec3 = (0.0, 0.0, 0.5)
@@ -141,11 +156,8 @@ class CommandReader:
         """Execute the set-up commands, then those of every frame: (line number, commands)."""
         for command in setup:
             self._execute(command, "the set-up before the first trial")
-        for frame, (line, commands) in enumerate(frames):
+        for frame, (line, commands) in enumerate(frames[: _count_frames(frames)]):
             self.frame = frame
-            # Lists that only destroy objects clean up for the next trial.
-            if frame and commands and all("destroy" in c["$type"] for c in commands):
-                break
             for command in commands:
                 self._execute(command, f"line {line}")
 
@@ -170,13 +182,40 @@ class CommandReader:
         thing = self.objects.get(command[key])
         if thing is None:
             raise BadInputError(f"object {shown(command[key])} was never created")
+        if thing.destroyed is not None:
+            raise BadInputError(
+                f"object {shown(command[key])} was destroyed at frame {thing.destroyed}"
+            )
         return thing
 
-    def _at_start(self) -> None:
-        if self.frame:
+    def _new(self, command: Command, key: str = "id") -> LoggedObject:
+        """Return the object of a command that sets what cannot change later in a scene."""
+        thing = self._object(command, key)
+        if thing.created != self.frame:
             raise BadInputError(
-                f"is at frame {self.frame}, but after frame 0 only pushes are allowed"
+                f"is at frame {self.frame}, but {thing.name} was created at frame "
+                f"{thing.created}; later it may only move, be pushed or vanish"
             )
+        return thing
+
+    def _move(
+        self, thing: LoggedObject, position: Vec3 | None = None, rotation: Quat | None = None
+    ) -> None:
+        """Give an object another pose: its first one, or an event if it was created earlier."""
+        old_position, old_rotation = thing.put or (thing.position, thing.rotation)
+        pose = (position or old_position, rotation or old_rotation)
+        if thing.created == self.frame:
+            thing.position, thing.rotation = pose
+            return
+        thing.put = pose
+        if not thing.free:
+            position, rotation = pose
+        index, event = self.events[-1] if self.events else (None, None)
+        if event and (index, event.frame, event.kind) == (thing.id, self.frame, "move"):
+            self.events.pop()
+            position, rotation = position or event.position, rotation or event.rotation
+        event = BodyEvent(self.frame, thing.name, "move", position, rotation)
+        self.events.append((thing.id, event))
 
     # One method per command.
 
@@ -196,68 +235,75 @@ class CommandReader:
         self.target = vector(command["position"])
 
     def do_add_object(self, command: Command) -> None:
-        self._at_start()
-        self.objects[int(command["id"])] = LoggedObject(
-            int(command["id"]),
+        id_ = int(command["id"])
+        if self.frame and id_ in self.objects:
+            raise BadInputError(f"object {id_} was already created; use a new id at later frames")
+        thing = LoggedObject(
+            id_,
             str(command["name"]),
             str(command.get("category", "")),
             vector(command["position"]),
             quaternion_from_euler(command["rotation"]),
+            created=self.frame,
         )
+        self.objects[id_] = thing
+        if self.frame:
+            self.events.append((id_, BodyEvent(self.frame, thing.name, "appear")))
 
     def do_destroy_object(self, command: Command) -> None:
-        self._at_start()
-        self._object(command).gone = True
+        thing = self._object(command)
+        if thing.created == self.frame:
+            thing.gone = True
+            return
+        thing.destroyed = self.frame
+        self.events.append((thing.id, BodyEvent(self.frame, thing.name, "vanish")))
 
     do_destroy_flex_object = do_destroy_object
 
     def do_scale_object(self, command: Command) -> None:
-        self._at_start()
-        thing, factor = self._object(command), vector(command["scale_factor"])
+        thing, factor = self._new(command), vector(command["scale_factor"])
         thing.scale = tuple(a * b for a, b in zip(thing.scale, factor, strict=True))  # type: ignore[assignment]
 
     def do_teleport_object(self, command: Command) -> None:
-        self._at_start()
-        self._object(command).position = vector(command["position"])
+        self._move(self._object(command), position=vector(command["position"]))
 
     def do_rotate_object_to(self, command: Command) -> None:
-        self._at_start()
         q = command["rotation"]
         unity = (float(q["w"]), float(q["x"]), float(q["y"]), float(q["z"]))
-        self._object(command).rotation = _to_our_axes(unity)
+        self._move(self._object(command), rotation=_to_our_axes(unity))
 
     def do_rotate_object_to_euler_angles(self, command: Command) -> None:
-        self._at_start()
-        self._object(command).rotation = quaternion_from_euler(command["euler_angles"])
+        self._move(self._object(command), rotation=quaternion_from_euler(command["euler_angles"]))
 
     def do_rotate_object_by(self, command: Command) -> None:
-        self._at_start()
+        thing = self._object(command)
+        if thing.created != self.frame and thing.free:
+            raise BadInputError(
+                f"rotates {thing.name} by an angle at frame {self.frame}, but its rotation then "
+                "is not in the log; give the rotation itself"
+            )
         axis = {"pitch": "x", "yaw": "y", "roll": "z"}[command.get("axis", "yaw")]
         angles = {"x": 0.0, "y": 0.0, "z": 0.0, axis: float(command["angle"])}
-        thing, by = self._object(command), quaternion_from_euler(angles)
+        by, old = quaternion_from_euler(angles), thing.put[1] if thing.put else thing.rotation
         world = bool(command.get("is_world", True))
-        factors = (by, thing.rotation) if world else (thing.rotation, by)
-        thing.rotation = as_quaternion(multiply_quaternions(*factors))
+        factors = (by, old) if world else (old, by)
+        self._move(thing, rotation=as_quaternion(multiply_quaternions(*factors)))
 
     def do_set_mass(self, command: Command) -> None:
-        self._at_start()
-        self._object(command).mass = float(command["mass"])
+        self._new(command).mass = float(command["mass"])
 
     def do_set_physic_material(self, command: Command) -> None:
-        self._at_start()
-        self._object(command).contact = SurfaceMaterial(
+        self._new(command).contact = SurfaceMaterial(
             float(command["static_friction"]),
             float(command["dynamic_friction"]),
             float(command["bounciness"]),
         )
 
     def do_set_kinematic_state(self, command: Command) -> None:
-        self._at_start()
-        self._object(command).kinematic = bool(command.get("is_kinematic", False))
+        self._new(command).kinematic = bool(command.get("is_kinematic", False))
 
     def do_set_object_drag(self, command: Command) -> None:
-        self._at_start()
-        thing = self._object(command)
+        thing = self._new(command)
         thing.drag, thing.angular_drag = float(command["drag"]), float(command["angular_drag"])
 
     def do_apply_force_at_position(self, command: Command) -> None:
@@ -272,8 +318,13 @@ class CommandReader:
             self.pushes.append((thing.id, Push(thing.name, impulse, point, self.frame)))
 
     def do_add_fixed_joint(self, command: Command) -> None:
-        self._at_start()
-        self.joints.append((self._object(command, "parent_id").id, self._object(command).id))
+        parent, child = self._object(command, "parent_id"), self._object(command)
+        if self.frame not in (parent.created, child.created):
+            raise BadInputError(
+                f"joins {parent.name} and {child.name} at frame {self.frame}, but both were "
+                "created before; joints hold from then on"
+            )
+        self.joints.append((parent.id, child.id))
 
     def do_set_color(self, command: Command) -> None:
         c = command["color"]
@@ -289,6 +340,8 @@ class CommandReader:
 
     def do_set_flex_cloth_actor(self, command: Command) -> None:
         thing = self._object(command)
+        if thing.created:
+            raise BadInputError(f"{thing.name} is cloth, which must be there from frame 0 on")
         thing.flex = True
         thing.cloth = (
             float(command["stretch_stiffness"]),
@@ -298,6 +351,23 @@ class CommandReader:
 
     def do_set_flex_object_mass(self, command: Command) -> None:
         self._object(command).mass = float(command["mass"])
+
+
+def _count_frames(frames: list[tuple[int, list[Command]]]) -> int:
+    """Return the number of frames, without the last lists that only destroy objects.
+
+    These clean up for the next trial. At least one frame is left.
+    """
+    count = len(frames)
+    while count > 1 and _cleans_up(frames[count - 1][1]):
+        count -= 1
+    return count
+
+
+def _cleans_up(commands: list[Command]) -> bool:
+    """Return whether a list of commands only destroys objects, or ends the program."""
+    kinds = [command["$type"] for command in commands]
+    return bool(kinds) and all("destroy" in kind or kind == "terminate" for kind in kinds)
 
 
 def _texture(material: str) -> str:

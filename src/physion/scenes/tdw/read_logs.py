@@ -18,6 +18,7 @@ from physion.numerics.rotations import rotate_vectors
 from physion.scenes.looks import prop_look
 from physion.scenes.scene import (
     Body,
+    BodyEvent,
     Camera,
     Cloth,
     Ending,
@@ -216,6 +217,11 @@ class _SceneBuilder:
             floor=FLOORS.get(self.commands.room, 0.0),
             ending=Ending(151, self._max_frames(scenario)),
             settle_frames=FLEX_SETTLE_FRAMES if self.commands.settles else 0,
+            events=tuple(
+                self._event(event, self.commands.objects[id_])
+                for id_, event in self.commands.events
+                if id_ in ids
+            ),
             parameters={
                 "source": "official command log",
                 "configuration": self.folder.name,
@@ -238,7 +244,9 @@ class _SceneBuilder:
         return MAX_FRAMES["collide"] if by_collision else MAX_FRAMES.get(scenario, 302)
 
     def _roles(self, kept: list[LoggedObject], pushes: tuple[Push, ...]) -> Roles:
-        """Find the roles: the lowest id is the zone, 2 the target (or the last of its colour)."""
+        """Find the roles: the lowest id is the zone, 2 the target (or the last of its colour).
+
+        The latter where another object of its colour takes its place."""
         by_id = {thing.id: thing for thing in kept}
         if not kept:
             raise BadInputError("no object is left in the trial")
@@ -247,8 +255,8 @@ class _SceneBuilder:
         if first is None or zone.id == 2:
             raise BadInputError("there is no object with id 2, the target")
         agent: LoggedObject | None = first
-        if first.gone:
-            alike = [t for t in kept if t.id > 2 and t.color == first.color]
+        alike = [t for t in kept if t.id > 2 and t.color == first.color]
+        if first.gone or any(t.created == first.destroyed for t in alike):
             agent = max(alike, key=lambda t: t.id) if alike else None
         if agent is None or agent.id not in by_id:
             raise BadInputError("the target was removed and no other object has its colour")
@@ -282,6 +290,13 @@ class _SceneBuilder:
             angular_drag=thing.angular_drag,
             look=self._look(thing),
         )
+
+    def _event(self, event: BodyEvent, thing: LoggedObject) -> BodyEvent:
+        """Return an event with the position of the pivot, which for props is not the log's."""
+        if event.position is None or thing.model in shapes:
+            return event
+        moved = replace(thing, position=event.position, rotation=event.rotation or thing.rotation)
+        return replace(event, position=self._prop(moved)[2])
 
     def _prop(self, thing: LoggedObject) -> tuple[str, Vec3, Vec3]:
         """Return shape, scale and position of the prop that fills the bounds of a library model."""
