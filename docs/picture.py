@@ -2,7 +2,7 @@
 
     python docs/picture.py [OFFICIAL_FRAME.png]
 
-With the published picture of the eight official scenarios, that stands on the right.
+If the published picture of the eight official scenarios is given, it is put on the right.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ PASSES = ("contain", ("color", "depth", "normals", "ids", "flow"))
 SIZE, GAP = 256, 6
 
 
-def painted(frame: Frame) -> list[NDArray[np.uint8]]:
-    """Depth, normals, ids and flow of a frame as pictures."""
+def color_passes(frame: Frame) -> list[NDArray[np.uint8]]:
+    """Return depth, normals, ids and flow of a frame as colour images (H, W, 3), uint8."""
     assert frame.depth is not None and frame.normals is not None
     assert frame.ids is not None and frame.flow is not None
     depth = plt.get_cmap("magma")(np.clip(1 - frame.depth / 10, 0, 1))[..., :3]
@@ -52,7 +52,7 @@ def painted(frame: Frame) -> list[NDArray[np.uint8]]:
 
 
 def renderer_of(name: str, cues: bool = False) -> Renderer:
-    """The renderer of the trial that stands for a scenario, in free colours or with cues."""
+    """Return the renderer of the trial of a scenario, in free colours or with red and yellow."""
     preset, index, _ = TRIALS[name]
     seed = trial_seed("picture", name, "testing", index)
     scene = sample_scene(name, seed, get_preset(name, preset).params)
@@ -60,7 +60,7 @@ def renderer_of(name: str, cues: bool = False) -> Renderer:
 
 
 def grid(tiles: list[NDArray[np.uint8]], columns: int) -> NDArray[np.uint8]:
-    """Square tiles in rows, with black between them."""
+    """Return one image with square tiles in rows, separated by black."""
     rows = -(-len(tiles) // columns)
     side = SIZE + GAP
     sheet = np.zeros((rows * side + GAP, columns * side + GAP, 3), np.uint8)
@@ -71,7 +71,7 @@ def grid(tiles: list[NDArray[np.uint8]], columns: int) -> NDArray[np.uint8]:
 
 
 def main() -> None:
-    """Sample, simulate, render, put together."""
+    """Sample, simulate and render the trials, and write the picture."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("official", nargs="?", type=Path)
     official = parser.parse_args().official
@@ -84,7 +84,7 @@ def main() -> None:
     assert first.color is not None and first.ids is not None and moving.color is not None
     roles = role_map(first.ids, trial.scene)
     cues = np.where(roles[..., 3:] > 0, roles[..., :3], first.color // 3)
-    strip = [first.color, cues.astype(np.uint8), moving.color, *painted(moving)]
+    strip = [first.color, cues.astype(np.uint8), moving.color, *color_passes(moving)]
     top = ours
     if official is not None:
         picture = Image.open(official).convert("RGB").resize((ours.shape[1], ours.shape[0]))
