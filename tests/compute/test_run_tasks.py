@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TypeVar
 
 import pytest
 
@@ -14,8 +12,6 @@ from physion.compute.local import SerialExecutor
 from physion.compute.progress import tracked
 from physion.compute.run_tasks import RunReport, run_tasks
 from physion.errors import PhysionError
-
-T = TypeVar("T")
 
 
 def half(number: int) -> float:
@@ -43,7 +39,7 @@ def test_a_failed_task_does_not_stop_the_others(tmp_path: Path) -> None:
 
 def test_a_full_disk_stops_the_run(tmp_path: Path) -> None:
     seen: list[TaskOutcome[float]] = []
-    with pytest.raises(PhysionError, match=r"No space left.*1 new trials are complete"):
+    with pytest.raises(PhysionError, match=r"No space left.*1 of 3 are complete"):
         run_tasks(
             half,
             {"a": 2, "full": -1, "b": 4},
@@ -55,26 +51,23 @@ def test_a_full_disk_stops_the_run(tmp_path: Path) -> None:
     assert [outcome.key for outcome in seen] == ["a"]
 
 
-class Recorder:
-    """Records the labels and totals of the loops that it tracks."""
-
-    def __init__(self) -> None:
-        self.calls: list[tuple[str, int]] = []
-
-    def __call__(self, items: Iterable[T], what: str, total: int, /) -> Iterator[T]:
-        """Pass the items on."""
-        self.calls.append((what, total))
-        yield from items
-
-
 def test_progress_is_shown(tmp_path: Path) -> None:
-    track = Recorder()
+    steps: list[tuple[str, int, int]] = []
+
+    def note(what: str, done: int, total: int) -> None:
+        steps.append((what, done, total))
+
     run_tasks(
-        half, {"a": 2}, folder=tmp_path, what="halving", executor=SerialExecutor(), track=track
+        half, {"a": 2}, folder=tmp_path, what="halving", executor=SerialExecutor(), progress=note
     )
-    assert list(tracked([1, 2], "counting", 2, track)) == [1, 2]
+    assert steps == [("halving", 0, 1), ("halving", 1, 1)]
     assert list(tracked([1, 2], "counting", 2, None)) == [1, 2]
-    assert track.calls == [("halving", 1), ("counting", 2)]
+
+
+def test_an_item_counts_as_done_once_it_was_used() -> None:
+    done: list[int] = []
+    before = [list(done) for _ in tracked("ab", "counting", 2, lambda *step: done.append(step[1]))]
+    assert before == [[0], [0, 1]] and done == [0, 1, 2]
 
 
 def test_exit_code(tmp_path: Path) -> None:

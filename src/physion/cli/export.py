@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import tyro
 
 from physion.cli.official_files import print_report
-from physion.cli.output import console, track
+from physion.cli.output import Stages, console
 from physion.compute.local import LocalExecutor
 from physion.errors import BadInputError
 
@@ -89,13 +89,16 @@ def _card(options: Options) -> int:
 def _webdataset(options: Options, out: Path) -> int:
     from physion.trials.publishing.shards import PARTS, SEEN_PARTS, export_shards
 
-    report = export_shards(
-        options.folder,
-        out,
-        split=options.split,
-        scenario=options.scenario,
-        parts=SEEN_PARTS if options.parts == "seen" else PARTS,
-    )
+    with Stages() as stages:
+        report = export_shards(
+            options.folder,
+            out,
+            split=options.split,
+            scenario=options.scenario,
+            parts=SEEN_PARTS if options.parts == "seen" else PARTS,
+            executor=LocalExecutor(workers=options.workers),
+            progress=stages,
+        )
     if options.json:
         values = {"made": report.made, "samples": report.samples, "bytes": report.bytes}
         print(json_module.dumps(values | {"index": str(report.manifest)}, default=list))
@@ -109,12 +112,13 @@ def _webdataset(options: Options, out: Path) -> int:
 def _official(options: Options, out: Path) -> int:
     from physion.trials.official.writing.export_folder import export_official
 
-    report = export_official(
-        options.folder,
-        out,
-        split=options.split,
-        scenario=options.scenario,
-        executor=LocalExecutor(workers=options.workers),
-        track=track,
-    )
+    with Stages() as stages:
+        report = export_official(
+            options.folder,
+            out,
+            split=options.split,
+            scenario=options.scenario,
+            executor=LocalExecutor(workers=options.workers),
+            progress=stages,
+        )
     return print_report(report, options.json)

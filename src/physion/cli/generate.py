@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from physion.cli.output import console, track
+from physion.cli.output import Stages, console
 from physion.compute.local import LocalExecutor
 from physion.compute.run_tasks import RunReport
 from physion.errors import BadInputError
@@ -61,13 +61,14 @@ def main(options: Options) -> int:
     splits = SPLITS if options.split == "all" else (options.split,)
     counts = {split: FULL_COUNTS[split] if options.full else options.count for split in splits}
     presets = {options.scenario: options.presets} if options.presets else None
-    report = generate(
-        options.folder,
-        plan_dataset(options.name, names, counts, presets),
-        options.settings,
-        executor=LocalExecutor(workers=options.workers),
-        track=track,
-    )
+    with Stages() as stages:
+        report = generate(
+            options.folder,
+            plan_dataset(options.name, names, counts, presets),
+            options.settings,
+            executor=LocalExecutor(workers=options.workers),
+            progress=stages,
+        )
     _print(report, options.json)
     return report.exit_code
 

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import tyro
 
 from physion.cli.official_files import print_report
-from physion.cli.output import track
+from physion.cli.output import Stages
 from physion.compute.local import LocalExecutor
 from physion.trials.official.reading.import_folder import import_official
 
@@ -37,13 +37,14 @@ class Options:
 
 def main(options: Options) -> int:
     """Import what is missing; return 1 if a file failed."""
-    report = import_official(
-        options.folder,
-        options.out,
-        name=options.name,
-        split=options.split,
-        scenario=options.scenario,
-        executor=LocalExecutor(workers=options.workers),
-        track=track,
-    )
+    with Stages() as stages:
+        report = import_official(
+            options.folder,
+            options.out,
+            name=options.name,
+            split=options.split,
+            scenario=options.scenario,
+            executor=LocalExecutor(workers=options.workers),
+            progress=stages,
+        )
     return print_report(report, options.json)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TypeVar
 
 from rich.console import Console
 from rich.progress import (
@@ -20,8 +18,6 @@ from rich.progress import (
 )
 
 from physion.atomic import write_atomic
-
-T = TypeVar("T")
 
 console = Console(highlight=False)
 """Console for results; progress goes to standard error, so that output can be piped."""
@@ -38,17 +34,8 @@ def _columns() -> tuple[ProgressColumn, ...]:
     )
 
 
-def track(items: Iterable[T], what: str, total: int) -> Iterator[T]:
-    """Yield ``items`` while showing their number and the remaining time."""
-    with Progress(*_columns(), console=Console(file=sys.stderr), transient=True) as progress:
-        task = progress.add_task(what, total=total)
-        for item in items:
-            yield item
-            progress.advance(task)
-
-
 class Stages:
-    """Progress display of work that reports (stage, done, total)."""
+    """Progress bars, one a stage, of work that reports to a `compute.progress.Progress`."""
 
     def __enter__(self) -> Stages:
         self._progress = Progress(*_columns(), console=Console(file=sys.stderr), transient=True)

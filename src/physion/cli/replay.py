@@ -13,8 +13,9 @@ from typing import Annotated
 import tyro
 from rich.table import Table
 
-from physion.cli.output import console, track, write_text
+from physion.cli.output import Stages, console, write_text
 from physion.compute.local import LocalExecutor
+from physion.compute.progress import tracked
 from physion.errors import BadInputError
 from physion.physics.replay import Replay, ReplayRow, ReplayTask, replay_trial, summarise
 from physion.scenes.tdw.read_logs import TrialSet, read_scenes
@@ -56,11 +57,12 @@ def main(options: Options) -> int:
     replays: list[Replay] = []
     failures = [str(failure) for failure in logs.failures]
     results = executor.map(replay_trial, {task.trial.scene.name: task for task in tasks})
-    for outcome in track(results, "replaying", len(tasks)):
-        if outcome.error is None:
-            replays.append(outcome.value)
-        else:
-            failures.append(f"{outcome.key}: {outcome.error}")
+    with Stages() as stages:
+        for outcome in tracked(results, "replaying", len(tasks), stages):
+            if outcome.error is None:
+                replays.append(outcome.value)
+            else:
+                failures.append(f"{outcome.key}: {outcome.error}")
     order = {task.trial.scene.name: position for position, task in enumerate(tasks)}
     replays.sort(key=lambda replay: order[replay.name])
     rows = summarise(replays)

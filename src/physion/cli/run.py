@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from physion.cli.output import Stages, console, track
+from physion.cli.output import Stages, console
 from physion.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -155,13 +155,14 @@ def generate_trials(options: Options, tasks: list[TrialTask]) -> list[str]:
     from physion.trials.making.generate import generate
     from physion.trials.making.plan import GenerateSettings
 
-    report = generate(
-        out_folder(options) / "trials",
-        tasks,
-        GenerateSettings(width=options.size, height=options.size, look="redyellow", jitters=0),
-        executor=LocalExecutor(workers=options.workers),
-        track=track,
-    )
+    with Stages() as stages:
+        report = generate(
+            out_folder(options) / "trials",
+            tasks,
+            GenerateSettings(width=options.size, height=options.size, look="redyellow", jitters=0),
+            executor=LocalExecutor(workers=options.workers),
+            progress=stages,
+        )
     return [f"{name}: {reason}" for name, reason in report.failed.items()]
 
 

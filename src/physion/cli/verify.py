@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from physion.cli.output import console, track
+from physion.cli.output import Stages, console
 from physion.trials.making.verify import SAMPLE, verify_dataset
 
 
@@ -27,7 +27,8 @@ class Options:
 
 def main(options: Options) -> int:
     """Print faults and notes; return 1 if there is a fault."""
-    result = verify_dataset(options.folder, again=options.again, track=track)
+    with Stages() as stages:
+        result = verify_dataset(options.folder, again=options.again, progress=stages)
     if options.json:
         print(json_module.dumps(asdict(result), indent=1))
         return 1 if result.faults else 0

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from physion.cli.output import console, track
+from physion.cli.output import Stages, console
 from physion.report.viewer.write_viewer import ViewerOptions, build_viewer
 
 
@@ -40,7 +40,8 @@ def main(options: Options) -> int:
     """Write the page and print its size and path."""
     wanted = ViewerOptions(options.trials, options.details, options.scenario, options.split)
     out = options.out if options.out is not None else options.folder / "view.html"
-    report = build_viewer(options.folder, out, wanted, track=track)
+    with Stages() as stages:
+        report = build_viewer(options.folder, out, wanted, progress=stages)
     if options.json:
         values = {"page": str(report.page), "bytes": report.size}
         print(json_module.dumps(values | {"shown": report.shown, "left_out": report.left_out}))

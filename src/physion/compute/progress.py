@@ -1,4 +1,4 @@
-"""Callbacks through which long-running functions report how far they are."""
+"""Callback through which long-running functions report how far they are."""
 
 from __future__ import annotations
 
@@ -8,19 +8,8 @@ from typing import Protocol, TypeVar
 T = TypeVar("T")
 
 
-class Track(Protocol):
-    """Callback that wraps a loop: it passes items on and shows how many are done.
-
-    `physion.cli.output.track` is the one of the command line.
-    """
-
-    def __call__(self, items: Iterable[T], what: str, total: int, /) -> Iterator[T]:
-        """Yield ``items``, of which there are ``total``; ``what`` is the label to show."""
-        ...
-
-
 class Progress(Protocol):
-    """Callback for functions with nested loops, called after each step.
+    """Callback that is called after each step, and with ``done`` 0 where a loop begins.
 
     `physion.cli.output.Stages` is the one of the command line.
     """
@@ -30,6 +19,12 @@ class Progress(Protocol):
         ...
 
 
-def tracked(items: Iterable[T], what: str, total: int, track: Track | None) -> Iterator[T]:
-    """Yield ``items`` through ``track``, or as they are if it is None."""
-    yield from items if track is None else track(items, what, total)
+def tracked(items: Iterable[T], what: str, total: int, progress: Progress | None) -> Iterator[T]:
+    """Yield ``items``, of which there are ``total``; ``progress`` learns when each was used."""
+    if progress is None:
+        yield from items
+        return
+    progress(what, 0, total)
+    for done, item in enumerate(items, start=1):
+        yield item
+        progress(what, done, total)

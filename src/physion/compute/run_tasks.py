@@ -1,7 +1,7 @@
 """Run many tasks that write files: a failed task does not stop the others, a full disk stops all.
 
-Generation of trials and export to and import from the official layout work in this way and report
-their results in the same form.
+Generation of trials, export as shards, and export to and import from the official layout work in
+this way.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from physion.compute.executor import Executor, TaskOutcome
-from physion.compute.progress import Track, tracked
+from physion.compute.progress import Progress, tracked
 from physion.errors import PhysionError
 
 T = TypeVar("T")
@@ -58,7 +58,7 @@ def run_tasks(
     folder: Path,
     what: str,
     executor: Executor | None = None,
-    track: Track | None = None,
+    progress: Progress | None = None,
     on_outcome: Callable[[TaskOutcome[R]], None] | None = None,
 ) -> tuple[dict[str, R], dict[str, str]]:
     """Run ``function`` on every task; an error in one task is recorded and the others go on.
@@ -75,7 +75,7 @@ def run_tasks(
         Label of the progress, such as ``generating``.
     executor
         Where to run; by default one process per core.
-    track
+    progress
         Shows the progress.
     on_outcome
         Called with each outcome as it comes.
@@ -98,13 +98,13 @@ def run_tasks(
     failed: dict[str, str] = {}
     outcomes = executor.map(function, tasks)
     try:
-        for outcome in tracked(outcomes, what, len(tasks), track):
+        for outcome in tracked(outcomes, what, len(tasks), progress):
             if outcome.error is None:
                 results[outcome.key] = outcome.value
             elif outcome.errno in FATAL_ERRNOS:
                 raise PhysionError(
-                    f"cannot write into {folder}: {outcome.error}; {len(results)} new trials are "
-                    "complete, and the same command continues from there"
+                    f"cannot write into {folder}: {outcome.error}; {len(results)} of {len(tasks)} "
+                    "are complete, and the same command continues from there"
                 )
             else:
                 failed[outcome.key] = outcome.error

@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -207,7 +207,7 @@ def test_a_fault_at_every_step_leaves_only_whole_files(
 
 def test_a_full_disk_stops_the_run_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     counter = Fault(monkeypatch, "write", 10, errno.ENOSPC)
-    with pytest.raises(PhysionError, match=r"No space left.*1 new trials are complete"):
+    with pytest.raises(PhysionError, match=r"No space left.*1 of . are complete"):
         run(tmp_path / "s", scenes_named("a", "b", "c"))
     assert counter.calls == 10, "no later trial is tried"
 
@@ -256,14 +256,14 @@ from support.hand_made import make_by_hand, make_scene
 from physion.compute.local import LocalExecutor
 from physion.trials.making.generate import generate
 from physion.trials.making.plan import plan_scenes
-def track(outcomes, what, total):
-    for outcome in outcomes:
-        print(outcome.key, flush=True)
-        yield outcome
+def progress(what, done, total):
+    if done:
+        print(done, flush=True)
 if __name__ == "__main__":
     names = [f"t{n:02d}" for n in range(int(sys.argv[3]))]
     tasks = plan_scenes("tests", [make_scene(name) for name in names])
-    generate(Path(sys.argv[1]), tasks, make=make_by_hand, executor=LocalExecutor(1), track=track)
+    executor = LocalExecutor(1)
+    generate(Path(sys.argv[1]), tasks, make=make_by_hand, executor=executor, progress=progress)
 """
 
 
@@ -428,15 +428,9 @@ def test_bad_plans_are_refused(tmp_path: Path) -> None:
 
 
 def test_progress_sees_every_outcome(tmp_path: Path) -> None:
-    seen: list[tuple[str, str, int]] = []
-
-    def track(outcomes: Any, what: str, total: int) -> Iterator[Any]:
-        for outcome in outcomes:
-            seen.append((outcome.key, what, total))
-            yield outcome
-
-    run(tmp_path / "s", scenes_named("a", "b"), track=track)
-    assert seen == [("a", "generating", 2), ("b", "generating", 2)]
+    seen: list[tuple[str, int, int]] = []
+    run(tmp_path / "s", scenes_named("a", "b"), progress=lambda *step: seen.append(step))
+    assert seen == [("generating", done, 2) for done in (0, 1, 2)]
 
 
 def test_writers_of_one_path_do_not_meet(tmp_path: Path) -> None:

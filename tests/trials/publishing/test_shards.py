@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 import tarfile
@@ -14,16 +15,20 @@ import pytest
 
 import physion.trials.publishing.shards as shards_module
 from physion.cli.main import main as cli
+from physion.compute.local import LocalExecutor, SerialExecutor
 from physion.errors import BadInputError, UnknownNameError
 from physion.trials.files import encode_png, write_files
 from physion.trials.index import build_index, write_index
 from physion.trials.layout import TrialPaths
-from physion.trials.publishing.shards import SEEN_PARTS, SHARD_BYTES, export_shards
+from physion.trials.publishing.shards import SEEN_PARTS, SHARD_BYTES
 from physion.trials.trial_file import Trial
 from physion.trials.video import encode_movie
 from support.hand_made import FRAMES, SIZE, images, make_parts, tree_digest
 
 OBSERVED = 45
+
+export_shards = functools.partial(shards_module.export_shards, executor=SerialExecutor())
+"""Export in this process, which is faster for few small shards."""
 
 
 def _make(folder: Path, split: str, trial: str, contact: bool, free: bool = False) -> TrialPaths:
@@ -240,6 +245,37 @@ def test_files_that_are_not_those_of_the_index_are_refused(tmp_path: Path) -> No
     with pytest.raises(BadInputError, match=r"t0_map\.png is not the file of the index"):
         export_shards(folder, tmp_path / "out")
     assert not list((tmp_path / "out").glob("*.tar"))
+
+
+def test_a_bad_file_does_not_stop_the_other_shards(tmp_path: Path) -> None:
+    folder, out = tmp_path / "dataset", tmp_path / "out"
+    paths = [_make(folder, "training", f"t{i}", True) for i in range(3)]
+    _index(folder)
+    good = paths[1].map.read_bytes()
+    for index in (0, 1):
+        paths[index].map.write_bytes(encode_png(np.ones((SIZE, SIZE, 4), np.uint8)))
+    with pytest.raises(BadInputError, match=r"t0_map\.png is not.*1 more shards failed"):
+        export_shards(folder, out, shard_bytes=1)
+    assert [path.name for path in out.glob("*.tar")] == ["physion-training-000002.tar"]
+    assert json.loads((out / "shards.json").read_text())["complete"] is False
+    for index in (0, 1):
+        paths[index].map.write_bytes(good)
+    assert len(export_shards(folder, out, shard_bytes=1).made) == 2
+
+
+def test_several_processes_write_the_same_shards(dataset: Path, tmp_path: Path) -> None:
+    steps: list[tuple[str, int, int]] = []
+    serial = export_shards(dataset, tmp_path / "serial", shard_bytes=1)
+    parallel = shards_module.export_shards(
+        dataset,
+        tmp_path / "parallel",
+        shard_bytes=1,
+        executor=LocalExecutor(2),
+        progress=lambda *step: steps.append(step),
+    )
+    assert parallel.shards == serial.shards and parallel.made == serial.made
+    assert tree_digest(tmp_path / "parallel") == tree_digest(tmp_path / "serial")
+    assert steps == [("shards", done, 5) for done in range(6)]
 
 
 def test_names_with_dots_may_not_meet(tmp_path: Path) -> None:

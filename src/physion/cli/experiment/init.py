@@ -71,11 +71,14 @@ def main(options: Options) -> int:
     from physion.cli.experiment.experiment import require_extra
 
     require_extra()
-    from physion.cli.output import track
+    from physion.cli.output import Stages
     from physion.experiment.study.init.study_folder import make_study
 
     password, chosen = _password(options.password_file), _choose(options)
-    study = make_study(_study(options, chosen.scenarios), chosen.sources, password, track=track)
+    with Stages() as stages:
+        study = make_study(
+            _study(options, chosen.scenarios), chosen.sources, password, progress=stages
+        )
     _print(options, study, chosen, password if options.password_file is None else None)
     return 0
 

@@ -10,7 +10,7 @@ from typing import Any
 import pandas as pd
 
 from physion.atomic import write_atomic
-from physion.compute.progress import Track
+from physion.compute.progress import Progress, tracked
 from physion.errors import BadInputError, UnknownNameError
 from physion.report.viewer import facts as viewer_facts
 from physion.report.viewer import motion as viewer_motion
@@ -58,7 +58,11 @@ class ViewerReport:
 
 
 def build_viewer(
-    folder: Path, out: Path, options: ViewerOptions | None = None, *, track: Track | None = None
+    folder: Path,
+    out: Path,
+    options: ViewerOptions | None = None,
+    *,
+    progress: Progress | None = None,
 ) -> ViewerReport:
     """Write the page of the dataset in ``folder`` to the file ``out``, whole or not at all.
 
@@ -80,7 +84,7 @@ def build_viewer(
     rows = [row for _, row in chosen.iterrows()]
     shapes: set[str] = set()
     found = []
-    for row in track(rows, "viewing", len(rows)) if track else rows:
+    for row in tracked(rows, "viewing", len(rows), progress):
         data, names = _trial_data(dataset, row, options)
         found.append(data)
         shapes |= names

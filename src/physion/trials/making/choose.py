@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from physion.compute.executor import Executor, TaskOutcome
-from physion.compute.progress import Track, tracked
+from physion.compute.progress import Progress, tracked
 from physion.errors import BadInputError, BadSceneError, PhysionError
 from physion.physics.engine import simulate
 from physion.physics.jitter import jitter_scene
@@ -243,7 +243,7 @@ def choose_all(
     groups: Mapping[Path, Collection[TrialTask]],
     settings: GenerateSettings,
     executor: Executor,
-    track: Track | None = None,
+    progress: Progress | None = None,
 ) -> tuple[dict[str, ChosenScene], dict[str, TaskOutcome[ChosenScene]]]:
     """Choose the scenes of all tasks that have none yet.
 
@@ -258,7 +258,7 @@ def choose_all(
         Conditions for accepting a scene.
     executor
         Where to run.
-    track
+    progress
         Shows the progress.
 
     Returns
@@ -271,7 +271,7 @@ def choose_all(
     while todo := _slots(groups, records, settings, failed.keys()):
         outcomes = executor.map(choose, {name: slot for name, (_, slot) in todo.items()})
         unsaved: set[Path] = set()
-        for done, outcome in enumerate(tracked(outcomes, "choosing", len(todo), track), start=1):
+        for done, outcome in enumerate(tracked(outcomes, "choosing", len(todo), progress), start=1):
             if outcome.error is not None:
                 failed[outcome.key] = outcome
                 continue

@@ -15,7 +15,7 @@ from typing import Any
 
 from physion.atomic import folder_lock, remove_leftovers, write_atomic
 from physion.compute.executor import Executor, TaskOutcome
-from physion.compute.progress import Track
+from physion.compute.progress import Progress
 from physion.compute.run_tasks import FATAL_ERRNOS, RunReport, run_tasks
 from physion.errors import BadInputError, PhysionError
 from physion.physics.engine import engines
@@ -34,7 +34,7 @@ def generate(
     settings: GenerateSettings | None = None,
     *,
     executor: Executor | None = None,
-    track: Track | None = None,
+    progress: Progress | None = None,
     make: Callable[[GenerateJob], str] | None = None,
 ) -> RunReport:
     """Make all trials of ``tasks`` that are missing in ``folder``, then the index.
@@ -52,7 +52,7 @@ def generate(
         How to choose, render and store trials; must be those of earlier runs in the folder.
     executor
         Where to run; by default one process per core.
-    track
+    progress
         Shows the progress.
     make
         Function that makes one trial; by default `make_trial`.
@@ -86,14 +86,14 @@ def generate(
             _fix_settings(folder, datasets.pop(), settings, tasks)
             remove_leftovers(folder)
             missing = {name: job for name, job in jobs.items() if not job.complete()}
-            chosen, unchosen = _choose(folder, jobs, missing, settings, executor, track)
+            chosen, unchosen = _choose(folder, jobs, missing, settings, executor, progress)
             made, failed = run_tasks(
                 make,
                 chosen,
                 folder=folder,
                 what="generating",
                 executor=executor,
-                track=track,
+                progress=progress,
                 on_outcome=lambda outcome: _note_outcome(folder, outcome, chosen[outcome.key]),
             )
             problems = _update_index(folder, set(made))
@@ -109,7 +109,7 @@ def _choose(
     missing: Mapping[str, GenerateJob],
     settings: GenerateSettings,
     executor: Executor,
-    track: Track | None,
+    progress: Progress | None,
 ) -> tuple[dict[str, GenerateJob], dict[str, str]]:
     """Return the missing jobs with their scenes chosen, and the reasons of failures by name."""
     groups: dict[Path, list[TrialTask]] = {}
@@ -127,7 +127,7 @@ def _choose(
         return chosen, failed
     from physion.trials.making.choose import choose_all
 
-    choices, outcomes = choose_all(wanted, settings, executor, track)
+    choices, outcomes = choose_all(wanted, settings, executor, progress)
     for name, outcome in outcomes.items():
         if outcome.errno in FATAL_ERRNOS:
             raise PhysionError(f"cannot write into {folder}: {outcome.error}")

@@ -13,7 +13,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from physion.compute.progress import Track, tracked
+from physion.compute.progress import Progress, tracked
 from physion.errors import BadInputError
 from physion.physics.labels import label_contact
 from physion.scenes.sampling.preset import load_presets
@@ -52,7 +52,7 @@ class Verification:
 
 
 def verify_dataset(
-    folder: Path, *, again: int = SAMPLE, track: Track | None = None
+    folder: Path, *, again: int = SAMPLE, progress: Progress | None = None
 ) -> Verification:
     """Check a dataset against its index and for consistency, and make some trials again.
 
@@ -68,7 +68,7 @@ def verify_dataset(
         Number of trials (-1: all) that are also sampled, simulated and rendered again. Scene,
         motion, map and movies must be identical under the same versions of engine and renderer.
         Which trials depends on their names alone.
-    track
+    progress
         Shows the progress.
 
     Raises
@@ -90,7 +90,7 @@ def verify_dataset(
     settings = _settings(folder)
     remade = _choose_trials(table, again)
     rows = [row for _, row in table.iterrows()]
-    for row in tracked(rows, "verifying", len(rows), track):
+    for row in tracked(rows, "verifying", len(rows), progress):
         paths = TrialPaths(folder, row["split"], row["scenario"], row["trial"])
         try:
             result.faults += _compare(row, paths)

@@ -27,6 +27,9 @@ from typing import Any
 import pandas as pd
 
 from physion.atomic import folder_lock, remove_leftovers, write_atomic
+from physion.compute.executor import Executor, TaskOutcome
+from physion.compute.progress import Progress
+from physion.compute.run_tasks import run_tasks
 from physion.errors import BadInputError, UnknownNameError
 from physion.trials.index import COLUMNS, read_index
 from physion.trials.layout import TrialPaths
@@ -111,6 +114,15 @@ class _Sample:
         return hashlib.sha256(json.dumps([self.key, known], sort_keys=True).encode()).hexdigest()
 
 
+@dataclass(frozen=True)
+class _ShardTask:
+    """One shard to write: its path, its samples, and the digest of their content."""
+
+    path: Path
+    samples: tuple[_Sample, ...]
+    contents: str
+
+
 def export_shards(
     folder: Path,
     out: Path,
@@ -119,6 +131,8 @@ def export_shards(
     scenario: str | None = None,
     parts: Sequence[str] = PARTS,
     shard_bytes: int = SHARD_BYTES,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
 ) -> ShardReport:
     """Write trials of the dataset in ``folder`` as tar shards into ``out``.
 
@@ -137,12 +151,18 @@ def export_shards(
         does not have are left out.
     shard_bytes
         Largest size of a shard; a trial that is larger has a shard of its own.
+    executor
+        Where to run; by default one process per core.
+    progress
+        Shows the progress.
 
     Raises
     ------
     BadInputError
-        If a file is not the one in the index, or ``out`` contains other files or shards of other
-        options.
+        If a file is not the one in the index (the shards without such files are written), or
+        ``out`` contains other files or shards of other options.
+    PhysionError
+        If nothing more can be written into ``out``.
     UnknownNameError
         For an unknown split, scenario or part.
     """
@@ -161,7 +181,7 @@ def export_shards(
         out.mkdir(parents=True, exist_ok=True)
         with folder_lock(out):
             remove_leftovers(out)
-            return _write_all(out, plan, options)
+            return _write_all(out, plan, options, executor, progress)
     except OSError as error:
         raise BadInputError(f"cannot write into {out}: {error.strerror or error}") from error
 
@@ -232,28 +252,53 @@ def _plan(samples: Iterable[_Sample], shard_bytes: int) -> dict[str, list[_Sampl
 
 
 def _write_all(
-    out: Path, plan: Mapping[str, Sequence[_Sample]], options: Mapping[str, Any]
+    out: Path,
+    plan: Mapping[str, Sequence[_Sample]],
+    options: Mapping[str, Any],
+    executor: Executor | None,
+    progress: Progress | None,
 ) -> ShardReport:
     before = _known_shards(out, options)
     done: dict[str, Shard] = {}
-    made = []
+    missing: dict[str, _ShardTask] = {}
     for name, samples in plan.items():
         contents = hashlib.sha256("".join(s.digest() for s in samples).encode()).hexdigest()
         known = before.get(name)
         if known is None or known.contents != contents or not _is_whole(out / name, known):
-            data = _archive(samples)
-            write_atomic(out / name, data)
-            sha = hashlib.sha256(data).hexdigest()
-            known = Shard(name, samples[0].split, len(samples), contents, len(data), sha)
-            made.append(name)
-        done[name] = known
-        if made:
+            missing[name] = _ShardTask(out / name, tuple(samples), contents)
+        else:
+            done[name] = known
+
+    def list_shard(outcome: TaskOutcome[Shard]) -> None:
+        if outcome.error is None:
+            done[outcome.key] = outcome.value
             # Shards of an earlier plan stay listed until their files are deleted.
             _write_manifest(out, options, {**before, **done}, complete=False)
+
+    made, failed = run_tasks(
+        _write_shard,
+        missing,
+        folder=out,
+        what="shards",
+        executor=executor,
+        progress=progress,
+        on_outcome=list_shard,
+    )
+    if failed:
+        more = f" (and {len(failed) - 1} more shards failed)" if len(failed) > 1 else ""
+        raise BadInputError(f"{next(iter(failed.values()))}{more}")
     for name in before.keys() - done.keys():
         (out / name).unlink(missing_ok=True)
     _write_manifest(out, options, done, complete=True)
-    return ShardReport(tuple(done.values()), tuple(made), out / MANIFEST)
+    return ShardReport(tuple(done[name] for name in plan), tuple(made), out / MANIFEST)
+
+
+def _write_shard(task: _ShardTask) -> Shard:
+    """Write one shard atomically."""
+    data = _archive(task.samples)
+    write_atomic(task.path, data)
+    sha, split = hashlib.sha256(data).hexdigest(), task.samples[0].split
+    return Shard(task.path.name, split, len(task.samples), task.contents, len(data), sha)
 
 
 def _archive(samples: Sequence[_Sample]) -> bytes:

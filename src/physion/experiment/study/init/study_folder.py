@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from physion.atomic import folder_lock, remove_leftovers, write_atomic
-from physion.compute.progress import Track
+from physion.compute.progress import Progress, tracked
 from physion.errors import BadInputError
 from physion.experiment.study.identity import SECRET_FILE, Secrets, set_password
 from physion.experiment.study.init.media import StimulusSource, import_stimulus
@@ -39,7 +39,11 @@ SHOWN = 3
 
 
 def make_study(
-    study: Study, sources: Sequence[StimulusSource], password: str, *, track: Track | None = None
+    study: Study,
+    sources: Sequence[StimulusSource],
+    password: str,
+    *,
+    progress: Progress | None = None,
 ) -> Study:
     """Create the folder of a study, with its stimuli and the texts of this package, and load it.
 
@@ -52,7 +56,7 @@ def make_study(
         The stimuli and their source files.
     password
         Password of the experimenter's pages.
-    track
+    progress
         Displays progress.
 
     Raises
@@ -71,7 +75,7 @@ def make_study(
     with folder_lock(folder):
         journal = _Journal(folder)
         stimuli = journal.take(sources)
-        rows = list(track(stimuli, "movies", len(sources)) if track else stimuli)
+        rows = list(tracked(stimuli, "movies", len(sources), progress))
         write_stimuli(folder / STIMULI_FILE, rows)
         (folder / TEXTS_FOLDER).mkdir(exist_ok=True)
         for language, content in texts.items():

@@ -24,7 +24,7 @@ from typing import Any
 
 from physion.atomic import folder_lock, remove_leftovers
 from physion.compute.executor import Executor
-from physion.compute.progress import Track
+from physion.compute.progress import Progress
 from physion.compute.run_tasks import RunReport, run_tasks
 from physion.errors import BadInputError, UnknownNameError
 from physion.stimulus_names import FOLDERS, guess_scenario, plain_name
@@ -46,7 +46,7 @@ def import_official(
     split: str | None = None,
     scenario: str | None = None,
     executor: Executor | None = None,
-    track: Track | None = None,
+    progress: Progress | None = None,
 ) -> RunReport:
     """Import every official trial under ``folder`` into the dataset ``out``, and index it.
 
@@ -65,7 +65,7 @@ def import_official(
         Scenario of trials whose scenario cannot be found from their names.
     executor
         Where to run; by default one process per core.
-    track
+    progress
         Shows the progress.
 
     Raises
@@ -101,7 +101,7 @@ def import_official(
                 folder=out,
                 what="importing",
                 executor=executor,
-                track=track,
+                progress=progress,
             )
             table, problems = build_index(out)
             write_index(out, table)

@@ -32,7 +32,7 @@ import numpy as np
 
 from physion.atomic import folder_lock, remove_leftovers, write_atomic
 from physion.compute.executor import Executor
-from physion.compute.progress import Track
+from physion.compute.progress import Progress
 from physion.compute.run_tasks import RunReport, run_tasks
 from physion.errors import BadInputError
 from physion.stimulus_names import FOLDERS
@@ -97,7 +97,7 @@ def export_official(
     split: str | None = None,
     scenario: str | None = None,
     executor: Executor | None = None,
-    track: Track | None = None,
+    progress: Progress | None = None,
 ) -> RunReport:
     """Export trials of a dataset in the official layouts, as shown at the top of the module.
 
@@ -112,7 +112,7 @@ def export_official(
         Trials to export; by default all.
     executor
         Where to run; by default one process per core.
-    track
+    progress
         Shows the progress.
 
     Raises
@@ -141,7 +141,7 @@ def export_official(
                 folder=out,
                 what="exporting",
                 executor=executor,
-                track=track,
+                progress=progress,
             )
             index, broken = _write_lists(out)
     except OSError as error:
