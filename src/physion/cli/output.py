@@ -39,15 +39,17 @@ class Stages:
 
     def __enter__(self) -> Stages:
         self._progress = Progress(*_columns(), console=Console(file=sys.stderr), transient=True)
-        self._progress.start()
         self._tasks: dict[str, TaskID] = {}
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._progress.stop()
+        if self._tasks:
+            self._progress.stop()
 
     def __call__(self, what: str, done: int, total: int) -> None:
         """Show that ``done`` of ``total`` items of a stage are finished."""
+        # Not started earlier: bars without a stage would still print an empty line when they stop.
+        self._progress.start()
         if what not in self._tasks:
             self._tasks[what] = self._progress.add_task(what, total=total)
         self._progress.update(self._tasks[what], completed=done, total=total)

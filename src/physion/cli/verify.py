@@ -22,7 +22,7 @@ class Options:
     again: int = SAMPLE
     """Number of trials to simulate and render again for a bitwise comparison; -1: all."""
     json: bool = False
-    """Print one JSON object: faults, and differences from trials of another version."""
+    """Print one JSON object: faults, differences from trials of another version, and notes."""
 
 
 def main(options: Options) -> int:
@@ -32,10 +32,11 @@ def main(options: Options) -> int:
     if options.json:
         print(json_module.dumps(asdict(result), indent=1))
         return 1 if result.faults else 0
-    for line in (*result.other_versions, *result.faults):
+    for line in (*result.notes, *result.other_versions, *result.faults):
         console.print(line, markup=False, soft_wrap=True)
     others = result.other_versions
     differ = f", {len(others)} differences from another version" if others else ""
-    line = f"{options.folder}: {len(result.faults)} faults{differ}"
+    noted = f", {len(result.notes)} notes" if result.notes else ""
+    line = f"{options.folder}: {len(result.faults)} faults{differ}{noted}"
     console.print(line, markup=False, soft_wrap=True)
     return 1 if result.faults else 0

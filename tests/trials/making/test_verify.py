@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
+import physion.trials.making.verify as verify_module
+from physion.cli.main import main as cli
 from physion.compute.local import SerialExecutor
 from physion.errors import BadInputError
 from physion.trials.dataset import Dataset
+from physion.trials.files import encode_png, same_picture
 from physion.trials.index import build_index, read_index, write_index
 from physion.trials.layout import TrialPaths
 from physion.trials.making.generate import generate
@@ -76,8 +81,6 @@ def test_simulating_again_finds_another_motion(folder: Path, tmp_path: Path) -> 
         TrialTask("t", "drop", "testing", 0, scene=scene), tmp_path / "r", GenerateSettings(64, 64)
     )
     make_trial(job)
-    from physion.trials.index import build_index
-
     write_index(tmp_path / "r", build_index(tmp_path / "r")[0])
     assert verify_dataset(tmp_path / "r", again=-1).faults == []
     parts = make_parts("a")
@@ -191,3 +194,49 @@ def test_trials_of_another_version_are_no_faults(
     newer = verify_dataset(tmp_path / "r", again=-1)
     assert not newer.faults and len(newer.other_versions) == 1
     assert "made by another version" in newer.other_versions[0]
+
+
+def test_a_map_in_another_compression_is_the_same_picture(sampled: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "d"
+    shutil.copytree(sampled, folder)
+    path = Dataset(folder).paths(str(read_index(folder)["trial"][0])).map
+    pixels = np.array(Image.open(path))
+    path.write_bytes(encode_png(pixels, compress_level=0))
+    write_index(folder, build_index(folder)[0])
+    result = verify_dataset(folder, again=-1)
+    assert result.faults == [] and result.notes == [f"{path}: same picture, other compression"]
+    pixels[3, 5, 0] ^= 1
+    path.write_bytes(encode_png(pixels, compress_level=0))
+    write_index(folder, build_index(folder)[0])
+    result = verify_dataset(folder, again=-1)
+    assert result.faults == [f"{path}: other bytes are rendered than the stored ones"]
+    assert result.notes == []
+
+
+def test_pictures_are_the_same_only_in_sound_files_of_equal_pixels() -> None:
+    pixels = np.random.default_rng(0).integers(0, 255, (9, 7, 4), dtype=np.uint8)
+    one, other = encode_png(pixels, 0), encode_png(pixels, 9)
+    assert one != other and same_picture(one, other)
+    assert not same_picture(one, encode_png(pixels[::-1].copy(), 9))
+    assert not same_picture(one, encode_png(pixels[:, :, :3].copy(), 9))
+    for broken in (other[:-3], other[:-12], other.replace(b"IEND", b"IENE"), other + b"x", b""):
+        assert not same_picture(one, broken) and not same_picture(broken, one)
+    for place in range(len(other)):
+        changed = bytearray(other)
+        changed[place] ^= 1
+        assert not same_picture(one, bytes(changed))
+
+
+def test_trials_of_an_unknown_preset_are_reported_as_not_drawn_again(
+    sampled: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(verify_module, "load_presets", lambda scenario: {})
+    result = verify_dataset(sampled, again=-1)
+    assert result.faults == [] and len(result.notes) == 2
+    assert all("not drawn again: preset 'default' of collide" in note for note in result.notes)
+    assert len(verify_dataset(sampled, again=1).notes) == 1
+    assert cli(["verify", str(sampled), "--again", "-1"]) == 0
+    printed = capsys.readouterr().out
+    assert printed.count("not drawn again") == 2 and "0 faults, 2 notes" in printed
+    assert cli(["verify", str(sampled), "--again", "1", "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["notes"]) == 1
