@@ -28,6 +28,8 @@ class Cart:
     covered: bool = False
     owner: str | None = None
     notes: Mapping[str, Any] = field(default_factory=dict)
+    loads: Mapping[str, float] = field(default_factory=dict)
+    spares: Mapping[str, Wheel] = field(default_factory=dict)
 
 
 def test_values_become_what_their_fields_declare() -> None:
@@ -35,6 +37,16 @@ def test_values_become_what_their_fields_declare() -> None:
     cart = read_dataclass(Cart, parse_json(text, "cart"), "cart")
     assert cart == Cart((Wheel(2.0),), (1.0, 2.5), notes={"a": [1]})
     assert isinstance(cart.wheels[0].radius, float)
+
+
+def test_values_of_mappings_are_read_and_kept() -> None:
+    notes = '{"a": [1, 2.5, {"b": null}], "c": true, "d": "NaN"}'
+    text = (
+        '{"wheels": [], "notes": ' + notes + ', "loads": {"l": 1}, "spares": {"s": {"radius": 1}}}'
+    )
+    cart = read_dataclass(Cart, parse_json(text, "cart"), "cart")
+    assert cart.notes == {"a": [1, 2.5, {"b": None}], "c": True, "d": "NaN"}
+    assert isinstance(cart.loads["l"], float) and cart.spares == {"s": Wheel(1.0)}
 
 
 @pytest.mark.parametrize(
@@ -53,6 +65,13 @@ def test_values_become_what_their_fields_declare() -> None:
         ('{"wheels": [], "covered": 1}', "cart.covered must be true or false, not 1"),
         ('{"wheels": [], "owner": 1}', "cart.owner must be a text, not 1"),
         ('{"wheels": [], "notes": []}', "cart.notes must be an object, not []"),
+        ('{"wheels": [], "notes": {"a": NaN}}', "cart.notes['a'] must be a finite number, not nan"),
+        ('{"wheels": [], "notes": {"a": [1, {"b": 1e999}]}}', "cart.notes['a'][1]['b'] must be a "),
+        ('{"wheels": [], "notes": {"a": -Infinity}}', "cart.notes['a'] must be a finite number"),
+        ('{"wheels": [], "loads": {"a": "1"}}', "cart.loads['a'] must be a finite number, not '1'"),
+        ('{"wheels": [], "spares": {"a": {}}}', "cart.spares['a']: missing 'radius'"),
+        ('{"wheels": [], "wheels": []}', "cart: key 'wheels' is repeated in one object"),
+        ('{"wheels": [], "notes": {"a": {"b": 1, "b": 1}}}', "cart: key 'b' is repeated in one"),
         ("{", "cart is not JSON: "),
         ("1" * 5000, "cart is not JSON: "),
     ],

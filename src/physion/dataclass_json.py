@@ -2,8 +2,8 @@
 
 Used for scenes, for metadata and labels of trial files, and (keys and field types) for the
 parameters of scenarios. The checks are stricter than those of libraries for this task: a number in
-quotes, NaN, an unknown key and JSON nested without end are all refused, and each error is one line
-that names the field.
+quotes, NaN, an unknown or repeated key and JSON nested without end are all refused, and each error
+is one line that names the field.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import math
 import reprlib
 import types
 import typing
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from typing import Any, TypeVar
 
@@ -33,9 +34,19 @@ _NAMES: dict[Any, str] = {bool: "true or false", int: "a whole number", str: "a 
 
 
 def parse_json(text: str, where: str, error: type[BadInputError] = BadInputError) -> Any:
-    """Parse JSON of limited depth; raise ``error`` where it is broken or nested too deeply."""
+    """Parse JSON; raise ``error`` if it is broken, repeats a key or is nested too deeply."""
+
+    def as_dict(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        values = dict(pairs)
+        if len(values) < len(pairs):
+            repeated = next(k for k, n in Counter(key for key, _ in pairs).items() if n > 1)
+            raise error(f"{where}: key {shown(repeated)} is repeated in one object")
+        return values
+
     try:
-        data = json.loads(text)
+        data = json.loads(text, object_pairs_hook=as_dict)
+    except error:
+        raise
     except RecursionError:
         raise error(f"{where} is nested deeper than {MAX_DEPTH} levels") from None
     except ValueError as problem:
@@ -57,7 +68,8 @@ def read_dataclass(
     ----------
     kind
         The dataclass. Its fields may be dataclasses, tuples, ``X | None``, numbers, texts,
-        booleans, and ``Mapping`` for any JSON object. A whole number is accepted for a float.
+        booleans, and ``Mapping`` from texts to one of these, or to ``Any`` for any JSON value
+        whose numbers are finite. A whole number is accepted for a float.
     data
         What `parse_json` returned.
     where
@@ -143,11 +155,31 @@ def _read_value(kind: Any, data: Any, where: str, error: type[BadInputError]) ->
         return _read_tuple(typing.get_args(kind), data, where, error)
     if kind is float:
         return _read_float(data, where, error)
+    if kind is Any:
+        return _read_any(data, where, error)
     if kind in _NAMES:
         if type(data) is not kind:
             raise error(f"{where} must be {_NAMES[kind]}, not {shown(data)}")
-    elif not isinstance(data, dict):
+        return data
+    if not isinstance(data, dict):
         raise error(f"{where} must be an object, not {shown(data)}")
+    item_kind = typing.get_args(kind)[1]
+    return {
+        key: _read_value(item_kind, value, f"{where}[{shown(key)}]", error)
+        for key, value in data.items()
+    }
+
+
+def _read_any(data: Any, where: str, error: type[BadInputError]) -> Any:
+    """Return any JSON value, or raise ``error`` for a number in it that is not finite."""
+    if isinstance(data, float):
+        return _read_float(data, where, error)
+    if isinstance(data, dict):
+        for key, value in data.items():
+            _read_any(value, f"{where}[{shown(key)}]", error)
+    elif isinstance(data, list):
+        for i, value in enumerate(data):
+            _read_any(value, f"{where}[{i}]", error)
     return data
 
 
