@@ -20,9 +20,12 @@ from physion.models.noisy_simulation import (
     log_likelihood,
     run_simulations,
 )
+from physion.numerics.elementary import exp_of
+from physion.numerics.random_normals import standard_normal
 from physion.physics.engine import simulate
 from physion.physics.trajectory import Contacts, State, Trajectory
 from physion.scenes.scene import Body, Camera, Cloth, Joint, Push, Roles, Scene
+from physion.seeds import child_generator, trial_seed
 
 FRAMES = 120
 
@@ -193,6 +196,31 @@ def test_noise_depends_on_seed_trial_and_sample_alone() -> None:
         len({tuple(state(*key)) for key in ((0, "a", 0), (1, "a", 0), (0, "b", 0), (0, "a", 1))})
         == 4
     )
+
+
+def test_noise_is_that_of_the_platform_independent_functions() -> None:
+    trial = scene()
+    question = cut_trial(trial, StraightEngine().simulate(trial))
+    config = NoisySimulationConfig(position=0.1, velocity=0.3, mass=0.2)
+    noisy, state = add_noise(question, config, 2.0, 7)
+    rng = child_generator(trial_seed(config.seed, trial.scenario, trial.name, 7), "noise")
+    shift, kick = standard_normal(rng, (3, 2)), standard_normal(rng, (3, 3))
+    mass = standard_normal(rng, 3)
+    moved = question.state.positions[:2, :2] + shift[:2] * 0.1 * 2.0
+    assert np.array_equal(state.positions[:2, :2], moved)
+    assert np.array_equal(state.velocities[:2], question.state.velocities[:2] + kick[:2] * 0.3 * 2)
+    factor = exp_of(float(mass[1]) * 0.2 * 2.0)
+    assert noisy.bodies[1].mass == trial.bodies[1].mass * factor
+
+
+def test_simulations_with_other_random_numbers_are_not_used(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    trial = scene(0.5)
+    task = model().task(cut_trial(trial, StraightEngine().simulate(trial)), 1.0)
+    before = task.digest()
+    monkeypatch.setattr("physion.models.noisy_simulation.NOISE_VERSION", 1)
+    assert task.digest() != before
 
 
 def test_tasks_are_told_apart_by_all_that_decides_them() -> None:

@@ -155,15 +155,16 @@ def test_simulations_are_stored_and_not_made_again(tmp_path: Path) -> None:
     shelf: Any = Shelf(4, 3)
     engines = [Flight(), Flight(), Flight()]
     (fold,) = plan_folds(shelf.index, Training.ALL, 5, 0)
-    found = []
+    found, stored = [], []
     for engine, config in zip(engines, (CONFIG, CONFIG, replace(CONFIG, seed=1)), strict=True):
         reader = SimulationReadout(shelf, NoisySimulation(config, engine), tmp_path)
         reader.prepare([fold])
         found.append(reader.predict(fold)[0].probability)
+        stored.append(sorted(tmp_path.rglob("*.json")))
     assert engines[0].calls > 0 and engines[1].calls == 0
     assert engines[2].calls == engines[0].calls
     assert (found[0] == found[1]).all()
-    next(tmp_path.rglob("*.json")).write_text('{"contacts": 3}')
+    stored[0][0].write_text('{"contacts": 3}')
     reader = SimulationReadout(shelf, NoisySimulation(CONFIG, engines[1]), tmp_path)
     reader.prepare([fold])
     assert engines[1].calls == 20

@@ -11,7 +11,8 @@ agent and patient touch. The model has no weights and needs no torch.
 - Noise of masses (bodies,): of the logarithm, so that 0.1 is about 10 %.
 - P(contact): in 0..1, a multiple of 1 / samples; 1 if the contact was already observed.
 
-All noise levels use the same normal random numbers, multiplied by the level.
+All noise levels use the same normal random numbers, multiplied by the level. Noise and fit of the
+scale compute with `physion.numerics`, so that predictions are the same on every machine.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -30,13 +32,18 @@ import physion
 from physion.errors import BadInputError
 from physion.models.interface import Provenance, Spec, make_config
 from physion.models.observed import cut_to_observed
-from physion.physics.engine import Engine, engines
+from physion.numerics.elementary import exp, log
+from physion.numerics.random_normals import standard_normal
+from physion.physics.engine import DEFAULT_ENGINE, Engine, make_engine, simulate_many
 from physion.physics.labels import label_contact
 from physion.physics.trajectory import State, Trajectory
 from physion.scenes.scene import OBSERVED_FRAMES, Scene
 from physion.seeds import child_generator, trial_seed
 
 LAST_OBSERVED = OBSERVED_FRAMES - 1
+
+NOISE_VERSION = 2
+"""Version of the random numbers; stored simulations of another version are not used."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +63,7 @@ class NoisySimulationConfig:
     scale: float = 1.0
     scales: tuple[float, ...] = (0.5, 1.0, 2.0)
     samples: int = 20
-    engine: str = "mujoco"
+    engine: str = DEFAULT_ENGINE
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -94,6 +101,7 @@ class SimulationTask:
         state = self.trial.state
         settings = dataclasses.asdict(replace(self.config, scale=self.scale, scales=(1.0,)))
         parts: list[Any] = [
+            NOISE_VERSION,
             self.trial.scene.physics_digest(),
             self.trial.scene.name,
             settings,
@@ -105,8 +113,7 @@ class SimulationTask:
         return sha.hexdigest()
 
     def _engine(self) -> Engine:
-        engine: Engine = self.built or engines.get(self.config.engine)()
-        return engine
+        return self.built or make_engine(self.config.engine)
 
 
 def cut_trial(scene: Scene, trajectory: Trajectory) -> ObservedTrial:
@@ -126,8 +133,11 @@ def run_simulations(task: SimulationTask) -> tuple[bool, ...]:
     """Return for each simulation of ``task`` whether agent and patient touch."""
     if task.trial.observed_contact:
         return (True,) * len(task.samples)
-    engine = task._engine()
-    return tuple(_touches(task, engine, sample) for sample in task.samples)
+    scenes, states = zip(*(_noisy_start(task, sample) for sample in task.samples), strict=True)
+    paths = simulate_many(scenes, engine=task._engine(), starts=states, until_contact=True)
+    return tuple(
+        label_contact(scene, path).contact for scene, path in zip(scenes, paths, strict=True)
+    )
 
 
 def add_noise(
@@ -142,9 +152,9 @@ def add_noise(
     count = len(scene.bodies)
     cloths = len(scene.cloths)
     shift = np.zeros((count + cloths, 3))
-    shift[:, :2] = rng.normal(size=(count + cloths, 2)) * config.position * scale
-    kick = rng.normal(size=(count + cloths, 3)) * config.velocity * scale
-    factors = np.exp(rng.normal(size=count) * config.mass * scale)
+    shift[:, :2] = standard_normal(rng, (count + cloths, 2)) * config.position * scale
+    kick = standard_normal(rng, (count + cloths, 3)) * config.velocity * scale
+    factors = exp(standard_normal(rng, count) * config.mass * scale)
     roots = _joint_roots(scene)
     still = np.array([b.kinematic or b.scenery for b in scene.bodies] + [False] * cloths)
     shift, kick, still = shift[roots], kick[roots], still[roots]
@@ -173,7 +183,8 @@ def log_likelihood(fractions: NDArray[Any], samples: int, outcomes: NDArray[Any]
     if len(fractions) == 0:
         return float("nan")
     p = (np.asarray(fractions, float) * samples + 0.5) / (samples + 1)
-    return float(np.mean(np.where(np.asarray(outcomes, bool), np.log(p), np.log1p(-p))))
+    # The exact sum: numpy's depends on the processor, and the fit compares sums.
+    return math.fsum(log(np.where(np.asarray(outcomes, bool), p, 1.0 - p))) / len(p)
 
 
 def fit_scale(
@@ -207,7 +218,7 @@ class NoisySimulation:
         self.config = config
         self.spec = Spec(modalities=("state",))
         self._built = engine
-        self._engine: Engine = engine if engine is not None else engines.get(config.engine)()
+        self._engine: Engine = engine or make_engine(config.engine)
 
     def predict_contact(self, scene: Scene, trajectory: Trajectory) -> float:
         """Return P(agent touches patient), from the observed frames of ``trajectory`` alone."""
@@ -237,7 +248,8 @@ def noisy_simulation(**options: Any) -> NoisySimulation:
     return NoisySimulation(make_config(NoisySimulationConfig, "noisy-simulation", options))
 
 
-def _touches(task: SimulationTask, engine: Engine, sample: int) -> bool:
+def _noisy_start(task: SimulationTask, sample: int) -> tuple[Scene, State]:
+    """Return scene and state of one simulation, whose ending counts from the state on."""
     scene, state = add_noise(task.trial, task.config, task.scale, sample)
     # The scene's limits of length count from its frame 0; the simulation starts later.
     ending = replace(
@@ -245,8 +257,7 @@ def _touches(task: SimulationTask, engine: Engine, sample: int) -> bool:
         min_frames=max(1, scene.ending.min_frames - state.frame),
         max_frames=max(2, scene.ending.max_frames - state.frame),
     )
-    scene = replace(scene, ending=ending)
-    return label_contact(scene, engine.simulate(scene, start=state, until_contact=True)).contact
+    return replace(scene, ending=ending), state
 
 
 def _joint_roots(scene: Scene) -> NDArray[np.int64]:
