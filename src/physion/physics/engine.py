@@ -1,9 +1,11 @@
-"""Interface of engines, their registry, and `simulate`, which runs the default one."""
+"""Interface of engines, their registry, and functions that run one of them."""
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
 
+from physion.errors import BadInputError
 from physion.physics.trajectory import State, Trajectory
 from physion.registry import Registry
 from physion.scenes.scene import Scene
@@ -33,10 +35,10 @@ class Engine(Protocol):
         Parameters
         ----------
         scene : Scene
-            Bodies, cloths, joints, pushes and ending.
+            Bodies, cloths, joints, pushes, events and ending.
         start : State, optional
-            Continue from this instant: it is frame 0 of the result, and pushes at later frames of
-            the trial still take place.
+            Continue from this instant: it is frame 0 of the result, and pushes and events at later
+            frames of the trial still take place.
         frames : int, optional
             Number of frames, frame 0 included, in place of the scene's own ending.
         until_contact : bool
@@ -46,7 +48,40 @@ class Engine(Protocol):
         ...
 
 
-engines: Registry[type] = Registry("engine", {"mujoco": "physion.physics.rigid.engine:RigidEngine"})
+@runtime_checkable
+class SimulatesMany(Protocol):
+    """Engine that can simulate several scenes in one call, which may be faster than one by one."""
+
+    def simulate_many(
+        self,
+        scenes: Sequence[Scene],
+        *,
+        starts: Sequence[State] | None = None,
+        frames: int | None = None,
+        until_contact: bool = False,
+    ) -> list[Trajectory]:
+        """Return for each scene what `Engine.simulate` gives, to the byte.
+
+        See `physion.physics.engine.simulate_many` for the parameters.
+        """
+        ...
+
+
+DEFAULT_ENGINE = "physion"
+engines: Registry[type] = Registry(
+    "engine",
+    {
+        "mujoco": "physion.physics.mujoco.engine:MujocoEngine",
+        "physion": "physion.physics.rigid.engine:RigidEngine",
+    },
+)
+"""Engines by name: ours, after the official simulator, and MuJoCo's solver for rigid scenes."""
+
+
+def make_engine(name: str = DEFAULT_ENGINE) -> Engine:
+    """Return the engine called ``name`` with its default settings."""
+    engine: Engine = engines.get(name)()
+    return engine
 
 
 def simulate(
@@ -57,11 +92,48 @@ def simulate(
     frames: int | None = None,
     until_contact: bool = False,
 ) -> Trajectory:
-    """Simulate a scene with ``engine``, by default `RigidEngine` with its default settings.
+    """Simulate a scene with ``engine``, by default the one called `DEFAULT_ENGINE`.
 
     See `Engine.simulate` for the other parameters.
     """
-    chosen = engine if engine is not None else engines.get("mujoco")()
-    return chosen.simulate(  # type: ignore[no-any-return]
-        scene, start=start, frames=frames, until_contact=until_contact
-    )
+    chosen = engine if engine is not None else make_engine()
+    return chosen.simulate(scene, start=start, frames=frames, until_contact=until_contact)
+
+
+def simulate_many(
+    scenes: Sequence[Scene],
+    *,
+    engine: Engine | None = None,
+    starts: Sequence[State] | None = None,
+    frames: int | None = None,
+    until_contact: bool = False,
+) -> list[Trajectory]:
+    """Simulate several scenes, in one call where the engine has one (`SimulatesMany`).
+
+    Parameters
+    ----------
+    scenes
+        For instance one scene with different noise; any scenes will do.
+    engine
+        By default the one called `DEFAULT_ENGINE`.
+    starts
+        The instant of each scene from which to continue; by default all start at rest.
+    frames, until_contact
+        As in `Engine.simulate`, for all scenes.
+    """
+    if starts is not None and len(starts) != len(scenes):
+        raise BadInputError(f"{len(scenes)} scenes need as many starts, not {len(starts)}")
+    chosen = engine if engine is not None else make_engine()
+    if isinstance(chosen, SimulatesMany):
+        return chosen.simulate_many(
+            scenes, starts=starts, frames=frames, until_contact=until_contact
+        )
+    return [
+        chosen.simulate(
+            scene,
+            start=None if starts is None else starts[index],
+            frames=frames,
+            until_contact=until_contact,
+        )
+        for index, scene in enumerate(scenes)
+    ]

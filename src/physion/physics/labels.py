@@ -51,8 +51,9 @@ def contact_frames(scene: Scene, trajectory: Trajectory) -> Ints:
         frames = np.flatnonzero(gaps < CLOTH_CONTACT_GAP).astype(np.int32)
     if not scene.events:
         return frames
-    both = [scene.present(frame)[agent] and scene.present(frame)[patient] for frame in frames]
-    return frames[np.asarray(both, bool)]
+    present = [scene.present(frame) for frame in frames.tolist()]
+    both = np.array([there[agent] and there[patient] for there in present], np.bool_)
+    return np.asarray(frames[both])
 
 
 def label_contact(scene: Scene, trajectory: Trajectory) -> Labels:

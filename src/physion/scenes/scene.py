@@ -117,18 +117,17 @@ class Push:
 
 @dataclass(frozen=True, slots=True)
 class BodyEvent:
-    """Body that appears, vanishes or moves, just before the step that follows ``frame``.
+    """Body that appears, vanishes or moves, just before the step that leads to ``frame``.
 
     Events come before the pushes of the same frame, in the order of `Scene.events`.
 
-    - ``kind``: ``appear``: the body is absent in all frames before and stands at rest at its pose
-      in this frame; ``vanish``: it is absent in all later frames; ``move``: it is put at a pose, at
-      rest, which shows from the next frame on.
-    - ``position`` (metres, of the pivot), ``rotation``: the new pose; None keeps the present one.
-      A body that appears has the pose of `Body` unless the event gives another.
+    - ``kind``: ``appear``: the body is absent before ``frame``; ``vanish``: it is absent from
+      ``frame`` on; ``move``: it is put at a pose. It starts from its pose at rest.
+    - ``position`` (metres, of the pivot), ``rotation``: the new pose; None keeps the present one,
+      which is that of `Body` for a body that appears first.
 
-    An absent body touches nothing, is not drawn and stays at rest: before it appears at the pose at
-    which it will, after it vanished at its last one. Joints hold between bodies that are there.
+    An absent body touches nothing, is not drawn and rests at its pose: before it appears at that of
+    `Body`, after it vanished at its last one. Joints hold between bodies that are there.
     """
 
     frame: int
@@ -248,10 +247,10 @@ class Scene:
                 raise BadSceneError(f"{where}: there is no such body; its bodies: {shown(bodies)}")
             if event.kind not in EVENT_KINDS:
                 raise BadSceneError(f"{where}: kinds are {', '.join(EVENT_KINDS)}")
-            if event.frame < max(before, 0 if event.kind == "move" else 1):
+            if event.frame < max(before, 1):
                 raise BadSceneError(
-                    f"{where} at frame {event.frame}: events are sorted by frame, "
-                    "and bodies appear and vanish at frame 1 or later"
+                    f"{where} at frame {event.frame}: events are sorted by frame, the first of "
+                    "which is 1; what holds from frame 0 on belongs to the body"
                 )
             if (event.kind == "appear") != (event.body in absent):
                 there = "is absent" if event.body in absent else "is already there"
@@ -265,24 +264,16 @@ class Scene:
         kinds = (e.kind for e in self.events if e.body == name and e.kind != "move")
         return next(kinds, "vanish") != "appear"
 
-    def active(self, frame: int) -> tuple[bool, ...]:
-        """Return which bodies and cloths take part in the step that follows ``frame``.
+    def present(self, frame: int) -> tuple[bool, ...]:
+        """Return which bodies and cloths are there in ``frame``, in the order of `names`.
 
-        In the order of `names`. Events at ``frame`` itself have taken place.
+        The same ones take part in the step that leads to it.
         """
         last = {e.body: e.kind for e in self.events if e.kind != "move" and e.frame <= frame}
         return tuple(
             last[name] == "appear" if name in last else self._starts_present(name)
             for name in self.names()
         )
-
-    def present(self, frame: int) -> tuple[bool, ...]:
-        """Return which bodies and cloths are there in ``frame``, in the order of `names`.
-
-        These are the ones that took part in the step before it or take part in the step after it.
-        """
-        before = self.active(max(frame - 1, 0))
-        return tuple(a or b for a, b in zip(before, self.active(frame), strict=True))
 
     def names(self) -> list[str]:
         """Return the names of all bodies, then of all cloths: the order of every per-body array."""

@@ -22,7 +22,7 @@ from typing import Any
 from physion.compute.executor import Executor, TaskOutcome
 from physion.compute.progress import Progress, tracked
 from physion.errors import BadInputError, BadSceneError, PhysionError
-from physion.physics.engine import simulate
+from physion.physics.engine import simulate, simulate_many
 from physion.physics.jitter import jitter_scene
 from physion.physics.labels import label_contact
 from physion.physics.trajectory import Trajectory
@@ -177,12 +177,12 @@ def judge(
 
 def robustness(scene: Scene, contact: bool, seed: Any, runs: int) -> float:
     """Return the fraction of ``runs`` simulations with noise `JITTER` that end as ``contact``."""
-    agree = 0
-    for run in range(runs):
-        moved = jitter_scene(scene, JITTER, child_generator(seed, f"robustness {run}"))
-        again = label_contact(moved, simulate(moved, until_contact=True))
-        agree += again.contact == contact
-    return agree / runs
+    moved = [
+        jitter_scene(scene, JITTER, child_generator(seed, f"robustness {run}"))
+        for run in range(runs)
+    ]
+    again = zip(moved, simulate_many(moved, until_contact=True), strict=True)
+    return sum(label_contact(*one).contact == contact for one in again) / runs
 
 
 def short(digest: str) -> int:

@@ -18,7 +18,7 @@ from physion.compute.executor import Executor, TaskOutcome
 from physion.compute.progress import Progress
 from physion.compute.run_tasks import FATAL_ERRNOS, RunReport, run_tasks
 from physion.errors import BadInputError, PhysionError
-from physion.physics.engine import engines
+from physion.physics.engine import make_engine
 from physion.scenes.sampling.preset import get_preset
 from physion.scenes.sampling.registry import as_record
 from physion.seeds import stable_hash
@@ -189,7 +189,7 @@ def _fix_settings(
     from physion.trials.making.make import RENDERER
 
     path = folder / SETTINGS
-    made_by = {"engine": engines.get("mujoco")().name, "renderer": RENDERER}
+    made_by = {"engine": make_engine().name, "renderer": RENDERER}
     plain = {"dataset": dataset, "settings": dataclasses.asdict(settings), "made_by": made_by}
     wanted = json.loads(json.dumps(plain))
     presets = _presets_in_use(tasks)

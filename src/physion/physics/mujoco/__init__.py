@@ -1,0 +1,1 @@
+"""The second engine: rigid bodies by MuJoCo's own solver."""
