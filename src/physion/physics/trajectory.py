@@ -74,7 +74,8 @@ class State:
 class Trajectory:
     """Motion of a scene: F frames, N rigid bodies, V cloth vertices.
 
-    - ``positions`` (F, N, 3): metres, of each body's pivot. Frame 0 is the initial state.
+    - ``positions`` (F, N, 3): metres, of each body's pivot. Frame 0 follows the first step, as in
+      the official recordings, or is the state from which a simulation was continued.
     - ``rotations`` (F, N, 4): unit quaternions (w, x, y, z).
     - ``velocities`` (F, N, 3): metres per second, of the centre of mass.
     - ``angular_velocities`` (F, N, 3): radians per second, world axes.

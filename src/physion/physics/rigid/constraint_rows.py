@@ -8,7 +8,9 @@ from __future__ import annotations
 import numpy as np
 
 from physion.numerics.kernel import kernel
-from physion.physics.rigid.patches import to_world
+from physion.physics.rigid.collision.manifold import Manifolds
+from physion.physics.rigid.collision.search import ContactList
+from physion.physics.rigid.friction_anchors import to_world
 from physion.physics.rigid.solver_records import (
     ANGULAR_A,
     ANGULAR_B,
@@ -16,76 +18,77 @@ from physion.physics.rigid.solver_records import (
     DIRECTION,
     EFFECTIVE_MASS,
     F64,
-    I64,
-    ROW_WIDTH,
-    SEPARATION,
+    MAX_PARTITIONS,
     SPIN_A,
     SPIN_B,
     TARGET,
+    Bodies,
     Constraints,
-    ContactSet,
-    Patches,
-    SolverBodies,
     SolverOptions,
 )
 
-MIN_SQUARED_SLIP = 0.1
+MIN_SQUARED_SLIP = 1e-4
 """Squared speed (m/s)^2 of sliding above which the first tangent follows it; below, the direction
 would be noise (constant ``p1`` of PhysX's ``setupFinalizeSolverConstraints4``)."""
 ORTHOGONAL_COSINE = 0.70710678
 """cos 45 degrees (PhysX's ``orthoThreshold``): a normal farther than that from the x axis is
 crossed with x to get a tangent, any other with z, so that the product is never short."""
-MAX_PARTITIONS = 64
-"""Partitions of the solving order that pairs of moving bodies are spread over."""
 
 
 @kernel
 def fill_row(
-    row: F64, a: int, b: int, arm_a: F64, arm_b: F64, d: F64, bodies: SolverBodies
+    rows: F64, r: int, a: int, b: int, point_a: F64, point_b: F64, d: F64, bodies: Bodies
 ) -> float:
-    """Write direction and angular columns of a row; return J M^-1 J^T, 1 / effective mass.
+    """Write direction and angular columns of row ``r``; return J M^-1 J^T, 1 / effective mass.
 
     J M^-1 J^T = 1/m_a + 1/m_b + (r_a x d) . I_a^-1 (r_a x d) + (r_b x d) . I_b^-1 (r_b x d),
-    with ``arm_a``, ``arm_b`` (3,) the lever arms r in metres and ``d`` (3,) the direction.
+    with r = point - x the lever arms in metres, from ``point_a``, ``point_b`` (3,) in world axes,
+    and ``d`` (3,) the direction.
     """
-    inv_inertia = bodies.inv_inertia
+    inv_inertia, x = bodies.free_inertia, bodies.x
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
-        row[DIRECTION + i] = d[i]
-        row[ANGULAR_A + i] = arm_a[j] * d[k] - arm_a[k] * d[j]
-        row[ANGULAR_B + i] = arm_b[j] * d[k] - arm_b[k] * d[j]
-    inverse_mass = bodies.inv_mass[a] + bodies.inv_mass[b]
+        rows[r, DIRECTION + i] = d[i]
+        rows[r, ANGULAR_A + i] = (point_a[j] - x[a, j]) * d[k] - (point_a[k] - x[a, k]) * d[j]
+        rows[r, ANGULAR_B + i] = (point_b[j] - x[b, j]) * d[k] - (point_b[k] - x[b, k]) * d[j]
+    inverse_mass = bodies.free_mass[a] + bodies.free_mass[b]
     for i in range(3):
         spin_a = 0.0
         spin_b = 0.0
         for j in range(3):
-            spin_a += inv_inertia[a, i, j] * row[ANGULAR_A + j]
-            spin_b += inv_inertia[b, i, j] * row[ANGULAR_B + j]
-        row[SPIN_A + i] = spin_a
-        row[SPIN_B + i] = spin_b
+            spin_a += inv_inertia[a, i, j] * rows[r, ANGULAR_A + j]
+            spin_b += inv_inertia[b, i, j] * rows[r, ANGULAR_B + j]
+        rows[r, SPIN_A + i] = spin_a
+        rows[r, SPIN_B + i] = spin_b
     for i in range(3):
-        inverse_mass += row[ANGULAR_A + i] * row[SPIN_A + i] + row[ANGULAR_B + i] * row[SPIN_B + i]
+        inverse_mass += rows[r, ANGULAR_A + i] * rows[r, SPIN_A + i]
+        inverse_mass += rows[r, ANGULAR_B + i] * rows[r, SPIN_B + i]
     return float(inverse_mass)
 
 
 @kernel
-def relative_speed(row: F64, a: int, b: int, v: F64, w: F64) -> float:
-    """Return J v of a row in m/s: positive where the bodies part."""
-    speed = 0.0
-    for i in range(3):
-        speed += row[DIRECTION + i] * (v[b, i] - v[a, i])
-        speed += row[ANGULAR_B + i] * w[b, i] - row[ANGULAR_A + i] * w[a, i]
-    return speed
+def relative_speed(rows: F64, r: int, a: int, b: int, v: F64, w: F64) -> float:
+    """Return J v of row ``r`` in m/s: positive where the bodies part."""
+    return float(
+        rows[r, 0] * (v[b, 0] - v[a, 0])
+        + rows[r, 1] * (v[b, 1] - v[a, 1])
+        + rows[r, 2] * (v[b, 2] - v[a, 2])
+        + (rows[r, 6] * w[b, 0] + rows[r, 7] * w[b, 1] + rows[r, 8] * w[b, 2])
+        - (rows[r, 3] * w[a, 0] + rows[r, 4] * w[a, 1] + rows[r, 5] * w[a, 2])
+    )
 
 
 @kernel
-def apply_impulse(row: F64, a: int, b: int, impulse: float, v: F64, w: F64, inv_mass: F64) -> None:
-    """Add M^-1 J^T ``impulse`` (N s) to the velocities of a row's bodies."""
+def apply_impulse(
+    rows: F64, r: int, a: int, b: int, impulse: float, v: F64, w: F64, inv_mass: F64
+) -> None:
+    """Add M^-1 J^T ``impulse`` (N s) to the velocities of the bodies of row ``r``."""
+    of_a, of_b = impulse * inv_mass[a], impulse * inv_mass[b]
     for i in range(3):
-        v[a, i] -= row[DIRECTION + i] * impulse * inv_mass[a]
-        v[b, i] += row[DIRECTION + i] * impulse * inv_mass[b]
-        w[a, i] -= row[SPIN_A + i] * impulse
-        w[b, i] += row[SPIN_B + i] * impulse
+        v[a, i] -= rows[r, DIRECTION + i] * of_a
+        v[b, i] += rows[r, DIRECTION + i] * of_b
+        w[a, i] -= rows[r, SPIN_A + i] * impulse
+        w[b, i] += rows[r, SPIN_B + i] * impulse
 
 
 @kernel
@@ -111,7 +114,7 @@ def first_tangent(normal: F64, relative: F64, out: F64) -> None:
         out[i] *= scale
 
 
-# Phase 3a: normal rows.
+# Phase 2a: normal rows.
 #
 # Non-penetration asks for J v + b >= 0 with b = BIAS - TARGET. With separation s and restitution e:
 #     BIAS   = max(-max_depenetration_speed, bias * s / dt)   where the contact does not bounce:
@@ -123,45 +126,40 @@ def first_tangent(normal: F64, relative: F64, out: F64) -> None:
 
 
 @kernel
-def normal_rows(contacts: ContactSet, bodies: SolverBodies, options: SolverOptions) -> F64:
-    """Return the rows (C, ROW_WIDTH) of non-penetration, one for each contact.
+def set_normal_rows(
+    contacts: ContactList, pairs: int, bodies: Bodies, options: SolverOptions, rows: Constraints
+) -> None:
+    """Fill the rows of non-penetration, one for each contact; impulses start from 0.
 
-    Parameters
-    ----------
-    contacts, bodies
-        Contacts in world axes; velocities are those before any impulse of this step.
-    options
-        ``dt``, ``bias``, ``max_depenetration_speed`` and ``bounce_threshold`` are used.
+    Velocities of ``bodies`` are those before any impulse of this step. ``dt``, ``bias``,
+    ``max_depenetration_speed`` and ``bounce_threshold`` of ``options`` are used.
     """
-    x, v, w = bodies.x, bodies.v, bodies.w
-    total = len(contacts.key)
-    rows = np.zeros((total, ROW_WIDTH))
-    for c in range(total):
-        a, b = contacts.bodies[c, 0], contacts.bodies[c, 1]
-        arm_a = contacts.point[c] - x[a]
-        arm_b = contacts.point[c] - x[b]
-        row = rows[c]
-        inverse_mass = fill_row(row, a, b, arm_a, arm_b, contacts.normal[c], bodies)
-        row[EFFECTIVE_MASS] = 1.0 / inverse_mass if inverse_mass > 0 else 0.0
-        separation = contacts.separation[c]
-        row[SEPARATION] = separation
-        speed = relative_speed(row, a, b, v, w)
-        restitution = contacts.material[c, 2]
-        bounces = (
-            restitution > 0
-            and speed < -options.bounce_threshold
-            and -speed > separation / options.dt
-        )
-        if bounces:
-            row[TARGET] = -restitution * speed
-        else:
-            row[BIAS] = max(
-                -options.max_depenetration_speed, separation * options.bias / options.dt
+    v, w = bodies.v, bodies.w
+    normal = rows.normal
+    for p in range(pairs):
+        a, b = contacts.actors[p, 0], contacts.actors[p, 1]
+        restitution = contacts.material[p, 2]
+        for c in range(contacts.first[p], contacts.first[p + 1]):
+            point = contacts.point[c]
+            inverse_mass = fill_row(normal, c, a, b, point, point, contacts.normal[p], bodies)
+            normal[c, EFFECTIVE_MASS] = 1.0 / inverse_mass if inverse_mass > 0 else 0.0
+            gap = contacts.gap[c]
+            normal[c, BIAS] = 0.0
+            normal[c, TARGET] = 0.0
+            speed = relative_speed(normal, c, a, b, v, w)
+            bounces = (
+                restitution > 0 and speed < -options.bounce_threshold and -speed > gap / options.dt
             )
-    return rows
+            if bounces:
+                normal[c, TARGET] = -restitution * speed
+            else:
+                normal[c, BIAS] = max(
+                    -options.max_depenetration_speed, gap * options.bias / options.dt
+                )
+            rows.normal_impulse[c] = 0.0
 
 
-# Phase 3b: friction rows.
+# Phase 2b: friction rows.
 #
 # Each anchor is a point p_a of body a and p_b of body b that should coincide. Along two tangents t1
 # and t2 = n x t1, friction asks for J v + BIAS = 0 with BIAS = (p_b - p_a) . t / dt, which also
@@ -171,42 +169,50 @@ def normal_rows(contacts: ContactSet, bodies: SolverBodies, options: SolverOptio
 
 
 @kernel
-def friction_rows(patches: Patches, bodies: SolverBodies, options: SolverOptions) -> F64:
-    """Return the rows (P, 2, 2, ROW_WIDTH) of friction: [patch, anchor, tangent, column].
+def set_friction_rows(
+    contacts: ContactList,
+    pairs: int,
+    manifolds: Manifolds,
+    bodies: Bodies,
+    options: SolverOptions,
+    rows: Constraints,
+) -> None:
+    """Fill the friction rows of all anchors; impulses start from 0.
 
-    Rows of anchors that a patch does not have are 0. ``dt`` and ``friction_gain`` of ``options``
-    are used.
+    ``dt`` and ``friction_gain`` of ``options`` are used.
     """
-    x, rot, v = bodies.x, bodies.rot, bodies.v
-    total = len(patches.anchor_count)
-    rows = np.zeros((total, 2, 2, ROW_WIDTH))
-    tangents = np.zeros((2, 3))
-    pa, pb = np.zeros(3), np.zeros(3)
-    for p in range(total):
-        a, b = patches.bodies[p, 0], patches.bodies[p, 1]
-        n = patches.normal[p]
-        first_tangent(n, v[b] - v[a], tangents[0])
+    v, friction, tangents = bodies.v, rows.friction, rows.tangents
+    pa, pb = rows.arm[0], rows.arm[1]
+    relative = np.zeros(3)
+    for p in range(pairs):
+        s = contacts.manifold[p]
+        a, b = contacts.actors[p, 0], contacts.actors[p, 1]
+        n = contacts.normal[p]
+        for i in range(3):
+            relative[i] = v[b, i] - v[a, i]
+        first_tangent(n, relative, tangents[0])
         for i in range(3):
             j, k = (i + 1) % 3, (i + 2) % 3
             tangents[1, i] = n[j] * tangents[0, k] - n[k] * tangents[0, j]
-        for k in range(patches.anchor_count[p]):
-            to_world(rot[a], x[a], patches.anchor[p, 0, k], pa)
-            to_world(rot[b], x[b], patches.anchor[p, 1, k], pb)
+        rows.slipped[p] = False
+        for k in range(manifolds.anchor_count[s]):
+            to_world(bodies, a, manifolds.anchor[s, 0, k], pa)
+            to_world(bodies, b, manifolds.anchor[s, 1, k], pb)
             for t in range(2):
-                row = rows[p, k, t]
+                r = 4 * p + 2 * k + t
                 d = tangents[t]
-                inverse_mass = fill_row(row, a, b, pa - x[a], pb - x[b], d, bodies)
-                row[EFFECTIVE_MASS] = (
+                inverse_mass = fill_row(friction, r, a, b, pa, pb, d, bodies)
+                friction[r, EFFECTIVE_MASS] = (
                     options.friction_gain / inverse_mass if inverse_mass > 0 else 0.0
                 )
                 slip = 0.0
                 for i in range(3):
                     slip += (pb[i] - pa[i]) * d[i]
-                row[BIAS] = slip / options.dt
-    return rows
+                friction[r, BIAS] = slip / options.dt
+                rows.friction_impulse[r] = 0.0
 
 
-# Phase 3c: order.
+# Phase 2c: order.
 #
 # Gauss-Seidel depends on the order of rows. Pairs of moving bodies are spread over partitions in
 # which no body comes twice; a pair with the world gets a partition after all others of its moving
@@ -214,80 +220,44 @@ def friction_rows(patches: Patches, bodies: SolverBodies, options: SolverOptions
 # PhysX: `partitionContactConstraints`. Deviations: a partition is a position in the order, not a
 # batch for threads; and at most MAX_PARTITIONS are told apart. All pairs of a body beyond that many
 # share the last partition without a warning. The sweep is sequential, so the result stays valid:
-# only the order within that partition is then the order of the keys.
+# only the order within that partition is then the order of the pairs.
 
 
 @kernel
-def solving_order(key: I64, bodies: I64, world: int) -> I64:
-    """Return the order (P,) in which patches are solved: what rests on the world comes last.
+def set_order(contacts: ContactList, pairs: int, world: int, rows: Constraints) -> None:
+    """Fill ``rows.order`` with the order of solving: what rests on the world comes last.
 
-    Parameters
-    ----------
-    key : (P,)
-        Pair of geoms of every patch, sorted; patches of one pair get one partition.
-    bodies : (P, 2)
-        Rows of `Bodies`.
-    world : int
-        The row that stands for what does not move.
+    ``world`` is the row of `Bodies` that stands for what does not move.
     """
-    patches = len(key)
-    partition = np.zeros(patches, np.int64)
-    taken = np.zeros((world + 1, MAX_PARTITIONS), np.bool_)
-    free = np.zeros(world + 1, np.int64)
-    p = 0
-    while p < patches:
-        q = p
-        while q < patches and key[q] == key[p]:
-            q += 1
-        a, b = bodies[p, 0], bodies[p, 1]
-        if a != world and b != world:
-            r = 0
-            while r < MAX_PARTITIONS - 1 and (taken[a, r] or taken[b, r]):
-                r += 1
-            taken[a, r] = True
-            taken[b, r] = True
-            free[a] = max(free[a], r + 1)
-            free[b] = max(free[b], r + 1)
-            partition[p:q] = r
-        p = q
-    p = 0
-    while p < patches:
-        q = p
-        while q < patches and key[q] == key[p]:
-            q += 1
-        a, b = bodies[p, 0], bodies[p, 1]
+    partition, taken, free = rows.partition, rows.taken, rows.free
+    for a in range(world + 1):
+        free[a] = 0
+        for r in range(MAX_PARTITIONS):
+            taken[a, r] = False
+    most = 0
+    for p in range(pairs):
+        a, b = contacts.actors[p, 0], contacts.actors[p, 1]
+        if a == world or b == world:
+            continue
+        r = 0
+        while r < MAX_PARTITIONS - 1 and (taken[a, r] or taken[b, r]):
+            r += 1
+        taken[a, r] = True
+        taken[b, r] = True
+        free[a] = max(free[a], r + 1)
+        free[b] = max(free[b], r + 1)
+        partition[p] = r
+        most = max(most, r)
+    for p in range(pairs):
+        a, b = contacts.actors[p, 0], contacts.actors[p, 1]
         if a == world or b == world:
             moving = b if a == world else a
-            partition[p:q] = free[moving]
+            partition[p] = free[moving]
+            most = max(most, free[moving])
             free[moving] += 1
-        p = q
-    return np.argsort(partition, kind="mergesort")
-
-
-@kernel
-def build_constraints(
-    contacts: ContactSet,
-    patches: Patches,
-    patch_of: I64,
-    bodies: SolverBodies,
-    options: SolverOptions,
-) -> Constraints:
-    """Return all rows of a step with accumulated impulses of 0 (no warm start, as in PhysX).
-
-    ``patch_of`` (C,) is the patch of every contact; every patch has one at least.
-    """
-    total = len(patches.first)
-    start = np.zeros(total + 1, np.int64)
-    for c in range(len(patch_of)):
-        start[patch_of[c] + 1] += 1
-    return Constraints(
-        solving_order(contacts.key[patches.first], patches.bodies, len(bodies.inv_mass) - 1),
-        np.cumsum(start),
-        np.argsort(patch_of, kind="mergesort"),
-        contacts.material[patches.first],
-        normal_rows(contacts, bodies, options),
-        friction_rows(patches, bodies, options),
-        np.zeros(len(patch_of)),
-        np.zeros((total, 2, 2)),
-        np.zeros(total, np.bool_),
-    )
+    used = 0
+    for r in range(most + 1):
+        for p in range(pairs):
+            if partition[p] == r:
+                rows.order[used] = p
+                used += 1

@@ -7,12 +7,15 @@ rolls and slides unlike a smooth ball, so ours are hulls as well.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
-from physion.physics.rigid.manifold import hull_faces
+from physion.numerics.elementary import arctan2
+from physion.numerics.kernel import kernel
+from physion.numerics.linear_algebra import dot, ordered_mean, unit
 from physion.scenes.scene import Vec3
 from physion.scenes.shapes.primitives import ConvexPiece, ball_mesh, shape
 
@@ -22,26 +25,47 @@ I64 = NDArray[np.int64]
 BALL_SEGMENTS = 16
 """Meridians of a ball's hull, with half as many bands. With 24, balls roll on for longer than in
 the recorded trials; with 12 they stop too soon. (PhysX allows 255 corners.)"""
+SAME_FACE_COSINE = 1 - 1e-7
+SAME_FACE_OFFSET = 1e-5
+"""Triangles of a hull are one face where their normals agree by this cosine, and their offsets to
+this fraction of the hull's size: what rounding leaves of a plane."""
+ACROSS = 1e-7
+"""A plane whose normal has no larger component along a direction does not cut it."""
+CACHED_HULLS = 512
+"""Scaled shapes whose hulls are kept in memory."""
 
 
 @dataclass(frozen=True, eq=False)
 class Hull:
-    """Convex hull: ``corners`` (K, 3) in metres, and for each face its corner numbers in order."""
+    """Convex hull in the frame of its body.
+
+    - ``corners`` (K, 3): metres. ``center`` (3,): their mean.
+    - ``faces``: for each face its corner numbers, counterclockwise from outside.
+    - ``inner_box`` (3,): half extents in metres of a box round ``center`` inside the hull.
+    """
 
     corners: F64
+    center: F64
     faces: tuple[I64, ...]
+    inner_box: F64
 
 
-def collision_hulls(name: str, scale: Vec3) -> list[Hull]:
+@lru_cache(maxsize=CACHED_HULLS)
+def collision_hulls(name: str, scale: Vec3) -> tuple[Hull, ...]:
     """Return the hulls of all convex pieces of the shape ``name``, scaled, in the body's frame."""
-    return [Hull(hull.corners * np.asarray(scale), hull.faces) for hull in _unit_hulls(name)]
+    hulls = []
+    for corners, faces in _unit_hulls(name):
+        scaled = corners * np.asarray(scale)
+        center = ordered_mean(scaled, axis=0)
+        hulls.append(Hull(scaled, center, faces, inner_box(scaled, faces, center)))
+    return tuple(hulls)
 
 
 @cache
-def _unit_hulls(name: str) -> tuple[Hull, ...]:
-    """Return the hulls of a shape at unit scale."""
+def _unit_hulls(name: str) -> tuple[tuple[F64, tuple[I64, ...]], ...]:
+    """Return corners and faces of the hulls of a shape at unit scale."""
     corners = [_corners(piece) for piece in shape(name).pieces]
-    return tuple(Hull(points, tuple(hull_faces(points))) for points in corners)
+    return tuple((points, tuple(hull_faces(points))) for points in corners)
 
 
 def _corners(piece: ConvexPiece) -> F64:
@@ -51,3 +75,106 @@ def _corners(piece: ConvexPiece) -> F64:
     if piece.kind == "sphere":
         return ball_mesh(piece.half[0], BALL_SEGMENTS).moved(offset=piece.center).vertices
     return piece.mesh.vertices
+
+
+def hull_faces(corners: F64) -> list[I64]:
+    """Return the corner numbers of every flat face of a convex hull, in order round the face.
+
+    ``corners`` (K, 3) are points in metres, all of them on the hull.
+    """
+    hull = ConvexHull(corners)
+    size = float(np.ptp(corners, axis=0).max())
+    normals, offsets = hull.equations[:, :3], hull.equations[:, 3]
+    face_of = np.full(len(normals), -1)
+    faces: list[I64] = []
+    for t in range(len(normals)):
+        if face_of[t] >= 0:
+            continue
+        same = (dot(normals, normals[t]) > SAME_FACE_COSINE) & (
+            np.abs(offsets - offsets[t]) < SAME_FACE_OFFSET * size
+        )
+        # Triangles of one plane are one face.
+        same &= face_of < 0
+        face_of[same] = len(faces)
+        used = np.unique(hull.simplices[same])
+        points = corners[used] - ordered_mean(corners[used], axis=0)
+        normal = normals[t]
+        first = unit(points[0] - normal * dot(points[0], normal))
+        second = np.cross(normal, first)
+        angle = arctan2(dot(points, second), dot(points, first))
+        faces.append(used[np.argsort(angle, kind="stable")].astype(np.int64))
+    return faces
+
+
+@kernel
+def face_planes(vertices: F64, loops: I64, first_loop: I64) -> F64:
+    """Return the planes (F, 4) of faces: outward unit normal n, and d in n . p = d.
+
+    ``loops`` (L,) are rows of ``vertices`` (V, 3), those of face f from ``first_loop[f]`` on,
+    counterclockwise from outside. The normal is the sum of the cross products of a fan of triangles
+    from the face's first corner.
+    """
+    planes = np.zeros((len(first_loop) - 1, 4))
+    for f in range(len(planes)):
+        start, stop = first_loop[f], first_loop[f + 1]
+        a = loops[start]
+        x = y = z = 0.0
+        for k in range(start + 1, stop - 1):
+            b, c = loops[k], loops[k + 1]
+            ux, uy, uz = (
+                vertices[b, 0] - vertices[a, 0],
+                vertices[b, 1] - vertices[a, 1],
+                vertices[b, 2] - vertices[a, 2],
+            )
+            wx, wy, wz = (
+                vertices[c, 0] - vertices[a, 0],
+                vertices[c, 1] - vertices[a, 1],
+                vertices[c, 2] - vertices[a, 2],
+            )
+            x += uy * wz - uz * wy
+            y += uz * wx - ux * wz
+            z += ux * wy - uy * wx
+        length = np.sqrt(x * x + y * y + z * z)
+        x, y, z = x / length, y / length, z / length
+        planes[f, 0], planes[f, 1], planes[f, 2] = x, y, z
+        planes[f, 3] = x * vertices[a, 0] + y * vertices[a, 1] + z * vertices[a, 2]
+    return planes
+
+
+def inner_box(corners: F64, faces: tuple[I64, ...], center: F64) -> F64:
+    """Return half extents (3,) in metres of a box round ``center`` inside a hull.
+
+    With r the radius of the ball round the centre that fits in, the box starts as the cube in that
+    ball, half a side r / sqrt 3; it is lengthened along the hull's longest axis until it meets a
+    face, then widened alike along the other two. As PhysX 4 does when it cooks a mesh
+    (``ComputeInternalExtent``): a manifold's tolerances depend on it.
+    """
+    loops = np.concatenate(faces)
+    planes = face_planes(corners, loops, np.cumsum([0, *(len(face) for face in faces)]))
+    normals = planes[:, :3]
+    distance = planes[:, 3] - dot(normals, center)
+    least = float(np.abs(distance).min()) / np.sqrt(3.0)
+    size = np.ptp(corners, axis=0)
+    longest = int(np.argmax(size))
+    i, j = (longest + 1) % 3, (longest + 2) % 3
+    if size[i] < size[j]:
+        i, j = j, i
+    half = np.full(3, least)
+    cuts = np.abs(normals[:, longest]) > ACROSS
+    reach = np.inf
+    for sign_i in (-1.0, 1.0):
+        for sign_j in (-1.0, 1.0):
+            side = least * (sign_i * normals[cuts, i] + sign_j * normals[cuts, j])
+            lengths = np.abs((distance[cuts] - side) / normals[cuts, longest])
+            reach = min(reach, float(np.maximum(lengths, least).min()))
+    half[longest] = reach
+    width = np.inf
+    for sign in (-1.0, 1.0):
+        along = normals[:, i] + sign * normals[:, j]
+        cuts = np.abs(along) > ACROSS
+        for end in (-1.0, 1.0):
+            left = distance[cuts] - end * half[longest] * normals[cuts, longest]
+            lengths = np.abs(left / along[cuts])
+            width = min(width, float(np.maximum(lengths, least).min()))
+    half[i] = half[j] = width
+    return half

@@ -8,6 +8,7 @@ the drawn solid.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,7 +16,6 @@ from scipy.spatial import ConvexHull
 
 from physion.numerics.linear_algebra import (
     apply,
-    determinant,
     dot,
     multiply,
     ordered_mean,
@@ -23,8 +23,9 @@ from physion.numerics.linear_algebra import (
     outer,
 )
 from physion.numerics.rotations import rotation_matrices
-from physion.physics.rigid.hulls import collision_hulls
-from physion.scenes.scene import Body
+from physion.physics.rigid.hulls import CACHED_HULLS, collision_hulls
+from physion.scenes.scene import Body, Vec3
+from physion.scenes.shapes.meshes import solid_moments
 
 F64 = NDArray[np.float64]
 
@@ -67,8 +68,13 @@ def merge_masses(parts: list[MassProperties]) -> MassProperties:
 
 def body_mass(body: Body) -> MassProperties:
     """Return the mass properties of a body in its own frame, scaled; its pose is not applied."""
-    hulls = collision_hulls(body.shape, body.scale)
-    return hull_mass([hull.corners for hull in hulls], body.mass)
+    return _body_mass(body.shape, body.scale, body.mass)
+
+
+@lru_cache(maxsize=CACHED_HULLS)
+def _body_mass(name: str, scale: Vec3, mass: float) -> MassProperties:
+    """Return the mass properties of a shape at a scale."""
+    return hull_mass([hull.corners for hull in collision_hulls(name, scale)], mass)
 
 
 def hull_mass(hulls: list[F64], mass: float) -> MassProperties:
@@ -88,20 +94,16 @@ def hull_mass(hulls: list[F64], mass: float) -> MassProperties:
 def _solid(corners: F64) -> MassProperties:
     """Return the mass properties of a convex hull of density 1, with corners (K, 3).
 
-    Sums over the tetrahedra from a point inside to every triangle of the surface.
+    With M = integral of x x^T about the centre of mass, the inertia is tr(M) 1 - M.
     """
     inside = ordered_mean(corners, axis=0)
-    hull = ConvexHull(corners)
-    triangles = corners[hull.simplices] - inside
-    # The volume of a tetrahedron does not depend on the winding once its sign is dropped, and all
-    # are positive because the apex lies inside.
-    volumes = np.abs(determinant(triangles)) / 6.0
-    volume = ordered_sum(volumes)
-    sums = ordered_sum(triangles, axis=1)
-    center = ordered_sum(volumes[:, None] * sums / 4.0, axis=0) / volume
-    # Second moments of a tetrahedron with one corner at the origin.
-    second = ordered_sum(outer(triangles, triangles), axis=1) + outer(sums, sums)
-    moments = ordered_sum(volumes[:, None, None] * second, axis=0) / 20.0
-    moments -= volume * outer(center, center)
+    triangles = corners[ConvexHull(corners).simplices] - inside
+    # Seen from inside, all triangles turn the same way once those with a negative volume are
+    # reversed.
+    reverse = dot(triangles[:, 0], np.cross(triangles[:, 1], triangles[:, 2])) < 0.0
+    triangles[reverse] = triangles[reverse][:, ::-1]
+    volume, first, second = solid_moments(triangles)
+    center = first / volume
+    moments = second - volume * outer(center, center)
     inertia = ordered_sum(np.diagonal(moments)) * np.eye(3) - moments
-    return MassProperties(float(volume), inside + center, inertia)
+    return MassProperties(volume, inside + center, inertia)

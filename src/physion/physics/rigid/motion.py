@@ -19,7 +19,7 @@ MIN_SPIN = 1e-12
 def move_freely(
     v: F64,
     w: F64,
-    awake: Flags,
+    asleep: Flags,
     drag: F64,
     gravity: float,
     max_angular_velocity: float,
@@ -30,9 +30,9 @@ def move_freely(
     Parameters
     ----------
     v, w : (B + 1, 3)
-        Velocities in m/s and rad/s, world axes; changed, but for the last row.
-    awake : (B,)
-        Where gravity acts.
+        Velocities in m/s and rad/s, world axes; changed, but for the last row and sleepers.
+    asleep : (B,)
+        Bodies that are not simulated.
     drag : (B, 2)
         Linear and angular drag c, d per second.
     gravity, max_angular_velocity, dt : float
@@ -42,9 +42,10 @@ def move_freely(
     -----
     v <- (v - g dt z) max(1 - c dt, 0), w <- w max(1 - d dt, 0), then w <- w min(1, cap / |w|).
     """
-    for i in range(len(awake)):
-        if awake[i]:
-            v[i, 2] -= gravity * dt
+    for i in range(len(asleep)):
+        if asleep[i]:
+            continue
+        v[i, 2] -= gravity * dt
         keep_v, keep_w = max(1.0 - drag[i, 0] * dt, 0.0), max(1.0 - drag[i, 1] * dt, 0.0)
         for j in range(3):
             v[i, j] *= keep_v
@@ -56,7 +57,7 @@ def move_freely(
 
 
 @kernel
-def move_poses(x: F64, q: F64, v: F64, w: F64, dt: float) -> None:
+def move_poses(x: F64, q: F64, v: F64, w: F64, asleep: Flags, dt: float) -> None:
     """Move centres of mass ``x`` and orientations ``q`` by constant velocities over ``dt`` seconds.
 
     Parameters
@@ -65,6 +66,8 @@ def move_poses(x: F64, q: F64, v: F64, w: F64, dt: float) -> None:
         Changed, but for the last row, which stands for the world.
     v, w : (B + 1, 3)
         Velocities in m/s and rad/s, world axes.
+    asleep : (B,)
+        Bodies that do not move.
     dt : float
         Seconds.
 
@@ -73,6 +76,8 @@ def move_poses(x: F64, q: F64, v: F64, w: F64, dt: float) -> None:
     x <- x + v dt; q <- (cos(|w| dt / 2), sin(|w| dt / 2) w / |w|) q, then q <- q / |q|.
     """
     for i in range(len(x) - 1):
+        if asleep[i]:
+            continue
         for j in range(3):
             x[i, j] += v[i, j] * dt
         speed = np.sqrt(w[i, 0] ** 2 + w[i, 1] ** 2 + w[i, 2] ** 2)
@@ -86,4 +91,22 @@ def move_poses(x: F64, q: F64, v: F64, w: F64, dt: float) -> None:
         q[i, 1] = c * qx + dx * qw + dy * qz - dz * qy
         q[i, 2] = c * qy - dx * qz + dy * qw + dz * qx
         q[i, 3] = c * qz + dx * qy - dy * qx + dz * qw
-        q[i] /= np.sqrt(q[i, 0] ** 2 + q[i, 1] ** 2 + q[i, 2] ** 2 + q[i, 3] ** 2)
+        length = np.sqrt(q[i, 0] ** 2 + q[i, 1] ** 2 + q[i, 2] ** 2 + q[i, 3] ** 2)
+        for j in range(4):
+            q[i, j] /= length
+
+
+@kernel
+def fill_rotations(q: F64, rot: F64, start: int, stop: int) -> None:
+    """Fill rows ``start`` to ``stop`` of ``rot`` (B, 3, 3) with the matrices of ``q`` (B, 4)."""
+    for i in range(start, stop):
+        w, x, y, z = q[i, 0], q[i, 1], q[i, 2], q[i, 3]
+        rot[i, 0, 0] = 1 - 2 * (y * y + z * z)
+        rot[i, 0, 1] = 2 * (x * y - w * z)
+        rot[i, 0, 2] = 2 * (x * z + w * y)
+        rot[i, 1, 0] = 2 * (x * y + w * z)
+        rot[i, 1, 1] = 1 - 2 * (x * x + z * z)
+        rot[i, 1, 2] = 2 * (y * z - w * x)
+        rot[i, 2, 0] = 2 * (x * z - w * y)
+        rot[i, 2, 1] = 2 * (y * z + w * x)
+        rot[i, 2, 2] = 1 - 2 * (x * x + y * y)

@@ -24,7 +24,8 @@ class RigidSettings:
     - ``position_iterations``: Gauss-Seidel sweeps with penetration bias (official: 32).
     - ``velocity_iterations``: sweeps without bias, after the poses have moved (Unity: 1).
     - ``friction_sweeps``: number of the last position sweeps that solve friction; 0 means all
-      (Unity: all).
+      (PhysX: 3).
+    - ``persistent_manifolds``: contact points are kept from step to step (Unity 2019).
     - ``friction_doubling``: each of a patch's two anchors may bear the whole friction force, so
       that flat contacts have twice the friction of Coulomb's law. The official simulator behaves
       so (Unity's "improved patch friction" is off); with False the anchors divide the force.
@@ -47,7 +48,8 @@ class RigidSettings:
     gravity: float = GRAVITY
     position_iterations: int = 32
     velocity_iterations: int = 1
-    friction_sweeps: int = 0
+    friction_sweeps: int = 3
+    persistent_manifolds: bool = True
     friction_doubling: bool = True
     contact_offset: float = 0.01
     bias: float = 0.8

@@ -12,8 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.numerics.kernel import kernel
-from physion.numerics.linear_algebra import inverse
-from physion.numerics.rotations import rotate_vector
 from physion.physics.rigid.solver_records import Bodies
 
 F64 = NDArray[np.float64]
@@ -33,12 +31,27 @@ class SleepState(NamedTuple):
     - ``sum_v``, ``sum_w`` (A, 3): velocities in m/s (world axes) and angular velocities in rad/s
       (body axes), summed over the steps of the counter's last part.
     - ``asleep`` (A,): actors that are not simulated.
+    - ``island`` (A,): from `find_islands`. ``touching`` (A, A + 1): work space.
     """
 
     counter: F64
     sum_v: F64
     sum_w: F64
     asleep: Flags
+    island: I64
+    touching: Flags
+
+
+def all_awake(actors: int, wake_time: float) -> SleepState:
+    """Return the state of ``actors`` that have just been put into the scene."""
+    return SleepState(
+        np.full(actors, wake_time),
+        np.zeros((actors, 3)),
+        np.zeros((actors, 3)),
+        np.zeros(actors, np.bool_),
+        np.zeros(actors, np.int64),
+        np.zeros((actors, actors + 1), np.bool_),
+    )
 
 
 class SleepOptions(NamedTuple):
@@ -50,29 +63,32 @@ class SleepOptions(NamedTuple):
 
 
 @kernel
-def find_islands(pairs: I64, actors: int) -> I64:
-    """Return (A,) for every actor the lowest actor that it touches, directly or through others.
+def find_islands(pairs: I64, count: int, island: I64) -> None:
+    """Fill ``island`` (A,) with the lowest actor that each actor touches, also through others.
 
-    ``pairs`` (C, 2) are the actors of the contacts of a step; numbers from ``actors`` on stand for
-    what does not move, and join nothing.
+    The first ``count`` rows of ``pairs`` (S, 2) are the actors that touch; numbers from A on stand
+    for what does not move, and join nothing.
     """
-    island = np.arange(actors)
-    for c in range(len(pairs)):
+    actors = len(island)
+    for i in range(actors):
+        island[i] = i
+    for c in range(count):
         a, b = pairs[c, 0], pairs[c, 1]
         if a < actors and b < actors and island[a] != island[b]:
             low, high = min(island[a], island[b]), max(island[a], island[b])
             for i in range(actors):
                 if island[i] == high:
                     island[i] = low
-    return island
 
 
 @kernel
-def wake_touched(island: I64, state: SleepState, wake_time: float) -> None:
-    """Wake every sleeping actor whose ``island`` (A,) holds an actor that is awake.
+def wake_touched(state: SleepState, wake_time: float) -> bool:
+    """Wake every sleeping actor whose island holds an actor that is awake; return whether any was.
 
     Its counter is set to ``wake_time`` seconds.
     """
+    island = state.island
+    woken = False
     for i in range(len(island)):
         if state.asleep[i]:
             continue
@@ -80,6 +96,8 @@ def wake_touched(island: I64, state: SleepState, wake_time: float) -> None:
             if state.asleep[j] and island[j] == island[i]:
                 state.asleep[j] = False
                 state.counter[j] = wake_time
+                woken = True
+    return woken
 
 
 # The wake counter runs down from wake_time. In its last half, velocities are summed up, so that a
@@ -94,30 +112,37 @@ def wake_touched(island: I64, state: SleepState, wake_time: float) -> None:
 
 @kernel
 def update_sleep(
-    pairs: I64, island: I64, bodies: Bodies, state: SleepState, options: SleepOptions
+    pairs: I64,
+    count: int,
+    bodies: Bodies,
+    move_v: F64,
+    move_w: F64,
+    state: SleepState,
+    options: SleepOptions,
 ) -> None:
     """Advance the wake counters of all actors by a step, and let islands at rest fall asleep.
 
     Parameters
     ----------
-    pairs : (C, 2)
-        Actors of the contacts of the step; A stands for what does not move.
-    island : (A,)
-        From `find_islands`.
+    pairs, count
+        As in `find_islands`, whose result is in ``state.island``.
     bodies : Bodies
-        With the velocities that moved the poses, and the masses of bodies that are awake.
+        Orientations and masses.
+    move_v, move_w : (A + 1, 3)
+        Velocities that moved the poses.
     state : SleepState
         Is changed.
     options : SleepOptions
         Threshold, wake time, length of a step.
     """
     counter, sum_v, sum_w, asleep = state.counter, state.sum_v, state.sum_w, state.asleep
-    v, w, q = bodies.v, bodies.w, bodies.q
     threshold, wake_time, dt = options.threshold, options.wake_time, options.dt
     actors = len(counter)
-    touching = np.zeros((actors, actors + 1), np.bool_)
-    opposite = np.zeros(4)
-    for c in range(len(pairs)):
+    touching, island, rot, inertia = state.touching, state.island, bodies.rot, bodies.inertia
+    for i in range(actors):
+        for j in range(actors + 1):
+            touching[i, j] = False
+    for c in range(count):
         a, b = pairs[c, 0], pairs[c, 1]
         if a < actors:
             touching[a, b] = True
@@ -129,26 +154,24 @@ def update_sleep(
         if counter[i] < COUNTING_FRACTION * wake_time or counter[i] < dt:
             energy = 0.0
             for j in range(3):
-                sum_v[i, j] += v[i, j]
+                sum_v[i, j] += move_v[i, j]
                 energy += sum_v[i, j] ** 2
-            opposite[:] = -q[i]
-            opposite[0] = q[i, 0]
-            local = rotate_vector(opposite, w[i])
             for j in range(3):
-                sum_w[i, j] += local[j]
-            inertia = inverse(bodies.inv_inertia[i])
+                for k in range(3):
+                    sum_w[i, j] += rot[i, k, j] * move_w[i, k]
             spin = 0.0
             for j in range(3):
                 for k in range(3):
-                    spin += sum_w[i, j] * inertia[j, k] * sum_w[i, k]
+                    spin += sum_w[i, j] * inertia[i, j, k] * sum_w[i, k]
             energy += bodies.inv_mass[i] * spin
             neighbours = 0
             for j in range(actors + 1):
                 neighbours += touching[i, j]
             limit = (1.0 + neighbours) * threshold
             if 0.5 * energy >= limit:
-                sum_v[i] = 0.0
-                sum_w[i] = 0.0
+                for j in range(3):
+                    sum_v[i, j] = 0.0
+                    sum_w[i, j] = 0.0
                 factor = min(0.5 * energy / limit, MAX_RESET) if limit > 0 else MAX_RESET
                 counter[i] = factor * COUNTING_FRACTION * wake_time + dt * neighbours
                 continue
@@ -165,5 +188,8 @@ def update_sleep(
         for j in range(actors):
             if island[j] == i and not asleep[j]:
                 asleep[j] = True
-                sum_v[j] = 0.0
-                sum_w[j] = 0.0
+                for k in range(3):
+                    sum_v[j, k] = 0.0
+                    sum_w[j, k] = 0.0
+                    bodies.v[j, k] = 0.0
+                    bodies.w[j, k] = 0.0

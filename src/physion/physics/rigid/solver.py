@@ -1,9 +1,8 @@
 """Contact solver: projected Gauss-Seidel on impulses with friction patches, after PhysX 4.
 
-MuJoCo finds the contacts; this module turns them into changes of velocity. The scheme is that of
-PhysX 4, the engine of Unity 2019, with patch friction. Its published source (``lowleveldynamics``)
-says what it does; everything here is written anew, and functions of that source are named where a
-phase follows them.
+This module turns contacts into changes of velocity. The scheme is that of PhysX 4, the engine of
+Unity 2019, with patch friction. Its published source (``lowleveldynamics``) says what it does;
+everything here is written anew, and functions of that source are named where a phase follows them.
 
 A constraint row with Jacobian J acts on the velocities of a pair of bodies a and b. Along a
 direction d, at a point with lever arms r_a and r_b,
@@ -11,80 +10,86 @@ direction d, at a point with lever arms r_a and r_b,
     J v = d . (v_b - v_a) + (r_b x d) . w_b - (r_a x d) . w_a        (relative speed, m/s)
     m   = 1 / (J M^-1 J^T)                                           (effective mass, kg)
 
-and an impulse lambda (N s) changes the velocities by M^-1 J^T lambda. A step has five phases:
+and an impulse lambda (N s) changes the velocities by M^-1 J^T lambda. A step has four phases:
 
-1. `find_patches`: contacts of a pair of geoms with one normal form a patch; patches keep the
-   friction anchors of the step before.
-2. `grow_anchors`: a patch gets up to two friction anchors, points held by friction.
-3. `normal_rows`, `friction_rows`: one row for each contact, two for each anchor.
-4. `sweep`: accumulated impulses are improved row after row, a fixed number of times.
-5. `remember_anchors`: anchors that did not slip are kept for the next step, so that resting bodies
+1. `keep_anchors`, `grow_anchors`: each pair of hulls in contact gets up to two friction anchors,
+   points held by friction; those of the step before are kept where they fit.
+2. `set_normal_rows`, `set_friction_rows`, `set_order`: one row for each contact, two for each
+   anchor, and the order of the pairs.
+3. `sweep`: accumulated impulses are improved row after row, a fixed number of times.
+4. `remember_anchors`: anchors that did not slip are kept for the next step, so that resting bodies
    do not creep.
 
-Bodies are numbered 0..B-1; row B stands for everything that does not move (infinite mass). The
+Actors are numbered 0..A-1; row A stands for everything that does not move (infinite mass). The
 order of all operations is fixed, so equal input gives equal bytes.
+
+References
+----------
+NVIDIA PhysX 4.1, ``lowleveldynamics``: ``createFinalizeSolverContacts``, ``solveContact``.
+E. Catto, Iterative Dynamics with Temporal Coherence, Game Developers Conference, 2005.
 """
 
 from __future__ import annotations
 
-import numpy as np
-
 from physion.numerics.kernel import kernel
-from physion.numerics.rotations import rotation_matrix
-from physion.physics.rigid.constraint_rows import apply_impulse, build_constraints, relative_speed
-from physion.physics.rigid.patches import (
-    drop_patches_without_contact,
-    find_patches,
-    grow_anchors,
-    remember_anchors,
+from physion.physics.rigid.collision.manifold import Manifolds
+from physion.physics.rigid.collision.search import ContactList
+from physion.physics.rigid.constraint_rows import (
+    apply_impulse,
+    relative_speed,
+    set_friction_rows,
+    set_normal_rows,
+    set_order,
 )
+from physion.physics.rigid.friction_anchors import grow_anchors, keep_anchors
 from physion.physics.rigid.solver_records import (
     BIAS,
     EFFECTIVE_MASS,
-    F64,
     TARGET,
-    AnchorMemory,
     Bodies,
     Constraints,
-    ContactSet,
-    Patches,
-    SolverBodies,
     SolverOptions,
-    StepResult,
 )
 
 
 @kernel
-def _to_world_axes(rot: F64, local: F64, out: F64) -> None:
-    """Fill ``out`` (3, 3) with R L R^T: a matrix of the body's frame in world axes."""
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = 0.0
-            for k in range(3):
-                along = rot[i, 0] * local[0, k] + rot[i, 1] * local[1, k] + rot[i, 2] * local[2, k]
-                out[i, j] += along * rot[j, k]
+def build_constraints(
+    contacts: ContactList,
+    pairs: int,
+    manifolds: Manifolds,
+    bodies: Bodies,
+    options: SolverOptions,
+    rows: Constraints,
+) -> None:
+    """Fill all rows of a step with accumulated impulses of 0 (no warm start, as in PhysX)."""
+    for p in range(pairs):
+        keep_anchors(contacts, p, manifolds, bodies, options)
+        grow_anchors(contacts, p, manifolds, bodies, options)
+    set_normal_rows(contacts, pairs, bodies, options, rows)
+    set_friction_rows(contacts, pairs, manifolds, bodies, options, rows)
+    set_order(contacts, pairs, len(bodies.x) - 1, rows)
 
 
-# Phase 4: sweeps.
-#
-# Projected Gauss-Seidel on the accumulated impulses: patch after patch, first every contact,
+# Projected Gauss-Seidel on the accumulated impulses: pair after pair, first every contact,
 #     lambda_n <- max(0, lambda_n - (J v + b) / (J M^-1 J^T)),         b = BIAS - TARGET,
-# then every tangent of every anchor; N is the sum of lambda_n over the patch, g = friction_gain:
+# then every tangent of every anchor; N is the sum of lambda_n over the pair, g = friction_gain:
 #     lambda_t <- lambda_t - g (J v + BIAS) / (J M^-1 J^T),
-#     and, where |lambda_t| > mu_s N, lambda_t <- clip(lambda_t, -mu_d N, mu_d N): the patch slips.
+#     and, where |lambda_t| > mu_s N, lambda_t <- clip(lambda_t, -mu_d N, mu_d N): the pair slips.
 # Velocities follow every change at once. Sweeps over positions use BIAS as it is; those over
 # velocities, after the poses have moved, use max(BIAS, 0) and no friction bias: a gap may still be
 # closed, but no speed is left that only corrected an overlap or a slip.
 # PhysX: `solveContact`, and `solveContactConcludeBlock` for the end of the position sweeps. As
-# there, N is that of the whole patch for each anchor, so that two anchors bear twice Coulomb's
+# there, N is that of the whole pair for each anchor, so that two anchors bear twice Coulomb's
 # force (divide_friction gives each its part), and the limits hold for each tangent apart.
 
 
 @kernel
 def sweep(
-    constraints: Constraints,
-    patches: Patches,
-    bodies: SolverBodies,
+    rows: Constraints,
+    contacts: ContactList,
+    pairs: int,
+    manifolds: Manifolds,
+    bodies: Bodies,
     with_friction: bool,
     with_bias: bool,
     divide_friction: bool,
@@ -93,9 +98,9 @@ def sweep(
 
     Parameters
     ----------
-    constraints, patches, bodies
-        ``normal_impulse``, ``friction_impulse`` and ``slipped`` of ``constraints`` and ``v``, ``w``
-        of ``bodies`` are changed.
+    rows, contacts, pairs, manifolds, bodies
+        ``normal_impulse``, ``friction_impulse`` and ``slipped`` of ``rows`` and ``v``, ``w`` of
+        ``bodies`` are changed.
     with_friction : bool
         Solve the friction rows too.
     with_bias : bool
@@ -103,95 +108,76 @@ def sweep(
     divide_friction : bool
         See `SolverOptions`.
     """
-    v, w, inv_mass = bodies.v, bodies.w, bodies.inv_mass
-    start, contact, material = constraints.start, constraints.contact, constraints.material
-    normal, friction = constraints.normal, constraints.friction
-    normal_impulse = constraints.normal_impulse
-    friction_impulse = constraints.friction_impulse
-    count, pair, slipped = patches.anchor_count, patches.bodies, constraints.slipped
-    for p in constraints.order:
-        a, b = pair[p, 0], pair[p, 1]
+    v, w, inv_mass = bodies.v, bodies.w, bodies.free_mass
+    normal, friction = rows.normal, rows.friction
+    normal_impulse, friction_impulse = rows.normal_impulse, rows.friction_impulse
+    for index in range(pairs):
+        p = rows.order[index]
+        a, b = contacts.actors[p, 0], contacts.actors[p, 1]
         patch_impulse = 0.0
-        for m in range(start[p], start[p + 1]):
-            c = contact[m]
-            row = normal[c]
-            bias = row[BIAS] if with_bias else max(row[BIAS], 0.0)
-            change = row[EFFECTIVE_MASS] * (row[TARGET] - bias - relative_speed(row, a, b, v, w))
+        for c in range(contacts.first[p], contacts.first[p + 1]):
+            bias = normal[c, BIAS] if with_bias else max(normal[c, BIAS], 0.0)
+            speed = relative_speed(normal, c, a, b, v, w)
+            change = normal[c, EFFECTIVE_MASS] * (normal[c, TARGET] - bias - speed)
             change = max(change, -normal_impulse[c])
             normal_impulse[c] += change
             patch_impulse += normal_impulse[c]
-            apply_impulse(row, a, b, change, v, w, inv_mass)
-        if not with_friction or count[p] == 0:
+            apply_impulse(normal, c, a, b, change, v, w, inv_mass)
+        if not with_friction:
             continue
-        fraction = 1.0 / count[p] if divide_friction else 1.0
-        static_limit = material[p, 0] * patch_impulse * fraction
-        dynamic_limit = material[p, 1] * patch_impulse * fraction
+        count = manifolds.anchor_count[contacts.manifold[p]]
+        if count == 0:
+            continue
+        fraction = 1.0 / count if divide_friction else 1.0
+        static_limit = contacts.material[p, 0] * patch_impulse * fraction
+        dynamic_limit = contacts.material[p, 1] * patch_impulse * fraction
         slips = False
-        for k in range(count[p]):
-            for t in range(2):
-                row = friction[p, k, t]
-                bias = row[BIAS] if with_bias else 0.0
-                impulse = friction_impulse[p, k, t] - row[EFFECTIVE_MASS] * (
-                    relative_speed(row, a, b, v, w) + bias
-                )
-                if abs(impulse) > static_limit:
-                    slips = True
-                    impulse = min(max(impulse, -dynamic_limit), dynamic_limit)
-                change = impulse - friction_impulse[p, k, t]
-                apply_impulse(row, a, b, change, v, w, inv_mass)
-                friction_impulse[p, k, t] = impulse
-        slipped[p] = slips
+        for r in range(4 * p, 4 * p + 2 * count):
+            bias = friction[r, BIAS] if with_bias else 0.0
+            speed = relative_speed(friction, r, a, b, v, w)
+            impulse = friction_impulse[r] - friction[r, EFFECTIVE_MASS] * (speed + bias)
+            if abs(impulse) > static_limit:
+                slips = True
+                impulse = min(max(impulse, -dynamic_limit), dynamic_limit)
+            apply_impulse(friction, r, a, b, impulse - friction_impulse[r], v, w, inv_mass)
+            friction_impulse[r] = impulse
+        rows.slipped[p] = slips
 
 
 @kernel
-def solve_step(
-    bodies: Bodies, contacts: ContactSet, anchors: AnchorMemory, options: SolverOptions
-) -> StepResult:
-    """Change the velocities of ``bodies`` by the contact impulses of one step.
-
-    Parameters
-    ----------
-    bodies : Bodies
-        ``v`` and ``w`` already hold gravity, drag and pushes of the step; they are changed.
-    contacts : ContactSet
-        Contacts at the present poses.
-    anchors : AnchorMemory
-        That of the last step, or `no_anchors`.
-    options : SolverOptions
-        Iterations, tolerances, step length.
-
-    Returns
-    -------
-    StepResult
-        Velocities that move the poses, normal impulses, anchors for the next step.
-
-    References
-    ----------
-    NVIDIA PhysX 4.1, ``lowleveldynamics``: ``createFinalizeSolverContacts``, ``solveContact``.
-    E. Catto, Iterative Dynamics with Temporal Coherence, Game Developers Conference, 2005.
-    """
-    total = len(bodies.inv_mass)
-    rot = np.zeros((total, 3, 3))
-    inv_inertia = np.zeros((total, 3, 3))
-    for i in range(total):
-        rot[i] = rotation_matrix(bodies.q[i])
-        _to_world_axes(rot[i], bodies.inv_inertia[i], inv_inertia[i])
-    v, w = bodies.v, bodies.w
-    in_world = SolverBodies(bodies.x, rot, v, w, bodies.inv_mass, inv_inertia)
-    candidates, patch_of = find_patches(contacts, anchors, in_world, options)
-    patches = drop_patches_without_contact(candidates, patch_of)
-    for p in range(len(patches.first)):
-        # Rows use the normal of this step's contacts, also where the anchors are older.
-        patches.normal[p] = contacts.normal[patches.first[p]]
-        grow_anchors(contacts, patch_of, patches, p, in_world, options)
-    constraints = build_constraints(contacts, patches, patch_of, in_world, options)
-    divide = options.divide_friction
+def correct_positions(
+    rows: Constraints,
+    contacts: ContactList,
+    pairs: int,
+    manifolds: Manifolds,
+    bodies: Bodies,
+    options: SolverOptions,
+) -> None:
+    """Run the sweeps whose velocities move the poses; friction acts in the last of them."""
     for i in range(options.position_iterations):
-        remaining = options.position_iterations - i
-        with_friction = options.friction_sweeps == 0 or remaining <= options.friction_sweeps
-        sweep(constraints, patches, in_world, with_friction, True, divide)
-    move_v, move_w = v.copy(), w.copy()
+        left = options.position_iterations - i
+        with_friction = options.friction_sweeps == 0 or left <= options.friction_sweeps
+        sweep(
+            rows,
+            contacts,
+            pairs,
+            manifolds,
+            bodies,
+            with_friction,
+            True,
+            options.divide_friction,
+        )
+
+
+@kernel
+def correct_velocities(
+    rows: Constraints,
+    contacts: ContactList,
+    pairs: int,
+    manifolds: Manifolds,
+    bodies: Bodies,
+    options: SolverOptions,
+) -> None:
+    """Run the sweeps after the poses have moved: no speed is left that only corrected a pose."""
     for _ in range(options.velocity_iterations):
-        sweep(constraints, patches, in_world, True, False, divide)
-    memory = remember_anchors(contacts.key[patches.first], patches, constraints.slipped, in_world)
-    return StepResult(move_v, move_w, constraints.normal_impulse, memory)
+        sweep(rows, contacts, pairs, manifolds, bodies, True, False, options.divide_friction)

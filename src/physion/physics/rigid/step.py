@@ -1,11 +1,36 @@
-"""One step of all rigid bodies, from the contacts at the present poses to the next poses."""
+"""Steps of all rigid bodies in compiled code: contacts, impulses, poses, sleep, record.
+
+`run_steps` moves a scene by many steps in one call. It neither allocates nor touches Python
+objects, so that several runs can go on in threads. One step is one frame:
+
+1. boxes of the bodies, candidates, pushes, manifolds (`physion.physics.rigid.collision.search`);
+2. islands of touching bodies; what an awake body touches is woken;
+3. gravity, drag, cap of the angular velocity (`physion.physics.rigid.motion`);
+4. contact impulses (`physion.physics.rigid.solver`), poses, velocities;
+5. the contacts are recorded, and bodies at rest fall asleep (`physion.physics.rigid.sleeping`).
+"""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from physion.numerics.kernel import kernel
-from physion.physics.rigid.motion import move_freely, move_poses
+from physion.physics.rigid.collision.hull_records import Hulls
+from physion.physics.rigid.collision.manifold import Manifolds, PairSpace
+from physion.physics.rigid.collision.search import (
+    FULL,
+    ContactList,
+    SearchScene,
+    SearchSpace,
+    find_candidates,
+    list_contacts,
+    update_boxes,
+    update_candidates,
+)
+from physion.physics.rigid.friction_anchors import remember_anchors
+from physion.physics.rigid.motion import fill_rotations, move_freely, move_poses
 from physion.physics.rigid.sleeping import (
     SleepOptions,
     SleepState,
@@ -13,83 +38,331 @@ from physion.physics.rigid.sleeping import (
     update_sleep,
     wake_touched,
 )
-from physion.physics.rigid.solver import solve_step
-from physion.physics.rigid.solver_records import (
-    F64,
-    AnchorMemory,
-    Bodies,
-    ContactSet,
-    SolverOptions,
-    StepResult,
-)
+from physion.physics.rigid.solver import build_constraints, correct_positions, correct_velocities
+from physion.physics.rigid.solver_records import F64, I64, Bodies, Constraints, SolverOptions
+
+DONE, NEEDS_PAIRS, NEEDS_ROWS = 0, 1, 2
+"""Results of `run_steps`: as many frames as asked, or no room for further pairs or records."""
+RECORD_WIDTH = 8
+"""Columns of a recorded contact: point (3), normal (3), impulse, gap."""
 
 
 class StepOptions(NamedTuple):
-    """Options of a step; ``gravity`` in m/s^2 downwards, ``max_angular_velocity`` in rad/s."""
+    """Options of a step.
+
+    ``gravity`` in m/s^2 downwards, ``max_angular_velocity`` in rad/s, ``reach`` in metres: distance
+    of surfaces below which points are contacts. ``floor``: its height in metres. ``persistent``:
+    manifolds are kept from step to step.
+    """
 
     solver: SolverOptions
     sleep: SleepOptions
     gravity: float
     max_angular_velocity: float
+    reach: float
+    floor: float
+    persistent: bool
+
+
+class EndRule(NamedTuple):
+    """When a run ends.
+
+    After ``most`` frames; or once all actors sleep and ``least`` frames are there, where actors
+    whose first body's pivot is below ``floor`` metres do not count. ``asked`` (2,): two bodies;
+    with ``until_touch`` the run also ends after the first frame in which they touch. ``pivot``
+    (A, 3): the pivot of each actor's first body in the actor's frame.
+    """
+
+    least: int
+    most: int
+    floor: float
+    until_touch: bool
+    asked: I64
+    pivot: F64
+
+
+class Pushes(NamedTuple):
+    """Q pushes in the order of their frames.
+
+    ``frame`` (Q,): the frame whose step starts with it. ``actor`` (Q,); A is none. ``impulse``
+    (Q, 3): J in N s. ``point`` (Q, 3): where it acts, metres, world; NaN: at the centre of mass.
+    """
+
+    frame: I64
+    actor: I64
+    impulse: F64
+    point: F64
+
+
+class Work(NamedTuple):
+    """Work space of a step: reused arrays without meaning between steps.
+
+    ``touching`` (S, 2): actors of touching pairs. ``move_v``, ``move_w`` (A + 1, 3): velocities
+    that move the poses.
+    """
+
+    pair: PairSpace
+    contacts: ContactList
+    rows: Constraints
+    touching: I64
+    move_v: F64
+    move_w: F64
+
+
+class History(NamedTuple):
+    """What a run has recorded.
+
+    - ``state`` (F, A + 1, 13): position, orientation, velocity, angular velocity of every actor.
+    - ``frame``, ``bodies`` (R,), (R, 2), ``contact`` (R, RECORD_WIDTH): touching contacts; the
+      floor is body N.
+    - ``counters`` (3,): frames, contacts, and 1 once the run has ended.
+    """
+
+    state: F64
+    frame: I64
+    bodies: I64
+    contact: F64
+    counters: I64
 
 
 @kernel
-def advance(
+def _push(bodies: Bodies, sleep: SleepState, pushes: Pushes, frame: int, wake_time: float) -> None:
+    """Apply the pushes of ``frame``: v += J / m, w += R I^-1 R^T (r x J); wake what is pushed."""
+    actors = len(sleep.asleep)
+    rot, inverse = bodies.rot, bodies.inv_inertia
+    torque, local = np.zeros(3), np.zeros(3)
+    for k in range(len(pushes.frame)):
+        a = pushes.actor[k]
+        if pushes.frame[k] != frame or a == actors:
+            continue
+        impulse, point = pushes.impulse[k], pushes.point[k]
+        for i in range(3):
+            bodies.v[a, i] += impulse[i] * bodies.inv_mass[a]
+        sleep.asleep[a] = False
+        sleep.counter[a] = wake_time
+        if np.isnan(point[0]):
+            continue
+        for i in range(3):
+            m, n = (i + 1) % 3, (i + 2) % 3
+            torque[i] = (point[m] - bodies.x[a, m]) * impulse[n] - (
+                point[n] - bodies.x[a, n]
+            ) * impulse[m]
+        for i in range(3):
+            local[i] = (
+                rot[a, 0, i] * torque[0] + rot[a, 1, i] * torque[1] + rot[a, 2, i] * torque[2]
+            )
+        for i in range(3):
+            spin = 0.0
+            for j in range(3):
+                along = 0.0
+                for m in range(3):
+                    along += inverse[a, j, m] * local[m]
+                spin += rot[a, i, j] * along
+            bodies.w[a, i] += spin
+
+
+@kernel
+def _list_touching(
+    scene: SearchScene,
+    manifolds: Manifolds,
+    space: SearchSpace,
+    candidates: int,
+    actors: int,
+    out: I64,
+) -> int:
+    """Fill ``out`` with the actors of touching pairs, sleeping ones too; return how many."""
+    count = 0
+    for c in range(candidates):
+        s = space.candidate[c]
+        if manifolds.touching[s] == 0:
+            continue
+        j = space.bodies[s, 1]
+        out[count, 0] = scene.actor[space.bodies[s, 0]]
+        out[count, 1] = scene.actor[j] if j < len(scene.actor) else actors
+        count += 1
+    return count
+
+
+@kernel
+def _free_masses(bodies: Bodies, sleep: SleepState) -> None:
+    """Fill inverse masses and inertias (world axes, R I^-1 R^T) of this step; sleepers get 0."""
+    rot, inverse, free = bodies.rot, bodies.inv_inertia, bodies.free_inertia
+    for a in range(len(sleep.asleep)):
+        if sleep.asleep[a]:
+            bodies.free_mass[a] = 0.0
+            for i in range(3):
+                for j in range(3):
+                    free[a, i, j] = 0.0
+            continue
+        bodies.free_mass[a] = bodies.inv_mass[a]
+        for i in range(3):
+            r0 = r1 = r2 = 0.0
+            for k in range(3):
+                r0 += rot[a, i, k] * inverse[a, k, 0]
+                r1 += rot[a, i, k] * inverse[a, k, 1]
+                r2 += rot[a, i, k] * inverse[a, k, 2]
+            for j in range(3):
+                free[a, i, j] = r0 * rot[a, j, 0] + r1 * rot[a, j, 1] + r2 * rot[a, j, 2]
+
+
+@kernel
+def _record(
+    contacts: ContactList, pairs: int, rows: Constraints, frame: int, asked: I64, history: History
+) -> bool:
+    """Record the contacts of a step that touch; return whether the asked bodies do.
+
+    A contact touches where it has an impulse, or no gap.
+    """
+    used = history.counters[1]
+    found = False
+    for p in range(pairs):
+        i, j = contacts.bodies[p, 0], contacts.bodies[p, 1]
+        for c in range(contacts.first[p], contacts.first[p + 1]):
+            if not (rows.normal_impulse[c] > 0.0 or contacts.gap[c] <= 0.0):
+                continue
+            history.frame[used] = frame
+            history.bodies[used, 0], history.bodies[used, 1] = i, j
+            for k in range(3):
+                history.contact[used, k] = contacts.point[c, k]
+                history.contact[used, 3 + k] = contacts.normal[p, k]
+            history.contact[used, 6] = rows.normal_impulse[c]
+            history.contact[used, 7] = contacts.gap[c]
+            used += 1
+            if (i == asked[0] and j == asked[1]) or (i == asked[1] and j == asked[0]):
+                found = True
+    history.counters[1] = used
+    return found
+
+
+@kernel
+def record_state(bodies: Bodies, history: History) -> None:
+    """Add the present state of all actors as the next frame."""
+    frame = history.counters[0]
+    for a in range(len(bodies.x)):
+        for i in range(3):
+            history.state[frame, a, i] = bodies.x[a, i]
+            history.state[frame, a, 7 + i] = bodies.v[a, i]
+            history.state[frame, a, 10 + i] = bodies.w[a, i]
+        for i in range(4):
+            history.state[frame, a, 3 + i] = bodies.q[a, i]
+    history.counters[0] = frame + 1
+
+
+@kernel
+def _at_rest(bodies: Bodies, sleep: SleepState, rule: EndRule) -> bool:
+    """Return whether every actor sleeps that has not fallen below the floor of the ending."""
+    for a in range(len(sleep.asleep)):
+        if sleep.asleep[a]:
+            continue
+        height = bodies.x[a, 2]
+        fill_rotations(bodies.q, bodies.rot, a, a + 1)
+        for j in range(3):
+            height += bodies.rot[a, 2, j] * rule.pivot[a, j]
+        if height >= rule.floor:
+            return False
+    return True
+
+
+@kernel
+def run_steps(
+    hulls: Hulls,
+    scene: SearchScene,
     bodies: Bodies,
-    contacts: ContactSet,
-    anchors: AnchorMemory,
     sleep: SleepState,
     drag: F64,
+    pushes: Pushes,
+    manifolds: Manifolds,
+    space: SearchSpace,
+    work: Work,
     options: StepOptions,
-) -> StepResult:
-    """Move ``bodies`` by one step; poses, velocities and ``sleep`` are changed.
-
-    In one compiled function, since each call from Python costs microseconds. The phases: wake what
-    awake bodies touch; gravity and drag; contact impulses; poses move with the velocities of the
-    position sweeps; bodies at rest fall asleep.
+    rule: EndRule,
+    first_frame: int,
+    stop: int,
+    history: History,
+) -> int:
+    """Move the scene until it ends, or until ``stop`` frames are recorded.
 
     Parameters
     ----------
-    bodies : Bodies
-        Actors, with the world as last row.
-    contacts : ContactSet
-        Contacts at the present poses.
-    anchors : AnchorMemory
-        That of the last step.
-    sleep : SleepState
-        Wake counters.
-    drag : (B, 2)
-        Linear and angular drag per second.
-    options : StepOptions
-        Tolerances, thresholds, gravity, length of a step.
+    hulls, scene, drag, pushes
+        What does not change; ``drag`` (A, 2) is linear and angular drag per second.
+    bodies, sleep, manifolds, space, history
+        State of the run; all are changed.
+    work : Work
+        Work space.
+    options, rule
+        Settings, and when the run ends.
+    first_frame : int
+        Number of the first recorded frame in the trial, for pushes.
+    stop : int
+        Frames; at most the room in ``history.state``.
 
     Returns
     -------
-    StepResult
-        Velocities that moved the poses, normal impulses, anchors for the next step.
+    int
+        `DONE`; or what has no room. Nothing of the step at hand has happened then: the call can be
+        repeated with more.
     """
-    dt, asleep = options.solver.dt, sleep.asleep
-    actors = len(asleep)
-    island = find_islands(contacts.bodies, actors)
-    wake_touched(island, sleep, options.sleep.wake_time)
-    move_freely(
-        bodies.v, bodies.w, ~asleep, drag, options.gravity, options.max_angular_velocity, dt
-    )
-    # Sleepers get infinite mass, so that they do not give way.
-    inv_mass, inv_inertia = bodies.inv_mass.copy(), bodies.inv_inertia.copy()
-    for i in range(actors):
-        if asleep[i]:
-            inv_mass[i] = 0.0
-            inv_inertia[i] = 0.0
-    solid = Bodies(bodies.x, bodies.q, bodies.v, bodies.w, inv_mass, inv_inertia)
-    result = solve_step(solid, contacts, anchors, options.solver)
-    move_poses(bodies.x, bodies.q, result.move_v, result.move_w, dt)
-    moved = Bodies(
-        bodies.x, bodies.q, result.move_v, result.move_w, bodies.inv_mass, bodies.inv_inertia
-    )
-    update_sleep(contacts.bodies, island, moved, sleep, options.sleep)
-    for i in range(actors):
-        if asleep[i]:
-            bodies.v[i] = 0.0
-            bodies.w[i] = 0.0
-    return result
+    actors = len(sleep.asleep)
+    dt = options.solver.dt
+    contacts, rows = work.contacts, work.rows
+    while history.counters[0] < stop and history.counters[2] == 0:
+        frames = history.counters[0]
+        if frames >= rule.most or (frames >= rule.least and _at_rest(bodies, sleep, rule)):
+            history.counters[2] = 1
+            break
+        now = first_frame + frames
+        idle = True
+        for a in range(actors):
+            idle = idle and sleep.asleep[a]
+        for k in range(len(pushes.frame)):
+            idle = idle and pushes.frame[k] != now
+        if idle:
+            record_state(bodies, history)
+            continue
+        fill_rotations(bodies.q, bodies.rot, 0, actors)
+        space.counters[1] += 1
+        update_boxes(
+            hulls, scene, bodies.x, bodies.rot, options.reach, space, space.counters[1] == 1
+        )
+        candidates = find_candidates(scene, manifolds, space, actors, options.floor, options.reach)
+        if candidates == FULL or history.counters[1] + 4 * candidates > len(history.frame):
+            space.counters[1] -= 1
+            return NEEDS_PAIRS if candidates == FULL else NEEDS_ROWS
+        _push(bodies, sleep, pushes, now, options.sleep.wake_time)
+        update_candidates(
+            hulls, scene, manifolds, space, candidates, bodies.x, bodies.q, bodies.rot,
+            sleep.asleep, options.reach, options.floor, options.persistent, work.pair, False,
+        )  # fmt: skip
+        touching = _list_touching(scene, manifolds, space, candidates, actors, work.touching)
+        find_islands(work.touching, touching, sleep.island)
+        if wake_touched(sleep, options.sleep.wake_time):
+            update_candidates(
+                hulls, scene, manifolds, space, candidates, bodies.x, bodies.q, bodies.rot,
+                sleep.asleep, options.reach, options.floor, options.persistent, work.pair, True,
+            )  # fmt: skip
+        pairs = list_contacts(
+            scene, manifolds, space, candidates, bodies.x, bodies.rot, options.reach, contacts
+        )
+        move_freely(
+            bodies.v, bodies.w, sleep.asleep, drag, options.gravity,
+            options.max_angular_velocity, dt,
+        )  # fmt: skip
+        _free_masses(bodies, sleep)
+        build_constraints(contacts, pairs, manifolds, bodies, options.solver, rows)
+        correct_positions(rows, contacts, pairs, manifolds, bodies, options.solver)
+        for a in range(actors):
+            for i in range(3):
+                work.move_v[a, i] = bodies.v[a, i]
+                work.move_w[a, i] = bodies.w[a, i]
+        correct_velocities(rows, contacts, pairs, manifolds, bodies, options.solver)
+        remember_anchors(contacts, pairs, rows.slipped, manifolds, bodies)
+        move_poses(bodies.x, bodies.q, work.move_v, work.move_w, sleep.asleep, dt)
+        touched = _record(contacts, pairs, rows, frames, rule.asked, history)
+        update_sleep(
+            work.touching, touching, bodies, work.move_v, work.move_w, sleep, options.sleep
+        )
+        record_state(bodies, history)
+        if touched and rule.until_touch:
+            history.counters[2] = 1
+    return DONE

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull
 
 from physion.numerics.elementary import cos, sin
-from physion.numerics.linear_algebra import apply, dot, ordered_sum
+from physion.numerics.linear_algebra import apply, dot, ordered_sum, outer
 
 Points = NDArray[np.float64]
 Faces = NDArray[np.int32]
@@ -130,14 +130,30 @@ def merge(meshes: Iterable[Mesh], smooth: float | None = None) -> Mesh:
     )
 
 
+def solid_moments(triangles: Points) -> tuple[float, Points, Points]:
+    """Return the integrals of 1, x (3,) and x x^T (3, 3) over the solid inside a closed surface.
+
+    ``triangles`` (F, 3, 3) are its faces in metres, counterclockwise from outside. The integrals
+    are exact sums over the tetrahedra from the origin to every face: with the corners a, b, c of a
+    face and the signed volume V = a . (b x c) / 6 these are V, V (a + b + c) / 4 and
+    V (a a^T + b b^T + c c^T + s s^T) / 20 with s = a + b + c.
+    """
+    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
+    volumes = dot(a, np.cross(b, c)) / 6.0
+    sums = a + b + c
+    squares = ordered_sum(outer(triangles, triangles), axis=1) + outer(sums, sums)
+    return (
+        float(ordered_sum(volumes)),
+        ordered_sum(volumes[:, None] * sums / 4.0, axis=0),
+        ordered_sum(volumes[:, None, None] * squares / 20.0, axis=0),
+    )
+
+
 def solid_properties(mesh: Mesh) -> tuple[float, Points]:
     """Return the volume and the centroid (3,) of the solid inside a closed mesh.
 
-    The integrals are exact sums over the tetrahedra from the origin to every face. The mass
-    properties of bodies are those of their collision pieces: see `physion.physics.rigid.mass`.
+    The mass properties of bodies are those of their collision pieces: see
+    `physion.physics.rigid.mass`.
     """
-    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
-    volumes = dot(a, np.cross(b, c)) / 6.0
-    volume = float(ordered_sum(volumes))
-    centroid = ordered_sum(volumes[:, None] * (a + b + c), axis=0) / (4.0 * volume)
-    return volume, centroid
+    volume, first, _ = solid_moments(mesh.vertices[mesh.faces])
+    return volume, first / volume

@@ -1,0 +1,1 @@
+"""Collision detection of convex hulls: closest points, penetration, persistent manifolds."""
