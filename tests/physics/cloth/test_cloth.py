@@ -6,16 +6,21 @@ import hashlib
 import subprocess
 import sys
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from physion.errors import BadInputError
+from physion.numerics.linear_algebra import unit
+from physion.numerics.rotations import rotate_vectors
+from physion.physics.cloth.contacts import smallest_distance
+from physion.physics.cloth.near_solids import BodyPoses, Neighbours, find_neighbours, world_bounds
 from physion.physics.cloth.sheet import sheet_springs, sheet_triangles, sheet_vertices
 from physion.physics.cloth.simulate import ClothMotion, ClothSettings, settle_solids, simulate_cloth
-from physion.physics.cloth.solids import fill_shape, particles_of, surface_particles
-from physion.physics.cloth.solver import smallest_distance
+from physion.physics.cloth.solids import fill_bodies, fill_shape, particles_of, surface_particles
+from physion.physics.cloth.springs import correct_springs
 from physion.physics.engine import simulate
 from physion.physics.labels import CLOTH_CONTACT_GAP, label_contact
 from physion.physics.replay import area_under_curve
@@ -62,8 +67,9 @@ def area(vertices: np.ndarray, resolution: int) -> float:
 
 def strain(vertices: np.ndarray, scene: Scene) -> np.ndarray:
     springs = sheet_springs(scene.cloths[0])
-    a, b = vertices[springs.ends[:, 0]], vertices[springs.ends[:, 1]]
-    return np.asarray(np.linalg.norm(a - b, axis=1) / springs.lengths - 1)
+    family, a = np.nonzero(springs.half_stiffness)
+    apart = np.linalg.norm(vertices[a] - vertices[a + springs.offsets[family]], axis=1)
+    return np.asarray(apart / springs.lengths[family] - 1)
 
 
 def test_free_fall_is_that_of_a_point_and_keeps_the_sheet_flat() -> None:
@@ -180,9 +186,85 @@ def test_distance_equals_brute_force() -> None:
     points = rng.uniform([-1.0, -1.0, 0.6], [1.0, 1.0, 2.6], (40, 3))
     brute = np.linalg.norm(points[:, None] - world[None], axis=2).min()
     found = smallest_distance(
-        points, surface_particles(body, SPACING), np.array(body.position), turn
+        points.T.copy(), surface_particles(body, SPACING), np.array(body.position), turn
     )
     assert found == pytest.approx(brute, abs=1e-12)
+
+
+def rotation_of(body: Body) -> np.ndarray:
+    """Return the matrix whose columns are the rotated axes."""
+    return np.array([rotate_vectors(unit(body.rotation), axis) for axis in np.eye(3)]).T
+
+
+def test_neighbours_equal_brute_force_and_are_kept_while_particles_stay() -> None:
+    rng = np.random.default_rng(1)
+    bodies = (
+        Body("a", "cone", (0.3, -0.2, 0.1), (0.4, 0.5, 0.6), (0.8, 0.3, -0.4, 0.2)),
+        Body("b", "cube", (0.1, 0.2, 0.0), (0.2, 0.2, 0.3)),
+    )
+    solids = fill_bodies(bodies, SPACING)
+    x = np.array([body.position for body in bodies])
+    poses = BodyPoses(x, np.array([rotation_of(body) for body in bodies]))
+    before = BodyPoses(x - [[0.0, 0.0, 0.0], [0.01, 0.0, 0.0]], poses.rot)
+    points, reach, room = rng.uniform(-0.5, 1.0, (3, 200)), 0.06, 100
+    near = Neighbours(
+        np.zeros(200, np.int64),
+        np.empty((200, room), np.int64),
+        np.empty((200, room, 3)),
+        np.empty((200, room, 3)),
+        np.full((3, 200), np.inf),
+    )
+    bounds = (np.empty((2, 3)), np.empty((2, 3)))
+    world_bounds(solids, poses, reach, *bounds)
+    find_neighbours(points, reach, -1.0, solids, poses, before, bounds, near)
+    world = [
+        rotate_vectors(unit(body.rotation), particles_of(body, SPACING)) + body.position
+        for body in bodies
+    ]
+    assert near.counts.sum() > 50
+    for v in range(200):
+        found = near.position[v, : near.counts[v]]
+        of = near.body[v, : near.counts[v]]
+        for number, cloud in enumerate(world):
+            close = cloud[np.linalg.norm(cloud - points[:, v], axis=1) < reach]
+            assert np.sort(found[of == number], axis=0) == pytest.approx(np.sort(close, axis=0))
+        moved = near.displacement[v, : near.counts[v]]
+        assert moved == pytest.approx(np.where(of[:, None] == 1, [0.01, 0.0, 0.0], 0.0), abs=1e-12)
+    counts = near.counts.copy()
+    points[2] += 0.005
+    find_neighbours(points, reach, 0.006, solids, poses, poses, bounds, near)
+    assert (near.counts == counts).all()
+    find_neighbours(points, reach, 0.004, solids, poses, poses, bounds, near)
+    assert (near.counts != counts).any()
+
+
+def test_springs_join_the_edges_of_the_triangles_and_the_corners_across_them() -> None:
+    rows = 5
+    springs = sheet_springs(Cloth("c", (0.0, 0.0, 0.0), resolution=rows))
+    family, a = np.nonzero(springs.half_stiffness)
+    found = list(zip(a.tolist(), (a + springs.offsets[family]).tolist(), strict=True))
+    corners = [set(triangle) for triangle in sheet_triangles(rows).tolist()]
+    edges = {frozenset(pair) for t in corners for pair in combinations(t, 2)}
+    across = {t ^ u for t, u in combinations(map(frozenset, corners), 2) if len(t & u) == 2}
+    assert len(found) == len(edges) + len(across)
+    assert set(map(frozenset, found)) == edges | across
+    degree = np.bincount(np.array(found).ravel(), minlength=rows**2)
+    assert springs.degree.tolist() == degree.tolist()
+
+
+def test_a_spring_takes_back_its_share_of_its_error() -> None:
+    springs = sheet_springs(
+        Cloth("c", (0.0, 0.0, 0.0), (1.0, 1.0, 0.0), resolution=2, stretch=0.6, bend=0.0)
+    )
+    points = np.array([[0.0, 0.0, 1.5, 1.0], [0.0, 1.0, 0.0, 1.0], [0.0, 0.0, 0.0, 0.0]])
+    shift = np.empty((3, 4))
+    correct_springs(points, springs, shift, np.empty(4))
+    # Particle 2 is 1.5 m from particle 0, half a metre too far: 0.6 / 2 of that along x. Its other
+    # spring, to particle 3, is the diagonal of a rectangle of 0.5 m by 1 m.
+    long = np.sqrt(1.25)
+    pull = 0.3 * (long - 1) / long * np.array([-0.5, 1.0])
+    assert shift[:2, 2] == pytest.approx(np.array([-0.15, 0.0]) + pull)
+    assert shift.sum(axis=1) == pytest.approx(0.0, abs=1e-15)
 
 
 def test_recorded_distance_is_that_of_the_recorded_vertices() -> None:

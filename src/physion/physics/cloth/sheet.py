@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from physion.errors import BadInputError
 from physion.numerics.linear_algebra import norm, unit
 from physion.numerics.rotations import rotate_vectors
-from physion.physics.cloth.solver import Springs
+from physion.physics.cloth.springs import SheetSprings
 from physion.scenes.scene import Cloth
 
 Points = NDArray[np.float64]
@@ -48,30 +48,29 @@ _CORNERS = (
 )
 
 
-def sheet_springs(cloth: Cloth) -> Springs:
+def sheet_springs(cloth: Cloth) -> SheetSprings:
     """Return the springs of a cloth, as Flex makes them from its triangles.
 
     Every edge has the stiffness ``stretch``, the two corners opposite every inner edge ``bend``.
     ``tether`` has no effect: Flex attaches tethers to fixed particles, and there are none.
     """
-    edges, across = _spring_pairs(cloth.resolution)
-    ends = np.concatenate([edges, across]) if cloth.bend > 0 else edges
-    vertices = sheet_vertices(cloth)
-    lengths = norm(vertices[ends[:, 0]] - vertices[ends[:, 1]])
-    stiffness = np.full(len(ends), cloth.stretch)
-    stiffness[len(edges) :] = cloth.bend
-    return Springs(ends.astype(np.int64), lengths, stiffness)
+    rows = cloth.resolution
+    steps = np.array(EDGES + (ACROSS if cloth.bend > 0 else ()), np.int64)
+    x, y = np.divmod(np.arange(rows**2), rows)
+    to_x, to_y = x + steps[:, :1], y + steps[:, 1:]
+    joined = (to_x < rows) & (to_y >= 0) & (to_y < rows)
+    sides = np.asarray(cloth.size[:2]) / (rows - 1)
+    stiffness = np.where(np.arange(len(steps)) < len(EDGES), cloth.stretch, cloth.bend)
+    offsets = steps[:, 0] * rows + steps[:, 1]
+    degree = np.count_nonzero(joined, axis=0).astype(np.float64)
+    for family, offset in zip(joined, offsets, strict=True):
+        degree[offset:] += family[: len(degree) - offset]
+    return SheetSprings(
+        offsets, norm(steps * sides), np.where(joined, stiffness[:, None] / 2, 0.0), degree
+    )
 
 
-@lru_cache(maxsize=8)
-def _spring_pairs(resolution: int) -> tuple[Indices, Indices]:
-    """Return the edges (E, 2) of the sheet, and the corners (B, 2) opposite its inner edges."""
-    triangles = sheet_triangles(resolution)
-    sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-    corners = np.concatenate([triangles[:, 2], triangles[:, 0], triangles[:, 1]])
-    order = np.lexsort((sides.max(axis=1), sides.min(axis=1)))
-    sides, corners = np.sort(sides[order], axis=1), corners[order]
-    twice = np.flatnonzero((sides[1:] == sides[:-1]).all(axis=1))
-    first = np.ones(len(sides), np.bool_)
-    first[twice + 1] = False
-    return sides[first], np.stack([corners[twice], corners[twice + 1]], axis=1)
+EDGES = ((1, 0), (0, 1), (1, 1))
+"""Steps along x and y between the ends of the edges of `sheet_triangles`."""
+ACROSS = ((1, -1), (1, 2), (2, 1))
+"""Steps between the two corners opposite an inner edge: the diagonal, and the sides of squares."""

@@ -24,15 +24,11 @@ from numpy.typing import NDArray
 from physion.errors import BadInputError
 from physion.numerics.linear_algebra import unit
 from physion.numerics.rotations import rotate_vectors
+from physion.physics.cloth.contacts import ClothOptions
+from physion.physics.cloth.near_solids import Solids
 from physion.physics.cloth.sheet import sheet_springs, sheet_vertices
 from physion.physics.cloth.solids import fill_bodies, particles_of, surface_particles
-from physion.physics.cloth.solver import (
-    ClothOptions,
-    ClothRecord,
-    MovingSolids,
-    Solids,
-    run_cloth,
-)
+from physion.physics.cloth.solver import ClothRecord, MovingSolids, run_cloth
 from physion.physics.trajectory import ENVIRONMENT, Contacts, Floats, State, Trajectory
 from physion.scenes.scene import FRAME_TIME, GRAVITY, Body, Scene
 
@@ -276,7 +272,15 @@ def _run(
         else np.zeros((0, 3))
     )
     scenery = MovingSolids(solids, positions, rotations, watched, particles)
-    run_cloth(points, velocities, sheet_springs(cloth), scenery, options, record)
+    run_cloth(
+        np.ascontiguousarray(points.T),
+        np.ascontiguousarray(velocities.T),
+        sheet_springs(cloth),
+        scenery,
+        options,
+        -np.inf,
+        record,
+    )
     record.distance[:] -= settings.rest_distance
     return record
 

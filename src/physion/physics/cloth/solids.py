@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from physion.numerics.kernel import kernel
 from physion.numerics.linear_algebra import dot, multiply, norm
-from physion.physics.cloth.solver import Solids
+from physion.physics.cloth.near_solids import Solids
 from physion.scenes.scene import Body, Vec3
 from physion.scenes.shapes.primitives import ConvexPiece, shape
 
@@ -40,18 +41,41 @@ def fill_shape(name: str, scale: Vec3, spacing: float) -> tuple[Points, Filled]:
     axes = [origin[k] + spacing * np.arange(sizes[k]) for k in range(3)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     filled = np.zeros(len(grid), np.bool_)
-    for piece in found.pieces:
-        filled |= _inside(piece, grid / np.asarray(scale))
+    for number, piece in enumerate(found.pieces):
+        if piece.kind == "convex":
+            _fill_convex(grid / np.asarray(scale), _planes(name, number), filled)
+        else:
+            filled |= _inside(piece, grid / np.asarray(scale))
     if not filled.any():
         filled[np.argmin(norm(grid - (low + high) / 2))] = True
     return origin, filled.reshape(tuple(int(n) for n in sizes))
 
 
+@lru_cache(maxsize=1024)
+def _planes(name: str, number: int) -> Points:
+    """Return the faces (K, 4) of a convex piece of a shape: unit normal out, and offset."""
+    return np.ascontiguousarray(ConvexHull(shape(name).pieces[number].vertices).equations)
+
+
+@kernel
+def _fill_convex(points: Points, planes: Points, filled: Filled) -> None:
+    """Set ``filled`` (P,) for the ``points`` (P, 3) that lie on the inner side of all planes."""
+    for p in range(len(points)):
+        inside = not filled[p]
+        for k in range(len(planes)):
+            if not inside:
+                break
+            height = points[p, 0] * planes[k, 0] + points[p, 1] * planes[k, 1]
+            inside = height + points[p, 2] * planes[k, 2] + planes[k, 3] <= 1e-9
+        if inside:
+            filled[p] = True
+
+
 def _inside(piece: ConvexPiece, points: Points) -> Filled:
-    """Return which ``points`` (P, 3), in the shape's frame at unit scale, lie in a piece."""
-    if piece.kind == "convex":
-        planes = ConvexHull(piece.vertices).equations
-        return np.asarray((multiply(points, planes[:, :3].T) + planes[:, 3] <= 1e-9).all(axis=1))
+    """Return which ``points`` (P, 3), in the shape's frame at unit scale, lie in a piece.
+
+    The piece is a box, a sphere or a cylinder.
+    """
     local = multiply(points - np.asarray(piece.center), piece.rotation) / np.asarray(piece.half)
     if piece.kind == "box":
         return np.asarray((np.abs(local) <= 1 + 1e-9).all(axis=1))

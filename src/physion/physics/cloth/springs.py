@@ -1,0 +1,90 @@
+"""Springs of a sheet of particles, in families that join each particle to one at a fixed offset."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from physion.numerics.kernel import kernel
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+MIN_LENGTH = 1e-12
+"""Metres below which a spring or a slip has no direction."""
+
+
+class SheetSprings(NamedTuple):
+    """Distance constraints between particles of a sheet of V particles, in G families.
+
+    Family g joins particle v and particle v + ``offsets[g]``, for all v at once, so that a pass
+    over it reads and writes memory in order.
+
+    - ``offsets`` (G,): positive differences of indices.
+    - ``lengths`` (G,): metres at rest.
+    - ``half_stiffness`` (G, V): half of the fraction of the error that one pass removes; 0 where v
+      has no partner in the family.
+    - ``degree`` (V,): number of springs at each particle.
+    """
+
+    offsets: I64
+    lengths: F64
+    half_stiffness: F64
+    degree: F64
+
+
+# C = |p_b - p_a| - l. Both ends have one mass, so each gets half of the error, times the stiffness
+# k:  dp_a = k/2 C (p_b - p_a) / |p_b - p_a| = -dp_b  (Müller et al. 2007, section 3.3). The loops
+# below have no branches and no sums across elements, so that the compiler may take several elements
+# at once without changing a bit.
+
+
+@kernel
+def correct_springs(points: F64, springs: SheetSprings, shift: F64, factor: F64) -> None:
+    """Fill ``shift`` (3, V) with the sums of the corrections that bring springs to their lengths.
+
+    ``points`` (3, V) are positions in metres, ``factor`` (V,) is working memory.
+    """
+    shift[:] = 0.0
+    x, y, z = points[0], points[1], points[2]
+    for g in range(len(springs.offsets)):
+        offset = springs.offsets[g]
+        first = len(factor) - offset
+        used = factor[:first]
+        _relative_errors(
+            (x[:first], y[:first], z[:first]),
+            (x[offset:], y[offset:], z[offset:]),
+            springs.half_stiffness[g, :first],
+            springs.lengths[g],
+            used,
+        )
+        for k in range(3):
+            along = points[k]
+            _add_difference(used, along[offset:], along[:first], shift[k, :first])
+            _add_difference(used, along[:first], along[offset:], shift[k, offset:])
+
+
+@kernel
+def _relative_errors(
+    a: tuple[F64, F64, F64], b: tuple[F64, F64, F64], half: F64, length: float, out: F64
+) -> None:
+    """Fill ``out`` (S,) with k/2 (|b - a| - l) / |b - a| of springs from ``a`` to ``b``.
+
+    ``a`` and ``b`` are coordinates x, y, z (S,) in metres.
+    """
+    ax, ay, az = a
+    bx, by, bz = b
+    for s in range(len(out)):
+        dx, dy, dz = bx[s] - ax[s], by[s] - ay[s], bz[s] - az[s]
+        found = np.sqrt(dx * dx + dy * dy + dz * dz)
+        error = half[s] * (found - length) / found
+        out[s] = error if found > MIN_LENGTH else 0.0
+
+
+@kernel
+def _add_difference(factor: F64, b: F64, a: F64, total: F64) -> None:
+    """Add ``factor * (b - a)``, arrays (S,), to ``total``."""
+    for s in range(len(total)):
+        total[s] += factor[s] * (b[s] - a[s])
