@@ -12,17 +12,26 @@ from hypothesis import strategies as st
 from sklearn.metrics import roc_auc_score
 
 from physion.physics.jitter import jitter_scene, pair_agreement
-from physion.physics.replay import Replay, area_under_curve, summarise
-from physion.scenes.scene import Body, Camera, Joint, Push, Roles, Scene
+from physion.physics.replay import (
+    Replay,
+    ReplayTask,
+    area_under_curve,
+    replay_trial,
+    summarise,
+)
+from physion.scenes.scene import Body, Camera, Ending, Joint, Push, Roles, Scene
+from physion.scenes.tdw.read_logs import ImportedTrial, RecordedOutcome
 
 
 def replay(name: str, recorded: bool, simulated: bool, **more: object) -> Replay:
     values = {
         "scenario": "collide",
+        "engine": "physion",
         "recorded_frame": 10 if recorded else None,
         "simulated_frame": 13 if simulated else None,
         "frames": 101,
         "distance": None,
+        "final_error": None,
         "cpu_seconds": 0.1,
         "physics_seconds": 1.0,
     }
@@ -50,6 +59,57 @@ def test_jittered_runs_give_the_ceiling() -> None:
     ]
     (row,) = summarise(replays)
     assert row.ceiling == pytest.approx((0.5 + 1.0) / 2)
+
+
+def test_jittered_runs_give_the_probability_of_the_recorded_outcome() -> None:
+    replays = [
+        replay("a", True, True, jittered=(True, True, True, False)),
+        replay("b", False, True, jittered=(True, True, True, True)),
+    ]
+    (row,) = summarise(replays)
+    assert row.jittered_agreement == pytest.approx((0.75 + 0.0) / 2)
+    assert row.brier == pytest.approx((0.25**2 + 1.0) / 2)
+    # A half is added to the runs of either outcome.
+    assert row.log_score == pytest.approx((math.log(3.5 / 5) + math.log(0.5 / 5)) / 2)
+
+
+def test_without_jittered_runs_there_is_no_probability() -> None:
+    (row,) = summarise([replay("a", True, True)])
+    assert all(math.isnan(x) for x in (row.jittered_agreement, row.brier, row.log_score))
+
+
+def test_the_final_error_is_a_median_over_the_trials_that_have_one() -> None:
+    errors = [0.1, 0.2, 3.0, None]
+    replays = [replay(f"{e}", True, True, final_error=e) for e in errors]
+    assert summarise(replays)[0].final_error == pytest.approx(0.2)
+    assert math.isnan(summarise(replays[3:])[0].final_error)
+
+
+def test_each_engine_has_a_row_of_its_own() -> None:
+    replays = [replay("a", True, True), replay("a", True, False, engine="mujoco")]
+    rows = summarise(replays)
+    assert [(row.engine, row.trials, row.agreement) for row in rows] == [
+        ("physion", 1, 1.0),
+        ("mujoco", 1, 0.0),
+    ]
+
+
+@pytest.mark.parametrize("engine", ["physion", "mujoco"])
+def test_a_trial_is_replayed_with_jitter_and_compared_with_its_record(engine: str) -> None:
+    zone = Body("zone", "cube", (0.0, 0.0, 0.0), (1.0, 1.0, 0.01), kinematic=True)
+    scene = Scene(
+        name="s",
+        scenario="drop",
+        bodies=(Body("box", "cube", (0.3, 0.0, 0.4), (0.2, 0.2, 0.2)), zone),
+        roles=Roles("box", "zone"),
+        camera=Camera((3.0, 3.0, 1.0)),
+        ending=Ending(60, 150),
+    )
+    outcome = RecordedOutcome(True, 28, 60, final_position=(0.3, 0.4, 0.01))
+    done = replay_trial(ReplayTask(ImportedTrial(scene, outcome), 0.001, 3, engine))
+    assert done.engine == engine and done.agrees and done.jittered == (True, True, True)
+    assert done.simulated_frame == pytest.approx(28, abs=2)
+    assert done.final_error == pytest.approx(0.4, abs=2e-3)
 
 
 @given(st.lists(st.booleans(), min_size=2, max_size=12))

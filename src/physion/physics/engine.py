@@ -84,6 +84,14 @@ def make_engine(name: str = DEFAULT_ENGINE) -> Engine:
     return engine
 
 
+def can_simulate(name: str, scene: Scene) -> bool:
+    """Return whether the engine called ``name`` simulates what is in ``scene``.
+
+    An engine without cloth says so with the class attribute ``simulates_cloth = False``.
+    """
+    return not scene.cloths or bool(getattr(engines.get(name), "simulates_cloth", True))
+
+
 def simulate(
     scene: Scene,
     *,

@@ -11,21 +11,32 @@ from statistics import fmean
 import numpy as np
 from scipy.stats import rankdata
 
-from physion.physics.engine import simulate
+from physion.numerics.elementary import log_of
+from physion.numerics.linear_algebra import norm
+from physion.physics.engine import DEFAULT_ENGINE, Engine, make_engine, simulate_many
 from physion.physics.jitter import jitter_scene, pair_agreement
 from physion.physics.labels import label_contact
+from physion.physics.trajectory import Trajectory
 from physion.scenes.scene import FRAME_TIME
 from physion.scenes.tdw.read_logs import ImportedTrial
 from physion.seeds import child_generator, trial_seed
 
+SMOOTHING = 0.5
+"""Added to the runs of either outcome before the logarithm: P = (k + .5) / (n + 1) for k of n runs,
+so that no probability is 0."""
+
 
 @dataclass(frozen=True)
 class ReplayTask:
-    """One trial to replay, and ``repeats`` runs with ``jitter`` metres of horizontal noise."""
+    """One trial to replay with the engine called ``engine``.
+
+    Then ``repeats`` more runs, with ``jitter`` metres of horizontal noise.
+    """
 
     trial: ImportedTrial
     jitter: float = 0.0
     repeats: int = 0
+    engine: str = DEFAULT_ENGINE
 
 
 @dataclass(frozen=True)
@@ -33,6 +44,8 @@ class Replay:
     """Result of one replayed trial. Frames count from 0.
 
     ``distance`` is the smallest gap between cloth and body in metres, None without cloth.
+    ``final_error`` is the distance in metres between simulated and recorded final position of the
+    agent, None where it is cloth or the position was not recorded.
 
     ``cpu_seconds`` is the processor time of one simulation, ``physics_seconds`` what it covers.
     ``jittered`` holds the outcomes of the runs with jitter.
@@ -40,12 +53,14 @@ class Replay:
 
     name: str
     scenario: str
+    engine: str
     recorded: bool
     simulated: bool
     recorded_frame: int | None
     simulated_frame: int | None
     frames: int
     distance: float | None
+    final_error: float | None
     cpu_seconds: float
     physics_seconds: float
     jittered: tuple[bool, ...] = ()
@@ -55,94 +70,155 @@ class Replay:
         """Return whether our outcome is the recorded one."""
         return self.recorded == self.simulated
 
+    @property
+    def agreeing_runs(self) -> int:
+        """Return the number of jittered runs with the recorded outcome."""
+        return self.jittered.count(self.recorded)
+
+    @property
+    def brier(self) -> float:
+        """Return (1 - k / n)² for k of n jittered runs with the recorded outcome."""
+        miss = 1 - self.agreeing_runs / len(self.jittered)
+        return miss * miss
+
+    @property
+    def log_score(self) -> float:
+        """Return log((k + .5) / (n + 1)) for k of n jittered runs with the recorded outcome."""
+        return float(log_of((self.agreeing_runs + SMOOTHING) / (len(self.jittered) + 1)))
+
 
 def replay_trial(task: ReplayTask) -> Replay:
     """Simulate one imported trial, and return the outcome with the recorded one."""
     scene, outcome = task.trial.scene, task.trial.outcome
+    engine = make_engine(task.engine)
     # Compiled code is loaded outside the measured time.
-    simulate(scene, frames=2)
+    engine.simulate(scene, frames=2)
     started = time.process_time()
-    trajectory = simulate(scene)
+    trajectory = engine.simulate(scene)
     spent = time.process_time() - started
     labels = label_contact(scene, trajectory)
-    seed = trial_seed("jitter", scene.scenario, scene.name, 0)
-    outcomes = []
-    for repeat in range(task.repeats):
-        moved = jitter_scene(scene, task.jitter, child_generator(seed, f"repeat {repeat}"))
-        outcomes.append(label_contact(moved, simulate(moved)).contact)
     return Replay(
         name=scene.name,
         scenario=scene.scenario,
+        engine=task.engine,
         recorded=outcome.contact,
         simulated=labels.contact,
         recorded_frame=outcome.first_frame,
         simulated_frame=labels.first_frame,
         frames=len(trajectory),
         distance=labels.min_distance,
+        final_error=_final_error(task.trial, trajectory),
         cpu_seconds=spent,
         physics_seconds=(len(trajectory) - 1) * FRAME_TIME,
-        jittered=tuple(outcomes),
+        jittered=_jittered_outcomes(task, engine),
     )
+
+
+def _jittered_outcomes(task: ReplayTask, engine: Engine) -> tuple[bool, ...]:
+    """Return the outcomes of the runs with jitter, which are given to the engine in one call."""
+    scene = task.trial.scene
+    seed = trial_seed("jitter", scene.scenario, scene.name, 0)
+    moved = [
+        jitter_scene(scene, task.jitter, child_generator(seed, f"repeat {repeat}"))
+        for repeat in range(task.repeats)
+    ]
+    paths = simulate_many(moved, engine=engine, until_contact=True)
+    return tuple(label_contact(*pair).contact for pair in zip(moved, paths, strict=True))
+
+
+def _final_error(trial: ImportedTrial, trajectory: Trajectory) -> float | None:
+    """Return the distance in metres of the agent's last position from the recorded one."""
+    scene, recorded = trial.scene, trial.outcome.final_position
+    agent = scene.index(scene.roles.agent)
+    if recorded is None or agent >= len(scene.bodies):
+        return None
+    return float(norm(trajectory.positions[-1, agent].astype(np.float64) - np.asarray(recorded)))
 
 
 @dataclass(frozen=True)
 class ReplayRow:
-    """One line of the replay table: a scenario, or the mean over scenarios.
+    """One line of the replay table: a scenario, simulated by one engine.
 
     - ``base_rate``: fraction of the more frequent recorded outcome.
     - ``agreement``: fraction of trials whose simulated outcome is the recorded one.
+    - ``jittered_agreement``: mean probability of the recorded outcome, which is the fraction of a
+      trial's jittered runs that have it.
+    - ``ceiling``: probability that two jittered runs of a trial agree.
+    - ``brier``: mean of the squares of 1 minus the probability of the recorded outcome; 0 is best,
+      .25 is guessing.
+    - ``log_score``: mean logarithm of the probability of the recorded outcome, where that is
+      (k + .5) / (n + 1) for k of n runs; 0 is best, log(.5) = -.693 is guessing.
     - ``frame_difference``: median of |simulated - recorded| first contact frame over the trials
-      with contact in both; NaN without any.
+      with contact in both.
+    - ``final_error``: median distance in metres between the simulated and the recorded final
+      position of the agent.
     - ``auc``: area under the curve of the smallest cloth gap against the recorded outcome, 1 if
-      every contact is closer than every miss; NaN without cloth.
+      every contact is closer than every miss.
     - ``milliseconds``: mean processor time of a trial; ``real_time``: physics time over it.
-    - ``ceiling``: probability that two jittered runs of a trial agree; NaN without jitter.
+
+    NaN where there is nothing to compute it from: jittered runs, common contacts, positions, cloth.
     """
 
     scenario: str
+    engine: str
     trials: int
     base_rate: float
     agreement: float
+    jittered_agreement: float
+    ceiling: float
+    brier: float
+    log_score: float
     frame_difference: float
+    final_error: float
     auc: float
     milliseconds: float
     real_time: float
-    ceiling: float
 
 
 def summarise(replays: Iterable[Replay]) -> list[ReplayRow]:
-    """Return one row for each scenario, in the order of first appearance."""
-    groups: dict[str, list[Replay]] = {}
+    """Return one row for each scenario and engine, in the order of first appearance."""
+    groups: dict[tuple[str, str], list[Replay]] = {}
     for replay in replays:
-        groups.setdefault(replay.scenario, []).append(replay)
-    return [_row(name, group) for name, group in groups.items()]
+        groups.setdefault((replay.scenario, replay.engine), []).append(replay)
+    return [_row(group) for group in groups.values()]
 
 
-def _row(scenario: str, group: list[Replay]) -> ReplayRow:
-    """Return the row of one scenario."""
+def _row(group: list[Replay]) -> ReplayRow:
+    """Return the row of one scenario and engine."""
     recorded = np.array([replay.recorded for replay in group])
     rate = fmean(recorded.tolist())
-    both = [
+    frame_differences = [
         abs(replay.simulated_frame - replay.recorded_frame)
         for replay in group
         if replay.simulated_frame is not None and replay.recorded_frame is not None
     ]
     distances = [replay.distance for replay in group if replay.distance is not None]
-    ceilings = [pair_agreement(np.array(replay.jittered)) for replay in group]
+    errors = [replay.final_error for replay in group if replay.final_error is not None]
+    jittered = [replay for replay in group if replay.jittered]
     spent = math.fsum(replay.cpu_seconds for replay in group)
     return ReplayRow(
-        scenario=scenario,
+        scenario=group[0].scenario,
+        engine=group[0].engine,
         trials=len(group),
         base_rate=max(rate, 1 - rate),
         agreement=fmean(replay.agrees for replay in group),
-        frame_difference=float(np.median(both)) if both else float("nan"),
+        jittered_agreement=_mean([r.agreeing_runs / len(r.jittered) for r in jittered]),
+        ceiling=_mean([pair_agreement(np.array(replay.jittered)) for replay in jittered]),
+        brier=_mean([replay.brier for replay in jittered]),
+        log_score=_mean([replay.log_score for replay in jittered]),
+        frame_difference=float(np.median(frame_differences)) if frame_differences else math.nan,
+        final_error=float(np.median(errors)) if errors else math.nan,
         auc=area_under_curve(-np.array(distances), recorded)
         if len(distances) == len(group)
-        else float("nan"),
+        else math.nan,
         milliseconds=1000 * spent / len(group),
         real_time=math.fsum(replay.physics_seconds for replay in group) / max(spent, 1e-9),
-        ceiling=fmean(ceilings) if group[0].jittered else float("nan"),
     )
+
+
+def _mean(values: list[float]) -> float:
+    """Return the mean, NaN without values."""
+    return fmean(values) if values else math.nan
 
 
 def area_under_curve(scores: np.ndarray, truth: np.ndarray) -> float:

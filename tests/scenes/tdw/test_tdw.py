@@ -195,6 +195,24 @@ def test_unknown_commands_are_counted_and_duplicates_found(tmp_path: Path) -> No
     assert (len(unique), copies) == (1, 1)
 
 
+def test_the_recorded_displacement_is_of_object_two(tmp_path: Path) -> None:
+    write_log(tmp_path / "same", [[two_cubes()]])
+    (trial,) = read_scenes(tmp_path / "same").trials
+    # Object 2 starts at (0, 0, .5) in our axes and moves by (1, 3, 2).
+    assert trial.outcome.final_position == (1, 3, 2.5)
+    red = (1, 0, 0)
+    commands = [
+        *thing(1, "cube", xyz(0, 0, 0)),
+        *thing(2, "cube", xyz(1, 10, 10), color=red),
+        {"$type": "destroy_object", "id": 2},
+        *thing(3, "sphere", xyz(0, 1, 0), color=red),
+    ]
+    write_log(tmp_path / "replaced", [[commands]])
+    (trial,) = read_scenes(tmp_path / "replaced").trials
+    assert trial.scene.roles.agent == "sphere_3"
+    assert trial.outcome.final_position == (2, 13, 12)
+
+
 def test_a_broken_line_fails_its_trial_only(tmp_path: Path) -> None:
     path = write_log(tmp_path / "config", [[two_cubes()], [two_cubes()]])
     lines = path.read_text().splitlines()

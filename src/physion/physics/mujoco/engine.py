@@ -33,6 +33,8 @@ MIN_SPIN = 1e-12
 class MujocoEngine:
     """Simulator of rigid bodies by MuJoCo; `BadSceneError` for scenes with cloth."""
 
+    simulates_cloth = False
+
     def __init__(self, settings: MujocoSettings | None = None) -> None:
         self.settings = settings if settings is not None else MujocoSettings()
 

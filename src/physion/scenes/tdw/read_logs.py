@@ -60,7 +60,9 @@ class RecordedOutcome:
     """Outcome that the official simulator recorded for a trial in ``metadata.json``.
 
     - ``first_frame``: first frame with contact, counted from 0.
-    - ``displacement``: final minus initial position of the agent, in our axes, metres.
+    - ``displacement``: as recorded, in our axes, metres: the final position of the agent minus the
+      initial one of object 2, or, in Drop, minus the origin.
+    - ``final_position``: of the agent in the last frame, in our axes, metres.
     - ``min_distance``: between cloth and zone, for cloth trials only.
     """
 
@@ -69,6 +71,7 @@ class RecordedOutcome:
     frames: int
     displacement: Vec3 | None = None
     min_distance: float | None = None
+    final_position: Vec3 | None = None
 
 
 @dataclass(frozen=True)
@@ -334,10 +337,25 @@ class _SceneBuilder:
             )
         first = record.get("first_target_contact_zone_frame")
         moved = record.get("final_target_displacement")
+        displacement = vector(moved) if isinstance(moved, dict) else None
         return RecordedOutcome(
             contact=contact,
             first_frame=int(first) if isinstance(first, int) else None,
             frames=int(record.get("num_frames") or 0),
-            displacement=vector(moved) if isinstance(moved, dict) else None,
+            displacement=displacement,
             min_distance=record.get("minimum_distance_target_to_zone"),
+            final_position=self._final_position(displacement),
         )
+
+    def _final_position(self, displacement: Vec3 | None) -> Vec3 | None:
+        """Return where the agent was in the last frame, from what the log's displacement is of.
+
+        It is of object 2, also where the controller has replaced that one by another agent; the
+        controller of Drop records the position itself.
+        """
+        first = self.commands.objects.get(2)
+        if displacement is None or first is None:
+            return None
+        origin = (0.0, 0.0, 0.0) if self._scenario() == "drop" else first.position
+        x, y, z = (a + b for a, b in zip(origin, displacement, strict=True))
+        return (x, y, z)
