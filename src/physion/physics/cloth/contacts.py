@@ -104,7 +104,7 @@ def correct_contacts(
             uz = mz - near.displacement[v, c, 2]
             along = ux * dx + uy * dy + uz * dz
             ux, uy, uz = ux - along * dx, uy - along * dy, uz - along * dz
-            hold = _held(ux * ux + uy * uy + uz * uz, options.friction * depth)
+            hold = friction_hold(ux * ux + uy * uy + uz * uz, options.friction * depth)
             sx += dx * depth - hold * ux
             sy += dy * depth - hold * uy
             sz += dz * depth - hold * uz
@@ -116,7 +116,7 @@ def correct_contacts(
             run_depth[runs - 1] += depth
         depth = options.floor + options.floor_gap - pz
         if depth > 0:
-            hold = _held(mx * mx + my * my, options.floor_friction * depth)
+            hold = friction_hold(mx * mx + my * my, options.floor_friction * depth)
             sx -= hold * mx
             sy -= hold * my
             sz += depth
@@ -133,7 +133,7 @@ def correct_contacts(
 
 
 @kernel
-def _held(slip_square: float, most: float) -> float:
+def friction_hold(slip_square: float, most: float) -> float:
     """Return which fraction of a slip friction takes back, at most ``most`` metres of it."""
     if slip_square <= most * most:
         return 1.0

@@ -22,15 +22,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.errors import BadInputError
-from physion.numerics.linear_algebra import unit
-from physion.numerics.rotations import rotate_vectors
 from physion.physics.cloth.contacts import ClothOptions
 from physion.physics.cloth.near_solids import Solids
+from physion.physics.cloth.settle import SolidBody, settled_poses
 from physion.physics.cloth.sheet import sheet_springs, sheet_vertices
-from physion.physics.cloth.solids import fill_bodies, particles_of, surface_particles
+from physion.physics.cloth.solids import fill_bodies, surface_particles
 from physion.physics.cloth.solver import ClothRecord, MovingSolids, run_cloth
 from physion.physics.trajectory import ENVIRONMENT, Contacts, Floats, State, Trajectory
-from physion.scenes.scene import FRAME_TIME, GRAVITY, Body, Scene
+from physion.scenes.scene import FRAME_TIME, GRAVITY, Scene
 
 Points = NDArray[np.float64]
 
@@ -152,28 +151,51 @@ def simulate_cloth(
 
 
 def settle_solids(scene: Scene, settings: ClothSettings | None = None) -> Scene:
-    """Return the scene with its kinematic bodies standing on the floor, as in Flex.
+    """Return the scene with its kinematic bodies settled on the floor, as in Flex.
 
-    The official cloth trials create solids above the floor and let them fall for
-    ``settle_frames`` before they add the cloth. Every kinematic body is moved vertically until its
-    lowest particle is ``floor_gap`` above the floor; it neither tips nor slides. Scenes without
-    cloth or without ``settle_frames`` are returned unchanged.
+    The official cloth trials add solids one after the other, above the floor, and let each settle
+    for ``settle_frames`` before they add the cloth. A body that keeps the rest distance from those
+    before it stands so that its lowest particle is ``floor_gap`` above the floor; others are thrown
+    aside (`physion.physics.cloth.settle`). Scenes without cloth or without ``settle_frames`` are
+    returned unchanged.
     """
     rules = settings if settings is not None else ClothSettings()
     if not (scene.cloths and scene.settle_frames):
         return scene
-    bodies = tuple(_stand(body, scene.floor, rules) for body in scene.bodies)
-    return replace(scene, bodies=bodies)
+    falling = [body for body in scene.bodies if body.kinematic and not body.scenery]
+    poses = settled_poses(
+        tuple(SolidBody(b.shape, b.scale, b.position, b.rotation, b.mass) for b in falling),
+        _options(scene, rules),
+        rules.particle_spacing,
+        scene.settle_frames,
+    )
+    settled = {body.name: pose for body, pose in zip(falling, poses, strict=True)}
+    return replace(
+        scene,
+        bodies=tuple(
+            replace(body, position=settled[body.name][0], rotation=settled[body.name][1])
+            if body.name in settled
+            else body
+            for body in scene.bodies
+        ),
+    )
 
 
-def _stand(body: Body, floor: float, settings: ClothSettings) -> Body:
-    """Return a kinematic body at the height at which it stands on the floor."""
-    if body.scenery or not body.kinematic:
-        return body
-    particles = rotate_vectors(unit(body.rotation), particles_of(body, settings.particle_spacing))
-    x, y, _ = body.position
-    height = floor + settings.floor_gap - float(particles[:, 2].min())
-    return replace(body, position=(x, y, height))
+def _options(scene: Scene, settings: ClothSettings) -> ClothOptions:
+    """Return the numbers that the compiled loops need."""
+    return ClothOptions(
+        FRAME_TIME,
+        settings.substeps,
+        settings.iterations,
+        settings.rest_distance,
+        settings.search_margin,
+        scene.floor,
+        settings.floor_gap,
+        settings.particle_friction,
+        settings.floor_friction,
+        settings.damping,
+        settings.gravity,
+    )
 
 
 def add_cloth(
@@ -253,19 +275,6 @@ def _run(
         np.zeros((frames, bodies + 1, 2, 3)),
         np.zeros((frames, bodies + 1)),
     )
-    options = ClothOptions(
-        FRAME_TIME,
-        settings.substeps,
-        settings.iterations,
-        settings.rest_distance,
-        settings.search_margin,
-        scene.floor,
-        settings.floor_gap,
-        settings.particle_friction,
-        settings.floor_friction,
-        settings.damping,
-        settings.gravity,
-    )
     particles = (
         surface_particles(scene.bodies[watched], settings.particle_spacing)
         if watched >= 0
@@ -277,7 +286,7 @@ def _run(
         np.ascontiguousarray(velocities.T),
         sheet_springs(cloth),
         scenery,
-        options,
+        _options(scene, settings),
         -np.inf,
         record,
     )

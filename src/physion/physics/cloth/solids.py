@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -107,11 +108,18 @@ def surface_particles(body: Body, spacing: float) -> Points:
 
 def fill_bodies(bodies: tuple[Body, ...], spacing: float) -> Solids:
     """Return the lattices of all bodies, in their order; those of scenery are empty."""
+    return fill_lattices(
+        [None if body.scenery else (body.shape, body.scale) for body in bodies], spacing
+    )
+
+
+def fill_lattices(shapes: Sequence[tuple[str, Vec3] | None], spacing: float) -> Solids:
+    """Return the lattices of shapes at their scales; None stands for an empty one."""
     lattices = [
         (np.zeros(3), np.zeros((0, 0, 0), np.bool_))
-        if body.scenery
-        else fill_shape(body.shape, body.scale, spacing)
-        for body in bodies
+        if found is None
+        else fill_shape(found[0], found[1], spacing)
+        for found in shapes
     ]
     counts = np.array([filled.size for _, filled in lattices], np.int64)
     return Solids(
