@@ -50,6 +50,9 @@ class Options:
     """Training steps of the dynamics."""
     samples: int = 20
     """Simulations per trial of noisy-simulation."""
+    engine: str = "physion"
+    """Engine of the trials and of noisy-simulation (see physion ls engines); mujoco has no
+    cloth."""
     workers: int = os.cpu_count() or 1
     """Number of processes."""
     json: bool = False
@@ -159,7 +162,13 @@ def generate_trials(options: Options, tasks: list[TrialTask]) -> list[str]:
         report = generate(
             out_folder(options) / "trials",
             tasks,
-            GenerateSettings(width=options.size, height=options.size, look="redyellow", jitters=0),
+            GenerateSettings(
+                width=options.size,
+                height=options.size,
+                look="redyellow",
+                jitters=0,
+                engine=options.engine,
+            ),
             executor=LocalExecutor(workers=options.workers),
             progress=stages,
         )
@@ -174,7 +183,7 @@ def chosen_models(options: Options) -> dict[str, dict[str, Any]]:
             "weights": options.weights,
             "dynamics": options.dynamics,
         },
-        "noisy-simulation": {"samples": options.samples},
+        "noisy-simulation": {"samples": options.samples, "engine": options.engine},
     }
 
 

@@ -19,7 +19,10 @@ class Engine(Protocol):
 
     @property
     def name(self) -> str:
-        """Return name and version of the engine and its settings, as stored with every trial."""
+        """Return name and version of the engine and its settings, as stored with every trial.
+
+        It starts with the engine's name in `engines` and a hyphen.
+        """
         ...
 
     def simulate(
@@ -82,6 +85,15 @@ def make_engine(name: str = DEFAULT_ENGINE) -> Engine:
     """Return the engine called ``name`` with its default settings."""
     engine: Engine = engines.get(name)()
     return engine
+
+
+def engine_of(stored: str) -> Engine:
+    """Return the engine whose `Engine.name` was ``stored``, whatever its version.
+
+    The default engine for a name that starts like none of `engines`.
+    """
+    name = stored.partition("-")[0]
+    return make_engine(name if name in engines else DEFAULT_ENGINE)
 
 
 def can_simulate(name: str, scene: Scene) -> bool:

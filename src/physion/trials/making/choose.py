@@ -22,7 +22,7 @@ from typing import Any
 from physion.compute.executor import Executor, TaskOutcome
 from physion.compute.progress import Progress, tracked
 from physion.errors import BadInputError, BadSceneError, PhysionError
-from physion.physics.engine import simulate, simulate_many
+from physion.physics.engine import Engine, make_engine, simulate_many
 from physion.physics.jitter import jitter_scene
 from physion.physics.labels import label_contact
 from physion.physics.trajectory import Trajectory
@@ -160,7 +160,8 @@ def judge(
     scene: Scene, seed: Any, task: TrialTask, settings: GenerateSettings
 ) -> tuple[str | None, float | None]:
     """Return the reason to reject a scene, or None, and its robustness if it was measured."""
-    trajectory = simulate(scene, until_contact=True)
+    engine = make_engine(settings.engine)
+    trajectory = engine.simulate(scene, until_contact=True)
     labels = label_contact(scene, trajectory)
     wanted = wanted_contact(task)
     if wanted is not None and labels.contact != wanted:
@@ -169,19 +170,26 @@ def judge(
         return "contact inside the observed part", None
     if settings.min_visible and not _visible(scene, trajectory, settings):
         return "agent or patient hardly visible in the first frame", None
-    robust = robustness(scene, labels.contact, seed, settings.jitters) if settings.jitters else None
+    robust = None
+    if settings.jitters:
+        robust = robustness(scene, labels.contact, seed, settings.jitters, engine)
     if robust is not None and robust < settings.robust:
         return "outcome not robust", None
     return None, robust
 
 
-def robustness(scene: Scene, contact: bool, seed: Any, runs: int) -> float:
-    """Return the fraction of ``runs`` simulations with noise `JITTER` that end as ``contact``."""
+def robustness(
+    scene: Scene, contact: bool, seed: Any, runs: int, engine: Engine | None = None
+) -> float:
+    """Return the fraction of ``runs`` simulations with noise `JITTER` that end as ``contact``.
+
+    ``seed`` is that of the trial; without ``engine`` the default one is used.
+    """
     moved = [
         jitter_scene(scene, JITTER, child_generator(seed, f"robustness {run}"))
         for run in range(runs)
     ]
-    again = zip(moved, simulate_many(moved, until_contact=True), strict=True)
+    again = zip(moved, simulate_many(moved, engine=engine, until_contact=True), strict=True)
     return sum(label_contact(*one).contact == contact for one in again) / runs
 
 

@@ -189,8 +189,8 @@ def _fix_settings(
     from physion.trials.making.make import RENDERER
 
     path = folder / SETTINGS
-    made_by = {"engine": make_engine().name, "renderer": RENDERER}
-    plain = {"dataset": dataset, "settings": dataclasses.asdict(settings), "made_by": made_by}
+    made_by = {"engine": make_engine(settings.engine).name, "renderer": RENDERER}
+    plain = {"dataset": dataset, "settings": settings.stored(), "made_by": made_by}
     wanted = json.loads(json.dumps(plain))
     presets = _presets_in_use(tasks)
     if path.is_file():

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 import physion
 from physion.errors import BadInputError, PhysionError
 from physion.golden import version_digest
-from physion.physics.engine import simulate
+from physion.physics.engine import make_engine
 from physion.physics.labels import Labels, label_contact
 from physion.physics.trajectory import Trajectory
 from physion.rendering.renderer import PASSES, Frame, Renderer, role_map
@@ -40,7 +40,7 @@ def make_trial(job: GenerateJob) -> str:
     """
     task = job.task
     scene = scene_of(task)
-    trajectory = simulate(scene)
+    trajectory = make_engine(job.settings.engine).simulate(scene)
     if len(trajectory) <= OBSERVED_FRAMES:
         raise BadInputError(
             f"trial {task.trial!r} has {len(trajectory)} frames; nothing is left to predict after "

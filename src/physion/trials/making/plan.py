@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from physion.errors import BadInputError, UnknownNameError
+from physion.physics.engine import DEFAULT_ENGINE, engines
 from physion.scenes.sampling.preset import default_presets, get_preset
 from physion.scenes.sampling.registry import scenarios as known_scenarios
 from physion.scenes.scene import FRAME_TIME, PLAYBACK_RATE, Scene
@@ -122,6 +124,8 @@ class GenerateSettings:
     """Smallest accepted fraction of jittered simulations with the trial's outcome."""
     min_visible: float = 0.0005
     """Smallest accepted fraction of the first frame that agent and patient each cover."""
+    engine: str = DEFAULT_ENGINE
+    """Engine that moves the bodies (see physion ls engines); mujoco has no cloth."""
     observed_contact: bool = False
     """Accept trials for readout, testing and familiarization also if agent and patient touch in the
     observed part, as the official sets do."""
@@ -134,6 +138,8 @@ class GenerateSettings:
         unknown = sorted(set(self.passes) - set(PASSES))
         if unknown:
             raise BadInputError(f"unknown passes {unknown}; known: {sorted(PASSES)}")
+        if self.engine not in engines:
+            raise UnknownNameError("engine", self.engine, engines.names())
         if self.look not in ("redyellow", "free", "split"):
             raise BadInputError(f"unknown look {self.look!r}; known: redyellow, free, split")
         if self.playback not in PLAYBACK_RATES:
@@ -147,6 +153,15 @@ class GenerateSettings:
             raise BadInputError("a least robustness needs jittered simulations; jitters is 0")
         if self.passes and not self.movies:
             raise BadInputError("image passes are stored with movies only; leave one of them out")
+
+    def stored(self) -> dict[str, Any]:
+        """Return the settings as they are stored with a dataset.
+
+        The engine is left out, because its whole name with all versions is stored next to them.
+        """
+        values = dataclasses.asdict(self)
+        del values["engine"]
+        return values
 
     def looks(self, split: str) -> tuple[str, ...]:
         """Return the looks of the movies of a split; the first is the trial's own."""

@@ -223,14 +223,14 @@ def _check_trial(paths: TrialPaths) -> list[str]:
 
 def _make_again(paths: TrialPaths, settings: Mapping[str, Any], result: Verification) -> None:
     """Sample, simulate and render a trial again; add the differences to ``result``."""
-    from physion.physics.engine import simulate
+    from physion.physics.engine import engine_of
     from physion.trials.making.make import RENDERER
 
     trial = Trial.open(paths.trial_file)
     meta = trial.metadata
     if meta.engine.startswith("imported"):
         return
-    motion = simulate(trial.scene)
+    motion = engine_of(meta.engine).simulate(trial.scene)
     found: list[str] = []
     if meta.preset is not None and meta.preset not in load_presets(meta.scenario):
         result.notes.append(
@@ -287,6 +287,7 @@ def _render_again(paths: TrialPaths, trial: Trial, notes: list[str]) -> list[str
 
 def _sample_again(paths: TrialPaths, trial: Trial, settings: Mapping[str, Any]) -> list[str]:
     """Return the differences when a scene is sampled again from its preset and seed."""
+    from physion.physics.engine import engine_of
     from physion.trials.making.make import scene_of
 
     meta = trial.metadata
@@ -306,9 +307,8 @@ def _sample_again(paths: TrialPaths, trial: Trial, settings: Mapping[str, Any]) 
     if scene_of(task) != trial.scene:
         faults.append(f"{paths.trial_file}: field 'scene' is not the one that preset and seed give")
     if trial.labels.robust is not None and settings:
-        found = robustness(
-            trial.scene, trial.labels.contact, task.seed(), settings.get("jitters", 0)
-        )
+        runs, engine = settings.get("jitters", 0), engine_of(meta.engine)
+        found = robustness(trial.scene, trial.labels.contact, task.seed(), runs, engine)
         if found != trial.labels.robust:
             faults.append(
                 f"{paths.trial_file}: labels/robust is {trial.labels.robust}, again it is {found}"
