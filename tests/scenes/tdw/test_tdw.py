@@ -14,6 +14,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from physion.errors import BadInputError
+from physion.physics.engine import make_engine
+from physion.physics.labels import label_contact
 from physion.scenes.scene import BodyEvent, Scene
 from physion.scenes.tdw.commands import quaternion_from_euler, vector
 from physion.scenes.tdw.read_logs import read_scenes
@@ -268,6 +270,29 @@ def test_objects_may_appear_move_and_vanish_later(tmp_path: Path) -> None:
     assert vanish == BodyEvent(3, "sphere_3", "vanish")
     assert [push.frame for push in scene.pushes] == [5]
     assert Scene.from_json(scene.to_json()) == scene
+
+
+@pytest.mark.parametrize("engine", ["physion", "mujoco"])
+def test_a_log_whose_shelf_vanishes_is_simulated(tmp_path: Path, engine: str) -> None:
+    still = {"$type": "set_kinematic_state", "is_kinematic": True, "use_gravity": True}
+    start = [
+        *thing(1, "cube", xyz(0, 0, 0), scale=xyz(2, 0.01, 2)),
+        still | {"id": 1},
+        *thing(2, "cube", xyz(0, 1.1, 0), scale=xyz(0.3, 0.3, 0.3)),
+        *thing(3, "cube", xyz(0, 1, 0), scale=xyz(1, 0.1, 1)),
+        still | {"id": 3},
+    ]
+    empty: list[list[Command]] = [[]] * 19
+    gone = [{"$type": "destroy_object", "id": 3}]
+    write_log(tmp_path / "held", [[start, *empty, []]])
+    write_log(tmp_path / "dropped", [[start, *empty, gone, []]])
+    labels = []
+    for folder in ("held", "dropped"):
+        scene = only_scene(tmp_path / folder)
+        labels.append(label_contact(scene, make_engine(engine).simulate(scene)))
+    assert not labels[0].contact
+    # From frame 20 on it falls by 1.09 m.
+    assert labels[1].first_frame == pytest.approx(20 + math.sqrt(2 * 1.09 / 9.81) / 0.01, abs=2)
 
 
 def test_the_last_lists_that_destroy_objects_are_no_events(tmp_path: Path) -> None:
