@@ -63,9 +63,18 @@ def collision_hulls(name: str, scale: Vec3) -> tuple[Hull, ...]:
 
 @cache
 def _unit_hulls(name: str) -> tuple[tuple[F64, tuple[I64, ...]], ...]:
-    """Return corners and faces of the hulls of a shape at unit scale."""
-    corners = [_corners(piece) for piece in shape(name).pieces]
-    return tuple((points, tuple(hull_faces(points))) for points in corners)
+    """Return corners and faces of the hulls of a shape at unit scale.
+
+    Points inside a face, such as the middle of a cylinder's ends, are no corners: a body would rest
+    on them in place of its rim.
+    """
+    hulls = []
+    for piece in shape(name).pieces:
+        points = _corners(piece)
+        faces = hull_faces(points)
+        used = np.unique(np.concatenate(faces))
+        hulls.append((points[used], tuple(np.searchsorted(used, face) for face in faces)))
+    return tuple(hulls)
 
 
 def _corners(piece: ConvexPiece) -> F64:
@@ -80,7 +89,7 @@ def _corners(piece: ConvexPiece) -> F64:
 def hull_faces(corners: F64) -> list[I64]:
     """Return the corner numbers of every flat face of a convex hull, in order round the face.
 
-    ``corners`` (K, 3) are points in metres, all of them on the hull.
+    ``corners`` (K, 3) are points in metres, on the hull or within its faces.
     """
     hull = ConvexHull(corners)
     size = float(np.ptp(corners, axis=0).max())
