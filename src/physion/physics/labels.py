@@ -6,17 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physion.physics.cloth.contact_gap import CLOTH_CONTACT_GAP
 from physion.physics.trajectory import Ints, Trajectory
 from physion.scenes.scene import OBSERVED_FRAMES, Scene
-
-CLOTH_CONTACT_GAP = -0.0055
-"""Metres between cloth and patient below which they touch, for every cloth trial alike.
-
-At a gap of 0 the rest distance of the particles (`ClothSettings.rest_distance`) just reaches the
-patient. The official label is true when particles come closer than about 0.1222 m, 2.8 mm less than
-the distance at which they rest: it asks whether the cloth presses on the patient, not whether it
-lies there. Our contacts are softer; 5.5 mm separates the official outcomes best.
-"""
 
 
 @dataclass(frozen=True)

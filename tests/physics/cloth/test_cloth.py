@@ -15,6 +15,7 @@ import pytest
 from physion.errors import BadInputError
 from physion.numerics.linear_algebra import unit
 from physion.numerics.rotations import rotate_vectors
+from physion.physics.cloth.contact_gap import CLOTH_CONTACT_GAP
 from physion.physics.cloth.contacts import smallest_distance
 from physion.physics.cloth.near_solids import BodyPoses, Neighbours, find_neighbours, world_bounds
 from physion.physics.cloth.sheet import sheet_springs, sheet_triangles, sheet_vertices
@@ -22,7 +23,7 @@ from physion.physics.cloth.simulate import ClothMotion, ClothSettings, settle_so
 from physion.physics.cloth.solids import fill_bodies, fill_shape, particles_of, surface_particles
 from physion.physics.cloth.springs import correct_springs
 from physion.physics.engine import simulate
-from physion.physics.labels import CLOTH_CONTACT_GAP, label_contact
+from physion.physics.labels import label_contact
 from physion.physics.replay import area_under_curve
 from physion.physics.trajectory import ENVIRONMENT, Contacts, Trajectory
 from physion.scenes.scene import Body, Camera, Cloth, Roles, Scene
@@ -398,3 +399,33 @@ def test_the_engine_lays_cloth_over_bodies_and_goes_on_from_a_state() -> None:
     later = simulate(scene, start=whole.state(40), frames=21)
     assert np.abs(later.cloth_vertices[0] - whole.cloth_vertices[40]).max() < 1e-6
     assert np.abs(later.cloth_vertices[20] - whole.cloth_vertices[60]).max() < 0.05
+
+
+def test_a_run_until_contact_is_the_beginning_of_the_whole_run() -> None:
+    solid = replace(ball(), kinematic=True)
+    scene = replace(draped(solid, stretch=1.0), settle_frames=100)
+    whole = simulate(scene, frames=101)
+    short = simulate(scene, frames=101, until_contact=True)
+    first = label_contact(scene, whole).first_frame
+    assert first is not None and len(short) == first + 1 < len(whole)
+    assert label_contact(scene, short).first_frame == first
+    assert short.cloth_vertices.tobytes() == whole.cloth_vertices[: first + 1].tobytes()
+    assert short.contacts.frame.max() <= first
+    kept = whole.contacts.frame <= first
+    assert short.contacts.impulse.tolist() == whole.contacts.impulse[kept].tolist()
+    missed = replace(draped(replace(far_away(), kinematic=True)), settle_frames=100)
+    assert len(simulate(missed, frames=31, until_contact=True)) == 31
+
+
+def test_a_sheet_that_nothing_touches_stays_as_it_is() -> None:
+    scene = draped(far_away(), height=2.0)
+    vertices = still(scene, 31).vertices.astype(np.float64)
+    assert (vertices[30] - vertices[0])[:, 2] == pytest.approx(vertices[30, 0, 2] - 2.0, abs=1e-6)
+    # A stretched sheet is not undeformed: it contracts while it falls.
+    wide = vertices[0] * [1.1, 1.1, 1.0]
+    positions, rotations = (
+        np.tile(far_away().position, (11, 1, 1)),
+        np.tile([1.0, 0, 0, 0], (11, 1, 1)),
+    )
+    moved = simulate_cloth(scene, positions, rotations, vertices=wide).vertices
+    assert np.ptp(moved[10, :, 0]) < np.ptp(wide[:, 0]) - 0.01

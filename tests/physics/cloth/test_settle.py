@@ -14,11 +14,11 @@ from physion.physics.cloth.contacts import ClothOptions
 from physion.physics.cloth.settle import (
     SolidBody,
     SolidState,
+    rotate_by,
     settle,
     settled_poses,
     solid_particles,
     spin_between,
-    turn,
 )
 from physion.physics.cloth.simulate import ClothSettings, settle_solids
 from physion.physics.cloth.solids import fill_lattices, fill_shape
@@ -133,11 +133,11 @@ def test_a_turn_and_thespin_between_agree_with_the_axis_and_angle() -> None:
     q, step = np.array(UPRIGHT), 0.01
     axis = np.array([0.6, 0.0, 0.8])
     for _ in range(1000):
-        turn(q, 0.001 * axis)
+        rotate_by(q, 0.001 * axis)
     assert q == pytest.approx(axis_angle_quaternion(axis, 1.0), abs=1e-6)
     spin = np.empty(3)
     later = q.copy()
-    turn(later, 0.002 * axis)
+    rotate_by(later, 0.002 * axis)
     spin_between(q, later, step, spin)
     assert spin == pytest.approx(0.2 * axis, rel=1e-5)
 

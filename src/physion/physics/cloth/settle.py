@@ -80,8 +80,8 @@ class SolidState(NamedTuple):
 
 
 @kernel
-def turn(q: F64, angle: F64) -> None:
-    """Turn a quaternion (4,) by a small rotation vector ``angle`` (3,) of the world, radians."""
+def rotate_by(q: F64, angle: F64) -> None:
+    """Rotate a quaternion (4,) by a small rotation vector ``angle`` (3,) of the world, radians."""
     half = 0.5 * angle
     w, x, y, z = q[0], q[1], q[2], q[3]
     q[0] = w - half[0] * x - half[1] * y - half[2] * z
@@ -165,7 +165,7 @@ def settle(
                 state.velocity[body, 2] -= step * options.gravity
                 for k in range(3):
                     state.center[body, k] += step * state.velocity[body, k]
-                turn(state.q[body], step * state.spin[body])
+                rotate_by(state.q[body], step * state.spin[body])
             _place(state, solids, poses)
             world_bounds(lattices, poses, reach, bounds[0], bounds[1])
             number = 0
@@ -333,7 +333,7 @@ def _pass(
             for m in range(3):
                 for j in range(3):
                     turned[k] += rot[b, k, m] * solids.inverse[b, m, j] * shift[j]
-        turn(state.q[b], turned)
+        rotate_by(state.q[b], turned)
 
 
 @lru_cache(maxsize=64)

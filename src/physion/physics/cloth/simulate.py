@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.errors import BadInputError
+from physion.physics.cloth.contact_gap import CLOTH_CONTACT_GAP
 from physion.physics.cloth.contacts import ClothOptions
 from physion.physics.cloth.near_solids import Solids
 from physion.physics.cloth.settle import SolidBody, settled_poses
@@ -99,6 +100,7 @@ def simulate_cloth(
     *,
     vertices: NDArray[np.floating] | None = None,
     velocities: NDArray[np.floating] | None = None,
+    until_gap: float | None = None,
 ) -> ClothMotion:
     """Simulate the cloths of ``scene`` on its bodies, whose motion is given.
 
@@ -114,6 +116,9 @@ def simulate_cloth(
         By default those of the official trials.
     vertices, velocities : (V, 3), optional
         State from which the cloths start, in metres and m/s; by default flat and at rest.
+    until_gap : float, optional
+        Gap in metres between agent and patient below which the motion ends with that frame; without
+        effect if there are several cloths.
 
     Raises
     ------
@@ -137,9 +142,10 @@ def simulate_cloth(
     at = _start(vertices, flat, "vertices")
     speed = _start(velocities, [np.zeros_like(sheet) for sheet in flat], "velocities")
     records = [
-        _run(scene, number, at[number], speed[number], solids, positions, rotations, rules)
-        for number in range(len(scene.cloths))
+        _run(scene, n, at[n], speed[n], solids, positions, rotations, rules, until_gap)
+        for n in range(len(scene.cloths))
     ]
+    frames = min((len(record.vertices) for record in records), default=frames)
     asked = [record.distance for record in records if not np.isnan(record.distance).all()]
     return ClothMotion(
         np.concatenate(
@@ -204,6 +210,7 @@ def add_cloth(
     settings: ClothSettings | None = None,
     *,
     start: State | None = None,
+    until_contact: bool = False,
 ) -> Trajectory:
     """Return the trajectory of the scene's bodies with the motion of its cloths added.
 
@@ -218,6 +225,9 @@ def add_cloth(
         By default those of the official trials.
     start : State, optional
         The state from which ``rigid`` started, if it was not the scene's.
+    until_contact : bool
+        End with the first frame in which cloth and patient touch, if nothing appears or vanishes:
+        the label is then known.
     """
     with_state = start is not None and len(start.cloth_vertices) > 0
     motion = simulate_cloth(
@@ -227,11 +237,19 @@ def add_cloth(
         settings,
         vertices=start.cloth_vertices if start is not None and with_state else None,
         velocities=start.cloth_velocities if start is not None and with_state else None,
+        until_gap=CLOTH_CONTACT_GAP if until_contact and not scene.events else None,
     )
+    frames = len(motion.vertices)
     both = (rigid.contacts, motion.contacts)
-    order = np.argsort(np.concatenate([c.frame for c in both]), kind="stable")
+    frame = np.concatenate([c.frame for c in both])
+    order = np.argsort(frame, kind="stable")
+    order = order[frame[order] < frames]
     return replace(
         rigid,
+        positions=rigid.positions[:frames],
+        rotations=rigid.rotations[:frames],
+        velocities=rigid.velocities[:frames],
+        angular_velocities=rigid.angular_velocities[:frames],
         cloth_vertices=motion.vertices,
         cloth_distance=motion.distance,
         contacts=Contacts(
@@ -264,8 +282,9 @@ def _run(
     positions: Points,
     rotations: Points,
     settings: ClothSettings,
+    until_gap: float | None,
 ) -> ClothRecord:
-    """Simulate cloth ``number`` of the scene."""
+    """Simulate one cloth of the scene, to the end or until its gap is below ``until_gap``."""
     cloth, frames, bodies = scene.cloths[number], len(positions), len(scene.bodies)
     watched = _other_body(scene, cloth.name)
     record = ClothRecord(
@@ -281,17 +300,20 @@ def _run(
         else np.zeros((0, 3))
     )
     scenery = MovingSolids(solids, positions, rotations, watched, particles)
-    run_cloth(
+    stop_below = -np.inf
+    if until_gap is not None and len(scene.cloths) == 1:
+        stop_below = until_gap + settings.rest_distance
+    frames = run_cloth(
         np.ascontiguousarray(points.T),
         np.ascontiguousarray(velocities.T),
         sheet_springs(cloth),
         scenery,
         _options(scene, settings),
-        -np.inf,
+        stop_below,
         record,
     )
     record.distance[:] -= settings.rest_distance
-    return record
+    return ClothRecord(*(part[:frames] for part in record))
 
 
 def _other_body(scene: Scene, cloth: str) -> int:

@@ -66,7 +66,9 @@ class RigidEngine:
         # Cloth does not sleep: with it a trial takes its whole time.
         least = most if frames is not None or scene.cloths else scene.ending.min_frames
         rigid = simulate_rigid(scene, self.settings, self.name, start, least, most, until_contact)
-        return add_cloth(scene, rigid, self.cloth, start=start) if scene.cloths else rigid
+        if not scene.cloths:
+            return rigid
+        return add_cloth(scene, rigid, self.cloth, start=start, until_contact=until_contact)
 
     def simulate_many(
         self,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from physion.errors import BadInputError
-from physion.physics.labels import CLOTH_CONTACT_GAP
+from physion.physics.cloth.contact_gap import CLOTH_CONTACT_GAP
 
 Bytes = NDArray[np.uint8]
 
