@@ -104,7 +104,7 @@ class Cloth:
 
 @dataclass(frozen=True, slots=True)
 class Push:
-    """Impulse (newton seconds) on a body, applied just before the step that follows ``frame``.
+    """Impulse (newton seconds) on a body, applied just before the step that leads to ``frame``.
 
     ``point`` is in world coordinates, metres; None is the centre of mass, which causes no rotation.
     """
