@@ -57,17 +57,19 @@ def hulls_of(*corners: F64, margin: float = 0.05, tolerance: float = 0.02) -> Hu
     bounds = [
         np.concatenate([(c.min(0) + c.max(0)) / 2, (c.max(0) - c.min(0)) / 2]) for c in corners
     ]
+    radius = np.array([np.linalg.norm(c, axis=1).max() for c in corners])
     return Hulls(
-        vertices,
-        first,
-        flat,
-        first_loop,
-        np.cumsum([0, *(len(hull) for hull in faces)]).astype(np.int64),
-        face_planes(vertices, flat, first_loop),
-        np.full(len(corners), margin),
-        np.full(len(corners), tolerance),
-        np.array([np.linalg.norm(c, axis=1).max() for c in corners]),
-        np.array(bounds),
+        vertices=vertices,
+        first_vertex=first,
+        loops=flat,
+        first_loop=first_loop,
+        first_face=np.cumsum([0, *(len(hull) for hull in faces)]).astype(np.int64),
+        plane=face_planes(vertices, flat, first_loop),
+        margin=np.full(len(corners), margin),
+        tolerance=np.full(len(corners), tolerance),
+        radius=radius,
+        extent=radius,
+        box=np.array(bounds),
     )
 
 
