@@ -366,19 +366,7 @@ def test_a_trial_does_not_end_before_its_last_event(name: str) -> None:
     assert len(path) > 150 and path.positions[125, 0, 2] > 0.9 and path.completed
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "mujoco",
-        pytest.param(
-            "physion",
-            marks=pytest.mark.xfail(
-                strict=True,
-                reason="what does not move is put at the pose of the scene, not of the state",
-            ),
-        ),
-    ],
-)
+@BOTH
 def test_going_on_from_a_state_takes_later_events_alone(name: str) -> None:
     box = Body("a", "cube", (0, 0, 3.0), (0.2, 0.2, 0.2))
     move, gone = BodyEvent(10, "a", "move", (2.0, 0.0, 5.0)), BodyEvent(30, "a", "vanish")

@@ -22,6 +22,7 @@ from numba.core.dispatcher import Dispatcher
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True}
+IN_PLACE_OPTIONS: dict[str, Any] = {**OPTIONS, "_nrt": False}
 
 
 def kernel(function: Function) -> Function:
@@ -32,7 +33,22 @@ def kernel(function: Function) -> Function:
     infinity or NaN. The cached machine code is discarded when the file of the kernel, of any
     kernel that it calls, or of any module of this package that it imports has changed.
     """
-    dispatcher: Any = numba.njit(**OPTIONS)(function)
+    return _compiled(function, OPTIONS)
+
+
+def in_place_kernel(function: Function) -> Function:
+    """Compile a function that makes no arrays, and calls only such kernels; see `kernel`.
+
+    It works on arrays of its caller. Numba counts references to every array that a function
+    touches, with atomic operations that cost more than short loops; here it does not. A function
+    that makes an array does not compile.
+    """
+    return _compiled(function, IN_PLACE_OPTIONS)
+
+
+def _compiled(function: Function, options: dict[str, Any]) -> Function:
+    """Return the compiled function with a cache on disk."""
+    dispatcher: Any = numba.njit(**options)(function)
     if not isinstance(dispatcher, Dispatcher):
         return function  # NUMBA_DISABLE_JIT is set: nothing is compiled
     compiled: Any = dispatcher

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from physion.numerics.elementary import cos, sin
 from physion.numerics.kernel import kernel
-from physion.numerics.linear_algebra import unit
+from physion.numerics.linear_algebra import cross, unit
 
 F64 = NDArray[np.float64]
 
@@ -91,8 +91,8 @@ def rotate_vectors(q: ArrayLike, vectors: ArrayLike) -> F64:
     """Return vectors (..., 3) rotated by unit quaternions (..., 4), leading axes broadcast."""
     rotation, v = np.asarray(q, np.float64), np.asarray(vectors, np.float64)
     axis = rotation[..., 1:]
-    twice = 2.0 * np.cross(axis, v)
-    return np.asarray(v + rotation[..., :1] * twice + np.cross(axis, twice))
+    twice = 2.0 * cross(axis, v)
+    return np.asarray(v + rotation[..., :1] * twice + cross(axis, twice))
 
 
 def axis_angle_quaternion(axis: ArrayLike, angle: float) -> F64:

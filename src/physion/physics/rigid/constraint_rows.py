@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from physion.numerics.kernel import kernel
+from physion.numerics.kernel import in_place_kernel
 from physion.physics.rigid.collision.manifold import Manifolds
 from physion.physics.rigid.collision.search import ContactList
 from physion.physics.rigid.friction_anchors import to_world
@@ -35,7 +35,7 @@ ORTHOGONAL_COSINE = 0.70710678
 crossed with x to get a tangent, any other with z, so that the product is never short."""
 
 
-@kernel
+@in_place_kernel
 def fill_row(
     rows: F64, r: int, a: int, b: int, point_a: F64, point_b: F64, d: F64, bodies: Bodies
 ) -> float:
@@ -66,7 +66,7 @@ def fill_row(
     return float(inverse_mass)
 
 
-@kernel
+@in_place_kernel
 def relative_speed(rows: F64, r: int, a: int, b: int, v: F64, w: F64) -> float:
     """Return J v of row ``r`` in m/s: positive where the bodies part."""
     return float(
@@ -78,7 +78,7 @@ def relative_speed(rows: F64, r: int, a: int, b: int, v: F64, w: F64) -> float:
     )
 
 
-@kernel
+@in_place_kernel
 def apply_impulse(
     rows: F64, r: int, a: int, b: int, impulse: float, v: F64, w: F64, inv_mass: F64
 ) -> None:
@@ -91,7 +91,7 @@ def apply_impulse(
         w[b, i] += rows[r, SPIN_B + i] * impulse
 
 
-@kernel
+@in_place_kernel
 def first_tangent(normal: F64, relative: F64, out: F64) -> None:
     """Fill ``out`` (3,) with the first friction direction, a unit vector across ``normal`` (3,).
 
@@ -125,7 +125,7 @@ def first_tangent(normal: F64, relative: F64, out: F64) -> None:
 # our bias / dt; maxPenetrationBias; bounceThreshold). No deviation is known.
 
 
-@kernel
+@in_place_kernel
 def set_normal_rows(
     contacts: ContactList, pairs: int, bodies: Bodies, options: SolverOptions, rows: Constraints
 ) -> None:
@@ -168,7 +168,7 @@ def set_normal_rows(
 # PhysX: the friction part of `setupFinalizeSolverConstraints`. No deviation is known.
 
 
-@kernel
+@in_place_kernel
 def set_friction_rows(
     contacts: ContactList,
     pairs: int,
@@ -183,7 +183,7 @@ def set_friction_rows(
     """
     v, friction, tangents = bodies.v, rows.friction, rows.tangents
     pa, pb = rows.arm[0], rows.arm[1]
-    relative = np.zeros(3)
+    relative = rows.relative
     for p in range(pairs):
         s = contacts.manifold[p]
         a, b = contacts.actors[p, 0], contacts.actors[p, 1]
@@ -223,7 +223,7 @@ def set_friction_rows(
 # only the order within that partition is then the order of the pairs.
 
 
-@kernel
+@in_place_kernel
 def set_order(contacts: ContactList, pairs: int, world: int, rows: Constraints) -> None:
     """Fill ``rows.order`` with the order of solving: what rests on the world comes last.
 

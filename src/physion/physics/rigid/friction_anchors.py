@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from physion.numerics.kernel import kernel
+from physion.numerics.kernel import in_place_kernel
 from physion.physics.rigid.collision.manifold import Manifolds
 from physion.physics.rigid.collision.search import ContactList
 from physion.physics.rigid.solver_records import F64, Bodies, Flags, SolverOptions
@@ -21,7 +21,7 @@ MIN_ANCHOR_SPREAD = 4.0
 is at most this many times theirs."""
 
 
-@kernel
+@in_place_kernel
 def to_world(bodies: Bodies, a: int, local: F64, out: F64) -> None:
     """Fill ``out`` (3,) with x + R local of actor ``a``."""
     rot, x = bodies.rot, bodies.x
@@ -31,7 +31,7 @@ def to_world(bodies: Bodies, a: int, local: F64, out: F64) -> None:
         )
 
 
-@kernel
+@in_place_kernel
 def _to_local(bodies: Bodies, a: int, world: F64, out: F64) -> None:
     """Fill ``out`` (3,) with R^T (world - x) of actor ``a``."""
     rot, x = bodies.rot, bodies.x
@@ -40,7 +40,14 @@ def _to_local(bodies: Bodies, a: int, world: F64, out: F64) -> None:
         out[i] = rot[a, 0, i] * dx + rot[a, 1, i] * dy + rot[a, 2, i] * dz
 
 
-@kernel
+@in_place_kernel
+def _copy(point: F64, out: F64) -> None:
+    """Fill ``out`` (3,) with a point (3,)."""
+    for i in range(3):
+        out[i] = point[i]
+
+
+@in_place_kernel
 def _squared_distance(a: F64, b: F64) -> float:
     """Return |a - b|^2 of points (3,)."""
     return float((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
@@ -57,7 +64,7 @@ def _squared_distance(a: F64, b: F64) -> float:
 # agree; here a pair of hulls is a patch.
 
 
-@kernel
+@in_place_kernel
 def keep_anchors(
     contacts: ContactList, p: int, manifolds: Manifolds, bodies: Bodies, options: SolverOptions
 ) -> None:
@@ -70,14 +77,20 @@ def keep_anchors(
     rot, x = bodies.rot, bodies.x
     local = manifolds.anchor_normal
     between = along = 0.0
-    na = np.zeros(3)
+    n0 = n1 = n2 = 0.0
     for i in range(3):
-        nb = 0.0
+        na = nb = 0.0
         for j in range(3):
-            na[i] += rot[a, i, j] * local[s, 0, j]
+            na += rot[a, i, j] * local[s, 0, j]
             nb += rot[b, i, j] * local[s, 1, j]
-        between += na[i] * nb
-        along += na[i] * contacts.normal[p, i]
+        between += na * nb
+        along += na * contacts.normal[p, i]
+        if i == 0:
+            n0 = na
+        elif i == 1:
+            n1 = na
+        else:
+            n2 = na
     keep = between > options.patch_cosine and along >= options.patch_cosine
     for k in range(count):
         gap = 0.0
@@ -86,7 +99,7 @@ def keep_anchors(
             for j in range(3):
                 pa += rot[a, i, j] * manifolds.anchor[s, 0, k, j]
                 pb += rot[b, i, j] * manifolds.anchor[s, 1, k, j]
-            gap += (pa - pb) * na[i]
+            gap += (pa - pb) * (n0 if i == 0 else (n1 if i == 1 else n2))
         keep = keep and abs(gap) < options.anchor_distance
     if not keep:
         manifolds.anchor_count[s] = 0
@@ -99,13 +112,19 @@ def keep_anchors(
 # PhysX: `growPatches`, with frictionOffsetThreshold as our anchor_gap. No deviation is known.
 
 
-@kernel
+@in_place_kernel
 def grow_anchors(
-    contacts: ContactList, p: int, manifolds: Manifolds, bodies: Bodies, options: SolverOptions
+    contacts: ContactList,
+    p: int,
+    manifolds: Manifolds,
+    bodies: Bodies,
+    options: SolverOptions,
+    world: F64,
 ) -> None:
     """Give pair ``p`` up to two anchors, chosen from its contact points; old ones stay if they fit.
 
-    Contacts farther apart than ``options.anchor_gap`` metres hold no anchor.
+    Contacts farther apart than ``options.anchor_gap`` metres hold no anchor. ``world`` (2, 3) is
+    work space.
     """
     s = contacts.manifold[p]
     a, b = contacts.actors[p, 0], contacts.actors[p, 1]
@@ -123,7 +142,6 @@ def grow_anchors(
         if MIN_ANCHOR_SPREAD * spread >= diagonal:
             return
         count[s] = 0
-    world = np.zeros((2, 3))
     old = count[s]
     have = old
     if old == 1:
@@ -134,22 +152,22 @@ def grow_anchors(
             continue
         point = contacts.point[c]
         if have == 0:
-            world[0] = point
+            _copy(point, world[0])
             have = 1
         elif have == 1:
             between = _squared_distance(point, world[0])
             if between > options.anchor_distance**2:
-                world[1] = point
+                _copy(point, world[1])
                 have = 2
         else:
             d0 = _squared_distance(point, world[0])
             d1 = _squared_distance(point, world[1])
             if d0 > d1:
                 if d0 > between:
-                    world[1] = point
+                    _copy(point, world[1])
                     between = d0
             elif d1 > between:
-                world[0] = point
+                _copy(point, world[0])
                 between = d1
     for k in range(old, have):
         _to_local(bodies, a, world[k], anchor[s, 0, k])
@@ -163,7 +181,7 @@ def grow_anchors(
 # PhysX: the ``broken`` flag that `solveContact` sets and `writeBackContact` stores with the patch.
 
 
-@kernel
+@in_place_kernel
 def remember_anchors(
     contacts: ContactList, pairs: int, slipped: Flags, manifolds: Manifolds, bodies: Bodies
 ) -> None:

@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull
 
 from physion.numerics.elementary import arctan2
 from physion.numerics.kernel import kernel
-from physion.numerics.linear_algebra import dot, ordered_mean, unit
+from physion.numerics.linear_algebra import cross, dot, ordered_mean, unit
 from physion.scenes.scene import Vec3
 from physion.scenes.shapes.primitives import ConvexPiece, ball_mesh, shape
 
@@ -109,7 +109,7 @@ def hull_faces(corners: F64) -> list[I64]:
         points = corners[used] - ordered_mean(corners[used], axis=0)
         normal = normals[t]
         first = unit(points[0] - normal * dot(points[0], normal))
-        second = np.cross(normal, first)
+        second = cross(normal, first)
         angle = arctan2(dot(points, second), dot(points, first))
         faces.append(used[np.argsort(angle, kind="stable")].astype(np.int64))
     return faces
@@ -151,39 +151,50 @@ def face_planes(vertices: F64, loops: I64, first_loop: I64) -> F64:
 
 
 def inner_box(corners: F64, faces: tuple[I64, ...], center: F64) -> F64:
-    """Return half extents (3,) in metres of a box round ``center`` inside a hull.
+    """Return half extents (3,) in metres of a box round ``center`` inside a hull; see `Hull`."""
+    first_loop = np.cumsum([0, *(len(face) for face in faces)]).astype(np.int64)
+    planes = face_planes(corners, np.concatenate(faces), first_loop)
+    return _inner_box(planes, center, np.ptp(corners, axis=0))
 
-    With r the radius of the ball round the centre that fits in, the box starts as the cube in that
-    ball, half a side r / sqrt 3; it is lengthened along the hull's longest axis until it meets a
-    face, then widened alike along the other two. As PhysX 4 does when it cooks a mesh
-    (``ComputeInternalExtent``): a manifold's tolerances depend on it.
-    """
-    loops = np.concatenate(faces)
-    planes = face_planes(corners, loops, np.cumsum([0, *(len(face) for face in faces)]))
-    normals = planes[:, :3]
-    distance = planes[:, 3] - dot(normals, center)
-    least = float(np.abs(distance).min()) / np.sqrt(3.0)
-    size = np.ptp(corners, axis=0)
+
+# With r the radius of the ball round the centre that fits in, the box starts as the cube in that
+# ball, half a side r / sqrt 3; it is lengthened along the hull's longest axis until it meets a
+# face, then widened alike along the other two. As PhysX 4 does when it cooks a mesh
+# (``ComputeInternalExtent``): a manifold's tolerances depend on it.
+
+
+@kernel
+def _inner_box(planes: F64, center: F64, size: F64) -> F64:
+    """Return the half extents of the box from the hull's planes (F, 4) and its size (3,)."""
+    distance = np.zeros(len(planes))
+    least = np.inf
+    for f in range(len(planes)):
+        distance[f] = planes[f, 3]
+        for k in range(3):
+            distance[f] -= planes[f, k] * center[k]
+        least = min(least, abs(distance[f]))
+    least /= np.sqrt(3.0)
     longest = int(np.argmax(size))
     i, j = (longest + 1) % 3, (longest + 2) % 3
     if size[i] < size[j]:
         i, j = j, i
-    half = np.full(3, least)
-    cuts = np.abs(normals[:, longest]) > ACROSS
-    reach = np.inf
-    for sign_i in (-1.0, 1.0):
-        for sign_j in (-1.0, 1.0):
-            side = least * (sign_i * normals[cuts, i] + sign_j * normals[cuts, j])
-            lengths = np.abs((distance[cuts] - side) / normals[cuts, longest])
-            reach = min(reach, float(np.maximum(lengths, least).min()))
-    half[longest] = reach
-    width = np.inf
-    for sign in (-1.0, 1.0):
-        along = normals[:, i] + sign * normals[:, j]
-        cuts = np.abs(along) > ACROSS
-        for end in (-1.0, 1.0):
-            left = distance[cuts] - end * half[longest] * normals[cuts, longest]
-            lengths = np.abs(left / along[cuts])
-            width = min(width, float(np.maximum(lengths, least).min()))
-    half[i] = half[j] = width
+    reach = width = np.inf
+    for f in range(len(planes)):
+        if abs(planes[f, longest]) <= ACROSS:
+            continue
+        for corner in range(4):
+            along_i = least if corner % 2 else -least
+            along_j = least if corner // 2 else -least
+            side = along_i * planes[f, i] + along_j * planes[f, j]
+            reach = min(reach, max(abs((distance[f] - side) / planes[f, longest]), least))
+    for f in range(len(planes)):
+        for diagonal in (-1.0, 1.0):
+            along = planes[f, i] + diagonal * planes[f, j]
+            if abs(along) <= ACROSS:
+                continue
+            for end in (-reach, reach):
+                left = distance[f] - end * planes[f, longest]
+                width = min(width, max(abs(left / along), least))
+    half = np.zeros(3)
+    half[longest], half[i], half[j] = reach, width, width
     return half

@@ -8,7 +8,7 @@ the drawn solid.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +16,7 @@ from scipy.spatial import ConvexHull
 
 from physion.numerics.linear_algebra import (
     apply,
+    determinant,
     dot,
     multiply,
     ordered_mean,
@@ -73,8 +74,35 @@ def body_mass(body: Body) -> MassProperties:
 
 @lru_cache(maxsize=CACHED_HULLS)
 def _body_mass(name: str, scale: Vec3, mass: float) -> MassProperties:
-    """Return the mass properties of a shape at a scale."""
-    return hull_mass([hull.corners for hull in collision_hulls(name, scale)], mass)
+    """Return the mass properties of a shape at a scale.
+
+    Stretching by S multiplies volumes by |S|, integrals of x by S |S|, of x x^T by S S^T |S|.
+    """
+    volume, first, second = _unit_moments(name)
+    if volume == 0.0:
+        return hull_mass([], mass)
+    factors = np.asarray(scale)
+    stretched = abs(scale[0] * scale[1] * scale[2])
+    return _from_moments(
+        volume * stretched,
+        first * factors * stretched,
+        second * outer(factors, factors) * stretched,
+        mass,
+    )
+
+
+@cache
+def _unit_moments(name: str) -> tuple[float, F64, F64]:
+    """Return the integrals of 1, x and x x^T over all pieces of a shape at unit scale."""
+    moments = [hull_moments(hull.corners) for hull in collision_hulls(name, (1.0, 1.0, 1.0))]
+    if not moments:
+        return 0.0, np.zeros(3), np.zeros((3, 3))
+    volumes, firsts, seconds = zip(*moments, strict=True)
+    return (
+        float(ordered_sum(volumes)),
+        ordered_sum(np.array(firsts), axis=0),
+        ordered_sum(np.array(seconds), axis=0),
+    )
 
 
 def hull_mass(hulls: list[F64], mass: float) -> MassProperties:
@@ -86,24 +114,40 @@ def hull_mass(hulls: list[F64], mass: float) -> MassProperties:
     """
     if not hulls:
         return MassProperties(mass, np.zeros(3), np.eye(3) * mass)
-    whole = merge_masses([_solid(np.asarray(hull)) for hull in hulls])
-    factor = mass / whole.mass
-    return MassProperties(mass, whole.center, whole.inertia * factor)
+    volumes, firsts, seconds = zip(*map(hull_moments, hulls), strict=True)
+    return _from_moments(
+        float(ordered_sum(volumes)),
+        ordered_sum(np.array(firsts), axis=0),
+        ordered_sum(np.array(seconds), axis=0),
+        mass,
+    )
 
 
-def _solid(corners: F64) -> MassProperties:
-    """Return the mass properties of a convex hull of density 1, with corners (K, 3).
+def _from_moments(volume: float, first: F64, second: F64, mass: float) -> MassProperties:
+    """Return the mass properties of a solid with the integrals of 1, x and x x^T.
 
-    With M = integral of x x^T about the centre of mass, the inertia is tr(M) 1 - M.
+    With M = integral of x x^T about the centre of mass over the volume, the inertia is
+    mass (tr(M) 1 - M).
     """
+    center = first / volume
+    moments = second / volume - outer(center, center)
+    inertia = mass * (ordered_sum(np.diagonal(moments)) * np.eye(3) - moments)
+    return MassProperties(mass, center, inertia)
+
+
+def hull_moments(corners: F64) -> tuple[float, F64, F64]:
+    """Return the integrals of 1, x (3,) and x x^T (3, 3) over a convex hull of corners (K, 3)."""
+    corners = np.asarray(corners, np.float64)
     inside = ordered_mean(corners, axis=0)
     triangles = corners[ConvexHull(corners).simplices] - inside
     # Seen from inside, all triangles turn the same way once those with a negative volume are
     # reversed.
-    reverse = dot(triangles[:, 0], np.cross(triangles[:, 1], triangles[:, 2])) < 0.0
+    reverse = determinant(triangles) < 0.0
     triangles[reverse] = triangles[reverse][:, ::-1]
     volume, first, second = solid_moments(triangles)
-    center = first / volume
-    moments = second - volume * outer(center, center)
-    inertia = ordered_sum(np.diagonal(moments)) * np.eye(3) - moments
-    return MassProperties(volume, inside + center, inertia)
+    shifted = outer(inside, first)
+    return (
+        volume,
+        first + volume * inside,
+        second + shifted + shifted.T + volume * outer(inside, inside),
+    )

@@ -205,5 +205,6 @@ def _gather(hulls: list[tuple[Hull, ...]], pivot: F64, rotation: F64) -> Hulls:
         np.minimum(MARGIN_FRACTION * least, MAX_MARGIN),
         np.clip(TOLERANCE_FRACTION * least, MIN_TOLERANCE, MAX_TOLERANCE),
         norm(np.array([hull.inner_box for hull in geoms]).reshape(-1, 3)),
+        np.array([norm(c).max() for c in corners]),
         np.concatenate([0.5 * (low + high), 0.5 * (high - low)], axis=1),
     )

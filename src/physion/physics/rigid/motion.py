@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from physion.numerics.elementary import cos_of, sin_of
-from physion.numerics.kernel import kernel
+from physion.numerics.kernel import in_place_kernel
 from physion.physics.rigid.solver_records import F64, Flags
 
 MIN_SPIN = 1e-12
@@ -15,7 +15,7 @@ MIN_SPIN = 1e-12
 # at the end of the step. PhysX: `bodyCoreComputeUnconstrainedVelocity` and `integrateCore`.
 
 
-@kernel
+@in_place_kernel
 def move_freely(
     v: F64,
     w: F64,
@@ -56,7 +56,7 @@ def move_freely(
             w[i, j] *= factor
 
 
-@kernel
+@in_place_kernel
 def move_poses(x: F64, q: F64, v: F64, w: F64, asleep: Flags, dt: float) -> None:
     """Move centres of mass ``x`` and orientations ``q`` by constant velocities over ``dt`` seconds.
 
@@ -96,7 +96,7 @@ def move_poses(x: F64, q: F64, v: F64, w: F64, asleep: Flags, dt: float) -> None
             q[i, j] /= length
 
 
-@kernel
+@in_place_kernel
 def fill_rotations(q: F64, rot: F64, start: int, stop: int) -> None:
     """Fill rows ``start`` to ``stop`` of ``rot`` (B, 3, 3) with the matrices of ``q`` (B, 4)."""
     for i in range(start, stop):

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.numerics.linear_algebra import unit
+from physion.numerics.linear_algebra import cross, unit
 from physion.numerics.rotations import (
     conjugate,
     multiply_quaternions,
@@ -174,7 +174,7 @@ class RigidRun:
         return Trajectory(
             positions=(x + rotate_vectors(q, model.pivot)).astype(np.float32),
             rotations=multiply_quaternions(q, model.rotation).astype(np.float32),
-            velocities=(v + np.cross(w, arm)).astype(np.float32),
+            velocities=(v + cross(w, arm)).astype(np.float32),
             angular_velocities=w.astype(np.float32),
             cloth_vertices=np.zeros((frames, 0, 3), np.float32),
             cloth_distance=np.full(frames, np.nan, np.float32),
@@ -236,7 +236,7 @@ class RigidRun:
             bodies.x[actor] = start.positions[i] - rotate_vectors(q, model.pivot[i])
             bodies.w[actor] = start.angular_velocities[i]
             arm = rotate_vectors(q, model.center[i])
-            bodies.v[actor] = start.velocities[i] - np.cross(bodies.w[actor], arm)
+            bodies.v[actor] = start.velocities[i] - cross(bodies.w[actor], arm)
         self.first_frame = start.frame
 
 

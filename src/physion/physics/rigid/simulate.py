@@ -5,12 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from physion.numerics.linear_algebra import unit
 from physion.physics.rigid.run import RigidRun
 from physion.physics.rigid.settings import RigidSettings
 from physion.physics.trajectory import Contacts, State, Trajectory
 from physion.scenes.scene import Scene
+
+F64 = NDArray[np.float64]
 
 
 def simulate_rigid(
@@ -41,6 +44,9 @@ def simulate_rigid(
     first = 0 if start is None else start.frame
     events = sorted({e.frame for e in scene.events if first < e.frame < first + most})
     before = 0 if start is None else start.frame
+    if start is not None and scene.events:
+        # Earlier events may have put bodies elsewhere that do not move by themselves.
+        scene = _at_poses(scene, start.positions, unit(start.rotations))
     run = RigidRun(scene, settings, start, scene.present(before))
     if not events:
         run.run(least, most, until_touch)
@@ -87,10 +93,6 @@ def _take_events(scene: Scene, state: State, frame: int) -> tuple[Scene, State]:
             positions[i] = event.position
         if event.rotation is not None:
             rotations[i] = unit(np.asarray(event.rotation))
-    bodies = tuple(
-        replace(body, position=tuple(p.tolist()), rotation=tuple(q.tolist()))
-        for body, p, q in zip(scene.bodies, positions, rotations, strict=True)
-    )
     moved = replace(
         state,
         frame=frame,
@@ -99,7 +101,16 @@ def _take_events(scene: Scene, state: State, frame: int) -> tuple[Scene, State]:
         velocities=velocities,
         angular_velocities=spins,
     )
-    return replace(scene, bodies=bodies), moved
+    return _at_poses(scene, positions, rotations), moved
+
+
+def _at_poses(scene: Scene, positions: F64, rotations: F64) -> Scene:
+    """Return the scene with its bodies at other poses (N, 3), (N, 4)."""
+    bodies = tuple(
+        replace(body, position=tuple(p.tolist()), rotation=tuple(q.tolist()))
+        for body, p, q in zip(scene.bodies, positions, rotations, strict=True)
+    )
+    return replace(scene, bodies=bodies)
 
 
 def _join(parts: list[Trajectory]) -> Trajectory:

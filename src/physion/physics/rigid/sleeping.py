@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.numerics.kernel import kernel
+from physion.numerics.kernel import in_place_kernel
 from physion.physics.rigid.solver_records import Bodies
 
 F64 = NDArray[np.float64]
@@ -62,7 +62,7 @@ class SleepOptions(NamedTuple):
     dt: float
 
 
-@kernel
+@in_place_kernel
 def find_islands(pairs: I64, count: int, island: I64) -> None:
     """Fill ``island`` (A,) with the lowest actor that each actor touches, also through others.
 
@@ -81,7 +81,7 @@ def find_islands(pairs: I64, count: int, island: I64) -> None:
                     island[i] = low
 
 
-@kernel
+@in_place_kernel
 def wake_touched(state: SleepState, wake_time: float) -> bool:
     """Wake every sleeping actor whose island holds an actor that is awake; return whether any was.
 
@@ -110,7 +110,7 @@ def wake_touched(state: SleepState, wake_time: float) -> bool:
 # island manager's deactivation. No deviation is known.
 
 
-@kernel
+@in_place_kernel
 def update_sleep(
     pairs: I64,
     count: int,

@@ -31,7 +31,7 @@ E. Catto, Iterative Dynamics with Temporal Coherence, Game Developers Conference
 
 from __future__ import annotations
 
-from physion.numerics.kernel import kernel
+from physion.numerics.kernel import in_place_kernel
 from physion.physics.rigid.collision.manifold import Manifolds
 from physion.physics.rigid.collision.search import ContactList
 from physion.physics.rigid.constraint_rows import (
@@ -52,7 +52,7 @@ from physion.physics.rigid.solver_records import (
 )
 
 
-@kernel
+@in_place_kernel
 def build_constraints(
     contacts: ContactList,
     pairs: int,
@@ -64,7 +64,7 @@ def build_constraints(
     """Fill all rows of a step with accumulated impulses of 0 (no warm start, as in PhysX)."""
     for p in range(pairs):
         keep_anchors(contacts, p, manifolds, bodies, options)
-        grow_anchors(contacts, p, manifolds, bodies, options)
+        grow_anchors(contacts, p, manifolds, bodies, options, rows.arm)
     set_normal_rows(contacts, pairs, bodies, options, rows)
     set_friction_rows(contacts, pairs, manifolds, bodies, options, rows)
     set_order(contacts, pairs, len(bodies.x) - 1, rows)
@@ -83,7 +83,7 @@ def build_constraints(
 # force (divide_friction gives each its part), and the limits hold for each tangent apart.
 
 
-@kernel
+@in_place_kernel
 def sweep(
     rows: Constraints,
     contacts: ContactList,
@@ -144,7 +144,7 @@ def sweep(
         rows.slipped[p] = slips
 
 
-@kernel
+@in_place_kernel
 def correct_positions(
     rows: Constraints,
     contacts: ContactList,
@@ -169,7 +169,7 @@ def correct_positions(
         )
 
 
-@kernel
+@in_place_kernel
 def correct_velocities(
     rows: Constraints,
     contacts: ContactList,

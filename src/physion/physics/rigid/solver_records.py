@@ -82,7 +82,7 @@ class Constraints(NamedTuple):
       [pair, anchor, tangent].
     - ``normal_impulse`` (C,), ``friction_impulse`` (4 P,): N s, accumulated.
     - ``slipped`` (P,): the static friction limit was passed in the last sweep.
-    - ``tangents`` (2, 3), ``arm`` (2, 3): work space.
+    - ``tangents`` (2, 3), ``arm`` (2, 3), ``relative`` (3,): work space.
     """
 
     order: I64
@@ -96,6 +96,7 @@ class Constraints(NamedTuple):
     slipped: Flags
     tangents: F64
     arm: F64
+    relative: F64
 
 
 def new_constraints(capacity: int, actors: int) -> Constraints:
@@ -112,4 +113,5 @@ def new_constraints(capacity: int, actors: int) -> Constraints:
         np.zeros(capacity, np.bool_),
         np.zeros((2, 3)),
         np.zeros((2, 3)),
+        np.zeros(3),
     )

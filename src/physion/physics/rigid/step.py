@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from physion.numerics.kernel import kernel
+from physion.numerics.kernel import in_place_kernel
 from physion.physics.rigid.collision.hull_records import Hulls
 from physion.physics.rigid.collision.manifold import Manifolds, PairSpace
 from physion.physics.rigid.collision.search import (
@@ -125,12 +125,22 @@ class History(NamedTuple):
     counters: I64
 
 
-@kernel
-def _push(bodies: Bodies, sleep: SleepState, pushes: Pushes, frame: int, wake_time: float) -> None:
-    """Apply the pushes of ``frame``: v += J / m, w += R I^-1 R^T (r x J); wake what is pushed."""
+@in_place_kernel
+def _push(
+    bodies: Bodies,
+    sleep: SleepState,
+    pushes: Pushes,
+    frame: int,
+    wake_time: float,
+    space: F64,
+) -> None:
+    """Apply the pushes of ``frame``: v += J / m, w += R I^-1 R^T (r x J); wake what is pushed.
+
+    ``space`` (2, 3) is work space.
+    """
     actors = len(sleep.asleep)
     rot, inverse = bodies.rot, bodies.inv_inertia
-    torque, local = np.zeros(3), np.zeros(3)
+    torque, local = space[0], space[1]
     for k in range(len(pushes.frame)):
         a = pushes.actor[k]
         if pushes.frame[k] != frame or a == actors:
@@ -161,7 +171,7 @@ def _push(bodies: Bodies, sleep: SleepState, pushes: Pushes, frame: int, wake_ti
             bodies.w[a, i] += spin
 
 
-@kernel
+@in_place_kernel
 def _list_touching(
     scene: SearchScene,
     manifolds: Manifolds,
@@ -183,7 +193,7 @@ def _list_touching(
     return count
 
 
-@kernel
+@in_place_kernel
 def _free_masses(bodies: Bodies, sleep: SleepState) -> None:
     """Fill inverse masses and inertias (world axes, R I^-1 R^T) of this step; sleepers get 0."""
     rot, inverse, free = bodies.rot, bodies.inv_inertia, bodies.free_inertia
@@ -205,7 +215,7 @@ def _free_masses(bodies: Bodies, sleep: SleepState) -> None:
                 free[a, i, j] = r0 * rot[a, j, 0] + r1 * rot[a, j, 1] + r2 * rot[a, j, 2]
 
 
-@kernel
+@in_place_kernel
 def _record(
     contacts: ContactList, pairs: int, rows: Constraints, frame: int, asked: I64, history: History
 ) -> bool:
@@ -234,7 +244,7 @@ def _record(
     return found
 
 
-@kernel
+@in_place_kernel
 def record_state(bodies: Bodies, history: History) -> None:
     """Add the present state of all actors as the next frame."""
     frame = history.counters[0]
@@ -248,7 +258,7 @@ def record_state(bodies: Bodies, history: History) -> None:
     history.counters[0] = frame + 1
 
 
-@kernel
+@in_place_kernel
 def _at_rest(bodies: Bodies, sleep: SleepState, rule: EndRule) -> bool:
     """Return whether every actor sleeps that has not fallen below the floor of the ending."""
     for a in range(len(sleep.asleep)):
@@ -263,7 +273,7 @@ def _at_rest(bodies: Bodies, sleep: SleepState, rule: EndRule) -> bool:
     return True
 
 
-@kernel
+@in_place_kernel
 def run_steps(
     hulls: Hulls,
     scene: SearchScene,
@@ -329,7 +339,7 @@ def run_steps(
         if candidates == FULL or history.counters[1] + 4 * candidates > len(history.frame):
             space.counters[1] -= 1
             return NEEDS_PAIRS if candidates == FULL else NEEDS_ROWS
-        _push(bodies, sleep, pushes, now, options.sleep.wake_time)
+        _push(bodies, sleep, pushes, now, options.sleep.wake_time, rows.arm)
         update_candidates(
             hulls, scene, manifolds, space, candidates, bodies.x, bodies.q, bodies.rot,
             sleep.asleep, options.reach, options.floor, options.persistent, work.pair, False,

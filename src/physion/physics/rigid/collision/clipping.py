@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.numerics.kernel import kernel
+from physion.numerics.kernel import in_place_kernel
 from physion.physics.rigid.collision.hull_records import Hulls
 
 F64 = NDArray[np.float64]
@@ -44,7 +44,7 @@ class ClipSpace(NamedTuple):
     - ``low`` (MAX_LOOP,): corners of the incident face near the reference face.
     - ``clipped`` (MAX_POINTS, 4): u, v, height of the incident face there, and above the reference.
     - ``points`` (MAX_POINTS, 7): point of A, point of B (frame of B, metres), gap.
-    - ``chosen`` (4,): rows of ``points`` that are kept.
+    - ``chosen`` (4,): rows of ``points`` that are kept. ``kept`` (4, 7): those rows.
     - ``axes`` (3, 3): the reference plane's axes and normal. ``normal`` (3,): from B to A.
     """
 
@@ -54,6 +54,7 @@ class ClipSpace(NamedTuple):
     clipped: F64
     points: F64
     chosen: I64
+    kept: F64
     axes: F64
     normal: F64
 
@@ -67,6 +68,7 @@ def new_clip_space() -> ClipSpace:
         np.zeros((MAX_POINTS, 4)),
         np.zeros((MAX_POINTS, 7)),
         np.zeros(MANIFOLD_SIZE, np.int64),
+        np.zeros((MANIFOLD_SIZE, 7)),
         np.zeros((3, 3)),
         np.zeros(3),
     )
@@ -78,7 +80,7 @@ def new_clip_space() -> ClipSpace:
 # largest n . m is taken; without any, the face that has the point farthest outside.
 
 
-@kernel
+@in_place_kernel
 def facing_face(
     hulls: Hulls, g: int, x: float, y: float, z: float, mx: float, my: float, mz: float
 ) -> int:
@@ -114,7 +116,7 @@ def facing_face(
     return int(chosen)
 
 
-@kernel
+@in_place_kernel
 def _inside(polygon: F64, corners: int, u: float, v: float) -> bool:
     """Return whether (u, v) lies in a convex polygon of either winding."""
     sign = 0.0
@@ -142,7 +144,7 @@ def _inside(polygon: F64, corners: int, u: float, v: float) -> bool:
 # Where one face lies wholly within the other, the remaining cases add nothing and are left out.
 
 
-@kernel
+@in_place_kernel
 def clip_faces(
     reference: F64, n: int, incident: F64, m: int, reach: float, low: Flags, clipped: F64
 ) -> int:
@@ -231,7 +233,7 @@ def clip_faces(
     return used
 
 
-@kernel
+@in_place_kernel
 def _flatten(hulls: Hulls, f: int, rot: F64, shift: F64, axes: F64, out: F64) -> int:
     """Fill ``out`` with the corners of a face along ``axes`` (3, 3); return how many.
 
@@ -250,7 +252,7 @@ def _flatten(hulls: Hulls, f: int, rot: F64, shift: F64, axes: F64, out: F64) ->
     return int(count)
 
 
-@kernel
+@in_place_kernel
 def _set_axes(axes: F64, x: float, y: float, z: float) -> None:
     """Fill ``axes`` (3, 3) with two axes across the unit normal (x, y, z), and the normal.
 
@@ -273,7 +275,7 @@ def _set_axes(axes: F64, x: float, y: float, z: float) -> None:
         axes[1, i] = axes[2, j] * axes[0, k] - axes[2, k] * axes[0, j]
 
 
-@kernel
+@in_place_kernel
 def face_points(
     hulls: Hulls,
     g: int,
@@ -365,7 +367,7 @@ def face_points(
 # smallest s . (p - a); if both lie on one side, the two largest.
 
 
-@kernel
+@in_place_kernel
 def spread_points(points: F64, count: int, normal: F64, chosen: I64) -> None:
     """Fill ``chosen`` (4,) with the rows of four points that stand for all.
 

@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.numerics.kernel import kernel
+from physion.numerics.kernel import in_place_kernel
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -70,7 +70,7 @@ def new_simplex() -> Simplex:
     )
 
 
-@kernel
+@in_place_kernel
 def support(vertices: F64, start: int, stop: int, x: float, y: float, z: float) -> int:
     """Return the row of the corner that lies farthest along (x, y, z); the first of equals.
 
@@ -86,7 +86,7 @@ def support(vertices: F64, start: int, stop: int, x: float, y: float, z: float) 
     return chosen
 
 
-@kernel
+@in_place_kernel
 def set_corner(
     simplex: Simplex, k: int, a: int, b: int, vertices: F64, rot: F64, shift: F64
 ) -> None:
@@ -108,7 +108,7 @@ def set_corner(
         point[k, i] = in_b - vertices[b, i]
 
 
-@kernel
+@in_place_kernel
 def find_corner(
     vertices: F64, span: I64, rot: F64, x: float, y: float, z: float
 ) -> tuple[int, int]:
@@ -129,7 +129,7 @@ def find_corner(
     return a, b
 
 
-@kernel
+@in_place_kernel
 def _segment(point: F64, i: int, j: int, weight: F64) -> float:
     """Weight the points of segment i-j for its point closest to the origin; return |point|^2.
 
@@ -155,7 +155,7 @@ def _segment(point: F64, i: int, j: int, weight: F64) -> float:
     return total
 
 
-@kernel
+@in_place_kernel
 def _triangle(point: F64, i: int, j: int, k: int, weight: F64) -> float:
     """Weight the corners of triangle i-j-k for its point closest to the origin; return |point|^2.
 
@@ -202,7 +202,7 @@ def _triangle(point: F64, i: int, j: int, k: int, weight: F64) -> float:
     return squared
 
 
-@kernel
+@in_place_kernel
 def _beyond(point: F64, i: int, j: int, k: int, opposite: int) -> bool:
     """Return whether the origin lies beyond face i-j-k of a tetrahedron, or this is unclear.
 
@@ -220,7 +220,7 @@ def _beyond(point: F64, i: int, j: int, k: int, opposite: int) -> bool:
     return bool(origin * fourth < 0.0 or fourth * fourth <= FLAT * squared)
 
 
-@kernel
+@in_place_kernel
 def reduce_simplex(simplex: Simplex, size: int) -> tuple[int, float]:
     """Find the point of a simplex closest to the origin; drop the corners that it does not need.
 
@@ -265,7 +265,7 @@ def reduce_simplex(simplex: Simplex, size: int) -> tuple[int, float]:
     return left, best
 
 
-@kernel
+@in_place_kernel
 def closest_points(
     vertices: F64,
     span: I64,
@@ -298,8 +298,9 @@ def closest_points(
     size : int
         Corners of the last simplex, in ``simplex``.
     distance : float
-        Metres, for `CLOSE`. The direction from B to A is then ``simplex.closest`` / distance, and
-        the closest points are the weighted sums of ``point[:, 3:6]`` and ``point[:, 6:9]``.
+        Metres: the distance for `CLOSE`, a lower bound of it for `APART`. With `CLOSE` the
+        direction from B to A is ``simplex.closest`` / distance, and the closest points are the
+        weighted sums of ``point[:, 3:6]`` and ``point[:, 6:9]``.
     """
     corner = simplex.corner
     for k in range(size):
@@ -326,7 +327,7 @@ def closest_points(
         point = simplex.point
         along = x * point[size, 0] + y * point[size, 1] + z * point[size, 2]
         if along > reach * distance:
-            return APART, size, distance
+            return APART, size, along / distance
         if squared - along <= CONVERGED * squared:
             return CLOSE, size, distance
         last = squared

@@ -23,6 +23,7 @@ class Hulls(NamedTuple):
     - ``margin`` (G,): metres that a contact may drift before it is found anew.
     - ``tolerance`` (G,): metres within which faces at the closest point count as equally close.
     - ``radius`` (G,): half diagonal in metres of the box inside the hull.
+    - ``extent`` (G,): largest distance in metres of a corner from the actor's centre of mass.
     - ``box`` (G, 6): centre and half extents of the box round the hull, in the actor's frame.
     """
 
@@ -35,4 +36,5 @@ class Hulls(NamedTuple):
     margin: F64
     tolerance: F64
     radius: F64
+    extent: F64
     box: F64

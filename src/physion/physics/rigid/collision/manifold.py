@@ -5,7 +5,7 @@ their bodies, with the normal from B to A in the frame of B. In every step:
 
 1. `refresh_points` moves the points along with the bodies, and forgets those whose two halves have
    slid apart;
-2. while nothing was forgotten and the pair has hardly moved (`has_moved`), these are the contacts;
+2. while nothing was forgotten and the pair has hardly moved (`keep_pair`), these are the contacts;
 3. otherwise the closest points are found anew (`physion.physics.rigid.collision.closest_points`,
    or `penetration` where the hulls overlap) and added;
 4. if points were lost, or the new direction is more than 45 degrees from the old, all points are
@@ -27,7 +27,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.numerics.kernel import kernel
+from physion.numerics.kernel import in_place_kernel
 from physion.physics.rigid.collision.clipping import (
     MANIFOLD_SIZE,
     ClipSpace,
@@ -75,6 +75,8 @@ class Manifolds(NamedTuple):
     - ``shift`` (S, 3), ``rotation`` (S, 2, 4): relative position and orientations of both bodies
       when points were last found.
     - ``corners`` (S,), ``corner`` (S, 4, 2): last simplex of the search for the closest points.
+    - ``apart`` (S,): metres that the hulls were apart at least, when they were relatively at
+      ``apart_rot`` (S, 3, 3), ``apart_shift`` (S, 3); 0 if unknown.
     - ``step`` (S,): last step in which the boxes of the pair overlapped.
     - ``touching`` (S,): the pair had contacts in its last step.
     - ``anchor_count`` (S,): friction anchors that held, 0 to 2. ``anchor`` (S, 2, 2, 3): anchors
@@ -92,6 +94,9 @@ class Manifolds(NamedTuple):
     rotation: F64
     corners: I64
     corner: I64
+    apart: F64
+    apart_rot: F64
+    apart_shift: F64
     step: I64
     touching: I64
     anchor_count: I64
@@ -113,6 +118,9 @@ def new_manifolds(capacity: int) -> Manifolds:
         np.zeros((capacity, 2, 4)),
         np.zeros(capacity, np.int64),
         np.zeros((capacity, 4, 2), np.int64),
+        np.zeros(capacity),
+        np.zeros((capacity, 3, 3)),
+        np.zeros((capacity, 3)),
         np.full(capacity, -2, np.int64),
         np.zeros(capacity, np.int64),
         np.zeros(capacity, np.int64),
@@ -165,11 +173,12 @@ def new_pair_space() -> PairSpace:
     )
 
 
-@kernel
+@in_place_kernel
 def clear_manifold(manifolds: Manifolds, s: int) -> None:
     """Forget points, search start and friction anchors of pair ``s``."""
     manifolds.size[s] = 0
     manifolds.corners[s] = 0
+    manifolds.apart[s] = 0.0
     manifolds.touching[s] = 0
     manifolds.anchor_count[s] = 0
 
@@ -178,7 +187,7 @@ def clear_manifold(manifolds: Manifolds, s: int) -> None:
 #     gap = (p_A - p_B) . n,      slide = |p_A - p_B - gap n|;  a point with slide > limit goes.
 
 
-@kernel
+@in_place_kernel
 def refresh_points(manifolds: Manifolds, s: int, rot: F64, shift: F64, limit: float) -> None:
     """Recompute the gaps of pair ``s``, and forget points that slid by more than ``limit`` metres.
 
@@ -201,7 +210,7 @@ def refresh_points(manifolds: Manifolds, s: int, rot: F64, shift: F64, limit: fl
             manifolds.gap[s, k] = gap
 
 
-@kernel
+@in_place_kernel
 def _copy_point(manifolds: Manifolds, s: int, source: int, target: int) -> None:
     """Copy one point of pair ``s`` onto another."""
     for i in range(3):
@@ -211,7 +220,7 @@ def _copy_point(manifolds: Manifolds, s: int, source: int, target: int) -> None:
     manifolds.gap[s, target] = manifolds.gap[s, source]
 
 
-@kernel
+@in_place_kernel
 def has_moved(
     manifolds: Manifolds,
     s: int,
@@ -245,7 +254,7 @@ def has_moved(
     return False
 
 
-@kernel
+@in_place_kernel
 def set_direction(manifolds: Manifolds, s: int) -> None:
     """Make the direction of pair ``s`` the unit mean of its normals; 0 without points."""
     x = y = z = 0.0
@@ -260,7 +269,7 @@ def set_direction(manifolds: Manifolds, s: int) -> None:
     direction[s, 0], direction[s, 1], direction[s, 2] = x, y, z
 
 
-@kernel
+@in_place_kernel
 def _set_point(manifolds: Manifolds, s: int, k: int, row: F64) -> None:
     """Make point ``k`` of pair ``s`` the row (10,): A, B, normal, gap."""
     for i in range(3):
@@ -270,12 +279,14 @@ def _set_point(manifolds: Manifolds, s: int, k: int, row: F64) -> None:
     manifolds.gap[s, k] = row[9]
 
 
-@kernel
-def add_point(manifolds: Manifolds, s: int, row: F64, replace: float, old: F64) -> None:
+@in_place_kernel
+def add_point(
+    manifolds: Manifolds, s: int, row: F64, replace: float, old: F64, chosen: I64
+) -> None:
     """Add a point to pair ``s``; it replaces one that is closer than ``replace`` metres.
 
     ``row`` (10,): point in the frame of A, in that of B, normal, gap. With more than four points
-    `_reduce_five` chooses. ``old`` (5, 10) is work space.
+    `_reduce_five` chooses. ``old`` (5, 10) and ``chosen`` (4,) are work space.
     """
     count = manifolds.size[s]
     for k in range(count):
@@ -298,10 +309,10 @@ def add_point(manifolds: Manifolds, s: int, row: F64, replace: float, old: F64) 
         old[k, 9] = manifolds.gap[s, k]
     for i in range(10):
         old[4, i] = row[i]
-    _reduce_five(manifolds, s, old)
+    _reduce_five(manifolds, s, old, chosen)
 
 
-@kernel
+@in_place_kernel
 def _to_segment(p: F64, k: int, a: int, b: int) -> float:
     """Return the squared distance of point ``k`` from the segment of points a and b, on hull B."""
     along = length = 0.0
@@ -316,7 +327,7 @@ def _to_segment(p: F64, k: int, a: int, b: int) -> float:
     return total
 
 
-@kernel
+@in_place_kernel
 def _outside_triangle(p: F64, k: int, a: int, b: int, c: int) -> float:
     """Return the squared distance of point ``k`` from triangle a-b-c, on hull B.
 
@@ -345,13 +356,13 @@ def _outside_triangle(p: F64, k: int, a: int, b: int, c: int) -> float:
     )
 
 
-@kernel
-def _reduce_five(manifolds: Manifolds, s: int, p: F64) -> None:
+@in_place_kernel
+def _reduce_five(manifolds: Manifolds, s: int, p: F64, chosen: I64) -> None:
     """Keep four of the five points ``p`` (5, 10): the deepest, then those that span most.
 
     Of the last two, the one that is dropped still replaces its neighbour if it is deeper.
+    ``chosen`` (4,) is work space.
     """
-    chosen = np.zeros(4, np.int64)
     deepest = 4
     for k in range(4):
         if p[k, 9] < p[deepest, 9]:
@@ -396,7 +407,7 @@ def _reduce_five(manifolds: Manifolds, s: int, p: F64) -> None:
         _set_point(manifolds, s, k, p[chosen[k]])
 
 
-@kernel
+@in_place_kernel
 def _closest_row(space: PairSpace, row: F64) -> None:
     """Fill ``row`` (10,) with the closest points of ``space``: A, B, normal, gap."""
     rot, shift, closest = space.rot, space.shift, space.closest
@@ -408,7 +419,7 @@ def _closest_row(space: PairSpace, row: F64) -> None:
     row[9] = -closest[9]
 
 
-@kernel
+@in_place_kernel
 def find_closest(
     hulls: Hulls, manifolds: Manifolds, s: int, reach: float, space: PairSpace
 ) -> bool:
@@ -433,6 +444,11 @@ def find_closest(
         manifolds.corner[s, k, 0] = simplex.corner[k, 0]
         manifolds.corner[s, k, 1] = simplex.corner[k, 1]
     if result == APART:
+        manifolds.apart[s] = distance
+        for i in range(3):
+            manifolds.apart_shift[s, i] = space.shift[i]
+            for j in range(3):
+                manifolds.apart_rot[s, i, j] = space.rot[i, j]
         return False
     if result == CLOSE:
         for i in range(3):
@@ -449,18 +465,64 @@ def find_closest(
     )
 
 
-@kernel
+# Between two poses, a corner p of A moves in the frame of B by (R - R') p + t - t', that is by at
+# most |R - R'| |p| + |t - t'|, with the Frobenius norm of the matrix.
+
+
+@in_place_kernel
+def still_apart(
+    manifolds: Manifolds, s: int, rot: F64, shift: F64, extent: float, reach: float
+) -> bool:
+    """Return whether pair ``s`` is sure to be farther apart than ``reach`` metres.
+
+    ``rot``, ``shift`` lead from the frame of A to that of B; ``extent`` is the largest distance of
+    a corner of A from the origin of its frame.
+    """
+    apart = manifolds.apart[s]
+    if apart <= reach:
+        return False
+    moved = turned = 0.0
+    for i in range(3):
+        moved += (shift[i] - manifolds.apart_shift[s, i]) ** 2
+        for j in range(3):
+            turned += (rot[i, j] - manifolds.apart_rot[s, i, j]) ** 2
+    return bool(apart - np.sqrt(moved) - np.sqrt(turned) * extent > reach)
+
+
+@in_place_kernel
+def keep_pair(
+    hulls: Hulls, manifolds: Manifolds, s: int, rot: F64, shift: F64, qa: F64, qb: F64
+) -> bool:
+    """Move the points of pair ``s`` along; return whether they still describe it.
+
+    Otherwise `update_pair` has to find points anew. ``rot``, ``shift`` lead from the frame of A to
+    that of B; ``qa``, ``qb`` (4,) are the orientations of both bodies.
+    """
+    g, h = manifolds.geoms[s, 0], manifolds.geoms[s, 1]
+    margin = min(hulls.margin[g], hulls.margin[h])
+    before = manifolds.size[s]
+    refresh_points(manifolds, s, rot, shift, BREAK_FRACTION * margin)
+    # PhysX takes the radius of the first hull for both.
+    if manifolds.size[s] != before or has_moved(
+        manifolds, s, shift, qa, qb, margin, hulls.radius[g]
+    ):
+        return False
+    set_direction(manifolds, s)
+    return True
+
+
+@in_place_kernel
 def update_pair(
     hulls: Hulls,
     manifolds: Manifolds,
     s: int,
     qa: F64,
     qb: F64,
+    before: int,
     reach: float,
-    persistent: bool,
     space: PairSpace,
 ) -> int:
-    """Bring the manifold of pair ``s`` up to the present poses.
+    """Find points of pair ``s`` anew: the closest ones, and all where too many were lost.
 
     Parameters
     ----------
@@ -468,10 +530,10 @@ def update_pair(
         All hulls, all manifolds, and the pair.
     qa, qb : (4,)
         Orientations of both bodies.
+    before : int
+        Points before those were lost that slid too far; -1 to find all anew.
     reach : float
         Metres between surfaces below which points are contacts.
-    persistent : bool
-        Keep points of earlier steps; otherwise all are found anew in every step.
     space : PairSpace
         Work space; its ``rot`` and ``shift`` are those of the pair.
 
@@ -482,16 +544,7 @@ def update_pair(
     """
     g, h = manifolds.geoms[s, 0], manifolds.geoms[s, 1]
     margin = min(hulls.margin[g], hulls.margin[h])
-    before = manifolds.size[s]
-    if persistent:
-        refresh_points(manifolds, s, space.rot, space.shift, BREAK_FRACTION * margin)
-        # PhysX takes the radius of the first hull for both.
-        if manifolds.size[s] == before and not has_moved(
-            manifolds, s, space.shift, qa, qb, margin, hulls.radius[g]
-        ):
-            set_direction(manifolds, s)
-            return int(manifolds.size[s])
-    else:
+    if before < 0:
         manifolds.size[s] = 0
     for i in range(3):
         manifolds.shift[s, i] = space.shift[i]
@@ -507,8 +560,8 @@ def update_pair(
         cosine += direction[s, i] * closest[i]
     row = space.old[4]
     _closest_row(space, row)
-    add_point(manifolds, s, row, REPLACE_FRACTION * margin, space.old)
-    if persistent and cosine >= SAME_DIRECTION and manifolds.size[s] >= before:
+    add_point(manifolds, s, row, REPLACE_FRACTION * margin, space.old, space.clip.chosen)
+    if before >= 0 and cosine >= SAME_DIRECTION and manifolds.size[s] >= before:
         # The new direction counts as much as all old ones together (PhysX).
         squared = 0.0
         for i in range(3):
@@ -522,7 +575,7 @@ def update_pair(
     return int(manifolds.size[s])
 
 
-@kernel
+@in_place_kernel
 def _points_of_faces(
     hulls: Hulls, manifolds: Manifolds, s: int, reach: float, space: PairSpace
 ) -> None:
@@ -565,7 +618,7 @@ def _points_of_faces(
     manifolds.size[s] = count
 
 
-@kernel
+@in_place_kernel
 def update_floor(
     hulls: Hulls,
     manifolds: Manifolds,
@@ -632,11 +685,11 @@ def update_floor(
     return count
 
 
-@kernel
+@in_place_kernel
 def _keep_four(clip: ClipSpace, count: int) -> int:
     """Move the four points that stand for all to the front of ``clip.points``; return 4."""
     spread_points(clip.points, count, clip.normal, clip.chosen)
-    kept = np.zeros((MANIFOLD_SIZE, 7))
+    kept = clip.kept
     for k in range(MANIFOLD_SIZE):
         for i in range(7):
             kept[k, i] = clip.points[clip.chosen[k], i]

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.numerics.kernel import kernel
+from physion.numerics.kernel import in_place_kernel
 from physion.physics.rigid.collision.closest_points import Simplex, find_corner, set_corner
 
 F64 = NDArray[np.float64]
@@ -66,7 +66,7 @@ def new_polytope() -> Polytope:
     )
 
 
-@kernel
+@in_place_kernel
 def _set_face(polytope: Polytope, f: int, i: int, j: int, k: int) -> None:
     """Make face ``f`` the triangle of points i, j, k; a triangle without area counts as removed."""
     p = polytope.point
@@ -83,7 +83,7 @@ def _set_face(polytope: Polytope, f: int, i: int, j: int, k: int) -> None:
     polytope.distance[f] = nx * p[i, 0] + ny * p[i, 1] + nz * p[i, 2]
 
 
-@kernel
+@in_place_kernel
 def _sixfold_volume(p: F64) -> float:
     """Return six times the signed volume of the tetrahedron of the first four points (P, 9)."""
     ax, ay, az = p[1, 0] - p[0, 0], p[1, 1] - p[0, 1], p[1, 2] - p[0, 2]
@@ -92,7 +92,7 @@ def _sixfold_volume(p: F64) -> float:
     return float(cx * (ay * bz - az * by) + cy * (az * bx - ax * bz) + cz * (ax * by - ay * bx))
 
 
-@kernel
+@in_place_kernel
 def complete_simplex(
     vertices: F64, span: I64, rot: F64, shift: F64, simplex: Simplex, size: int
 ) -> bool:
@@ -101,20 +101,18 @@ def complete_simplex(
     The corners are the farthest of A - B along directions in which the simplex has no extent.
     """
     p = simplex.point
-    normal = np.zeros(3)
+    nx = ny = nz = 0.0
     while size < 4:
         if size == 3:
             ax, ay, az = p[1, 0] - p[0, 0], p[1, 1] - p[0, 1], p[1, 2] - p[0, 2]
             bx, by, bz = p[2, 0] - p[0, 0], p[2, 1] - p[0, 1], p[2, 2] - p[0, 2]
-            normal[0] = ay * bz - az * by
-            normal[1] = az * bx - ax * bz
-            normal[2] = ax * by - ay * bx
+            nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
         found = False
         for attempt in range(6):
             sign = 1.0 if attempt % 2 == 0 else -1.0
             x = y = z = 0.0
             if size == 3:
-                x, y, z = sign * normal[0], sign * normal[1], sign * normal[2]
+                x, y, z = sign * nx, sign * ny, sign * nz
             elif size == 2:
                 # Across the segment: its product with an axis.
                 ax, ay, az = p[1, 0] - p[0, 0], p[1, 1] - p[0, 1], p[1, 2] - p[0, 2]
@@ -153,7 +151,7 @@ def complete_simplex(
     return bool(abs(_sixfold_volume(p)) > MIN_VOLUME)
 
 
-@kernel
+@in_place_kernel
 def penetration(
     vertices: F64,
     span: I64,
@@ -267,7 +265,7 @@ def penetration(
     return True
 
 
-@kernel
+@in_place_kernel
 def _barycentric(
     p: F64, i: int, j: int, k: int, x: float, y: float, z: float
 ) -> tuple[float, float]:

@@ -13,12 +13,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.numerics.kernel import kernel
+from physion.numerics.kernel import in_place_kernel
 from physion.physics.rigid.collision.hull_records import Hulls
 from physion.physics.rigid.collision.manifold import (
     Manifolds,
     PairSpace,
     clear_manifold,
+    keep_pair,
+    still_apart,
     update_floor,
     update_pair,
 )
@@ -126,7 +128,7 @@ def new_contact_list(capacity: int) -> ContactList:
 # R c + x and half extents |R| e, with |R| the absolute values. Boxes are grown by half the reach.
 
 
-@kernel
+@in_place_kernel
 def update_boxes(
     hulls: Hulls,
     scene: SearchScene,
@@ -161,7 +163,7 @@ def update_boxes(
                 space.body_box[body, 3 + i] = max(space.body_box[body, 3 + i], center + half)
 
 
-@kernel
+@in_place_kernel
 def _overlap(boxes: F64, i: int, j: int) -> bool:
     """Return whether two boxes share a point."""
     for k in range(3):
@@ -170,7 +172,7 @@ def _overlap(boxes: F64, i: int, j: int) -> bool:
     return True
 
 
-@kernel
+@in_place_kernel
 def _enter(space: SearchSpace, manifolds: Manifolds, g: int, h: int, i: int, j: int) -> int:
     """Return the manifold of geoms ``g``, ``h`` of bodies ``i``, ``j``, or `FULL`.
 
@@ -192,7 +194,7 @@ def _enter(space: SearchSpace, manifolds: Manifolds, g: int, h: int, i: int, j: 
     return s
 
 
-@kernel
+@in_place_kernel
 def find_candidates(
     scene: SearchScene,
     manifolds: Manifolds,
@@ -236,7 +238,7 @@ def find_candidates(
     return used
 
 
-@kernel
+@in_place_kernel
 def update_candidates(
     hulls: Hulls,
     scene: SearchScene,
@@ -301,7 +303,16 @@ def update_candidates(
         if j == bodies:
             count = update_floor(hulls, manifolds, s, q[a], reach, floor, persistent, pair)
         else:
-            count = update_pair(hulls, manifolds, s, q[a], q[b], reach, persistent, pair)
+            before = int(manifolds.size[s])
+            if before == 0 and still_apart(
+                manifolds, s, pair.rot, pair.shift, hulls.extent[manifolds.geoms[s, 0]], reach
+            ):
+                continue
+            if persistent and keep_pair(hulls, manifolds, s, pair.rot, pair.shift, q[a], q[b]):
+                count = manifolds.size[s]
+            else:
+                before = before if persistent else -1
+                count = update_pair(hulls, manifolds, s, q[a], q[b], before, reach, pair)
         touching = 0
         for k in range(count):
             if manifolds.gap[s, k] <= reach:
@@ -311,7 +322,7 @@ def update_candidates(
             manifolds.anchor_count[s] = 0
 
 
-@kernel
+@in_place_kernel
 def list_contacts(
     scene: SearchScene,
     manifolds: Manifolds,
