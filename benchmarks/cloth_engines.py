@@ -18,6 +18,7 @@ import mujoco
 import numpy as np
 from scipy.spatial import cKDTree
 
+from physion.numerics.rotations import rotate_vectors
 from physion.physics.cloth.simulate import ClothSettings, settle_solids, simulate_cloth
 from physion.physics.cloth.solids import particles_of
 from physion.physics.replay import area_under_curve
@@ -41,7 +42,8 @@ def mujoco_flex(scene: Scene, resolution: int) -> float:
     model = mujoco.MjModel.from_xml_string(_model_xml(scene, resolution, settings))
     data = mujoco.MjData(model)
     patient = scene.bodies[scene.index(scene.roles.patient)]
-    tree = cKDTree(particles_of(patient, settings.particle_spacing) + patient.position)
+    particles = rotate_vectors(patient.rotation, particles_of(patient, settings.particle_spacing))
+    tree = cKDTree(particles + patient.position)
     smallest = np.inf
     steps = round(0.01 / model.opt.timestep)
     for _ in range(FRAMES - 1):
