@@ -175,7 +175,12 @@ def new_pair_space() -> PairSpace:
 
 @in_place_kernel
 def clear_manifold(manifolds: Manifolds, s: int) -> None:
-    """Forget points, search start and friction anchors of pair ``s``."""
+    """Forget points, search start and friction anchors of pair ``s``.
+
+    Where it was last searched is forgotten too: at the same place there would be no new search.
+    """
+    for i in range(3):
+        manifolds.shift[s, i] = np.inf
     manifolds.size[s] = 0
     manifolds.corners[s] = 0
     manifolds.apart[s] = 0.0
