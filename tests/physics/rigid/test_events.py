@@ -113,6 +113,16 @@ def test_joints_hold_between_those_that_are_there() -> None:
     assert gained == pytest.approx(1.0, rel=1e-4)
 
 
+def test_an_event_far_away_disturbs_nothing() -> None:
+    tower = [Body(f"{k}", "cube", (0, 0, 0.4 * k), CUBE, contact=ROUGH) for k in range(4)]
+    far = Body("far", "cube", (7.0, 0, 0), CUBE)
+    scene = scene_of(*tower, far)
+    quiet = run(scene, frames=120)
+    path = run(replace(scene, events=(BodyEvent(60, "far", "vanish"),)), frames=120)
+    assert np.array_equal(path.positions[:60], quiet.positions[:60])
+    assert np.abs(path.positions - quiet.positions).max() < 1e-3
+
+
 def test_labels_count_only_contacts_while_both_are_there() -> None:
     """The agent lands on the patient, which vanishes before, or appears after that."""
     patient = replace(ZONE, position=(0.0, 0.0, 0.0))
