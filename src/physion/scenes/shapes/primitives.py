@@ -44,11 +44,15 @@ RING_SEGMENTS = 16
 TORUS_INNER = 0.429
 """Inner radius of the torus: 0.688 (sd 0.004) of the outer 0.625, measured on 8 corners of a
 torus-shaped zone in a published picture; 0.429 from the boxes of 16 colliders (0.2618)."""
+TORUS_PIECE_INNER, TORUS_SECTORS = 0.429, 16
+"""Inner radius at the corners of the torus's collision pieces, and their number."""
 TORUS_BEVEL = 0.06
 """The cross-section of the torus is a rectangle with corners cut by this length (from pictures)."""
 PIPE_INNER = 0.389
 """Inner radius of the pipe: the boxes of 16 to 32 colliders have the recorded volume of 0.5146 for
 radii of 0.386 to 0.391."""
+PIPE_PIECE_INNER = 0.389
+"""Inner radius at the corners of the pipe's collision pieces."""
 BOWL_RADIUS, BOWL_HEIGHT = 0.4904, 0.3789
 BOWL_FLAT = 0.2
 """Radius of the bowl's flat bottom: of 0.12, 0.2 and 0.28 it predicts the official final positions
@@ -277,20 +281,30 @@ def _dumbbell() -> Shape:
 
 @shapes.register("torus")
 def _torus() -> Shape:
-    inner, outer, cut = TORUS_INNER, 0.625, TORUS_BEVEL
+    mesh = revolve(_torus_section(TORUS_INNER), RING_SEGMENTS, closed=True, smooth=CURVED)
+    section = np.array(_torus_section(TORUS_PIECE_INNER))
+    pieces = ring_pieces([section], TORUS_SECTORS, RING_SEGMENTS // TORUS_SECTORS)
+    return Shape("torus", mesh, pieces, hollow=True)
+
+
+def _torus_section(inner: float) -> Outline:
+    """Return the cross-section of a torus as (radius, height)."""
+    outer, cut = 0.625, min(TORUS_BEVEL, 0.45 * (0.625 - inner))
     section = [(inner + cut, 0.0), (outer - cut, 0.0), (outer, cut), (outer, 0.25 - cut)]
-    section += [(outer - cut, 0.25), (inner + cut, 0.25), (inner, 0.25 - cut), (inner, cut)]
-    mesh = revolve(section, RING_SEGMENTS, closed=True, smooth=CURVED)
-    return Shape("torus", mesh, ring_pieces([np.array(section)], RING_SEGMENTS, 1), hollow=True)
+    return [*section, (outer - cut, 0.25), (inner + cut, 0.25), (inner, 0.25 - cut), (inner, cut)]
 
 
 @shapes.register("pipe")
 def _pipe() -> Shape:
-    section = [(PIPE_INNER, 0.0), (0.5, 0.0), (0.5, 1.0), (PIPE_INNER, 1.0)]
-    mesh = revolve(section, ROUND_SEGMENTS, closed=True, smooth=CURVED)
+    mesh = revolve(_pipe_section(PIPE_INNER), ROUND_SEGMENTS, closed=True, smooth=CURVED)
     steps = ROUND_SEGMENTS // PIPE_SECTORS
-    pieces = ring_pieces([np.array(section)], PIPE_SECTORS, steps)
+    pieces = ring_pieces([np.array(_pipe_section(PIPE_PIECE_INNER))], PIPE_SECTORS, steps)
     return Shape("pipe", mesh, pieces, hollow=True)
+
+
+def _pipe_section(inner: float) -> Outline:
+    """Return the cross-section of a pipe as (radius, height)."""
+    return [(inner, 0.0), (0.5, 0.0), (0.5, 1.0), (inner, 1.0)]
 
 
 def bowl_outline(radius: float, height: float, flat: float, points: int) -> Outline:
