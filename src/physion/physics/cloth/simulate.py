@@ -116,7 +116,8 @@ def simulate_cloth(
     settings : ClothSettings, optional
         By default those of the official trials.
     vertices, velocities : (V, 3), optional
-        State from which the cloths start, in metres and m/s; by default flat and at rest.
+        State from which the cloths start, in metres and m/s: that of frame 0. By default they are
+        flat and at rest, and frame 0 follows the first step.
     until_gap : float, optional
         Gap in metres between agent and patient below which the motion ends with that frame; without
         effect if there are several cloths.
@@ -138,6 +139,10 @@ def simulate_cloth(
         raise BadInputError(
             f"cloth: rotations have the shape {rotations.shape}, not {(frames, bodies, 4)}"
         )
+    if vertices is None:
+        # Frame 0 follows the first step, in which the bodies count as standing where it ends.
+        positions = np.concatenate([positions[:1], positions])
+        rotations = np.concatenate([rotations[:1], rotations])
     solids = fill_bodies(scene.bodies, rules.particle_spacing)
     flat = [sheet_vertices(cloth) for cloth in scene.cloths]
     at = _start(vertices, flat, "vertices")
@@ -146,6 +151,8 @@ def simulate_cloth(
         _run(scene, n, at[n], speed[n], solids, positions, rotations, rules, until_gap)
         for n in range(len(scene.cloths))
     ]
+    if vertices is None:
+        records = [ClothRecord(*(part[1:] for part in record)) for record in records]
     frames = min((len(record.vertices) for record in records), default=frames)
     asked = [record.distance for record in records if not np.isnan(record.distance).all()]
     return ClothMotion(
