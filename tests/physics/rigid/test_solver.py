@@ -37,7 +37,7 @@ DEFAULTS = RigidSettings()
 OPTIONS = SolverOptions(
     DEFAULTS.dt,
     DEFAULTS.position_iterations,
-    DEFAULTS.velocity_iterations,
+    1,
     0,
     False,
     DEFAULTS.bias,

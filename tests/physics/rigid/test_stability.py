@@ -53,10 +53,10 @@ def test_energy_never_rises_in_a_frictionless_inelastic_stack(
     path = run(scene_of(*cubes), frames=200, floor=ICE)
     total = energy(path, cubes)
     # Overlaps that the sweeps leave are pushed out later, which lifts bodies without a speed. They
-    # are small: what rises is less than the work of lifting the whole stack by 0.05 mm. (Without
+    # are small: what rises is less than the work of lifting the whole stack by 0.2 mm. (Without
     # the sweep that takes the speed of the correction away, it would be 30 mm.)
     weight = G * sum(cube.mass for cube in cubes)
-    assert (total - np.minimum.accumulate(total)).max() < 5e-5 * weight
+    assert (total - np.minimum.accumulate(total)).max() < 2e-4 * weight
     # The stack stands, and has lost what it fell: cube k by k + 1 gaps.
     lost = G * gap * sum(cube.mass * (k + 1) for k, cube in enumerate(cubes))
     assert total[0] - total[-1] == pytest.approx(lost, abs=1e-3 * weight)
