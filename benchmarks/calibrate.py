@@ -84,18 +84,17 @@ def material(friction: float) -> SurfaceMaterial:
     return SurfaceMaterial(friction, friction, 0.0)
 
 
-SETTINGS = RigidSettings()
 QUANTITIES = {
     q.name: q
     for q in (
-        Quantity("friction_sweeps", (SETTINGS.friction_sweeps, 0, 3), field="friction_sweeps"),
+        Quantity("friction_sweeps", (3, 0), field="friction_sweeps"),
         Quantity("persistent_manifolds", (True, False), field="persistent_manifolds"),
         Quantity(
             "floor_friction",
-            tuple(material(value) for value in (0.6, 0.4, 0.5, 0.7, 0.8)),
+            tuple(material(value) for value in (0.6, 0.4, 0.8)),
             field="floor",
         ),
-        Quantity("floor_height", (0.0043, 0.0, 0.002, 0.003, 0.004, 0.005, 0.006), floor="bright"),
+        Quantity("floor_height", (0.0043, 0.0, 0.002, 0.004, 0.006), floor="bright"),
         Quantity("ball_segments", (16, 12, 14, 20, 24), constant="BALL_SEGMENTS", module=hulls,
                  shapes=("sphere",)),
         Quantity("pipe_inner", (0.389, 0.25, 0.3, 0.33, 0.35, 0.37, 0.42),
@@ -112,12 +111,8 @@ QUANTITIES = {
         Quantity("round_sides", (32, 16, 24), constant="ROUND_SEGMENTS",
                  shapes=("cylinder", "pipe")),
         Quantity("cone_sides", (22, 16, 32), constant="CONE_SEGMENTS", shapes=("cone",)),
-        Quantity("ramp_foot", (1.629, 1.5, 1.58, 1.68, 1.75), constant="RAMP_FOOT",
+        Quantity("ramp_foot", (1.629, 1.5, 1.58, 1.68), constant="RAMP_FOOT",
                  shapes=("ramp_with_platform_30", "ramp_with_platform_60")),
-        Quantity("contact_offset", (0.01, 0.005, 0.02), field="contact_offset"),
-        Quantity("bounce_threshold", (2.0, 1.0, 0.5), field="bounce_threshold"),
-        Quantity("sleep_threshold", (0.01, 0.005, 0.02), field="sleep_threshold"),
-        Quantity("max_depenetration_speed", (10.0, 5.0, 100.0), field="max_depenetration_speed"),
     )
 }  # fmt: skip
 
