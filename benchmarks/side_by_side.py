@@ -24,10 +24,7 @@ from replay import RESULTS, processor
 HERE = Path(__file__).parents[1] / "src"
 WORK = """
 import json, sys, time
-try:
-    from physion.scenes.sampling.registry import sample_scene, scenarios
-except ModuleNotFoundError:
-    from physion.scenes.sampling.registry import sample_scene, scenarios
+from physion.scenes.sampling.registry import sample_scene, scenarios
 from physion.physics.engine import simulate
 from physion.rendering.renderer import Renderer
 from physion.seeds import trial_seed
