@@ -17,6 +17,7 @@ from physion.numerics.elementary import arctan2
 from physion.numerics.kernel import kernel
 from physion.numerics.linear_algebra import cross, dot, ordered_mean, unit
 from physion.scenes.scene import Vec3
+from physion.scenes.shapes.meshes import revolve
 from physion.scenes.shapes.primitives import ConvexPiece, ball_mesh, shape
 
 F64 = NDArray[np.float64]
@@ -25,6 +26,10 @@ I64 = NDArray[np.int64]
 BALL_SEGMENTS = 16
 """Meridians of a ball's hull, with half as many bands. With 24, balls roll on for longer than in
 the recorded trials; with 12 they stop too soon. (PhysX allows 255 corners.)"""
+CYLINDER_SIDES = 16
+"""Sides of a cylinder's hull. With 32, as drawn, outcomes, contact frames and final positions of
+the recorded trials are all predicted worse, with 24 by half as much
+(benchmarks/results/calibration.md)."""
 SAME_FACE_COSINE = 1 - 1e-7
 SAME_FACE_OFFSET = 1e-5
 """Triangles of a hull are one face where their normals agree by this cosine, and their offsets to
@@ -83,6 +88,10 @@ def _corners(piece: ConvexPiece) -> F64:
         return piece.vertices
     if piece.kind == "sphere":
         return ball_mesh(piece.half[0], BALL_SEGMENTS).moved(offset=piece.center).vertices
+    if piece.kind == "cylinder":
+        outline = [(0.0, -1.0), (1.0, -1.0), (1.0, 1.0), (0.0, 1.0)]
+        solid = revolve(outline, CYLINDER_SIDES).moved(piece.half).rotated(piece.rotation)
+        return solid.moved(offset=piece.center).vertices
     return piece.mesh.vertices
 
 

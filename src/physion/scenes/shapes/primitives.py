@@ -297,8 +297,7 @@ def _torus_section(inner: float) -> Outline:
 @shapes.register("pipe")
 def _pipe() -> Shape:
     mesh = revolve(_pipe_section(PIPE_INNER), ROUND_SEGMENTS, closed=True, smooth=CURVED)
-    steps = ROUND_SEGMENTS // PIPE_SECTORS
-    pieces = ring_pieces([np.array(_pipe_section(PIPE_PIECE_INNER))], PIPE_SECTORS, steps)
+    pieces = ring_pieces([np.array(_pipe_section(PIPE_PIECE_INNER))], PIPE_SECTORS, 1)
     return Shape("pipe", mesh, pieces, hollow=True)
 
 
