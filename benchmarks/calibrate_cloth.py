@@ -1,6 +1,6 @@
 """Calibrate cloth on the official Drape trials, cross-validated by configuration.
 
-    python benchmarks/calibrate_cloth.py ../shared/official/scenes --workers 2
+    python benchmarks/calibrate_cloth.py SCENES --workers 2 [--gaps FILE]
 
 Each candidate changes one quantity of the cloth within its physical bounds. All trials are
 simulated with each. A trial's score is its smallest gap between cloth and patient; that the trial
@@ -8,10 +8,10 @@ was recorded as contact has the probability
 
     p = e / 2 + (1 - e) / (1 + exp((gap - t) / s)),
 
-with the threshold t, the width s and a share e of trials whose outcome the gap does not
-tell. Every configuration is held out once: t and s, and for the last line the candidate too, are
-those with the largest likelihood on the other configurations, and the outcome of the held-out
-trials is predicted by gap < t. Printed: agreement and mean log likelihood of held-out trials, and
+with the threshold t, the width s and the fraction e (`UNTOLD`) of trials whose outcome does not
+depend on the gap. Every configuration is held out once. t and s are those with the largest
+likelihood on the other configurations; in the last line the candidate is chosen so too. A held-out
+trial is predicted as contact if gap < t. Printed: agreement and mean log likelihood of held-out trials, and
 the area under the curve of the gap. benchmarks/results/calibration_cloth.md says what was kept.
 """
 
@@ -40,7 +40,7 @@ Truth = NDArray[np.bool_]
 Names = NDArray[np.str_]
 FRAMES = 151
 UNTOLD = 0.1
-"""Share e of trials whose outcome the gap does not tell."""
+"""Fraction e of trials whose outcome does not depend on the gap."""
 THRESHOLDS = np.arange(-0.012, 0.002, 0.0001)
 WIDTHS = (0.0003, 0.0005, 0.001, 0.002, 0.004)
 
@@ -179,7 +179,7 @@ def table(found: dict[str, Floats], recorded: Truth, group: Names) -> str:
 
 
 def main() -> None:
-    """Simulate all trials with all candidates, cross-validate, print, and write if asked to."""
+    """Simulate all trials with all candidates, cross-validate, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scenes", type=Path)
     parser.add_argument("--workers", type=int, default=1)

@@ -22,7 +22,8 @@ ENVIRONMENT = -1
 class Contacts:
     """Contacts of a trajectory: one row for each touching pair in each frame, at its deepest point.
 
-    A pair touches where its impulse is above 0 or its surfaces meet.
+    A pair touches where its impulse is above 0 or its surfaces meet. The engine "physion" records no
+    contacts of pairs in which nothing is awake: they end when the pair falls asleep.
 
     - ``frame`` (C,): the frame that shows the contact.
     - ``bodies`` (C, 2): indices of `Scene.names`, the smaller first; `ENVIRONMENT` is the floor.

@@ -225,8 +225,8 @@ class RigidRun:
     def restore(self, start: State) -> None:
         """Set the actors from the state of the first body of each.
 
-        The next frame is the one after ``start.frame``, or ``start.frame`` itself if the start is
-        to be recorded.
+        The start itself is not recorded. If the caller records it, as frame 0, the first step leads
+        to the frame after ``start.frame``; otherwise to ``start.frame`` itself.
         """
         bodies, model = self.bodies, self.model
         for actor, i in enumerate(model.leader):
