@@ -11,8 +11,9 @@ was recorded as contact has the probability
 with the threshold t, the width s and the fraction e (`UNTOLD`) of trials whose outcome does not
 depend on the gap. Every configuration is held out once. t and s are those with the largest
 likelihood on the other configurations; in the last line the candidate is chosen so too. A held-out
-trial is predicted as contact if gap < t. Printed: agreement and mean log likelihood of held-out trials, and
-the area under the curve of the gap. benchmarks/results/calibration_cloth.md says what was kept.
+trial is predicted as contact if gap < t. Printed: agreement and mean log likelihood of held-out
+trials, and the area under the curve of the gap. benchmarks/results/calibration_cloth.md says what
+was kept.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ ENVIRONMENT = -1
 class Contacts:
     """Contacts of a trajectory: one row for each touching pair in each frame, at its deepest point.
 
-    A pair touches where its impulse is above 0 or its surfaces meet. The engine "physion" records no
+    A pair touches where its impulse is above 0 or its surfaces meet. `RigidEngine` records no
     contacts of pairs in which nothing is awake: they end when the pair falls asleep.
 
     - ``frame`` (C,): the frame that shows the contact.
