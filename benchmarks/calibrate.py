@@ -322,6 +322,11 @@ def main() -> None:
             file.write("\n".join(head + lines) + "\n")
 
 
+def shown_value(value: Any) -> Any:
+    """Return a value as it stands in a table: for a material its friction."""
+    return value.static_friction if isinstance(value, SurfaceMaterial) else value
+
+
 def report(
     quantity: Quantity,
     rows: np.ndarray,
@@ -339,10 +344,10 @@ def report(
     ]
     for index, value in enumerate(quantity.values):
         mean = rows[index].mean(axis=0)
-        shown = value.static_friction if isinstance(value, SurfaceMaterial) else value
+        shown = shown_value(value)
         parts = " | ".join(f"{part:.3f}" for part in mean[:4])
         lines.append(f"| {shown} | {mean[4]:.3f} | {parts} | {mean[:4].sum():.3f} |")
-    picks = ", ".join(str(quantity.values[c]) for c in chosen)
+    picks = ", ".join(str(shown_value(quantity.values[c])) for c in chosen)
     lines.append("")
     lines.append(
         f"Held-out gain of choosing: {gain:+.4f} nats a trial (standard error {error:.4f}); chosen "
