@@ -7,12 +7,12 @@ is simulated once as it is and ``--runs`` times with 1 mm of jitter, and gets th
 likelihood of everything that its log records:
 
 - outcome: (k + 1/2) / (n + 1) with k of n runs having the recorded outcome;
-- first frame with contact, frame of the first motion of the target, number of frames: mean over
-  the runs of a Laplace density (3, 3 and 10 frames), mixed with 5 % of a uniform density;
+- first frame with contact, number of frames: mean over the runs of a Laplace density (3 and 10
+  frames), mixed with 5 % of a uniform density;
 - final position of the target: mean over the runs of exp(-r / s) / (8 pi s^3) with s = 0.1 m,
   mixed with 5 % of a uniform density over 30 m^3.
 
-For the last four, a run without the event counts as density 0 before the mixing. The configurations
+For the last three, a run without the event counts as density 0 before the mixing. Configurations
 are divided into folds; for each fold the value with the largest sum over the *other* folds is
 chosen, and its gain over the present value is counted on the fold itself. A change is worth keeping
 if this gain is larger than its standard error over configurations. Only trials with a shape that
@@ -53,10 +53,6 @@ JITTER = 0.001
 FRAME_SCALE, LENGTH_SCALE, POSITION_SCALE = 3.0, 10.0, 0.1
 UNIFORM = 0.05
 FRAMES, VOLUME = 300.0, 30.0
-MOVED = 0.01
-"""Metres: a target has moved once it is this far from its start."""
-REFERENCE = {name: np.array([1.0, 10.0, 10.0]) for name in ("support", "contain", "link")}
-"""What recorded displacements are relative to where the first target was replaced, metres."""
 RIGID = ("dominoes", "support", "collide", "contain", "drop", "link", "roll")
 Change = Callable[[Any], Callable[[], None]]
 
@@ -66,7 +62,7 @@ class Quantity:
     """Something unknown: the present value first, then others.
 
     ``field`` names a field of `RigidSettings`, ``constant`` a constant of the module of shapes;
-    ``shapes`` the shapes that it concerns, by default all. ``floor`` is a room whose floor height
+    ``shapes`` the shapes that it concerns, by default all. ``room`` is the one whose floor height
     is meant.
     """
 
@@ -74,7 +70,7 @@ class Quantity:
     values: tuple[Any, ...]
     field: str = ""
     constant: str = ""
-    floor: str = ""
+    room: str = ""
     shapes: tuple[str, ...] = ()
     module: Any = primitives
 
@@ -94,7 +90,7 @@ QUANTITIES = {
             tuple(material(value) for value in (0.6, 0.4, 0.8)),
             field="floor",
         ),
-        Quantity("floor_height", (0.0043, 0.0, 0.002, 0.004, 0.006), floor="bright"),
+        Quantity("floor_height", (0.0043, 0.0, 0.002, 0.004, 0.006), room="bright"),
         Quantity("ball_segments", (16, 12, 14, 20, 24), constant="BALL_SEGMENTS", module=hulls,
                  shapes=("sphere",)),
         Quantity("pipe_inner", (0.389, 0.25, 0.3, 0.33, 0.35, 0.37, 0.42),
@@ -149,7 +145,7 @@ class Variant:
     def scene(self, scene: Scene) -> Scene:
         """Return the scene with the variant's height of the floor."""
         quantity = None if self.quantity is None else QUANTITIES[self.quantity]
-        if quantity is None or not quantity.floor or scene.room != quantity.floor:
+        if quantity is None or not quantity.room or scene.room != quantity.room:
             return scene
         return replace(scene, floor=quantity.values[self.index])
 
@@ -158,7 +154,6 @@ _originals = [
     (q.constant, q.module, getattr(q.module, q.constant)) for q in QUANTITIES.values() if q.constant
 ]
 _trials: list[ImportedTrial] = []
-_moves: list[int | None] = []
 
 
 def load(folder: Path) -> None:
@@ -172,8 +167,8 @@ def load(folder: Path) -> None:
 
 def concerns(quantity: Quantity, trial: ImportedTrial) -> bool:
     """Return whether the trial has a shape or room that the quantity concerns."""
-    if quantity.floor:
-        return trial.scene.room == quantity.floor
+    if quantity.room:
+        return trial.scene.room == quantity.room
     shapes = {body.shape for body in trial.scene.bodies if not body.scenery}
     return not quantity.shapes or bool(shapes & set(quantity.shapes))
 
@@ -188,23 +183,12 @@ def log_mixture(densities: list[float], uniform: float) -> float:
     return math.log((1.0 - UNIFORM) * math.fsum(densities) / len(densities) + UNIFORM * uniform)
 
 
-def target_end(trial: ImportedTrial) -> np.ndarray | None:
-    """Return the recorded final position of the target, metres."""
-    scene, moved = trial.scene, trial.outcome.displacement
-    if moved is None:
-        return None
-    start = np.array(scene.bodies[scene.index(scene.roles.agent)].position)
-    if scene.scenario == "drop":
-        start = np.zeros(3)
-    return np.array(moved) + REFERENCE.get(scene.scenario, start)
-
-
 def score(trial: ImportedTrial, runs: list[tuple[Scene, Trajectory]]) -> list[float]:
     """Return the log-likelihoods of a trial: outcome, first contact, frames, final position."""
     outcome = trial.outcome
     hits = 0
     first, length, position = [], [], []
-    end = target_end(trial)
+    end = None if outcome.final_position is None else np.array(outcome.final_position)
     for scene, path in runs:
         labels = label_contact(scene, path)
         hits += labels.contact == outcome.contact

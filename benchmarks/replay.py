@@ -95,6 +95,7 @@ def main() -> None:
         subprocess.run([*command, "--repeats", str(repeats)], check=True)
         result = json.loads(out.read_text())
         rows += result["scenarios"]
+    result.pop("trials")
     out.write_text(json.dumps({**result, "scenarios": rows}, indent=2) + "\n")
     lines = [
         "# Official scenes, simulated again",

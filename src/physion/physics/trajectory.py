@@ -111,6 +111,7 @@ class Trajectory:
     def state(self, frame: int) -> State:
         """Return the state at ``frame``, from which another simulation can start."""
         cloth = self.cloth_vertices.astype(np.float64)
+        # Frame 0 follows a step from rest, whose start is not stored.
         before = max(frame - 1, 0)
         return State(
             frame,

@@ -128,8 +128,7 @@ def settle(
 ) -> int:
     """Let the first ``added`` solids settle; return how many frames it took, at most ``frames``.
 
-    ``state`` is changed. It ends early once all particles are slower than `REST_SPEED` after a
-    frame in which the floor carried them.
+    ``state`` is changed. It ends early once all particles are slower than `REST_SPEED`.
     """
     count = solids.local.shape[1]
     step = options.frame_time / options.substeps

@@ -21,7 +21,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.errors import BadInputError
+from physion.errors import BadInputError, BadSceneError
 from physion.physics.cloth.contact_gap import CLOTH_CONTACT_GAP
 from physion.physics.cloth.contacts import ClothOptions
 from physion.physics.cloth.near_solids import Solids
@@ -126,7 +126,14 @@ def simulate_cloth(
     ------
     BadInputError
         If arrays have other shapes.
+    BadSceneError
+        If bodies appear or vanish.
     """
+    if any(event.kind != "move" for event in scene.events):
+        raise BadSceneError(
+            f"scene {scene.name!r}: bodies may not appear or vanish beside cloth; leave out these "
+            "events or the cloth"
+        )
     rules = settings if settings is not None else ClothSettings()
     positions = np.ascontiguousarray(rigid_positions, np.float64)
     rotations = np.ascontiguousarray(rigid_rotations, np.float64)
@@ -177,6 +184,8 @@ def settle_solids(scene: Scene, settings: ClothSettings | None = None) -> Scene:
     if not (scene.cloths and scene.settle_frames):
         return scene
     falling = [body for body in scene.bodies if body.kinematic and not body.scenery]
+    if not falling:
+        return scene
     poses = settled_poses(
         tuple(SolidBody(b.shape, b.scale, b.position, b.rotation, b.mass) for b in falling),
         _options(scene, rules),

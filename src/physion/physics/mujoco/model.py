@@ -71,8 +71,7 @@ def find_actors(scene: Scene, active: tuple[bool, ...], positions: F64, rotation
     positions, rotations : (N, 3), (N, 4)
         Present poses of all bodies.
     """
-    groups = [[i for i in group if active[i]] for group in group_bodies(scene)]
-    groups = [group for group in groups if group]
+    groups = group_bodies(scene, active)
     bodies, count = scene.bodies, len(groups)
     rotations = unit(rotations)
     own = [body_mass(body) for body in bodies]

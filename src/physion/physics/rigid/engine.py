@@ -65,7 +65,9 @@ class RigidEngine:
         most = scene.ending.max_frames if frames is None else frames
         # Cloth does not sleep: with it a trial takes its whole time.
         least = most if frames is not None or scene.cloths else scene.ending.min_frames
-        rigid = simulate_rigid(scene, self.settings, self.name, start, least, most, until_contact)
+        # With cloth, its contact is what is asked for, and bodies are needed until then.
+        until_touch = until_contact and not scene.cloths
+        rigid = simulate_rigid(scene, self.settings, self.name, start, least, most, until_touch)
         if not scene.cloths:
             return rigid
         return add_cloth(scene, rigid, self.cloth, start=start, until_contact=until_contact)
@@ -83,6 +85,9 @@ class RigidEngine:
         The compiled steps run without Python's lock, one thread for each processor core. Each run
         has arrays of its own, so that the number of threads does not change a byte.
         """
+
+        if starts is not None and len(starts) != len(scenes):
+            raise BadInputError(f"{len(scenes)} scenes need as many starts, not {len(starts)}")
 
         def run(index: int) -> Trajectory:
             start = None if starts is None else starts[index]

@@ -43,11 +43,10 @@ def simulate_rigid(
     """
     first = 0 if start is None else start.frame
     events = sorted({e.frame for e in scene.events if first < e.frame < first + most})
-    before = 0 if start is None else start.frame
     if start is not None and scene.events:
         # Earlier events may have put bodies elsewhere that do not move by themselves.
         scene = _at_poses(scene, start.positions, unit(start.rotations))
-    run = RigidRun(scene, settings, start, scene.present(before))
+    run = RigidRun(scene, settings, start, scene.present(first))
     if not events:
         run.run(least, most, until_touch)
         return run.trajectory(engine)

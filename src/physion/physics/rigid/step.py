@@ -82,7 +82,7 @@ class EndRule(NamedTuple):
 
 
 class Pushes(NamedTuple):
-    """Q pushes in the order of their frames.
+    """Q pushes.
 
     ``frame`` (Q,): the frame whose step starts with it. ``actor`` (Q,); A is none. ``impulse``
     (Q, 3): J in N s. ``point`` (Q, 3): where it acts, metres, world; NaN: at the centre of mass.

@@ -39,8 +39,8 @@ TOUCHING = 1e-14
 """Square metres: hulls whose squared distance is smaller count as overlapping, since the direction
 from one to the other would be noise."""
 FLAT = 1e-12
-"""Sine to the power of two under which two edges count as parallel, and part of an edge product
-under which a tetrahedron counts as flat."""
+"""Squared sine of the angle between a face and the fourth corner of a tetrahedron under which the
+tetrahedron counts as flat."""
 MAX_CORNERS = 48
 """Corners added before the search ends with the best simplex so far. Exact arithmetic needs no
 limit; a dozen are usual."""

@@ -38,6 +38,7 @@ from physion.physics.rigid.collision.clipping import (
 from physion.physics.rigid.collision.closest_points import (
     APART,
     CLOSE,
+    OVERLAPPING,
     Simplex,
     closest_points,
     new_simplex,
@@ -425,10 +426,11 @@ def _closest_row(space: PairSpace, row: F64) -> None:
 
 
 @in_place_kernel
-def find_closest(
-    hulls: Hulls, manifolds: Manifolds, s: int, reach: float, space: PairSpace
-) -> bool:
-    """Find the closest points of pair ``s``; return whether they are within ``reach`` metres.
+def find_closest(hulls: Hulls, manifolds: Manifolds, s: int, reach: float, space: PairSpace) -> int:
+    """Find the closest points of pair ``s``.
+
+    Returns `APART` beyond ``reach`` metres, `CLOSE` where they were found, and `OVERLAPPING` where
+    the hulls overlap and the depth could not be computed.
 
     ``space.closest`` is filled: direction from B to A, points, depth (negative if apart).
     """
@@ -454,7 +456,7 @@ def find_closest(
             manifolds.apart_shift[s, i] = space.shift[i]
             for j in range(3):
                 manifolds.apart_rot[s, i, j] = space.rot[i, j]
-        return False
+        return APART
     if result == CLOSE:
         for i in range(3):
             closest[i] = simplex.closest[i] / distance
@@ -464,10 +466,12 @@ def find_closest(
                 closest[3 + i] += simplex.weight[k] * simplex.point[k, 3 + i]
                 closest[6 + i] += simplex.weight[k] * simplex.point[k, 6 + i]
         closest[9] = -distance
-        return True
-    return penetration(
+        return CLOSE
+    if penetration(
         hulls.vertices, span, space.rot, space.shift, simplex, size, space.polytope, closest
-    )
+    ):
+        return CLOSE
+    return OVERLAPPING
 
 
 # Between two poses, a corner p of A moves in the frame of B by (R - R') p + t - t', that is by at
@@ -545,7 +549,8 @@ def update_pair(
     Returns
     -------
     int
-        Number of points; those with a gap above ``reach`` are not contacts.
+        Number of points; those with a gap above ``reach`` are not contacts. Old points stay where
+        an overlap has no computable depth.
     """
     g, h = manifolds.geoms[s, 0], manifolds.geoms[s, 1]
     margin = min(hulls.margin[g], hulls.margin[h])
@@ -556,8 +561,12 @@ def update_pair(
     for i in range(4):
         manifolds.rotation[s, 0, i] = qa[i]
         manifolds.rotation[s, 1, i] = qb[i]
-    if not find_closest(hulls, manifolds, s, reach, space):
+    result = find_closest(hulls, manifolds, s, reach, space)
+    if result == APART:
         return 0
+    if result == OVERLAPPING:
+        set_direction(manifolds, s)
+        return int(manifolds.size[s])
     closest, direction = space.closest, manifolds.direction
     set_direction(manifolds, s)
     cosine = 0.0

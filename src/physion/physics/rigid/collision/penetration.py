@@ -35,8 +35,8 @@ GAIN = 1e-8
 SEEN = 1e-12
 """Metres: a point this far outside a face sees it."""
 MIN_VOLUME = 1e-15
-"""Cubic metres: smallest volume (times 6) of a first tetrahedron, squared areas and lengths in
-proportion. Smaller simplices are given further corners."""
+"""Smallest squared length (m^2) and squared area (m^4, times 4) of a first simplex, and smallest
+volume (m^3, times 6) of a first tetrahedron. Smaller ones are given other corners."""
 
 
 class Polytope(NamedTuple):
