@@ -232,7 +232,7 @@ def spin_between(old: F64, new: F64, step: float, out: F64) -> None:
 
 
 # Contact of two solid particles p and s of masses m_p, m_s: as for cloth (`contacts`), but p gets
-# the share w_p / (w_p + w_s) of each correction, with w = 1 / m.
+# the fraction w_p / (w_p + w_s) of each correction, with w = 1 / m.
 
 
 @kernel
@@ -291,7 +291,7 @@ def _pass(
             distance = np.sqrt(square)
             if distance < MIN_DISTANCE:
                 continue
-            share = weight[body] / (weight[body] + weight[b])
+            fraction = weight[body] / (weight[body] + weight[b])
             depth = rest_distance - distance
             dx, dy, dz = dx / distance, dy / distance, dz / distance
             ux = mx - near.displacement[p, c, 0] - (qx - fx)
@@ -300,9 +300,9 @@ def _pass(
             along = ux * dx + uy * dy + uz * dz
             ux, uy, uz = ux - along * dx, uy - along * dy, uz - along * dz
             hold = friction_hold(ux * ux + uy * uy + uz * uz, options.friction * depth)
-            sx += share * (dx * depth - hold * ux)
-            sy += share * (dy * depth - hold * uy)
-            sz += share * (dz * depth - hold * uz)
+            sx += fraction * (dx * depth - hold * ux)
+            sy += fraction * (dy * depth - hold * uy)
+            sz += fraction * (dz * depth - hold * uz)
             contacts += 1
         depth = options.floor + options.floor_gap - pz
         if depth > 0:
