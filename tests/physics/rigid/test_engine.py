@@ -96,7 +96,7 @@ def test_joined_bodies_move_as_one_and_keep_their_materials() -> None:
     assert np.abs(gap - 0.2).max() < 1e-5
     assert np.allclose(path.rotations[:, 0], path.rotations[:, 1], atol=1e-6)
     run_ = RigidRun(held, RigidSettings())
-    assert run_.model.actors == 1
+    assert run_.model.actors.count == 1
     assert run_.model.inv_mass[0] == pytest.approx(1 / 4.0)
     assert run_.model.material[0].tolist() == [0.5, 0.5, 0.0]
     assert run_.model.material[1].tolist() == [0.0, 0.0, 0.0]

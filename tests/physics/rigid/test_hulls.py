@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from physion.numerics.rotations import axis_angle_quaternion, rotation_matrices
-from physion.physics.rigid.contact_record import summarise_contacts
+from physion.physics.contact_record import summarise_contacts
 from physion.physics.rigid.hulls import collision_hulls, hull_faces, inner_box
 from physion.physics.rigid.model import build_model
 from physion.physics.rigid.settings import RigidSettings
@@ -77,13 +77,13 @@ def test_hulls_of_joined_bodies_are_in_the_frame_of_their_common_centre() -> Non
     lower = Body("a", "cube", (1, 2, 0), rotation=tuple(q.tolist()))  # type: ignore[arg-type]
     upper = Body("b", "cube", (1, 2, 1), mass=3.0)
     model = build_model(scene_of(lower, upper, joints=(Joint("a", "b"),)), RigidSettings())
-    assert model.actors == 1
-    assert model.start_x[0].tolist() == pytest.approx([1, 2, 1.25])
+    assert model.actors.count == 1
+    assert model.actors.x[0].tolist() == pytest.approx([1, 2, 1.25])
     first, stop = model.hulls.first_vertex[:2]
     assert model.hulls.vertices[first:stop].mean(0).tolist() == pytest.approx([0, 0, -0.75])
     upper_corners = model.hulls.vertices[model.hulls.first_vertex[1] : model.hulls.first_vertex[2]]
     # Back in the world, the upper cube is upright.
-    world = upper_corners @ rotation_matrices(model.start_q[0]).T + model.start_x[0]
+    world = upper_corners @ rotation_matrices(model.actors.q[0]).T + model.actors.x[0]
     assert sorted(np.round(world, 9).tolist()) == [
         [x, y, z] for x in (0.5, 1.5) for y in (1.5, 2.5) for z in (1.0, 2.0)
     ]

@@ -14,9 +14,7 @@ Cloth does not touch itself or other cloth (official: self-collision off).
 
 from __future__ import annotations
 
-import hashlib
-import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +27,7 @@ from physion.physics.cloth.settle import SolidBody, settled_poses
 from physion.physics.cloth.sheet import sheet_springs, sheet_vertices
 from physion.physics.cloth.solids import fill_bodies, surface_particles
 from physion.physics.cloth.solver import ClothRecord, MovingSolids, run_cloth
+from physion.physics.settings_tag import settings_tag
 from physion.physics.trajectory import ENVIRONMENT, Contacts, Floats, State, Trajectory
 from physion.scenes.scene import FRAME_TIME, GRAVITY, Scene
 
@@ -71,8 +70,7 @@ class ClothSettings:
 
     def tag(self) -> str:
         """Return eight hexadecimal digits that change whenever a setting does."""
-        text = json.dumps(asdict(self), sort_keys=True)
-        return hashlib.sha256(text.encode()).hexdigest()[:8]
+        return settings_tag(self)
 
 
 @dataclass(frozen=True)

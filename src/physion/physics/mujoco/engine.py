@@ -17,8 +17,9 @@ from physion.errors import BadInputError, BadSceneError
 from physion.numerics.linear_algebra import apply, dot, inverse, norm, unit
 from physion.numerics.rotations import conjugate, multiply_quaternions, rotate_vectors
 from physion.physics.mujoco.contacts import ContactRows
-from physion.physics.mujoco.model import compile_model, find_actors
+from physion.physics.mujoco.model import compile_model
 from physion.physics.mujoco.settings import MujocoSettings
+from physion.physics.rigid.actors import find_actors
 from physion.physics.trajectory import State, Trajectory
 from physion.scenes.scene import FRAME_TIME, Scene
 
@@ -148,7 +149,7 @@ class MujocoRun:
         self.data = mujoco.MjData(self.model)
         actors, speeds = self.actors, self.data.qvel.reshape(-1, 6)
         for actor in range(actors.count):
-            i = int(np.flatnonzero(actors.actor_of == actor)[0])
+            i = actors.leader[actor]
             arm = rotate_vectors(actors.q[actor], actors.center[i])
             # MuJoCo's free bodies have their velocity in world axes and their spin in body axes.
             speeds[actor, :3] = self.velocities[i] - np.cross(self.spins[i], arm)

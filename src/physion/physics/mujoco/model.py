@@ -1,13 +1,8 @@
-"""MuJoCo's model of a scene: a free body for every actor, a convex mesh for every piece.
-
-An actor is what moves as one: a body, or several bodies joined together. Its frame has its origin
-at the centre of mass and the axes of its first body. Bodies that do not move belong to the world.
-"""
+"""MuJoCo's model of a scene: a free body for every actor, a convex mesh for every piece."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -15,12 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.numerics.elementary import log_of
-from physion.numerics.linear_algebra import unit
-from physion.numerics.rotations import conjugate, multiply_quaternions, rotate_vectors
+from physion.numerics.rotations import rotate_vectors
 from physion.physics.mujoco.settings import MujocoSettings
+from physion.physics.rigid.actors import Actors
 from physion.physics.rigid.hulls import collision_hulls
-from physion.physics.rigid.mass import MassProperties, body_mass, merge_masses
-from physion.physics.rigid.model import group_bodies
 from physion.physics.trajectory import ENVIRONMENT
 from physion.scenes.scene import FRAME_TIME, Scene, SurfaceMaterial
 
@@ -29,82 +22,6 @@ I64 = NDArray[np.int64]
 
 LEAST_DAMPING = 0.01
 """Smallest damping ratio of a contact, so that its spring is not infinitely slow to settle."""
-
-
-@dataclass(frozen=True)
-class Actors:
-    """Bodies of a scene grouped into A actors that move as one; N bodies.
-
-    - ``mass`` (A,) kg, ``inertia`` (A, 3, 3) kg m², in actor frames. ``drag`` (A, 2): linear and
-      angular drag per second.
-    - ``actor_of`` (N,): actor of each body; A for those that do not move or are absent.
-    - ``pivot`` (N, 3), ``rotation`` (N, 4), ``center`` (N, 3): a body's pose and its own centre of
-      mass in the frame of its actor; the world frame for those without.
-    - ``x`` (A + 1, 3), ``q`` (A + 1, 4): poses of the actors; the last is the world.
-    """
-
-    mass: F64
-    inertia: F64
-    drag: F64
-    actor_of: I64
-    pivot: F64
-    rotation: F64
-    center: F64
-    x: F64
-    q: F64
-
-    @property
-    def count(self) -> int:
-        """Number of actors."""
-        return len(self.mass)
-
-
-def find_actors(scene: Scene, active: tuple[bool, ...], positions: F64, rotations: F64) -> Actors:
-    """Group the bodies that move into actors.
-
-    Parameters
-    ----------
-    scene
-        Bodies and joints.
-    active
-        Which bodies take part, in the order of `Scene.names`.
-    positions, rotations : (N, 3), (N, 4)
-        Present poses of all bodies.
-    """
-    groups = group_bodies(scene, active)
-    bodies, count = scene.bodies, len(groups)
-    rotations = unit(rotations)
-    own = [body_mass(body) for body in bodies]
-    actor_of = np.full(len(bodies), count, np.int64)
-    pivot, rotation = positions.copy(), rotations.copy()
-    center = positions + rotate_vectors(rotations, np.array([m.center for m in own]))
-    x, q = np.zeros((count + 1, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (count + 1, 1))
-    whole: list[MassProperties] = []
-    for actor, group in enumerate(groups):
-        first, frame = positions[group[0]], rotations[group[0]]
-        parts = []
-        for i in group:
-            actor_of[i] = actor
-            rotation[i] = multiply_quaternions(conjugate(frame), rotations[i])
-            pivot[i] = rotate_vectors(conjugate(frame), positions[i] - first)
-            parts.append(own[i].moved(pivot[i], rotation[i]))
-        whole.append(merge_masses(parts))
-        x[actor], q[actor] = first + rotate_vectors(frame, whole[-1].center), frame
-        for i, part in zip(group, parts, strict=True):
-            pivot[i] -= whole[-1].center
-            center[i] = part.center - whole[-1].center
-    drag = [(bodies[group[0]].drag, bodies[group[0]].angular_drag) for group in groups]
-    return Actors(
-        mass=np.array([properties.mass for properties in whole]),
-        inertia=np.array([properties.inertia for properties in whole]).reshape(-1, 3, 3),
-        drag=np.array(drag, np.float64).reshape(-1, 2),
-        actor_of=actor_of,
-        pivot=pivot,
-        rotation=rotation,
-        center=center,
-        x=x,
-        q=q,
-    )
 
 
 def compile_model(

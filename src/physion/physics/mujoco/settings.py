@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 from physion.physics.rigid.settings import FLOOR_MATERIAL
+from physion.physics.settings_tag import settings_tag
 from physion.scenes.scene import GRAVITY, SurfaceMaterial
 
 
@@ -41,5 +40,4 @@ class MujocoSettings:
 
     def tag(self) -> str:
         """Return eight hexadecimal digits that change whenever a setting does."""
-        text = json.dumps(asdict(self), sort_keys=True)
-        return hashlib.sha256(text.encode()).hexdigest()[:8]
+        return settings_tag(self)

@@ -69,13 +69,12 @@ def fill_row(
 @in_place_kernel
 def relative_speed(rows: F64, r: int, a: int, b: int, v: F64, w: F64) -> float:
     """Return J v of row ``r`` in m/s: positive where the bodies part."""
-    return float(
-        rows[r, 0] * (v[b, 0] - v[a, 0])
-        + rows[r, 1] * (v[b, 1] - v[a, 1])
-        + rows[r, 2] * (v[b, 2] - v[a, 2])
-        + (rows[r, 6] * w[b, 0] + rows[r, 7] * w[b, 1] + rows[r, 8] * w[b, 2])
-        - (rows[r, 3] * w[a, 0] + rows[r, 4] * w[a, 1] + rows[r, 5] * w[a, 2])
-    )
+    linear = turning_a = turning_b = 0.0
+    for i in range(3):
+        linear += rows[r, DIRECTION + i] * (v[b, i] - v[a, i])
+        turning_a += rows[r, ANGULAR_A + i] * w[a, i]
+        turning_b += rows[r, ANGULAR_B + i] * w[b, i]
+    return float(linear + turning_b - turning_a)
 
 
 @in_place_kernel

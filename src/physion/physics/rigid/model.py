@@ -1,8 +1,6 @@
 """Model of a scene for the rigid engine: actors with mass, and convex hulls called geoms.
 
-An actor is what moves as one: a body, or several bodies joined together. Its frame has its origin
-at the centre of mass and the axes of its first body. The floor is handled apart, because a hull
-touches a plane with all its low corners.
+The floor is handled apart, because a hull touches a plane with all its low corners.
 """
 
 from __future__ import annotations
@@ -13,12 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.errors import BadSceneError
-from physion.numerics.linear_algebra import inverse, norm, unit
-from physion.numerics.rotations import conjugate, multiply_quaternions, rotate_vectors
+from physion.numerics.linear_algebra import inverse, norm
+from physion.numerics.rotations import rotate_vectors
+from physion.physics.rigid.actors import Actors, find_actors
 from physion.physics.rigid.collision.hull_records import Hulls
 from physion.physics.rigid.hulls import Hull, collision_hulls, face_planes
-from physion.physics.rigid.mass import MassProperties, body_mass, hull_mass, merge_masses
 from physion.physics.rigid.settings import RigidSettings
 from physion.scenes.scene import Scene
 
@@ -37,80 +34,22 @@ TOLERANCE_FRACTION, MIN_TOLERANCE, MAX_TOLERANCE = 0.1, 0.01, 0.05
 class RigidModel:
     """Everything about a scene that does not change while it moves.
 
-    A actors, N bodies, G geoms. Actor A stands for the world.
+    A actors, N bodies, G geoms.
 
+    - ``actors``: masses, frames, poses at the start.
     - ``inertia`` (A + 1, 3, 3) in kg m^2, ``inv_mass`` (A + 1,), ``inv_inertia`` (A + 1, 3, 3): in
-      actor frames; 0 for the world.
-    - ``drag`` (A, 2): linear and angular drag per second.
-    - ``actor_of`` (N,): actor of each body; A for kinematic bodies and scenery.
-    - ``pivot`` (N, 3), ``rotation`` (N, 4), ``center`` (N, 3): a body's pose and its own centre of
-      mass in its actor's frame (the world frame for kinematic bodies).
-    - ``leader`` (A,): first body of each actor.
+      actor frames; 0 for the world, which is the last.
     - ``hulls``: all geoms, in their actors' frames. ``first_geom`` (N + 1,): those of each body.
     - ``material`` (N + 1, 3): static and dynamic friction, restitution; the last is the floor.
-    - ``start_x`` (A + 1, 3), ``start_q`` (A + 1, 4): poses of the actors in the scene.
     """
 
+    actors: Actors
     inertia: F64
     inv_mass: F64
     inv_inertia: F64
-    drag: F64
-    actor_of: I64
-    pivot: F64
-    rotation: F64
-    center: F64
-    leader: I64
     hulls: Hulls
     first_geom: I64
     material: F64
-    start_x: F64
-    start_q: F64
-
-    @property
-    def actors(self) -> int:
-        """Number of actors that can move."""
-        return len(self.inv_mass) - 1
-
-
-def group_bodies(scene: Scene, present: Sequence[bool] | None = None) -> list[list[int]]:
-    """Return the indices of the bodies of every actor, in the order of their first body.
-
-    ``present`` tells which bodies are in the scene, by default all. Joints to others do not hold.
-
-    Raises `BadSceneError` for a joint between a body that moves and one that does not.
-    """
-    here = [True] * len(scene.bodies) if present is None else present
-    moving = [
-        i for i, body in enumerate(scene.bodies) if here[i] and not (body.kinematic or body.scenery)
-    ]
-    leader = {i: i for i in moving}
-    for joint in scene.joints:
-        a, b = scene.index(joint.parent), scene.index(joint.child)
-        if not (here[a] and here[b]):
-            continue
-        if a not in leader or b not in leader:
-            raise BadSceneError(
-                f"scene {scene.name!r}: joint {joint.parent!r}-{joint.child!r} needs two bodies "
-                "that move; make both kinematic or neither"
-            )
-        low, high = sorted((leader[a], leader[b]))
-        leader = {i: low if at == high else at for i, at in leader.items()}
-    groups: dict[int, list[int]] = {}
-    for i in moving:
-        groups.setdefault(leader[i], []).append(i)
-    return list(groups.values())
-
-
-def center_of_mass(scene: Scene, name: str) -> F64:
-    """Return the centre of mass (3,) of what a body moves with, at the start; metres, world.
-
-    This is where an impulse without a point acts: on all bodies that are joined to it together.
-    """
-    index = scene.index(name)
-    group = next((group for group in group_bodies(scene) if index in group), [index])
-    bodies = [scene.bodies[i] for i in group]
-    parts = [body_mass(body).moved(body.position, unit(body.rotation)) for body in bodies]
-    return merge_masses(parts).center
 
 
 def build_model(
@@ -122,60 +61,28 @@ def build_model(
     where they are.
     """
     here = [True] * len(scene.bodies) if present is None else present
-    groups = group_bodies(scene, here)
-    actors, count = len(groups), len(scene.bodies)
-    positions = np.array([b.position for b in scene.bodies], dtype=np.float64).reshape(-1, 3)
-    rotations = np.array([b.rotation for b in scene.bodies], dtype=np.float64).reshape(-1, 4)
-    rotations = unit(rotations)
+    actors = find_actors(scene, here)
+    inertia, inv_inertia = np.zeros((2, actors.count + 1, 3, 3))
+    inv_mass = np.zeros(actors.count + 1)
+    for actor in range(actors.count):
+        inertia[actor] = actors.inertia[actor]
+        inv_inertia[actor] = inverse(actors.inertia[actor])
+        inv_mass[actor] = 1.0 / actors.mass[actor]
     hulls = [
         collision_hulls(body.shape, body.scale) if there and not body.scenery else ()
         for body, there in zip(scene.bodies, here, strict=False)
     ]
-    masses = [hull_mass([], b.mass) if b.scenery else body_mass(b) for b in scene.bodies]
-    actor_of = np.full(count, actors, np.int64)
-    pivot, rotation = positions.copy(), rotations.copy()
-    center = positions + rotate_vectors(rotations, np.array([m.center for m in masses]))
-    inv_mass, inv_inertia = np.zeros(actors + 1), np.zeros((actors + 1, 3, 3))
-    inertia = np.zeros((actors + 1, 3, 3))
-    start_x, start_q = np.zeros((actors + 1, 3)), np.tile([1.0, 0, 0, 0], (actors + 1, 1))
-    for actor, group in enumerate(groups):
-        frame = rotations[group[0]]
-        parts: list[MassProperties] = []
-        for i in group:
-            actor_of[i] = actor
-            rotation[i] = multiply_quaternions(conjugate(frame), rotations[i])
-            pivot[i] = rotate_vectors(conjugate(frame), positions[i] - positions[group[0]])
-            parts.append(masses[i].moved(pivot[i], rotation[i]))
-        whole = merge_masses(parts)
-        inv_mass[actor] = 1.0 / whole.mass
-        inertia[actor] = whole.inertia
-        inv_inertia[actor] = inverse(whole.inertia)
-        start_x[actor] = positions[group[0]] + rotate_vectors(frame, whole.center)
-        start_q[actor] = frame
-        for i, part in zip(group, parts, strict=True):
-            pivot[i] -= whole.center
-            center[i] = part.center - whole.center
-    drag = np.array(
-        [[scene.bodies[g[0]].drag, scene.bodies[g[0]].angular_drag] for g in groups]
-    ).reshape(-1, 2)
     materials = [b.contact for b in scene.bodies] + [settings.floor]
     return RigidModel(
+        actors=actors,
         inertia=inertia,
         inv_mass=inv_mass,
         inv_inertia=inv_inertia,
-        drag=drag,
-        actor_of=actor_of,
-        pivot=pivot,
-        rotation=rotation,
-        center=center,
-        leader=np.array([group[0] for group in groups], np.int64),
-        hulls=_gather(hulls, pivot, rotation),
+        hulls=_gather(hulls, actors.pivot, actors.rotation),
         first_geom=np.cumsum([0, *(len(pieces) for pieces in hulls)]).astype(np.int64),
         material=np.array(
             [[m.static_friction, m.dynamic_friction, m.restitution] for m in materials]
         ),
-        start_x=start_x,
-        start_q=start_q,
     )
 
 

@@ -14,6 +14,7 @@ from physion.numerics.rotations import (
     rotate_vectors,
     rotation_matrices,
 )
+from physion.physics.contact_record import summarise_contacts
 from physion.physics.rigid.collision.manifold import grown, new_manifolds, new_pair_space
 from physion.physics.rigid.collision.search import (
     SearchScene,
@@ -21,7 +22,6 @@ from physion.physics.rigid.collision.search import (
     new_contact_list,
     new_search_space,
 )
-from physion.physics.rigid.contact_record import summarise_contacts
 from physion.physics.rigid.model import build_model
 from physion.physics.rigid.settings import RigidSettings
 from physion.physics.rigid.sleeping import SleepOptions, all_awake
@@ -64,11 +64,11 @@ class RigidRun:
     ) -> None:
         self.scene, self.settings = scene, settings
         self.model = model = build_model(scene, settings, present)
-        actors, bodies = model.actors, len(scene.bodies)
+        actors, bodies = model.actors.count, len(scene.bodies)
         self.bodies = Bodies(
-            x=model.start_x.copy(),
-            q=model.start_q.copy(),
-            rot=rotation_matrices(model.start_q),
+            x=model.actors.x.copy(),
+            q=model.actors.q.copy(),
+            rot=rotation_matrices(model.actors.q),
             v=np.zeros((actors + 1, 3)),
             w=np.zeros((actors + 1, 3)),
             inertia=model.inertia,
@@ -79,7 +79,7 @@ class RigidRun:
         )
         self.first_frame = 0
         self.sleep = all_awake(actors, settings.wake_time)
-        self.search_scene = SearchScene(model.first_geom, model.actor_of, model.material)
+        self.search_scene = SearchScene(model.first_geom, model.actors.actor_of, model.material)
         geoms = len(model.hulls.margin)
         self.manifolds = new_manifolds(PAIRS)
         self.space = new_search_space(geoms, bodies, PAIRS)
@@ -110,7 +110,7 @@ class RigidRun:
         """Simulate until the scene ends: see `physion.physics.rigid.step.EndRule`."""
         scene, model = self.scene, self.model
         asked = [scene.index(scene.roles.agent), scene.index(scene.roles.patient)]
-        pivot = model.pivot[model.leader].reshape(-1, 3)
+        pivot = model.actors.pivot[model.actors.leader].reshape(-1, 3)
         rule = EndRule(
             least, most, scene.ending.floor, until_touch, np.array(asked, np.int64), pivot
         )
@@ -135,7 +135,7 @@ class RigidRun:
                 self.search_scene,
                 self.bodies,
                 self.sleep,
-                self.model.drag,
+                self.model.actors.drag,
                 self.pushes,
                 self.manifolds,
                 self.space,
@@ -168,12 +168,12 @@ class RigidRun:
         """Return all frames so far; ``engine`` is the name that is stored with them."""
         model = self.model
         frames, rows, _ = self.history.counters
-        of_body = self.history.state[:frames, model.actor_of]
+        of_body = self.history.state[:frames, model.actors.actor_of]
         x, q, v, w = np.split(of_body, [3, 7, 10], axis=2)
-        arm = rotate_vectors(q, model.center)
+        arm = rotate_vectors(q, model.actors.center)
         return Trajectory(
-            positions=(x + rotate_vectors(q, model.pivot)).astype(np.float32),
-            rotations=multiply_quaternions(q, model.rotation).astype(np.float32),
+            positions=(x + rotate_vectors(q, model.actors.pivot)).astype(np.float32),
+            rotations=multiply_quaternions(q, model.actors.rotation).astype(np.float32),
             velocities=(v + cross(w, arm)).astype(np.float32),
             angular_velocities=w.astype(np.float32),
             cloth_vertices=np.zeros((frames, 0, 3), np.float32),
@@ -193,15 +193,15 @@ class RigidRun:
         asleep = self.sleep.asleep
         if asleep.all():
             return True
-        actor = self.model.actor_of
-        rotated = rotate_vectors(self.bodies.q[actor], self.model.pivot)
+        actor = self.model.actors.actor_of
+        rotated = rotate_vectors(self.bodies.q[actor], self.model.actors.pivot)
         height = (self.bodies.x[actor] + rotated)[:, 2]
         counted = actor[height >= self.scene.ending.floor]
         return bool(np.append(asleep, True)[counted].all())
 
     def _new_work(self, capacity: int) -> Work:
         """Return the work space for ``capacity`` pairs."""
-        actors = self.model.actors
+        actors = self.model.actors.count
         return Work(
             new_pair_space(),
             new_contact_list(capacity),
@@ -213,11 +213,11 @@ class RigidRun:
 
     def _pushes(self) -> Pushes:
         """Return the pushes of the scene as arrays."""
-        pushes = self.scene.pushes
+        pushes, actor_of = self.scene.pushes, self.model.actors.actor_of
         nowhere = (np.nan, np.nan, np.nan)
         return Pushes(
             np.array([push.frame for push in pushes], np.int64),
-            np.array([self.model.actor_of[self.scene.index(p.body)] for p in pushes], np.int64),
+            np.array([actor_of[self.scene.index(p.body)] for p in pushes], np.int64),
             np.array([push.impulse for push in pushes], np.float64).reshape(-1, 3),
             np.array([p.point or nowhere for p in pushes], np.float64).reshape(-1, 3),
         )
@@ -229,13 +229,13 @@ class RigidRun:
         to the frame after ``start.frame``; otherwise to ``start.frame`` itself.
         """
         bodies, model = self.bodies, self.model
-        for actor, i in enumerate(model.leader):
+        for actor, i in enumerate(model.actors.leader):
             rotation = np.asarray(start.rotations[i], np.float64)
-            q = multiply_quaternions(unit(rotation), conjugate(model.rotation[i]))
+            q = multiply_quaternions(unit(rotation), conjugate(model.actors.rotation[i]))
             bodies.q[actor] = q
-            bodies.x[actor] = start.positions[i] - rotate_vectors(q, model.pivot[i])
+            bodies.x[actor] = start.positions[i] - rotate_vectors(q, model.actors.pivot[i])
             bodies.w[actor] = start.angular_velocities[i]
-            arm = rotate_vectors(q, model.center[i])
+            arm = rotate_vectors(q, model.actors.center[i])
             bodies.v[actor] = start.velocities[i] - cross(bodies.w[actor], arm)
         self.first_frame = start.frame
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
+from physion.physics.settings_tag import settings_tag
 from physion.scenes.scene import FRAME_TIME, GRAVITY, SurfaceMaterial
 
 FLOOR_MATERIAL = SurfaceMaterial(static_friction=0.6, dynamic_friction=0.6, restitution=0.0)
@@ -66,5 +65,4 @@ class RigidSettings:
 
     def tag(self) -> str:
         """Return eight hexadecimal digits that change whenever a setting does."""
-        text = json.dumps(asdict(self), sort_keys=True)
-        return hashlib.sha256(text.encode()).hexdigest()[:8]
+        return settings_tag(self)

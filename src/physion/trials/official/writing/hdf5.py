@@ -19,7 +19,7 @@ import h5py
 import numpy as np
 
 import physion
-from physion.physics.rigid.model import center_of_mass
+from physion.physics.rigid.actors import center_of_mass
 from physion.scenes.scene import Cloth
 from physion.trials.official.axes import swap_axes, to_official_euler
 from physion.trials.official.names import RAMPS, ROOMS, TRIAL_FILE, segmentation_colors, split_name
