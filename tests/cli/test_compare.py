@@ -181,7 +181,14 @@ def test_the_python_of_the_documentation_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     own = own_study(tmp_path)
-    own.predictions.rename(tmp_path / "model.csv")
+    # The folders of the page: predictions of evaluate, an export of the study, the trials.
+    predictions, data = tmp_path / "models" / "predictions", tmp_path / "data"
+    predictions.mkdir(parents=True)
+    data.mkdir()
+    own.predictions.rename(predictions / "model-1234.csv")
+    for path in (own.responses, tmp_path / "expected.csv"):
+        path.rename(data / path.name)
+    (tmp_path / "dataset").rename(tmp_path / "trials")
     page = (Path(__file__).parents[2] / "docs" / "analysis.md").read_text(encoding="utf-8")
     code = page.split("```python\n")[1].split("```")[0]
     monkeypatch.chdir(tmp_path)
