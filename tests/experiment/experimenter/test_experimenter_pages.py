@@ -324,7 +324,13 @@ def test_deleting_ids_needs_the_word_and_leaves_answers(tmp_path: Path, database
         visitor = own.experimenter()
         assert "Delete raw ids" in visitor.open_payments().text
         token = visitor.token("/payments")
-        before = table_after(visitor.see().text, "Progress")[1:]
+
+        def progress() -> list[list[str]]:
+            # Flagged sessions, column 7, are counted in the background: known now or later.
+            rows = table_after(visitor.see().text, "Progress")[1:]
+            return [row[:7] + row[8:] for row in rows]
+
+        before = progress()
         for word in ("", "yes", "delete all"):
             answer = visitor.submit("/payments/forget", token, word=word)
             assert answer.status_code == 422 and "Nothing was deleted" in answer.text
@@ -332,7 +338,7 @@ def test_deleting_ids_needs_the_word_and_leaves_answers(tmp_path: Path, database
         assert "20 ids were deleted" in answer.text and "Delete raw ids" not in answer.text
         with engine.connect() as connection:
             assert connection.scalar(sa.select(sa.func.count()).select_from(RAW_IDS)) == 0
-        assert table_after(visitor.see().text, "Progress")[1:] == before
+        assert progress() == before
         assert before[0][2] != "0 of 100"
         if engine.dialect.name == "sqlite":
             stored = b"".join(path.read_bytes() for path in tmp_path.glob("*.sqlite*"))
