@@ -1,138 +1,42 @@
-"""Model interface: the specification of a model's inputs, and its optional capabilities.
+"""Model interface: what a model may offer, as protocols.
 
-A model implements one or more of the methods `encode` (features of clips), `simulate` (future
-features), `loss` (training) and `predict_contact` (P(contact) without a readout). This module does
-not import torch, so that simulators run without it.
+A model offers a capability by having its method; it needs no base class. The harness owns data,
+optimiser, schedule, device and disk: it gives a torch ``Module`` tensors on its device, any other
+model numpy arrays. This module does not import torch, so that simulators run without it.
 """
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar, runtime_checkable
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.errors import BadInputError, MissingExtraError, UnknownNameError
-from physion.registry import Registry
-from physion.scenes.scene import OBSERVED_FRAMES
+from physion.models.batch import Batch, Provenance, Rollout, Spec
+from physion.models.settings import TrainingSettings
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-C = TypeVar("C")
-
-_EXTRA_LIBRARIES = ("torch", "torchvision", "timm", "safetensors", "lightning_fabric")
-IMAGENET_MEAN = (0.485, 0.456, 0.406)
-IMAGENET_STD = (0.229, 0.224, 0.225)
+Diet = Literal["clips", "features", "states"]
 
 
-@dataclass(frozen=True, slots=True)
-class Spec:
-    """Specification of the clips that a model receives.
-
-    - ``image_size``: pixels per side; clips are scaled to it.
-    - ``mean``, ``std``: of the red, green and blue channel in 0..1. The model itself normalises
-      its uint8 frames with them.
-    - ``stride``: movie frames between clip frames (6 at 30 frames/s: 5 clip frames/s).
-    - ``context``: clip frames in the observed part; ``total``: clip frames of the whole clip.
-    - ``modalities``: content of a clip: ``rgb``, or ``state`` for simulators.
-
-    The defaults are those of the released frozen-encoder models: movie frames 0, 6, ..., 36 of
-    the 45 observed ones, and 0, 6, ..., 144 of the whole movie.
-    """
-
-    image_size: int = 224
-    mean: tuple[float, float, float] = IMAGENET_MEAN
-    std: tuple[float, float, float] = IMAGENET_STD
-    stride: int = 6
-    context: int = 7
-    total: int = 25
-    modalities: tuple[str, ...] = ("rgb",)
-
-    def __post_init__(self) -> None:
-        if min(self.image_size, self.stride, self.context) < 1 or self.total <= self.context:
-            raise BadInputError(
-                f"spec: image size {self.image_size}, stride {self.stride} and context "
-                f"{self.context} must be at least 1, and total {self.total} above the context"
-            )
-        if self.observed_indices()[-1] >= OBSERVED_FRAMES:
-            raise BadInputError(
-                f"spec: {self.context} context frames at stride {self.stride} end at movie frame "
-                f"{self.observed_indices()[-1]}, past the {OBSERVED_FRAMES} observed frames"
-            )
-
-    def observed_indices(self) -> tuple[int, ...]:
-        """Return the movie frames of the context; all are observed."""
-        return tuple(range(0, self.context * self.stride, self.stride))
-
-    def all_indices(self) -> tuple[int, ...]:
-        """Return the movie frames of the whole clip."""
-        return tuple(range(0, self.total * self.stride, self.stride))
-
-
-@dataclass(frozen=True)
-class Clip:
-    """Frames of one trial, as a model receives them.
-
-    - ``frames`` (T, H, W, 3): uint8, sRGB, at the model's stride and size.
-    - ``indices`` (T,): movie frame of each. ``observed``: whether all are in the observed part.
-    """
-
-    trial: str
-    frames: NDArray[np.uint8]
-    indices: tuple[int, ...]
-    observed: bool
-
-    def __post_init__(self) -> None:
-        if self.frames.ndim != 4 or self.frames.shape[3] != 3 or self.frames.dtype != np.uint8:
-            raise BadInputError(
-                f"clip of {self.trial!r}: frames must be uint8 (T, H, W, 3), "
-                f"not {self.frames.dtype} {self.frames.shape}"
-            )
-        if len(self.frames) != len(self.indices):
-            raise BadInputError(
-                f"clip of {self.trial!r}: {len(self.frames)} frames for {len(self.indices)} indices"
-            )
-        if self.observed and self.indices and max(self.indices) >= OBSERVED_FRAMES:
-            raise BadInputError(
-                f"clip of {self.trial!r}: movie frame {max(self.indices)} is past the "
-                f"{OBSERVED_FRAMES} observed frames"
-            )
-
-
-@dataclass(frozen=True, slots=True)
-class Provenance:
-    """Origin of a model, which is written to every row of its predictions.
-
-    ``init`` names the initial weights: ``imagenet``, ``local:<sha256>``, ``random``, or ``none``
-    for a model without weights. The other fields are columns of the official result files.
-    """
-
-    model: str
-    init: str
-    encoder_type: str = ""
-    dynamics_type: str = ""
-    encoder_pretraining_task: str = ""
-    encoder_pretraining_dataset: str = ""
-    encoder_pretraining_seed: str = ""
-    encoder_training_task: str = ""
-    dynamics_training_task: str = ""
-    versions: str = ""
-
-
+@runtime_checkable
 class Model(Protocol):
-    """Common interface of all models."""
+    """What every model has."""
 
     @property
     def spec(self) -> Spec:
-        """Specification of the clips that the model receives."""
+        """What the model asks for."""
         ...
 
     def provenance(self) -> Provenance:
         """Return name, weights and versions for the table of predictions."""
+        ...
+
+    def digest(self) -> str:
+        """Return the hexadecimal SHA-256 of code version, settings and weights as they are now."""
         ...
 
 
@@ -140,89 +44,102 @@ class Model(Protocol):
 class Encodes(Protocol):
     """Model that computes features of clips."""
 
-    def encode(self, frames: Tensor) -> Tensor:
-        """Return features (batch, time, features), float32, of clips.
+    def encode(self, batch: Batch) -> Any:
+        """Return features (B, T', D), float32, of the frames of ``batch``.
 
-        ``frames`` is (batch, time, height, width, 3), uint8, sRGB, of ``spec.image_size``. The
-        time of the features may be shorter for a model that combines several frames.
+        T' is T, or less for a model that combines frames. With ``spec.framewise`` it is T, and any
+        number of frames may be given.
         """
-        ...
-
-    def encoder_digest(self) -> str:
-        """Return the hexadecimal SHA-256 of all that determines the features, as cache key."""
         ...
 
 
 @runtime_checkable
-class Simulates(Protocol):
-    """Model that predicts future features."""
+class EncodesApart(Encodes, Protocol):
+    """Model whose features do not depend on all of its weights, such as those of its dynamics."""
 
-    def simulate(self, context: Tensor, steps: int) -> Tensor:
-        """Return (batch, steps, features) that follow ``context`` (batch, context, features)."""
+    def encoder_digest(self) -> str:
+        """Return the hexadecimal SHA-256 of all that determines the features of `encode`."""
+        ...
+
+
+@runtime_checkable
+class Imagines(Protocol):
+    """Model that imagines the future of a clip.
+
+    If the model also encodes, ``context.features`` holds the features of the context.
+    """
+
+    def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
+        """Return ``samples`` futures of every clip.
+
+        ``seed`` and the names of the trials determine all random numbers. ``knobs`` are the
+        settings that a reader fits, such as a level of noise.
+        """
         ...
 
 
 @runtime_checkable
 class Learns(Protocol):
-    """Model with dynamics that train on features without labels; also a torch ``Module``."""
+    """Model that is trained without labels; also a torch ``Module``.
 
-    def adapt(self, features: Tensor) -> None:
-        """Set statistics from all training features (trials, time, features) before training."""
+    - ``diet``: what it is trained on: ``clips`` (what `Spec` asks for), ``features`` (of its own
+      `Encodes.encode`), or ``states`` (whole motions).
+    - ``window``: frames of a training clip, at ``spec.stride``, from a random start.
+    - ``settings``: optimiser and schedule.
+    """
+
+    diet: Diet
+    window: int
+    settings: TrainingSettings
+
+    def prepare(self, sample: Batch) -> None:
+        """Set statistics, such as the mean of the features, from a sample of training clips."""
         ...
 
-    def loss(self, batch: Mapping[str, Tensor]) -> Tensor:
-        """Return the scalar loss of ``batch["features"]`` (batch, time, features), float32."""
+    def loss(self, batch: Batch) -> Mapping[str, Tensor]:
+        """Return the scalar ``loss`` of a batch, and parts of it to be logged."""
         ...
 
 
 @runtime_checkable
-class PredictsContact(Protocol):
-    """Model that returns P(contact) without a readout."""
+class Predicts(Protocol):
+    """Model that gives P(contact) itself, without a readout.
 
-    def predict_contact(self, scene: Any, trajectory: Any) -> float:
-        """Return P(agent touches patient) in 0..1, from a `Scene` and its `Trajectory`.
+    ``answers``: protocol under which it answers: ``observed``, ``observed+simulated``, or ``full``
+    for a model that is shown the outcome.
+    """
 
-        Frames after the observed part must not be used.
-        """
+    answers: str
+
+    def predict(self, batch: Batch) -> Any:
+        """Return P(agent touches patient) (B,) in 0..1 from the context of every clip."""
         ...
 
 
-ModelFactory = Callable[..., Model]
-"""Function that builds a model from the fields of its config."""
+@runtime_checkable
+class Fits(Protocol):
+    """Model that is fitted on the readout trials of a scenario, in place of a readout."""
 
-models: Registry[ModelFactory] = Registry(
-    "model",
-    {
-        "frozen-encoder": "physion.models.frozen_encoder:frozen_encoder",
-        "pVGG-mlp": "physion.models.frozen_encoder:pvgg_mlp",
-        "pVGG-lstm": "physion.models.frozen_encoder:pvgg_lstm",
-        "pDeIT-mlp": "physion.models.frozen_encoder:pdeit_mlp",
-        "pDeIT-lstm": "physion.models.frozen_encoder:pdeit_lstm",
-        "noisy-simulation": "physion.models.noisy_simulation:noisy_simulation",
-    },
-)
-"""All models by name; other packages add theirs with the entry point group physion.models."""
+    answers: str
+
+    def fit(self, batch: Batch, labels: NDArray[np.bool_], seed: int) -> Predicts:
+        """Return a predictor fitted on clips and their outcomes (B,); the model stays as it is."""
+        ...
 
 
-def build_model(name: str, **options: Any) -> Model:
-    """Build the model called ``name``; ``options`` override the defaults of its config.
+@runtime_checkable
+class HasReader(Protocol):
+    """Model that names the reader which turns its rollouts or features into P(contact).
 
-    Raises `UnknownNameError` with the closest names for an unknown model or option, and
-    `MissingExtraError` for a model whose libraries are not installed.
+    - ``reader``: name in `physion.readout.readers.readers`.
+    - ``samples``: futures of a trial. ``knobs``: values that the reader chooses from, by name.
     """
-    try:
-        factory = models.get(name)
-    except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] in _EXTRA_LIBRARIES:
-            raise MissingExtraError(f"model {name!r}", "models") from error
-        raise
-    return factory(**options)
+
+    reader: str
+    samples: int
+    knobs: Mapping[str, tuple[float, ...]]
 
 
-def make_config(kind: type[C], model: str, options: Mapping[str, Any]) -> C:
-    """Build a config of the dataclass ``kind``; raise `UnknownNameError` for an unknown option."""
-    known = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
-    for option in options:
-        if option not in known:
-            raise UnknownNameError(f"option of model {model}", option, known)
-    return kind(**options)
+def features_digest(model: Model) -> str:
+    """Return the digest under which the features of a model are stored."""
+    return model.encoder_digest() if isinstance(model, EncodesApart) else model.digest()

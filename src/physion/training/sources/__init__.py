@@ -1,0 +1,1 @@
+"""Sources of batches: from movies, from rendering on demand, and from states."""
