@@ -13,15 +13,14 @@ from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 
 from physion.numerics.rotations import axis_angle_matrix
-from physion.physics.rigid.collision.clipping import (
-    FAR,
+from physion.physics.rigid.collision.clipping import clip_faces
+from physion.physics.rigid.collision.facing_faces import (
     MAX_LOOP,
-    clip_faces,
     face_points,
     facing_face,
     new_clip_space,
-    spread_points,
 )
+from physion.physics.rigid.collision.reduction import FAR, spread_points
 from physion.physics.rigid.hulls import face_planes, hull_faces
 from support.hull_pairs import NOWHERE, UPRIGHT, box, hulls_of
 

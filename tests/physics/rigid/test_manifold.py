@@ -11,25 +11,24 @@ from hypothesis import strategies as st
 from numpy.typing import ArrayLike, NDArray
 
 from physion.numerics.rotations import axis_angle_matrix, axis_angle_quaternion
+from physion.physics.rigid.collision.floor_update import FLOOR_FRACTION, FLOOR_ROTATED, update_floor
 from physion.physics.rigid.collision.hull_records import Hulls
 from physion.physics.rigid.collision.manifold import (
-    BREAK_FRACTION,
-    FLOOR_FRACTION,
-    FLOOR_ROTATED,
     MOVED_FRACTIONS,
-    REPLACE_FRACTION,
     ROTATED,
     add_point,
     clear_manifold,
     grown,
     has_moved,
-    keep_pair,
     new_manifolds,
-    new_pair_space,
     refresh_points,
     set_direction,
-    still_apart,
-    update_floor,
+)
+from physion.physics.rigid.collision.pair_distance import new_pair_space, still_apart
+from physion.physics.rigid.collision.pair_update import (
+    BREAK_FRACTION,
+    REPLACE_FRACTION,
+    keep_pair,
     update_pair,
 )
 from physion.physics.rigid.hulls import collision_hulls

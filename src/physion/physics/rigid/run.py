@@ -15,7 +15,8 @@ from physion.numerics.rotations import (
     rotation_matrices,
 )
 from physion.physics.contact_record import summarise_contacts
-from physion.physics.rigid.collision.manifold import grown, new_manifolds, new_pair_space
+from physion.physics.rigid.collision.manifold import grown, new_manifolds
+from physion.physics.rigid.collision.pair_distance import new_pair_space
 from physion.physics.rigid.collision.search import (
     SearchScene,
     grown_search_space,

@@ -18,7 +18,8 @@ import numpy as np
 
 from physion.numerics.kernel import in_place_kernel
 from physion.physics.rigid.collision.hull_records import Hulls
-from physion.physics.rigid.collision.manifold import Manifolds, PairSpace
+from physion.physics.rigid.collision.manifold import Manifolds
+from physion.physics.rigid.collision.pair_distance import PairSpace
 from physion.physics.rigid.collision.search import (
     FULL,
     ContactList,
