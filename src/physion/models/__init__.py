@@ -1,5 +1,7 @@
-"""Models that encode or simulate trials."""
+"""Models that encode, imagine or predict trials."""
 
-from physion.models.interface import Clip, Model, Provenance, Spec, build_model, models
+from physion.models.batch import Batch, Motion, Provenance, Rollout, Spec
+from physion.models.build import build_model, models
+from physion.models.interface import Model
 
-__all__ = ["Clip", "Model", "Provenance", "Spec", "build_model", "models"]
+__all__ = ["Batch", "Model", "Motion", "Provenance", "Rollout", "Spec", "build_model", "models"]

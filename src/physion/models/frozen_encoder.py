@@ -2,7 +2,7 @@
 
 Tensors (B clips, T frames, D features of one frame, c = ``spec.context``):
 
-- frames (B, T, H, W, 3): uint8, sRGB, H = W = ``image_size``.
+- pictures (B, T, H, W, 3): uint8, sRGB, H = W = ``image_size``.
 - features (B, T, D): float32, unbounded; D is 4096 for VGG, 768 for DeiT base.
 - context (B, c, D): features of the observed frames, the input of the dynamics.
 - next feature (B, D): their output.
@@ -25,7 +25,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from physion.errors import BadInputError
-from physion.models.interface import Provenance, Spec, make_config
+from physion.models.batch import Batch, Provenance, Rollout, Spec
+from physion.models.build import make_config
+from physion.models.interface import Diet
+from physion.models.settings import TrainingSettings
+from physion.models.torch_model import digest_of
 from physion.models.weights import (
     IMAGENET,
     RANDOM,
@@ -38,6 +42,8 @@ from physion.seeds import stable_hash
 
 _FAMILIES = {"vgg19": "pVGG", "vgg16_bn": "pVGG", "deit_base_patch16_224": "pDeIT"}
 """Names that the paper gives to models with these encoders."""
+_VERSION = 1
+"""To be raised with every change that alters what the dynamics compute."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +57,7 @@ class FrozenEncoderConfig:
     - ``residual``: predict the change from the last feature, initially zero, instead of the
       feature itself as the published models do. With few training trials only this works well.
     - ``seed``: of random encoders and of the initial weights of the dynamics.
-    - ``stride``, ``context``, ``total``: see `Spec`.
+    - ``stride``, ``context``, ``future``: see `Spec`.
     """
 
     encoder: str = "resnet18"
@@ -63,7 +69,7 @@ class FrozenEncoderConfig:
     seed: int = 0
     stride: int = 6
     context: int = 7
-    total: int = 25
+    future: int = 18
 
     def __post_init__(self) -> None:
         if self.dynamics not in ("mlp", "lstm"):
@@ -104,11 +110,25 @@ class LstmDynamics(nn.Module):
 class FrozenEncoder(nn.Module):
     """Frozen encoder with dynamics. The encoder is no parameter and is loaded at first use."""
 
+    diet: Diet = "features"
+    reader = "logistic"
+    samples, seed = 1, 0
+
     def __init__(self, config: FrozenEncoderConfig) -> None:
         super().__init__()
         mean, std = input_statistics(config.encoder)
         self.config = config
-        self.spec = Spec(config.image_size, mean, std, config.stride, config.context, config.total)
+        self.spec = Spec(
+            image_size=config.image_size,
+            mean=mean,
+            std=std,
+            stride=config.stride,
+            context=config.context,
+            future=config.future,
+        )
+        self.window = config.context + 1
+        self.settings = TrainingSettings()
+        self.knobs: Mapping[str, tuple[float, ...]] = {}
         self.feature_size = feature_size(config.encoder, config.image_size)
         self._weights = EncoderWeights(config.weights, config.seed)
         # A tuple hides the encoder from torch, which would otherwise train and save it.
@@ -124,13 +144,15 @@ class FrozenEncoder(nn.Module):
         self.scale = nn.Buffer(torch.ones(()))
 
     @torch.no_grad()
-    def encode(self, frames: Tensor) -> Tensor:
-        """Return features (B, T, D) of uint8 frames (B, T, H, W, 3), on their device."""
+    def encode(self, batch: Batch) -> Tensor:
+        """Return features (B, T, D) of the pictures of a batch, on their device."""
+        frames = batch.rgb
         size = self.spec.image_size
-        if frames.dtype != torch.uint8 or frames.ndim != 5 or frames.shape[2:] != (size, size, 3):
+        if frames is None or tuple(frames.shape[2:]) != (size, size, 3):
+            found = "none" if frames is None else tuple(frames.shape)
             raise BadInputError(
-                f"{self.name()}: frames must be uint8 (batch, time, {size}, {size}, 3), "
-                f"not {frames.dtype} {tuple(frames.shape)}"
+                f"{self.name()}: pictures must be uint8 (batch, time, {size}, {size}, 3), "
+                f"not {found}"
             )
         encoder = self._encoder_on(frames.device)
         mean = torch.tensor(self.spec.mean, device=frames.device).view(3, 1, 1)
@@ -139,43 +161,50 @@ class FrozenEncoder(nn.Module):
         features: Tensor = encoder((flat - mean) / std)
         return features.float().view(frames.shape[0], frames.shape[1], -1)
 
-    def simulate(self, context: Tensor, steps: int) -> Tensor:
-        """Roll the dynamics out from ``context`` (B, c, D) and return (B, steps, D)."""
-        window, simulated = context, []
-        for _ in range(steps):
-            following = self._next(window)
-            simulated.append(following)
-            window = torch.cat([window[:, 1:], following[:, None]], dim=1)
-        return torch.stack(simulated, dim=1)
+    def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
+        """Roll the dynamics out from ``context.features`` (B, c, D).
 
-    def adapt(self, features: Tensor) -> None:
-        """Store the mean (D,) and one common scale of training features (trials, time, D).
+        The dynamics are deterministic: all samples are equal, and ``seed`` has no effect.
+        """
+        window, imagined = context.features, []
+        for _ in range(self.spec.future):
+            following = self._next(window)
+            imagined.append(following)
+            window = torch.cat([window[:, 1:], following[:, None]], dim=1)
+        features = torch.stack(imagined, dim=1)[:, None]
+        return Rollout(features=features.expand(-1, samples, -1, -1))
+
+    def prepare(self, sample: Batch) -> None:
+        """Store the mean (D,) and one common scale of the features (B, T, D) of training clips.
 
         The dynamics standardise their inputs and outputs by them. A common scale keeps the
         relative weights of the features in the loss.
         """
-        flat = features.flatten(0, 1).double()
+        flat = sample.features.flatten(0, 1).double()
         self.center.copy_(flat.mean(0))
         deviation = float((flat - flat.mean(0)).pow(2).mean().sqrt())
         self.scale.fill_(deviation if deviation > 0 else 1.0)
 
-    def loss(self, batch: Mapping[str, Tensor]) -> Tensor:
+    def loss(self, batch: Batch) -> dict[str, Tensor]:
         """Return the mean squared error of the next feature over all windows of a batch.
 
-        ``batch["features"]`` is (B, T, D). The unit is the squared scale of `adapt`.
+        The unit is the squared scale of `prepare`.
         """
-        features = batch["features"]
-        count = self.config.context
-        windows = features.unfold(1, count + 1, 1).transpose(2, 3).flatten(0, 1)
-        target = (windows[:, count] - self.center) / self.scale
-        return functional.mse_loss(self._step(windows[:, :count]), target)
+        windows, target = self._windows(batch)
+        return {"loss": functional.mse_loss(self._step(windows), target)}
 
-    def forward(self, batch: Mapping[str, Tensor]) -> Tensor:
-        """Return the loss; Fabric wraps this method."""
-        return self.loss(batch)
+    def baseline(self, batch: Batch) -> Tensor:
+        """Return the loss of predicting the last feature again."""
+        windows, target = self._windows(batch)
+        return functional.mse_loss((windows[:, -1] - self.center) / self.scale, target)
+
+    def digest(self) -> str:
+        """Return the SHA-256 of the encoder, the settings and the weights of the dynamics."""
+        settings = [_VERSION, self.encoder_digest(), dataclasses.asdict(self.config)]
+        return digest_of(settings, self.state_dict().items())
 
     def encoder_digest(self) -> str:
-        """Return the key of cached features, which does not depend on the dynamics."""
+        """Return the key of stored features, which does not depend on the dynamics."""
         parts = [self.config.encoder, self.config.image_size, self._weights.identity()]
         parts += [self.spec.mean, self.spec.std, f"timm{timm.__version__}", "penultimate"]
         return hashlib.sha256(repr(parts).encode()).hexdigest()
@@ -204,6 +233,12 @@ class FrozenEncoder(nn.Module):
 
     def _is_random(self) -> bool:
         return self.config.weights == RANDOM
+
+    def _windows(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        """Return all windows (N, c, D) of features, and the standardised next feature (N, D)."""
+        count = self.config.context
+        windows = batch.features.unfold(1, count + 1, 1).transpose(2, 3).flatten(0, 1)
+        return windows[:, :count], (windows[:, count] - self.center) / self.scale
 
     def _step(self, window: Tensor) -> Tensor:
         """Return the next feature, standardised."""

@@ -102,6 +102,15 @@ class Learns(Protocol):
 
 
 @runtime_checkable
+class HasBaseline(Protocol):
+    """Model that can say how well a predictor that has learnt nothing does."""
+
+    def baseline(self, batch: Batch) -> Tensor:
+        """Return the scalar loss of the trivial predictor, in the unit of `Learns.loss`."""
+        ...
+
+
+@runtime_checkable
 class Predicts(Protocol):
     """Model that gives P(contact) itself, without a readout.
 
@@ -132,11 +141,13 @@ class HasReader(Protocol):
     """Model that names the reader which turns its rollouts or features into P(contact).
 
     - ``reader``: name in `physion.readout.readers.readers`.
-    - ``samples``: futures of a trial. ``knobs``: values that the reader chooses from, by name.
+    - ``samples``: futures of a trial, and ``seed`` of their random numbers.
+    - ``knobs``: values that the reader chooses from, by name.
     """
 
     reader: str
     samples: int
+    seed: int
     knobs: Mapping[str, tuple[float, ...]]
 
 

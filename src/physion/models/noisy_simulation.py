@@ -20,9 +20,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -30,9 +28,10 @@ from numpy.typing import NDArray
 
 import physion
 from physion.errors import BadInputError
-from physion.models.interface import Provenance, Spec, make_config
+from physion.models.batch import Batch, Provenance, Rollout, Spec
+from physion.models.build import make_config
 from physion.models.observed import cut_to_observed
-from physion.numerics.elementary import exp, log
+from physion.numerics.elementary import exp
 from physion.numerics.random_normals import standard_normal
 from physion.physics.engine import DEFAULT_ENGINE, Engine, make_engine, simulate_many
 from physion.physics.labels import label_contact
@@ -52,7 +51,7 @@ class NoisySimulationConfig:
 
     - ``position`` (metres), ``velocity`` (metres per second), ``mass`` (relative): standard
       deviations of the noise. ``scale`` multiplies all three.
-    - ``scales``: values of ``scale`` among which `fit_scale` chooses; with one value nothing is
+    - ``scales``: values of ``scale`` among which a reader chooses; with one value nothing is
       fitted.
     - ``samples``: simulations per trial. ``engine``: name of the engine. ``seed``: of the noise.
     """
@@ -82,40 +81,6 @@ class ObservedTrial:
     observed_contact: bool
 
 
-@dataclass(frozen=True)
-class SimulationTask:
-    """Simulations of one trial at one noise level, which an executor can send to a process.
-
-    ``built`` is an engine object for use in this process; if None, the engine named in the config
-    is built.
-    """
-
-    trial: ObservedTrial
-    config: NoisySimulationConfig
-    scale: float
-    samples: tuple[int, ...]
-    built: Engine | None = field(default=None, compare=False)
-
-    def digest(self) -> str:
-        """Return the hexadecimal SHA-256 of all inputs of the simulations."""
-        state = self.trial.state
-        settings = dataclasses.asdict(replace(self.config, scale=self.scale, scales=(1.0,)))
-        parts: list[Any] = [
-            NOISE_VERSION,
-            self.trial.scene.physics_digest(),
-            self.trial.scene.name,
-            settings,
-        ]
-        parts += [self.samples, self.trial.observed_contact, state.frame, self._engine().name]
-        sha = hashlib.sha256(json.dumps(parts, sort_keys=True).encode())
-        for item in dataclasses.fields(state)[1:]:
-            sha.update(np.ascontiguousarray(getattr(state, item.name)).tobytes())
-        return sha.hexdigest()
-
-    def _engine(self) -> Engine:
-        return self.built or make_engine(self.config.engine)
-
-
 def cut_trial(scene: Scene, trajectory: Trajectory) -> ObservedTrial:
     """Return the part of a trial that a model may use: the state at the last observed frame.
 
@@ -127,17 +92,6 @@ def cut_trial(scene: Scene, trajectory: Trajectory) -> ObservedTrial:
             f"trial {scene.name!r} was imported without motion ({trajectory.engine})"
         )
     return ObservedTrial(scene, seen.state(LAST_OBSERVED), label_contact(scene, seen).contact)
-
-
-def run_simulations(task: SimulationTask) -> tuple[bool, ...]:
-    """Return for each simulation of ``task`` whether agent and patient touch."""
-    if task.trial.observed_contact:
-        return (True,) * len(task.samples)
-    scenes, states = zip(*(_noisy_start(task, sample) for sample in task.samples), strict=True)
-    paths = simulate_many(scenes, engine=task._engine(), starts=states, until_contact=True)
-    return tuple(
-        label_contact(scene, path).contact for scene, path in zip(scenes, paths, strict=True)
-    )
 
 
 def add_noise(
@@ -174,63 +128,49 @@ def add_noise(
     return replace(scene, bodies=bodies), noisy
 
 
-def log_likelihood(fractions: NDArray[Any], samples: int, outcomes: NDArray[Any]) -> float:
-    """Return the mean log-likelihood of ``outcomes`` (n,); NaN for n = 0.
-
-    The probability of a contact is (k + 0.5) / (samples + 1), where k = fraction * samples is the
-    number of simulations with a contact, so that it is never 0 or 1.
-    """
-    if len(fractions) == 0:
-        return float("nan")
-    p = (np.asarray(fractions, float) * samples + 0.5) / (samples + 1)
-    # The exact sum: numpy's depends on the processor, and the fit compares sums.
-    return math.fsum(log(np.where(np.asarray(outcomes, bool), p, 1.0 - p))) / len(p)
-
-
-def fit_scale(
-    fractions: Mapping[float, NDArray[Any]], samples: int, outcomes: NDArray[Any], default: float
-) -> float:
-    """Return the scale with the highest likelihood of ``outcomes``; among equals the smallest.
-
-    Parameters
-    ----------
-    fractions
-        For each scale the fractions (n,) of simulations with a contact.
-    samples
-        Simulations per trial.
-    outcomes
-        Contact or not (n,), of fit trials alone.
-    default
-        Scale to return if there is no trial. A single scale is always returned.
-    """
-    scales = sorted(fractions)
-    if len(scales) == 1:
-        return scales[0]
-    if len(outcomes) == 0:
-        return default
-    return max(scales, key=lambda s: (log_likelihood(fractions[s], samples, outcomes), -s))
-
-
 class NoisySimulation:
-    """Model that simulates the rest of a trial several times with noise; see the module."""
+    """Model that simulates the rest of a trial several times with noise; see the module.
+
+    ``engine`` is an engine object for use in this process; by default the one named in the config.
+    """
+
+    reader = "noise"
 
     def __init__(self, config: NoisySimulationConfig, engine: Engine | None = None) -> None:
         self.config = config
-        self.spec = Spec(modalities=("state",))
-        self._built = engine
-        self._engine: Engine = engine or make_engine(config.engine)
+        self.spec = Spec(inputs=("state",), anchor="end", stride=1, context=1, future=0)
+        self.samples, self.seed = config.samples, config.seed
+        self.knobs = {"scale": config.scales}
+        self._given = engine
+        self._built: Engine | None = None
 
-    def predict_contact(self, scene: Scene, trajectory: Trajectory) -> float:
-        """Return P(agent touches patient), from the observed frames of ``trajectory`` alone."""
-        return float(
-            np.mean(run_simulations(self.task(cut_trial(scene, trajectory), self.config.scale)))
-        )
+    @property
+    def engine(self) -> Engine:
+        """The engine that simulates."""
+        if self._built is None:
+            self._built = self._given or make_engine(self.config.engine)
+        return self._built
 
-    def task(self, trial: ObservedTrial, scale: float) -> SimulationTask:
-        """Return the task with all simulations of a trial at one noise level."""
-        return SimulationTask(
-            trial, self.config, scale, tuple(range(self.config.samples)), self._built
-        )
+    def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
+        """Simulate every trial ``samples`` times; ``contact`` says whether agent and patient touch.
+
+        ``scale`` is the only knob; by default it is that of the config. The noise of a sample is a
+        function of ``seed``, the trial's name and the number of the sample.
+        """
+        scale = knobs.get("scale", self.config.scale)
+        assert context.state is not None, "the spec asks for states"
+        found = [
+            self._simulate(cut_trial(motion.scene, motion.trajectory), samples, seed, scale)
+            for motion in context.state
+        ]
+        return Rollout(contact=np.array(found, np.bool_).reshape(len(found), samples))
+
+    def digest(self) -> str:
+        """Return the SHA-256 of engine and noise; scales and number of samples are no part."""
+        config = dataclasses.asdict(self.config)
+        settings = {name: config[name] for name in ("position", "velocity", "mass")}
+        parts = [NOISE_VERSION, self.engine.name, settings]
+        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
     def provenance(self) -> Provenance:
         """Return name and versions for the table of predictions."""
@@ -239,8 +179,23 @@ class NoisySimulation:
             init="none",
             encoder_type="true state",
             dynamics_type="physics engine",
-            versions=f"{self._engine.name}, physion {physion.__version__}",
+            versions=f"{self.engine.name}, physion {physion.__version__}",
         )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave the engine behind that another process can build from its name."""
+        return {**self.__dict__, "_built": None}
+
+    def _simulate(self, trial: ObservedTrial, samples: int, seed: int, scale: float) -> list[bool]:
+        if trial.observed_contact:
+            return [True] * samples
+        config = replace(self.config, seed=seed)
+        starts = [_noisy_start(trial, config, scale, sample) for sample in range(samples)]
+        scenes, states = zip(*starts, strict=True)
+        paths = simulate_many(scenes, engine=self.engine, starts=states, until_contact=True)
+        return [
+            label_contact(scene, path).contact for scene, path in zip(scenes, paths, strict=True)
+        ]
 
 
 def noisy_simulation(**options: Any) -> NoisySimulation:
@@ -248,9 +203,11 @@ def noisy_simulation(**options: Any) -> NoisySimulation:
     return NoisySimulation(make_config(NoisySimulationConfig, "noisy-simulation", options))
 
 
-def _noisy_start(task: SimulationTask, sample: int) -> tuple[Scene, State]:
+def _noisy_start(
+    trial: ObservedTrial, config: NoisySimulationConfig, scale: float, sample: int
+) -> tuple[Scene, State]:
     """Return scene and state of one simulation, whose ending counts from the state on."""
-    scene, state = add_noise(task.trial, task.config, task.scale, sample)
+    scene, state = add_noise(trial, config, scale, sample)
     # The scene's limits of length count from its frame 0; the simulation starts later.
     ending = replace(
         scene.ending,
