@@ -17,7 +17,12 @@ from physion.numerics.linear_algebra import unit
 from physion.numerics.rotations import rotate_vectors
 from physion.physics.cloth.contact_gap import CLOTH_CONTACT_GAP
 from physion.physics.cloth.contacts import smallest_distance
-from physion.physics.cloth.near_solids import BodyPoses, Neighbours, find_neighbours, world_bounds
+from physion.physics.cloth.near_solids import (
+    BodyPoses,
+    find_neighbours,
+    new_neighbours,
+    world_bounds,
+)
 from physion.physics.cloth.sheet import sheet_springs, sheet_triangles, sheet_vertices
 from physion.physics.cloth.simulate import ClothMotion, ClothSettings, settle_solids, simulate_cloth
 from physion.physics.cloth.solids import fill_bodies, fill_shape, particles_of, surface_particles
@@ -209,13 +214,7 @@ def test_neighbours_equal_brute_force_and_are_kept_while_particles_stay() -> Non
     poses = BodyPoses(x, np.array([rotation_of(body) for body in bodies]))
     before = BodyPoses(x - [[0.0, 0.0, 0.0], [0.01, 0.0, 0.0]], poses.rot)
     points, reach, room = rng.uniform(-0.5, 1.0, (3, 200)), 0.06, 100
-    near = Neighbours(
-        np.zeros(200, np.int64),
-        np.empty((200, room), np.int64),
-        np.empty((200, room, 3)),
-        np.empty((200, room, 3)),
-        np.full((3, 200), np.inf),
-    )
+    near = new_neighbours(200, room)
     bounds = (np.empty((2, 3)), np.empty((2, 3)))
     world_bounds(solids, poses, reach, *bounds)
     find_neighbours(points, reach, -1.0, solids, poses, before, bounds, near)

@@ -56,6 +56,24 @@ class Neighbours(NamedTuple):
     searched_at: F64
 
 
+@kernel
+def new_poses(bodies: int) -> BodyPoses:
+    """Return room for the poses of ``bodies`` bodies."""
+    return BodyPoses(np.zeros((bodies, 3)), np.zeros((bodies, 3, 3)))
+
+
+@kernel
+def new_neighbours(particles: int, room: int) -> Neighbours:
+    """Return room for ``room`` neighbours of each of ``particles`` particles."""
+    return Neighbours(
+        np.zeros(particles, np.int64),
+        np.empty((particles, room), np.int64),
+        np.empty((particles, room, 3)),
+        np.empty((particles, room, 3)),
+        np.full((3, particles), np.inf),
+    )
+
+
 # Poses between frames: positions are interpolated linearly, orientations by the normalized linear
 # mix of quaternions, q = ((1 - f) q0 +- f q1) / |...|, on the shorter way round (q and -q are one
 # rotation).

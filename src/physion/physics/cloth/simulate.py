@@ -23,8 +23,9 @@ from physion.errors import BadInputError, BadSceneError
 from physion.physics.cloth.contact_gap import CLOTH_CONTACT_GAP
 from physion.physics.cloth.contacts import ClothOptions
 from physion.physics.cloth.near_solids import Solids
-from physion.physics.cloth.settle import SolidBody, settled_poses
+from physion.physics.cloth.settle import settled_poses
 from physion.physics.cloth.sheet import sheet_springs, sheet_vertices
+from physion.physics.cloth.solid_motion import SolidBody
 from physion.physics.cloth.solids import fill_bodies, surface_particles
 from physion.physics.cloth.solver import ClothRecord, MovingSolids, run_cloth
 from physion.physics.settings_tag import settings_tag

@@ -45,6 +45,8 @@ from physion.physics.cloth.near_solids import (
     Solids,
     find_neighbours,
     interpolate_poses,
+    new_neighbours,
+    new_poses,
     world_bounds,
 )
 from physion.physics.cloth.springs import SheetSprings, correct_springs
@@ -209,16 +211,9 @@ def run_cloth(
     number, bodies = points.shape[1], positions.shape[1]
     start = points.copy()
     work = (np.zeros((3, number)), np.zeros(number), np.zeros(number))
-    near = Neighbours(
-        np.zeros(number, np.int64),
-        np.empty((number, MAX_NEIGHBOURS), np.int64),
-        np.empty((number, MAX_NEIGHBOURS, 3)),
-        np.empty((number, MAX_NEIGHBOURS, 3)),
-        np.full((3, number), np.inf),
-    )
+    near = new_neighbours(number, MAX_NEIGHBOURS)
     touching = np.empty(number, np.int64)
-    poses = BodyPoses(np.zeros((bodies, 3)), np.zeros((bodies, 3, 3)))
-    old = BodyPoses(np.zeros((bodies, 3)), np.zeros((bodies, 3, 3)))
+    poses, old = new_poses(bodies), new_poses(bodies)
     bounds = (np.empty((bodies, 3)), np.empty((bodies, 3)))
     step = options.frame_time / options.substeps
     reach = options.rest_distance + options.search_margin
