@@ -1,0 +1,180 @@
+"""Calls of the methods of a model, whose code may be a user's.
+
+A torch ``Module`` is called on its device, in evaluation mode and without gradients; any other
+model receives numpy arrays. What a model raises becomes an error that names model and method. This
+module does not import torch: where torch was not imported, no model is a ``Module``.
+"""
+
+from __future__ import annotations
+
+import sys
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from physion.errors import BadInputError, PhysionError
+from physion.models.batch import Batch
+from physion.models.interface import Model
+
+_MEMORY_TEXTS = ("out of memory", "can't allocate memory", "not enough memory")
+"""Parts of the messages by which torch reports that memory is used up."""
+
+
+class OutOfMemoryError(PhysionError):
+    """Error for a model that needs more memory than there is."""
+
+
+def call_model(model: Model, method: str, batch: Batch, *arguments: Any, **options: Any) -> Any:
+    """Return what ``model.method(batch, ...)`` returns.
+
+    Parameters
+    ----------
+    model
+        A torch ``Module`` receives tensors on its device and is in evaluation mode meanwhile.
+    method
+        Name of a method whose first argument is a batch.
+    batch
+        Clips, numpy arrays.
+    *arguments, **options
+        Further arguments.
+
+    Raises
+    ------
+    OutOfMemoryError
+        If memory is used up; the message names the setting to lower.
+    BadInputError
+        If the model lacks the method or raises an exception. A `PhysionError` is passed on.
+    """
+    function = getattr(model, method, None)
+    if function is None:
+        raise BadInputError(f"model {_name(model)!r} has no method {method}")
+    try:
+        if not is_network(model):
+            return function(batch, *arguments, **options)
+        with _evaluating(model):
+            return function(batch.to(_device(model)), *arguments, **options)
+    except PhysionError:
+        raise
+    except Exception as error:
+        raise _explain(error, model, function, batch) from error
+
+
+def is_network(model: object) -> bool:
+    """Return whether a model is a torch ``Module``."""
+    torch = sys.modules.get("torch")
+    return torch is not None and isinstance(model, torch.nn.Module)
+
+
+def to_array(
+    value: Any, model: Model, what: str, shape: tuple[int | None, ...], dtypes: tuple[str, ...]
+) -> NDArray[Any]:
+    """Return what a model gave as a numpy array, after its shape and data type were checked.
+
+    Parameters
+    ----------
+    value
+        numpy array or tensor.
+    model
+        Model, for the message.
+    what
+        What the value is, for the message, such as ``encode gave features``.
+    shape
+        Expected shape; None stands for any size of at least 1.
+    dtypes
+        Data types that are accepted; the message names the first.
+
+    Raises
+    ------
+    BadInputError
+        If the value is no array, or has another shape or data type; the message says what was
+        expected and what was given.
+    """
+    actual = getattr(value, "shape", None)
+    kind = str(getattr(value, "dtype", type(value).__name__)).removeprefix("torch.")
+    fits = (
+        actual is not None
+        and len(actual) == len(shape)
+        and all(b == a or (a is None and b > 0) for a, b in zip(shape, actual, strict=True))
+    )
+    if not fits or kind not in dtypes:
+        got = kind if actual is None else f"{kind} {tuple(actual)}"
+        sizes = ", ".join("any" if size is None else str(size) for size in shape)
+        raise BadInputError(
+            f"model {_name(model)!r}: {what} as {got}, expected {dtypes[0]} ({sizes})"
+        )
+    if not isinstance(value, np.ndarray):
+        value = value.detach().cpu().numpy()
+    array: NDArray[Any] = value
+    return array
+
+
+def check_finite(values: NDArray[Any], model: Model, what: str, trials: tuple[str, ...]) -> None:
+    """Raise `BadInputError` with the first trial, a row of ``values``, with a value not finite."""
+    for trial, row in zip(trials, values, strict=True):
+        finite = np.isfinite(row)
+        if not finite.all():
+            where = tuple(int(at) for at in np.argwhere(~finite)[0])
+            raise BadInputError(
+                f"model {_name(model)!r}, trial {trial!r}: {what} that are not finite "
+                f"({row[where]} at {where} of {row.shape}); check its weights and its inputs"
+            )
+
+
+@contextmanager
+def _evaluating(network: Any) -> Iterator[None]:
+    """Set a network to evaluation mode without gradients; afterwards every part is as before."""
+    import torch
+
+    modes = [(part, part.training) for part in network.modules()]
+    network.eval()
+    try:
+        with torch.inference_mode():
+            yield
+    finally:
+        for part, training in modes:
+            part.training = training
+
+
+def _device(network: Any) -> Any:
+    """Return the device of a network's first parameter or buffer; ``cpu`` without any."""
+    for tensors in (network.parameters(), network.buffers()):
+        for tensor in tensors:
+            return tensor.device
+    return "cpu"
+
+
+def _explain(
+    error: Exception, model: Model, function: Callable[..., Any], batch: Batch
+) -> PhysionError:
+    """Return the error that says in one line what a model raised."""
+    name, clips, steps = _name(model), *batch.frames.shape[:2]
+    if _is_out_of_memory(error):
+        advice = (
+            f"lower the encoder batch, now {clips}" if clips > 1 else "lower the image size of it"
+        )
+        return OutOfMemoryError(
+            f"model {name!r}: {function.__name__} ran out of memory with {clips} clips of {steps} "
+            f"frames at a time; {advice}"
+        )
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    return BadInputError(
+        f"model {name!r}: {function.__name__} raised {type(error).__name__}: "
+        f"{' '.join(str(error).split())} ({Path(last.filename).name}, line {last.lineno})"
+    )
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    """Return whether an exception of numpy or torch says that memory is used up."""
+    if isinstance(error, MemoryError):
+        return True
+    text = str(error).lower()
+    return isinstance(error, RuntimeError) and any(part in text for part in _MEMORY_TEXTS)
+
+
+def _name(model: Model) -> str:
+    return str(model.provenance().model)
