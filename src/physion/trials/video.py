@@ -1,4 +1,4 @@
-"""Writing and reading of movies: H.264 in MP4, in memory.
+"""Writing and reading of movies: H.264 in MP4.
 
 The full movie and the observed movie of a trial are encoded separately: the observed one from its
 own frames alone, so that the look-ahead of the encoder cannot carry over information of later
@@ -8,7 +8,8 @@ frames.
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+import threading
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 
 from physion.errors import BadInputError
 from physion.scenes.scene import PLAYBACK_RATE
+from physion.trials.decoder import MovieDecoder, MovieProperties, open_movie
 
 CRF = 18
 """Quality of x264; at lower values the chroma subsampling of yuv420p limits the quality."""
@@ -131,6 +133,9 @@ def read_frames(
 ) -> NDArray[np.uint8]:
     """Read frames ``start``, ``start + stride``, ... of a movie.
 
+    Decoding begins at the key frame before ``start``. A movie whose end is not asked for is not
+    checked to its end.
+
     Parameters
     ----------
     path
@@ -154,14 +159,92 @@ def read_frames(
     """
     if start < 0 or stride < 1 or (count is not None and count < 1):
         raise BadInputError(f"no frames at start {start}, stride {stride}, count {count}")
-    kept: list[NDArray[np.uint8]] = []
-    reformatter = VideoReformatter()
-    for index, picture in _decode(path):
-        if index < start or (index - start) % stride:
-            continue
+    with open_movie(path) as decoder:
+        there = len(range(start, decoder.frames, stride))
+        if there < (count or 1):
+            wanted = "all frames" if count is None else f"{count} frames"
+            raise BadInputError(
+                f"movie {path} does not have the {wanted} requested from {start} in steps of "
+                f"{stride}: it has {there}"
+            )
+        chosen = range(start, start + (count or there) * stride, stride)
+        frames = _convert_all(decoder, chosen, size)
+        if count is None:
+            decoder.finish()
+    return frames
+
+
+def read_chosen(
+    path: Path,
+    frames: Sequence[int],
+    *,
+    size: tuple[int, int] | None = None,
+    expected: MovieProperties | None = None,
+) -> NDArray[np.uint8]:
+    """Read the frames of a movie with the indices ``frames``, which must not decrease.
+
+    Parameters
+    ----------
+    path
+        Movie file.
+    frames
+        Indices of frames; a repeated one is returned again.
+    size
+        (height, width) in pixels to scale to by area averaging; by default the movie's own.
+    expected
+        Properties that the movie must have.
+
+    Returns
+    -------
+    frames
+        (len(frames), height, width, 3) in sRGB, 0..255.
+
+    Raises
+    ------
+    BadInputError
+        If the movie is missing, damaged, cut short, or not as expected.
+    """
+    indices = np.asarray(frames, np.int64)
+    if not len(indices) or indices[0] < 0 or (np.diff(indices) < 0).any():
+        raise BadInputError(f"frames must start at 0 or later and not decrease, not {list(frames)}")
+    chosen, rows = np.unique(indices, return_inverse=True)
+    with open_movie(path) as decoder:
+        known = decoder.properties
+        if expected is not None and not known.same(expected):
+            raise BadInputError(
+                f"movie {path} has {known}, not {expected} as expected; make the trial again"
+            )
+        if chosen[-1] >= known.frames:
+            raise BadInputError(f"movie {path} has no frame {chosen[-1]}: it has {known.frames}")
+        pictures = _convert_all(decoder, chosen.tolist(), size)
+    return pictures if len(chosen) == len(indices) else pictures[rows]
+
+
+def count_frames(path: Path) -> int:
+    """Return the number of frames according to the movie's index, without decoding."""
+    with open_movie(path) as decoder:
+        return decoder.frames
+
+
+class _Reformatters(threading.local):
+    """One reformatter for each thread: it keeps tables between pictures of one size."""
+
+    def __init__(self) -> None:
+        self.rgb = VideoReformatter()
+
+
+_reformatters = _Reformatters()
+
+
+def _convert_all(
+    decoder: MovieDecoder, frames: Sequence[int], size: tuple[int, int] | None
+) -> NDArray[np.uint8]:
+    """Return the pictures of ``frames`` as (len(frames), height, width, 3) in sRGB."""
+    out = np.empty((0, 0, 0, 3), np.uint8)
+    # Conversion takes as long as decoding, so only the needed frames are converted.
+    for row, picture in enumerate(decoder.pictures(frames)):
         height, width = size or (picture.height, picture.width)
-        # Conversion takes three times as long as decoding, so only the needed frames are converted.
-        rgb = reformatter.reformat(
+        rgb: Any = _reformatters.rgb.reformat(
             picture,
             width=width,
             height=height,
@@ -171,51 +254,7 @@ def read_frames(
             dst_color_range=ColorRange.JPEG,
             interpolation=_CONVERSION,
         )
-        kept.append(rgb.to_ndarray())  # type: ignore[arg-type]
-        if len(kept) == count:
-            break
-    if not kept or (count is not None and len(kept) < count):
-        wanted = "all frames" if count is None else f"{count} frames"
-        raise BadInputError(
-            f"movie {path} does not have the {wanted} requested from {start} in steps of {stride}: "
-            f"it has {len(kept)}"
-        )
-    return np.stack(kept)
-
-
-def count_frames(path: Path) -> int:
-    """Return the number of frames according to the movie's index, without decoding."""
-    with _open(path) as container:
-        return int(container.streams.video[0].frames)
-
-
-def _open(path: Path) -> Any:
-    if not path.is_file():
-        raise BadInputError(f"movie {path} is missing")
-    try:
-        container = av.open(str(path), metadata_errors="replace")
-    except (av.FFmpegError, ValueError) as error:
-        raise BadInputError(f"movie {path} cannot be read: {error}") from error
-    # A stream whose header is damaged can lack a codec.
-    if not container.streams.video or container.streams.video[0].codec_context is None:
-        container.close()
-        raise BadInputError(f"movie {path} holds no pictures")
-    return container
-
-
-def _decode(path: Path) -> Iterator[tuple[int, av.VideoFrame]]:
-    """Yield index and picture of every frame in order; `BadInputError` at damage."""
-    with _open(path) as container:
-        stream = container.streams.video[0]
-        stream.codec_context.thread_count = 1
-        expected, index = stream.frames, 0
-        try:
-            for picture in container.decode(stream):
-                if picture.is_corrupt:
-                    raise BadInputError(f"movie {path} is damaged at frame {index}")
-                yield index, picture
-                index += 1
-        except av.FFmpegError as error:
-            raise BadInputError(f"movie {path} is damaged at frame {index}: {error}") from error
-        if index != expected:
-            raise BadInputError(f"movie {path} is cut short: {index} of {expected} frames")
+        if row == 0:
+            out = np.empty((len(frames), height, width, 3), np.uint8)
+        out[row] = rgb.to_ndarray()
+    return out

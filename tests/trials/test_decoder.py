@@ -1,0 +1,157 @@
+"""Seeking in movies: the same pictures as decoding from the start, at a cost without the start."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from physion.errors import BadInputError
+from physion.trials.decoder import MovieDecoder, MovieProperties
+from physion.trials.video import GROUP, encode_movie, read_chosen, read_frames
+
+FRAMES, HEIGHT, WIDTH = 100, 48, 64
+SIZES: tuple[tuple[int, int] | None, ...] = (None, (24, 32), (17, 40), (96, 96))
+
+
+def drifting_noise() -> NDArray[np.uint8]:
+    """Smooth noise that moves, with a cut at frame 37: movies with all kinds of pictures."""
+    rng = np.random.default_rng(3)
+    pictures = []
+    for part, length in enumerate((37, FRAMES - 37)):
+        coarse = rng.integers(0, 255, (HEIGHT // 8, WIDTH // 8, 3), np.uint8)
+        wide = coarse.repeat(8, 0).repeat(8, 1)
+        pictures += [np.roll(wide, (part + 1) * frame, axis=1) for frame in range(length)]
+    return np.stack(pictures)
+
+
+@pytest.fixture(scope="module")
+def movie(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("movie") / "noise.mp4"
+    path.write_bytes(encode_movie(drifting_noise()))
+    return path
+
+
+@pytest.fixture(scope="module")
+def from_start(movie: Path) -> dict[tuple[int, int] | None, NDArray[np.uint8]]:
+    """All frames by size, decoded without a seek."""
+    return {size: read_frames(movie, size=size) for size in SIZES}
+
+
+@settings(
+    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(data=st.data(), size=st.sampled_from(SIZES))
+def test_seeking_gives_the_bytes_of_decoding_from_the_start(
+    movie: Path,
+    from_start: dict[tuple[int, int] | None, NDArray[np.uint8]],
+    data: st.DataObject,
+    size: tuple[int, int] | None,
+) -> None:
+    start = data.draw(st.integers(0, FRAMES - 1), "start")
+    stride = data.draw(st.integers(1, 40), "stride")
+    count = data.draw(st.integers(1, len(range(start, FRAMES, stride))), "count")
+    read = read_frames(movie, start=start, count=count, stride=stride, size=size)
+    np.testing.assert_array_equal(read, from_start[size][start::stride][:count])
+
+
+@settings(max_examples=100, deadline=None)
+@given(frames=st.lists(st.integers(0, FRAMES - 1), min_size=1, max_size=12).map(sorted))
+def test_any_increasing_frames_and_repeated_ones(
+    movie: Path, from_start: dict[tuple[int, int] | None, NDArray[np.uint8]], frames: list[int]
+) -> None:
+    read = read_chosen(movie, frames, size=(24, 32))
+    np.testing.assert_array_equal(read, from_start[24, 32][frames])
+
+
+def test_the_reference_is_what_the_decoder_gives_in_order(
+    movie: Path, from_start: dict[tuple[int, int] | None, NDArray[np.uint8]]
+) -> None:
+    """The luminance of the pictures, read without this package, orders the frames."""
+    with av.open(str(movie)) as container:
+        planes = [picture.to_ndarray()[:HEIGHT] for picture in container.decode(video=0)]
+    brightness = [plane.mean() for plane in planes]
+    ours = from_start[None].mean((1, 2)) @ (0.2126, 0.7152, 0.0722)
+    assert len(planes) == FRAMES
+    assert np.corrcoef(brightness, ours)[0, 1] > 0.999
+
+
+def count_decoded(monkeypatch: pytest.MonkeyPatch, movie: Path, start: int, stride: int) -> int:
+    """Return how many pictures are decoded for five frames."""
+    seen: list[int] = []
+    index = MovieDecoder._index
+
+    def counted(self: MovieDecoder, picture: av.VideoFrame) -> int:
+        seen.append(index(self, picture))
+        return seen[-1]
+
+    monkeypatch.setattr(MovieDecoder, "_index", counted)
+    read_frames(movie, start=start, count=5, stride=stride)
+    monkeypatch.undo()
+    return len(seen)
+
+
+@pytest.mark.parametrize("start", [0, 1, 14, 15, 29, 44, 60, 95])
+def test_at_most_a_group_more_is_decoded_than_is_asked_for(
+    monkeypatch: pytest.MonkeyPatch, movie: Path, start: int
+) -> None:
+    assert 5 <= count_decoded(monkeypatch, movie, start, 1) < 5 + GROUP
+
+
+def test_groups_between_two_frames_are_left_out(
+    monkeypatch: pytest.MonkeyPatch, movie: Path
+) -> None:
+    assert count_decoded(monkeypatch, movie, 0, 20) <= 1 + 4 * GROUP - 15 < 80
+
+
+def damage(movie: Path, folder: Path, first: float, last: float) -> Path:
+    """Return a copy of which a range of bytes, as fractions of the file, is overwritten."""
+    content = bytearray(movie.read_bytes())
+    low, high = (int(part * len(content)) for part in (first, last))
+    content[low:high] = b"\xff" * (high - low)
+    path = folder / "bad.mp4"
+    path.write_bytes(bytes(content))
+    return path
+
+
+@pytest.mark.parametrize("start", [60, 70, 90])
+def test_damage_is_noticed_where_it_is_decoded(movie: Path, tmp_path: Path, start: int) -> None:
+    bad = damage(movie, tmp_path, 0.55, 1.0)
+    with pytest.raises(BadInputError, match=r"bad\.mp4 is (damaged|cut short)"):
+        read_frames(bad, start=start, count=5)
+    # What lies before is whole and is read.
+    np.testing.assert_array_equal(read_frames(bad, count=5), read_frames(movie, count=5))
+
+
+@pytest.mark.parametrize("kept", [0.3, 0.6, 0.9])
+def test_a_cut_movie_is_noticed_after_a_seek(movie: Path, tmp_path: Path, kept: float) -> None:
+    content = movie.read_bytes()
+    cut = tmp_path / "cut.mp4"
+    cut.write_bytes(content[: int(kept * len(content))])
+    with pytest.raises(BadInputError, match=r"cut\.mp4 is (damaged|cut short)"):
+        read_frames(cut, start=95, count=5)
+
+
+def test_random_damage_gives_the_frames_or_a_plain_error(movie: Path, tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    content = np.frombuffer(movie.read_bytes(), np.uint8)
+    errors = []
+    for _ in range(150):
+        changed = content.copy()
+        places = rng.integers(0, len(content), rng.integers(1, 30))
+        changed[places] = rng.integers(0, 256, len(places))
+        path = tmp_path / "bad.mp4"
+        path.write_bytes(changed.tobytes())
+        try:
+            frames = read_chosen(path, [0, 50, 90], size=(24, 32))
+        except BadInputError as error:
+            errors.append(str(error))
+        else:
+            assert frames.shape == (3, 24, 32, 3)
+    assert len(errors) > 20
+    assert all("bad.mp4" in error and "\n" not in error for error in errors)
