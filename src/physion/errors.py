@@ -27,13 +27,15 @@ class UnknownNameError(PhysionError):
         The unknown name.
     known
         All known names.
+    advice
+        What else can be done, if anything.
     """
 
-    def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
+    def __init__(self, kind: str, name: str, known: Iterable[str], advice: str = "") -> None:
         names = sorted(known)
         close = difflib.get_close_matches(name, names, n=3, cutoff=0.0)
         hint = f"; closest: {', '.join(close)}" if close else f"; no {kind} is registered"
-        super().__init__(f"unknown {kind} {name!r}{hint}")
+        super().__init__(f"unknown {kind} {name!r}{hint}{advice and '; '}{advice}")
         self.kind, self.name, self.close = kind, name, close
 
 
@@ -50,6 +52,7 @@ class MissingExtraError(PhysionError):
 
     def __init__(self, what: str, extra: str) -> None:
         super().__init__(
-            f"{what} needs the extra {extra!r}: pip install -e '.[{extra}]' in the clone"
+            f"{what} needs the extra {extra!r}; in the clone: "
+            f".venv/bin/pip install -e '.[{extra}]' -c requirements.lock"
         )
         self.extra = extra

@@ -13,7 +13,7 @@ import tyro
 from physion.cli.output import Stages, console
 from physion.compute.local import LocalExecutor
 from physion.errors import BadInputError
-from physion.readout.evaluate import EvaluationConfig, evaluate
+from physion.readout import EvaluationConfig, evaluate
 from physion.trials.dataset import Dataset
 
 

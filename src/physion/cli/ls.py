@@ -12,7 +12,7 @@ import tyro
 from physion.cli.output import console
 from physion.compute.executor import executors
 from physion.errors import BadInputError
-from physion.models.interface import models
+from physion.models import models
 from physion.physics.engine import engines
 from physion.scenes.looks import MATERIALS
 from physion.scenes.sampling.parameters import describe_limits

@@ -189,7 +189,7 @@ def chosen_models(options: Options) -> dict[str, dict[str, Any]]:
 
 def check_models(options: Options) -> None:
     """Build every model once, so that a wrong name or a missing extra fails early."""
-    from physion.models.interface import build_model
+    from physion.models import build_model
 
     for model, settings in chosen_models(options).items():
         build_model(model, **settings)
@@ -198,7 +198,7 @@ def check_models(options: Options) -> None:
 def predict(options: Options) -> tuple[list[Path], list[str]]:
     """Write predictions of a frozen encoder and of noisy simulation; return paths and failures."""
     from physion.compute.local import LocalExecutor
-    from physion.readout.evaluate import EvaluationConfig, evaluate
+    from physion.readout import EvaluationConfig, evaluate
     from physion.trials.dataset import Dataset
 
     dataset = Dataset(out_folder(options) / "trials")

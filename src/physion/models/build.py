@@ -6,7 +6,8 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
-from physion.errors import MissingExtraError, UnknownNameError
+from physion.errors import BadInputError, MissingExtraError, PhysionError, UnknownNameError
+from physion.models.from_file import is_file_name, load_from_file
 from physion.models.interface import Model
 from physion.registry import Registry
 
@@ -32,18 +33,51 @@ models: Registry[ModelFactory] = Registry(
 
 
 def build_model(name: str, **options: Any) -> Model:
-    """Build the model called ``name``; ``options`` override the defaults of its config.
+    """Build the model called ``name``, or that of a file: ``FILE.py:Class``.
 
-    Raises `UnknownNameError` with the closest names for an unknown model or option, and
-    `MissingExtraError` for a model whose libraries are not installed.
+    ``options`` override the defaults of its config. Raises `UnknownNameError` with the closest
+    names for an unknown model or option, `MissingExtraError` for a model whose libraries are not
+    installed, and `BadInputError` for a model that cannot be built or lacks what every `Model` has.
     """
+    if is_file_name(name):
+        factory: ModelFactory = load_from_file(name)
+    else:
+        factory = _registered(name)
     try:
-        factory = models.get(name)
-    except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] in _EXTRA_LIBRARIES:
-            raise MissingExtraError(f"model {name!r}", "models") from error
+        model = factory(**options)
+    except PhysionError:
         raise
-    return factory(**options)
+    except ModuleNotFoundError as error:
+        raise _missing(name, error) from error
+    except Exception as error:
+        raise BadInputError(
+            f"model {name!r} could not be built: {type(error).__name__}: {error}"
+        ) from error
+    lacking = [part for part in ("spec", "provenance", "digest") if not hasattr(model, part)]
+    if lacking:
+        raise BadInputError(
+            f"model {name!r} lacks {', '.join(lacking)}; see docs/own-model.md for what a model has"
+        )
+    return model
+
+
+def _registered(name: str) -> ModelFactory:
+    try:
+        return models.get(name)
+    except UnknownNameError as error:
+        raise UnknownNameError(
+            "model", name, models.names(), "for one of your own write FILE.py:Class"
+        ) from error
+    except ModuleNotFoundError as error:
+        raise _missing(name, error) from error
+
+
+def _missing(name: str, error: ModuleNotFoundError) -> Exception:
+    """Return the error that names the extra, or the library, that a model needs."""
+    library = (error.name or "").partition(".")[0]
+    if library in _EXTRA_LIBRARIES:
+        return MissingExtraError(f"model {name!r}", "models")
+    return BadInputError(f"model {name!r} needs the library {error.name!r}, which is not installed")
 
 
 def make_config(kind: type[C], model: str, options: Mapping[str, Any]) -> C:

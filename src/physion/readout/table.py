@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
-from collections.abc import Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from physion.atomic import write_atomic
-from physion.models.interface import Provenance
+from physion.models.batch import Provenance
 from physion.readout.protocols import Readout
 
 OFFICIAL_COLUMNS = (
@@ -49,7 +51,9 @@ OWN_COLUMNS = (
     "Fold",
     "Readout C",
     "CV Accuracy",
+    "Reader",
     "Noise Scale",
+    "Gap Threshold",
     "Validation Loss",
     "Copy-last Loss",
     "Note",
@@ -62,6 +66,8 @@ OWN_COLUMNS = (
   ``Actual Outcome`` is that of the trial as simulated here.
 - ``Fit Labels``: outcomes that the readout or the noise level was fitted on (`describe_labels`).
 - ``Fit Trials``: number of trials in the fit. ``Fold``: fold of a cross-validation, or -1.
+- ``Reader``: what turned features or rollouts into probabilities. ``Noise Scale`` and
+  ``Gap Threshold`` (metres): what it fitted. ``Copy-last Loss``: of the trivial predictor.
 - The others are empty where they do not apply.
 """
 
@@ -80,9 +86,10 @@ class ScenarioPredictions:
     fit_labels: str
     training_set: str = ""
     training_seed: str = ""
+    reader: str = ""
     c: float = float("nan")
     cv_accuracy: float = float("nan")
-    noise_scale: float = float("nan")
+    fitted: Mapping[str, float] = field(default_factory=dict)
     validation_loss: float = float("nan")
     copy_last_loss: float = float("nan")
     note: str = ""
@@ -141,7 +148,9 @@ def make_table(
                     "Fold": part.fold,
                     "Readout C": part.c,
                     "CV Accuracy": part.cv_accuracy,
-                    "Noise Scale": part.noise_scale,
+                    "Reader": part.reader,
+                    "Noise Scale": part.fitted.get("scale", float("nan")),
+                    "Gap Threshold": part.fitted.get("gap", float("nan")),
                     "Validation Loss": part.validation_loss,
                     "Copy-last Loss": part.copy_last_loss,
                     "Note": part.note,
@@ -158,18 +167,39 @@ def make_table(
 
 
 def write_table(table: pd.DataFrame, path: Path) -> None:
-    """Write a CSV file atomically; equal tables give equal bytes."""
+    """Write a CSV file atomically, then its checksum; equal tables give equal bytes."""
     buffer = io.StringIO()
     table.to_csv(buffer, index=False, lineterminator="\n")
+    content = buffer.getvalue().encode()
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomic(path, buffer.getvalue().encode())
+    write_atomic(path, content)
+    line = f"{hashlib.sha256(content).hexdigest()}  {path.name}\n"
+    write_atomic(_checksum_path(path), line.encode())
+
+
+def is_complete(path: Path) -> bool:
+    """Return whether a table exists with exactly the bytes that `write_table` wrote."""
+    try:
+        wanted = _checksum_path(path).read_text().partition(" ")[0]
+        return hashlib.sha256(path.read_bytes()).hexdigest() == wanted
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def file_name(model: str) -> str:
+    """Return the name of a model as part of a file's name: other characters become ``-``."""
+    return re.sub(r"[^A-Za-z0-9._+]+", "-", model).strip("-.") or "model"
+
+
+def _checksum_path(path: Path) -> Path:
+    return path.with_name(path.name + ".sha256")
 
 
 def read_table(path: Path) -> pd.DataFrame:
     """Read a table that `write_table` wrote; texts stay texts, and empty ones stay empty."""
     numbers = {
         "Train Accuracy", "Test Accuracy", "Predicted Prob_false", "Predicted Prob_true",
-        "Readout C", "CV Accuracy", "Noise Scale", "Validation Loss", "Copy-last Loss",
+        "Readout C", "CV Accuracy", "Noise Scale", "Gap Threshold", "Validation Loss", "Copy-last Loss",
     }  # fmt: skip
     table = pd.read_csv(path, dtype=str, keep_default_na=False)
     for name in numbers:

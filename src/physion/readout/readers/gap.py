@@ -1,0 +1,71 @@
+"""Reader of rollouts by a threshold on the smallest distance of agent and patient."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from physion.errors import BadInputError
+from physion.readout.logistic import ReadoutConfig
+from physion.readout.readers.reader import Reading
+from physion.readout.rollouts import Knobs, Outcomes
+
+
+@dataclass(frozen=True)
+class GapReader:
+    """Threshold on the gap, in metres, that is right for most of the fit trials.
+
+    P(contact) of n samples, k of them with a gap of at most the threshold, is (k + 1/2) / (n + 1)
+    for n > 1 and k for one sample. Thresholds that are right equally often leave the one that is
+    closest to 0; without fit trials it is 0.
+    """
+
+    config: ReadoutConfig = field(default_factory=ReadoutConfig)
+    input: Literal["rollouts"] = "rollouts"
+    labels: Literal["simulated", "recorded"] = "simulated"
+
+    def read(
+        self,
+        fit: Mapping[Knobs, Outcomes],
+        labels: NDArray[np.bool_],
+        test: Mapping[Knobs, Outcomes],
+    ) -> Reading:
+        """Fit the threshold on the gaps (n, S) of the fit trials and read the others."""
+        (knobs,) = fit
+        near, tested = fit[knobs].gap, test[knobs].gap
+        if near is None or tested is None:
+            raise BadInputError(
+                "the reader 'gap' needs distances, but the model gives contacts alone; "
+                "use the reader 'noise'"
+            )
+        threshold = best_threshold(np.median(near, axis=1), labels)
+        predicted = _probability(near, threshold) > 0.5
+        accuracy = float(np.mean(predicted == labels)) if len(labels) else float("nan")
+        return Reading(
+            _probability(tested, threshold), accuracy, fitted={**dict(knobs), "gap": threshold}
+        )
+
+
+def best_threshold(gaps: NDArray[np.float64], labels: NDArray[np.bool_]) -> float:
+    """Return the threshold (m) under which ``gap <= threshold`` equals most ``labels`` (n,).
+
+    The candidates are 0 and the middles between neighbouring gaps.
+    """
+    values = np.unique(gaps[np.isfinite(gaps)])
+    candidates = np.concatenate([[0.0], (values[1:] + values[:-1]) / 2])
+    if len(labels) == 0:
+        return 0.0
+    hits = (gaps[None, :] <= candidates[:, None]) == labels[None, :]
+    right = hits.sum(axis=1)
+    best = candidates[right == right.max()]
+    return float(best[np.argmin(np.abs(best))])
+
+
+def _probability(gaps: NDArray[np.float64], threshold: float) -> NDArray[np.float64]:
+    samples = gaps.shape[1]
+    near: NDArray[np.float64] = (gaps <= threshold).sum(axis=1).astype(np.float64)
+    return near if samples == 1 else (near + 0.5) / (samples + 1)

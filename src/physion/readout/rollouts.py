@@ -1,0 +1,238 @@
+"""Imagined outcomes of trials by models that are no networks: made in processes, and stored.
+
+Outcomes are small: for every trial, value of the knobs and sample, whether agent and patient touch
+or how close they come. They are kept as one JSON file for a trial and value of the knobs, under a
+digest of everything that decides them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from physion.atomic import write_atomic
+from physion.compute.executor import Executor
+from physion.compute.progress import Progress
+from physion.errors import BadInputError
+from physion.models.batch import Batch, Rollout
+from physion.readout.model_calls import call_model, check_finite, to_array
+from physion.training.sources.source import ObservedSource
+
+Cell = tuple[list[bool] | None, list[float] | None]
+"""Contacts and gaps of the samples of one trial."""
+
+Knobs = tuple[tuple[str, float], ...]
+"""Values of the knobs of a model, sorted by name."""
+
+_VERSION = 1
+"""To be raised with every change of the stored files."""
+
+
+@dataclass(frozen=True, eq=False)
+class Outcomes:
+    """Imagined outcomes of n trials, S samples each.
+
+    ``contact`` (n, S) bool where the model reports contacts, and ``gap`` (n, S) float64 in metres
+    where it reports distances; 0 or less is a touch.
+    """
+
+    contact: NDArray[np.bool_] | None
+    gap: NDArray[np.float64] | None
+
+    @property
+    def samples(self) -> int:
+        """Number of samples S."""
+        return int(self.touches().shape[1])
+
+    def touches(self) -> NDArray[np.bool_]:
+        """Return for every trial and sample (n, S) whether agent and patient touch."""
+        if self.contact is not None:
+            return self.contact
+        assert self.gap is not None, "checked when they were made"
+        return self.gap <= 0
+
+    def fractions(self) -> NDArray[np.float64]:
+        """Return the fractions (n,) of samples with a contact."""
+        return np.array([float(np.mean(row)) for row in self.touches()], np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class _Request:
+    """One trial at one value of the knobs: what a worker process needs."""
+
+    model: Any
+    context: Batch
+    samples: int
+    seed: int
+    knobs: Knobs
+
+
+class RolloutStore:
+    """Maker and store of imagined outcomes.
+
+    Parameters
+    ----------
+    folder
+        Where outcomes are kept; None keeps nothing.
+    executor
+        Runs the model, a trial and value of the knobs a task. Networks, which imagine many trials
+        at a time, use `FeatureStore.imagined` instead.
+    """
+
+    def __init__(self, folder: Path | None, executor: Executor) -> None:
+        self._folder, self._executor = folder, executor
+        self.problems: dict[str, str] = {}
+        """Reasons of trials that could not be imagined, by name."""
+
+    def outcomes(
+        self,
+        model: Any,
+        source: ObservedSource,
+        trials: Sequence[str],
+        *,
+        samples: int,
+        seed: int,
+        knobs: Mapping[str, Sequence[float]],
+        progress: Progress | None = None,
+    ) -> dict[Knobs, dict[str, Cell]]:
+        """Return contacts and gaps of every trial at all values of the knobs.
+
+        Trials that fail are left out; `problems` names the reasons.
+        """
+        digest = model.digest()
+        found: dict[Knobs, dict[str, Any]] = {value: {} for value in all_knobs(knobs)}
+        missing: dict[str, list[tuple[Knobs, Path | None]]] = {}
+        for trial in dict.fromkeys(trials):
+            try:
+                key = source.key(trial, "context")
+            except BadInputError as error:
+                self.problems[trial] = str(error)
+                continue
+            for value in found:
+                path = self._path([digest, key, trial, samples, seed, value])
+                stored = _read(path, samples)
+                if stored is None:
+                    missing.setdefault(trial, []).append((value, path))
+                else:
+                    found[value][trial] = stored
+        total = sum(len(cells) for cells in missing.values())
+        results = self._imagine(model, source, missing, samples, seed)
+        for done, (trial, value, path, outcome) in enumerate(results, start=1):
+            if isinstance(outcome, str):
+                self.problems[trial] = outcome
+            else:
+                _write(path, outcome)
+                found[value][trial] = outcome
+            if progress is not None:
+                progress("rollouts", done, total)
+        return found
+
+    def _imagine(
+        self,
+        model: Any,
+        source: ObservedSource,
+        missing: Mapping[str, list[tuple[Knobs, Path | None]]],
+        samples: int,
+        seed: int,
+    ) -> Iterator[tuple[str, Knobs, Path | None, Any]]:
+        requests: dict[str, _Request] = {}
+        cells: dict[str, tuple[str, Knobs, Path | None]] = {}
+        for trial, wanted in missing.items():
+            try:
+                context = source.context([trial])
+            except BadInputError as error:
+                yield from ((trial, value, path, str(error)) for value, path in wanted)
+                continue
+            for value, path in wanted:
+                name = " ".join([trial, *(f"{knob}={level:g}" for knob, level in value)])
+                requests[name] = _Request(model, context, samples, seed, value)
+                cells[name] = (trial, value, path)
+        for outcome in self._executor.map(_run, requests):
+            yield (*cells[outcome.key], outcome.error if outcome.error else outcome.value)
+
+    def _path(self, parts: Sequence[Any]) -> Path | None:
+        if self._folder is None:
+            return None
+        text = json.dumps([_VERSION, *parts])
+        name = hashlib.sha256(text.encode()).hexdigest()
+        return self._folder / name[:2] / f"{name}.json"
+
+
+def all_knobs(knobs: Mapping[str, Sequence[float]]) -> list[Knobs]:
+    """Return every combination of the values of ``knobs``; one empty one without knobs."""
+    names = sorted(knobs)
+    values = [[float(value) for value in knobs[name]] for name in names]
+    return [tuple(zip(names, chosen, strict=True)) for chosen in itertools.product(*values)]
+
+
+def stack_outcomes(
+    found: Mapping[Knobs, Mapping[str, Any]], trials: Sequence[str]
+) -> dict[Knobs, Outcomes]:
+    """Return the outcomes of ``trials``, in order, for every value of the knobs."""
+    stacked = {}
+    for value, by_trial in found.items():
+        contacts = [by_trial[trial][0] for trial in trials]
+        gaps = [by_trial[trial][1] for trial in trials]
+        stacked[value] = Outcomes(
+            None if None in contacts else np.array(contacts, np.bool_).reshape(len(trials), -1),
+            None if None in gaps else np.array(gaps, np.float64).reshape(len(trials), -1),
+        )
+    return stacked
+
+
+def _run(request: _Request) -> Cell:
+    """Return contacts and gaps of one trial."""
+    model, samples = request.model, request.samples
+    rollout: Rollout = call_model(
+        model, "imagine", request.context, samples, request.seed, **dict(request.knobs)
+    )
+    contact = gap = None
+    if rollout.contact is not None:
+        row = to_array(rollout.contact, model, "imagine gave contacts", (1, samples), ("bool",))
+        contact = [bool(value) for value in row[0]]
+    if rollout.gap is not None:
+        kinds = ("float64", "float32")
+        row = to_array(rollout.gap, model, "imagine gave gaps", (1, samples), kinds)
+        check_finite(row, model, "imagine gave gaps", request.context.trials)
+        gap = [float(value) for value in row[0]]
+    if contact is None and gap is None:
+        raise BadInputError(
+            f"model {model.provenance().model!r}: imagine gave neither contacts nor gaps"
+        )
+    return contact, gap
+
+
+def _read(path: Path | None, samples: int) -> Cell | None:
+    """Return stored outcomes; None if there are none, or the file is damaged."""
+    if path is None or not path.is_file():
+        return None
+    try:
+        content = json.loads(path.read_bytes())
+        checksum, values = content["sha256"], content["outcomes"]
+        contact, gap = values["contact"], values["gap"]
+    except (ValueError, KeyError, TypeError):
+        return None
+    if checksum != _checksum(values) or samples not in (len(contact or ()), len(gap or ())):
+        return None
+    return contact, gap
+
+
+def _write(path: Path | None, outcome: Cell) -> None:
+    if path is None:
+        return
+    values = {"contact": outcome[0], "gap": outcome[1]}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    content = {"outcomes": values, "sha256": _checksum(values)}
+    write_atomic(path, json.dumps(content).encode())
+
+
+def _checksum(values: Any) -> str:
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()

@@ -1,0 +1,47 @@
+"""Settings of an evaluation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from physion.errors import BadInputError
+from physion.readout.logistic import ReadoutConfig
+
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """Settings of an evaluation."""
+
+    readouts: tuple[str, ...] = ()
+    """Protocols: observed, observed+simulated, full. Default: all that the model supports."""
+    training: str = "all"
+    """Scenarios that train the model: all, all-but or only the tested one."""
+    untrained: bool = False
+    """Leave the weights of the model as they are; the table says untrained."""
+    steps: int | None = None
+    """Training steps; default: the model's own setting. So for the next two."""
+    batch: int | None = None
+    """Clips per training step."""
+    learning_rate: float | None = None
+    """Learning rate of the optimiser."""
+    reader: str = ""
+    """Reader of features or rollouts (physion ls readers); default: the model's own."""
+    readout: ReadoutConfig = field(default_factory=ReadoutConfig)
+    """Settings of the readout."""
+    folds: int = 5
+    """Folds of the cross-validation of a dataset without a readout split."""
+    seed: int = 0
+    """Seed of folds and training."""
+    encoder_batch: int = 4
+    """Clips that a network encodes at a time; lower it when memory runs out."""
+    rendered: bool = False
+    """Render the pictures from the stored motions instead of reading the movies."""
+    accelerator: str = "auto"
+    """Device of the networks, by Lightning's name: auto, cpu, cuda, ..."""
+
+    def __post_init__(self) -> None:
+        if self.encoder_batch < 1 or self.folds < 2:
+            raise BadInputError(
+                f"encoder_batch must be at least 1 and folds at least 2, not "
+                f"{self.encoder_batch} and {self.folds}"
+            )
