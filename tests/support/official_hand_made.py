@@ -10,11 +10,12 @@ import numpy as np
 from physion.physics.labels import label_contact
 from physion.physics.trajectory import ENVIRONMENT, Contacts, Trajectory
 from physion.rendering.renderer import Renderer, role_map
+from physion.scenes.looks import in_look
 from physion.scenes.scene import Body, Camera, Cloth, Look, Push, Roles, Scene, SurfaceMaterial
 from physion.trials.files import write_files
 from physion.trials.index import build_index, write_index
 from physion.trials.layout import TrialPaths
-from physion.trials.trial_file import Metadata, TrialWriter, in_look
+from physion.trials.trial_file import Metadata, TrialWriter
 from physion.trials.video import encode_movie
 from support.hand_made import encode_png
 

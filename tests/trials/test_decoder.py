@@ -155,3 +155,23 @@ def test_random_damage_gives_the_frames_or_a_plain_error(movie: Path, tmp_path: 
             assert frames.shape == (3, 24, 32, 3)
     assert len(errors) > 20
     assert all("bad.mp4" in error and "\n" not in error for error in errors)
+
+
+def test_properties_that_differ_from_the_expected_ones_are_named(movie: Path) -> None:
+    known = MovieProperties(FRAMES, WIDTH, HEIGHT, 30.0)
+    assert read_chosen(movie, [3], expected=known).shape == (1, HEIGHT, WIDTH, 3)
+    for name, value in (("frames", 150), ("rate", 100.0), ("width", 256)):
+        with pytest.raises(
+            BadInputError, match=r"100 frames of 64 x 48 pixels at 30 a second, not"
+        ):
+            read_chosen(movie, [3], expected=known._replace(**{name: value}))
+
+
+def test_frames_that_do_not_exist_or_decrease_are_refused(movie: Path) -> None:
+    with pytest.raises(BadInputError, match="no frame 100: it has 100"):
+        read_chosen(movie, [0, 100])
+    for frames in ([], [-1, 3], [5, 4]):
+        with pytest.raises(BadInputError, match="not decrease"):
+            read_chosen(movie, frames)
+    with pytest.raises(BadInputError, match="it has 0"):
+        read_frames(movie, start=100, count=1)

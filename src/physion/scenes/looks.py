@@ -28,6 +28,8 @@ TEXTURES = (
     *("plain", "cloth", "carpet", "plaster", "tiles", "wicker", "fur", "moon"),
 )
 """All texture names that the renderer knows; a texture is multiplied by the colour of the look."""
+LOOKS = ("redyellow", "free")
+"""Colours of a trial: agent red and patient yellow, or the sampled colours of the scene."""
 RED: Vec3 = (1.0, 0.0, 0.0)
 YELLOW: Vec3 = (1.0, 1.0, 0.0)
 MARGIN = 0.25
@@ -136,6 +138,13 @@ def prop_look(rng: np.random.Generator, shape: str) -> Look:
     colors = _PALETTES[palette]
     color, texture = int(rng.integers(len(colors))), int(rng.integers(len(textures)))
     return Look(colors[color], textures[texture])
+
+
+def in_look(scene: Scene, look: str) -> Scene:
+    """Return ``scene`` in the colours of ``look``; `BadInputError` if it is not one of `LOOKS`."""
+    if look not in LOOKS:
+        raise BadInputError(f"unknown look {look!r}; known: {', '.join(LOOKS)}")
+    return with_role_colors(scene) if look == "redyellow" else scene
 
 
 def with_role_colors(scene: Scene) -> Scene:

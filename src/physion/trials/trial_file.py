@@ -25,7 +25,7 @@ from physion.dataclass_json import parse_json, read_dataclass
 from physion.errors import BadInputError
 from physion.physics.labels import Labels
 from physion.physics.trajectory import Contacts, Trajectory
-from physion.scenes.looks import with_role_colors
+from physion.scenes.looks import in_look
 from physion.scenes.scene import Scene
 from physion.trials.guarded_hdf5 import open_hdf5
 from physion.trials.schema import (
@@ -43,9 +43,6 @@ if TYPE_CHECKING:
     from physion.rendering.renderer import Frame, Renderer
 
 T = TypeVar("T")
-
-LOOKS = ("redyellow", "free")
-"""Colours of a trial: agent red and patient yellow, or the sampled colours of the scene."""
 
 _STATE = ("positions", "rotations", "velocities", "angular_velocities")
 _CONTACTS = ("frame", "bodies", "point", "normal", "impulse")
@@ -66,7 +63,7 @@ class Metadata:
     seed
         Entropy of the trial's `SeedSequence` in hexadecimal; None for an imported scene.
     look
-        Colours of the trial's movies, one of `LOOKS`.
+        Colours of the trial's movies, one of `physion.scenes.looks.LOOKS`.
     width, height
         Size of the pictures in pixels.
     frames, observed_frames
@@ -371,13 +368,6 @@ class Trial:
         if key not in self._renderers:
             self._renderers[key] = Renderer(self.shown(key[2]), self.trajectory, *key[:2])
         return self._renderers[key]
-
-
-def in_look(scene: Scene, look: str) -> Scene:
-    """Return ``scene`` in the colours of ``look``; `BadInputError` if it is not one of `LOOKS`."""
-    if look not in LOOKS:
-        raise BadInputError(f"unknown look {look!r}; known: {', '.join(LOOKS)}")
-    return with_role_colors(scene) if look == "redyellow" else scene
 
 
 def _arrays(trajectory: Trajectory, ids: NDArray[Any], things: int) -> dict[str, NDArray[Any]]:

@@ -17,12 +17,13 @@ from physion.physics.labels import Labels, label_contact
 from physion.physics.trajectory import Trajectory
 from physion.rendering.renderer import PASSES, Frame, Renderer, role_map
 from physion.rendering.renderer import VERSION as RENDERER_VERSION
+from physion.scenes.looks import in_look
 from physion.scenes.sampling.preset import get_preset
 from physion.scenes.sampling.registry import sample_scene
 from physion.scenes.scene import FRAME_TIME, OBSERVED_FRAMES, Scene
 from physion.trials.files import encode_png, write_files
 from physion.trials.making.plan import GenerateJob, TrialTask
-from physion.trials.trial_file import Metadata, TrialWriter, in_look
+from physion.trials.trial_file import Metadata, TrialWriter
 from physion.trials.video import MovieEncoder
 
 RENDERER = (
