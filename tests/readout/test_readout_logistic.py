@@ -12,11 +12,11 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from physion.errors import BadInputError, UnknownNameError
+from physion.readout.gram import gram
 from physion.readout.logistic import (
     C_GRID,
     ReadoutConfig,
     fit_readout,
-    gram,
     solve_path,
     undersample,
 )

@@ -27,16 +27,16 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from physion.errors import BadInputError
+from physion.readout.gram import Array, Fit, JoinedFeatures, Parts, Rows, grams
 from physion.seeds import generator
 
-Array = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
 
 C_GRID: tuple[float, ...] = tuple(float(c) for c in np.logspace(-8, 8, 17))
 """Inverse penalties among which cross-validation chooses."""
 FOLDS = 5
-_CHUNK = 4096
-"""Feature columns that are standardised at a time, which limits the memory."""
+_RELEASED = 200
+"""Iterations after which the released code stopped."""
 _ITERATIONS = 200
 _TOLERANCE = 1e-9
 """Tolerance of the gradient, relative to its two terms, which cancel at the optimum."""
@@ -84,21 +84,22 @@ class FittedReadout:
 
 
 def fit_readout(
-    train: NDArray[Any], labels: Booleans, test: NDArray[Any], config: ReadoutConfig | None = None
+    train: Parts, labels: Booleans, test: Parts, config: ReadoutConfig | None = None
 ) -> FittedReadout:
     """Fit a readout on ``train`` and predict ``test``.
 
     Parameters
     ----------
     train
-        Features (n, d) of the fit trials. They set the mean and standard deviation by which all
-        features are standardised; a constant feature is ignored.
+        Features of the fit trials: (n, d), (n, T, D), stored features, or several of these, which
+        are joined in time. They set the mean and standard deviation by which all features are
+        standardised; a constant feature is ignored.
     labels
         Contact or not (n,). If all are equal, nothing is fitted and the probability is that of
         Laplace's rule of succession. If a label occurs fewer than twice there is no
         cross-validation, and C is the middle of the grid.
     test
-        Features (m, d) of the trials to predict.
+        Features of the m trials to predict, as ``train``.
     config
         Settings of the readout.
 
@@ -109,23 +110,24 @@ def fit_readout(
     """
     config = config if config is not None else ReadoutConfig()
     labels = np.asarray(labels, bool)
-    _check(train, labels, test)
+    fit, tested = JoinedFeatures(train), JoinedFeatures(test, "test")
+    _check(fit, labels, tested)
     if config.balance:
         kept = undersample(labels, config.seed)
-        train, labels = train[kept], labels[kept]
+        fit, labels = fit.select(kept), labels[kept]
     hits, count = int(labels.sum()), len(labels)
     if hits in (0, count):
         p = (hits + 1) / (count + 2)
         note = "no trial to fit" if count == 0 else "one answer only"
         accuracy = float("nan") if count == 0 else float(np.mean(labels == (p > 0.5)))
-        return FittedReadout(np.full(len(test), p), accuracy, float("nan"), float("nan"), note)
-    c, cv_accuracy, note = _choose(train, labels, config)
-    everything = np.concatenate([train, test])
-    grid = tuple(value for value in config.grid if value <= c)
-    scores = _decision_values(everything, np.arange(count), labels, grid, config)[:, -1]
-    probability = 1 / (1 + np.exp(-np.clip(scores, -700, 700)))
+        return FittedReadout(
+            np.full(tested.shape[0], p), accuracy, float("nan"), float("nan"), note
+        )
+    solve = _solve_released if config.released else _solve_exactly
+    c, cv_accuracy, note, scores = solve(fit, labels, tested, config)
+    probability = 1 / (1 + np.exp(-np.clip(scores[count:], -700, 700)))
     accuracy = float(np.mean((scores[:count] > 0) == labels))
-    return FittedReadout(probability[count:], accuracy, cv_accuracy, c, note)
+    return FittedReadout(probability, accuracy, cv_accuracy, c, note)
 
 
 def undersample(labels: Booleans, seed: int) -> NDArray[np.int64]:
@@ -140,22 +142,6 @@ def undersample(labels: Booleans, seed: int) -> NDArray[np.int64]:
     rng = generator("undersample", seed)
     picked = [rng.choice(rows, count, replace=False) for rows in (yes, no)]
     return np.sort(np.concatenate(picked))
-
-
-def gram(features: NDArray[Any], fitted: NDArray[np.int64]) -> Array:
-    """Return inner products (n, k) of all rows with the ``fitted`` rows, which also standardise.
-
-    Works on chunks of columns, so that no standardised copy of all features is needed.
-    """
-    out = np.zeros((len(features), len(fitted)))
-    for start in range(0, features.shape[1], _CHUNK):
-        block = np.asarray(features[:, start : start + _CHUNK], np.float64)
-        mean, deviation = block[fitted].mean(0), block[fitted].std(0)
-        # Rounding leaves a constant column a deviation near, but not at, zero.
-        varies = deviation > 1e-9 * np.maximum(np.abs(mean), 1e-30)
-        block = (block[:, varies] - mean[varies]) / deviation[varies]
-        out += block @ block[fitted].T
-    return out
 
 
 def solve_path(kernel: Array, labels: Booleans, grid: tuple[float, ...]) -> tuple[Array, Array]:
@@ -218,57 +204,85 @@ def _objective(design: Array, signs: Array, penalty: Array, x: Array) -> tuple[f
     return float(loss), margins
 
 
-def _choose(
-    train: NDArray[Any], labels: Booleans, config: ReadoutConfig
-) -> tuple[float, float, str]:
-    """Return the C with the highest mean accuracy over folds, that accuracy, and a note.
+def _solve_exactly(
+    train: JoinedFeatures, labels: Booleans, test: JoinedFeatures, config: ReadoutConfig
+) -> tuple[float, float, str, Array]:
+    """Return the chosen C, its accuracy, a note, and the decision values (n + m,) of all trials.
 
-    Among equal accuracies the smallest C is taken.
+    The Gram matrices of all folds and of the final fit are made in one pass over the features.
     """
+    splits, note = _splits(labels, config)
+    count, everything = len(labels), np.arange(len(labels) + test.shape[0])
+    final = Fit(everything[:count], everything[count:])
+    *of_folds, (within, across) = grams(
+        [train, test], [*(Fit(fitted, held) for fitted, held in splits), final]
+    )
+    scores = []
+    for (fitted, _), (inner, outer) in zip(splits, of_folds, strict=True):
+        weights, intercepts = solve_path(inner, labels[fitted], config.grid)
+        scores.append(outer @ weights + intercepts)
+    c, cv_accuracy = _choose(scores, splits, labels, config)
+    # The solution for one C starts from that for the next smaller one.
+    weights, intercepts = solve_path(within, labels, tuple(v for v in config.grid if v <= c))
+    values: Array = np.concatenate([within, across]) @ weights[:, -1] + intercepts[-1]
+    return c, cv_accuracy, note, values
+
+
+def _solve_released(
+    train: JoinedFeatures, labels: Booleans, test: JoinedFeatures, config: ReadoutConfig
+) -> tuple[float, float, str, Array]:
+    """Return what `_solve_exactly` does, from scikit-learn's lbfgs with 200 iterations."""
+    splits, note = _splits(labels, config)
+    features = train.array()
+
+    def fit(rows: Rows, c: float) -> Any:
+        model = make_pipeline(StandardScaler(), LogisticRegression(C=c, max_iter=_RELEASED))
+        return model.fit(features[rows], labels[rows])
+
+    scores = [
+        np.column_stack([fit(f, c).decision_function(features[held]) for c in config.grid])
+        for f, held in splits
+    ]
+    c, cv_accuracy = _choose(scores, splits, labels, config)
+    chosen = fit(np.arange(len(labels)), c)
+    parts = [features, test.array()]
+    values: Array = np.concatenate([chosen.decision_function(part) for part in parts if len(part)])
+    return c, cv_accuracy, note, values
+
+
+def _splits(labels: Booleans, config: ReadoutConfig) -> tuple[list[tuple[Rows, Rows]], str]:
+    """Return fitted and held-out rows of every fold of the cross-validation, and a note."""
     folds = min(config.folds, int(labels.sum()), int((~labels).sum()))
     if len(config.grid) == 1 or folds < 2:
-        note = "" if len(config.grid) == 1 else "too few trials to choose C"
-        return config.grid[len(config.grid) // 2], float("nan"), note
+        return [], "" if len(config.grid) == 1 else "too few trials to choose C"
     splitter = StratifiedKFold(folds, shuffle=True, random_state=config.seed)
-    accuracies = []
-    for fitted, held in splitter.split(np.zeros(len(labels)), labels):
-        scores = _decision_values(train, fitted, labels[fitted], config.grid, config)
-        accuracies.append(np.mean((scores[held] > 0) == labels[held][:, None], axis=0))
+    splits = list(splitter.split(np.zeros(len(labels)), labels))
+    return splits, f"only {folds} folds" if folds < config.folds else ""
+
+
+def _choose(
+    scores: list[Array], splits: list[tuple[Rows, Rows]], labels: Booleans, config: ReadoutConfig
+) -> tuple[float, float]:
+    """Return the C with the highest mean accuracy over folds, and that accuracy.
+
+    ``scores`` are the decision values (held out, C) of every fold. Among equal accuracies the
+    smallest C is taken; without folds, the middle of the grid.
+    """
+    if not splits:
+        return config.grid[len(config.grid) // 2], float("nan")
+    accuracies = [
+        np.mean((values > 0) == labels[held][:, None], axis=0)
+        for values, (_, held) in zip(scores, splits, strict=True)
+    ]
     mean = np.mean(accuracies, axis=0)
     best = int(np.argmax(mean))
-    note = f"only {folds} folds" if folds < config.folds else ""
-    return config.grid[best], float(mean[best]), note
+    return config.grid[best], float(mean[best])
 
 
-def _decision_values(
-    features: NDArray[Any],
-    fitted: NDArray[np.int64],
-    labels: Booleans,
-    grid: tuple[float, ...],
-    config: ReadoutConfig,
-) -> Array:
-    """Return decision values (n, len(grid)) of all rows; readouts are fitted on ``fitted`` rows."""
-    if not config.released:
-        kernel = gram(features, fitted)
-        weights, intercepts = solve_path(kernel[fitted], labels, grid)
-        values: Array = kernel @ weights + intercepts
-        return values
-    columns = []
-    for c in grid:
-        model = make_pipeline(StandardScaler(), LogisticRegression(C=c, max_iter=200))
-        model.fit(features[fitted], labels)
-        columns.append(model.decision_function(features))
-    return np.column_stack(columns)
-
-
-def _check(train: NDArray[Any], labels: Booleans, test: NDArray[Any]) -> None:
-    if train.ndim != 2 or test.ndim != 2 or train.shape[1] != test.shape[1]:
+def _check(train: JoinedFeatures, labels: Booleans, test: JoinedFeatures) -> None:
+    if train.shape[1] != test.shape[1]:
         raise BadInputError(
             f"readout needs (n, d) features of one width, not {train.shape} and {test.shape}"
         )
-    if labels.shape != (len(train),):
-        raise BadInputError(f"readout: {len(train)} trials but {labels.shape} labels")
-    for name, values in (("training", train), ("test", test)):
-        bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
-        if len(bad):
-            raise BadInputError(f"readout: {name} trial {bad[0]} has a feature that is not finite")
+    if labels.shape != (train.shape[0],):
+        raise BadInputError(f"readout: {train.shape[0]} trials but {labels.shape} labels")
