@@ -1,0 +1,96 @@
+"""Readers of rollouts: the threshold of a gap and the level of noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from physion.errors import BadInputError
+from physion.readout.logistic import ReadoutConfig
+from physion.readout.readers import readers
+from physion.readout.readers.gap import GapReader, best_threshold
+from physion.readout.readers.noise import NoiseReader, fit_knobs, log_likelihood
+from physion.readout.rollouts import Knobs, Outcomes, all_knobs
+
+NO_KNOBS: Knobs = ()
+
+
+def knobs(scale: float) -> Knobs:
+    return (("scale", scale),)
+
+
+def gaps(*rows: list[float]) -> dict[Knobs, Outcomes]:
+    return {NO_KNOBS: Outcomes(None, np.array(rows, np.float64))}
+
+
+@pytest.mark.parametrize("name", readers.names())
+def test_every_reader_says_what_it_reads(name: str) -> None:
+    reader = readers.get(name)(ReadoutConfig())
+    assert reader.input in ("features", "rollouts") and reader.labels in ("simulated", "recorded")
+
+
+def test_all_combinations_of_knobs_are_tried_in_the_order_of_their_names() -> None:
+    assert all_knobs({}) == [()]
+    assert all_knobs({"b": (1, 2), "a": (3,)}) == [
+        (("a", 3.0), ("b", 1.0)),
+        (("a", 3.0), ("b", 2.0)),
+    ]
+
+
+def test_the_scale_is_the_one_under_which_outcomes_are_likeliest() -> None:
+    outcomes = np.array([True, True, False, True])
+    fractions = {
+        knobs(0.5): np.array([1.0, 0, 1, 0]),
+        knobs(1.0): np.array([0.9, 0.8, 0.3, 0.9]),
+        knobs(2.0): np.full(4, 0.5),
+    }
+    samples = dict.fromkeys(fractions, 20)
+    assert fit_knobs(fractions, samples, outcomes) == knobs(1.0)
+    only = {knobs(2.0): fractions[knobs(2.0)]}
+    assert fit_knobs(only, samples, outcomes) == knobs(2.0)
+    nothing = {k: v[:0] for k, v in fractions.items()}
+    assert fit_knobs(nothing, samples, outcomes[:0]) == knobs(1.0), "the middle one"
+    equal = {knobs(s): np.full(4, 0.5) for s in (2.0, 0.5, 1.0)}
+    assert fit_knobs(equal, samples, outcomes) == knobs(0.5), "the smallest of equal ones"
+
+
+def test_the_likelihood_of_certain_answers_is_finite() -> None:
+    assert np.isnan(log_likelihood(np.zeros(0), 20, np.zeros(0)))
+    assert log_likelihood(np.array([1.0]), 1, np.array([True])) == pytest.approx(np.log(0.75))
+    assert np.isfinite(log_likelihood(np.array([1.0]), 20, np.array([False])))
+
+
+def test_noise_gives_the_fractions_of_the_chosen_level() -> None:
+    sure = Outcomes(np.array([[True, True], [False, False]]), None)
+    wrong = Outcomes(np.array([[False, False], [True, True]]), None)
+    tested = Outcomes(np.array([[True, False]]), None)
+    fit = {knobs(1.0): sure, knobs(2.0): wrong}
+    test = {knobs(1.0): tested, knobs(2.0): wrong}
+    reading = NoiseReader().read(fit, np.array([True, False]), test)
+    assert reading.probability.tolist() == [0.5] and reading.train_accuracy == 1.0
+    assert reading.fitted == {"scale": 1.0}
+
+
+def test_the_threshold_separates_gaps_and_stays_near_zero() -> None:
+    near = np.array([0.02, 0.05, 0.2, 0.4])
+    labels = np.array([True, True, False, False])
+    assert best_threshold(near, labels) == pytest.approx(0.125)
+    assert best_threshold(near, ~labels) == 0.0, "none is right more often than the contact itself"
+    assert best_threshold(near[:0], labels[:0]) == 0.0
+    assert best_threshold(np.array([np.inf, -0.1]), np.array([False, True])) == 0.0
+
+
+def test_gaps_of_several_samples_give_probabilities() -> None:
+    fit = gaps([0.02, 0.03], [0.04, 0.05], [0.5, 0.6], [0.7, 0.8])
+    labels = np.array([True, True, False, False])
+    reading = GapReader().read(fit, labels, gaps([0.0, 0.9], [0.0, 0.0]))
+    assert reading.probability == pytest.approx([0.5, 2.5 / 3]) and reading.train_accuracy == 1.0
+    one = GapReader().read(gaps([0.1], [0.6]), np.array([True, False]), gaps([0.2], [0.5]))
+    assert one.probability.tolist() == [1.0, 0.0]
+    assert one.fitted["gap"] == pytest.approx(0.35)
+
+
+def test_contacts_alone_have_no_threshold() -> None:
+    contacts = {NO_KNOBS: Outcomes(np.array([[True]]), None)}
+    with pytest.raises(BadInputError, match="use the reader 'noise'"):
+        GapReader().read(contacts, np.array([True]), contacts)
