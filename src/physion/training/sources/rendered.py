@@ -1,0 +1,212 @@
+"""Clips rendered on demand from motions: no file is read or written, and no movie encoded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from physion.errors import BadInputError
+from physion.golden import version_digest
+from physion.models.batch import (
+    AGENT_ID,
+    FIRST_OTHER_ID,
+    LAST_OBSERVED,
+    PATIENT_ID,
+    PIXELS,
+    SCENERY_ID,
+    Batch,
+    Motion,
+    Spec,
+)
+from physion.rendering.camera import projection_matrix, view_matrix
+from physion.rendering.renderer import PASSES, VERSION, Frame, Renderer
+from physion.scenes.looks import in_look
+from physion.scenes.scene import Scene
+from physion.training.sources.batches import ObservedBatches, TrialReaders, WholeBatches
+from physion.training.sources.motions import CutMotions, cut_motion, motion_digest
+from physion.training.sources.source import FutureFrameError
+
+_PASS = {"rgb": "color", "ids": "ids", "boxes": "ids", "depth": "depth"}
+"""Pass of the renderer by input of a `Spec`."""
+_MOST_OBJECTS = 255
+"""Largest id of an object in ``Batch.ids``."""
+
+
+class MotionRenderer:
+    """Reader of what the camera sees, rendered from motions.
+
+    Parameters
+    ----------
+    motions
+        Scene, in its free colours, and motion by trial.
+    inputs
+        Which of `PIXELS` are rendered.
+    size
+        Pixels per side.
+    objects
+        Rows of ``boxes``.
+    look
+        Function from a trial to its colours, ``redyellow`` or ``free``.
+    """
+
+    def __init__(
+        self,
+        motions: Mapping[str, Motion],
+        inputs: Sequence[str],
+        size: int,
+        objects: int,
+        look: Callable[[str], str],
+    ) -> None:
+        self._motions, self._inputs = motions, tuple(inputs)
+        self._size, self._objects, self._look = size, objects, look
+        self._passes = tuple({_PASS[name]: None for name in inputs if name in _PASS})
+        self._digests: dict[str, str] = {}
+
+    def read(self, trial: str, frames: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
+        """Return the inputs of the clip that shows ``frames``."""
+        motion = self._motions[trial]
+        scene, size = motion.scene, self._size
+        arrays = self._render(trial, motion, frames) if self._passes else {}
+        if "camera" in self._inputs:
+            projection = projection_matrix(scene.camera, size, size)
+            arrays["camera"] = np.stack([view_matrix(scene.camera), projection])
+        return {name: arrays[name] for name in self._inputs}
+
+    def _render(
+        self, trial: str, motion: Motion, frames: NDArray[np.int64]
+    ) -> dict[str, NDArray[Any]]:
+        chosen, rows = np.unique(frames, return_inverse=True)
+        if not np.isfinite(motion.trajectory.positions[chosen]).all():
+            raise BadInputError(
+                f"trial {trial!r} was imported without motion ({motion.trajectory.engine}): it "
+                "cannot be rendered, only its movies can be read"
+            )
+        scene = in_look(motion.scene, self._look(trial))
+        renderer = Renderer(scene, motion.trajectory, self._size, self._size)
+        shown = [renderer.render(int(frame), self._passes) for frame in chosen]
+        passes = {name: _stack(shown, name) for name in self._passes}
+        if "ids" in passes:
+            passes["ids"] = object_ids(scene)[passes["ids"]]
+        return {
+            name: boxes(passes["ids"], self._objects)[rows]
+            if name == "boxes"
+            else passes[_PASS[name]][rows]
+            for name in self._inputs
+            if name in _PASS
+        }
+
+    def identity(self, trial: str) -> str:
+        """Return look, version of the renderer, and digest of scene and motion."""
+        if trial not in self._digests:
+            self._digests[trial] = motion_digest(self._motions[trial])
+        version = f"{VERSION}.{version_digest(*PASSES)}"
+        return f"rendered {self._look(trial)} {version} {self._digests[trial]}"
+
+
+class RenderedSource(WholeBatches):
+    """Source over motions in memory.
+
+    Parameters
+    ----------
+    motions
+        Scene, in its free colours, and motion by trial.
+    spec
+        What the batches hold.
+    look
+        Colours: ``redyellow`` or ``free``.
+    observed
+        Cut all motions at the last observed frame. Then `later`, `whole` and `window` raise
+        `FutureFrameError` unless all their frames are observed.
+    """
+
+    def __init__(
+        self,
+        motions: Mapping[str, Motion],
+        spec: Spec,
+        *,
+        look: str = "redyellow",
+        observed: bool,
+    ) -> None:
+        kept = {name: cut_motion(motion) for name, motion in motions.items()} if observed else None
+        context = ObservedBatches(spec, _readers(kept or CutMotions(motions), spec, look))
+        super().__init__(context, _readers(kept or motions, spec, look))
+        self._last = LAST_OBSERVED if observed else None
+
+    def _read(self, trials: Sequence[str], frames: Sequence[Sequence[int]]) -> Batch:
+        for trial, wanted in zip(trials, frames, strict=True):
+            if self._last is not None and max(wanted) > self._last:
+                raise FutureFrameError(
+                    f"trial {trial!r}: frame {max(wanted)} comes after the observed part, whose "
+                    f"last frame is {self._last}"
+                )
+        return super()._read(trials, frames)
+
+
+def _readers(motions: Mapping[str, Motion], spec: Spec, look: str) -> TrialReaders:
+    """Return readers of all that ``spec`` asks for."""
+    inputs = [name for name in spec.inputs if name in PIXELS]
+    lengths = {name: len(motion.trajectory) for name, motion in motions.items()}
+    reader = MotionRenderer(motions, inputs, spec.image_size, spec.objects, lambda trial: look)
+    return TrialReaders(
+        lengths, [reader] if inputs else [], motions if "state" in spec.inputs else None
+    )
+
+
+def object_ids(scene: Scene) -> NDArray[np.uint8]:
+    """Return the value of ``Batch.ids`` for each value of ``Frame.ids``: (1 + objects,).
+
+    The room and scenery are 0, the agent 1, the patient 2, and the others 3 and more in the order
+    of `Scene.names`. Raises `BadInputError` for a scene with more objects than fit.
+    """
+    names = scene.names()
+    scenery = {body.name for body in scene.bodies if body.scenery}
+    roles = {scene.roles.agent: AGENT_ID, scene.roles.patient: PATIENT_ID}
+    others = [name for name in names if name not in scenery and name not in roles]
+    numbers = {name: FIRST_OTHER_ID + index for index, name in enumerate(others)} | roles
+    if max(numbers.values()) > _MOST_OBJECTS:
+        raise BadInputError(
+            f"scene {scene.name!r} has {len(numbers)} objects; ids of pixels hold at most "
+            f"{_MOST_OBJECTS}"
+        )
+    return np.array([SCENERY_ID, *(numbers.get(name, SCENERY_ID) for name in names)], np.uint8)
+
+
+def boxes(ids: NDArray[np.uint8], objects: int) -> NDArray[np.float32]:
+    """Return left, top, right and bottom (T, objects, 4) of the pixels of the objects 1, 2, ...
+
+    Parameters
+    ----------
+    ids
+        (T, H, W) as ``Batch.ids``.
+    objects
+        Number of rows.
+
+    Returns
+    -------
+    boxes
+        In 0..1 of width and height: the left edge of the first pixel and the right edge of the
+        last; NaN for an object that is not seen.
+    """
+    frames, height, width = ids.shape
+    out = np.full((frames, objects, 4), np.nan, np.float32)
+    for number in np.unique(ids):
+        if not SCENERY_ID < number <= objects:
+            continue
+        mask = ids == number
+        seen = mask.any(axis=(1, 2))
+        columns, rows = mask[seen].any(axis=1), mask[seen].any(axis=2)
+        edges = (
+            columns.argmax(1) / width,
+            rows.argmax(1) / height,
+            1.0 - columns[:, ::-1].argmax(1) / width,
+            1.0 - rows[:, ::-1].argmax(1) / height,
+        )
+        out[seen, number - 1] = np.stack(edges, axis=1)
+    return out
+
+
+def _stack(frames: Sequence[Frame], name: str) -> NDArray[Any]:
+    return np.stack([getattr(frame, name) for frame in frames])

@@ -1,0 +1,66 @@
+"""Motions of trials, from trial files. This module needs h5py and hdf5plugin."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from physion.errors import UnknownNameError
+from physion.models.batch import Motion
+from physion.training.sources.motions import cut_motion
+from physion.trials.trial_file import Trial
+
+_KEPT_BYTES = 2**28
+"""Motions that were read last are kept in memory up to this size."""
+
+
+class TrialMotions(Mapping[str, Motion]):
+    """Motions of trials by name, each read from its file when it is asked for.
+
+    With ``observed``, a motion is cut at the last observed frame when it is read.
+    """
+
+    def __init__(self, files: Mapping[str, Path], *, observed: bool) -> None:
+        self._files, self._observed = files, observed
+        self._kept: OrderedDict[str, Motion] = OrderedDict()
+        self._bytes, self._lock = 0, threading.Lock()
+
+    def __getitem__(self, trial: str) -> Motion:
+        with self._lock:
+            if trial in self._kept:
+                self._kept.move_to_end(trial)
+                return self._kept[trial]
+        if trial not in self._files:
+            raise UnknownNameError("trial", trial, self._files)
+        file = Trial.open(self._files[trial])
+        motion = Motion(file.scene, file.trajectory)
+        if self._observed:
+            motion = cut_motion(motion)
+        with self._lock:
+            self._keep(trial, motion)
+        return motion
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._files)
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+    def _keep(self, trial: str, motion: Motion) -> None:
+        """Keep a motion, and forget those that were used longest ago."""
+        if trial in self._kept:
+            return
+        self._kept[trial] = motion
+        self._bytes += _size(motion)
+        while self._bytes > _KEPT_BYTES and len(self._kept) > 1:
+            self._bytes -= _size(self._kept.popitem(last=False)[1])
+
+
+def _size(motion: Motion) -> int:
+    """Return the bytes of the arrays of a motion."""
+    parts = (motion.trajectory, motion.trajectory.contacts)
+    values = [getattr(part, field.name) for part in parts for field in dataclasses.fields(part)]
+    return sum(int(getattr(value, "nbytes", 0)) for value in values)
