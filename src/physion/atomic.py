@@ -8,7 +8,7 @@ import secrets
 from collections.abc import Iterator
 from pathlib import Path
 
-from physion.errors import PhysionError
+from physion.errors import BadInputError, PhysionError
 
 try:
     import fcntl
@@ -110,6 +110,21 @@ def folder_lock(folder: Path) -> Iterator[None]:
     finally:
         path.unlink(missing_ok=True)
         os.close(descriptor)
+
+
+@contextlib.contextmanager
+def folder_for_writing(folder: Path) -> Iterator[None]:
+    """Create ``folder`` if it is missing, and hold its lock while files are written into it.
+
+    Raises `BadInputError` in place of an `OSError` of the block, and `PhysionError` as
+    `folder_lock`.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with folder_lock(folder):
+            yield
+    except OSError as error:
+        raise BadInputError(f"cannot write into {folder}: {error.strerror or error}") from error
 
 
 def _is_same_file(path: Path, descriptor: int) -> bool:

@@ -10,12 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from physion.errors import BadSceneError
+from physion.errors import BadInputError, BadSceneError
 from physion.scenes.scene import (
     Body,
     BodyEvent,
     Camera,
     Cloth,
+    Ending,
     Joint,
     Look,
     Push,
@@ -163,3 +164,12 @@ def test_bodies_are_present_between_their_events() -> None:
 def test_impossible_events_are_refused(events: tuple[BodyEvent, ...], complaint: str) -> None:
     with pytest.raises(BadSceneError, match=complaint):
         with_events(*events)
+
+
+def test_given_frames_are_the_fewest_and_the_most() -> None:
+    ending = Ending(min_frames=20, max_frames=50)
+    assert ending.frame_limits() == (20, 50)
+    assert ending.frame_limits(1) == (1, 1)
+    assert ending.frame_limits(70) == (70, 70)
+    with pytest.raises(BadInputError, match="at least 1, not 0"):
+        ending.frame_limits(0)

@@ -78,28 +78,23 @@ def compare(
         For ``people`` beside averages, and as `compare_scores`.
     """
     draws = bootstrap or Bootstrap()
-    excluded = tuple(exclude)
+    settings: dict[str, Any] = {
+        "exclude": tuple(exclude),
+        "exclude_ledge": exclude_ledge,
+        "bootstrap": draws,
+    }
     if people is not None:
         if humans is not None or labels is not None or zone is not None:
             raise BadInputError("give averages of people or their single responses, not both")
-        return _with_participants(
-            predictions, people, exclude=excluded, exclude_ledge=exclude_ledge, bootstrap=draws
-        )
+        return _with_participants(predictions, people, draws, settings)
     comparison = compare_scores(
-        predictions,
-        humans,
-        labels,
-        zone=zone,
-        zone_origin=zone_origin,
-        exclude=excluded,
-        exclude_ledge=exclude_ledge,
-        bootstrap=draws,
+        predictions, humans, labels, zone=zone, zone_origin=zone_origin, **settings
     )
     return _with_averages(comparison, predictions, draws)
 
 
 def _with_averages(
-    comparison: Comparison, predictions: pd.DataFrame, bootstrap: Bootstrap | None = None
+    comparison: Comparison, predictions: pd.DataFrame, draws: Bootstrap
 ) -> ComparisonResults:
     """Complete a comparison with people's averages, or without people, by tests and fits."""
     pooled = pool_comparison(comparison)
@@ -107,7 +102,7 @@ def _with_averages(
     return ComparisonResults(
         comparison,
         predictions=predictions,
-        paired=paired_tests(pooled, bootstrap or Bootstrap()) if several else None,
+        paired=paired_tests(pooled, draws) if several else None,
         calibration=calibration_scores(pooled),
         mixed=tuple(fits_of_models(comparison)),
     )
@@ -116,28 +111,13 @@ def _with_averages(
 def _with_participants(
     predictions: pd.DataFrame,
     people: PeopleResults,
-    *,
-    exclude: Iterable[str] = (),
-    exclude_ledge: bool = True,
-    bootstrap: Bootstrap | None = None,
+    draws: Bootstrap,
+    settings: Mapping[str, Any],
 ) -> ComparisonResults:
     """Compare models with the sessions that are not flagged, and with all complete ones.
 
-    Parameters
-    ----------
-    predictions
-        From `predictions.read_predictions`.
-    people
-        From `people.results.analyse_people`.
-    exclude, exclude_ledge, bootstrap
-        As in `compare_scores`.
+    ``settings`` are the options of `compare_scores`, which resamples with ``draws``.
     """
-    draws = bootstrap or Bootstrap()
-    settings: dict[str, Any] = {
-        "exclude": tuple(exclude),
-        "exclude_ledge": exclude_ledge,
-        "bootstrap": draws,
-    }
     main = compare_scores(
         predictions,
         people.tables["by_stimulus"],

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 from physion.dataclass_json import parse_json, read_dataclass, shown
-from physion.errors import BadSceneError
+from physion.errors import BadInputError, BadSceneError
 
 Vec3: TypeAlias = tuple[float, float, float]
 Quat: TypeAlias = tuple[float, float, float, float]
@@ -170,6 +170,17 @@ class Ending:
     min_frames: int = 151
     max_frames: int = 302
     floor: float = -1.0
+
+    def frame_limits(self, frames: int | None = None) -> tuple[int, int]:
+        """Return the fewest and the most frames of a simulation.
+
+        Both are ``frames``, if given; `BadInputError` if that is less than 1.
+        """
+        if frames is None:
+            return self.min_frames, self.max_frames
+        if frames < 1:
+            raise BadInputError(f"frames must be at least 1, not {frames}")
+        return frames, frames
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.errors import BadInputError, BadSceneError
+from physion.errors import BadSceneError
 from physion.numerics.linear_algebra import apply, dot, inverse, norm, unit
 from physion.numerics.rotations import conjugate, multiply_quaternions, rotate_vectors
 from physion.physics.mujoco.contacts import ContactRows
@@ -53,19 +53,16 @@ class MujocoEngine:
         until_contact: bool = False,
     ) -> Trajectory:
         """Simulate ``scene`` until it ends; see `physion.physics.engine.Engine.simulate`."""
-        if frames is not None and frames < 1:
-            raise BadInputError(f"frames must be at least 1, not {frames}")
+        least, most = scene.ending.frame_limits(frames)
         if scene.cloths:
             raise BadSceneError(
                 f"scene {scene.name!r} has cloth, which the engine 'mujoco' does not simulate; "
                 "use the engine 'physion'"
             )
         run = MujocoRun(scene, self.settings, start)
-        limit = scene.ending.max_frames if frames is None else frames
-        least = limit if frames is not None else scene.ending.min_frames
         asked = (scene.index(scene.roles.agent), scene.index(scene.roles.patient))
         pair = (min(asked), max(asked))
-        while len(run.history) < limit and not (len(run.history) >= least and run.is_over()):
+        while len(run.history) < most and not (len(run.history) >= least and run.is_over()):
             run.step()
             if until_contact and run.rows.touches(len(run.history) - 1, pair):
                 break

@@ -59,12 +59,11 @@ class RigidEngine:
         until_contact: bool = False,
     ) -> Trajectory:
         """Simulate ``scene`` until it ends; see `physion.physics.engine.Engine.simulate`."""
-        if frames is not None and frames < 1:
-            raise BadInputError(f"frames must be at least 1, not {frames}")
+        least, most = scene.ending.frame_limits(frames)
         scene = settle_solids(scene, self.cloth)
-        most = scene.ending.max_frames if frames is None else frames
-        # Cloth does not sleep: with it a trial takes its whole time.
-        least = most if frames is not None or scene.cloths else scene.ending.min_frames
+        if scene.cloths:
+            # Cloth does not sleep: with it a trial takes its whole time.
+            least = most
         # With cloth, its contact is what is asked for, and bodies are needed until then.
         until_touch = until_contact and not scene.cloths
         rigid = simulate_rigid(scene, self.settings, self.name, start, least, most, until_touch)

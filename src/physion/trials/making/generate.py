@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from physion.atomic import folder_lock, remove_leftovers, write_atomic
+from physion.atomic import folder_for_writing, remove_leftovers, write_atomic
 from physion.compute.executor import Executor, TaskOutcome
 from physion.compute.progress import Progress
 from physion.compute.run_tasks import FATAL_ERRNOS, RunReport, run_tasks
@@ -80,25 +80,21 @@ def generate(
     if len(datasets) != 1:
         raise BadInputError(f"one folder takes one dataset, not {sorted(datasets) or 'none'}")
     jobs = {task.trial: GenerateJob(task, folder, settings) for task in tasks}
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with folder_lock(folder):
-            _fix_settings(folder, datasets.pop(), settings, tasks)
-            remove_leftovers(folder)
-            missing = {name: job for name, job in jobs.items() if not job.complete()}
-            chosen, unchosen = _choose(folder, jobs, missing, settings, executor, progress)
-            made, failed = run_tasks(
-                make,
-                chosen,
-                folder=folder,
-                what="generating",
-                executor=executor,
-                progress=progress,
-                on_outcome=lambda outcome: _note_outcome(folder, outcome, chosen[outcome.key]),
-            )
-            problems = _update_index(folder, set(made))
-    except OSError as error:
-        raise BadInputError(f"cannot write into {folder}: {error.strerror or error}") from error
+    with folder_for_writing(folder):
+        _fix_settings(folder, datasets.pop(), settings, tasks)
+        remove_leftovers(folder)
+        missing = {name: job for name, job in jobs.items() if not job.complete()}
+        chosen, unchosen = _choose(folder, jobs, missing, settings, executor, progress)
+        made, failed = run_tasks(
+            make,
+            chosen,
+            folder=folder,
+            what="generating",
+            executor=executor,
+            progress=progress,
+            on_outcome=lambda outcome: _note_outcome(folder, outcome, chosen[outcome.key]),
+        )
+        problems = _update_index(folder, set(made))
     kept = [name for name in jobs if name not in missing]
     return RunReport(list(made), kept, {**unchosen, **failed, **problems}, folder / INDEX)
 

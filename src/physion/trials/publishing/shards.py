@@ -26,7 +26,7 @@ from typing import Any
 
 import pandas as pd
 
-from physion.atomic import folder_lock, remove_leftovers, write_atomic
+from physion.atomic import folder_for_writing, remove_leftovers, write_atomic
 from physion.compute.executor import Executor, TaskOutcome
 from physion.compute.progress import Progress
 from physion.compute.run_tasks import run_tasks
@@ -177,13 +177,9 @@ def export_shards(
     plan = _plan(_samples(folder, table, sorted(set(parts))), shard_bytes)
     options = {"layout": LAYOUT, "dataset": sorted(set(table["dataset"])), "split": split}
     options |= {"scenario": scenario, "parts": sorted(set(parts)), "shard_bytes": shard_bytes}
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        with folder_lock(out):
-            remove_leftovers(out)
-            return _write_all(out, plan, options, executor, progress)
-    except OSError as error:
-        raise BadInputError(f"cannot write into {out}: {error.strerror or error}") from error
+    with folder_for_writing(out):
+        remove_leftovers(out)
+        return _write_all(out, plan, options, executor, progress)
 
 
 def _select(table: pd.DataFrame, split: str | None, scenario: str | None) -> pd.DataFrame:

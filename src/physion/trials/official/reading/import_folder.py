@@ -22,7 +22,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from physion.atomic import folder_lock, remove_leftovers
+from physion.atomic import folder_for_writing, remove_leftovers
 from physion.compute.executor import Executor
 from physion.compute.progress import Progress
 from physion.compute.run_tasks import RunReport, run_tasks
@@ -90,23 +90,19 @@ def import_official(
     if (out / SETTINGS).exists():
         raise BadInputError(f"{out} contains generated trials; import into another folder")
     jobs, failed = _plan(folder, out, name, split, scenario)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        with folder_lock(out):
-            remove_leftovers(out)
-            missing = {t: job for t, job in jobs.items() if not job.paths.trial_file.is_file()}
-            made, broken = run_tasks(
-                import_trial,
-                missing,
-                folder=out,
-                what="importing",
-                executor=executor,
-                progress=progress,
-            )
-            table, problems = build_index(out)
-            write_index(out, table)
-    except OSError as error:
-        raise BadInputError(f"cannot write into {out}: {error.strerror or error}") from error
+    with folder_for_writing(out):
+        remove_leftovers(out)
+        missing = {t: job for t, job in jobs.items() if not job.paths.trial_file.is_file()}
+        made, broken = run_tasks(
+            import_trial,
+            missing,
+            folder=out,
+            what="importing",
+            executor=executor,
+            progress=progress,
+        )
+        table, problems = build_index(out)
+        write_index(out, table)
     notes = {trial: notes for trial, notes in made.items() if notes}
     failed = {**failed, **broken, **problems}
     kept = tuple(trial for trial in jobs if trial not in missing)

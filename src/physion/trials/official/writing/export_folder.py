@@ -30,7 +30,7 @@ from typing import Any
 
 import numpy as np
 
-from physion.atomic import folder_lock, remove_leftovers, write_atomic
+from physion.atomic import folder_for_writing, remove_leftovers, write_atomic
 from physion.compute.executor import Executor
 from physion.compute.progress import Progress
 from physion.compute.run_tasks import RunReport, run_tasks
@@ -129,23 +129,19 @@ def export_official(
         )
     jobs = {name: ExportJob(source.paths(name), out) for name in names}
     _check(jobs, dataset, out)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        with folder_lock(out):
-            remove_leftovers(out)
-            kept = {name for name, job in jobs.items() if _is_done(job)}
-            missing = {name: job for name, job in jobs.items() if name not in kept}
-            made, failed = run_tasks(
-                export_trial,
-                missing,
-                folder=out,
-                what="exporting",
-                executor=executor,
-                progress=progress,
-            )
-            index, broken = _write_lists(out)
-    except OSError as error:
-        raise BadInputError(f"cannot write into {out}: {error.strerror or error}") from error
+    with folder_for_writing(out):
+        remove_leftovers(out)
+        kept = {name for name, job in jobs.items() if _is_done(job)}
+        missing = {name: job for name, job in jobs.items() if name not in kept}
+        made, failed = run_tasks(
+            export_trial,
+            missing,
+            folder=out,
+            what="exporting",
+            executor=executor,
+            progress=progress,
+        )
+        index, broken = _write_lists(out)
     in_order = tuple(name for name in jobs if name in kept)
     return RunReport(tuple(made), in_order, {**failed, **broken}, index)
 
