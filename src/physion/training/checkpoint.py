@@ -1,14 +1,15 @@
 """Checkpoints: one safetensors file, written atomically, with metadata as JSON in its header.
 
-Only safetensors and JSON are read, so that no code in a file can be executed.
+Only safetensors and JSON are read, so that no code in a file can be executed. The metadata hold the
+SHA-256 of all tensors and of the metadata themselves, which is verified when a file is read.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import platform
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,98 +19,198 @@ from safetensors.torch import save
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+import physion
 from physion.atomic import write_atomic
 from physion.errors import BadInputError
 
 _METADATA = "physion"
-_MODEL, _OPTIMIZER, _LOSSES = "model/", "optimizer/", "losses"
+_VERSION = 1
+"""To be increased with every change of the files."""
+_MODEL, _OPTIMIZER = "model/", "optimizer/"
+_NAMED = 3
+"""Largest number of differences that a message names."""
 
 
-@dataclass(frozen=True)
-class Checkpoint:
-    """State of a training after ``step`` steps.
-
-    ``losses`` has one value per step. ``config_hash`` identifies everything that determines the
-    losses; a checkpoint is not resumed under another one.
-    """
-
-    step: int
-    losses: tuple[float, ...]
-    config_hash: str
-    details: Mapping[str, Any]
+class DamagedFileError(BadInputError):
+    """Error for a checkpoint that was cut, or of which bits have changed."""
 
 
-def hash_config(parts: Mapping[str, Any]) -> str:
+def hash_config(config: Mapping[str, Any]) -> str:
     """Return the hexadecimal SHA-256 of JSON values, independent of the order of keys."""
-    text = json.dumps(parts, sort_keys=True, separators=(",", ":"))
+    text = json.dumps(config, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def save_checkpoint(
-    path: Path, checkpoint: Checkpoint, model: nn.Module, optimizer: Optimizer
+def versions() -> dict[str, str]:
+    """Return the versions of this package, torch and Python."""
+    return {
+        "physion": physion.__version__,
+        "torch": str(torch.__version__),
+        "python": platform.python_version(),
+    }
+
+
+def write_checkpoint(
+    path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]
 ) -> None:
-    """Write model, optimiser and metadata; also the metadata alone, as a ``.json`` file."""
-    tensors = {_MODEL + name: value for name, value in model.state_dict().items()}
-    for index, values in optimizer.state_dict()["state"].items():
-        tensors |= {f"{_OPTIMIZER}{index}/{key}": value for key, value in values.items()}
-    tensors = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-    tensors[_LOSSES] = torch.tensor(checkpoint.losses, dtype=torch.float64)
-    metadata = json.dumps(
-        {
-            "step": checkpoint.step,
-            "config_hash": checkpoint.config_hash,
-            "details": dict(checkpoint.details),
-        },
-        sort_keys=True,
-    )
+    """Write tensors and metadata, JSON values, to a file that is replaced atomically."""
+    copies = {
+        name: value.detach().to("cpu", copy=True).contiguous() for name, value in tensors.items()
+    }
+    content = {**metadata, "version": _VERSION}
+    content["sha256"] = _digest(copies, content)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomic(path, save(tensors, {_METADATA: metadata}))
-    write_atomic(path.with_suffix(".json"), metadata.encode() + b"\n")
+    # One key only: safetensors stores several in a random order.
+    write_atomic(path, save(copies, {_METADATA: json.dumps(content, sort_keys=True)}))
 
 
-def load_checkpoint(
-    path: Path, config_hash: str, model: nn.Module, optimizer: Optimizer | None = None
-) -> Checkpoint:
-    """Load a checkpoint into ``model`` and ``optimizer``.
+def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Return tensors and metadata of a file.
 
-    Raises `BadInputError`, and changes nothing, if the file is damaged or belongs to another
-    config or network.
+    Raises
+    ------
+    DamagedFileError
+        If it cannot be read or its SHA-256 is wrong.
+    BadInputError
+        If it is a whole safetensors file that `write_checkpoint` did not write.
     """
     try:
         with safe_open(path, framework="pt") as file:
-            metadata = json.loads((file.metadata() or {})[_METADATA])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        losses = tuple(float(value) for value in tensors[_LOSSES])
-        checkpoint = Checkpoint(
-            metadata["step"], losses, metadata["config_hash"], metadata["details"]
-        )
-    except (SafetensorError, OSError, KeyError, ValueError, TypeError) as error:
+            header = file.metadata() or {}
+            names = list(file.keys())
+            tensors = {name: file.get_tensor(name) for name in names} if header else {}
+    except (SafetensorError, OSError, ValueError) as error:
+        raise DamagedFileError(f"checkpoint {path} cannot be read ({error})") from error
+    if _METADATA not in header:
         raise BadInputError(
-            f"checkpoint {path} cannot be read ({error}); delete it to start training again"
-        ) from error
-    if checkpoint.config_hash != config_hash:
-        raise BadInputError(
-            f"checkpoint {path} belongs to another config ({checkpoint.config_hash[:12]}, "
-            f"not {config_hash[:12]}); use another folder, or delete it"
+            f"{path} is a safetensors file, but not a checkpoint of physion; move it elsewhere"
         )
+    try:
+        metadata = json.loads(header[_METADATA])
+        stored = metadata.pop("sha256")
+        known = metadata["version"] == _VERSION
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise DamagedFileError(f"checkpoint {path} cannot be read: damaged metadata") from error
+    if stored != _digest(tensors, metadata):
+        raise DamagedFileError(f"checkpoint {path} is damaged: its SHA-256 is wrong")
+    if not known:
+        raise BadInputError(
+            f"checkpoint {path} has version {metadata['version']}, not {_VERSION}; read it with "
+            f"physion {metadata.get('versions', {}).get('physion', '')}, or move it elsewhere"
+        )
+    return tensors, metadata
+
+
+def tensors_of(model: nn.Module, optimizer: Optimizer | None = None) -> dict[str, Tensor]:
+    """Return the tensors of a model, and those of an optimiser, by the names in a checkpoint."""
+    tensors = {_MODEL + name: value for name, value in model.state_dict().items()}
+    if optimizer is not None:
+        for index, values in optimizer.state_dict()["state"].items():
+            tensors |= {f"{_OPTIMIZER}{index}/{key}": value for key, value in values.items()}
+    return tensors
+
+
+def load_tensors(
+    path: Path,
+    tensors: Mapping[str, Tensor],
+    model: nn.Module,
+    optimizer: Optimizer | None = None,
+) -> None:
+    """Load tensors of the file ``path`` into a model, and into an optimiser.
+
+    Raises `BadInputError`, and changes nothing, for those of another network; the message names
+    the tensors that differ.
+    """
     weights = _with_prefix(tensors, _MODEL)
-    expected = model.state_dict()
-    if {k: v.shape for k, v in weights.items()} != {k: v.shape for k, v in expected.items()}:
-        raise BadInputError(f"checkpoint {path} holds the weights of another network")
+    differences = _compare_tensors(weights, model.state_dict())
+    if differences:
+        raise BadInputError(
+            f"checkpoint {path} holds the weights of another network: {_listed(differences)}"
+        )
     model.load_state_dict(weights)
     if optimizer is not None:
-        _load_optimizer(optimizer, _with_prefix(tensors, _OPTIMIZER))
-    return checkpoint
+        state: dict[int, dict[str, Tensor]] = {}
+        for name, value in _with_prefix(tensors, _OPTIMIZER).items():
+            index, _, key = name.partition("/")
+            state.setdefault(int(index), {})[key] = value
+        groups = optimizer.state_dict()["param_groups"]
+        optimizer.load_state_dict({"state": state, "param_groups": groups})
+
+
+def load_weights(path: Path, model: nn.Module) -> None:
+    """Load the weights of a trained model from its file into a model that was built alike.
+
+    Raises `BadInputError` for a damaged or foreign file, or the weights of another network.
+    """
+    tensors, _ = read_checkpoint(path)
+    load_tensors(path, tensors, model)
+
+
+def check_same(
+    path: Path, what: str, stored: Mapping[str, Any], current: Mapping[str, Any]
+) -> None:
+    """Raise `BadInputError` that names the values of ``what`` that differ."""
+    old, new = _flat(stored), _flat(current)
+    differences = [
+        f"{key} was {_shown(old, key)} and is {_shown(new, key)}"
+        for key in sorted({*old, *new})
+        if old.get(key) != new.get(key)
+    ]
+    if differences:
+        raise BadInputError(
+            f"checkpoint {path} belongs to another {what}: {_listed(differences)}; delete it to "
+            "start again"
+        )
+
+
+def _digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of metadata, and of names, types, shapes and values of tensors."""
+    sha = hashlib.sha256(json.dumps(metadata, sort_keys=True).encode())
+    for name in sorted(tensors):
+        value = tensors[name]
+        sha.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
+        sha.update(value.reshape(-1).view(torch.uint8).numpy().data)
+    return sha.hexdigest()
 
 
 def _with_prefix(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
 
 
-def _load_optimizer(optimizer: Optimizer, tensors: Mapping[str, Tensor]) -> None:
-    state: dict[int, dict[str, Tensor]] = {}
-    for name, value in tensors.items():
-        index, _, key = name.partition("/")
-        state.setdefault(int(index), {})[key] = value
-    groups = optimizer.state_dict()["param_groups"]
-    optimizer.load_state_dict({"state": state, "param_groups": groups})
+def _compare_tensors(stored: Mapping[str, Tensor], model: Mapping[str, Tensor]) -> list[str]:
+    """Return in words which tensors are missing, unknown, or of another shape or type."""
+    differences = [f"{name} is missing" for name in model if name not in stored]
+    differences += [f"{name} is unknown" for name in stored if name not in model]
+    for name in model:
+        if name in stored:
+            old, new = stored[name], model[name]
+            if (old.shape, old.dtype) != (new.shape, new.dtype):
+                differences.append(
+                    f"{name} is {_described(old)}, and {_described(new)} in the model"
+                )
+    return differences
+
+
+def _described(tensor: Tensor) -> str:
+    return f"{str(tensor.dtype).removeprefix('torch.')} {tuple(tensor.shape)}"
+
+
+def _listed(differences: list[str]) -> str:
+    more = len(differences) - _NAMED
+    return "; ".join(differences[:_NAMED]) + (f"; and {more} more" if more > 0 else "")
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        flat |= (
+            _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+        )
+    return flat
+
+
+def _shown(values: Mapping[str, Any], key: str) -> str:
+    if key not in values:
+        return "not there"
+    text = str(values[key])
+    return text if len(text) <= 20 else text[:16] + "..."

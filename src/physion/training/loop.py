@@ -1,158 +1,287 @@
-"""Training loop: seeded, resumable with identical results on a CPU, stopped by a bad loss."""
+"""Training loop: seeded, resumable with identical results on a CPU, stopped by a bad loss.
+
+The losses of the steps stay on the device and are read every ``log_every`` steps, so that the
+device does not wait for the processor at every step.
+"""
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
 from lightning_fabric import Fabric
-from torch import Tensor, nn
+from torch import Tensor
 
-from physion.atomic import write_atomic
-from physion.compute.progress import Progress
 from physion.errors import BadInputError, PhysionError
+from physion.models.batch import Batch
+from physion.models.interface import HasBaseline
+from physion.models.settings import TrainingSettings
 from physion.seeds import stable_hash
-from physion.training.checkpoint import (
-    Checkpoint,
-    hash_config,
-    load_checkpoint,
-    save_checkpoint,
-)
+from physion.training.checkpoint import load_tensors, tensors_of
+from physion.training.folder import Stored, TrainingFolder
+from physion.training.losses import LOSS, Given, Learner, evaluating, losses_of, mean_over, ordered
+from physion.training.metrics_log import MetricsLog
+from physion.training.schedule import learning_rate
+from physion.training.state import TrainingState
+from physion.training.windows import Windows, step_request, validation_requests
 
-CHECKPOINT, METRICS = "checkpoint.safetensors", "metrics.jsonl"
-_NOT_HASHED = ("steps", "log_every", "checkpoint_every")
-"""Settings that do not change the losses, only their number and how often they are written."""
-
-Batches = Callable[[int], Mapping[str, Tensor]]
+_OPTIMIZERS = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}
 
 
 class TrainingStoppedError(PhysionError):
-    """Error for a loss that became NaN or infinite; the last checkpoint before it is kept."""
+    """Error for a loss or weight that became NaN or infinite; the last checkpoint is kept."""
 
 
-@dataclass(frozen=True, slots=True)
-class TrainingConfig:
-    """Settings of the training of dynamics.
+@dataclass(frozen=True, eq=False)
+class TrainingData:
+    """Windows of the training trials, and of the trials held out for validation."""
 
-    - ``steps``, ``batch`` (windows per step), ``learning_rate`` of Adam. The released code used
-      1000, 32 and 1e-2, and reset Adam's moments at every step; here they are kept.
-    - ``seed``: of the batches and of random operations in the model.
-    - ``log_every``, ``checkpoint_every``: intervals in steps.
-    """
-
-    steps: int = 1000
-    batch: int = 32
-    learning_rate: float = 1e-3
-    seed: int = 0
-    log_every: int = 10
-    checkpoint_every: int = 100
-
-    def __post_init__(self) -> None:
-        if min(self.steps, self.batch, self.log_every, self.checkpoint_every) < 1:
-            raise BadInputError("steps, batch, log_every and checkpoint_every must be at least 1")
-        if not 0 < self.learning_rate < math.inf:
-            raise BadInputError(f"learning rate must be positive, not {self.learning_rate}")
+    training: Windows
+    held_out: Windows | None
 
 
-@dataclass(frozen=True)
-class TrainingResult:
-    """Result of a training; ``losses`` has one value per step, including those before a resume."""
-
-    losses: tuple[float, ...]
-    config_hash: str
-
-
-def train(
-    model: nn.Module,
-    batches: Batches,
-    config: TrainingConfig,
-    fabric: Fabric,
-    *,
-    folder: Path | None = None,
-    identity: Mapping[str, Any] | None = None,
-    progress: Progress | None = None,
-) -> TrainingResult:
-    """Train ``model`` in place for ``config.steps`` steps.
+class TrainingLoop:
+    """Training of one model.
 
     Parameters
     ----------
     model
-        Module whose ``forward(batch)`` returns the loss.
-    batches
-        Function that returns the batch of a step (from 0).
-    config
-        Settings of the training.
+        `Learns` and a torch ``Module``, already on its device.
+    data
+        Windows for training and validation.
+    settings
+        Optimiser and schedule.
+    seed
+        Of the batches and of random operations in the model.
     fabric
-        Device.
+        Devices.
     folder
-        Where a checkpoint and ``metrics.jsonl`` are kept, and from which training resumes; None
-        keeps nothing.
-    identity
-        JSON values that identify model and data, part of the checkpoint's hash.
+        Where checkpoints and metrics are kept; None keeps nothing.
+    describe
+        Returns the metadata of a checkpoint, to which the state is added.
     progress
         Called after every step.
-
-    Raises
-    ------
-    TrainingStoppedError
-        If a loss is not finite; the message names the step.
-    BadInputError
-        If the checkpoint in ``folder`` belongs to another config.
     """
-    settings = {k: v for k, v in dataclasses.asdict(config).items() if k not in _NOT_HASHED}
-    config_hash = hash_config({"training": settings, "identity": dict(identity or {})})
-    trained = [parameter for parameter in model.parameters() if parameter.requires_grad]
-    optimizer = torch.optim.Adam(trained, lr=config.learning_rate)
-    losses: list[float] = []
-    path = folder / CHECKPOINT if folder is not None else None
-    wrapped, wrapped_optimizer = fabric.setup(model, optimizer)
-    if path is not None and path.is_file():
+
+    def __init__(
+        self,
+        model: Any,
+        data: TrainingData,
+        settings: TrainingSettings,
+        seed: int,
+        fabric: Fabric,
+        *,
+        folder: TrainingFolder | None,
+        describe: Mapping[str, Any],
+        progress: Callable[[int, int], None] | None,
+    ) -> None:
+        self._model, self._data, self._settings, self._seed = model, data, settings, seed
+        self._fabric, self._describe, self._progress = fabric, describe, progress
+        # Only the first process writes.
+        self._folder = folder if fabric.global_rank == 0 else None
+        self._kept = folder is not None
+        self.state = TrainingState()
+        self._unread: list[Tensor] = []
+        self._names: tuple[str, ...] = ()
+        self._parts = settings.accumulate * fabric.world_size
+        trained = [parameter for parameter in model.parameters() if parameter.requires_grad]
+        _check(settings, data, fabric.world_size, trained)
+        self._optimizer = _OPTIMIZERS[settings.optimizer](
+            trained,
+            lr=settings.learning_rate,
+            betas=settings.betas,
+            weight_decay=settings.weight_decay,
+        )
+        self._learner, self._wrapped = fabric.setup(Learner(model), self._optimizer)
+
+    def resume(self, stored: Stored) -> None:
+        """Load a checkpoint."""
         # After the set-up, so that the optimiser's state is on the device of the weights.
-        losses = list(load_checkpoint(path, config_hash, model, optimizer).losses)
-        if len(losses) > config.steps:
-            raise BadInputError(f"{path} has {len(losses)} steps, more than the {config.steps}")
-    model.train()
-    for step in range(len(losses), config.steps):
-        loss = _step(wrapped, wrapped_optimizer, batches(step), step, config.seed, fabric)
-        losses.append(loss)
-        last = step + 1 == config.steps
-        if path is not None and (last or (step + 1) % config.checkpoint_every == 0):
-            checkpoint = Checkpoint(step + 1, tuple(losses), config_hash, dict(identity or {}))
-            save_checkpoint(path, checkpoint, model, optimizer)
-            _write_metrics(path.with_name(METRICS), losses, config.log_every)
-        if progress is not None:
-            progress("training", step + 1, config.steps)
-    model.eval()
-    return TrainingResult(tuple(losses), config_hash)
+        load_tensors(stored.path, stored.tensors, self._model, self._optimizer)
+        self.state = TrainingState.of(stored.metadata["state"])
+        self._fabric.strategy.precision.load_state_dict(stored.metadata["precision"])
 
+    def run(self) -> None:
+        """Train until the last step.
 
-def _step(
-    model: Any, optimizer: Any, batch: Mapping[str, Tensor], step: int, seed: int, fabric: Fabric
-) -> float:
-    # Seeded by the step, so that no state of a generator has to be stored.
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(stable_hash("step", seed, step) % 2**63)
-        optimizer.zero_grad(set_to_none=True)
-        loss: Tensor = model({name: fabric.to_device(value) for name, value in batch.items()})
-        value = float(loss.detach())
-        if not math.isfinite(value):
-            raise TrainingStoppedError(
-                f"training stopped at step {step}: the loss is {value}; "
-                "lower the learning rate, or check the features of that batch"
+        Raises
+        ------
+        TrainingStoppedError
+            If a loss or weight is not finite; the message names the steps.
+        BadInputError
+            If the model gives no usable loss.
+        """
+        settings, state = self._settings, self.state
+        self._model.train()
+        with ExitStack() as stack:
+            log = None
+            if self._folder is not None:
+                log = stack.enter_context(MetricsLog(self._folder.path, state.step))
+            batches = self._batches(state.step)
+            for step in range(state.step, settings.steps):
+                self._step(step, batches)
+                state.step = step + 1
+                self._after_step(log)
+                if self._progress is not None:
+                    self._progress(state.step, settings.steps)
+        self._model.eval()
+
+    def metadata(self) -> dict[str, Any]:
+        """Return the metadata of a checkpoint of the present state."""
+        return {
+            **self._describe,
+            "step": self.state.step,
+            "state": self.state.to_json(),
+            "precision": self._fabric.strategy.precision.state_dict(),
+        }
+
+    def _batches(self, first: int) -> Iterator[Batch]:
+        """Yield the batches of this process from step ``first`` on."""
+        settings, fabric = self._settings, self._fabric
+        size = settings.batch * settings.accumulate
+        for step in range(first, settings.steps):
+            request = step_request(self._data.training, size, self._seed, step)
+            for index in range(settings.accumulate):
+                part = request.part(index * fabric.world_size + fabric.global_rank, self._parts)
+                yield self._data.training.read(part)
+
+    def _step(self, step: int, batches: Iterator[Batch]) -> None:
+        """Do one step of the optimiser."""
+        settings, fabric = self._settings, self._fabric
+        rate = learning_rate(settings, step, self.state.plateau.factor)
+        for group in self._optimizer.param_groups:
+            group["lr"] = rate
+        self._optimizer.zero_grad(set_to_none=True)
+        values = []
+        for index in range(settings.accumulate):
+            batch = next(batches).to(fabric.device)
+            last = index + 1 == settings.accumulate
+            part = index * fabric.world_size + fabric.global_rank
+            # Seeded by the step, so that no state of a generator has to be stored.
+            with (
+                torch.random.fork_rng(devices=[]),
+                fabric.no_backward_sync(self._learner, enabled=not last),
+            ):
+                torch.manual_seed(stable_hash("step", self._seed, step, part) % 2**63)
+                losses = self._learner(Given(batch))
+                fabric.backward(losses[LOSS] / settings.accumulate)
+            values.append(self._stack(losses))
+        if settings.clip > 0:
+            fabric.clip_gradients(
+                self._learner, self._wrapped, max_norm=settings.clip, error_if_nonfinite=False
             )
-        fabric.backward(loss)
-        optimizer.step()
-    return value
+        self._wrapped.step()
+        self._unread.append(torch.stack(values).mean(0))
+
+    def _after_step(self, log: MetricsLog | None) -> None:
+        """Read losses, validate and write a checkpoint where it is time."""
+        settings, state = self._settings, self.state
+        last = state.step == settings.steps
+        logs = last or state.step % settings.log_every == 0
+        validates = last or state.step % settings.validate_every == 0
+        saves = self._kept and (last or state.step % settings.checkpoint_every == 0)
+        if logs or validates or saves:
+            self._read_losses()
+        if logs:
+            means = {f"train/{k}": v for k, v in _means(state.recent).items()}
+            state.loss, state.recent = means[f"train/{LOSS}"], []
+            rate = learning_rate(settings, state.step - 1, state.plateau.factor)
+            if log is not None:
+                log.write(state.step, {**means, "learning_rate": rate})
+        if validates and self._data.held_out is not None:
+            self._validate(log, last)
+        if saves:
+            self._check_weights()
+            if log is not None and self._folder is not None and not last:
+                log.sync()
+                self._folder.save(tensors_of(self._model, self._optimizer), self.metadata())
+            elif log is not None:
+                log.sync()
+
+    def _read_losses(self) -> None:
+        """Move the losses of the last steps from the device, and stop at one that is not finite."""
+        if not self._unread:
+            return
+        reduced = self._fabric.all_reduce(torch.stack(self._unread), reduce_op="mean")
+        assert isinstance(reduced, Tensor)
+        rows = reduced.double().cpu().tolist()
+        self._unread.clear()
+        first = self.state.step - len(rows) + 1
+        for index, row in enumerate(rows):
+            if not math.isfinite(row[0]):
+                raise self._stopped(f"the loss of step {first + index} is {row[0]}", first)
+        self.state.recent += [dict(zip(self._names, row, strict=True)) for row in rows]
+
+    def _check_weights(self) -> None:
+        """Stop if a weight is not finite: a step can spoil it though its loss was finite."""
+        finite = [
+            value.isfinite().all()
+            for value in self._model.state_dict().values()
+            if value.is_floating_point()
+        ]
+        if finite and not bool(torch.stack(finite).all()):
+            names = [
+                name
+                for name, value in self._model.state_dict().items()
+                if value.is_floating_point() and not bool(value.isfinite().all())
+            ]
+            raise self._stopped(f"{names[0]} is not finite", self.state.step)
+
+    def _stopped(self, reason: str, first: int) -> TrainingStoppedError:
+        last = self.state.step
+        steps = f"step {last}" if first >= last else f"steps {first} to {last}"
+        return TrainingStoppedError(
+            f"training stopped after {steps}: {reason}; the checkpoint before stays. Lower the "
+            "learning rate, clip the gradients, or check the trials"
+        )
+
+    def _validate(self, log: MetricsLog | None, last: bool) -> None:
+        """Compute the loss of held-out trials; after the last step also that of the baseline."""
+        model, state, windows = self._model, self.state, self._data.held_out
+        assert windows is not None
+        requests = validation_requests(windows, self._settings.batch, self._seed)
+        shared = (windows, requests, self._fabric, self._seed)
+        with evaluating(model, self._fabric):
+            values = mean_over(lambda batch: losses_of(model, batch), *shared)
+            if last and isinstance(model, HasBaseline):
+                trivial = mean_over(lambda batch: {LOSS: model.baseline(batch)}, *shared)
+                state.baseline = trivial[LOSS]
+        state.validation = values[LOSS]
+        if not math.isfinite(state.validation):
+            raise self._stopped("the loss of the held-out trials is not finite", state.step)
+        if self._settings.schedule == "plateau":
+            state.plateau.update(state.validation, self._settings)
+        if log is not None:
+            log.write(state.step, {f"validation/{name}": v for name, v in values.items()})
+
+    def _stack(self, losses: Mapping[str, Tensor]) -> Tensor:
+        names = ordered(losses)
+        if self._names and names != self._names:
+            raise BadInputError(
+                f"the model's loss has the parts {list(names)}, before {list(self._names)}; they "
+                "must be the same at every step"
+            )
+        self._names = names
+        return torch.stack([losses[name].detach().float() for name in names])
 
 
-def _write_metrics(path: Path, losses: list[float], every: int) -> None:
-    """Write all losses again, so that a resume neither repeats nor loses a line."""
-    kept = [i for i in range(len(losses)) if i % every == 0 or i + 1 == len(losses)]
-    lines = [json.dumps({"step": i, "loss": losses[i]}) + "\n" for i in kept]
-    write_atomic(path, "".join(lines).encode())
+def _check(
+    settings: TrainingSettings, data: TrainingData, processes: int, trained: Sequence[Tensor]
+) -> None:
+    if not trained:
+        raise BadInputError("the model has no weight that can be trained")
+    if settings.batch % processes != 0:
+        raise BadInputError(
+            f"training: batch {settings.batch} cannot be divided among {processes} devices; "
+            f"choose a multiple of {processes}"
+        )
+    if settings.schedule == "plateau" and data.held_out is None:
+        raise BadInputError("training: the schedule plateau needs held_out above 0")
+
+
+def _means(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    return {name: math.fsum(row[name] for row in rows) / len(rows) for name in rows[0]}

@@ -1,0 +1,94 @@
+"""Devices of a training, by Lightning Fabric."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import timedelta
+from typing import Any
+
+import torch
+from lightning_fabric import Fabric
+from lightning_fabric.strategies.ddp import DDPStrategy
+
+from physion.errors import BadInputError, PhysionError
+from physion.models.settings import TrainingSettings
+
+PRECISIONS = ("32-true", "16-mixed", "bf16-mixed")
+"""Precisions in which weights and features stay float32."""
+_MEMORY_TEXTS = ("out of memory", "can't allocate memory", "not enough memory")
+"""Parts of the messages by which torch reports that memory is used up."""
+_TIMEOUT = timedelta(hours=6)
+"""How long processes wait for one of them, which may compute features before the others."""
+
+
+class OutOfMemoryError(PhysionError):
+    """Error for a training that needs more memory than there is."""
+
+
+@dataclass(frozen=True, slots=True)
+class Devices:
+    """Devices of a training.
+
+    - ``accelerator``: Lightning's name: ``auto``, ``cpu``, ``cuda``, ``mps``.
+    - ``devices``: of each node; more than one train together, each on a part of every batch.
+    - ``nodes``: machines, on each of which the same command is started, as Lightning describes.
+    """
+
+    accelerator: str = "auto"
+    devices: int = 1
+    nodes: int = 1
+
+
+def make_fabric(devices: Devices, precision: str) -> Fabric:
+    """Return a Fabric on the given devices, launched if there are several.
+
+    Raises `BadInputError` for devices that are not there, or an unknown precision.
+    """
+    if precision not in PRECISIONS:
+        raise BadInputError(
+            f"training: precision must be one of {', '.join(PRECISIONS)}, not {precision!r}"
+        )
+    if min(devices.devices, devices.nodes) < 1:
+        raise BadInputError("training: devices and nodes must be at least 1")
+    options: dict[str, Any] = {}
+    if devices.devices * devices.nodes > 1:
+        # A model may have weights that a batch does not use.
+        options["strategy"] = DDPStrategy(find_unused_parameters=True, timeout=_TIMEOUT)
+    try:
+        fabric = Fabric(
+            accelerator=devices.accelerator,
+            devices=devices.devices,
+            num_nodes=devices.nodes,
+            precision=precision,  # type: ignore[arg-type]
+            **options,
+        )
+    except (ValueError, RuntimeError, TypeError) as error:
+        reason = " ".join(str(error).split())
+        raise BadInputError(
+            f"{devices.devices} devices {devices.accelerator!r} cannot be used: {reason}"
+        ) from error
+    if options:
+        fabric.launch()
+    return fabric
+
+
+@contextmanager
+def memory_advice(settings: TrainingSettings) -> Iterator[None]:
+    """Turn an error for memory that is used up into one that names the setting to lower."""
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        text = str(error).lower()
+        memory = isinstance(error, MemoryError | torch.OutOfMemoryError)
+        if not memory and not any(part in text for part in _MEMORY_TEXTS):
+            raise
+        clips, parts = settings.batch, settings.accumulate
+        advice = (
+            f"lower the batch and accumulate more, such as batch {clips // 2} and accumulate "
+            f"{2 * parts}"
+            if clips > 1
+            else "use a smaller size of the model, or precision bf16-mixed"
+        )
+        raise OutOfMemoryError(f"training ran out of memory at batch {clips}; {advice}") from error

@@ -1,0 +1,263 @@
+"""Training of a model on trials, resumed where it was interrupted, or loaded where it is done."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lightning_fabric import Fabric
+from numpy.typing import NDArray
+from torch import nn
+
+from physion.atomic import folder_lock
+from physion.compute.progress import Progress
+from physion.errors import BadInputError
+from physion.models.interface import Learns, features_digest
+from physion.models.settings import TrainingSettings
+from physion.seeds import stable_hash
+from physion.training.checkpoint import hash_config, load_tensors, tensors_of, versions
+from physion.training.devices import Devices, make_fabric, memory_advice
+from physion.training.folder import TrainingFolder
+from physion.training.loop import TrainingData, TrainingLoop
+from physion.training.losses import evaluating
+from physion.training.model_card import model_card
+from physion.training.sources.source import WholeSource
+from physion.training.state import TrainingState
+from physion.training.windows import ClipWindows, FeatureWindows, hold_out
+
+Features = Callable[[Sequence[str]], NDArray[np.float32]]
+
+_NOT_HASHED = ("log_every", "checkpoint_every")
+"""Settings that do not change the weights, only how often something is written."""
+
+
+@dataclass(frozen=True)
+class TrainedModel:
+    """Result of a training.
+
+    - ``name``: of the set of trials. ``folder``: its files, None if nothing is kept.
+    - ``loss``: mean of the last ``log_every`` steps. ``validation``: of held-out trials, and
+      ``baseline`` that of a predictor that has learnt nothing; NaN if there is none.
+    - ``config_hash``: of everything that determines the weights.
+    - ``loaded``: whether it was there already. ``notes``: files that were found damaged.
+    """
+
+    name: str
+    folder: Path | None
+    steps: int
+    loss: float
+    validation: float
+    baseline: float
+    config_hash: str
+    loaded: bool
+    notes: tuple[str, ...]
+
+
+def train_model(
+    model: Any,
+    source: WholeSource,
+    trials: Sequence[str],
+    *,
+    seed: int,
+    name: str,
+    folder: Path | None,
+    settings: TrainingSettings | None = None,
+    features: Features | None = None,
+    accelerator: str = "auto",
+    fabric: Fabric | None = None,
+    progress: Progress | None = None,
+) -> TrainedModel:
+    """Train ``model`` in place; it ends on the device of ``fabric``, in evaluation mode.
+
+    If ``folder`` holds the same training, its weights are loaded if it is done, and it is resumed
+    if it is not, with the results of an uninterrupted one (to the bit on a CPU).
+
+    Parameters
+    ----------
+    model
+        `Learns` and a torch ``Module``, with its initial weights.
+    source
+        Source of clips with the model's ``spec``.
+    trials
+        Training trials; a part of them is held out for validation.
+    seed
+        Of the batches, the held-out trials, and random operations in the model.
+    name
+        Name of the set of trials, for the folder and the model card.
+    folder
+        Folder of all trainings, in which ``<model>-<name>-<hash>`` is created; None keeps nothing.
+    settings
+        Optimiser and schedule; those of the model by default.
+    features
+        Returns features (n, T, D) of whole clips, for models whose diet is features.
+    accelerator
+        Lightning's name of the device: auto, cpu, cuda, ...
+    fabric
+        Several devices (`make_fabric`), in place of ``accelerator``.
+    progress
+        Called after every step.
+
+    Raises
+    ------
+    BadInputError
+        If the model cannot be trained, or a stored training differs from this one.
+    TrainingStoppedError
+        If a loss or weight is not finite.
+    OutOfMemoryError
+        If memory is used up; the message names the setting to lower.
+    """
+    _check(model, trials)
+    settings = settings if settings is not None else model.settings
+    fabric = fabric or make_fabric(Devices(accelerator), settings.precision)
+    config = _config(model, source, trials, settings, seed)
+    config_hash = hash_config(config)
+    kept = None
+    if folder is not None:
+        title = re.sub(r"[^A-Za-z0-9._-]+", "-", f"{model.provenance().model}-{name}")
+        kept = TrainingFolder(folder / f"{title}-{config_hash[:12]}", config)
+    fabric.to_device(model)
+    done = kept.finished() if kept is not None else None
+    if kept is not None and done is not None:
+        load_tensors(done.path, done.tensors, model)
+        model.eval()
+        return _result(name, kept, TrainingState.of(done.metadata["state"]), config_hash, True)
+    metadata = {
+        "config": config,
+        "config_hash": config_hash,
+        "versions": versions(),
+        "provenance": dataclasses.asdict(model.provenance()),
+    }
+    with _writing(kept, fabric), memory_advice(settings):
+        stored = kept.resumable() if kept is not None else None
+        if kept is not None and fabric.is_global_zero:
+            kept.clean()
+        fabric.barrier()
+        data = _windows(model, source, trials, settings, seed, features, fabric)
+        if stored is None:
+            _prepare(model, data, seed, fabric)
+        loop = TrainingLoop(
+            model,
+            data,
+            settings,
+            seed,
+            fabric,
+            folder=kept,
+            describe=metadata,
+            progress=_named(progress, f"training {name}") if fabric.is_global_zero else None,
+        )
+        if stored is not None:
+            loop.resume(stored)
+        loop.run()
+        if kept is not None and fabric.is_global_zero:
+            card = model_card(model, name, trials, settings, seed, metadata, loop.state)
+            kept.finish(tensors_of(model), loop.metadata(), card)
+        fabric.barrier()
+    return _result(name, kept, loop.state, config_hash, False)
+
+
+def _check(model: Any, trials: Sequence[str]) -> None:
+    """Raise `BadInputError` if there is nothing to train, or nothing to train on."""
+    name = model.provenance().model
+    if not (isinstance(model, nn.Module) and isinstance(model, Learns)):
+        raise BadInputError(f"model {name!r} has nothing to train")
+    if not trials:
+        raise BadInputError(f"there is no trial to train {name!r} on")
+
+
+def _config(
+    model: Any, source: WholeSource, trials: Sequence[str], settings: TrainingSettings, seed: int
+) -> dict[str, Any]:
+    """Return JSON values of everything that determines the weights."""
+    keys = hashlib.sha256()
+    for trial in trials:
+        keys.update(f"{trial} {source.key(trial, 'whole')}\n".encode())
+    chosen = dataclasses.asdict(settings)
+    return {
+        "model": model.digest(),
+        "features": features_digest(model) if model.diet == "features" else "",
+        "trials": keys.hexdigest(),
+        "settings": {
+            name: list(value) if isinstance(value, tuple) else value
+            for name, value in chosen.items()
+            if name not in _NOT_HASHED
+        },
+        "seed": seed,
+        "diet": model.diet,
+        "window": model.window,
+    }
+
+
+@contextlib.contextmanager
+def _writing(folder: TrainingFolder | None, fabric: Fabric) -> Iterator[None]:
+    """Let no other process of this machine train in the same folder."""
+    if folder is None or not fabric.is_global_zero:
+        yield
+        return
+    folder.path.mkdir(parents=True, exist_ok=True)
+    with folder_lock(folder.path):
+        yield
+
+
+def _windows(
+    model: Any,
+    source: WholeSource,
+    trials: Sequence[str],
+    settings: TrainingSettings,
+    seed: int,
+    features: Features | None,
+    fabric: Fabric,
+) -> TrainingData:
+    rows, held = hold_out(len(trials), settings.held_out, seed)
+    if model.diet != "features":
+        training, held_out = (
+            ClipWindows(source, tuple(trials[row] for row in part), model.window)
+            for part in (rows, held)
+        )
+        return TrainingData(training, held_out if len(held) else None)
+    if features is None:
+        raise BadInputError(f"model {model.provenance().model!r} is trained on features")
+    with fabric.rank_zero_first():  # which stores them for the others
+        values = features(trials)
+    frames = [source.length(trial) for trial in trials]
+    chosen, rest = (
+        FeatureWindows(model.spec, trials, values, frames, part, model.window)
+        for part in (rows, held)
+    )
+    return TrainingData(chosen, rest if len(held) else None)
+
+
+def _prepare(model: Any, data: TrainingData, seed: int, fabric: Fabric) -> None:
+    """Let the model set its statistics from training clips."""
+    with evaluating(model, fabric):
+        torch.manual_seed(stable_hash("prepare", seed) % 2**63)
+        model.prepare(data.training.sample(seed).to(fabric.device))
+
+
+def _named(progress: Progress | None, what: str) -> Callable[[int, int], None] | None:
+    if progress is None:
+        return None
+    return lambda done, total: progress(what, done, total)
+
+
+def _result(
+    name: str, folder: TrainingFolder | None, state: TrainingState, config_hash: str, loaded: bool
+) -> TrainedModel:
+    return TrainedModel(
+        name=name,
+        folder=folder.path if folder is not None else None,
+        steps=state.step,
+        loss=state.loss,
+        validation=state.validation,
+        baseline=state.baseline,
+        config_hash=config_hash,
+        loaded=loaded,
+        notes=tuple(folder.notes) if folder is not None else (),
+    )

@@ -1,0 +1,193 @@
+"""Training clips: which windows of which trials a step receives, a function of seed and step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from physion.errors import BadInputError
+from physion.models.batch import Batch, Spec, clip_frames
+from physion.seeds import generator
+from physion.training.sources.source import WholeSource
+
+Floats = NDArray[np.float32]
+
+SAMPLE_CLIPS = 64
+"""Clips from which a model sets its statistics, unless it is trained on features."""
+VALIDATION_CLIPS = 256
+"""Largest number of clips of a validation."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """Windows to be read: names of trials, and the first frame or time step of each."""
+
+    trials: tuple[str, ...]
+    starts: tuple[int, ...]
+
+    def part(self, index: int, parts: int) -> Request:
+        """Return part ``index`` of ``parts`` equal parts."""
+        size = len(self.trials) // parts
+        chosen = slice(index * size, (index + 1) * size)
+        return Request(self.trials[chosen], self.starts[chosen])
+
+
+class Windows(Protocol):
+    """Windows of training clips, drawn from some trials."""
+
+    @property
+    def trials(self) -> tuple[str, ...]:
+        """Trials from which windows are drawn."""
+        ...
+
+    def starts(self, trials: Sequence[int], rng: np.random.Generator) -> NDArray[np.int64]:
+        """Return random starts of windows of the trials with the given row numbers."""
+        ...
+
+    def read(self, request: Request) -> Batch:
+        """Return the windows of a request."""
+        ...
+
+    def sample(self, seed: int) -> Batch:
+        """Return the clips from which a model sets its statistics."""
+        ...
+
+
+@dataclass(frozen=True)
+class ClipWindows:
+    """Windows of ``length`` frames, ``spec.stride`` apart, from any frame of a trial.
+
+    A window of a trial that is shorter than a window starts at frame 0.
+    """
+
+    source: WholeSource
+    trials: tuple[str, ...]
+    length: int
+
+    def starts(self, trials: Sequence[int], rng: np.random.Generator) -> NDArray[np.int64]:
+        """Return random first frames such that the windows end within their trials."""
+        span = (self.length - 1) * self.source.spec.stride
+        lengths = [self.source.length(self.trials[row]) for row in trials]
+        return rng.integers(np.maximum(np.array(lengths, np.int64) - span, 1))
+
+    def read(self, request: Request) -> Batch:
+        """Return the windows of a request."""
+        return self.source.window(request.trials, request.starts, self.length)
+
+    def sample(self, seed: int) -> Batch:
+        """Return up to `SAMPLE_CLIPS` random windows."""
+        rng = generator("sample", seed)
+        return self.read(_draw(self, min(SAMPLE_CLIPS, len(self.trials)), rng, distinct=True))
+
+
+class FeatureWindows:
+    """Windows of ``length`` time steps of stored features.
+
+    Parameters
+    ----------
+    spec
+        What the clips are, of which the features are.
+    trials
+        Names of n trials.
+    features
+        Features (n, T, D) of their whole clips, T = ``spec.total``.
+    frames
+        Number of frames of each trial's motion.
+    rows
+        Row numbers of the trials from which windows are drawn.
+    length
+        Time steps of a window.
+    """
+
+    def __init__(
+        self,
+        spec: Spec,
+        trials: Sequence[str],
+        features: Floats,
+        frames: Sequence[int],
+        rows: NDArray[np.int64],
+        length: int,
+    ) -> None:
+        if features.ndim != 3 or features.shape[:2] != (len(trials), spec.total):
+            raise BadInputError(
+                f"features of {len(trials)} clips of {spec.total} frames must have the shape "
+                f"({len(trials)}, {spec.total}, size), not {features.shape}"
+            )
+        if length > spec.total:
+            raise BadInputError(
+                f"training needs windows of {length} steps, but the clips have {spec.total}"
+            )
+        self._features, self._chosen, self._length = features, rows, length
+        self._rows = {trials[row]: int(row) for row in rows}
+        clipped = [clip_frames(spec.all_frames(), count) for count in frames]
+        self._frames = np.stack([shown for shown, _ in clipped])
+        self._valid = np.stack([valid for _, valid in clipped])
+
+    @property
+    def trials(self) -> tuple[str, ...]:
+        """Trials from which windows are drawn."""
+        return tuple(self._rows)
+
+    def starts(self, trials: Sequence[int], rng: np.random.Generator) -> NDArray[np.int64]:
+        """Return random first time steps."""
+        return rng.integers(self._features.shape[1] - self._length + 1, size=len(trials))
+
+    def read(self, request: Request) -> Batch:
+        """Return the windows of a request."""
+        rows = np.array([self._rows[trial] for trial in request.trials], np.int64)[:, None]
+        steps = np.array(request.starts, np.int64)[:, None] + np.arange(self._length)
+        return Batch(
+            trials=request.trials,
+            frames=self._frames[rows, steps],
+            valid=self._valid[rows, steps],
+            features=self._features[rows, steps],
+        )
+
+    def sample(self, seed: int) -> Batch:
+        """Return all clips."""
+        rows = self._chosen
+        return Batch(
+            self.trials, self._frames[rows], self._valid[rows], features=self._features[rows]
+        )
+
+
+def hold_out(count: int, fraction: float, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the sorted rows for training and those held out for validation.
+
+    ``fraction`` of ``count`` rows is held out, but at least one if there are two or more; a single
+    row is used for both. A ``fraction`` of 0 holds out nothing.
+    """
+    rows = np.arange(count)
+    if fraction == 0:
+        return rows, rows[:0]
+    if count < 2:
+        return rows, rows
+    held = min(count - 1, max(1, round(fraction * count)))
+    order = generator("hold out", seed).permutation(count)
+    return np.sort(order[held:]), np.sort(order[:held])
+
+
+def step_request(windows: Windows, size: int, seed: int, step: int) -> Request:
+    """Return the ``size`` windows of a step of the optimiser, a function of seed and step."""
+    return _draw(windows, size, generator("batch", seed, step))
+
+
+def validation_requests(windows: Windows, size: int, seed: int) -> list[Request]:
+    """Return one window of each trial, at most `VALIDATION_CLIPS`, in batches of ``size``."""
+    rng = generator("validation", seed)
+    drawn = _draw(windows, min(VALIDATION_CLIPS, len(windows.trials)), rng, distinct=True)
+    bounds = range(0, len(drawn.trials), size)
+    return [Request(drawn.trials[a : a + size], drawn.starts[a : a + size]) for a in bounds]
+
+
+def _draw(
+    windows: Windows, size: int, rng: np.random.Generator, *, distinct: bool = False
+) -> Request:
+    count = len(windows.trials)
+    rows = rng.permutation(count)[:size] if distinct else rng.integers(count, size=size)
+    starts = windows.starts([int(row) for row in rows], rng)
+    return Request(tuple(windows.trials[row] for row in rows), tuple(int(s) for s in starts))
