@@ -21,7 +21,7 @@ from physion.report.inputs import ReportInputs
 from physion.report.words import number
 
 SQUARE = 1.16
-"""Width of a scenario's square and the gap beside it, in units of its scale from 0 to 1."""
+"""Distance from the left edge of one scenario's square to that of the next; a square is 1 wide."""
 
 
 @register_figure("scatter", section=BY_STIMULUS, heading="Models against people", order=60)
