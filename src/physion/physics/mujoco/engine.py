@@ -20,6 +20,7 @@ from physion.physics.mujoco.contacts import ContactRows
 from physion.physics.mujoco.model import compile_model
 from physion.physics.mujoco.settings import MujocoSettings
 from physion.physics.rigid.actors import find_actors
+from physion.physics.rigid.motion import MIN_SPIN
 from physion.physics.trajectory import State, Trajectory
 from physion.scenes.scene import FRAME_TIME, Scene
 
@@ -27,8 +28,6 @@ F64 = NDArray[np.float64]
 
 VERSION = 1
 """Version of the engine: to be raised when scenes move differently under the same settings."""
-MIN_SPIN = 1e-12
-"""Radians per second: keeps the cap of the angular velocity from dividing by zero."""
 
 
 class MujocoEngine:
