@@ -8,23 +8,17 @@ from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any
 
-import torch
 from lightning_fabric import Fabric
 from lightning_fabric.strategies.ddp import DDPStrategy
 
-from physion.errors import BadInputError, PhysionError
+from physion.errors import BadInputError
+from physion.models.raised import OutOfMemoryError, is_out_of_memory
 from physion.models.settings import TrainingSettings
 
 PRECISIONS = ("32-true", "16-mixed", "bf16-mixed")
 """Precisions in which weights and features stay float32."""
-_MEMORY_TEXTS = ("out of memory", "can't allocate memory", "not enough memory")
-"""Parts of the messages by which torch reports that memory is used up."""
 _TIMEOUT = timedelta(hours=6)
 """How long processes wait for one of them, which may compute features before the others."""
-
-
-class OutOfMemoryError(PhysionError):
-    """Error for a training that needs more memory than there is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +35,7 @@ class Devices:
     nodes: int = 1
 
 
-def make_fabric(devices: Devices, precision: str) -> Fabric:
+def make_fabric(devices: Devices, precision: str = "32-true") -> Fabric:
     """Return a Fabric on the given devices, launched if there are several.
 
     Raises `BadInputError` for devices that are not there, or an unknown precision.
@@ -80,9 +74,7 @@ def memory_advice(settings: TrainingSettings) -> Iterator[None]:
     try:
         yield
     except (MemoryError, RuntimeError) as error:
-        text = str(error).lower()
-        memory = isinstance(error, MemoryError | torch.OutOfMemoryError)
-        if not memory and not any(part in text for part in _MEMORY_TEXTS):
+        if not is_out_of_memory(error):
             raise
         clips, parts = settings.batch, settings.accumulate
         advice = (

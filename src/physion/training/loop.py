@@ -7,8 +7,9 @@ device does not wait for the processor at every step.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,12 +24,24 @@ from physion.models.settings import TrainingSettings
 from physion.seeds import stable_hash
 from physion.training.checkpoint import load_tensors, tensors_of
 from physion.training.folder import Stored, TrainingFolder
-from physion.training.losses import LOSS, Given, Learner, evaluating, losses_of, mean_over, ordered
+from physion.training.losses import (
+    LOSS,
+    Given,
+    Learner,
+    call,
+    evaluating,
+    losses_of,
+    mean_over,
+    ordered,
+)
 from physion.training.metrics_log import MetricsLog
 from physion.training.schedule import learning_rate
+from physion.training.sources.background import background
 from physion.training.state import TrainingState
-from physion.training.windows import Windows, step_request, validation_requests
+from physion.training.windows import Request, Windows, step_request, validation_requests
 
+_AHEAD = 8
+"""Largest number of batches that are read ahead."""
 _OPTIMIZERS = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}
 
 
@@ -121,7 +134,10 @@ class TrainingLoop:
             log = None
             if self._folder is not None:
                 log = stack.enter_context(MetricsLog(self._folder.path, state.step))
-            batches = self._batches(state.step)
+            requests = self._requests(state.step)
+            ahead = min(max(2, os.cpu_count() or 1), _AHEAD)
+            batches: Any = background(requests, self._data.training.read, ahead=ahead)
+            stack.enter_context(closing(batches))
             for step in range(state.step, settings.steps):
                 self._step(step, batches)
                 state.step = step + 1
@@ -139,15 +155,14 @@ class TrainingLoop:
             "precision": self._fabric.strategy.precision.state_dict(),
         }
 
-    def _batches(self, first: int) -> Iterator[Batch]:
-        """Yield the batches of this process from step ``first`` on."""
+    def _requests(self, first: int) -> Iterator[Request]:
+        """Yield what this process reads from step ``first`` on."""
         settings, fabric = self._settings, self._fabric
         size = settings.batch * settings.accumulate
         for step in range(first, settings.steps):
             request = step_request(self._data.training, size, self._seed, step)
             for index in range(settings.accumulate):
-                part = request.part(index * fabric.world_size + fabric.global_rank, self._parts)
-                yield self._data.training.read(part)
+                yield request.part(index * fabric.world_size + fabric.global_rank, self._parts)
 
     def _step(self, step: int, batches: Iterator[Batch]) -> None:
         """Do one step of the optimiser."""
@@ -248,7 +263,7 @@ class TrainingLoop:
         with evaluating(model, self._fabric):
             values = mean_over(lambda batch: losses_of(model, batch), *shared)
             if last and isinstance(model, HasBaseline):
-                trivial = mean_over(lambda batch: {LOSS: model.baseline(batch)}, *shared)
+                trivial = mean_over(lambda batch: {LOSS: call(model, "baseline", batch)}, *shared)
                 state.baseline = trivial[LOSS]
         state.validation = values[LOSS]
         if not math.isfinite(state.validation):

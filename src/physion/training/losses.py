@@ -10,9 +10,11 @@ import torch
 from lightning_fabric import Fabric
 from torch import Tensor, nn
 
-from physion.errors import BadInputError
+from physion.errors import BadInputError, PhysionError
 from physion.models.batch import Batch
+from physion.models.raised import describe_raised, is_out_of_memory
 from physion.seeds import stable_hash
+from physion.training.sources.background import background
 from physion.training.windows import Request, Windows
 
 LOSS = "loss"
@@ -51,10 +53,22 @@ def evaluating(model: nn.Module, fabric: Fabric) -> Iterator[None]:
         model.train()
 
 
+def call(model: Any, method: str, batch: Batch) -> Any:
+    """Return what a method of a model returns; what it raises names model, method and line."""
+    try:
+        return getattr(model, method)(batch)
+    except PhysionError:
+        raise
+    except Exception as error:
+        if is_out_of_memory(error):
+            raise
+        raise describe_raised(error, model.provenance().model, method) from error
+
+
 def losses_of(model: Any, batch: Batch) -> dict[str, Tensor]:
     """Return loss and parts of a batch; raise `BadInputError` if they are no scalars."""
-    losses = model.loss(batch)
     name = model.provenance().model
+    losses = call(model, "loss", batch)
     if not isinstance(losses, Mapping) or LOSS not in losses:
         raise BadInputError(f"model {name!r}: loss must give a mapping with {LOSS!r}")
     for part, value in losses.items():
@@ -82,10 +96,12 @@ def mean_over(
     sums: Tensor | None = None
     names: tuple[str, ...] = ()
     # A process without a batch of its own computes the first one and gives it no weight.
-    for number in range(rank, len(requests), processes) or [0]:
-        weight = len(requests[number].trials) if number % processes == rank else 0
+    own = list(range(rank, len(requests), processes)) or [0]
+    batches = background([requests[number] for number in own], windows.read)
+    for number, batch in zip(own, batches, strict=True):
+        weight = len(batch) if number % processes == rank else 0
         torch.manual_seed(stable_hash("validation", seed, number) % 2**63)
-        values = function(windows.read(requests[number]).to(fabric.device))
+        values = function(batch.to(fabric.device))
         names = ordered(values)
         row = torch.stack([values[name].detach().float() for name in names])
         row = torch.cat([row * weight, row.new_tensor([weight])])

@@ -27,7 +27,7 @@ from physion.training.checkpoint import hash_config, load_tensors, tensors_of, v
 from physion.training.devices import Devices, make_fabric, memory_advice
 from physion.training.folder import TrainingFolder
 from physion.training.loop import TrainingData, TrainingLoop
-from physion.training.losses import evaluating
+from physion.training.losses import call, evaluating
 from physion.training.model_card import model_card
 from physion.training.sources.source import WholeSource
 from physion.training.state import TrainingState
@@ -238,7 +238,7 @@ def _prepare(model: Any, data: TrainingData, seed: int, fabric: Fabric) -> None:
     """Let the model set its statistics from training clips."""
     with evaluating(model, fabric):
         torch.manual_seed(stable_hash("prepare", seed) % 2**63)
-        model.prepare(data.training.sample(seed).to(fabric.device))
+        call(model, "prepare", data.training.sample(seed).to(fabric.device))
 
 
 def _named(progress: Progress | None, what: str) -> Callable[[int, int], None] | None:
