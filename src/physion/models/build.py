@@ -29,6 +29,13 @@ models: Registry[ModelFactory] = Registry(
         "pEffNetLite0-mlp": "physion.models.frozen_encoder:peffnet_mlp",
         "pEffNetLite0-lstm": "physion.models.frozen_encoder:peffnet_lstm",
         "noisy-simulation": "physion.models.noisy_simulation:noisy_simulation",
+        "outcome": "physion.models.anchors.outcome:outcome",
+        "majority-of-people": "physion.models.anchors.majority_of_people:majority_of_people",
+        "state-classifier": "physion.models.anchors.state_classifier:state_classifier",
+        "already-touched": "physion.models.anchors.already_touched:already_touched",
+        "constant-motion": "physion.models.anchors.constant_motion:constant_motion",
+        "blob-centroids": "physion.models.anchors.blob_centroids:blob_centroids",
+        "copy-last-frame": "physion.models.anchors.copy_last_frame:copy_last_frame",
     },
 )
 """All models by name; other packages add theirs with the entry point group physion.models."""
