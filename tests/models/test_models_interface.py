@@ -23,7 +23,10 @@ from physion.readout.capabilities import ways
 from physion.registry import Registry
 
 TINY = {"encoder": "test_vit", "image_size": 64, "weights": "random", "hidden": 16}
-FROZEN = ["frozen-encoder", "pVGG-mlp", "pVGG-lstm", "pDeIT-mlp", "pDeIT-lstm"]
+FROZEN = [
+    "frozen-encoder", "pVGG-mlp", "pVGG-lstm", "pDeIT-mlp", "pDeIT-lstm", "pEffNetLite0-mlp",
+    "pEffNetLite0-lstm",
+]  # fmt: skip
 
 
 def tiny(name: str) -> Any:

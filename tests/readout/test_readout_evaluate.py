@@ -94,7 +94,7 @@ def test_a_second_run_does_nothing_and_says_the_same(
     content = done.path.read_bytes()
     done.path.unlink()
     evaluate(dots, "frozen-encoder", work, options=TINY, config=QUICK, progress=note)
-    assert "features" not in steps and "training" not in steps
+    assert "features" not in steps and "training all" not in steps
     assert done.path.read_bytes() == content
 
 
@@ -107,7 +107,7 @@ def test_other_dynamics_share_the_features(done: Evaluation, dots: Dataset, work
         dots, "frozen-encoder", work, options={**TINY, "dynamics": "lstm"}, config=config,
         progress=lambda what, done, total: steps.append(what),
     )  # fmt: skip
-    assert "features" not in steps and steps.count("training") == 5
+    assert "features" not in steps and steps.count("training all") == 6
     assert set(evaluation.predictions["Model"]) == {"random-test_vit-lstm"}
 
 
@@ -166,8 +166,10 @@ def test_an_encoder_without_dynamics_has_two_readouts(
     class Seeing:
         spec = inner.spec
         provenance = inner.provenance
-        encoder_digest = inner.encoder_digest
-        encode = inner.encode
+        digest = encoder_digest = inner.encoder_digest
+
+        def encode(self, batch: Any) -> Any:
+            return inner.encode(batch.to("cpu")).numpy()
 
     table = evaluate_model(dots, Seeing(), work, config=QUICK).predictions
     assert set(table["Protocol"]) == {"observed", "full"}

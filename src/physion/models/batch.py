@@ -229,7 +229,8 @@ class Provenance:
     """Origin of a model, which is written to every row of its predictions.
 
     ``init`` names the initial weights: ``imagenet``, ``package:<name>``, ``local:<sha256>``,
-    ``random``, or ``none`` for a model without weights. The other fields are columns of the official result files.
+    ``random``, or ``none`` for a model without weights. The other fields are columns of the
+    official result files.
     """
 
     model: str

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.compute.progress import Progress
+from physion.compute.progress import Progress, tracked
 from physion.errors import BadInputError
-from physion.models.batch import Batch, Rollout
+from physion.models.batch import Batch
 from physion.models.interface import Model, features_digest
 from physion.readout.feature_file import (
     ArraysInMemory,
@@ -28,7 +28,8 @@ from physion.readout.feature_file import (
     open_features,
     write_features,
 )
-from physion.readout.model_calls import call_model, check_finite, to_array
+from physion.readout.model_calls import model_name
+from physion.readout.model_outputs import CONTACT, GAP, Arrays, encode_clips, imagine_clips
 from physion.readout.rollouts import Outcomes
 from physion.readout.stored_features import FEATURES, StoredFeatures
 from physion.training.sources.source import ObservedSource, Part
@@ -38,9 +39,7 @@ _VERSION = "1"
 _WRITE_TRIALS, _WRITE_BYTES = 32, 2**26
 """Trials, or bytes, after which features are written. The digest is asked before each writing,
 which for a large network takes as long as encoding some clips."""
-GAP, CONTACT = "gap", "contact"
 IMAGINED = "imagined"
-Arrays = Mapping[str, NDArray[Any]]
 
 
 @dataclass(frozen=True)
@@ -92,7 +91,7 @@ class FeatureStore:
         part
             Frames of the clip that are encoded.
         progress
-            Learns how many trials are encoded.
+            Learns how many encoder batches are done.
 
         Raises
         ------
@@ -108,9 +107,9 @@ class FeatureStore:
 
         def compute(group: tuple[str, ...]) -> list[Arrays]:
             batch: Batch = read(group)
-            return _encode(model, batch)
+            return encode_clips(model, batch)
 
-        work = _Work("features", lambda: features_digest(model), compute, _name(model), part)
+        work = _Work("features", lambda: features_digest(model), compute, model_name(model), part)
         rows = self._rows(work, source, trials, progress)
         return StoredFeatures(trials, [rows[trial] for trial in trials])
 
@@ -135,13 +134,13 @@ class FeatureStore:
         source
             Source of the context.
         context
-            Features of the context for a model that also encodes, rows as ``trials``.
+            Features of the context of at least ``trials``, for a model that also encodes.
         trials
             Names, in the order of the result.
         samples, seed, knobs
             Number of futures S, seed and settings for ``model.imagine``.
         progress
-            Learns how many trials are imagined.
+            As `encoded`.
 
         Returns
         -------
@@ -154,18 +153,19 @@ class FeatureStore:
         BadInputError, OutOfMemoryError
             As `encoded`.
         """
-        place = {trial: row for row, trial in enumerate(trials)}
+        place = {trial: row for row, trial in enumerate(context.trials if context else ())}
 
         def compute(group: tuple[str, ...]) -> list[Arrays]:
             batch = source.context(group)
             if context is not None:
                 features = context.select([place[trial] for trial in group]).array()
                 batch = dataclasses.replace(batch, features=features)
-            return _imagine(model, batch, samples, seed, knobs)
+            return imagine_clips(model, batch, samples, seed, knobs)
 
-        settings = {"samples": samples, "seed": seed, "knobs": dict(sorted(knobs.items()))}
+        values = {name: float(knobs[name]) for name in sorted(knobs)}
+        settings = {"samples": samples, "seed": seed, "knobs": values}
         work = _Work(
-            "imagined", model.digest, compute, _name(model), IMAGINED, json.dumps(settings)
+            "imagined", model.digest, compute, model_name(model), IMAGINED, json.dumps(settings)
         )
         by_trial = self._rows(work, source, trials, progress)
         rows = [by_trial[trial] for trial in trials]
@@ -194,8 +194,7 @@ class FeatureStore:
             if stored is not None:
                 rows[trial] = stored
         missing = [trial for trial in identities if trial not in rows]
-        done = len(rows)
-        for computed in self._compute(work, missing):
+        for computed in self._compute(work, missing, progress):
             if _ask_digest(work) != digest:
                 raise BadInputError(
                     f"model {work.model!r}: its digest changed while it computed {work.what}; "
@@ -203,15 +202,15 @@ class FeatureStore:
                 )
             for trial, arrays in computed.items():
                 rows[trial] = self._write(identities[trial], arrays)
-            if progress is not None:
-                progress(work.what, len(rows) - done, len(missing))
         return rows
 
-    def _compute(self, work: _Work, trials: Sequence[str]) -> Iterator[dict[str, Arrays]]:
-        """Yield the arrays of some trials after the other, as many as are written at a time."""
+    def _compute(
+        self, work: _Work, trials: Sequence[str], progress: Progress | None
+    ) -> Iterator[dict[str, Arrays]]:
+        """Yield the arrays of ``trials``, as many at a time as are written together."""
+        groups = [tuple(trials[i : i + self._batch]) for i in range(0, len(trials), self._batch)]
         pending: dict[str, Arrays] = {}
-        for start in range(0, len(trials), self._batch):
-            group = tuple(trials[start : start + self._batch])
+        for group in tracked(groups, work.what, len(groups), progress if groups else None):
             pending |= zip(group, work.compute(group), strict=True)
             size = sum(value.nbytes for arrays in pending.values() for value in arrays.values())
             if len(pending) >= _WRITE_TRIALS or size >= _WRITE_BYTES:
@@ -264,60 +263,6 @@ def _ask_digest(work: _Work) -> str:
     return digest
 
 
-def _encode(model: Model, batch: Batch) -> list[Arrays]:
-    """Return the features (T', D) of every clip of a batch."""
-    clips, steps = batch.frames.shape[:2]
-    value = call_model(model, "encode", batch)
-    expected = steps if model.spec.framewise else None
-    features = to_array(value, model, "encode gave features", (clips, expected, None), ("float32",))
-    if features.shape[1] > steps:
-        raise BadInputError(
-            f"model {_name(model)!r}: encode gave features of {features.shape[1]} time steps for "
-            f"clips of {steps} frames"
-        )
-    check_finite(features, model, "encode gave features", batch.trials)
-    return [{FEATURES: row} for row in features]
-
-
-def _imagine(
-    model: Model, batch: Batch, samples: int, seed: int, knobs: Mapping[str, float]
-) -> list[Arrays]:
-    """Return features (S * future, D), gap (S) and contact (S) of every clip, if given."""
-    rollout = call_model(model, "imagine", batch, samples, seed, **knobs)
-    if not isinstance(rollout, Rollout):
-        raise BadInputError(
-            f"model {_name(model)!r}: imagine gave {type(rollout).__name__}, expected Rollout"
-        )
-    clips, future = len(batch), model.spec.future
-    expected: dict[str, tuple[tuple[int | None, ...], tuple[str, ...]]] = {
-        FEATURES: ((clips, samples, future, None), ("float32",)),
-        GAP: ((clips, samples), ("float64", "float32")),
-        CONTACT: ((clips, samples), ("bool",)),
-    }
-    arrays: dict[str, NDArray[Any]] = {}
-    for name, (shape, dtypes) in expected.items():
-        value = getattr(rollout, name)
-        if value is None:
-            continue
-        what = f"imagine gave {name}"
-        arrays[name] = to_array(value, model, what, shape, dtypes)
-        check_finite(arrays[name], model, what, batch.trials)
-    if not arrays:
-        raise BadInputError(
-            f"model {_name(model)!r}: imagine gave none of features, gap and contact"
-        )
-    if FEATURES in arrays:
-        features = arrays[FEATURES]
-        arrays[FEATURES] = features.reshape(clips, samples * future, features.shape[-1])
-    if GAP in arrays:
-        arrays[GAP] = arrays[GAP].astype(np.float64)
-    return [{name: value[row] for name, value in arrays.items()} for row in range(clips)]
-
-
 def _stack(rows: Sequence[FeatureArrays], name: str) -> NDArray[Any]:
     """Return one array of all trials."""
     return np.stack([row.read(name).reshape(row.shapes[name]) for row in rows])
-
-
-def _name(model: Model) -> str:
-    return str(model.provenance().model)

@@ -23,7 +23,7 @@ Part = StoredFeatures | NDArray[Any]
 Parts = Part | Sequence[Part]
 """Features (n, d) or (n, T, D) of n trials, or several that are joined in time."""
 
-_READ_BYTES = 2**26
+_READ_BYTES = 2**25
 """Bytes of features that are read at a time."""
 _COLUMNS = 1024
 """Columns that are standardised at a time; they should fit into the cache of the processor."""
@@ -70,6 +70,8 @@ class JoinedFeatures:
 
     def columns(self, start: int, stop: int) -> NDArray[Any]:
         """Return columns ``start`` to ``stop``; raise `BadInputError` if one is not finite."""
+        if 0 in self.shape:
+            return np.zeros((self.shape[0], stop - start), np.float32)
         pieces = []
         for part in self._parts:
             width = _width(part)

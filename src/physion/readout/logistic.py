@@ -280,7 +280,7 @@ def _choose(
 
 
 def _check(train: JoinedFeatures, labels: Booleans, test: JoinedFeatures) -> None:
-    if train.shape[1] != test.shape[1]:
+    if train.shape[0] and test.shape[0] and train.shape[1] != test.shape[1]:
         raise BadInputError(
             f"readout needs (n, d) features of one width, not {train.shape} and {test.shape}"
         )

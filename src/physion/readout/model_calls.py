@@ -8,10 +8,8 @@ module does not import torch: where torch was not imported, no model is a ``Modu
 from __future__ import annotations
 
 import sys
-import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,16 +18,10 @@ from numpy.typing import NDArray
 from physion.errors import BadInputError, PhysionError
 from physion.models.batch import Batch
 from physion.models.interface import Model
-
-_MEMORY_TEXTS = ("out of memory", "can't allocate memory", "not enough memory")
-"""Parts of the messages by which torch reports that memory is used up."""
+from physion.models.raised import OutOfMemoryError, describe_raised, is_out_of_memory
 
 
-class OutOfMemoryError(PhysionError):
-    """Error for a model that needs more memory than there is."""
-
-
-def call_model(model: Model, method: str, batch: Batch, *arguments: Any, **options: Any) -> Any:
+def call_model(model: Model, method: str, batch: Batch, /, *arguments: Any, **options: Any) -> Any:
     """Return what ``model.method(batch, ...)`` returns.
 
     Parameters
@@ -52,7 +44,7 @@ def call_model(model: Model, method: str, batch: Batch, *arguments: Any, **optio
     """
     function = getattr(model, method, None)
     if function is None:
-        raise BadInputError(f"model {_name(model)!r} has no method {method}")
+        raise BadInputError(f"model {model_name(model)!r} has no method {method}")
     try:
         if not is_network(model):
             return function(batch, *arguments, **options)
@@ -61,7 +53,7 @@ def call_model(model: Model, method: str, batch: Batch, *arguments: Any, **optio
     except PhysionError:
         raise
     except Exception as error:
-        raise _explain(error, model, function, batch) from error
+        raise _explain(error, model, method, batch) from error
 
 
 def is_network(model: object) -> bool:
@@ -105,7 +97,7 @@ def to_array(
         got = kind if actual is None else f"{kind} {tuple(actual)}"
         sizes = ", ".join("any" if size is None else str(size) for size in shape)
         raise BadInputError(
-            f"model {_name(model)!r}: {what} as {got}, expected {dtypes[0]} ({sizes})"
+            f"model {model_name(model)!r}: {what} as {got}, expected {dtypes[0]} ({sizes})"
         )
     if not isinstance(value, np.ndarray):
         value = value.detach().cpu().numpy()
@@ -120,7 +112,7 @@ def check_finite(values: NDArray[Any], model: Model, what: str, trials: tuple[st
         if not finite.all():
             where = tuple(int(at) for at in np.argwhere(~finite)[0])
             raise BadInputError(
-                f"model {_name(model)!r}, trial {trial!r}: {what} that are not finite "
+                f"model {model_name(model)!r}, trial {trial!r}: {what} that are not finite "
                 f"({row[where]} at {where} of {row.shape}); check its weights and its inputs"
             )
 
@@ -148,33 +140,19 @@ def _device(network: Any) -> Any:
     return "cpu"
 
 
-def _explain(
-    error: Exception, model: Model, function: Callable[..., Any], batch: Batch
-) -> PhysionError:
+def _explain(error: Exception, model: Model, method: str, batch: Batch) -> PhysionError:
     """Return the error that says in one line what a model raised."""
-    name, clips, steps = _name(model), *batch.frames.shape[:2]
-    if _is_out_of_memory(error):
-        advice = (
-            f"lower the encoder batch, now {clips}" if clips > 1 else "lower the image size of it"
-        )
+    name = model_name(model)
+    clips, steps = batch.frames.shape[:2]
+    if is_out_of_memory(error):
+        lower = f"the encoder batch, now {clips}" if clips > 1 else "the image size of the model"
         return OutOfMemoryError(
-            f"model {name!r}: {function.__name__} ran out of memory with {clips} clips of {steps} "
-            f"frames at a time; {advice}"
+            f"model {name!r}: {method} ran out of memory with {clips} clips of {steps} frames at a "
+            f"time; lower {lower}"
         )
-    last = traceback.extract_tb(error.__traceback__)[-1]
-    return BadInputError(
-        f"model {name!r}: {function.__name__} raised {type(error).__name__}: "
-        f"{' '.join(str(error).split())} ({Path(last.filename).name}, line {last.lineno})"
-    )
+    return describe_raised(error, name, method)
 
 
-def _is_out_of_memory(error: Exception) -> bool:
-    """Return whether an exception of numpy or torch says that memory is used up."""
-    if isinstance(error, MemoryError):
-        return True
-    text = str(error).lower()
-    return isinstance(error, RuntimeError) and any(part in text for part in _MEMORY_TEXTS)
-
-
-def _name(model: Model) -> str:
+def model_name(model: Model) -> str:
+    """Return the name of a model in messages."""
     return str(model.provenance().model)

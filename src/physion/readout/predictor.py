@@ -85,9 +85,9 @@ class Predictor:
         self.problems: dict[str, str] = self._rollouts.problems
         self._initial: Any = None
         if is_network(self.model):
-            from physion.training.device import place_model
+            from physion.training.devices import Devices, make_fabric
 
-            place_model(self.model, self.config.accelerator)
+            make_fabric(Devices(self.config.accelerator), "32-true").to_device(self.model)
         if isinstance(self.model, SeesOutcomes):
             self.model = self.model.with_outcomes(self._outcomes)
 
