@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -19,7 +21,6 @@ from torch import nn
 
 from physion.errors import BadInputError
 from physion.models.batch import Batch, Provenance, Rollout, Spec
-from physion.readout.feature_file import open_features
 from physion.readout.feature_store import FeatureStore
 from physion.readout.model_calls import OutOfMemoryError
 
@@ -156,3 +157,392 @@ def test_features_are_those_of_the_model_and_are_computed_once(
     assert (again.array() == in_memory.array()[[4, 1, 4, 0]]).all()
     assert (first.array() == in_memory.array()[:3]).all()
     assert again.array().dtype == np.float32
+
+
+def test_features_after_training_are_never_those_from_before(tmp_path: Path) -> None:
+    model, movies, store = Network(), Movies(), FeatureStore(tmp_path)
+    before = store.encoded(model, movies, TRIALS, "context").array()
+    weights = {name: value.clone() for name, value in model.state_dict().items()}
+    loss = model.layer(torch.ones(1, 12)).sum()
+    loss.backward()  # type: ignore[no-untyped-call]
+    torch.optim.SGD(model.parameters(), lr=0.1).step()
+    movies.read.clear()
+    after = store.encoded(model, movies, TRIALS, "context").array()
+    assert movies.read and not np.isclose(after, before).any()
+    fresh = FeatureStore(None).encoded(model, movies, TRIALS, "context").array()
+    assert (after == fresh).all()
+    model.load_state_dict(weights)
+    movies.read.clear()
+    assert (store.encoded(model, movies, TRIALS, "context").array() == before).all()
+    assert not movies.read, "the features of the first weights are still there"
+
+
+def test_other_clips_are_other_features(tmp_path: Path) -> None:
+    store, model = FeatureStore(tmp_path), Numpy()
+    first = store.encoded(model, Movies(), TRIALS, "context").array()
+    other = store.encoded(model, Movies(version=1), TRIALS, "context").array()
+    assert not (first == other).all() and len(files(tmp_path)) == 2 * len(TRIALS)
+
+
+class Forgetful(Numpy):
+    """Its digest depends on how often it encoded, as that of a network which is not frozen."""
+
+    def encode(self, batch: Batch) -> Any:
+        self.version += 1
+        return super().encode(batch)
+
+
+def test_a_model_that_changes_while_it_encodes_is_refused(tmp_path: Path) -> None:
+    model = Forgetful()
+    with pytest.raises(BadInputError, match="digest changed while it computed features"):
+        FeatureStore(tmp_path).encoded(model, Movies(), TRIALS, "context")
+    assert not files(tmp_path)
+
+
+class Apart(Network):
+    """Network whose features do not depend on its dynamics."""
+
+    def encoder_digest(self) -> str:
+        return sha(self.layer.weight.tolist(), self.layer.bias.tolist())
+
+
+def test_dynamics_change_what_is_imagined_and_not_what_is_encoded(tmp_path: Path) -> None:
+    model, movies, store = Apart(), Movies(), FeatureStore(tmp_path, batch=2)
+
+    def imagined(**knobs: float) -> tuple[Any, Any]:
+        context = store.encoded(model, movies, TRIALS, "context")
+        return store.imagined(model, movies, context, TRIALS[1:], samples=3, seed=0, knobs=knobs)
+
+    features, outcomes = imagined()
+    context = FeatureStore(None).encoded(model, movies, TRIALS, "context").array()[1:]
+    with torch.inference_mode():
+        last = model.dynamics(torch.tensor(context[:, -1])).numpy()
+    expected = [last * step + sample for sample in range(3) for step in range(1, 5)]
+    assert features.shape == (4, 12, 5), "sample after sample"
+    assert features.array() == pytest.approx(np.stack(expected, axis=1), abs=1e-5)
+    assert outcomes.gap == pytest.approx(features.array().reshape(4, 3, -1).mean(2), abs=1e-5)
+    assert outcomes.contact is None
+    movies.read.clear()
+    again, stored = imagined()
+    assert not movies.read and (again.array() == features.array()).all()
+    assert (stored.gap == outcomes.gap).all()
+    scaled, _ = imagined(scale=2.0)
+    assert not np.isclose(scaled.array(), features.array()).all()
+    with torch.no_grad():
+        model.dynamics.weight += 1
+    movies.read.clear()
+    changed, _ = imagined()
+    assert movies.read == [TRIALS[1:3], TRIALS[3:]], "only the futures are computed again"
+    assert not np.isclose(changed.array(), features.array()).any()
+
+
+def test_every_damaged_bit_is_noticed_and_the_file_written_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Hundreds of files are written, none of which must survive a power failure.
+    monkeypatch.setattr("physion.atomic.os.fsync", lambda descriptor: None)
+    model, movies, store = Numpy(), Movies(), FeatureStore(tmp_path)
+    expected = store.encoded(model, movies, TRIALS[:1], "context").array()
+    (path,) = files(tmp_path)
+    whole = path.read_bytes()
+    bits = np.random.default_rng(0).integers(0, 8, len(whole))
+    for place, bit in enumerate(bits):
+        damaged = bytearray(whole)
+        damaged[place] ^= 1 << int(bit)
+        path.write_bytes(damaged)
+        movies.read.clear()
+        features = store.encoded(model, movies, TRIALS[:1], "context").array()
+        assert movies.read, f"bit {bit} of byte {place}"
+        assert (features == expected).all() and path.read_bytes() == whole
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda whole: b"",
+        lambda whole: whole[:5],
+        lambda whole: whole[:-1],
+        lambda whole: whole + b"\0",
+        lambda whole: (2**63).to_bytes(8, "little") + whole[8:],
+        lambda whole: (4).to_bytes(8, "little") + b"null" + whole[12:],
+        lambda whole: (8).to_bytes(8, "little") + b"[" * 8 + whole[16:],
+        lambda whole: (100_000).to_bytes(8, "little") + b"[" * 100_000,
+        lambda whole: whole.replace(b'"F32"', b'"F16"'),
+        lambda whole: whole.replace(b"[3,12]", b"[12,3]"),
+        lambda whole: whole.replace(b"[3,12]", b"[3,-1]"),
+    ],
+)
+def test_a_broken_file_is_written_anew(tmp_path: Path, damage: Callable[[bytes], bytes]) -> None:
+    model, movies, store = Numpy(), Movies(), FeatureStore(tmp_path)
+    expected = store.encoded(model, movies, TRIALS[:1], "context").array()
+    (path,) = files(tmp_path)
+    whole = path.read_bytes()
+    assert damage(whole) != whole
+    path.write_bytes(damage(whole))
+    assert (store.encoded(model, movies, TRIALS[:1], "context").array() == expected).all()
+    assert path.read_bytes() == whole
+
+
+def test_a_file_in_the_place_of_another_is_not_read(tmp_path: Path) -> None:
+    model, movies, store = Numpy(), Movies(), FeatureStore(tmp_path)
+    expected = store.encoded(model, movies, TRIALS[:2], "context").array()
+    first, second = files(tmp_path)
+    shutil.copy(first, second)
+    assert (store.encoded(model, movies, TRIALS[:2], "context").array() == expected).all()
+    assert first.read_bytes() != second.read_bytes()
+
+
+@pytest.mark.parametrize("delete", [True, False])
+def test_a_file_that_changes_while_in_use_is_an_error(tmp_path: Path, delete: bool) -> None:
+    features = FeatureStore(tmp_path).encoded(Numpy(), Movies(), TRIALS, "context")
+    path = files(tmp_path)[0]
+    content = path.read_bytes()
+    path.unlink()
+    if not delete:
+        path.write_bytes(content[:-1] + b"x")
+    with pytest.raises(BadInputError, match="run again"):
+        features.array()
+
+
+def test_files_are_safetensors_with_aligned_float32(tmp_path: Path) -> None:
+    model = Numpy()
+    features = FeatureStore(tmp_path).encoded(model, Movies(), TRIALS[:1], "context").array()
+    (path,) = files(tmp_path)
+    with safe_open(path, "numpy") as file:
+        assert (file.get_tensor("features") == features[0]).all()
+        metadata = file.metadata()
+    assert metadata["trial"] == TRIALS[0] and metadata["digest"] == model.digest()
+    assert metadata["part"] == "context" and len(metadata["sha256"]) == 64
+    start = 8 + int.from_bytes(path.read_bytes()[:8], "little")
+    assert start % 64 == 0
+    assert (np.memmap(path, np.float32, "r", start, (3, 12)) == features[0]).all()
+
+
+def test_what_was_written_before_a_failure_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("physion.readout.feature_store._WRITE_TRIALS", 2)
+    model, movies, store = Numpy(), Movies(), FeatureStore(tmp_path, batch=1)
+    good = model.give
+
+    def fail_late(pixels: Any) -> Any:
+        if len(movies.read) > 4:
+            raise ValueError("too hot")
+        return good(pixels)
+
+    model.give = fail_late
+    with pytest.raises(BadInputError, match="encode raised ValueError: too hot"):
+        store.encoded(model, movies, TRIALS, "context")
+    assert len(files(tmp_path)) == 4
+    model.give = good
+    movies.read.clear()
+    store.encoded(model, movies, TRIALS, "context")
+    assert movies.read == [(TRIALS[4],)]
+
+
+def test_features_of_many_trials_keep_no_file_open(tmp_path: Path) -> None:
+    descriptors = Path("/proc/self/fd")
+    if not descriptors.is_dir():
+        pytest.skip("this system does not list open files")
+    store = FeatureStore(tmp_path)
+    before = len(os.listdir(descriptors))  # noqa: PTH208 - the list itself is what is counted
+    features = store.encoded(Numpy(), Movies(), TRIALS, "context")
+    features.frame(1)
+    assert len(os.listdir(descriptors)) == before  # noqa: PTH208
+    assert len(features) == 5
+
+
+def with_nan(pixels: Any) -> Any:
+    features = pixels.reshape(*pixels.shape[:2], -1).copy()
+    features[-1, 2, 7] = np.nan
+    return features
+
+
+def test_features_that_are_not_finite_name_model_trial_and_tensor(tmp_path: Path) -> None:
+    store = FeatureStore(tmp_path, batch=2)
+    with pytest.raises(BadInputError) as caught:
+        store.encoded(Numpy(with_nan), Movies(), TRIALS, "context")
+    assert str(caught.value).startswith(
+        "model 'plain', trial 'roll_2': encode gave features that are not finite (nan at (2, 7)"
+    )
+    assert not files(tmp_path)
+
+
+def flat(pixels: Any) -> Any:
+    return pixels.reshape(*pixels.shape[:2], -1)
+
+
+@pytest.mark.parametrize(
+    ("give", "got"),
+    [
+        (lambda x: flat(x).astype(np.float64), "float64 (2, 3, 12)"),
+        (lambda x: flat(x)[:1], "float32 (1, 3, 12)"),
+        (lambda x: flat(x)[:, :2], "float32 (2, 2, 12)"),
+        (lambda x: flat(x)[..., :0], "float32 (2, 3, 0)"),
+        (lambda x: x, "float32 (2, 3, 2, 2, 3)"),
+        (lambda x: flat(x).tolist(), "list"),
+        (lambda x: None, "NoneType"),
+    ],
+)
+def test_features_of_another_shape_or_type_are_refused(give: Any, got: str) -> None:
+    with pytest.raises(BadInputError) as caught:
+        FeatureStore(None, batch=2).encoded(Numpy(give), Movies(), TRIALS, "context")
+    assert str(caught.value) == (
+        f"model 'plain': encode gave features as {got}, expected float32 (2, 3, any)"
+    )
+
+
+def test_features_of_unequal_trials_are_refused() -> None:
+    sizes = iter([12, 12, 6])
+    model = Numpy(lambda x: flat(x)[..., : next(sizes)])
+    with pytest.raises(BadInputError, match=r"'link_1' are .3, 6., those of 'roll_1' .3, 12."):
+        FeatureStore(None, batch=2).encoded(model, Movies(), TRIALS, "context")
+
+
+def test_fewer_steps_are_for_models_that_combine_frames() -> None:
+    model = Numpy(lambda x: flat(x).mean(axis=1, keepdims=True))
+    model.spec = Spec(image_size=2, context=3, future=4, framewise=False)
+    assert FeatureStore(None).encoded(model, Movies(), TRIALS, "context").shape == (5, 1, 12)
+    model.give = lambda x: np.concatenate([flat(x)] * 2, axis=1)
+    with pytest.raises(BadInputError, match="6 time steps for clips of 3 frames"):
+        FeatureStore(None).encoded(model, Movies(), TRIALS, "context")
+
+
+class Dreamer(Numpy):
+    """Model that imagines what it is given."""
+
+    def __init__(self, **given: Any) -> None:
+        super().__init__()
+        self.given = given
+
+    def imagine(self, context: Batch, samples: int, seed: int) -> Any:
+        return self.given.get("rollout") or Rollout(**self.given)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"features": np.zeros((5, 2, 3, 1), np.float32)}, "expected float32 (5, 2, 4, any)"),
+        ({"features": np.full((5, 2, 4, 1), np.inf, np.float32)}, "trial 'roll_1': imagine gave"),
+        ({"gap": np.zeros((5, 3))}, "gap as float64 (5, 3), expected float64 (5, 2)"),
+        ({"gap": np.full((5, 2), np.nan)}, "imagine gave gap that are not finite"),
+        ({"contact": np.zeros((5, 2))}, "contact as float64 (5, 2), expected bool (5, 2)"),
+        ({}, "imagine gave none of features, gap and contact"),
+        ({"rollout": 3}, "imagine gave int, expected Rollout"),
+    ],
+)
+def test_wrong_rollouts_are_refused(given: Any, message: str) -> None:
+    with pytest.raises(BadInputError) as caught:
+        FeatureStore(None, batch=5).imagined(
+            Dreamer(**given), Movies(), None, TRIALS, samples=2, seed=0, knobs={}
+        )
+    assert message in str(caught.value)
+
+
+def test_outcomes_alone_are_stored_too(tmp_path: Path) -> None:
+    contact = np.array([[True, False]] * 5)
+    model, movies, store = Dreamer(contact=contact), Movies(), FeatureStore(tmp_path, batch=5)
+    for _ in range(2):
+        features, outcomes = store.imagined(
+            model, movies, None, TRIALS, samples=2, seed=0, knobs={}
+        )
+        assert features is None and outcomes.gap is None
+        assert outcomes.contact.dtype == bool and (outcomes.contact == contact).all()
+    assert len(movies.read) == 1
+    store.imagined(model, movies, None, TRIALS, samples=2, seed=1, knobs={})
+    assert len(movies.read) == 2
+
+
+def fill_memory(pixels: Any) -> Any:
+    return np.ones(2**50)
+
+
+class HugeNetwork(Network):
+    def encode(self, batch: Batch) -> Any:
+        return torch.ones(2**50)
+
+
+class FullDevice(Network):
+    def encode(self, batch: Batch) -> Any:
+        raise torch.OutOfMemoryError("CUDA: tried to get 20.00 MiB")
+
+
+@pytest.mark.parametrize("model", [Numpy(fill_memory), HugeNetwork(), FullDevice()])
+def test_memory_used_up_names_the_setting_to_lower(model: Any) -> None:
+    with pytest.raises(OutOfMemoryError, match=r"3 clips of 3 frames .* encoder batch, now 3"):
+        FeatureStore(None, batch=3).encoded(model, Movies(), TRIALS, "context")
+    with pytest.raises(OutOfMemoryError, match="lower the image size of the model"):
+        FeatureStore(None, batch=1).encoded(model, Movies(), TRIALS, "context")
+
+
+def test_what_a_model_raises_names_model_method_and_line() -> None:
+    def divide(pixels: Any) -> Any:
+        return 1 // 0
+
+    with pytest.raises(BadInputError) as caught:
+        FeatureStore(None).encoded(Numpy(divide), Movies(), TRIALS, "context")
+    line = divide.__code__.co_firstlineno + 1
+    assert "model 'plain': encode raised ZeroDivisionError" in str(caught.value)
+    assert f"({Path(__file__).name}, line {line})" in str(caught.value)
+    assert isinstance(caught.value.__cause__, ZeroDivisionError)
+    absent: Any = Network()
+    absent.encode = None
+    with pytest.raises(BadInputError, match="has no method encode"):
+        FeatureStore(None).encoded(absent, Movies(), TRIALS, "context")
+
+
+def test_every_part_of_a_network_is_in_its_mode_again() -> None:
+    model = Network()
+    model.train()
+    model.dropout.eval()
+    FeatureStore(None).encoded(model, Movies(), TRIALS, "context")
+    assert model.training and model.layer.training and not model.dropout.training
+    assert torch.is_grad_enabled() and not torch.is_inference_mode_enabled()
+
+
+def test_later_frames_need_a_whole_source() -> None:
+    observed: Any = ObservedMovies(Movies())
+    store = FeatureStore(None)
+    assert store.encoded(Numpy(), observed, TRIALS, "context").shape == (5, 3, 12)
+    for part in ("later", "whole"):
+        with pytest.raises(BadInputError, match=f"no part '{part}'"):
+            store.encoded(Numpy(), observed, TRIALS, part)  # type: ignore[arg-type]
+
+
+def test_bad_folders_batches_and_digests_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="at least 1, not 0"):
+        FeatureStore(None, batch=0)
+    (tmp_path / "file").write_text("not a folder")
+    with pytest.raises(BadInputError, match="cannot be stored in"):
+        FeatureStore(tmp_path / "file").encoded(Numpy(), Movies(), TRIALS, "context")
+    model: Any = Numpy()
+    model.digest = lambda: "../" * 10
+    with pytest.raises(BadInputError, match="expected a SHA-256"):
+        FeatureStore(tmp_path).encoded(model, Movies(), TRIALS, "context")
+
+
+def test_progress_counts_what_is_computed(tmp_path: Path) -> None:
+    calls: list[tuple[str, int, int]] = []
+    store = FeatureStore(tmp_path, batch=2)
+    for _ in range(2):
+        store.encoded(Numpy(), Movies(), TRIALS, "context", lambda *call: calls.append(call))
+    assert calls == [("features", done, 3) for done in range(4)] + [("features", 0, 0)]
+
+
+def test_no_trial_has_no_feature(tmp_path: Path) -> None:
+    store = FeatureStore(tmp_path)
+    assert store.encoded(Numpy(), Movies(), [], "context").array().size == 0
+    features, outcomes = store.imagined(Dreamer(), Movies(), None, [], samples=1, seed=0, knobs={})
+    assert features is None and outcomes.gap is None
+
+
+def test_models_without_torch_do_not_import_it() -> None:
+    code = (
+        "import sys\n"
+        "import physion.readout.feature_store, physion.readout.logistic\n"
+        "print(json.dumps(sorted({'torch', 'lightning_fabric', 'timm'} & set(sys.modules))))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", "import json\n" + code], capture_output=True, text=True, check=True
+    )
+    assert json.loads(done.stdout) == []
