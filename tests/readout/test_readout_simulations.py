@@ -11,15 +11,18 @@ import numpy as np
 import pandas as pd
 import pytest
 
+import physion.training.sources.states
 from physion.errors import BadInputError
-from physion.models import Provenance, Spec
+from physion.models import Batch, Provenance, Spec
 from physion.models.noisy_simulation import NoisySimulation, NoisySimulationConfig
 from physion.physics.trajectory import Contacts, State, Trajectory
 from physion.readout import EvaluationConfig, evaluate, evaluate_model
+from physion.readout.capabilities import choose_readouts
 from physion.readout.folds import plan_folds
-from physion.readout.simulations import SimulationReadout
+from physion.readout.predictor import Predictor
 from physion.scenes.scene import Body, Camera, Roles, Scene
 from physion.training.protocols import Training
+from physion.trials.trial_file import Trial
 
 FRAMES = 100
 CONFIG = NoisySimulationConfig(
@@ -92,12 +95,36 @@ class Shelf:
                         "trial": name, "scenario": "collide", "split": split, "digest": name,
                         "contact": len(path.contacts.frame) > 0, "recorded_contact": i % 2 == 0,
                         "movie_sha256": "", "observed_movie_sha256": "",
+                        "frames": FRAMES, "observed_frames": 45, "look": "redyellow",
                     }
                 )  # fmt: skip
         self.index = pd.DataFrame(rows)
 
-    def trial(self, name: str) -> Any:
-        return self.trials[name]
+        SHELVED.update(self.trials)
+
+    def paths(self, name: str) -> Any:
+        return SimpleNamespace(trial_file=Path(name))
+
+
+SHELVED: dict[str, Any] = {}
+"""Trials of all shelves, in place of their files."""
+
+
+@pytest.fixture(autouse=True)
+def shelves_in_place_of_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    def opened(path: Path) -> Any:
+        return SHELVED[path.name] if path.name in SHELVED else Trial.open(path)
+
+    monkeypatch.setattr(physion.training.sources.states, "Trial", SimpleNamespace(open=opened))
+
+
+def fitted_scale(shelf: Any, model: Any, folder: Path) -> tuple[float, np.ndarray]:
+    """Return the fitted scale and the probabilities of the tested trials."""
+    ways = choose_readouts(model, ())
+    predictor = Predictor(shelf, model, ways, EvaluationConfig(), folder)
+    (fold,) = plan_folds(shelf.index, Training.ALL, 5, 0)
+    (answers,) = predictor.predict(fold)
+    return answers.fitted["scale"], answers.probability
 
 
 @pytest.mark.parametrize("column", ["contact", "recorded_contact"])
@@ -105,14 +132,10 @@ def test_the_noise_is_fitted_on_readout_trials_alone(tmp_path: Path, column: str
     """The fit uses recorded outcomes, or simulated ones where there is no record."""
     shelf: Any = Shelf()
     shelf.index["recorded_contact"] = pd.array([pd.NA] * len(shelf.index), "boolean")
-    (fold,) = plan_folds(shelf.index, Training.ALL, 5, 0)
 
     def fitted(labels: pd.Series) -> tuple[float, np.ndarray]:
         shelf.index[column] = labels.astype(bool)
-        reader = SimulationReadout(shelf, NoisySimulation(CONFIG, Flight()), tmp_path)
-        reader.prepare([fold])
-        (answers,) = reader.predict(fold)
-        return answers.noise_scale, answers.probability
+        return fitted_scale(shelf, NoisySimulation(CONFIG, Flight()), tmp_path)
 
     truth = shelf.index["contact"].copy()
     tested = shelf.index["split"] == "testing"
@@ -154,20 +177,22 @@ def test_predictions_are_fractions_and_state_their_scale(tmp_path: Path) -> None
 def test_simulations_are_stored_and_not_made_again(tmp_path: Path) -> None:
     shelf: Any = Shelf(4, 3)
     engines = [Flight(), Flight(), Flight()]
-    (fold,) = plan_folds(shelf.index, Training.ALL, 5, 0)
     found, stored = [], []
     for engine, config in zip(engines, (CONFIG, CONFIG, replace(CONFIG, seed=1)), strict=True):
-        reader = SimulationReadout(shelf, NoisySimulation(config, engine), tmp_path)
-        reader.prepare([fold])
-        found.append(reader.predict(fold)[0].probability)
+        found.append(fitted_scale(shelf, NoisySimulation(config, engine), tmp_path)[1])
         stored.append(sorted(tmp_path.rglob("*.json")))
     assert engines[0].calls > 0 and engines[1].calls == 0
     assert engines[2].calls == engines[0].calls
     assert (found[0] == found[1]).all()
-    stored[0][0].write_text('{"contacts": 3}')
-    reader = SimulationReadout(shelf, NoisySimulation(CONFIG, engines[1]), tmp_path)
-    reader.prepare([fold])
-    assert engines[1].calls == 20
+    assert len(stored[0]) == 7 * 3 and len(stored[2]) == 2 * 7 * 3
+    text = stored[0][0].read_text()
+    changed = text.replace("true", "TRUE", 1).replace("false", "true", 1).replace("TRUE", "false")
+    for damaged in ('{"contacts": 3}', text[:-5], changed):
+        stored[0][0].write_text(damaged)
+        engines[1].calls = 0
+        again = fitted_scale(shelf, NoisySimulation(CONFIG, engines[1]), tmp_path)[1]
+        assert engines[1].calls == 20 and (again == found[0]).all()
+    assert stored[0][0].read_text() == text
 
 
 def test_a_trial_that_fails_is_named_and_the_others_go_on(tmp_path: Path) -> None:
@@ -196,7 +221,8 @@ def test_without_readout_trials_the_tested_ones_are_cross_fitted(tmp_path: Path)
 class Oracle:
     """State model of another package that reports the contacts it receives."""
 
-    spec = Spec(modalities=("state",))
+    spec = Spec(inputs=("state",), anchor="end", stride=1, context=1, future=0)
+    answers = "observed"
 
     def __init__(self, answer: float | None = None) -> None:
         self.answer, self.shown = answer, []  # type: ignore[var-annotated]
@@ -204,9 +230,14 @@ class Oracle:
     def provenance(self) -> Provenance:
         return Provenance("oracle", "none")
 
-    def predict_contact(self, scene: Scene, trajectory: Trajectory) -> float:
-        self.shown.append((len(trajectory), len(trajectory.contacts.frame)))
-        return self.answer if self.answer is not None else float(len(trajectory.contacts.frame) > 0)
+    def digest(self) -> str:
+        return "0" * 64
+
+    def predict(self, batch: Batch) -> Any:
+        paths = [motion.trajectory for motion in batch.state or ()]
+        self.shown += [(len(path), len(path.contacts.frame)) for path in paths]
+        found = [float(len(path.contacts.frame) > 0) for path in paths]
+        return np.array(found if self.answer is None else [self.answer] * len(found))
 
 
 def test_other_state_models_are_shown_the_observed_part_alone(tmp_path: Path) -> None:
@@ -217,6 +248,7 @@ def test_other_state_models_are_shown_the_observed_part_alone(tmp_path: Path) ->
     assert set(oracle.shown) == {(45, 0)}, "neither later frames nor later contacts"
     assert len(table) == 10 and (table["Predicted Prob_true"] == 0).all()
     assert set(table["Fit Labels"]) == {""}, "nothing is fitted"
+    assert set(table["Readout Type"]) == {"C"}
     with pytest.raises(BadInputError, match="not a probability"):
         evaluate_model(shelf, Oracle(1.5), tmp_path / "b", config=EvaluationConfig())
 
