@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -11,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from physion.cli import doctor
-from physion.cli.main import VERBS, main
+from physion.cli.main import OUTPUT_CLOSED, VERBS, main
 
 PYPROJECT = Path(__file__).parents[2] / "pyproject.toml"
 
@@ -103,3 +104,33 @@ def test_unknown_scenarios_get_the_closest(
         message = capsys.readouterr().err
         assert message.count("\n") == 1 and "collide" in message
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("buffered", [True, False])
+@pytest.mark.parametrize("command", ["--help", "ls", "ls --help", "doctor"])
+def test_a_closed_output_ends_the_command_quietly(command: str, buffered: bool) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    try:
+        done = subprocess.run(
+            [sys.executable, "-m", "physion.cli.main", *command.split()],
+            env={**os.environ, "PYTHONUNBUFFERED": "" if buffered else "1"},
+            stdout=writer,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    finally:
+        os.close(writer)
+    assert (done.returncode, done.stderr) == (OUTPUT_CLOSED, "")
+
+
+def test_no_output_is_no_error() -> None:
+    code = "import os, sys; os.close(1); os.execv(sys.executable, [sys.executable, *sys.argv[1:]])"
+    done = subprocess.run(
+        [sys.executable, "-c", code, "-m", "physion.cli.main", "ls"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")

@@ -1,12 +1,14 @@
 """Entry point ``physion VERB ...``: imports the module of the verb and prints errors in one line.
 
 Exit codes: 0 done; 1 done, but some trials failed or a check found a fault; 2 bad input or usage,
-no file is left half-written; 130 interrupted, the same command resumes.
+no file is left half-written; 130 interrupted, the same command resumes; 141 the program that reads
+the output closed it, as ``head`` does.
 """
 
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 
 VERBS = {
@@ -31,6 +33,9 @@ MODULES = {
 }
 """Modules of verbs that are Python keywords or have sub-verbs."""
 
+OUTPUT_CLOSED = 141
+"""Exit code that shells show for programs that write to a closed pipe: 128 + SIGPIPE."""
+
 
 def _usage() -> str:
     verbs = "\n".join(f"  {name:<10} {text}" for name, text in VERBS.items())
@@ -43,7 +48,32 @@ def _usage() -> str:
 
 def main(argv: list[str] | None = None) -> int:
     """Run one verb and return the exit code."""
-    args = sys.argv[1:] if argv is None else argv
+    from physion.errors import PhysionError
+
+    try:
+        try:
+            return _run_verb(sys.argv[1:] if argv is None else argv)
+        finally:
+            # Otherwise what is buffered would be written, and fail, after the last handler.
+            if sys.stdout is not None:
+                sys.stdout.flush()
+    except PhysionError as error:
+        message = " ".join(str(error).split())
+        print(f"physion: {message}", file=sys.stderr)
+        return error.exit_code
+    except BrokenPipeError:
+        _discard_output()
+        return OUTPUT_CLOSED
+    except OSError as error:
+        print(f"physion: {error.filename or 'a file'}: {error.strerror or error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("physion: interrupted; run the same command again to resume", file=sys.stderr)
+        return 130
+
+
+def _run_verb(args: list[str]) -> int:
+    """Print usage or version, or run the verb that ``args`` start with; return the exit code."""
     if not args or args[0] in ("-h", "--help"):
         print(_usage())
         return 0 if args else 2
@@ -52,34 +82,30 @@ def main(argv: list[str] | None = None) -> int:
 
         print(f"physion {__version__}")
         return 0
-    from physion.errors import PhysionError, UnknownNameError
+    if args[0] not in VERBS:
+        from physion.errors import UnknownNameError
 
-    try:
-        if args[0] not in VERBS:
-            raise UnknownNameError("verb", args[0], VERBS)
-        import tyro
+        raise UnknownNameError("verb", args[0], VERBS)
+    import tyro
 
-        module = importlib.import_module(f"physion.cli.{MODULES.get(args[0], args[0])}")
-        taken = 1
-        if args[1:2] and args[1] in getattr(module, "SUBVERBS", {}):
-            module, taken = importlib.import_module(module.SUBVERBS[args[1]]), 2
-        options = tyro.cli(
-            module.Options,
-            args=args[taken:],
-            prog=" ".join(["physion", *args[:taken]]),
-            description=module.__doc__,
-        )
-        return int(module.main(options))
-    except PhysionError as error:
-        message = " ".join(str(error).split())
-        print(f"physion: {message}", file=sys.stderr)
-        return error.exit_code
-    except OSError as error:
-        print(f"physion: {error.filename or 'a file'}: {error.strerror or error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("physion: interrupted; run the same command again to resume", file=sys.stderr)
-        return 130
+    module = importlib.import_module(f"physion.cli.{MODULES.get(args[0], args[0])}")
+    taken = 1
+    if args[1:2] and args[1] in getattr(module, "SUBVERBS", {}):
+        module, taken = importlib.import_module(module.SUBVERBS[args[1]]), 2
+    options = tyro.cli(
+        module.Options,
+        args=args[taken:],
+        prog=" ".join(["physion", *args[:taken]]),
+        description=module.__doc__,
+    )
+    return int(module.main(options))
+
+
+def _discard_output() -> None:
+    """Let standard output lead nowhere, so that what is buffered causes no error at exit."""
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, sys.stdout.fileno())
+    os.close(null)
 
 
 if __name__ == "__main__":

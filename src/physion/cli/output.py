@@ -19,7 +19,16 @@ from rich.progress import (
 
 from physion.atomic import write_atomic
 
-console = Console(highlight=False)
+
+class OutputConsole(Console):
+    """Console that leaves a closed standard output to `physion.cli.main`."""
+
+    def on_broken_pipe(self) -> None:
+        """Raise again the `BrokenPipeError` that rich is handling; it would exit with code 1."""
+        raise
+
+
+console = OutputConsole(highlight=False)
 """Console for results; progress goes to standard error, so that output can be piped."""
 
 
