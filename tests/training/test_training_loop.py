@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,23 +12,31 @@ import pytest
 import torch
 from torch import Tensor
 
-from physion.errors import BadInputError
+from physion.atomic import folder_lock
+from physion.errors import BadInputError, PhysionError
 from physion.models.batch import Batch
+from physion.models.raised import OutOfMemoryError
 from physion.models.settings import TrainingSettings
 from physion.training.checkpoint import read_checkpoint
-from physion.training.devices import Devices, OutOfMemoryError, make_fabric
+from physion.training.devices import Devices, make_fabric
 from physion.training.folder import CARD, CHECKPOINT, PREVIOUS, WEIGHTS
 from physion.training.loop import TrainingStoppedError
 from physion.training.metrics_log import METRICS, read_metrics
-from physion.training.schedule import Plateau, learning_rate
 from physion.training.train import TrainedModel, train_model
 from support.trained_models import QUICK, MovingValues, NextBrightness, equal_weights
 
-CPU = make_fabric(Devices("cpu"), "32-true")
+CPU = make_fabric(Devices("cpu"))
+ALL_AT_ONCE = replace(
+    QUICK, optimizer="adamw", schedule="cosine", warmup=5, clip=0.5, accumulate=2, weight_decay=0.1
+)
+PLATEAU = replace(
+    QUICK, schedule="plateau", validate_every=3, plateau_patience=0, plateau_factor=0.5,
+    learning_rate=0.1,
+)  # fmt: skip
 
 
 class Killed(Exception):
-    """End of a training in the middle, as by a signal: nothing is written after it."""
+    """End of a training in the middle, after which nothing is written."""
 
 
 def kill_at(step: int) -> Callable[[str, int, int], None]:
@@ -40,38 +47,333 @@ def kill_at(step: int) -> Callable[[str, int, int], None]:
     return progress
 
 
-def run(model: NextBrightness, folder: Path | None = None, **options: Any) -> TrainedModel:
-    source = options.pop("source", None) or MovingValues()
+def run(
+    model: NextBrightness,
+    folder: Path | None = None,
+    settings: TrainingSettings = QUICK,
+    source: MovingValues | None = None,
+    **options: Any,
+) -> TrainedModel:
+    source = source if source is not None else MovingValues(spec=model.spec)
     features = source.features if model.diet == "features" else None
+    options = {"seed": 0, "name": "all", "fabric": CPU, **options}
     return train_model(
-        model,
-        source,
-        source.trials,
-        **{"seed": 0, "name": "all", "folder": folder, "features": features, **options},
-        fabric=CPU,
+        model, source, source.trials, settings=settings, features=features, folder=folder, **options
     )
 
 
 def files_of(folder: Path) -> dict[str, bytes]:
-    return {
-        path.name: path.read_bytes()
-        for path in folder.rglob("*")
-        if path.is_file() and path.parent.name != "events"
-    }
+    """Return the content of all files but TensorBoard's, which hold the time of day."""
+    paths = [path for path in folder.rglob("*") if path.is_file() and path.parent.name != "events"]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
 
 
 @pytest.mark.parametrize("diet", ["clips", "features", "states"])
 def test_a_model_learns_from_every_diet(diet: Any) -> None:
+    first = run(NextBrightness(diet), settings=replace(QUICK, steps=1, learning_rate=1e-9))
     model = NextBrightness(diet)
-    source = MovingValues(spec=model.spec)
-    result = run(model, source=source, settings=replace(QUICK, steps=200))
-    assert result.loss < 0.2 * NextBrightness_loss_at_start(diet)
+    result = run(model, settings=replace(QUICK, steps=200))
+    assert result.loss < 0.2 * first.loss
     assert result.validation < 0.5 * result.baseline
-    assert not model.training and len(model.prepared) == 1
+    assert not model.training and result.steps == 200 and not result.loaded
 
 
-def NextBrightness_loss_at_start(diet: Any) -> float:
-    model = NextBrightness(diet)
-    source = MovingValues(spec=model.spec)
-    first = run(model, source=source, settings=replace(QUICK, steps=1, learning_rate=1e-9))
-    return first.loss
+@pytest.mark.parametrize("diet", ["clips", "features"])
+@pytest.mark.parametrize("settings", [QUICK, ALL_AT_ONCE, PLATEAU], ids=["adam", "all", "plateau"])
+def test_resumed_training_is_the_uninterrupted_one_to_the_bit(
+    diet: Any, settings: TrainingSettings, tmp_path: Path
+) -> None:
+    settings = replace(settings, log_every=4)  # checkpoints lie inside of intervals
+    whole = NextBrightness(diet, dropout=0.2)
+    run(whole, tmp_path / "whole", settings)
+    for step in (7, 25, 39):
+        with pytest.raises(Killed):
+            run(NextBrightness(diet, 0.2), tmp_path / "parts", settings, progress=kill_at(step))
+        torch.rand(3)  # the state of torch's generator does not matter
+    model = NextBrightness(diet, 0.2)
+    result = run(model, tmp_path / "parts", settings)
+    assert equal_weights(model, whole) and result.notes == ()
+    assert files_of(tmp_path / "parts") == files_of(tmp_path / "whole")
+    assert {Path(name).name for name in files_of(tmp_path)} == {WEIGHTS, CARD, METRICS}
+
+
+def test_a_resumed_training_reads_only_the_batches_that_are_left(tmp_path: Path) -> None:
+    sources = [MovingValues() for _ in range(2)]
+    settings = replace(QUICK, held_out=0.0)
+    run(NextBrightness(), tmp_path / "whole", settings, sources[0])
+    with pytest.raises(Killed):
+        run(NextBrightness(), tmp_path / "parts", settings, progress=kill_at(25))
+    run(NextBrightness(), tmp_path / "parts", settings, sources[1])
+    # The first reading of the first run is the sample from which the model sets its statistics.
+    assert len(sources[0].read) == 41 and len(sources[1].read) == 20
+    assert sorted(sources[1].read) == sorted(sources[0].read[21:])
+
+
+def test_batches_depend_on_seed_and_step_alone() -> None:
+    read = []
+    for seed in (0, 0, 1):
+        source = MovingValues()
+        settings = replace(QUICK, steps=5, held_out=0.0)
+        run(NextBrightness(), source=source, seed=seed, settings=settings)
+        read.append(sorted(source.read))
+    assert read[0] == read[1] != read[2]
+    assert len(set(read[0])) == 6  # five steps, and the sample for statistics
+
+
+def test_windows_start_anywhere_and_stay_inside_of_their_trials() -> None:
+    source = MovingValues(frames=40)
+    source.frames[source.trials[3]] = 10  # shorter than a window
+    run(NextBrightness(), source=source, settings=replace(QUICK, steps=30))
+    starts = {(t, s) for trials, at in source.read for t, s in zip(trials, at, strict=True)}
+    assert {s for t, s in starts if t == source.trials[3]} == {0}
+    assert {s for _, s in starts} == set(range(40 - 18))
+
+
+def test_held_out_trials_are_not_trained_on() -> None:
+    source = MovingValues(count=20)
+    run(NextBrightness(), source=source, settings=replace(QUICK, held_out=0.25))
+    sizes = {8, 15, 5}  # batches, the sample for statistics, and the held-out trials
+    assert {len(trials) for trials, _ in source.read} == sizes
+    (held,) = {trials for trials, _ in source.read if len(trials) == 5}
+    others = {t for trials, _ in source.read if len(trials) != 5 for t in trials}
+    assert len(held) == 5 and others == set(source.trials) - set(held)
+
+
+def test_models_see_a_sample_of_clips_or_all_features_before_training() -> None:
+    for diet, count in (("clips", 64), ("features", 90)):
+        model = NextBrightness(diet)  # type: ignore[arg-type]
+        run(model, source=MovingValues(count=100), settings=replace(QUICK, steps=1))
+        (sample,) = model.prepared
+        assert len(sample) == count == len(set(sample.trials))
+        assert sample.frames.shape[1] == (4 if diet == "clips" else 8)
+
+
+def test_frames_of_feature_windows_are_those_of_the_features() -> None:
+    class Checked(NextBrightness):
+        def loss(self, batch: Batch) -> dict[str, Tensor]:
+            rows = zip(batch.trials, batch.frames.numpy(), batch.features.numpy(), strict=True)
+            for trial, frames, features in rows:
+                expected = source.values(trial, frames) / 100
+                assert features[:, 0] == pytest.approx(expected, rel=1e-6)
+            assert (batch.valid.numpy() == (batch.frames.numpy() % 6 == 0)).all()
+            return super().loss(batch)
+
+    source = MovingValues(frames=40)  # the last steps of a clip repeat frame 39
+    run(Checked("features"), source=source, settings=replace(QUICK, steps=3))
+
+
+def test_validation_does_not_change_what_is_learnt() -> None:
+    models = [NextBrightness(dropout=0.2) for _ in range(2)]
+    for model, every in zip(models, (1, 40), strict=True):
+        run(model, settings=replace(QUICK, validate_every=every))
+    assert equal_weights(*models)
+
+
+def test_accumulated_batches_are_one_large_batch() -> None:
+    losses = []
+    for batch, parts in ((8, 1), (4, 2), (2, 4)):
+        settings = replace(QUICK, batch=batch, accumulate=parts)
+        losses.append(run(NextBrightness(), settings=settings).loss)
+    assert losses[1:] == pytest.approx(losses[:1] * 2, rel=1e-5)
+
+
+def test_the_optimiser_keeps_its_moments(tmp_path: Path) -> None:
+    """Adam that is created again at every step, as released, would take steps of equal length."""
+    with pytest.raises(Killed):
+        run(NextBrightness(), tmp_path, progress=kill_at(25))
+    tensors, metadata = read_checkpoint(next(tmp_path.rglob(CHECKPOINT)))
+    steps = [v for k, v in tensors.items() if k.startswith("optimizer/") and k.endswith("/step")]
+    assert [float(value) for value in steps] == [20.0] * 4 and metadata["step"] == 20
+    _, previous = read_checkpoint(next(tmp_path.rglob(PREVIOUS)))
+    assert previous["step"] == 10
+
+
+class Poisoned(NextBrightness):
+    """Network whose loss, or its gradient, is spoilt at one step."""
+
+    def __init__(self, step: int, value: float | None, **options: Any) -> None:
+        super().__init__(**options)
+        self.step, self.value, self.calls = step, value, 0
+
+    def loss(self, batch: Batch) -> dict[str, Tensor]:
+        losses = super().loss(batch)
+        self.calls += self.training
+        if self.training and self.calls == self.step:
+            if self.value is not None:
+                losses["loss"] = losses["loss"] * self.value
+            else:  # the root of zero, whose slope is infinite
+                losses["loss"] = losses["loss"] + (losses["loss"] * 0).sqrt()
+        return losses
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), None])
+def test_a_loss_or_weight_that_is_not_finite_stops_and_the_last_checkpoint_stays(
+    value: float | None, tmp_path: Path
+) -> None:
+    settings = replace(QUICK, log_every=7, checkpoint_every=10)
+    with pytest.raises(Killed):
+        run(Poisoned(13, value), tmp_path, settings, progress=kill_at(11))
+    before = files_of(tmp_path)
+    with pytest.raises(TrainingStoppedError) as caught:
+        run(Poisoned(3, value), tmp_path, settings)
+    # The loss of step 13, or that of step 14 after a step along an infinite gradient.
+    step, shown = (13, str(value)) if value is not None else (14, "nan")
+    assert f"steps 11 to 14: the loss of step {step} is {shown}" in str(caught.value)
+    assert files_of(tmp_path) == before
+
+
+def test_a_step_that_spoils_the_weights_just_before_a_checkpoint_is_noticed(
+    tmp_path: Path,
+) -> None:
+    with pytest.raises(TrainingStoppedError, match=r"step 20: net\.0\.weight is not finite"):
+        run(Poisoned(20, None), tmp_path, replace(QUICK, held_out=0.0))
+    assert read_checkpoint(next(tmp_path.rglob(CHECKPOINT)))[1]["step"] == 10
+    assert not list(tmp_path.rglob(WEIGHTS))
+
+
+def test_losses_are_read_from_the_device_only_where_they_are_logged(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Reading a value waits for the device; a graphics processor would idle at every step."""
+    counts = dict.fromkeys(("__float__", "__bool__", "tolist", "numpy"), 0)
+    for name in counts:
+        original = getattr(Tensor, name)
+
+        def counted(self: Tensor, *args: Any, n: str = name, f: Any = original, **kw: Any) -> Any:
+            counts[n] += 1
+            return f(self, *args, **kw)
+
+        monkeypatch.setattr(Tensor, name, counted)
+    read = []
+    for every in (40, 10, 1):
+        counts.update(dict.fromkeys(counts, 0))
+        run(NextBrightness(), settings=replace(QUICK, held_out=0.0, log_every=every))
+        read.append(sum(counts.values()))
+    assert read[1] - read[0] == 3 and read[2] - read[0] == 39
+
+
+def test_a_finished_training_is_loaded_and_nothing_is_read_or_written(tmp_path: Path) -> None:
+    first, second = NextBrightness(), NextBrightness()
+    trained = run(first, tmp_path)
+    times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    source = MovingValues()
+    loaded = run(second, tmp_path, source=source)
+    assert loaded == replace(trained, loaded=True) and source.read == []
+    assert equal_weights(first, second) and not second.training
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == times
+
+
+def test_each_training_has_a_folder_of_its_own(tmp_path: Path) -> None:
+    run(NextBrightness(), tmp_path)
+    run(NextBrightness(), tmp_path, seed=1)
+    run(NextBrightness(), tmp_path, replace(QUICK, learning_rate=1e-3))
+    run(NextBrightness(), tmp_path, source=MovingValues(frames=90))
+    run(NextBrightness(), tmp_path, replace(QUICK, log_every=5))  # changes no weight
+    assert len(list(tmp_path.iterdir())) == 4
+    assert all(folder.name.startswith("NextBrightness-all-") for folder in tmp_path.iterdir())
+
+
+def test_two_processes_cannot_train_in_one_folder(tmp_path: Path) -> None:
+    folder = run(NextBrightness(), tmp_path).folder
+    assert folder is not None
+    (folder / WEIGHTS).unlink()
+    with folder_lock(folder), pytest.raises(PhysionError, match="another process"):
+        run(NextBrightness(), tmp_path)
+
+
+@pytest.mark.parametrize(
+    "error", [torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB"), MemoryError()]
+)
+def test_memory_that_is_used_up_names_the_setting_to_lower(error: Exception) -> None:
+    class Large(NextBrightness):
+        def loss(self, batch: Batch) -> dict[str, Tensor]:
+            raise error
+
+    with pytest.raises(OutOfMemoryError, match="batch 4 and accumulate 2"):
+        run(Large(), settings=replace(QUICK, held_out=0.0))
+
+
+@pytest.mark.parametrize(
+    ("losses", "message"),
+    [
+        (lambda x: x.mean(), "must give a mapping"),
+        (lambda x: {"error": x.mean()}, "must give a mapping"),
+        (lambda x: {"loss": x}, r"gave loss as \(8, 1\), expected a scalar"),
+        (lambda x: {"loss": x.mean(), "part": 1.0}, "gave part as float"),
+        (lambda x: {"loss": x.mean().detach()}, "depends on no weight"),
+        (lambda x: {"loss": x.missing}, r"loss raised AttributeError: .* \(test_training_loop"),
+    ],
+)
+def test_a_loss_that_cannot_be_used_is_one_clear_error(losses: Any, message: str) -> None:
+    class Wrong(NextBrightness):
+        def loss(self, batch: Batch) -> Any:
+            return losses(self.net(self._pair(batch)[0]))
+
+    with pytest.raises(BadInputError, match=message):
+        run(Wrong())
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"schedule": "plateau", "held_out": 0.0}, "held_out above 0"),
+        ({"precision": "8-true"}, "precision must be one of"),
+    ],
+)
+def test_settings_that_do_not_fit_together_are_refused(
+    settings: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(BadInputError, match=message):
+        run(NextBrightness(), settings=replace(QUICK, **settings), fabric=None, accelerator="cpu")
+
+
+def test_what_cannot_be_trained_is_refused() -> None:
+    source = MovingValues()
+    options: Any = {"seed": 0, "name": "all", "folder": None, "fabric": CPU}
+    with pytest.raises(BadInputError, match="no trial to train"):
+        train_model(NextBrightness(), source, [], **options)
+    with pytest.raises(BadInputError, match="is trained on features"):
+        train_model(NextBrightness("features"), source, source.trials, **options)
+    fixed = NextBrightness()
+    fixed.requires_grad_(False)
+    with pytest.raises(BadInputError, match="no weight that can be trained"):
+        run(fixed)
+    with pytest.raises(BadInputError, match="cannot be used"):
+        make_fabric(Devices("abacus"))
+    with pytest.raises(BadInputError, match="at least 1"):
+        make_fabric(Devices("cpu", devices=0))
+
+
+def test_half_precision_trains(tmp_path: Path) -> None:
+    settings = replace(QUICK, precision="bf16-mixed")
+    model = NextBrightness()
+    result = run(model, settings=settings, fabric=None, accelerator="cpu")
+    assert all(value.dtype == torch.float32 for value in model.state_dict().values())
+    exact = run(NextBrightness())
+    assert result.loss != exact.loss and result.loss < 2 * exact.loss + 0.01
+
+
+def test_metrics_hold_the_means_of_intervals_and_the_validations(tmp_path: Path) -> None:
+    folder = run(NextBrightness(), tmp_path, replace(QUICK, steps=25)).folder
+    assert folder is not None
+    lines = read_metrics(folder)
+    train = [line for line in lines if "train/loss" in line]
+    assert [line["step"] for line in train] == [10, 20, 25]
+    assert [line["step"] for line in lines if "validation/loss" in line] == [20, 25]
+    assert set(train[0]) == {"step", "train/loss", "train/bias", "learning_rate"}
+    each = run(NextBrightness(), tmp_path, replace(QUICK, steps=25, log_every=1), seed=0)
+    assert each.loaded  # of the same weights: only the number of lines differs
+    other = run(NextBrightness(), None, replace(QUICK, steps=5))
+    assert np.isfinite(other.loss)
+
+
+def test_the_model_card_tells_what_the_model_is(tmp_path: Path) -> None:
+    result = run(NextBrightness(), tmp_path)
+    assert result.folder is not None
+    card = (result.folder / CARD).read_text()
+    for text in (
+        "# NextBrightness, trained on all", "20 trials", "drop 10, roll 10", "| steps | 40 |",
+        "| seed | 0 |", f"{result.validation:.6g}", f"{result.baseline:.6g}", "Licence",
+        f"torch | {torch.__version__}", "load_weights",
+    ):  # fmt: skip
+        assert text in card, text

@@ -32,7 +32,7 @@ _NAMED = 3
 
 
 class DamagedFileError(BadInputError):
-    """Error for a checkpoint that was cut, or of which bits have changed."""
+    """Error for a checkpoint that was cut or changed, or that is none."""
 
 
 def hash_config(config: Mapping[str, Any]) -> str:
@@ -70,9 +70,9 @@ def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     Raises
     ------
     DamagedFileError
-        If it cannot be read or its SHA-256 is wrong.
+        If it cannot be read, its SHA-256 is wrong, or `write_checkpoint` did not write it.
     BadInputError
-        If it is a whole safetensors file that `write_checkpoint` did not write.
+        If another version of this package wrote it.
     """
     try:
         with safe_open(path, framework="pt") as file:
@@ -82,9 +82,7 @@ def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     except (SafetensorError, OSError, ValueError) as error:
         raise DamagedFileError(f"checkpoint {path} cannot be read ({error})") from error
     if _METADATA not in header:
-        raise BadInputError(
-            f"{path} is a safetensors file, but not a checkpoint of physion; move it elsewhere"
-        )
+        raise DamagedFileError(f"{path} is a safetensors file, but not a checkpoint of physion")
     try:
         metadata = json.loads(header[_METADATA])
         stored = metadata.pop("sha256")

@@ -20,6 +20,8 @@ from physion.training.checkpoint import (
 
 CHECKPOINT, PREVIOUS = "checkpoint.safetensors", "previous.safetensors"
 WEIGHTS, CARD = "model.safetensors", "model_card.md"
+_DAMAGED = ".damaged"
+"""Suffix of damaged files that were set aside."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,11 +73,11 @@ class TrainingFolder:
         return found
 
     def clean(self) -> None:
-        """Create the folder; delete damaged files and what an interrupted writer left."""
+        """Create the folder, set damaged files aside, delete what an interrupted writer left."""
         self.path.mkdir(parents=True, exist_ok=True)
         remove_leftovers(self.path)
         for path in self._damaged:
-            path.unlink(missing_ok=True)
+            path.replace(path.with_name(path.name + _DAMAGED))
 
     def save(self, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
         """Write a checkpoint and keep the one before."""
@@ -102,7 +104,7 @@ class TrainingFolder:
         try:
             tensors, metadata = read_checkpoint(path)
         except DamagedFileError as error:
-            self.notes.append(str(error))
+            self.notes.append(f"{error}; it is set aside as {name}{_DAMAGED}")
             self._damaged.append(path)
             return None
         check_same(path, "config", metadata["config"], self._config)

@@ -197,7 +197,8 @@ class TrainingLoop:
         settings, state = self._settings, self.state
         last = state.step == settings.steps
         logs = last or state.step % settings.log_every == 0
-        validates = last or state.step % settings.validate_every == 0
+        held_out = self._data.held_out is not None
+        validates = held_out and (last or state.step % settings.validate_every == 0)
         saves = self._kept and (last or state.step % settings.checkpoint_every == 0)
         if logs or validates or saves:
             self._read_losses()
@@ -207,7 +208,7 @@ class TrainingLoop:
             rate = learning_rate(settings, state.step - 1, state.plateau.factor)
             if log is not None:
                 log.write(state.step, {**means, "learning_rate": rate})
-        if validates and self._data.held_out is not None:
+        if validates:
             self._validate(log, last)
         if saves:
             self._check_weights()
@@ -299,4 +300,5 @@ def _check(
 
 
 def _means(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    return {name: math.fsum(row[name] for row in rows) / len(rows) for name in rows[0]}
+    names = sorted(rows[0], key=lambda name: (name != LOSS, name))
+    return {name: math.fsum(row[name] for row in rows) / len(rows) for name in names}

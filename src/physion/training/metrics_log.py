@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 from collections.abc import Mapping
@@ -43,8 +44,9 @@ class MetricsLog:
             self._add_events(json.loads(line))
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
-        """Append the values after ``step`` steps."""
-        line = {"step": step, **values}
+        """Append the values after ``step`` steps; one that is not finite becomes null."""
+        line: dict[str, Any] = {"step": step}
+        line |= {name: value if math.isfinite(value) else None for name, value in values.items()}
         self._file.write(json.dumps(line) + "\n")
         self._file.flush()
         self._add_events(line)
@@ -72,11 +74,11 @@ class MetricsLog:
     def _add_events(self, line: Mapping[str, Any]) -> None:
         if self._events is not None:
             for name, value in line.items():
-                if name != "step":
+                if name != "step" and value is not None:
                     self._events.add_scalar(name, value, int(line["step"]))
 
 
-def read_metrics(folder: Path) -> list[dict[str, float]]:
+def read_metrics(folder: Path) -> list[dict[str, Any]]:
     """Return the lines of ``metrics.jsonl`` in the folder of a training."""
     return [json.loads(line) for line in (folder / METRICS).read_text().splitlines()]
 

@@ -128,6 +128,8 @@ def train_model(
     if kept is not None and done is not None:
         load_tensors(done.path, done.tensors, model)
         model.eval()
+        if fabric.is_global_zero:
+            kept.remove_checkpoints()
         return _result(name, kept, TrainingState.of(done.metadata["state"]), config_hash, True)
     metadata = {
         "config": config,
@@ -137,6 +139,7 @@ def train_model(
     }
     with _writing(kept, fabric), memory_advice(settings):
         stored = kept.resumable() if kept is not None else None
+        fabric.barrier()
         if kept is not None and fabric.is_global_zero:
             kept.clean()
         fabric.barrier()
