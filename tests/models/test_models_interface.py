@@ -21,17 +21,7 @@ from physion.models.build import ModelFactory
 from physion.models.interface import Encodes, Fits, Imagines, Learns, Model, Predicts
 from physion.readout.capabilities import ways
 from physion.registry import Registry
-
-TINY = {"encoder": "test_vit", "image_size": 64, "weights": "random", "hidden": 16}
-FROZEN = [
-    "frozen-encoder", "pVGG-mlp", "pVGG-lstm", "pDeIT-mlp", "pDeIT-lstm", "pEffNetLite0-mlp",
-    "pEffNetLite0-lstm",
-]  # fmt: skip
-
-
-def tiny(name: str) -> Any:
-    """Build a model in its smallest configuration."""
-    return build_model(name, **(TINY if name in FROZEN else {}))
+from support.tiny_models import FROZEN, TINY, tiny
 
 
 def clips(frames: Any, features: Any = None) -> Batch:
@@ -192,7 +182,7 @@ def test_unknown_options_get_the_closest_ones(name: str) -> None:
 
 
 def test_unknown_names_get_the_closest_ones() -> None:
-    with pytest.raises(UnknownNameError, match="pVGG-lstm.*FILE.py:Class"):
+    with pytest.raises(UnknownNameError, match=r"pVGG-lstm.*FILE\.py:Class"):
         build_model("pVGG-lsm")
     with pytest.raises(UnknownNameError, match="resnet18"):
         build_model("frozen-encoder", encoder="resnet81", weights="random")

@@ -17,10 +17,8 @@ from physion.readout.logistic import ReadoutConfig
 from physion.readout.table import OFFICIAL_COLUMNS, OWN_COLUMNS, read_table, write_table
 from physion.trials.dataset import Dataset
 from support.moving_dots import make_dots
+from support.tiny_models import TINY
 
-TINY: dict[str, Any] = {
-    "encoder": "test_vit", "image_size": 64, "weights": "random", "hidden": 16,
-}  # fmt: skip
 QUICK = EvaluationConfig(steps=20, accelerator="cpu", readout=ReadoutConfig(grid=(1e-4, 1e-2, 1.0)))
 COUNTS = {"training": 4, "readout": 24, "testing": 20}
 

@@ -1,0 +1,155 @@
+"""Changed copies of a dataset that show whether predictions use what they must not.
+
+- With poisoned futures, everything after the observed part is noise. Predictions under *observed*
+  and *observed+simulated* must stay the same to the byte.
+- With exchanged futures, every movie ends like that of another trial. Predictions under *full* must
+  fall to chance.
+- With permuted labels, nothing that is fitted can be better than chance.
+
+A copy must be evaluated in a folder of its own: stored features and rollouts of the observed part
+have the same names for the copy and the original.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from physion.errors import BadInputError
+from physion.physics.trajectory import Contacts, Trajectory
+from physion.scenes.scene import OBSERVED_FRAMES
+from physion.seeds import generator
+from physion.trials.dataset import Dataset
+from physion.trials.index import write_index
+from physion.trials.trial_file import Trial, write_trial
+from physion.trials.video import encode_movie, read_frames
+
+Pictures = NDArray[np.uint8]
+
+
+def with_poisoned_futures(
+    dataset: Dataset, folder: Path, splits: Sequence[str] = ("readout", "testing"), seed: int = 0
+) -> Dataset:
+    """Return a copy whose movies and motions are noise after the observed part.
+
+    Parameters
+    ----------
+    dataset
+        The dataset, which stays as it is.
+    folder
+        New folder of the copy.
+    splits
+        Splits whose trials are changed. Trials that train a model must not be among them.
+    seed
+        Of the noise.
+
+    Raises
+    ------
+    BadInputError
+        If the folder exists.
+    """
+
+    def poison(trial: str, frames: Pictures) -> Pictures:
+        changed = frames.copy()
+        later = changed[OBSERVED_FRAMES:]
+        later[:] = generator("poison", seed, trial).integers(0, 256, later.shape, np.uint8)
+        return changed
+
+    copy = _copy(dataset, folder)
+    for trial in _trials(copy, splits):
+        _change_movie(copy, trial, poison)
+        path = copy.paths(trial).trial_file
+        if path.is_file():
+            _poison_motion(path, generator("poison motion", seed, trial))
+    return _written(copy)
+
+
+def with_exchanged_futures(
+    dataset: Dataset, folder: Path, splits: Sequence[str] = ("testing",), seed: int = 0
+) -> Dataset:
+    """Return a copy in which every movie continues like that of another trial of its scenario.
+
+    A scenario needs two trials or more. Motions are not exchanged, as those of another scene do not
+    fit. Parameters and errors are as for `with_poisoned_futures`.
+    """
+    copy = _copy(dataset, folder)
+    for scenario in sorted(set(copy.index["scenario"])):
+        trials = [t for split in splits for t in copy.trials(split, scenario)]
+        order = [trials[i] for i in generator("exchange", seed, scenario).permutation(len(trials))]
+        for trial, other in zip(order, order[1:] + order[:1], strict=True):
+            ending = read_frames(dataset.paths(other).movie)[OBSERVED_FRAMES:]
+            _change_movie(
+                copy,
+                trial,
+                lambda _, frames, ending=ending: np.concatenate(  # type: ignore[misc]
+                    [frames[:OBSERVED_FRAMES], ending]
+                ),
+            )
+    return _written(copy)
+
+
+def with_permuted_labels(dataset: Dataset, seed: int = 0) -> Dataset:
+    """Return the dataset with outcomes permuted within every scenario and split, in memory."""
+    copy = Dataset(dataset.folder)
+    columns = ["contact", "recorded_contact"]
+    for (scenario, split), rows in copy.index.groupby(["scenario", "split"]).groups.items():
+        order = generator("permute labels", seed, str(scenario), str(split)).permutation(len(rows))
+        copy.index.loc[rows, columns] = copy.index.loc[rows[order], columns].to_numpy()
+    return copy
+
+
+def _copy(dataset: Dataset, folder: Path) -> Dataset:
+    if folder.exists():
+        raise BadInputError(f"{folder} exists; name a new folder for the changed copy")
+    shutil.copytree(dataset.folder, folder)
+    return Dataset(folder)
+
+
+def _trials(dataset: Dataset, splits: Sequence[str]) -> list[str]:
+    return [trial for split in splits for trial in dataset.trials(split)]
+
+
+def _change_movie(
+    dataset: Dataset, trial: str, change: Callable[[str, Pictures], Pictures]
+) -> None:
+    """Write a trial's movie anew and put its new size and checksum into the index."""
+    path = dataset.paths(trial).movie
+    frames = change(trial, read_frames(path))
+    content = encode_movie(frames)
+    path.write_bytes(content)
+    row = dataset.index["trial"] == trial
+    dataset.index.loc[row, "movie_bytes"] = len(content)
+    dataset.index.loc[row, "movie_sha256"] = hashlib.sha256(content).hexdigest()
+    dataset.index.loc[row, "frames"] = len(frames)
+
+
+def _written(dataset: Dataset) -> Dataset:
+    write_index(dataset.folder, dataset.index)
+    return Dataset(dataset.folder)
+
+
+def _poison_motion(path: Path, rng: np.random.Generator) -> None:
+    """Replace the motion after the observed part by noise, and remove its contacts."""
+    trial = Trial.open(path)
+    trajectory = trial.trajectory
+    changed: dict[str, Any] = {}
+    for name in ("positions", "rotations", "velocities", "angular_velocities", "cloth_vertices"):
+        array = getattr(trajectory, name).copy()
+        array[OBSERVED_FRAMES:] = rng.normal(size=array[OBSERVED_FRAMES:].shape)
+        changed[name] = array
+    observed = trajectory.contacts.frame < OBSERVED_FRAMES
+    contacts = {
+        field.name: getattr(trajectory.contacts, field.name)[observed]
+        for field in dataclasses.fields(Contacts)
+    }
+    poisoned: Trajectory = dataclasses.replace(
+        trajectory, **changed, contacts=Contacts(**contacts), completed=not trajectory.completed
+    )
+    write_trial(path, trial.metadata, trial.scene, poisoned, trial.labels, trial.ids)

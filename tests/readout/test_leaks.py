@@ -1,0 +1,106 @@
+"""No prediction uses what it must not: every registered model on changed copies of a dataset."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from physion.compute.local import SerialExecutor
+from physion.errors import BadInputError
+from physion.models import build_model, models
+from physion.readout import EvaluationConfig, evaluate, evaluate_model
+from physion.readout.leak_checks import (
+    with_exchanged_futures,
+    with_permuted_labels,
+    with_poisoned_futures,
+)
+from physion.readout.logistic import ReadoutConfig
+from physion.trials.dataset import Dataset
+from physion.trials.making.generate import generate
+from physion.trials.making.plan import GenerateSettings, plan_dataset
+from support.moving_dots import make_dots
+from support.tiny_models import OPTIONS, TINY
+
+QUICK = EvaluationConfig(steps=3, accelerator="cpu", readout=ReadoutConfig(grid=(1e-2, 1.0)))
+PREDICTING = ("observed", "observed+simulated")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    folder = tmp_path_factory.mktemp("leaks") / "data"
+    tasks = plan_dataset("leaks", ("collide", "drop"), {"training": 2, "readout": 4, "testing": 3})
+    settings = GenerateSettings(width=64, height=64, look="redyellow", jitters=0)
+    assert not generate(folder, tasks, settings, executor=SerialExecutor()).failed
+    return Dataset(folder)
+
+
+@pytest.fixture(scope="module")
+def poisoned(made: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return with_poisoned_futures(made, tmp_path_factory.mktemp("poisoned") / "data")
+
+
+def predict(dataset: Dataset, name: str, folder: Path) -> pd.DataFrame:
+    options = dict(OPTIONS.get(name, {}))
+    if name == "majority-of-people":
+        options["humans"] = dict.fromkeys(dataset.trials(), 0.3)
+    model = build_model(name, **options)
+    table = evaluate_model(dataset, model, folder, config=QUICK).predictions
+    return table.set_index(["Protocol", "Stimulus Name"])["Predicted Prob_true"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", models.names())
+def test_what_follows_the_observed_part_changes_no_prediction(
+    name: str, made: Dataset, poisoned: Dataset, tmp_path: Path
+) -> None:
+    before = predict(made, name, tmp_path / "before")
+    after = predict(poisoned, name, tmp_path / "after")
+    kept = before.index.get_level_values("Protocol").isin(PREDICTING)
+    assert kept.any() or name == "outcome", "each but the outcome itself predicts"
+    assert before[kept].to_numpy().tobytes() == after[kept].to_numpy().tobytes()
+
+
+def test_the_copy_is_poisoned_where_it_should_be(made: Dataset, poisoned: Dataset) -> None:
+    for trial in made.trials("testing"):
+        clean, changed = made.trial(trial).trajectory, poisoned.trial(trial).trajectory
+        assert np.array_equal(clean.positions[:45], changed.positions[:45])
+        assert not np.isclose(clean.positions[45:], changed.positions[45:]).all(axis=2).any()
+        assert (changed.contacts.frame < 45).all()
+        frames = made.frames(trial), poisoned.frames(trial)
+        assert np.abs(frames[0][45:].astype(int) - frames[1][45:]).mean() > 20
+        assert np.abs(frames[0][:40].astype(int) - frames[1][:40]).mean() < 5
+        paths = made.paths(trial).observed_movie, poisoned.paths(trial).observed_movie
+        assert paths[0].read_bytes() == paths[1].read_bytes()
+    for trial in made.trials("training"):
+        assert made.paths(trial).movie.read_bytes() == poisoned.paths(trial).movie.read_bytes()
+    with pytest.raises(BadInputError, match="exists"):
+        with_poisoned_futures(made, poisoned.folder)
+
+
+@pytest.fixture(scope="module")
+def dots(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    counts = {"training": 2, "readout": 24, "testing": 40}
+    return make_dots(tmp_path_factory.mktemp("dots") / "data", counts, ("drop",))
+
+
+def accuracy_of_full(dataset: Dataset, folder: Path) -> float:
+    config: Any = EvaluationConfig(("full",), accelerator="cpu", readout=QUICK.readout)
+    table = evaluate(dataset, "frozen-encoder", folder, options=TINY, config=config).predictions
+    return float((table["Predicted Outcome"] == table["Actual Outcome"]).mean())
+
+
+def test_full_falls_to_chance_with_exchanged_futures_and_permuted_labels(
+    dots: Dataset, tmp_path: Path
+) -> None:
+    """Of 40 trials, 3 standard errors of chance are .24."""
+    exchanged = with_exchanged_futures(dots, tmp_path / "exchanged")
+    assert accuracy_of_full(dots, tmp_path / "a") > 0.74
+    assert abs(accuracy_of_full(exchanged, tmp_path / "b") - 0.5) < 0.24
+    permuted = with_permuted_labels(dots)
+    assert not permuted.index["contact"].equals(dots.index["contact"])
+    assert permuted.index["contact"].sum() == dots.index["contact"].sum()
+    assert abs(accuracy_of_full(permuted, tmp_path / "c") - 0.5) < 0.24

@@ -1,0 +1,25 @@
+"""Every registered model in its smallest configuration."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from physion.models import build_model
+
+TINY: dict[str, Any] = {
+    "encoder": "test_vit", "image_size": 64, "weights": "random", "hidden": 16,
+}  # fmt: skip
+FROZEN = [
+    "frozen-encoder", "pVGG-mlp", "pVGG-lstm", "pDeIT-mlp", "pDeIT-lstm", "pEffNetLite0-mlp",
+    "pEffNetLite0-lstm",
+]  # fmt: skip
+OPTIONS: dict[str, dict[str, Any]] = {
+    **dict.fromkeys(FROZEN, TINY),
+    "noisy-simulation": {"samples": 3},
+}
+"""Options by name of the model; other models have none."""
+
+
+def tiny(name: str) -> Any:
+    """Build a model in its smallest configuration."""
+    return build_model(name, **OPTIONS.get(name, {}))
