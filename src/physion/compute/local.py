@@ -59,7 +59,7 @@ class LocalExecutor:
     def __init__(
         self, workers: int | None = None, *, tries: int = TRIES, timeout: float | None = None
     ) -> None:
-        self.workers = workers if workers is not None else _cores()
+        self.workers = workers if workers is not None else available_cores()
         if self.workers < 1 or tries < 1:
             raise PhysionError(f"{workers} workers and {tries} tries: both must be at least 1")
         self.tries, self.timeout = tries, timeout
@@ -263,7 +263,7 @@ def _one_thread() -> Iterator[None]:
             del os.environ[name]
 
 
-def _cores() -> int:
+def available_cores() -> int:
     """Return the number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))

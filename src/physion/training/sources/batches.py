@@ -121,7 +121,11 @@ class ObservedBatches:
     def context(self, trials: Sequence[str]) -> Batch:
         """Return the context of clips; motions end with the last observed frame."""
         frames = self._spec.context_frames()
-        assert max(frames) <= LAST_OBSERVED, "a Spec has no context after the observed part"
+        if max(frames) > LAST_OBSERVED:
+            raise FutureFrameError(
+                f"frame {max(frames)} comes after the observed part, whose last frame is "
+                f"{LAST_OBSERVED}"
+            )
         return self._readers.batch(trials, [frames] * len(trials))
 
     def key(self, trial: str, part: Part) -> str:

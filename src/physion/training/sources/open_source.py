@@ -114,16 +114,8 @@ def _readers(
 
         if from_movies:
             _check_square(dataset)
-        own = dict(zip(index["trial"], index["look"], strict=True))
-        readers.append(
-            MotionRenderer(
-                motions,
-                from_motion,
-                spec.image_size,
-                spec.objects,
-                lambda trial: look or own[trial],
-            )
-        )
+        looks = {str(row.trial): look or str(row.look) for row in index.itertuples()}
+        readers.append(MotionRenderer(motions, from_motion, spec.image_size, spec.objects, looks))
     return TrialReaders(lengths, readers, motions if "state" in spec.inputs else None)
 
 

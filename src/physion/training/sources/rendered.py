@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -48,8 +48,8 @@ class MotionRenderer:
         Pixels per side.
     objects
         Rows of ``boxes``.
-    look
-        Function from a trial to its colours, ``redyellow`` or ``free``.
+    looks
+        Colours by trial, ``redyellow`` or ``free``.
     """
 
     def __init__(
@@ -58,10 +58,10 @@ class MotionRenderer:
         inputs: Sequence[str],
         size: int,
         objects: int,
-        look: Callable[[str], str],
+        looks: Mapping[str, str],
     ) -> None:
         self._motions, self._inputs = motions, tuple(inputs)
-        self._size, self._objects, self._look = size, objects, look
+        self._size, self._objects, self._looks = size, objects, looks
         self._passes = tuple({_PASS[name]: None for name in inputs if name in _PASS})
         self._digests: dict[str, str] = {}
 
@@ -84,7 +84,7 @@ class MotionRenderer:
                 f"trial {trial!r} was imported without motion ({motion.trajectory.engine}): it "
                 "cannot be rendered, only its movies can be read"
             )
-        scene = in_look(motion.scene, self._look(trial))
+        scene = in_look(motion.scene, self._looks[trial])
         renderer = Renderer(scene, motion.trajectory, self._size, self._size)
         shown = [renderer.render(int(frame), self._passes) for frame in chosen]
         passes = {name: _stack(shown, name) for name in self._passes}
@@ -103,7 +103,7 @@ class MotionRenderer:
         if trial not in self._digests:
             self._digests[trial] = motion_digest(self._motions[trial])
         version = f"{VERSION}.{version_digest(*PASSES)}"
-        return f"rendered {self._look(trial)} {version} {self._digests[trial]}"
+        return f"rendered {self._looks[trial]} {version} {self._digests[trial]}"
 
 
 class RenderedSource(WholeBatches):
@@ -149,7 +149,8 @@ def _readers(motions: Mapping[str, Motion], spec: Spec, look: str) -> TrialReade
     """Return readers of all that ``spec`` asks for."""
     inputs = [name for name in spec.inputs if name in PIXELS]
     lengths = {name: len(motion.trajectory) for name, motion in motions.items()}
-    reader = MotionRenderer(motions, inputs, spec.image_size, spec.objects, lambda trial: look)
+    looks = dict.fromkeys(motions, look)
+    reader = MotionRenderer(motions, inputs, spec.image_size, spec.objects, looks)
     return TrialReaders(
         lengths, [reader] if inputs else [], motions if "state" in spec.inputs else None
     )

@@ -6,7 +6,9 @@ import dataclasses
 import threading
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from physion.errors import UnknownNameError
 from physion.models.batch import Motion
@@ -48,6 +50,10 @@ class TrialMotions(Mapping[str, Motion]):
 
     def __len__(self) -> int:
         return len(self._files)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Another process reads the files itself; a lock cannot be sent to it.
+        return partial(TrialMotions, observed=self._observed), (self._files,)
 
     def _keep(self, trial: str, motion: Motion) -> None:
         """Keep a motion, and forget those that were used longest ago."""

@@ -1,0 +1,213 @@
+"""Clips rendered on demand: equal to what movies are encoded from, with ids, depth and boxes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from physion.errors import BadInputError
+from physion.models.batch import Motion, Spec
+from physion.rendering.camera import View
+from physion.rendering.renderer import Renderer
+from physion.scenes.looks import in_look
+from physion.scenes.scene import Roles, Scene
+from physion.training.sources.open_source import observed_source, whole_source
+from physion.training.sources.rendered import RenderedSource, boxes, object_ids
+from physion.training.sources.source import FutureFrameError
+from physion.trials.dataset import Dataset
+from physion.trials.video import encode_movie
+from support.official_hand_made import CLOTH, FRAMES, RIGID, SIZE, make_scene, make_trajectory
+
+EVERYTHING = ("rgb", "ids", "depth", "boxes", "camera", "state")
+SPEC = Spec(inputs=EVERYTHING, image_size=24, stride=7, context=4, future=3, objects=4)
+
+
+@pytest.fixture(scope="module")
+def motions() -> dict[str, Motion]:
+    texts = {name: make_scene(name, name == CLOTH).to_json() for name in (RIGID, CLOTH)}
+    # As a file stores it, with 1.0 for 1: keys follow the text of a scene.
+    scenes = {name: Scene.from_json(text) for name, text in texts.items()}
+    return {name: Motion(scene, make_trajectory(scene)) for name, scene in scenes.items()}
+
+
+@pytest.mark.parametrize("look", ["redyellow", "free"])
+@pytest.mark.parametrize("trial", [RIGID, CLOTH])
+def test_rendered_pictures_are_those_that_the_movies_were_encoded_from(
+    made: Dataset, motions: dict[str, Motion], trial: str, look: str
+) -> None:
+    spec = Spec(image_size=SIZE, stride=1, context=45, future=FRAMES - 45)
+    paths = made.paths(trial)
+    movie = paths.movie if look == "redyellow" else paths.free_movie
+    observed = paths.observed_movie if look == "redyellow" else paths.free_observed_movie
+    for source in (
+        whole_source(made, spec, look=look, rendered=True),
+        RenderedSource(motions, spec, look=look, observed=False),
+    ):
+        assert encode_movie(source.whole([trial]).rgb[0]) == movie.read_bytes()
+        assert encode_movie(source.context([trial]).rgb[0]) == observed.read_bytes()
+
+
+def test_inputs_are_those_of_the_renderer(motions: dict[str, Motion]) -> None:
+    source = RenderedSource(motions, SPEC, observed=False)
+    batch = source.whole([RIGID, CLOTH])
+    assert batch.frames.tolist() == [[0, 7, 14, 21, 28, 35, 42]] * 2
+    for row, trial in enumerate(batch.trials):
+        motion = motions[trial]
+        scene = in_look(motion.scene, "redyellow")
+        renderer = Renderer(scene, motion.trajectory, 24, 24)
+        for step, frame in enumerate(batch.frames[row]):
+            shown = renderer.render(int(frame), ("color", "depth", "ids"))
+            np.testing.assert_array_equal(batch.rgb[row, step], shown.color)
+            np.testing.assert_array_equal(batch.depth[row, step], shown.depth)
+            ids = batch.ids[row, step]
+            for name, number in {scene.roles.agent: 1, scene.roles.patient: 2}.items():
+                index = scene.index(name) + 1
+                np.testing.assert_array_equal(ids == number, shown.ids == index)
+        assert batch.state is not None and batch.state[row].scene == motion.scene
+
+
+def test_ids_number_agent_patient_and_others_and_leave_out_scenery() -> None:
+    rigid, cloth = make_scene(RIGID, False), make_scene(CLOTH, True)
+    assert rigid.names() == ["ball", "zone", "distractor_0", "cone"]
+    # cone is the agent, zone the patient; the vase is scenery.
+    assert object_ids(rigid).tolist() == [0, 3, 2, 0, 1]
+    assert cloth.names()[-1] == "sheet" == cloth.roles.agent
+    assert object_ids(cloth).tolist() == [0, 3, 2, 0, 4, 1]
+    assert object_ids(cloth).dtype == np.uint8
+
+
+def test_ids_that_do_not_fit_are_refused() -> None:
+    scene = make_scene(RIGID, False)
+    ball = scene.bodies[0]
+    many = tuple(replace(ball, name=f"ball_{number}") for number in range(255))
+    crowd = replace(scene, bodies=many, pushes=(), roles=Roles("ball_0", "ball_1"))
+    assert object_ids(crowd).max() == 255
+    crowd = replace(crowd, bodies=(*many, ball))
+    with pytest.raises(BadInputError, match="256 objects"):
+        object_ids(crowd)
+
+
+def test_depth_is_infinite_where_nothing_is(motions: dict[str, Motion]) -> None:
+    motion = motions[RIGID]
+    alone = Motion(replace(motion.scene, room="empty"), motion.trajectory)
+    source = RenderedSource({RIGID: alone}, replace(SPEC, inputs=("depth",)), observed=True)
+    depth = source.context([RIGID]).depth
+    assert np.isposinf(depth).any() and (depth[np.isfinite(depth)] > 0.1).all()
+
+
+def test_boxes_are_the_edges_of_visible_pixels() -> None:
+    ids = np.zeros((2, 4, 8), np.uint8)
+    ids[0, 1:3, 2:5] = 1
+    ids[0, 3, 7] = 3
+    ids[1, 0, 0] = 2
+    found = boxes(ids, 4)
+    assert found.shape == (2, 4, 4) and found.dtype == np.float32
+    assert found[0, 0].tolist() == [2 / 8, 1 / 4, 5 / 8, 3 / 4]
+    assert found[0, 2].tolist() == [7 / 8, 3 / 4, 1.0, 1.0]
+    assert found[1, 1].tolist() == [0.0, 0.0, 1 / 8, 1 / 4]
+    seen = [(0, 0), (0, 2), (1, 1)]
+    assert sorted(zip(*np.nonzero(np.isfinite(found).all(-1)), strict=True)) == seen
+    assert np.isnan(found).sum() == 4 * (8 - len(seen))
+    # An object beyond the rows is left out.
+    assert boxes(ids, 1).shape == (2, 1, 4) and np.isnan(boxes(ids, 1)[1]).all()
+
+
+def test_boxes_of_a_batch_enclose_its_ids(motions: dict[str, Motion]) -> None:
+    batch = RenderedSource(motions, SPEC, observed=True).context([RIGID, CLOTH])
+    assert batch.boxes.shape == (2, 4, 4, 4)
+    for row, step, number in np.ndindex(2, 4, 4):
+        rows, columns = np.nonzero(batch.ids[row, step] == number + 1)
+        box = batch.boxes[row, step, number] * 24
+        if not len(rows):
+            assert np.isnan(box).all()
+            continue
+        expected = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
+        np.testing.assert_allclose(box, expected, atol=1e-5)
+
+
+def test_the_camera_projects_onto_the_pixels_of_the_ids(motions: dict[str, Motion]) -> None:
+    """The agent's middle, through both matrices, lies on a pixel of the agent."""
+    spec = replace(SPEC, image_size=64)
+    batch = RenderedSource(motions, spec, observed=True).context([RIGID])
+    scene, trajectory = motions[RIGID].scene, motions[RIGID].trajectory
+    view, projection = batch.camera[0]
+    agent = scene.index(scene.roles.agent)
+    point = np.append(trajectory.positions[0, agent] + [0, 0, 0.1], 1.0)
+    clip = projection @ view @ point
+    column, row = (clip[0] / clip[3] + 1) / 2 * 64, (1 - clip[1] / clip[3]) / 2 * 64
+    pixels, _ = View(scene.camera, 64, 64).project(point[:3])
+    np.testing.assert_allclose([column, row], pixels, atol=1e-9)
+    assert batch.ids[0, 0, int(row), int(column)] == 1
+
+
+def test_a_dataset_gives_the_same_as_its_motions(made: Dataset, motions: dict[str, Motion]) -> None:
+    from_files = observed_source(made, SPEC, rendered=True)
+    in_memory = RenderedSource(motions, SPEC, observed=True)
+    both = [source.context([CLOTH, RIGID]) for source in (from_files, in_memory)]
+    for name, values in both[0].arrays().items():
+        np.testing.assert_array_equal(values, both[1].arrays()[name], name)
+    assert from_files.key(RIGID, "context") == in_memory.key(RIGID, "context")
+
+
+def test_movies_and_rendered_inputs_go_together_if_square(made: Dataset) -> None:
+    spec = replace(SPEC, image_size=SIZE)
+    mixed = observed_source(made, spec).context([RIGID])
+    rendered = observed_source(made, spec, rendered=True).context([RIGID])
+    np.testing.assert_array_equal(mixed.ids, rendered.ids)
+    difference = np.abs(mixed.rgb.astype(int) - rendered.rgb).mean()
+    assert 0 < difference < 8  # the encoder's rounding
+    oblong = Dataset(made.folder)
+    oblong.index["width"] = 64
+    with pytest.raises(BadInputError, match=r"64 x 32 pixels.*rendered=True"):
+        observed_source(oblong, spec)
+    assert observed_source(oblong, spec, rendered=True).context([RIGID]).rgb.any()
+
+
+def test_a_trial_without_motion_cannot_be_rendered(motions: dict[str, Motion]) -> None:
+    motion = motions[RIGID]
+    empty = replace(
+        motion.trajectory,
+        positions=np.full_like(motion.trajectory.positions, np.nan),
+        engine="imported movie",
+    )
+    source = RenderedSource({RIGID: Motion(motion.scene, empty)}, SPEC, observed=True)
+    with pytest.raises(BadInputError, match=rf"{RIGID}.*without motion \(imported movie\)"):
+        source.context([RIGID])
+
+
+def test_keys_follow_motion_look_and_size(motions: dict[str, Motion]) -> None:
+    def key(motion: Motion, spec: Spec = SPEC, look: str = "redyellow") -> str:
+        source = RenderedSource({RIGID: motion}, spec, look=look, observed=True)
+        return source.key(RIGID, "context")
+
+    motion = motions[RIGID]
+    moved = replace(motion.trajectory, positions=motion.trajectory.positions + np.float32(0.01))
+    seen_from = replace(motion.scene.camera, position=(3.0, 1.1, 1.5))
+    keys = {
+        key(motion),
+        key(Motion(motion.scene, moved)),
+        key(Motion(replace(motion.scene, camera=seen_from), motion.trajectory)),
+        key(motion, look="free"),
+        key(motion, replace(SPEC, image_size=32)),
+        key(motion, replace(SPEC, objects=5)),
+        key(motion, replace(SPEC, inputs=("state",))),
+    }
+    assert len(keys) == 7
+    plain = replace(SPEC, inputs=("rgb",))
+    assert key(motion, plain) == key(motion, replace(plain, objects=5))
+
+
+def test_a_source_of_observed_motions_has_observed_windows_only(
+    motions: dict[str, Motion],
+) -> None:
+    observed = RenderedSource(motions, SPEC, observed=True)
+    assert observed.length(RIGID) == 45
+    assert observed.window([RIGID], [30], 3).frames.tolist() == [[30, 37, 44]]
+    with pytest.raises(FutureFrameError, match="frame 45 comes after the observed part"):
+        observed.window([RIGID], [31], 3)
+    longer = RenderedSource(motions, replace(SPEC, future=4), observed=True)
+    for ask in (longer.later, longer.whole):
+        with pytest.raises(FutureFrameError, match="frame 49 comes after"):
+            ask([RIGID])
