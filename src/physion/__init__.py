@@ -1,3 +1,3 @@
 """Physion: physical scenes, people and models. Will the red object touch the yellow one?"""
 
-__version__ = "0.1.0"
+from physion.version import __version__

@@ -11,8 +11,8 @@ import tempfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import physion
 from physion.cli.output import console
+from physion.version import __version__
 
 EXTRAS = {
     "models": ("torch", "timm", "lightning-fabric", "safetensors"),
@@ -89,7 +89,7 @@ def machine() -> list[Check]:
     version = platform.python_version()
     fresh = tuple(map(int, version.split(".")[:2])) >= (3, 11)
     return [
-        Check("physion", physion.__version__),
+        Check("physion", __version__),
         Check("python", version, fresh, remedy="" if fresh else "install Python 3.11 or newer"),
         Check("system", platform.platform()),
         Check("cores", str(cores)),

@@ -26,7 +26,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import physion
 from physion.errors import BadInputError
 from physion.models.batch import Batch, Provenance, Rollout, Spec
 from physion.models.build import make_config
@@ -38,6 +37,7 @@ from physion.physics.labels import label_contact
 from physion.physics.trajectory import State, Trajectory
 from physion.scenes.scene import OBSERVED_FRAMES, Scene
 from physion.seeds import child_generator, trial_seed
+from physion.version import __version__
 
 LAST_OBSERVED = OBSERVED_FRAMES - 1
 
@@ -179,7 +179,7 @@ class NoisySimulation:
             init="none",
             encoder_type="true state",
             dynamics_type="physics engine",
-            versions=f"{self.engine.name}, physion {physion.__version__}",
+            versions=f"{self.engine.name}, physion {__version__}",
         )
 
     def __getstate__(self) -> dict[str, Any]:

@@ -12,7 +12,6 @@ from typing import Any
 
 import pandas as pd
 
-import physion
 from physion.compute.executor import Executor
 from physion.compute.progress import Progress, tracked
 from physion.errors import BadInputError
@@ -33,6 +32,7 @@ from physion.readout.table import (
 )
 from physion.training.protocols import Training
 from physion.trials.dataset import Dataset
+from physion.version import __version__
 
 _VERSION = 3
 """To be increased with every change that can alter the table of an evaluation."""
@@ -134,7 +134,7 @@ def _digest(
     options = dataclasses.asdict(model_config) if dataclasses.is_dataclass(model_config) else {}  # type: ignore[arg-type]
     if isinstance(model, Learns):
         options["training settings"] = dataclasses.asdict(training_settings(model, config))
-    parts = [_VERSION, physion.__version__, settings, dataclasses.asdict(model.provenance())]
+    parts = [_VERSION, __version__, settings, dataclasses.asdict(model.provenance())]
     sha = hashlib.sha256(json.dumps([*parts, options], sort_keys=True, default=str).encode())
     sha.update(model.digest().encode())
     sha.update(dataset.index[columns].to_csv(index=False).encode())

@@ -19,9 +19,9 @@ from safetensors.torch import save
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-import physion
 from physion.atomic import write_atomic
 from physion.errors import BadInputError
+from physion.version import __version__
 
 _METADATA = "physion"
 _VERSION = 1
@@ -44,7 +44,7 @@ def hash_config(config: Mapping[str, Any]) -> str:
 def versions() -> dict[str, str]:
     """Return the versions of this package, torch and Python."""
     return {
-        "physion": physion.__version__,
+        "physion": __version__,
         "torch": str(torch.__version__),
         "python": platform.python_version(),
     }

@@ -31,7 +31,6 @@ import numpy as np
 import pyarrow.compute as pc
 from sqlalchemy import Connection, Engine, select
 
-import physion
 from physion.analysis.people.response_schema import data_dictionary
 from physion.experiment.export.answer_tables import snapshot
 from physion.experiment.export.conventions.bids import BidsWriter
@@ -49,6 +48,7 @@ from physion.experiment.export.spreadsheet import RULE
 from physion.experiment.export.write_tables import TABLES, WrittenTables, write_tables
 from physion.experiment.store.tables import STUDIES
 from physion.experiment.study.study import Study
+from physion.version import __version__
 
 Layout = Literal["both", "psych-ds", "bids"]
 GONE = "its stimulus is no longer in the study folder"
@@ -141,13 +141,13 @@ def export_study(
         _write_json(folder / "data_dictionary.json", dictionary | {"spreadsheet_safety": RULE})
         if bids is not None:
             without = bids.close(
-                name=study.title, readme=readme(study, "bids"), version=physion.__version__
+                name=study.title, readme=readme(study, "bids"), version=__version__
             )
             report = _with_left_out(report, "session", "any", NO_FILE, without)
         if layout != "bids":
             _write_psych_ds(folder, study, sessions, report.until)
         (folder / "README.md").write_text(readme(study, "export", report.facts()), "utf-8")
-        known = {"package": f"physion {physion.__version__}", "name": study.name}
+        known = {"package": f"physion {__version__}", "name": study.name}
         write_manifest(folder, known | {"version": study.version} | report.facts())
     return report
 

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import physion
 from physion.errors import BadInputError
 from physion.models.anchors.observed_motion import motions, observed_motion, touched
 from physion.models.anchors.settings_digest import settings_digest
 from physion.models.batch import Batch, Provenance, Spec
 from physion.models.build import make_config
+from physion.version import __version__
 
 NAME, VERSION = "already-touched", 1
 
@@ -58,7 +58,7 @@ class AlreadyTouched:
 
     def provenance(self) -> Provenance:
         """Return name and versions for the table of predictions."""
-        return Provenance(NAME, "none", versions=f"physion {physion.__version__}")
+        return Provenance(NAME, "none", versions=f"physion {__version__}")
 
     def digest(self) -> str:
         """Return the SHA-256 of code version and settings."""

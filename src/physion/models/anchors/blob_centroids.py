@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import physion
 from physion.models.anchors.copy_last_frame import pictures
 from physion.models.anchors.settings_digest import settings_digest
 from physion.models.batch import Batch, Provenance, Spec
 from physion.models.build import make_config
 from physion.scenes.looks import RED, ROLE_HUES, STRONG_SATURATION, STRONG_VALUE, YELLOW
+from physion.version import __version__
 
 NAME, VERSION = "blob-centroids", 1
 FEATURES = ("red x", "red y", "red area", "yellow x", "yellow y", "yellow area")
@@ -64,7 +64,7 @@ class BlobCentroids:
     def provenance(self) -> Provenance:
         """Return name and versions for the table of predictions."""
         return Provenance(
-            NAME, "none", encoder_type="colour blobs", versions=f"physion {physion.__version__}"
+            NAME, "none", encoder_type="colour blobs", versions=f"physion {__version__}"
         )
 
     def digest(self) -> str:

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-import physion
 from physion.errors import BadInputError
 from physion.models.anchors.observed_motion import motions, observed_motion, touched
 from physion.models.anchors.settings_digest import settings_digest
 from physion.models.anchors.smallest_gap import gap_in_constant_motion
 from physion.models.batch import LAST_OBSERVED, Batch, Motion, Provenance, Rollout, Spec
 from physion.models.build import make_config
+from physion.version import __version__
 
 NAME, VERSION = "constant-motion", 1
 
@@ -68,7 +68,7 @@ class ConstantMotion:
             "none",
             encoder_type="true state",
             dynamics_type="constant velocity",
-            versions=f"physion {physion.__version__}",
+            versions=f"physion {__version__}",
         )
 
     def digest(self) -> str:

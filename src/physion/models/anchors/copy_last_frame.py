@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import physion
 from physion.errors import BadInputError
 from physion.models.anchors.settings_digest import settings_digest
 from physion.models.batch import Batch, Provenance, Rollout, Spec
 from physion.models.build import make_config
+from physion.version import __version__
 
 NAME, VERSION = "copy-last-frame", 1
 
@@ -73,7 +73,7 @@ class CopyLastFrame:
             "none",
             encoder_type="pixels",
             dynamics_type="none",
-            versions=f"physion {physion.__version__}",
+            versions=f"physion {__version__}",
         )
 
     def digest(self) -> str:

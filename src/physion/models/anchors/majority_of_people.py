@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import physion
 from physion.errors import BadInputError
 from physion.models.anchors.people_files import as_fraction, read_people
 from physion.models.anchors.settings_digest import settings_digest
 from physion.models.batch import Batch, Provenance, Spec
 from physion.models.build import make_config
 from physion.stimulus_names import canonical_name
+from physion.version import __version__
 
 NAME, VERSION = "majority-of-people", 1
 
@@ -63,7 +63,7 @@ class MajorityOfPeople:
 
     def provenance(self) -> Provenance:
         """Return name and versions for the table of predictions."""
-        return Provenance(NAME, "none", versions=f"physion {physion.__version__}")
+        return Provenance(NAME, "none", versions=f"physion {__version__}")
 
     def digest(self) -> str:
         """Return the SHA-256 of code version and answers."""

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import physion
 from physion.errors import BadInputError
 from physion.models.anchors.observed_motion import motions, require_motion, touched
 from physion.models.anchors.settings_digest import settings_digest
@@ -17,6 +16,7 @@ from physion.models.batch import Batch, Motion, Provenance, Spec
 from physion.models.build import make_config
 from physion.scenes.scene import OBSERVED_FRAMES
 from physion.stimulus_names import canonical_name
+from physion.version import __version__
 
 NAME, VERSION = "outcome", 1
 
@@ -67,7 +67,7 @@ class Outcome:
 
     def provenance(self) -> Provenance:
         """Return name and versions for the table of predictions."""
-        return Provenance(NAME, "none", versions=f"physion {physion.__version__}")
+        return Provenance(NAME, "none", versions=f"physion {__version__}")
 
     def digest(self) -> str:
         """Return the SHA-256 of code version and known outcomes."""

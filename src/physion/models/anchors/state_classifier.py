@@ -11,13 +11,13 @@ import sklearn
 from numpy.typing import NDArray
 from sklearn.ensemble import ExtraTreesClassifier
 
-import physion
 from physion.errors import BadInputError
 from physion.models.anchors.observed_motion import motions, observed_motion
 from physion.models.anchors.settings_digest import settings_digest
 from physion.models.anchors.state_features import NAMES, state_features
 from physion.models.batch import Batch, Provenance, Spec
 from physion.models.build import make_config
+from physion.version import __version__
 
 NAME, VERSION = "state-classifier", 1
 
@@ -71,7 +71,7 @@ class StateClassifier:
             NAME,
             "none",
             encoder_type="true state",
-            versions=f"scikit-learn {sklearn.__version__}, physion {physion.__version__}",
+            versions=f"scikit-learn {sklearn.__version__}, physion {__version__}",
         )
 
     def digest(self) -> str:

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import physion
 from physion.errors import BadInputError, PhysionError
 from physion.golden import version_digest
 from physion.physics.engine import make_engine
@@ -25,6 +24,7 @@ from physion.trials.files import encode_png, write_files
 from physion.trials.making.plan import GenerateJob, TrialTask
 from physion.trials.trial_file import Metadata, TrialWriter
 from physion.trials.video import MovieEncoder
+from physion.version import __version__
 
 RENDERER = (
     f"physion-{RENDERER_VERSION}.{version_digest(*PASSES)}, "
@@ -153,7 +153,7 @@ def _metadata(job: GenerateJob, scene: Scene, trajectory: Trajectory) -> Metadat
         completed=bool(trajectory.completed),
         engine=trajectory.engine,
         renderer=RENDERER,
-        package=f"physion {physion.__version__}",
+        package=f"physion {__version__}",
         digest=trajectory.digest(),
         recorded_contact=task.recorded_contact,
     )

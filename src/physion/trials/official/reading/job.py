@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-import physion
 from physion.physics.trajectory import Trajectory
 from physion.scenes.scene import FRAME_TIME, OBSERVED_FRAMES, Scene
 from physion.trials.layout import TrialPaths
 from physion.trials.trial_file import Metadata
+from physion.version import __version__
 
 IMPORTED = "imported"
 """Default name of a dataset that is imported from files of other authors."""
@@ -98,7 +98,7 @@ def imported_metadata(
         completed=bool(trajectory.completed),
         engine=trajectory.engine,
         renderer="imported",
-        package=f"physion {physion.__version__}",
+        package=f"physion {__version__}",
         digest=trajectory.digest(),
         scene_digest=scene.physics_digest(),
         movies=movies,

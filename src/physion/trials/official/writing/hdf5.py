@@ -18,7 +18,6 @@ from typing import Any
 import h5py
 import numpy as np
 
-import physion
 from physion.physics.rigid.actors import center_of_mass
 from physion.scenes.scene import Cloth
 from physion.trials.official.axes import swap_axes, to_official_euler
@@ -28,6 +27,7 @@ from physion.trials.official.writing.frames import PASSES, FrameWriter, put
 from physion.trials.official.writing.metadata import trial_record
 from physion.trials.official.writing.objects import OfficialObjects, model_name
 from physion.trials.trial_file import Trial, TrialWriter
+from physion.version import __version__
 
 NONE = -1
 """Id that stands for an object that a trial does not have."""
@@ -87,7 +87,7 @@ def _static(trial: Trial, objects: OfficialObjects) -> dict[str, Any]:
     ramps = [body for body in scene.bodies if body.shape in RAMPS]
     things = dict(zip(ids, objects.things, strict=True))
     found: dict[str, Any] = {
-        "git_commit": f"physion {physion.__version__}",
+        "git_commit": f"physion {__version__}",
         "stimulus_name": f"{config}_{number}",
         "room": ROOMS.get(scene.room, scene.room),
         "seed": 0,
