@@ -7,26 +7,29 @@ is simulated once as it is and ``--runs`` times with 1 mm of jitter, and gets th
 likelihood of everything that its log records:
 
 - outcome: (k + 1/2) / (n + 1) with k of n runs having the recorded outcome;
-- first frame with contact, number of frames: mean over the runs of a Laplace density (3 and 10
-  frames), mixed with 5 % of a uniform density;
+- first frame with contact, first frame in which the target is more than 1 cm from its start (where
+  the recorded one is that of the target), number of frames: mean over the runs of a Laplace density
+  (3, 3 and 10 frames), mixed with 5 % of a uniform density;
 - final position of the target: mean over the runs of exp(-r / s) / (8 pi s^3) with s = 0.1 m,
   mixed with 5 % of a uniform density over 30 m^3.
 
-For the last three, a run without the event counts as density 0 before the mixing. Configurations
+For all but the first, a run without the event counts as density 0 before the mixing. Configurations
 are divided into folds; for each fold the value with the largest sum over the *other* folds is
 chosen, and its gain over the present value is counted on the fold itself. A change is worth keeping
 if this gain is larger than its standard error over configurations. Only trials with a shape that
-the quantity concerns are simulated. ``--write`` appends a table to
-benchmarks/results/calibration.md.
+the quantity concerns are simulated; a quantity with trials of one configuration only cannot be
+cross-validated. ``--write`` appends a table to benchmarks/results/calibration.md.
 """
 
 from __future__ import annotations
 
 import argparse
 import datetime
+import json
 import math
 import os
 import platform
+import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -37,14 +40,16 @@ from typing import Any
 
 import numpy as np
 
+from calibration_quantities import QUANTITIES, Quantity
 from physion.physics.jitter import jitter_scene
 from physion.physics.labels import label_contact
 from physion.physics.rigid import hulls, mass
 from physion.physics.rigid.engine import RigidEngine
 from physion.physics.rigid.settings import RigidSettings
 from physion.physics.trajectory import Trajectory
-from physion.scenes.scene import Scene, SurfaceMaterial
+from physion.scenes.scene import Scene, SurfaceMaterial, Vec3
 from physion.scenes.shapes import primitives
+from physion.scenes.shapes.primitives import Shape
 from physion.scenes.tdw.read_logs import ImportedTrial, read_scenes
 from physion.seeds import child_generator, trial_seed
 
@@ -53,64 +58,13 @@ JITTER = 0.001
 FRAME_SCALE, LENGTH_SCALE, POSITION_SCALE = 3.0, 10.0, 0.1
 UNIFORM = 0.05
 FRAMES, VOLUME = 300.0, 30.0
+MOVED = 0.01
+"""Distance in metres from its start at which the official target "has moved"."""
+PARTS = ("outcome", "first contact", "first motion", "frames", "final position")
+MOTION_RECORDED = ("MultiDominoes", "Collision", "RollingSliding")
+"""Controllers that record the first motion of the target. The others replace the target after they
+have noted where it is, or count from the origin."""
 RIGID = ("dominoes", "support", "collide", "contain", "drop", "link", "roll")
-Change = Callable[[Any], Callable[[], None]]
-
-
-@dataclass(frozen=True)
-class Quantity:
-    """Something unknown: the present value first, then others.
-
-    ``field`` names a field of `RigidSettings`, ``constant`` a constant of the module of shapes;
-    ``shapes`` the shapes that it concerns, by default all. ``room`` is the one whose floor height
-    is meant.
-    """
-
-    name: str
-    values: tuple[Any, ...]
-    field: str = ""
-    constant: str = ""
-    room: str = ""
-    shapes: tuple[str, ...] = ()
-    module: Any = primitives
-
-
-def material(friction: float) -> SurfaceMaterial:
-    """Material of the floor with equal static and dynamic friction."""
-    return SurfaceMaterial(friction, friction, 0.0)
-
-
-QUANTITIES = {
-    q.name: q
-    for q in (
-        Quantity("friction_sweeps", (3, 0), field="friction_sweeps"),
-        Quantity("persistent_manifolds", (True, False), field="persistent_manifolds"),
-        Quantity(
-            "floor_friction",
-            tuple(material(value) for value in (0.6, 0.4, 0.8)),
-            field="floor",
-        ),
-        Quantity("floor_height", (0.0043, 0.0, 0.002, 0.004, 0.006), room="bright"),
-        Quantity("ball_segments", (16, 12, 14, 20, 24), constant="BALL_SEGMENTS", module=hulls,
-                 shapes=("sphere",)),
-        Quantity("pipe_inner", (0.389, 0.25, 0.3, 0.33, 0.35, 0.37, 0.42),
-                 constant="PIPE_PIECE_INNER", shapes=("pipe",)),
-        Quantity("pipe_sectors", (16, 8, 32), constant="PIPE_SECTORS", shapes=("pipe",)),
-        Quantity("torus_inner", (0.429, 0.34, 0.355, 0.37, 0.385, 0.40, 0.45),
-                 constant="TORUS_PIECE_INNER", shapes=("torus",)),
-        Quantity("torus_sectors", (16, 8, 4), constant="TORUS_SECTORS", shapes=("torus",)),
-        Quantity("torus_bevel", (0.06, 0.001, 0.03, 0.09, 0.12), constant="TORUS_BEVEL",
-                 shapes=("torus",)),
-        Quantity("bowl_flat", (0.2, 0.1, 0.15, 0.25, 0.3), constant="BOWL_FLAT", shapes=("bowl",)),
-        Quantity("bowl_wall", (0.035, 0.02, 0.028, 0.045, 0.06), constant="BOWL_PIECE_WALL",
-                 shapes=("bowl",)),
-        Quantity("cylinder_sides", (16, 12, 20, 24, 32), constant="CYLINDER_SIDES", module=hulls,
-                 shapes=("cylinder",)),
-        Quantity("cone_sides", (22, 16, 32), constant="CONE_SEGMENTS", shapes=("cone",)),
-        Quantity("ramp_foot", (1.629, 1.5, 1.58, 1.68), constant="RAMP_FOOT",
-                 shapes=("ramp_with_platform_30", "ramp_with_platform_60")),
-    )
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -124,6 +78,8 @@ class Variant:
         """Change the shapes of this process as the variant says, and return its engine."""
         for name, module, value in _originals:
             setattr(module, name, value)
+        for cached in CACHED:
+            cached.cache_clear()
         settings = RigidSettings()
         if self.quantity is not None:
             quantity = QUANTITIES[self.quantity]
@@ -132,28 +88,57 @@ class Variant:
                 settings = replace(settings, **{quantity.field: value})
             if quantity.constant:
                 setattr(quantity.module, quantity.constant, value)
-        for cached in (
-            primitives.shape,
-            hulls._unit_hulls,
-            hulls.collision_hulls,
-            mass._body_mass,
-            mass._unit_moments,
-        ):
-            cached.cache_clear()
+            if quantity.build is not None:
+                replace_shape(quantity.shapes[0], quantity.build(value))
+            if quantity.mass is not None:
+                replace_mass(quantity.shapes[0], quantity.mass, value)
         return RigidEngine(settings, threads=1)
 
     def scene(self, scene: Scene) -> Scene:
-        """Return the scene with the variant's height of the floor."""
-        quantity = None if self.quantity is None else QUANTITIES[self.quantity]
-        if quantity is None or not quantity.room or scene.room != quantity.room:
+        """Return the scene with the variant's height of the floor, or its other changes."""
+        if self.quantity is None:
             return scene
-        return replace(scene, floor=quantity.values[self.index])
+        quantity, value = QUANTITIES[self.quantity], QUANTITIES[self.quantity].values[self.index]
+        if quantity.scene is not None:
+            return quantity.scene(scene, value)
+        if not quantity.room or scene.room != quantity.room:
+            return scene
+        return replace(scene, floor=value)
 
 
+CACHED = (
+    primitives.shape,
+    hulls._unit_hulls,
+    hulls.collision_hulls,
+    mass._body_mass,
+    mass._unit_moments,
+)
+"""Functions that remember shapes."""
 _originals = [
     (q.constant, q.module, getattr(q.module, q.constant)) for q in QUANTITIES.values() if q.constant
 ]
+_originals += [("shape", hulls, primitives.shape), ("_body_mass", mass, mass._body_mass)]
 _trials: list[ImportedTrial] = []
+_motions: list[int | None] = []
+
+
+def replace_shape(name: str, changed: Shape) -> None:
+    """Let bodies of the shape ``name`` collide as ``changed``."""
+    present = primitives.shape
+    setattr(hulls, "shape", lambda asked: changed if asked == name else present(asked))  # noqa: B010
+
+
+def replace_mass(
+    name: str, change: Callable[[Any, mass.MassProperties], mass.MassProperties], value: Any
+) -> None:
+    """Let bodies of the shape ``name`` have changed mass properties."""
+    present = mass._body_mass
+
+    def changed(asked: str, scale: Vec3, kilograms: float) -> mass.MassProperties:
+        found = present(asked, scale, kilograms)
+        return change(value, found) if asked == name else found
+
+    setattr(mass, "_body_mass", changed)  # noqa: B010
 
 
 def load(folder: Path) -> None:
@@ -163,12 +148,26 @@ def load(folder: Path) -> None:
     for scenario in RIGID:
         trials, _ = read_scenes(folder, scenario).unique()
         _trials.extend(trials)
+    motions = read_first_motions(folder)
+    _motions.extend(motions.get(trial.scene.name) for trial in _trials)
+
+
+def read_first_motions(folder: Path) -> dict[str, int | None]:
+    """Return the recorded first frame in which the target has moved, by name of the trial."""
+    found = {}
+    for path in folder.rglob("metadata.json"):
+        for record in json.loads(path.read_text()):
+            if record["controller_name"] in MOTION_RECORDED:
+                found[record["stimulus_name"]] = record["first_target_move_frame"]
+    return found
 
 
 def concerns(quantity: Quantity, trial: ImportedTrial) -> bool:
     """Return whether the trial has a shape or room that the quantity concerns."""
     if quantity.room:
         return trial.scene.room == quantity.room
+    if quantity.configurations not in str(trial.scene.parameters.get("configuration")):
+        return False
     shapes = {body.shape for body in trial.scene.bodies if not body.scenery}
     return not quantity.shapes or bool(shapes & set(quantity.shapes))
 
@@ -183,11 +182,23 @@ def log_mixture(densities: list[float], uniform: float) -> float:
     return math.log((1.0 - UNIFORM) * math.fsum(densities) / len(densities) + UNIFORM * uniform)
 
 
-def score(trial: ImportedTrial, runs: list[tuple[Scene, Trajectory]]) -> list[float]:
-    """Return the log-likelihoods of a trial: outcome, first contact, frames, final position."""
+def first_motion(scene: Scene, path: Trajectory) -> int | None:
+    """Return the first frame in which the target has moved, None if it never does."""
+    start = np.array(scene.bodies[scene.index(scene.roles.agent)].position)
+    away = np.linalg.norm(path.positions[:, scene.index(scene.roles.agent)] - start, axis=1)
+    return int(np.argmax(away > MOVED)) if bool((away > MOVED).any()) else None
+
+
+def score(
+    trial: ImportedTrial, motion: int | None, runs: list[tuple[Scene, Trajectory]]
+) -> list[float]:
+    """Return the log-likelihoods of a trial, as in `PARTS`, and whether the first run agrees.
+
+    ``motion`` is the recorded first frame of the target's motion.
+    """
     outcome = trial.outcome
     hits = 0
-    first, length, position = [], [], []
+    first, moved, length, position = [], [], [], []
     end = None if outcome.final_position is None else np.array(outcome.final_position)
     for scene, path in runs:
         labels = label_contact(scene, path)
@@ -196,6 +207,9 @@ def score(trial: ImportedTrial, runs: list[tuple[Scene, Trajectory]]) -> list[fl
             first.append(laplace(labels.first_frame - outcome.first_frame, FRAME_SCALE))
         else:
             first.append(0.0)
+        if motion is not None:
+            frame = first_motion(scene, path)
+            moved.append(0.0 if frame is None else laplace(frame - motion, FRAME_SCALE))
         length.append(laplace(len(path) - outcome.frames, LENGTH_SCALE))
         if end is not None:
             away = float(np.linalg.norm(path.positions[-1, scene.index(scene.roles.agent)] - end))
@@ -204,6 +218,7 @@ def score(trial: ImportedTrial, runs: list[tuple[Scene, Trajectory]]) -> list[fl
     return [
         math.log((hits + 0.5) / (len(runs) + 1.0)),
         log_mixture(first, 1.0 / FRAMES) if outcome.first_frame is not None else 0.0,
+        log_mixture(moved, 1.0 / FRAMES) if moved else 0.0,
         log_mixture(length, 1.0 / FRAMES),
         log_mixture(position, 1.0 / VOLUME) if position else 0.0,
         float(label_contact(*runs[0]).contact == outcome.contact),
@@ -223,7 +238,7 @@ def run_chunk(
         seed = trial_seed("jitter", scene.scenario, scene.name, 0)
         draws = [child_generator(seed, f"repeat {repeat}") for repeat in range(repeats)]
         scenes = [scene, *(jitter_scene(scene, JITTER, draw) for draw in draws)]
-        rows.append(score(trial, [(s, engine.simulate(s)) for s in scenes]))
+        rows.append(score(trial, _motions[index], [(s, engine.simulate(s)) for s in scenes]))
     return rows
 
 
@@ -271,6 +286,8 @@ def main() -> None:
             started = time.time()
             indices = [i for i, trial in enumerate(_trials) if concerns(quantity, trial)]
             if not indices:
+                lines.append(f"\n### {name}: no trial with such a shape in the folder")
+                print(lines[-1], flush=True)
                 continue
             configurations = [
                 str(_trials[i].scene.parameters.get("configuration")) for i in indices
@@ -292,7 +309,7 @@ def main() -> None:
                     base = found
                 table.append([found[i] for i in indices])
             rows = np.array(table)
-            total = rows[:, :, :4].sum(axis=2)
+            total = rows[:, :, : len(PARTS)].sum(axis=2)
             gain, error, chosen = cross_validate(total, configurations)
             lines += report(quantity, rows, gain, error, chosen, time.time() - started)
             print("\n".join(lines[-len(quantity.values) - 6 :]), flush=True)
@@ -300,7 +317,7 @@ def main() -> None:
         cpu = platform.processor() or platform.machine()
         head = [
             f"\n## {datetime.date.today()}, {cpu}, `python benchmarks/calibrate.py FOLDER "
-            f"--runs {options.runs}`\n"
+            f"{' '.join(sys.argv[2:])}`\n"
         ]
         with RESULTS.open("a") as file:
             file.write("\n".join(head + lines) + "\n")
@@ -323,14 +340,14 @@ def report(
     lines = [
         f"\n### {quantity.name}: {rows.shape[1]} trials, {seconds:.0f} s",
         "",
-        "| value | agreement | outcome | first contact | frames | final position | sum |",
-        "|---|---|---|---|---|---|---|",
+        f"| value | agreement | {' | '.join(PARTS)} | sum |",
+        "|---|---|" + "---|" * (len(PARTS) + 1),
     ]
     for index, value in enumerate(quantity.values):
         mean = rows[index].mean(axis=0)
         shown = shown_value(value)
-        parts = " | ".join(f"{part:.3f}" for part in mean[:4])
-        lines.append(f"| {shown} | {mean[4]:.3f} | {parts} | {mean[:4].sum():.3f} |")
+        parts = " | ".join(f"{part:.3f}" for part in mean[:-1])
+        lines.append(f"| {shown} | {mean[-1]:.3f} | {parts} | {mean[:-1].sum():.3f} |")
     picks = ", ".join(str(shown_value(quantity.values[c])) for c in chosen)
     lines.append("")
     lines.append(
