@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+from physion.compute.executor import Executor
 from physion.compute.local import LocalExecutor, SerialExecutor
 from physion.errors import BadInputError, PhysionError
 from physion.models.batch import Spec
@@ -106,21 +107,25 @@ def test_a_forgotten_iterator_ends_its_threads() -> None:
     assert not running()
 
 
-def test_batches_of_a_source_are_the_same_in_threads_and_processes(made: Dataset) -> None:
+@pytest.mark.parametrize(
+    "executor", [None, SerialExecutor(), pytest.param(LocalExecutor(2), marks=pytest.mark.slow)]
+)
+def test_batches_of_a_source_are_the_same_read_ahead(
+    made: Dataset, executor: Executor | None
+) -> None:
     """Movies, rendering and motions, with more threads than trials."""
     spec = Spec(inputs=("rgb", "ids", "boxes", "state"), image_size=16, stride=3)
     source = whole_source(made, spec)
     requests = [((RIGID, CLOTH), (start, 2 * start)) for start in range(8)]
     expected = [source.window(*request, 4) for request in requests]
     read = partial(window, source)
-    for executor in (None, SerialExecutor(), LocalExecutor(2)):
-        ahead = background(requests, read, ahead=6, threads=6, executor=executor)
-        for batch, known in zip(ahead, expected, strict=True):
-            for name, values in known.arrays().items():
-                np.testing.assert_array_equal(batch.arrays()[name], values, name)
-            assert [m.trajectory.digest() for m in batch.state or ()] == [
-                m.trajectory.digest() for m in known.state or ()
-            ]
+    ahead = background(requests, read, ahead=6, threads=6, executor=executor)
+    for batch, known in zip(ahead, expected, strict=True):
+        for name, values in known.arrays().items():
+            np.testing.assert_array_equal(batch.arrays()[name], values, name)
+        assert [motion.trajectory.digest() for motion in batch.state or ()] == [
+            motion.trajectory.digest() for motion in known.state or ()
+        ]
 
 
 def window(source, request):  # type: ignore[no-untyped-def]
@@ -128,6 +133,7 @@ def window(source, request):  # type: ignore[no-untyped-def]
     return source.window(*request, 4)
 
 
+@pytest.mark.slow
 def test_processes_give_results_in_order_and_errors_at_their_place() -> None:
     found: list[int] = []
     with pytest.raises(PhysionError, match="seven is bad"):

@@ -17,6 +17,10 @@ class Absent:
             raise ModuleNotFoundError(f'No module named {name!r}', name=name)
 sys.meta_path.insert(0, Absent())
 """
+SOURCES = """
+from physion.training.sources import background, open_source, rendered
+assert not {'av', 'hdf5plugin', 'h5py', 'torch'} & set(sys.modules)
+"""
 IMPORTS = """
 import importlib, pkgutil
 import physion.models, physion.training
@@ -86,7 +90,14 @@ assert not {'av', 'hdf5plugin', 'h5py'} & set(sys.modules)
 """
 
 
-@pytest.mark.parametrize("program", [IMPORTS, TRAINING], ids=["imports", "training"])
+@pytest.mark.parametrize(
+    "program",
+    [
+        pytest.param(SOURCES, id="sources"),
+        pytest.param(IMPORTS, id="imports", marks=pytest.mark.slow),
+        pytest.param(TRAINING, id="training", marks=pytest.mark.slow),
+    ],
+)
 def test_without_av_and_hdf5plugin(program: str, tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", BLOCK + f"sys.path.insert(0, {str(TESTS)!r})\n" + program],

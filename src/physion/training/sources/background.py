@@ -1,8 +1,8 @@
 """Reading of batches ahead, in threads or processes.
 
 Decoding of movies and the kernels of the renderer release Python's global lock, so that threads
-read while a model trains. The renderer spends a third of its time, at 128 pixels, in Python itself:
-to render with more than about three cores, processes are needed.
+read while a model trains. The renderer is partly Python itself: on more than a few cores, processes
+render faster than threads.
 """
 
 from __future__ import annotations
