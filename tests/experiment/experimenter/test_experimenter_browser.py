@@ -128,6 +128,8 @@ def test_from_login_to_logout_by_keyboard(chromium: Any, site: tuple[Study, str]
     page = context.new_page()
     log_in(page, url, "wrong")
     assert "not the password" in page.locator("[role=alert]").inner_text()
+    # The new page takes the focus at its first rendering, after which keys are not lost.
+    page.locator("#password:focus").wait_for()
     page.keyboard.type(PASSWORD)
     page.keyboard.press("Enter")
     page.wait_for_selector("text=Log out")
