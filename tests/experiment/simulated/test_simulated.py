@@ -23,6 +23,11 @@ from physion.experiment.study.study import Study
 from support.experiment.serving import stored_answers, stored_sessions
 from support.experiment.tiny_study import make_tiny_study
 
+COLUMNS_OF_PREDICTIONS = (
+    "Model,Readout Type,Readout Test Data,Predicted Prob_true,Predicted Outcome,Actual Outcome,"
+    "Stimulus Name"
+)
+
 
 def _stimulus(number: int, label: bool) -> Stimulus:
     return Stimulus(
@@ -119,6 +124,32 @@ def test_simulated_is_written_in_the_data_for_good(
             right = [(a.response == "yes") == labels[a.stimulus]
                      for a in visit.answers if a.phase == "test"]  # fmt: skip
             assert visit.result.correct == sum(right)
+
+
+@pytest.mark.parametrize("verb", [["compare"], ["compare", "leaderboard"]])
+@pytest.mark.parametrize("with_sessions", [False, True])
+def test_models_are_not_compared_with_simulated_participants_alone(
+    study: Study,
+    served: tuple[ServerProcess, list[Visit], list[Visit]],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    verb: list[str],
+    with_sessions: bool,
+) -> None:
+    assert len(stored_sessions(study)) == 8
+    data, predictions = tmp_path / "data", tmp_path / "m.csv"
+    assert main(["experiment", "export", str(study.folder), "--out", str(data)]) == 0
+    rows = [f"m,B,{s.scenario},0.9,True,{s.label},{s.stimulus}" for s in study.stimuli]
+    predictions.write_text("\n".join([COLUMNS_OF_PREDICTIONS, *rows]) + "\n")
+    words = [*verb, str(predictions), "--responses", str(data / "trials.csv")]
+    words += ["--sessions", str(data / "sessions.csv")] if with_sessions else []
+    capsys.readouterr()
+    assert main([*words, "--out", str(tmp_path / "report")]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and str(data / "trials.csv") in said
+    assert "only simulated participants were found (8 sessions)" in said
+    assert "export the study again" in said
+    assert not (tmp_path / "report").exists()
 
 
 @pytest.mark.slow

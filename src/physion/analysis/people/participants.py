@@ -105,7 +105,8 @@ def read_responses(
     Raises
     ------
     BadInputError
-        For files that break the schema or contradict themselves.
+        For files that break the schema or contradict themselves, and where simulated participants
+        alone have answered, unless their sessions are kept.
     """
     table = check_table(read_table(trials, ()), TRIAL_COLUMNS, str(trials))
     people = None
@@ -119,6 +120,12 @@ def read_responses(
         simulated_sessions |= set(cleaned.sessions.loc[cleaned.sessions["simulated"], "session"])
     if simulated or not simulated_sessions:
         return cleaned
+    if set(cleaned.trials["session"]) <= simulated_sessions:
+        count = cleaned.trials["session"].nunique()
+        raise BadInputError(
+            f"{trials}: only simulated participants were found ({count} sessions), and these are "
+            "left out; export the study again when people have taken part"
+        )
     return cleaned.keep_sessions(set(cleaned.sessions["session"]) - simulated_sessions, SIMULATED)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -29,6 +30,7 @@ from physion.trials.index import write_index
 from physion.trials.video import read_frames
 from support.experiment.tiny_dataset import is_marked, make_tiny_dataset
 from support.experiment.tiny_study import OBSERVED, make_tiny_study, read_number
+from support.paths import ROOT
 
 
 @pytest.fixture(scope="module")
@@ -327,7 +329,12 @@ def test_a_missing_extra_is_said_in_one_line(
     more = ["--all"] if word == "forget" else []
     assert main(["experiment", word, str(tmp_path / "s"), *more]) == 2
     said = capsys.readouterr().err
-    assert ".[experiment]" in said and said.count("\n") == 1
+    assert said.count("\n") == 1
+    # The README's first command has the same form, for another extra.
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    found = re.search(r"(\S*pip install) -q (-e '\.\[)[a-z,]+(\]' -c \S+)", readme)
+    assert found is not None
+    assert said.endswith(f": {found[1]} {found[2]}experiment{found[3]}\n")
 
 
 @pytest.mark.slow
