@@ -25,7 +25,8 @@ from physion.errors import BadSceneError
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
 from physion.scenes.sampling.preset import Preset, get_preset, load_presets
-from physion.scenes.sampling.registry import sample_scene, scenarios
+from physion.scenes.sampling.registry import scenarios
+from physion.scenes.sampling.sample import sample_scene
 from physion.seeds import trial_seed
 from replay import RESULTS, cell, processor
 

@@ -24,13 +24,14 @@ from replay import RESULTS, processor
 HERE = Path(__file__).parents[1] / "src"
 WORK = """
 import json, sys, time
-from physion.scenes.sampling.registry import sample_scene, scenarios
+from physion.scenes.sampling.registry import scenarios
 from physion.physics.engine import simulate
 from physion.rendering.renderer import Renderer
 from physion.seeds import trial_seed
 times = {}
 for scenario in sorted(scenarios.names()):
-    scenes = [sample_scene(scenario, trial_seed("speed", scenario, "testing", i))
+    chosen = scenarios.get(scenario)
+    scenes = [chosen.sample(chosen.params(), trial_seed("speed", scenario, "testing", i))
               for i in range(int(sys.argv[1]))]
     simulate(scenes[0], frames=30)
     start = time.process_time()

@@ -20,7 +20,7 @@ from physion.physics.engine import simulate
 from physion.rendering.renderer import Frame, Renderer, role_map
 from physion.scenes.looks import with_role_colors
 from physion.scenes.sampling.preset import get_preset
-from physion.scenes.sampling.registry import sample_scene
+from physion.scenes.sampling.sample import sample_scene
 from physion.seeds import trial_seed
 
 TRIALS = {

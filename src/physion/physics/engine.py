@@ -107,16 +107,46 @@ def can_simulate(name: str, scene: Scene) -> bool:
 def simulate(
     scene: Scene,
     *,
-    engine: Engine | None = None,
+    engine: Engine | str = DEFAULT_ENGINE,
     start: State | None = None,
     frames: int | None = None,
     until_contact: bool = False,
 ) -> Trajectory:
-    """Simulate a scene with ``engine``, by default the one called `DEFAULT_ENGINE`.
+    """Simulate a scene.
 
-    See `Engine.simulate` for the other parameters.
+    Parameters
+    ----------
+    scene
+        Bodies, cloths, joints, pushes, events and ending.
+    engine
+        Engine, or its name (``physion ls engines``).
+    start
+        Continue from this instant, which is frame 0 of the result; by default all start at rest.
+    frames
+        Number of frames of 0.01 s, frame 0 included, in place of the scene's own ending.
+    until_contact
+        Allow the engine to stop after the first frame in which agent and patient touch.
+
+    Returns
+    -------
+    trajectory
+        Positions (F, N, 3) in metres, rotations (F, N, 4) as (w, x, y, z), velocities, vertices of
+        cloths, and contacts of all F frames and N bodies.
+
+    Raises
+    ------
+    UnknownNameError
+        For an unknown engine.
+    BadSceneError
+        For a scene that the engine cannot simulate, such as cloth with MuJoCo.
+
+    Examples
+    --------
+    >>> from physion import sample_scene
+    >>> simulate(sample_scene("collide", 3), frames=20).positions.shape
+    (20, 3, 3)
     """
-    chosen = engine if engine is not None else make_engine()
+    chosen = make_engine(engine) if isinstance(engine, str) else engine
     return chosen.simulate(scene, start=start, frames=frames, until_contact=until_contact)
 
 

@@ -17,7 +17,7 @@ from physion.physics.rigid.engine import RigidEngine
 from physion.physics.rigid.run import RigidRun
 from physion.physics.rigid.settings import RigidSettings
 from physion.physics.trajectory import ENVIRONMENT
-from physion.scenes.sampling.registry import sample_scene
+from physion.scenes.sampling.sample import sample_scene
 from physion.scenes.scene import Body, Ending, Joint, Push, SurfaceMaterial
 from physion.seeds import trial_seed
 from support.rigid_scenes import DT, ICE, ROUGH, ZONE, G, run, scene_of, way_of_steps

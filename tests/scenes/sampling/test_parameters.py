@@ -41,7 +41,7 @@ from physion.scenes.sampling.parameters import (
     retry,
     uniform,
 )
-from physion.scenes.sampling.registry import as_record, sample_scene, scenarios
+from physion.scenes.sampling.registry import as_record, scenarios
 from physion.scenes.sampling.rules import (
     BodyRule,
     PushRule,
@@ -52,6 +52,7 @@ from physion.scenes.sampling.rules import (
     raise_to_floor,
     require_apart,
 )
+from physion.scenes.sampling.sample import sample_scene
 from physion.scenes.scene import Body, Look
 from physion.scenes.shapes.primitives import shape, shapes
 

@@ -25,7 +25,8 @@ from physion.scenes.sampling.preset import (
     parse_presets,
     read_preset_file,
 )
-from physion.scenes.sampling.registry import sample_scene, scenarios
+from physion.scenes.sampling.registry import scenarios
+from physion.scenes.sampling.sample import sample_scene
 from physion.seeds import trial_seed
 from support.sound_scenes import assert_seen, assert_valid, overlapping
 

@@ -19,7 +19,8 @@ from physion.scenes.sampling.clearance import GAP, is_clear_of, raise_above, req
 from physion.scenes.sampling.parameters import LEAST_MASS, Range, yaw
 from physion.scenes.sampling.placement import world_bounds
 from physion.scenes.sampling.preset import get_preset, load_presets, parse_presets
-from physion.scenes.sampling.registry import sample_scene, scenarios
+from physion.scenes.sampling.registry import scenarios
+from physion.scenes.sampling.sample import sample_scene
 from physion.scenes.sampling.stacks import (
     SMALLEST,
     StackRule,

@@ -23,8 +23,8 @@ from physion.physics.rigid.hulls import collision_hulls
 from physion.scenes.sampling.parameters import euler_rotation
 from physion.scenes.sampling.placement import project_to_image, world_bounds, world_corners
 from physion.scenes.sampling.preset import Preset, load_presets, parse_presets
-from physion.scenes.sampling.registry import sample_scene
 from physion.scenes.sampling.rules import BodyRule
+from physion.scenes.sampling.sample import sample_scene
 from physion.scenes.scenarios import drape, roll
 from physion.scenes.scene import Body, Scene
 from physion.scenes.shapes.primitives import shape

@@ -16,7 +16,8 @@ from physion.numerics.rotations import rotate_vectors
 from physion.scenes.looks import RED, YELLOW, is_mistakable, with_role_colors
 from physion.scenes.sampling.placement import CameraRule, SceneryRule, place_camera, world_bounds
 from physion.scenes.sampling.preset import get_preset, parse_presets
-from physion.scenes.sampling.registry import Scenario, sample_scene, scenarios
+from physion.scenes.sampling.registry import Scenario, scenarios
+from physion.scenes.sampling.sample import sample_scene
 from physion.scenes.scenarios.collide import CollideParameters as Collide
 from physion.scenes.scenarios.dominoes import DominoesParameters as Dominoes
 from physion.scenes.scenarios.drop import DropParameters as Drop

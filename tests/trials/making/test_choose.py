@@ -12,7 +12,7 @@ from physion.compute.local import SerialExecutor
 from physion.errors import BadInputError, BadSceneError, PhysionError
 from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
-from physion.scenes.sampling.registry import sample_scene
+from physion.scenes.sampling.sample import sample_scene
 from physion.seeds import trial_seed
 from physion.trials.dataset import Dataset
 from physion.trials.making import choose as choosing

@@ -10,9 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from physion.errors import BadInputError
 from physion.registry import Registry
-from physion.scenes.sampling.parameters import check_params
 from physion.scenes.scene import Scene
 from physion.seeds import stable_hash
 
@@ -65,25 +63,6 @@ def scenario(
         return sample
 
     return add
-
-
-def sample_scene(name: str, seed: np.random.SeedSequence, params: object | None = None) -> Scene:
-    """Sample a scene of the scenario ``name``, by default with its default parameters.
-
-    Raises `UnknownNameError` with the closest names for an unknown scenario, `BadInputError` for
-    parameters that are not allowed, and `BadSceneError` if no scene fits them.
-    """
-    chosen = scenarios.get(name)
-    if params is None:
-        params = chosen.params()
-    elif not isinstance(params, chosen.params):
-        raise BadInputError(
-            f"scenario {name!r} takes {chosen.params.__module__}.{chosen.params.__name__}, "
-            f"not {type(params).__name__}"
-        )
-    else:
-        check_params(params, f"parameters of {name}")
-    return chosen.sample(params, seed)
 
 
 def scene_name(scenario: str, seed: np.random.SeedSequence) -> str:

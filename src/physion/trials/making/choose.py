@@ -27,7 +27,7 @@ from physion.physics.jitter import jitter_scene
 from physion.physics.labels import label_contact
 from physion.physics.trajectory import Trajectory
 from physion.scenes.sampling.preset import get_preset
-from physion.scenes.sampling.registry import sample_scene
+from physion.scenes.sampling.sample import sample_scene
 from physion.scenes.scene import Scene
 from physion.seeds import child_generator, stable_hash, trial_seed
 from physion.trials.making.plan import GenerateSettings, TrialTask

@@ -18,7 +18,7 @@ from physion.rendering.renderer import PASSES, Frame, Renderer, role_map
 from physion.rendering.renderer import VERSION as RENDERER_VERSION
 from physion.scenes.looks import in_look
 from physion.scenes.sampling.preset import get_preset
-from physion.scenes.sampling.registry import sample_scene
+from physion.scenes.sampling.sample import sample_scene
 from physion.scenes.scene import FRAME_TIME, OBSERVED_FRAMES, Scene
 from physion.trials.files import encode_png, write_files
 from physion.trials.making.plan import GenerateJob, TrialTask

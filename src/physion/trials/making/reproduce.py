@@ -15,7 +15,8 @@ from physion.physics.engine import simulate
 from physion.physics.labels import label_contact
 from physion.physics.particles import particles_over_time
 from physion.rendering.renderer import PASSES, Renderer
-from physion.scenes.sampling.registry import sample_scene, scenarios
+from physion.scenes.sampling.registry import scenarios
+from physion.scenes.sampling.sample import sample_scene
 from physion.seeds import trial_seed
 from physion.trials.making.choose import robustness
 
