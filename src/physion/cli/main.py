@@ -15,12 +15,14 @@ VERBS = {
     "run": "run the whole pipeline: scenes, trials, models, readout, comparison, report",
     "generate": "sample scenes and write trials",
     "replay": "simulate official command logs and compare with the recorded outcomes",
+    "train": "train a model on trials, without labels",
     "evaluate": "train models and readouts on trials and write their predictions",
     "compare": "compare predictions with people",
     "experiment": "run the experiment with people: init, serve, export",
     "view": "write a page that shows a dataset: movies, passes, motion in 3D",
     "export": "write the official layout, webdataset shards, or a dataset card",
     "import": "convert official HDF5 files and movies to trials",
+    "import-official": "convert a checkout of the original study: scenes, outcomes, people",
     "verify": "check every byte, label and motion of a dataset",
     "ls": "list scenarios, presets, shapes, props, materials, models, engines",
     "doctor": "check this machine and print what to install",
@@ -28,6 +30,7 @@ VERBS = {
 
 MODULES = {
     "import": "import_trials",
+    "import-official": "import_official",
     "compare": "compare.compare",
     "experiment": "experiment.experiment",
 }
@@ -38,7 +41,7 @@ OUTPUT_CLOSED = 141
 
 
 def _usage() -> str:
-    verbs = "\n".join(f"  {name:<10} {text}" for name, text in VERBS.items())
+    verbs = "\n".join(f"  {name:<15} {text}" for name, text in VERBS.items())
     return (
         "usage: physion VERB [options]     (physion VERB --help lists them)\n\n"
         f"{verbs}\n\n"
@@ -78,7 +81,7 @@ def _run_verb(args: list[str]) -> int:
         print(_usage())
         return 0 if args else 2
     if args[0] == "--version":
-        from physion import __version__
+        from physion.version import __version__
 
         print(f"physion {__version__}")
         return 0

@@ -19,14 +19,16 @@ from typing import Annotated
 import pandas as pd
 import tyro
 
+from physion.cli.official_data import read_trials
 from physion.cli.output import Stages, console, write_text
 from physion.cli.text_table import text_table
 from physion.compute.local import LocalExecutor
 from physion.compute.progress import tracked
+from physion.data import PACKAGED
 from physion.errors import BadInputError
 from physion.physics.engine import DEFAULT_ENGINE, can_simulate, engines
 from physion.physics.replay import Replay, ReplayRow, ReplayTask, replay_trial, summarise
-from physion.scenes.tdw.read_logs import TrialSet, read_scenes
+from physion.scenes.tdw.read_logs import TrialSet
 
 SHOWN_FAILURES = 5
 COLUMNS = {
@@ -81,8 +83,9 @@ class ReplayResult:
 class Options:
     """Options of ``physion replay``."""
 
-    folder: Annotated[Path, tyro.conf.Positional]
-    """Folder with official command logs, at any depth."""
+    folder: Annotated[Path, tyro.conf.Positional] = Path(PACKAGED)
+    """Folder with official command logs, at any depth, or made by import-official; official stands
+    for the scenes of the package."""
     json: Path | None = None
     """Write the table, all trials and all failures to this file."""
     scenario: str | None = None
@@ -106,7 +109,7 @@ def main(options: Options) -> int:
         raise BadInputError("--repeats and --jitter must not be negative")
     if options.json is not None and options.json.is_dir():
         raise BadInputError(f"--json {options.json} is a folder; give a file")
-    logs = read_scenes(options.folder, options.scenario, options.limit)
+    logs = read_trials(options.folder, options.scenario, options.limit)
     logs.require_trials()
     trials, copies = logs.unique()
     names = _engine_names(options.engines)

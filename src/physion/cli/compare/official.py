@@ -24,8 +24,9 @@ if TYPE_CHECKING:
 class Options:
     """Where the official data is."""
 
-    folder: Annotated[Path, tyro.conf.Positional]
-    """Folder with results/ and humans/ of the original study."""
+    folder: Annotated[Path, tyro.conf.Positional] = Path("official")
+    """Folder with results/ and humans/ of the original study; official stands for the tables of
+    the package."""
     out: Path | None = None
     """Folder for the page, the figures, the tables as CSV files and published.json."""
     json: bool = False
@@ -35,10 +36,11 @@ class Options:
 def main(options: Options) -> int:
     """Print the tables, and write the page if asked."""
     from physion.analysis.published.summary import published_results
+    from physion.cli.official_data import study_folder
     from physion.cli.output import console
     from physion.report.published_report import build_published_report, published_numbers
 
-    results = published_results(options.folder)
+    results = published_results(study_folder(options.folder))
     page = None if options.out is None else build_published_report(results, options.out)
     if options.json:
         print(json_module.dumps(published_numbers(results), indent=1))

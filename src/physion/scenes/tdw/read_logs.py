@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -175,7 +176,8 @@ def _find_model_bounds(root: Path) -> Mapping[str, ModelBounds]:
     for folder in (root, *root.resolve().parents[:3]):
         if (folder / "model_bounds.json").is_file():
             return read_model_bounds(folder / "model_bounds.json")
-    return {}
+    packaged = Path(str(files("physion") / "data" / "official_study" / "model_bounds.json"))
+    return read_model_bounds(packaged) if packaged.is_file() else {}
 
 
 class _SceneBuilder:
