@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -146,6 +147,14 @@ class NextBrightness(TorchModel):
             heights = [motion.trajectory.positions[rows, 0, 2] for motion, rows in pairs]
             return torch.tensor(np.stack(heights), dtype=torch.float32)
         return batch.rgb.float().mean(dim=(2, 3, 4)) / 100
+
+
+class SlowBrightness(NextBrightness):
+    """Network that takes its time, so that a process can be killed in the middle."""
+
+    def loss(self, batch: Batch) -> dict[str, Tensor]:
+        time.sleep(0.05)
+        return super().loss(batch)
 
 
 def equal_weights(one: nn.Module, other: nn.Module) -> bool:

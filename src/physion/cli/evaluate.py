@@ -6,13 +6,13 @@ import json as json_module
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
+from physion.cli.model_options import parse_options
 from physion.cli.output import Stages, console
 from physion.compute.local import LocalExecutor
-from physion.errors import BadInputError
 from physion.readout import EvaluationConfig, evaluate
 from physion.trials.dataset import Dataset
 
@@ -60,17 +60,3 @@ def main(options: Options) -> int:
     count = len(result.predictions)
     console.print(f"{count} predictions: {result.path}", markup=False, soft_wrap=True)
     return 1 if result.problems else 0
-
-
-def parse_options(pairs: tuple[str, ...]) -> dict[str, Any]:
-    """Parse NAME=VALUE pairs; a value that is not JSON is taken as text."""
-    values: dict[str, Any] = {}
-    for pair in pairs:
-        name, sign, text = pair.partition("=")
-        if not sign or not name:
-            raise BadInputError(f"--option takes NAME=VALUE, not {pair!r}")
-        try:
-            values[name] = json_module.loads(text)
-        except json_module.JSONDecodeError:
-            values[name] = text
-    return values

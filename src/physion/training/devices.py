@@ -10,6 +10,7 @@ from typing import Any
 
 from lightning_fabric import Fabric
 from lightning_fabric.strategies.ddp import DDPStrategy
+from lightning_fabric.utilities.rank_zero import rank_zero_only
 
 from physion.errors import BadInputError
 from physion.models.raised import OutOfMemoryError, is_out_of_memory
@@ -66,6 +67,11 @@ def make_fabric(devices: Devices, precision: str = "32-true") -> Fabric:
     if options:
         fabric.launch()
     return fabric
+
+
+def is_first_process() -> bool:
+    """Return whether this is the process that writes and prints, of those that train together."""
+    return int(getattr(rank_zero_only, "rank", 0) or 0) == 0
 
 
 @contextmanager

@@ -114,7 +114,9 @@ def train_model(
     OutOfMemoryError
         If memory is used up; the message names the setting to lower.
     """
-    _check(model, trials)
+    check_trainable(model)
+    if not trials:
+        raise BadInputError(f"there is no trial to train {model.provenance().model!r} on")
     settings = settings if settings is not None else model.settings
     fabric = fabric or make_fabric(Devices(accelerator), settings.precision)
     config = _config(model, source, trials, settings, seed)
@@ -166,13 +168,10 @@ def train_model(
     return _result(name, kept, loop.state, config_hash, False)
 
 
-def _check(model: Any, trials: Sequence[str]) -> None:
-    """Raise `BadInputError` if there is nothing to train, or nothing to train on."""
-    name = model.provenance().model
+def check_trainable(model: Any) -> None:
+    """Raise `BadInputError` if a model has nothing to train."""
     if not (isinstance(model, nn.Module) and isinstance(model, Learns)):
-        raise BadInputError(f"model {name!r} has nothing to train")
-    if not trials:
-        raise BadInputError(f"there is no trial to train {name!r} on")
+        raise BadInputError(f"model {model.provenance().model!r} has nothing to train")
 
 
 def _config(
