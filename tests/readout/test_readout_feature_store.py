@@ -21,7 +21,7 @@ from torch import nn
 
 from physion.errors import BadInputError
 from physion.models.batch import Batch, Provenance, Rollout, Spec
-from physion.readout.feature_store import FeatureStore
+from physion.readout.features.feature_store import FeatureStore
 from physion.readout.model_calls import OutOfMemoryError
 
 SPEC = Spec(image_size=2, context=3, future=4)
@@ -321,7 +321,7 @@ def test_files_are_safetensors_with_aligned_float32(tmp_path: Path) -> None:
 def test_what_was_written_before_a_failure_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("physion.readout.feature_store._WRITE_TRIALS", 2)
+    monkeypatch.setattr("physion.readout.features.feature_store._WRITE_TRIALS", 2)
     model, movies, store = Numpy(), Movies(), FeatureStore(tmp_path, batch=1)
     good = model.give
 
@@ -526,7 +526,7 @@ def test_progress_counts_what_is_computed(tmp_path: Path) -> None:
     store = FeatureStore(tmp_path, batch=2)
     for _ in range(2):
         store.encoded(Numpy(), Movies(), TRIALS, "context", lambda *call: calls.append(call))
-    assert calls == [("features", done, 3) for done in range(4)] + [("features", 0, 0)]
+    assert calls == [("features", done, 3) for done in range(4)], "nothing of what is stored"
 
 
 def test_no_trial_has_no_feature(tmp_path: Path) -> None:
@@ -539,7 +539,7 @@ def test_no_trial_has_no_feature(tmp_path: Path) -> None:
 def test_models_without_torch_do_not_import_it() -> None:
     code = (
         "import sys\n"
-        "import physion.readout.feature_store, physion.readout.logistic\n"
+        "import physion.readout.features.feature_store, physion.readout.logistic\n"
         "print(json.dumps(sorted({'torch', 'lightning_fabric', 'timm'} & set(sys.modules))))"
     )
     done = subprocess.run(

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from physion.errors import BadInputError
-from physion.readout.feature_file import ArraysInMemory, open_features, write_features
+from physion.readout.features.feature_file import ArraysInMemory, open_features, write_features
+from physion.readout.features.stored_features import StoredFeatures
 from physion.readout.gram import Fit, JoinedFeatures, gram, grams
 from physion.readout.logistic import ReadoutConfig, fit_readout
-from physion.readout.stored_features import StoredFeatures
 
 
 def features_of(n: int, steps: int, size: int, seed: int = 0) -> np.ndarray:
@@ -134,9 +134,9 @@ PEAK = """
 import json, resource, sys
 from pathlib import Path
 import numpy as np
-from physion.readout.feature_file import open_features, write_features
+from physion.readout.features.feature_file import open_features, write_features
 from physion.readout.logistic import fit_readout
-from physion.readout.stored_features import StoredFeatures
+from physion.readout.features.stored_features import StoredFeatures
 
 folder, trials, steps, size = Path(sys.argv[1]), 300, 25, 8000
 rng = np.random.default_rng(0)

@@ -26,14 +26,14 @@ from physion.models.interface import (
     SeesOutcomes,
 )
 from physion.readout.capabilities import Way, build_reader, reader_name
-from physion.readout.feature_store import FeatureStore
+from physion.readout.features.feature_store import FeatureStore
+from physion.readout.features.stored_features import StoredFeatures
 from physion.readout.folds import Fold, ScenarioSplit
 from physion.readout.model_calls import call_model, check_finite, is_network, to_array
 from physion.readout.protocols import Readout
 from physion.readout.readers.reader import Reading
 from physion.readout.rollouts import Knobs, Outcomes, RolloutStore, all_knobs, stack_outcomes
 from physion.readout.settings import EvaluationConfig
-from physion.readout.stored_features import StoredFeatures
 from physion.readout.table import ScenarioPredictions, describe_labels
 from physion.training.sources.open_source import observed_source, whole_source
 from physion.training.sources.source import ObservedSource, WholeSource

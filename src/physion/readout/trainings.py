@@ -13,7 +13,7 @@ import pandas as pd
 from physion.compute.progress import Progress
 from physion.errors import BadInputError, MissingExtraError, UnknownNameError
 from physion.models.build import build_model
-from physion.readout.feature_store import FeatureStore
+from physion.readout.features.feature_store import FeatureStore
 from physion.readout.folds import READOUT, TESTING, TRAINING, plan_folds
 from physion.training.overrides import TrainingOverrides
 from physion.training.protocols import Training, training_sets

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.errors import BadInputError
-from physion.readout.feature_file import FeatureArrays
+from physion.readout.features.feature_file import FeatureArrays
 
 Floats = NDArray[np.float32]
 

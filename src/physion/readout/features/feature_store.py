@@ -22,16 +22,16 @@ from physion.compute.progress import Progress, tracked
 from physion.errors import BadInputError
 from physion.models.batch import Batch
 from physion.models.interface import Model, features_digest
-from physion.readout.feature_file import (
+from physion.readout.features.feature_file import (
     ArraysInMemory,
     FeatureArrays,
     open_features,
     write_features,
 )
+from physion.readout.features.model_outputs import CONTACT, GAP, Arrays, encode_clips, imagine_clips
+from physion.readout.features.stored_features import FEATURES, StoredFeatures
 from physion.readout.model_calls import model_name
-from physion.readout.model_outputs import CONTACT, GAP, Arrays, encode_clips, imagine_clips
 from physion.readout.rollouts import Outcomes
-from physion.readout.stored_features import FEATURES, StoredFeatures
 from physion.training.sources.source import ObservedSource, Part
 
 _VERSION = "1"

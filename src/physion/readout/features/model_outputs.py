@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from physion.errors import BadInputError
 from physion.models.batch import Batch, Rollout
 from physion.models.interface import Model
+from physion.readout.features.stored_features import FEATURES
 from physion.readout.model_calls import call_model, check_finite, model_name, to_array
-from physion.readout.stored_features import FEATURES
 
 GAP, CONTACT = "gap", "contact"
 Arrays = Mapping[str, NDArray[Any]]

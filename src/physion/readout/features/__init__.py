@@ -1,0 +1,1 @@
+"""Features of trials: computed by models, stored in files, read piece by piece."""
