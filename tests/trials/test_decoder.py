@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -107,6 +108,41 @@ def test_groups_between_two_frames_are_left_out(
     monkeypatch: pytest.MonkeyPatch, movie: Path
 ) -> None:
     assert count_decoded(monkeypatch, movie, 0, 20) <= 1 + 4 * GROUP - 15 < 80
+
+
+FOREIGN: dict[str, tuple[str, dict[str, str], int]] = {
+    "open groups": (
+        "libx264",
+        {"x264-params": "open-gop=1:keyint=20:min-keyint=20:bframes=3:b-adapt=0:scenecut=0"},
+        0,
+    ),
+    "long groups": ("libx264", {}, 0),
+    "no key frames": ("libx264", {"x264-params": "intra-refresh=1:keyint=20"}, 0),
+    "changing rate": ("libx264", {"g": "15"}, 7),
+    "another codec": ("mpeg4", {"g": "12", "bf": "2"}, 0),
+}
+"""Movies of other programs: codec, its options, and frames left out in the middle."""
+
+
+@pytest.mark.parametrize("kind", sorted(FOREIGN))
+def test_movies_of_other_programs_are_read_as_from_the_start(kind: str, tmp_path: Path) -> None:
+    codec, options, gap = FOREIGN[kind]
+    path = tmp_path / "foreign.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=30, options=options)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        for index, picture in enumerate(drifting_noise()):
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+            frame.pts, frame.time_base = index + gap * (index > 30), Fraction(1, 30)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    everything = read_frames(path)
+    assert len(everything) == FRAMES
+    for start in range(0, FRAMES, 7):
+        for stride in (1, 5, 22):
+            count = min(4, len(range(start, FRAMES, stride)))
+            read = read_frames(path, start=start, count=count, stride=stride)
+            np.testing.assert_array_equal(read, everything[start::stride][:count])
 
 
 def damage(movie: Path, folder: Path, first: float, last: float) -> Path:

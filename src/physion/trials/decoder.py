@@ -5,13 +5,16 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import av
 
 from physion.errors import BadInputError
+
+_IDR = 5
+"""Type of the NAL units of an IDR picture."""
 
 
 class MovieProperties(NamedTuple):
@@ -34,9 +37,10 @@ class MovieProperties(NamedTuple):
 class MovieDecoder:
     """Decoder of the pictures of one open movie, made by `open_movie`.
 
-    A movie of a constant rate is entered at the key frame before a picture, so that the cost of a
-    picture does not depend on where it lies. Pictures are the same as when all before them are
-    decoded: no picture refers to one from before a key frame.
+    An H.264 movie of a constant rate is entered at the key frame before a picture, so that the cost
+    of a picture does not depend on where it lies. Pictures are the same as when all before them are
+    decoded, since nothing after an IDR picture refers to anything before it. Where a key frame is
+    of another kind (an open group of pictures), and in other movies, all is decoded from the start.
     """
 
     def __init__(self, path: Path, container: Any) -> None:
@@ -63,8 +67,9 @@ class MovieDecoder:
         """
         for frame in frames:
             key = self._keys[bisect_right(self._keys, frame) - 1] if self._keys else 0
-            if key > self._next:
-                self._seek(key)
+            if key > self._next and not self._seek(key):
+                self._keys = []
+                self._seek(0)
             for index, picture in self._decode():
                 if index == frame:
                     yield picture
@@ -75,14 +80,17 @@ class MovieDecoder:
         for _ in self._decode(to_end=True):
             pass
 
-    def _seek(self, key: int) -> None:
-        """Continue with the key frame ``key``."""
+    def _seek(self, key: int) -> bool:
+        """Continue with the key frame ``key``; return whether it can be decoded by itself."""
         try:
             offset = self._stream.start_time + key * self._step
             self._container.seek(offset, stream=self._stream, backward=True)
+            packets = self._container.demux(self._stream)
+            first = next(packets)
         except (av.FFmpegError, OSError) as error:
             raise self._damaged(key, error) from error
-        self._pictures, self._next = self._container.decode(self._stream), key
+        self._pictures, self._next = _decode_packets(chain([first], packets)), key
+        return _is_idr(bytes(first))
 
     def _decode(self, to_end: bool = False) -> Iterator[tuple[int, av.VideoFrame]]:
         """Yield index and picture of the frames from ``self._next`` on.
@@ -133,11 +141,30 @@ def open_movie(path: Path) -> Iterator[MovieDecoder]:
         yield MovieDecoder(path, container)
 
 
+def _decode_packets(packets: Iterable[Any]) -> Iterator[av.VideoFrame]:
+    for packet in packets:
+        yield from packet.decode()
+
+
+def _is_idr(packet: bytes) -> bool:
+    """Return whether a packet of H.264 as MP4 stores it holds an IDR picture.
+
+    It is a sequence of NAL units, each after its length in four bytes. The last five bits of a unit
+    are its type (ITU-T H.264, table 7-1).
+    """
+    start = 0
+    while start + 4 < len(packet):
+        if packet[start + 4] & 0x1F == _IDR:
+            return True
+        start += 4 + int.from_bytes(packet[start : start + 4], "big")
+    return False
+
+
 def _frame_times(stream: Any) -> tuple[int, list[int]]:
     """Return the time from frame to frame in ``stream.time_base``, and the key frames.
 
     Without a constant rate, or where the index does not list every frame, they are 0 and empty:
-    such a movie is decoded from the start.
+    such a movie is decoded from the start. So is one that is not H.264 with lengths of four bytes.
     """
     entries = list(getattr(stream, "index_entries", None) or ())  # absent in older versions of av
     if len(entries) < 2 or len(entries) != stream.frames or stream.start_time is None:
@@ -146,6 +173,10 @@ def _frame_times(stream: Any) -> tuple[int, list[int]]:
     steps = {after - before for before, after in pairwise(times)}
     if len(steps) != 1 or min(steps) < 1 or any(entry.is_discard for entry in entries):
         return 0, []
-    # Entries are in the order of decoding; nothing is shown after a key frame that was decoded
-    # before it, so the n-th entry, if it is a key frame, is the n-th frame.
+    settings = bytes(stream.codec_context.extradata or b"")
+    lengths = settings[4] & 3 if len(settings) > 4 and settings[0] == 1 else None
+    if stream.codec_context.name != "h264" or lengths != 3:
+        return min(steps), []
+    # Entries are in the order of decoding. All that is decoded before an IDR picture is shown
+    # before it, so that the n-th entry, if it is one, is the n-th frame.
     return min(steps), [index for index, entry in enumerate(entries) if entry.is_keyframe]
