@@ -29,8 +29,8 @@ from physion.models.batch import Spec
 from physion.training.sources.open_source import whole_source
 from physion.trials.dataset import Dataset
 from physion.trials.decoder import open_movie
-from physion.trials.making.generate import generate
-from physion.trials.making.plan import GenerateSettings, plan_dataset
+from physion.trials.generate import generate
+from physion.trials.making.plan import GenerateSettings
 
 RESULTS = Path(__file__).parent / "results"
 SCENARIOS, TRIALS, SIZE = ("collide", "drop"), 6, 128
@@ -39,12 +39,13 @@ GOALS = {"movies": 60, "rendered": 5}
 """Clips a second and core that are to be reached."""
 
 
-def make_trials(folder: Path) -> Dataset:
+def make_dataset(folder: Path) -> Dataset:
     """Make `TRIALS` trials of each scenario with movies of `SIZE` pixels."""
     settings = GenerateSettings(width=SIZE, height=SIZE, look="redyellow", jitters=0)
-    tasks = plan_dataset("clips", SCENARIOS, {"training": TRIALS})
-    generate(folder, tasks, settings, executor=SerialExecutor())
-    return Dataset(folder)
+    counts = {"training": TRIALS}
+    return generate(
+        folder, SCENARIOS, counts, name="clips", settings=settings, executor=SerialExecutor()
+    )
 
 
 def clips_per_second(read: Callable[[int], Any], clips: int) -> dict[str, float]:
@@ -128,12 +129,12 @@ def main() -> None:
     """Print the figures, and write them if asked."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--dataset", type=Path, help="use the trials of this dataset")
-    parser.add_argument("--scale", type=int, default=4, help="factor of the numbers of clips")
+    parser.add_argument("--scale", type=int, default=6, help="factor of the numbers of clips")
     parser.add_argument("--write", action="store_true", help="write benchmarks/results/clips.json")
     arguments = parser.parse_args()
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     with tempfile.TemporaryDirectory() as folder:
-        data = Dataset(arguments.dataset) if arguments.dataset else make_trials(Path(folder))
+        data = Dataset(arguments.dataset) if arguments.dataset else make_dataset(Path(folder))
         text = json.dumps(measure(data, arguments.scale), indent=1)
     print(text)
     if arguments.write:
