@@ -20,7 +20,7 @@ from physion.readout.leak_checks import (
 )
 from physion.readout.logistic import ReadoutConfig
 from physion.trials.dataset import Dataset
-from physion.trials.making.generate import generate
+from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import GenerateSettings, plan_dataset
 from support.moving_dots import make_dots
 from support.tiny_models import OPTIONS, TINY
@@ -34,7 +34,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     folder = tmp_path_factory.mktemp("leaks") / "data"
     tasks = plan_dataset("leaks", ("collide", "drop"), {"training": 2, "readout": 4, "testing": 3})
     settings = GenerateSettings(width=64, height=64, look="redyellow", jitters=0)
-    assert not generate(folder, tasks, settings, executor=SerialExecutor()).failed
+    assert not make_trials(folder, tasks, settings, executor=SerialExecutor()).failed
     return Dataset(folder)
 
 

@@ -95,7 +95,7 @@ class Shelf:
                         "trial": name, "scenario": "collide", "split": split, "digest": name,
                         "contact": len(path.contacts.frame) > 0, "recorded_contact": i % 2 == 0,
                         "movie_sha256": "", "observed_movie_sha256": "",
-                        "frames": FRAMES, "observed_frames": 45, "look": "redyellow",
+                        "frames": FRAMES, "observed_frames": 45, "observed_contact": False, "look": "redyellow",
                     }
                 )  # fmt: skip
         self.index = pd.DataFrame(rows)
@@ -258,11 +258,11 @@ def test_evaluation_of_generated_trials(tmp_path: Path) -> None:
     """Generated trials, evaluated with an encoder and with simulations."""
     from physion.compute.local import LocalExecutor, SerialExecutor
     from physion.trials.dataset import Dataset
-    from physion.trials.making.generate import generate
+    from physion.trials.making.generate import make_trials
     from physion.trials.making.plan import GenerateSettings, plan_dataset
 
     tasks = plan_dataset("road", ("drop",), {"readout": 4, "testing": 3})
-    report = generate(
+    report = make_trials(
         tmp_path / "data", tasks, GenerateSettings(width=64, height=64), executor=SerialExecutor()
     )
     assert not report.failed

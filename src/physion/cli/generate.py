@@ -15,7 +15,7 @@ from physion.compute.local import LocalExecutor
 from physion.compute.run_tasks import RunReport
 from physion.errors import BadInputError
 from physion.scenes.sampling.registry import scenarios
-from physion.trials.making.generate import generate
+from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import FULL_COUNTS, SPLITS, GenerateSettings, plan_dataset
 
 
@@ -62,7 +62,7 @@ def main(options: Options) -> int:
     counts = {split: FULL_COUNTS[split] if options.full else options.count for split in splits}
     presets = {options.scenario: options.presets} if options.presets else None
     with Stages() as stages:
-        report = generate(
+        report = make_trials(
             options.folder,
             plan_dataset(options.name, names, counts, presets),
             options.settings,

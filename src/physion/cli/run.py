@@ -155,11 +155,11 @@ def limit_trials(trials: Iterable[ImportedTrial], limit: int | None) -> list[Imp
 def generate_trials(options: Options, tasks: list[TrialTask]) -> list[str]:
     """Simulate, label, render and store missing trials; return the failures."""
     from physion.compute.local import LocalExecutor
-    from physion.trials.making.generate import generate
+    from physion.trials.making.generate import make_trials
     from physion.trials.making.plan import GenerateSettings
 
     with Stages() as stages:
-        report = generate(
+        report = make_trials(
             out_folder(options) / "trials",
             tasks,
             GenerateSettings(

@@ -27,7 +27,7 @@ from physion.trials.making.choose import (
     split_of,
     wanted_contact,
 )
-from physion.trials.making.generate import generate
+from physion.trials.making.generate import make_trials
 from physion.trials.making.make import scene_of
 from physion.trials.making.plan import SPLITS, GenerateSettings, TrialTask, plan_dataset
 
@@ -216,7 +216,7 @@ def test_no_draw_says_why() -> None:
 def test_a_dataset_of_states_alone(tmp_path: Path) -> None:
     settings = GenerateSettings(width=64, height=64, movies=False, jitters=2, playback="real")
     tasks = slots("readout", 2)
-    report = generate(tmp_path / "d", tasks, settings, executor=SerialExecutor())
+    report = make_trials(tmp_path / "d", tasks, settings, executor=SerialExecutor())
     assert not report.failed
     index = Dataset(tmp_path / "d").index
     assert sorted(index["contact"]) == [False, True]
@@ -225,4 +225,4 @@ def test_a_dataset_of_states_alone(tmp_path: Path) -> None:
     assert (index["playback_seconds"] == index["frames"] / 100).all()
     other = plan_dataset("choose", ["collide"], {"readout": 2}, {"collide": ["debug"]})
     with pytest.raises(BadInputError, match="readout/collide"):
-        generate(tmp_path / "d", other, settings, executor=SerialExecutor())
+        make_trials(tmp_path / "d", other, settings, executor=SerialExecutor())

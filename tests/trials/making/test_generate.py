@@ -23,7 +23,7 @@ from physion.errors import BadInputError, PhysionError, UnknownNameError
 from physion.trials.dataset import Dataset
 from physion.trials.index import build_index, index_row
 from physion.trials.layout import TrialPaths, find_trials
-from physion.trials.making.generate import generate
+from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import GenerateSettings, TrialTask, plan_dataset, plan_scenes
 from physion.trials.trial_file import Trial
 from physion.trials.video import count_frames, read_frames
@@ -39,7 +39,7 @@ def scenes_named(*names: str) -> list[TrialTask]:
 
 def run(folder: Path, tasks: list[TrialTask], **options: Any) -> RunReport:
     options.setdefault("executor", SerialExecutor())
-    return generate(folder, tasks, make=make_by_hand, **options)
+    return make_trials(folder, tasks, make=make_by_hand, **options)
 
 
 @pytest.fixture(scope="module")
@@ -220,12 +220,12 @@ from support.paths import TESTS
 from support.hand_made import make_by_hand, make_scene
 from physion.compute.local import SerialExecutor
 from physion.errors import PhysionError
-from physion.trials.making.generate import generate
+from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import plan_scenes
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 tasks = plan_scenes("tests", [make_scene("a")])
 try:
-    generate(Path(sys.argv[1]), tasks, make=make_by_hand, executor=SerialExecutor())
+    make_trials(Path(sys.argv[1]), tasks, make=make_by_hand, executor=SerialExecutor())
 except PhysionError as error:
     print(error)
     sys.exit(error.exit_code)
@@ -254,7 +254,7 @@ sys.path.insert(0, sys.argv[2])
 from support.paths import TESTS
 from support.hand_made import make_by_hand, make_scene
 from physion.compute.local import LocalExecutor
-from physion.trials.making.generate import generate
+from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import plan_scenes
 def progress(what, done, total):
     if done:
@@ -263,7 +263,7 @@ if __name__ == "__main__":
     names = [f"t{n:02d}" for n in range(int(sys.argv[3]))]
     tasks = plan_scenes("tests", [make_scene(name) for name in names])
     executor = LocalExecutor(1)
-    generate(Path(sys.argv[1]), tasks, make=make_by_hand, executor=executor, progress=progress)
+    make_trials(Path(sys.argv[1]), tasks, make=make_by_hand, executor=executor, progress=progress)
 """
 
 

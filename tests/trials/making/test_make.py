@@ -22,7 +22,7 @@ from physion.scenes.scene import Ending
 from physion.scenes.tdw.read_logs import read_scenes
 from physion.trials.dataset import Dataset
 from physion.trials.index import index_row
-from physion.trials.making.generate import generate
+from physion.trials.making.generate import make_trials
 from physion.trials.making.make import make_trial
 from physion.trials.making.plan import GenerateJob, GenerateSettings, TrialTask, plan_dataset
 from physion.trials.trial_file import Trial
@@ -154,7 +154,7 @@ def test_fresh_processes_make_the_same_bytes_whatever_their_environment(
 @pytest.mark.slow
 def test_dataset_of_every_scenario_with_real_workers(tmp_path: Path) -> None:
     tasks = plan_dataset("tests", scenarios.names(), {"training": 1, "testing": 1})
-    report = generate(
+    report = make_trials(
         tmp_path / "two",
         tasks,
         GenerateSettings(width=64, height=64, look="redyellow"),
@@ -164,7 +164,7 @@ def test_dataset_of_every_scenario_with_real_workers(tmp_path: Path) -> None:
     dataset = Dataset(tmp_path / "two")
     assert sorted(dataset.trials()) == sorted(task.trial for task in tasks)
     assert (dataset.index[["agent_share", "patient_share"]] > 0).to_numpy().all()
-    serial = generate(
+    serial = make_trials(
         tmp_path / "one",
         tasks[::-1],
         GenerateSettings(width=64, height=64, look="redyellow"),
@@ -181,7 +181,7 @@ def test_official_scenes_become_trials(official: Path, tmp_path: Path) -> None:
         TrialTask("official", "dominoes", "testing", i, None, trial.scene, trial.outcome.contact)
         for i, trial in enumerate(found.trials)
     ]
-    report = generate(
+    report = make_trials(
         tmp_path / "s",
         tasks,
         GenerateSettings(width=64, height=64, look="redyellow"),

@@ -10,7 +10,7 @@ from physion.compute.local import SerialExecutor
 from physion.errors import BadInputError, UnknownNameError
 from physion.physics.engine import make_engine
 from physion.trials.dataset import Dataset
-from physion.trials.making.generate import generate
+from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import GenerateSettings, plan_dataset
 from physion.trials.making.verify import verify_dataset
 from physion.trials.sealed import read_sealed
@@ -22,7 +22,7 @@ MUJOCO = GenerateSettings(
 
 def test_trials_of_another_engine_are_verified_with_it(tmp_path: Path) -> None:
     tasks = plan_dataset("tests", ["collide"], {"testing": 1})
-    report = generate(tmp_path, tasks, MUJOCO, executor=SerialExecutor())
+    report = make_trials(tmp_path, tasks, MUJOCO, executor=SerialExecutor())
     assert not report.failed
     (name,) = Dataset(tmp_path).index["engine"]
     assert name == make_engine("mujoco").name
@@ -33,11 +33,11 @@ def test_trials_of_another_engine_are_verified_with_it(tmp_path: Path) -> None:
 def test_the_engine_is_stored_by_its_whole_name_alone(tmp_path: Path) -> None:
     assert GenerateSettings(engine="mujoco").stored() == GenerateSettings().stored()
     tasks = plan_dataset("tests", ["collide"], {"testing": 1})
-    generate(tmp_path, tasks, MUJOCO, executor=SerialExecutor(), make=lambda job: "")
+    make_trials(tmp_path, tasks, MUJOCO, executor=SerialExecutor(), make=lambda job: "")
     stored = read_sealed(tmp_path / "dataset.json")
     assert stored["made_by"]["engine"] == make_engine("mujoco").name
     with pytest.raises(BadInputError, match="made_by"):
-        generate(
+        make_trials(
             tmp_path,
             tasks,
             GenerateSettings(width=32, height=32, jitters=1, min_visible=0.0, movies=False),

@@ -19,7 +19,7 @@ from physion.trials.dataset import Dataset
 from physion.trials.files import encode_png, same_picture
 from physion.trials.index import build_index, read_index, write_index
 from physion.trials.layout import TrialPaths
-from physion.trials.making.generate import generate
+from physion.trials.making.generate import make_trials
 from physion.trials.making.make import make_trial
 from physion.trials.making.plan import (
     GenerateJob,
@@ -36,7 +36,7 @@ from support.hand_made import make_by_hand, make_parts, make_scene
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     tasks = plan_scenes("tests", [make_scene("a"), make_scene("b")])
-    generate(tmp_path / "s", tasks, make=make_by_hand, executor=SerialExecutor())
+    make_trials(tmp_path / "s", tasks, make=make_by_hand, executor=SerialExecutor())
     return tmp_path / "s"
 
 
@@ -114,7 +114,7 @@ def sampled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sampled") / "d"
     settings = GenerateSettings(width=64, height=64, jitters=2, passes=("depth", "flow"))
     tasks = plan_dataset("verify", ["collide"], {"testing": 2}, {"collide": ["default"]})
-    assert not generate(folder, tasks, settings, executor=SerialExecutor()).failed
+    assert not make_trials(folder, tasks, settings, executor=SerialExecutor()).failed
     return folder
 
 
@@ -174,7 +174,7 @@ def test_a_trial_made_again_is_indexed_again(sampled: Path, tmp_path: Path) -> N
     paths.trial_file.unlink()
     tasks = plan_dataset("verify", ["collide"], {"testing": 2}, {"collide": ["default"]})
     settings = GenerateSettings(width=64, height=64, jitters=2, passes=("depth", "flow"))
-    report = generate(folder, tasks, settings, executor=SerialExecutor())
+    report = make_trials(folder, tasks, settings, executor=SerialExecutor())
     assert len(report.made) == 1 and verify_dataset(folder, again=0).faults == []
 
 

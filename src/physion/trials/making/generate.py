@@ -28,7 +28,7 @@ from physion.trials.making.plan import GenerateJob, GenerateSettings, TrialTask,
 from physion.trials.sealed import read_sealed, write_sealed
 
 
-def generate(
+def make_trials(
     folder: Path,
     tasks: Sequence[TrialTask],
     settings: GenerateSettings | None = None,
