@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from physion.cli.official_files import print_report
+from physion.cli.official.report import print_report
 from physion.cli.output import Stages, console
 from physion.compute.local import LocalExecutor
 from physion.errors import BadInputError

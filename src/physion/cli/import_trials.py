@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from physion.cli.official_files import print_report
+from physion.cli.official.report import print_report
 from physion.cli.output import Stages
 from physion.compute.local import LocalExecutor
 from physion.trials.official.reading.import_folder import import_official

@@ -30,7 +30,8 @@ VERBS = {
 
 MODULES = {
     "import": "import_trials",
-    "import-official": "import_official",
+    "import-official": "official.import_official",
+    "run": "run.run",
     "compare": "compare.compare",
     "experiment": "experiment.experiment",
 }

@@ -19,7 +19,7 @@ from typing import Annotated
 import pandas as pd
 import tyro
 
-from physion.cli.official_data import read_trials
+from physion.cli.official.read import read_trials
 from physion.cli.output import Stages, console, write_text
 from physion.cli.text_table import text_table
 from physion.compute.local import LocalExecutor

@@ -33,6 +33,7 @@ models: Registry[ModelFactory] = Registry(
         "majority-of-people": "physion.models.anchors.majority_of_people:majority_of_people",
         "state-classifier": "physion.models.anchors.state_classifier:state_classifier",
         "already-touched": "physion.models.anchors.already_touched:already_touched",
+        "chance": "physion.models.anchors.chance:chance",
         "constant-motion": "physion.models.anchors.constant_motion:constant_motion",
         "blob-centroids": "physion.models.anchors.blob_centroids:blob_centroids",
         "copy-last-frame": "physion.models.anchors.copy_last_frame:copy_last_frame",

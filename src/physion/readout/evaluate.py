@@ -34,7 +34,7 @@ from physion.training.protocols import Training
 from physion.trials.dataset import Dataset
 from physion.version import __version__
 
-_VERSION = 3
+_VERSION = 4
 """To be increased with every change that can alter the table of an evaluation."""
 
 
@@ -127,7 +127,7 @@ def _digest(
 ) -> str:
     """Return the SHA-256 of all inputs of the table: trials, labels, model and config."""
     columns = ["trial", "scenario", "split", "contact", "digest", "movie_sha256"]
-    columns += ["observed_movie_sha256", "recorded_contact"]
+    columns += ["observed_movie_sha256", "recorded_contact", "observed_contact"]
     settings = dataclasses.asdict(config)
     settings["readouts"] = [readout.value for readout in readouts]
     model_config = getattr(model, "config", None)

@@ -46,6 +46,7 @@ OWN_COLUMNS = (
     "Protocol",
     "Init",
     "Recorded Outcome",
+    "Observed Contact",
     "Fit Labels",
     "Fit Trials",
     "Fold",
@@ -64,6 +65,7 @@ OWN_COLUMNS = (
 - ``Protocol``: readout protocol by its name. ``Init``: initial weights of the model.
 - ``Recorded Outcome``: outcome in the official recording, empty where there is none;
   ``Actual Outcome`` is that of the trial as simulated here.
+- ``Observed Contact``: whether agent and patient touched in the observed part already.
 - ``Fit Labels``: outcomes that the readout or the noise level was fitted on (`describe_labels`).
 - ``Fit Trials``: number of trials in the fit. ``Fold``: fold of a cross-validation, or -1.
 - ``Reader``: what turned features or rollouts into probabilities. ``Noise Scale`` and
@@ -143,6 +145,7 @@ def make_table(
                     "Protocol": part.protocol.value,
                     "Init": provenance.init,
                     "Recorded Outcome": "" if pd.isna(recorded) else bool(recorded),
+                    "Observed Contact": bool(truth["observed_contact"][trial]),
                     "Fit Labels": part.fit_labels,
                     "Fit Trials": part.fit_trials,
                     "Fold": part.fold,
@@ -205,7 +208,7 @@ def read_table(path: Path) -> pd.DataFrame:
     table = pd.read_csv(path, dtype=str, keep_default_na=False)
     for name in numbers:
         table[name] = pd.to_numeric(table[name].replace("", np.nan))
-    for name in ("Predicted Outcome", "Actual Outcome"):
+    for name in ("Predicted Outcome", "Actual Outcome", "Observed Contact"):
         table[name] = table[name] == "True"
     for name in ("Fit Trials", "Fold"):
         table[name] = table[name].astype(int)

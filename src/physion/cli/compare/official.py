@@ -36,7 +36,7 @@ class Options:
 def main(options: Options) -> int:
     """Print the tables, and write the page if asked."""
     from physion.analysis.published.summary import published_results
-    from physion.cli.official_data import study_folder
+    from physion.cli.official.read import study_folder
     from physion.cli.output import console
     from physion.report.published_report import build_published_report, published_numbers
 

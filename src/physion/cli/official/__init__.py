@@ -1,0 +1,1 @@
+"""Official data and files for the verbs, and the verb ``import-official``."""

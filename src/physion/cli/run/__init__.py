@@ -1,0 +1,1 @@
+"""The verb ``run``: which trials, which models, and the report."""
