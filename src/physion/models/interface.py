@@ -93,7 +93,10 @@ class Learns(Protocol):
     settings: TrainingSettings
 
     def prepare(self, sample: Batch) -> None:
-        """Set statistics, such as the mean of the features, from a sample of training clips."""
+        """Set statistics, such as the mean of the features, from a sample of training clips.
+
+        They must be weights or buffers: a model that is loaded or resumed is not prepared again.
+        """
         ...
 
     def loss(self, batch: Batch) -> Mapping[str, Tensor]:

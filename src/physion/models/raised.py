@@ -1,4 +1,4 @@
-"""What the code of a model raised, told in one line. This module does not import torch."""
+"""What the code of a model raised, in one line. This module does not import torch."""
 
 from __future__ import annotations
 

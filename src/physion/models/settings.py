@@ -18,9 +18,9 @@ class TrainingSettings:
     - ``optimizer``: ``adam`` or ``adamw``, with ``learning_rate``, ``betas`` and ``weight_decay``.
     - ``schedule``: of the learning rate after ``warmup`` steps of linear rise: ``constant``,
       ``cosine`` (to 0 at the last step), or ``plateau`` (times ``plateau_factor`` after
-      ``plateau_patience`` validations without improvement).
+      more than ``plateau_patience`` validations in a row without improvement, as in torch).
     - ``clip``: largest norm of the gradient; 0 does not clip.
-    - ``precision``: of Fabric, such as ``32-true`` or ``bf16-mixed``.
+    - ``precision``: of Fabric: ``32-true``, ``16-mixed`` or ``bf16-mixed``.
     - ``validate_every``: steps between validations on held-out trials; ``held_out``: their
       fraction. ``log_every``, ``checkpoint_every``: intervals in steps.
     """

@@ -176,7 +176,7 @@ def _with_prefix(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor
 
 
 def _compare_tensors(stored: Mapping[str, Tensor], model: Mapping[str, Tensor]) -> list[str]:
-    """Return in words which tensors are missing, unknown, or of another shape or type."""
+    """Return which tensors are missing, unknown, or of another shape or type."""
     differences = [f"{name} is missing" for name in model if name not in stored]
     differences += [f"{name} is unknown" for name in stored if name not in model]
     for name in model:

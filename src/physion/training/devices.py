@@ -76,7 +76,7 @@ def is_first_process() -> bool:
 
 @contextmanager
 def memory_advice(settings: TrainingSettings) -> Iterator[None]:
-    """Turn an error for memory that is used up into one that names the setting to lower."""
+    """Replace an error for memory that is used up by one that names the setting to lower."""
     try:
         yield
     except (MemoryError, RuntimeError) as error:

@@ -25,7 +25,7 @@ _DAMAGED = ".damaged"
 
 
 @dataclass(frozen=True, eq=False)
-class Stored:
+class CheckpointContent:
     """Content of a checkpoint, or of the file of a trained model."""
 
     path: Path
@@ -54,11 +54,11 @@ class TrainingFolder:
         """What was found damaged, in sentences."""
         self._damaged: list[Path] = []
 
-    def finished(self) -> Stored | None:
+    def finished(self) -> CheckpointContent | None:
         """Return the trained model, if there is one."""
         return self._read(WEIGHTS)
 
-    def resumable(self) -> Stored | None:
+    def resumable(self) -> CheckpointContent | None:
         """Return the newest whole checkpoint, if there is one.
 
         Raises `BadInputError` if it was written by other versions of the libraries, with which the
@@ -97,7 +97,7 @@ class TrainingFolder:
         for name in (CHECKPOINT, PREVIOUS):
             (self.path / name).unlink(missing_ok=True)
 
-    def _read(self, name: str) -> Stored | None:
+    def _read(self, name: str) -> CheckpointContent | None:
         path = self.path / name
         if not path.is_file():
             return None
@@ -108,4 +108,4 @@ class TrainingFolder:
             self._damaged.append(path)
             return None
         check_same(path, "config", metadata["config"], self._config)
-        return Stored(path, tensors, metadata)
+        return CheckpointContent(path, tensors, metadata)

@@ -23,7 +23,7 @@ from physion.models.interface import HasBaseline
 from physion.models.settings import TrainingSettings
 from physion.seeds import stable_hash
 from physion.training.checkpoint import load_tensors, tensors_of
-from physion.training.folder import Stored, TrainingFolder
+from physion.training.folder import CheckpointContent, TrainingFolder
 from physion.training.losses import (
     LOSS,
     Given,
@@ -111,7 +111,7 @@ class TrainingLoop:
         )
         self._learner, self._wrapped = fabric.setup(Learner(model), self._optimizer)
 
-    def resume(self, stored: Stored) -> None:
+    def resume(self, stored: CheckpointContent) -> None:
         """Load a checkpoint."""
         # After the set-up, so that the optimiser's state is on the device of the weights.
         load_tensors(stored.path, stored.tensors, self._model, self._optimizer)
@@ -234,18 +234,11 @@ class TrainingLoop:
 
     def _check_weights(self) -> None:
         """Stop if a weight is not finite: a step can spoil it though its loss was finite."""
-        finite = [
-            value.isfinite().all()
-            for value in self._model.state_dict().values()
-            if value.is_floating_point()
-        ]
-        if finite and not bool(torch.stack(finite).all()):
-            names = [
-                name
-                for name, value in self._model.state_dict().items()
-                if value.is_floating_point() and not bool(value.isfinite().all())
-            ]
-            raise self._stopped(f"{names[0]} is not finite", self.state.step)
+        weights = dict(self._model.named_parameters())
+        finite = torch.stack([value.isfinite().all() for value in weights.values()])
+        if not bool(finite.all()):
+            name = next(name for name, good in zip(weights, finite, strict=True) if not good)
+            raise self._stopped(f"{name} is not finite", self.state.step)
 
     def _stopped(self, reason: str, first: int) -> TrainingStoppedError:
         last = self.state.step

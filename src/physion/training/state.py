@@ -1,4 +1,4 @@
-"""How far a training is: what a checkpoint holds beside weights and optimiser."""
+"""How far a training is: what a checkpoint holds in addition to weights and optimiser."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from physion.training.schedule import Plateau
 
 @dataclass
 class TrainingState:
-    """How far a training is, as stored in its checkpoints beside weights and optimiser.
+    """How far a training is, as stored in its checkpoints.
 
     - ``step``: finished steps.
     - ``recent``: values of the steps since the last line of the metrics, by name.
