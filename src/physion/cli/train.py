@@ -79,7 +79,7 @@ def _print(trained: list[TrainedModel], json: bool) -> None:
         if not math.isnan(result.validation):
             losses.append(f"held-out trials {result.validation:.4g}")
         if not math.isnan(result.baseline):
-            losses.append(f"untrained predictor {result.baseline:.4g}")
+            losses.append(f"trivial predictor {result.baseline:.4g}")
         done = "was trained before" if result.loaded else f"trained for {result.steps} steps"
         console.print(
             f"{result.name} {done}, {', '.join(losses)}: {result.folder}",

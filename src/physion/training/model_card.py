@@ -47,7 +47,7 @@ def model_card(
     losses = {
         f"training, mean of the last {settings.log_every} steps": state.loss,
         "held-out trials": state.validation,
-        "held-out trials, predictor that has learnt nothing": state.baseline,
+        "held-out trials, trivial predictor": state.baseline,
     }
     return "\n\n".join(
         [
@@ -65,6 +65,7 @@ def model_card(
             "under the MIT licence.",
             "## Use\nBuild the model with the same options, then load the weights:\n\n"
             "```python\n"
+            "from pathlib import Path\n\n"
             "from physion.training.checkpoint import load_weights\n\n"
             f'load_weights(Path("{WEIGHTS}"), model)\n'
             "```\n",
