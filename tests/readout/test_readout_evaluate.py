@@ -56,6 +56,7 @@ def test_the_table_is_the_official_one_and_says_more(done: Evaluation, dots: Dat
     assert tuple(table.columns) == (*OFFICIAL_COLUMNS, *OWN_COLUMNS)
     assert len(table) == 3 * 2 * COUNTS["testing"]
     assert (table["Init"] == "random").all()
+    assert (table["Inputs"] == "rgb").all()
     assert (table["Model"] == "random-test_vit-mlp").all()
     assert set(zip(table["Protocol"], table["Readout Type"], strict=True)) == {
         ("full", "A"), ("observed+simulated", "B"), ("observed", "C"),

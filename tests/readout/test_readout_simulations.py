@@ -249,6 +249,7 @@ def test_other_state_models_are_shown_the_observed_part_alone(tmp_path: Path) ->
     assert len(table) == 10 and (table["Predicted Prob_true"] == 0).all()
     assert set(table["Fit Labels"]) == {""}, "nothing is fitted"
     assert set(table["Readout Type"]) == {"C"}
+    assert set(table["Inputs"]) == {"state"}, "what its Spec asks for"
     with pytest.raises(BadInputError, match="not a probability"):
         evaluate_model(shelf, Oracle(1.5), tmp_path / "b", config=EvaluationConfig())
 

@@ -229,8 +229,9 @@ class Provenance:
     """Origin of a model, which is written to every row of its predictions.
 
     ``init`` names the initial weights: ``imagenet``, ``package:<name>``, ``local:<sha256>``,
-    ``random``, or ``none`` for a model without weights. The other fields are columns of the
-    official result files.
+    ``random``, or ``none`` for a model without weights. ``inputs`` says what the model uses, where
+    that is not what its `Spec` asks for: ``base rate`` for one that looks at no trial. The other
+    fields are columns of the official result files.
     """
 
     model: str
@@ -243,6 +244,7 @@ class Provenance:
     encoder_training_task: str = ""
     dynamics_training_task: str = ""
     versions: str = ""
+    inputs: str = ""
 
 
 def join_batches(parts: Sequence[Batch]) -> Batch:

@@ -15,6 +15,7 @@ import pandas as pd
 from physion.compute.executor import Executor
 from physion.compute.progress import Progress, tracked
 from physion.errors import BadInputError
+from physion.models.batch import Provenance
 from physion.models.build import build_model
 from physion.models.interface import Learns, Model
 from physion.readout.capabilities import choose_readouts
@@ -34,7 +35,7 @@ from physion.training.protocols import Training
 from physion.trials.dataset import Dataset
 from physion.version import __version__
 
-_VERSION = 4
+_VERSION = 5
 """To be increased with every change that can alter the table of an evaluation."""
 
 
@@ -100,7 +101,7 @@ def evaluate_model(
     progress: Progress | None = None,
 ) -> Evaluation:
     """Predict every testing trial with a model that is already built; see `evaluate`."""
-    provenance = model.provenance()
+    provenance = _provenance(model)
     chosen = choose_readouts(model, config.readouts, config.reader)
     name = f"{file_name(provenance.model)}-{_digest(dataset, model, config, chosen)[:12]}.csv"
     path = folder / "predictions" / name
@@ -120,6 +121,12 @@ def evaluate_model(
     path = path.with_suffix(".partial.csv") if problems else path
     write_table(table, path)
     return Evaluation(read_table(path), path, problems)
+
+
+def _provenance(model: Model) -> Provenance:
+    """Return the provenance of a model, with the inputs of its `Spec` if it names no others."""
+    known = model.provenance()
+    return dataclasses.replace(known, inputs=known.inputs or ", ".join(model.spec.inputs))
 
 
 def _digest(

@@ -45,6 +45,7 @@ OFFICIAL_COLUMNS = (
 OWN_COLUMNS = (
     "Protocol",
     "Init",
+    "Inputs",
     "Recorded Outcome",
     "Observed Contact",
     "Fit Labels",
@@ -63,6 +64,8 @@ OWN_COLUMNS = (
 """Columns that this package adds.
 
 - ``Protocol``: readout protocol by its name. ``Init``: initial weights of the model.
+- ``Inputs``: what the model was given of a trial: names of `models.batch.INPUTS` with commas,
+  ``outcomes``, ``answers of people``, or ``base rate`` (nothing of the trial).
 - ``Recorded Outcome``: outcome in the official recording, empty where there is none;
   ``Actual Outcome`` is that of the trial as simulated here.
 - ``Observed Contact``: whether agent and patient touched in the observed part already.
@@ -144,6 +147,7 @@ def make_table(
                     "Dynamics Training Seed": part.training_seed,
                     "Protocol": part.protocol.value,
                     "Init": provenance.init,
+                    "Inputs": provenance.inputs,
                     "Recorded Outcome": "" if pd.isna(recorded) else bool(recorded),
                     "Observed Contact": bool(truth["observed_contact"][trial]),
                     "Fit Labels": part.fit_labels,

@@ -65,6 +65,13 @@ def test_digests_of_different_anchors_differ() -> None:
     assert len({build_model(name).digest() for name in OTHERS}) == len(OTHERS)
 
 
+def test_anchors_that_look_at_no_trial_say_so() -> None:
+    stated = {name: build_model(name).provenance().inputs for name in [*OTHERS, "chance"]}
+    assert {name: words for name, words in stated.items() if words} == {
+        "outcome": "outcomes", "majority-of-people": "answers of people", "chance": "base rate",
+    }  # fmt: skip
+
+
 def test_only_the_outcome_is_shown_outcomes() -> None:
     assert [name for name in OTHERS if isinstance(build_model(name), SeesOutcomes)] == ["outcome"]
 

@@ -41,7 +41,8 @@ class Chance:
 
     def provenance(self) -> Provenance:
         """Return name and versions for the table of predictions."""
-        return Provenance(NAME, "none", versions=f"physion {__version__}")
+        versions = f"physion {__version__}"
+        return Provenance(NAME, "none", versions=versions, inputs="base rate")
 
     def digest(self) -> str:
         """Return the SHA-256 of the code version."""

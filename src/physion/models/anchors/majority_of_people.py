@@ -63,7 +63,8 @@ class MajorityOfPeople:
 
     def provenance(self) -> Provenance:
         """Return name and versions for the table of predictions."""
-        return Provenance(NAME, "none", versions=f"physion {__version__}")
+        versions = f"physion {__version__}"
+        return Provenance(NAME, "none", versions=versions, inputs="answers of people")
 
     def digest(self) -> str:
         """Return the SHA-256 of code version and answers."""

@@ -67,7 +67,8 @@ class Outcome:
 
     def provenance(self) -> Provenance:
         """Return name and versions for the table of predictions."""
-        return Provenance(NAME, "none", versions=f"physion {__version__}")
+        versions = f"physion {__version__}"
+        return Provenance(NAME, "none", versions=versions, inputs="outcomes")
 
     def digest(self) -> str:
         """Return the SHA-256 of code version and known outcomes."""
