@@ -52,8 +52,9 @@ class Search:
         self.x[: len(x)] = np.array(x).reshape(-1, 3)
         self.space.counters[1] += 1
         update_boxes(
-            self.hulls, self.scene, self.x, self.rot, REACH, self.space, self.space.counters[1] == 1
-        )
+            self.hulls, self.scene, self.x, self.rot, REACH, self.space.box, self.space.body_box,
+            self.space.counters[1] == 1,
+        )  # fmt: skip
         self.candidates = find_candidates(
             self.scene, self.manifolds, self.space, self.actors, FLOOR, REACH
         )

@@ -47,28 +47,32 @@ class Hull:
     - ``corners`` (K, 3): metres. ``center`` (3,): their mean.
     - ``faces``: for each face its corner numbers, counterclockwise from outside.
     - ``inner_box`` (3,): half extents in metres of a box round ``center`` inside the hull.
+    - ``inradius``: metres: the least scale times the radius of a ball round ``center`` inside the
+      hull at unit scale, as PhysX 4 takes it.
     """
 
     corners: F64
     center: F64
     faces: tuple[I64, ...]
     inner_box: F64
+    inradius: float
 
 
 @lru_cache(maxsize=CACHED_HULLS)
 def collision_hulls(name: str, scale: Vec3) -> tuple[Hull, ...]:
     """Return the hulls of all convex pieces of the shape ``name``, scaled, in the body's frame."""
     hulls = []
-    for corners, faces in _unit_hulls(name):
+    for corners, faces, inradius in _unit_hulls(name):
         scaled = corners * np.asarray(scale)
         center = ordered_mean(scaled, axis=0)
-        hulls.append(Hull(scaled, center, faces, inner_box(scaled, faces, center)))
+        box = inner_box(scaled, faces, center)
+        hulls.append(Hull(scaled, center, faces, box, float(min(scale)) * inradius))
     return tuple(hulls)
 
 
 @cache
-def _unit_hulls(name: str) -> tuple[tuple[F64, tuple[I64, ...]], ...]:
-    """Return corners and faces of the hulls of a shape at unit scale.
+def _unit_hulls(name: str) -> tuple[tuple[F64, tuple[I64, ...], float], ...]:
+    """Return corners, faces and the radius of an inscribed ball of the hulls at unit scale.
 
     Points inside a face, such as the middle of a cylinder's ends, are no corners: a body would rest
     on them in place of its rim.
@@ -78,7 +82,9 @@ def _unit_hulls(name: str) -> tuple[tuple[F64, tuple[I64, ...]], ...]:
         points = _corners(piece)
         faces = hull_faces(points)
         used = np.unique(np.concatenate(faces))
-        hulls.append((points[used], tuple(np.searchsorted(used, face) for face in faces)))
+        corners = points[used]
+        kept = tuple(np.searchsorted(used, face) for face in faces)
+        hulls.append((corners, kept, inscribed_radius(corners, kept)))
     return tuple(hulls)
 
 
@@ -157,6 +163,14 @@ def face_planes(vertices: F64, loops: I64, first_loop: I64) -> F64:
         planes[f, 0], planes[f, 1], planes[f, 2] = x, y, z
         planes[f, 3] = x * vertices[a, 0] + y * vertices[a, 1] + z * vertices[a, 2]
     return planes
+
+
+def inscribed_radius(corners: F64, faces: tuple[I64, ...]) -> float:
+    """Return the radius in metres of the ball round the mean of the corners inside a hull."""
+    first_loop = np.cumsum([0, *(len(face) for face in faces)]).astype(np.int64)
+    planes = face_planes(corners, np.concatenate(faces), first_loop)
+    center = ordered_mean(corners, axis=0)
+    return float((planes[:, 3] - dot(planes[:, :3], center)).min())
 
 
 def inner_box(corners: F64, faces: tuple[I64, ...], center: F64) -> F64:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from physion.numerics.linear_algebra import inverse, norm
 from physion.numerics.rotations import rotate_vectors
 from physion.physics.rigid.actors import Actors, find_actors
+from physion.physics.rigid.collision.fast_pairs import SweepScene, sweep_scene
 from physion.physics.rigid.collision.hull_records import Hulls
 from physion.physics.rigid.hulls import Hull, collision_hulls, face_planes
 from physion.physics.rigid.settings import RigidSettings
@@ -40,6 +41,7 @@ class RigidModel:
     - ``inertia`` (A + 1, 3, 3) in kg m^2, ``inv_mass`` (A + 1,), ``inv_inertia`` (A + 1, 3, 3): in
       actor frames; 0 for the world, which is the last.
     - ``hulls``: all geoms, in their actors' frames. ``first_geom`` (N + 1,): those of each body.
+    - ``swept``: thresholds of continuous collision detection.
     - ``material`` (N + 1, 3): static and dynamic friction, restitution; the last is the floor.
     """
 
@@ -49,6 +51,7 @@ class RigidModel:
     inv_inertia: F64
     hulls: Hulls
     first_geom: I64
+    swept: SweepScene
     material: F64
 
 
@@ -72,6 +75,8 @@ def build_model(
         collision_hulls(body.shape, body.scale) if there and not body.scenery else ()
         for body, there in zip(scene.bodies, here, strict=False)
     ]
+    first_geom = np.cumsum([0, *(len(pieces) for pieces in hulls)]).astype(np.int64)
+    inradius = np.array([hull.inradius for pieces in hulls for hull in pieces])
     materials = [b.contact for b in scene.bodies] + [settings.floor]
     return RigidModel(
         actors=actors,
@@ -79,7 +84,8 @@ def build_model(
         inv_mass=inv_mass,
         inv_inertia=inv_inertia,
         hulls=_gather(hulls, actors.pivot, actors.rotation),
-        first_geom=np.cumsum([0, *(len(pieces) for pieces in hulls)]).astype(np.int64),
+        first_geom=first_geom,
+        swept=sweep_scene(inradius, first_geom, actors.pivot),
         material=np.array(
             [[m.static_friction, m.dynamic_friction, m.restitution] for m in materials]
         ),

@@ -57,6 +57,27 @@ def move_freely(
 
 
 @in_place_kernel
+def move_pose(x: F64, q: F64, v: F64, w: F64, dt: float) -> None:
+    """Move one body: ``x`` (3,), ``q`` (4,) by ``v``, ``w`` (3,), as in `move_poses`."""
+    for j in range(3):
+        x[j] += v[j] * dt
+    speed = np.sqrt(w[0] ** 2 + w[1] ** 2 + w[2] ** 2)
+    if speed == 0.0:
+        return
+    half = 0.5 * speed * dt
+    c, s = cos_of(half), sin_of(half) / speed
+    dx, dy, dz = w[0] * s, w[1] * s, w[2] * s
+    qw, qx, qy, qz = q[0], q[1], q[2], q[3]
+    q[0] = c * qw - dx * qx - dy * qy - dz * qz
+    q[1] = c * qx + dx * qw + dy * qz - dz * qy
+    q[2] = c * qy - dx * qz + dy * qw + dz * qx
+    q[3] = c * qz + dx * qy - dy * qx + dz * qw
+    length = np.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
+    for j in range(4):
+        q[j] /= length
+
+
+@in_place_kernel
 def move_poses(x: F64, q: F64, v: F64, w: F64, asleep: Flags, dt: float) -> None:
     """Move centres of mass ``x`` and orientations ``q`` by constant velocities over ``dt`` seconds.
 
@@ -76,24 +97,8 @@ def move_poses(x: F64, q: F64, v: F64, w: F64, asleep: Flags, dt: float) -> None
     x <- x + v dt; q <- (cos(|w| dt / 2), sin(|w| dt / 2) w / |w|) q, then q <- q / |q|.
     """
     for i in range(len(x) - 1):
-        if asleep[i]:
-            continue
-        for j in range(3):
-            x[i, j] += v[i, j] * dt
-        speed = np.sqrt(w[i, 0] ** 2 + w[i, 1] ** 2 + w[i, 2] ** 2)
-        if speed == 0.0:
-            continue
-        half = 0.5 * speed * dt
-        c, s = cos_of(half), sin_of(half) / speed
-        dx, dy, dz = w[i, 0] * s, w[i, 1] * s, w[i, 2] * s
-        qw, qx, qy, qz = q[i, 0], q[i, 1], q[i, 2], q[i, 3]
-        q[i, 0] = c * qw - dx * qx - dy * qy - dz * qz
-        q[i, 1] = c * qx + dx * qw + dy * qz - dz * qy
-        q[i, 2] = c * qy - dx * qz + dy * qw + dz * qx
-        q[i, 3] = c * qz + dx * qy - dy * qx + dz * qw
-        length = np.sqrt(q[i, 0] ** 2 + q[i, 1] ** 2 + q[i, 2] ** 2 + q[i, 3] ** 2)
-        for j in range(4):
-            q[i, j] /= length
+        if not asleep[i]:
+            move_pose(x[i], q[i], v[i], w[i], dt)
 
 
 @in_place_kernel

@@ -15,6 +15,7 @@ from physion.numerics.rotations import (
     rotation_matrices,
 )
 from physion.physics.contact_record import summarise_contacts
+from physion.physics.rigid.collision.fast_pairs import new_sweeps
 from physion.physics.rigid.collision.manifold import grown, new_manifolds
 from physion.physics.rigid.collision.pair_distance import new_pair_space
 from physion.physics.rigid.collision.search import (
@@ -95,6 +96,7 @@ class RigidRun:
             2.0 * settings.contact_offset,
             scene.floor,
             settings.persistent_manifolds,
+            settings.continuous,
         )
         self.history = History(
             np.zeros((FRAMES, actors + 1, 13)),
@@ -134,6 +136,7 @@ class RigidRun:
             result = run_steps(
                 self.model.hulls,
                 self.search_scene,
+                self.model.swept,
                 self.bodies,
                 self.sleep,
                 self.model.actors.drag,
@@ -207,6 +210,7 @@ class RigidRun:
             new_pair_space(),
             new_contact_list(capacity),
             new_constraints(capacity, actors),
+            new_sweeps(len(self.model.hulls.margin), len(self.scene.bodies), actors),
             np.zeros((capacity, 2), np.int64),
             np.zeros((actors + 1, 3)),
             np.zeros((actors + 1, 3)),

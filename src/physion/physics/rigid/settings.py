@@ -25,6 +25,8 @@ class RigidSettings:
     - ``friction_sweeps``: number of the last position sweeps that solve friction; 0 means all
       (PhysX: 3).
     - ``persistent_manifolds``: contact points are kept from step to step (Unity 2019).
+    - ``continuous``: bodies that could pass through each other in a step are swept, and stop where
+      they hit (Unity's mode ``continuous_dynamic``, inferred from the motion of pipes).
     - ``friction_doubling``: each of a patch's two anchors may bear the whole friction force, so
       that flat contacts have twice the friction of Coulomb's law. The official simulator behaves
       so (Unity's "improved patch friction" is off); with False the anchors divide the force.
@@ -49,6 +51,7 @@ class RigidSettings:
     velocity_iterations: int = 1
     friction_sweeps: int = 3
     persistent_manifolds: bool = True
+    continuous: bool = False
     friction_doubling: bool = True
     contact_offset: float = 0.01
     bias: float = 0.8

@@ -100,6 +100,28 @@ def wake_touched(state: SleepState, wake_time: float) -> bool:
     return woken
 
 
+@in_place_kernel
+def free_masses(bodies: Bodies, state: SleepState) -> None:
+    """Fill inverse masses and inertias (world axes, R I^-1 R^T) of this step; sleepers get 0."""
+    rot, inverse, free = bodies.rot, bodies.inv_inertia, bodies.free_inertia
+    for a in range(len(state.asleep)):
+        if state.asleep[a]:
+            bodies.free_mass[a] = 0.0
+            for i in range(3):
+                for j in range(3):
+                    free[a, i, j] = 0.0
+            continue
+        bodies.free_mass[a] = bodies.inv_mass[a]
+        for i in range(3):
+            r0 = r1 = r2 = 0.0
+            for k in range(3):
+                r0 += rot[a, i, k] * inverse[a, k, 0]
+                r1 += rot[a, i, k] * inverse[a, k, 1]
+                r2 += rot[a, i, k] * inverse[a, k, 2]
+            for j in range(3):
+                free[a, i, j] = r0 * rot[a, j, 0] + r1 * rot[a, j, 1] + r2 * rot[a, j, 2]
+
+
 # The wake counter runs down from wake_time. In its last half, velocities are summed up, so that a
 # shake to and fro cancels and a drift does not: with sums V and W over those steps,
 #     E = (V . V + (W . I W) / m) / 2                (m^2/s^2, energy by mass of the summed motion)

@@ -7,7 +7,9 @@ objects, so that several runs can go on in threads. One step is one frame:
 2. islands of touching bodies; what an awake body touches is woken;
 3. gravity, drag, cap of the angular velocity (`physion.physics.rigid.motion`);
 4. contact impulses (`physion.physics.rigid.solver`), poses, velocities;
-5. the contacts are recorded, and bodies at rest fall asleep (`physion.physics.rigid.sleeping`).
+5. the contacts are recorded, and bodies at rest fall asleep (`physion.physics.rigid.sleeping`);
+6. what has hit something on a fast way is put where it did
+   (`physion.physics.rigid.collision.impacts`).
 """
 
 from __future__ import annotations
@@ -17,7 +19,9 @@ from typing import NamedTuple
 import numpy as np
 
 from physion.numerics.kernel import in_place_kernel
+from physion.physics.rigid.collision.fast_pairs import Sweeps, SweepScene
 from physion.physics.rigid.collision.hull_records import Hulls
+from physion.physics.rigid.collision.impacts import keep_start, stop_at_impacts
 from physion.physics.rigid.collision.manifold import Manifolds
 from physion.physics.rigid.collision.pair_distance import PairSpace
 from physion.physics.rigid.collision.search import (
@@ -36,6 +40,7 @@ from physion.physics.rigid.sleeping import (
     SleepOptions,
     SleepState,
     find_islands,
+    free_masses,
     update_sleep,
     wake_touched,
 )
@@ -53,7 +58,7 @@ class StepOptions(NamedTuple):
 
     ``gravity`` in m/s^2 downwards, ``max_angular_velocity`` in rad/s, ``reach`` in metres: distance
     of surfaces below which points are contacts. ``floor``: its height in metres. ``persistent``:
-    manifolds are kept from step to step.
+    manifolds are kept from step to step. ``continuous``: fast pairs are swept.
     """
 
     solver: SolverOptions
@@ -63,6 +68,7 @@ class StepOptions(NamedTuple):
     reach: float
     floor: float
     persistent: bool
+    continuous: bool
 
 
 class EndRule(NamedTuple):
@@ -105,6 +111,7 @@ class Work(NamedTuple):
     pair: PairSpace
     contacts: ContactList
     rows: Constraints
+    sweeps: Sweeps
     touching: I64
     move_v: F64
     move_w: F64
@@ -195,28 +202,6 @@ def _list_touching(
 
 
 @in_place_kernel
-def _free_masses(bodies: Bodies, sleep: SleepState) -> None:
-    """Fill inverse masses and inertias (world axes, R I^-1 R^T) of this step; sleepers get 0."""
-    rot, inverse, free = bodies.rot, bodies.inv_inertia, bodies.free_inertia
-    for a in range(len(sleep.asleep)):
-        if sleep.asleep[a]:
-            bodies.free_mass[a] = 0.0
-            for i in range(3):
-                for j in range(3):
-                    free[a, i, j] = 0.0
-            continue
-        bodies.free_mass[a] = bodies.inv_mass[a]
-        for i in range(3):
-            r0 = r1 = r2 = 0.0
-            for k in range(3):
-                r0 += rot[a, i, k] * inverse[a, k, 0]
-                r1 += rot[a, i, k] * inverse[a, k, 1]
-                r2 += rot[a, i, k] * inverse[a, k, 2]
-            for j in range(3):
-                free[a, i, j] = r0 * rot[a, j, 0] + r1 * rot[a, j, 1] + r2 * rot[a, j, 2]
-
-
-@in_place_kernel
 def _record(
     contacts: ContactList, pairs: int, rows: Constraints, frame: int, asked: I64, history: History
 ) -> bool:
@@ -242,6 +227,23 @@ def _record(
             if (i == asked[0] and j == asked[1]) or (i == asked[1] and j == asked[0]):
                 found = True
     history.counters[1] = used
+    return found
+
+
+@in_place_kernel
+def _record_impacts(sweeps: Sweeps, count: int, frame: int, asked: I64, history: History) -> bool:
+    """Record ``count`` hits of a step; return whether one is of the asked bodies."""
+    found = False
+    for c in range(count):
+        used = history.counters[1] + c
+        i, j = sweeps.contact_bodies[c, 0], sweeps.contact_bodies[c, 1]
+        history.frame[used] = frame
+        history.bodies[used, 0], history.bodies[used, 1] = i, j
+        for k in range(RECORD_WIDTH):
+            history.contact[used, k] = sweeps.contact[c, k]
+        if (i == asked[0] and j == asked[1]) or (i == asked[1] and j == asked[0]):
+            found = True
+    history.counters[1] += count
     return found
 
 
@@ -278,6 +280,7 @@ def _at_rest(bodies: Bodies, sleep: SleepState, rule: EndRule) -> bool:
 def run_steps(
     hulls: Hulls,
     scene: SearchScene,
+    swept: SweepScene,
     bodies: Bodies,
     sleep: SleepState,
     drag: F64,
@@ -295,7 +298,7 @@ def run_steps(
 
     Parameters
     ----------
-    hulls, scene, drag, pushes
+    hulls, scene, swept, drag, pushes
         What does not change; ``drag`` (A, 2) is linear and angular drag per second.
     bodies, sleep, manifolds, space, history
         State of the run; all are changed.
@@ -334,10 +337,12 @@ def run_steps(
         fill_rotations(bodies.q, bodies.rot, 0, actors)
         space.counters[1] += 1
         update_boxes(
-            hulls, scene, bodies.x, bodies.rot, options.reach, space, space.counters[1] == 1
-        )
+            hulls, scene, bodies.x, bodies.rot, options.reach, space.box,
+            space.body_box, space.counters[1] == 1,
+        )  # fmt: skip
         candidates = find_candidates(scene, manifolds, space, actors, options.floor, options.reach)
-        if candidates == FULL or history.counters[1] + 4 * candidates > len(history.frame):
+        room = len(history.frame) - history.counters[1]
+        if candidates == FULL or 4 * candidates + actors > room:
             space.counters[1] -= 1
             return NEEDS_PAIRS if candidates == FULL else NEEDS_ROWS
         _push(bodies, sleep, pushes, now, options.sleep.wake_time, rows.arm)
@@ -359,7 +364,7 @@ def run_steps(
             bodies.v, bodies.w, sleep.asleep, drag, options.gravity,
             options.max_angular_velocity, dt,
         )  # fmt: skip
-        _free_masses(bodies, sleep)
+        free_masses(bodies, sleep)
         build_constraints(contacts, pairs, manifolds, bodies, options.solver, rows)
         correct_positions(rows, contacts, pairs, manifolds, bodies, options.solver)
         for a in range(actors):
@@ -368,11 +373,19 @@ def run_steps(
                 work.move_w[a, i] = bodies.w[a, i]
         correct_velocities(rows, contacts, pairs, manifolds, bodies, options.solver)
         remember_anchors(contacts, pairs, rows.slipped, manifolds, bodies)
+        if options.continuous:
+            keep_start(bodies, work.sweeps)
         move_poses(bodies.x, bodies.q, work.move_v, work.move_w, sleep.asleep, dt)
         touched = _record(contacts, pairs, rows, frames, rule.asked, history)
         update_sleep(
             work.touching, touching, bodies, work.move_v, work.move_w, sleep, options.sleep
         )
+        if options.continuous:
+            hits = stop_at_impacts(
+                hulls, scene, swept, bodies, sleep, work.move_v, work.move_w, dt,
+                options.sleep.wake_time, work.sweeps, work.pair,
+            )  # fmt: skip
+            touched |= _record_impacts(work.sweeps, hits, frames, rule.asked, history)
         record_state(bodies, history)
         if touched and rule.until_touch:
             history.counters[2] = 1

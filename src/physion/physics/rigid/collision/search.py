@@ -130,11 +130,13 @@ def update_boxes(
     x: F64,
     rot: F64,
     reach: float,
-    space: SearchSpace,
+    box: F64,
+    body_box: F64,
     first: bool,
 ) -> None:
     """Compute the boxes of all geoms and bodies that can move; with ``first`` of all.
 
+    They are the lower and upper corners in ``box`` (G, 6) and ``body_box`` (N, 6), world axes.
     ``x`` (A + 1, 3), ``rot`` (A + 1, 3, 3) are the poses of the actors, the world last.
     """
     margin = 0.5 * reach
@@ -143,8 +145,8 @@ def update_boxes(
         if not first and a == len(x) - 1:
             continue
         for i in range(3):
-            space.body_box[body, i] = np.inf
-            space.body_box[body, 3 + i] = -np.inf
+            body_box[body, i] = np.inf
+            body_box[body, 3 + i] = -np.inf
         for g in range(scene.first_geom[body], scene.first_geom[body + 1]):
             for i in range(3):
                 center = x[a, i]
@@ -152,10 +154,10 @@ def update_boxes(
                 for j in range(3):
                     center += rot[a, i, j] * hulls.box[g, j]
                     half += abs(rot[a, i, j]) * hulls.box[g, 3 + j]
-                space.box[g, i] = center - half
-                space.box[g, 3 + i] = center + half
-                space.body_box[body, i] = min(space.body_box[body, i], center - half)
-                space.body_box[body, 3 + i] = max(space.body_box[body, 3 + i], center + half)
+                box[g, i] = center - half
+                box[g, 3 + i] = center + half
+                body_box[body, i] = min(body_box[body, i], center - half)
+                body_box[body, 3 + i] = max(body_box[body, 3 + i], center + half)
 
 
 @in_place_kernel
