@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -58,10 +61,20 @@ class ObservedDataset:
 
 
 class Dataset:
-    """Dataset in a folder.
+    """Dataset in a folder: a map from row numbers to trials, and from names to files and frames.
 
-    The index is read at once (`BadInputError` if there is none), trials and movies on request.
-    Methods that take the name of a trial raise `UnknownNameError` for an unknown one.
+    The index is read at once, trials and movies on request.
+
+    Parameters
+    ----------
+    folder
+        Folder that `physion.generate` or ``physion import`` made.
+
+    Raises
+    ------
+    BadInputError
+        If there is no index. Methods that take the name of a trial raise `UnknownNameError` for an
+        unknown one.
     """
 
     def __init__(self, folder: Path | str) -> None:
@@ -71,6 +84,10 @@ class Dataset:
 
     def __len__(self) -> int:
         return len(self.index)
+
+    def __getitem__(self, row: int) -> Trial:
+        """Open and check the trial in a row of the index."""
+        return self.trial(self.trials()[row])
 
     def trials(self, split: str | None = None, scenario: str | None = None) -> list[str]:
         """Return the names of the trials of a split and a scenario, by default of all, in order."""
@@ -120,6 +137,95 @@ class Dataset:
     ) -> NDArray[np.uint8]:
         """Return frames of the observed movie (T, H, W, 3) in sRGB; see `video.read_frames`."""
         return self.observed.frames(trial, count=count, stride=stride, size=size)
+
+    def clips(
+        self,
+        *,
+        split: str | None = None,
+        scenario: str | None = None,
+        context: int = 7,
+        future: int = 18,
+        stride: int = 6,
+        anchor: Literal["start", "end"] = "start",
+        size: int = 224,
+        passes: Sequence[str] = ("rgb",),
+        look: str | None = None,
+        objects: int = 10,
+        padding: bool = True,
+        labels: bool = True,
+        rendered: bool = False,
+    ) -> Sequence[dict[str, Any]]:
+        """Return clips, one for each trial, which torch's ``DataLoader`` takes as they are.
+
+        The words are those of `physion.models.batch.Spec`; its defaults are those of the study.
+
+        Parameters
+        ----------
+        split, scenario
+            Which trials; by default all.
+        context, future
+            Frames of a clip in the observed part, and after them. With ``future=0`` nothing that
+            follows the observed part is opened.
+        stride
+            Frames of 0.01 s from one frame of a clip to the next.
+        anchor
+            ``start``: frame 0 comes first; ``end``: the last frame of the context is the last
+            observed one.
+        size
+            Pixels per side.
+        passes
+            Any of rgb, ids, depth, boxes, camera. All but ``rgb`` are rendered.
+        look
+            Colours: ``redyellow`` or ``free``; by default each trial's own.
+        objects
+            Rows of ``boxes``.
+        padding
+            Repeat the last frame in clips that are longer than their trial; otherwise such trials
+            are left out.
+        labels
+            Give the outcome, too.
+        rendered
+            Render ``rgb`` from the motion instead of reading movies.
+
+        Returns
+        -------
+        clips
+            A sequence of dictionaries: ``trial`` (name), ``label`` (bool: agent and patient touch),
+            ``frames`` (T) int64, ``valid`` (T) bool: whether the trial has that frame, ``rgb``
+            (T, H, W, 3) uint8, ``ids`` (T, H, W) uint8: 0 scenery, 1 agent, 2 patient, 3 and more
+            the others, ``depth`` (T, H, W) float32 in metres, ``boxes`` (T, objects, 4) float32 in
+            0..1 with NaN for the unseen, ``camera`` (2, 4, 4) float64: view and projection.
+
+        Raises
+        ------
+        BadInputError
+            For an unknown pass or look, a context that is not observed, or no trial. Items raise it
+            for a file that is missing, damaged or changed.
+
+        Examples
+        --------
+        >>> clips = Dataset("trials").clips(split="training", size=64)  # doctest: +SKIP
+        >>> loader = torch.utils.data.DataLoader(clips, 32, shuffle=True)  # doctest: +SKIP
+        """
+        # By name: training imports this module, and what only reads trials does not need it.
+        made: Any = import_module("physion.training.clips").Clips(
+            self,
+            split=split,
+            scenario=scenario,
+            context=context,
+            future=future,
+            stride=stride,
+            anchor=anchor,
+            size=size,
+            passes=passes,
+            look=look,
+            objects=objects,
+            padding=padding,
+            labels=labels,
+            rendered=rendered,
+        )
+        clips: Sequence[dict[str, Any]] = made
+        return clips
 
     @cached_property
     def _rows(self) -> dict[str, int]:

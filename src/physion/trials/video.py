@@ -8,6 +8,7 @@ frames.
 from __future__ import annotations
 
 import io
+import os
 import threading
 from collections.abc import Sequence
 from pathlib import Path
@@ -234,6 +235,19 @@ class _Reformatters(threading.local):
 
 
 _reformatters = _Reformatters()
+_of_parents: list[_Reformatters] = []
+
+
+def _renew_reformatters() -> None:
+    """Replace the reformatters in a forked process, which has none of the threads they wait for."""
+    global _reformatters
+    # To free them would wait for the threads, too.
+    _of_parents.append(_reformatters)
+    _reformatters = _Reformatters()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_renew_reformatters)
 
 
 def _convert_all(
