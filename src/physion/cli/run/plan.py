@@ -84,12 +84,21 @@ def balanced_trials(trials: Iterable[ImportedTrial], limit: int | None) -> list[
     groups: dict[str, list[ImportedTrial]] = defaultdict(list)
     for trial in sorted(trials, key=lambda trial: stable_hash("limit", trial.scene.name)):
         groups[trial.scene.scenario].append(trial)
-    return [trial for group in groups.values() for trial in _in_turn(group)[:limit]]
+    # Scenarios begin with either kind, so that one trial of each is balanced, too.
+    ordered = sorted(groups)
+    return [
+        trial
+        for place, scenario in enumerate(ordered)
+        for trial in _in_turn(groups[scenario], first=place % 2 == 0)[:limit]
+    ]
 
 
-def _in_turn(trials: Sequence[ImportedTrial]) -> list[ImportedTrial]:
-    """Return trials with and without contact in turn; what is left of the longer kind at last."""
-    yes = [trial for trial in trials if trial.outcome.contact]
-    no = [trial for trial in trials if not trial.outcome.contact]
-    pairs = zip_longest(yes, no)
+def _in_turn(trials: Sequence[ImportedTrial], *, first: bool) -> list[ImportedTrial]:
+    """Return trials with the outcome ``first`` and with the other in turn.
+
+    What is left of the more frequent kind comes last.
+    """
+    same = [trial for trial in trials if trial.outcome.contact == first]
+    others = [trial for trial in trials if trial.outcome.contact != first]
+    pairs = zip_longest(same, others)
     return [trial for pair in pairs for trial in pair if trial is not None]

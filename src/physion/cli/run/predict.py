@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from physion.cli.output import Stages
 
 if TYPE_CHECKING:
-    from physion.cli.run.run import Options
+    from physion.cli.run.options import Options
 
 OFFICIAL_MODELS = (
     "pEffNetLite0-mlp",
@@ -43,7 +43,7 @@ def chosen_models(options: Options) -> dict[str, dict[str, Any]]:
 
 def check_models(options: Options) -> None:
     """Build every model once, so that a wrong name or a missing library fails early."""
-    from physion.models import build_model
+    from physion.models.build import build_model
 
     for model, settings in chosen_models(options).items():
         build_model(model, **settings)
@@ -52,7 +52,8 @@ def check_models(options: Options) -> None:
 def predict(options: Options, folder: Path) -> tuple[list[Path], list[str]]:
     """Write the predictions of every model; return their paths and the failures."""
     from physion.compute.local import LocalExecutor
-    from physion.readout import EvaluationConfig, evaluate
+    from physion.readout.evaluate import evaluate
+    from physion.readout.settings import EvaluationConfig
     from physion.trials.dataset import Dataset
 
     dataset = Dataset(folder / "trials")

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from physion.cli.run.options import Options
     from physion.cli.run.plan import RunPlan
-    from physion.cli.run.run import Options
 
 
 def write_report(

@@ -1,0 +1,105 @@
+"""The verb run: sampled scenes, and the official ones compared with real people."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from physion.cli.main import main
+from physion.cli.run.plan import balanced_trials
+from physion.data import official
+
+SMALL = ["--limit", "2", "--size", "64", "--steps", "10", "--samples", "4", "--workers", "2"]
+
+
+def digests(folder: Path) -> dict[str, str]:
+    """SHA-256 of every file by its path in the folder."""
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and not path.name.startswith(".")
+    }
+
+
+@pytest.mark.slow
+def test_sampled_scenes_to_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["run", "--sampled", "--out", str(tmp_path), *SMALL, "--json"]
+    assert main(command) == 0
+    answer = json.loads(capsys.readouterr().out)
+    page = Path(answer["report"])
+    assert page.is_file() and "<html" in page.read_text()
+    agents = {row["model"] for row in answer["scores"]}
+    assert agents == {"random-resnet18-mlp", "noisy-simulation"}
+    index = pd.read_parquet(tmp_path / "trials" / "index.parquet")
+    assert dict(index.groupby("split").size()) == {"readout": 12, "testing": 6}
+    first = digests(tmp_path)
+    assert main(command) == 0
+    assert digests(tmp_path) == first, "a second run must change nothing"
+
+
+@pytest.mark.slow
+def test_the_first_command_compares_models_with_people(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    few = ["--models", "noisy-simulation,state-classifier,chance"]
+    command = ["run", "--out", str(tmp_path), *SMALL, *few, "--json"]
+    assert main(command) == 0
+    answer = json.loads(capsys.readouterr().out)
+    scores = pd.DataFrame(answer["scores"])
+    assert {"noisy-simulation", "state-classifier", "chance"} <= set(scores["model"])
+    rows = scores[(scores["scenario"] == "pooled") & (scores["model"] == "noisy-simulation")]
+    assert rows["stimuli"].item() >= 14  # two a scenario; Roll trials with a ledge may be left out
+    assert 0.5 < rows["human_accuracy"].item() < 1
+    stimuli = pd.read_csv(Path(answer["report"]).parent / "tables" / "stimuli.csv")
+    index = pd.read_parquet(tmp_path / "trials" / "index.parquet").set_index("trial")
+    for row in stimuli.itertuples():
+        assert row.label == index.loc[row.stimulus, "recorded_contact"]
+    tested = index[index["split"] == "testing"]
+    assert (tested.groupby("scenario")["recorded_contact"].sum() == 1).all(), "balanced"
+    first = digests(tmp_path)
+    assert main(command) == 0
+    again = capsys.readouterr()
+    assert json.loads(again.out) == answer and again.err == ""
+    assert digests(tmp_path) == first
+    (tmp_path / "report" / "report.html").write_text("changed")
+    assert main(command) == 0
+    assert digests(tmp_path) == first, "what was changed is made again"
+
+
+@pytest.mark.slow
+def test_command_logs_against_people(
+    official: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["run", "--scenes", str(official / "scenes"), "--humans", str(official / "humans")]
+    command += [*SMALL, "--limit", "1", "--models", "chance", "--out", str(tmp_path), "--json"]
+    assert main(command) == 0
+    scores = pd.DataFrame(json.loads(capsys.readouterr().out)["scores"])
+    assert scores["human_accuracy"].notna().any()
+
+
+def test_a_larger_limit_adds_to_the_trials_of_a_smaller_one() -> None:
+    trials = official().trials
+    few, more = (balanced_trials(trials, limit) for limit in (3, 7))
+    assert {t.scene.name for t in few} < {t.scene.name for t in more}
+    counts = pd.Series([t.outcome.contact for t in more]).groupby([t.scene.scenario for t in more])
+    assert (counts.size() == 7).all() and counts.sum().isin((3, 4)).all()
+    assert len(balanced_trials(trials, None)) == len(trials)
+
+
+def test_nobody_has_seen_sampled_scenes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["run", "--sampled", "--humans", "official", "--out", str(tmp_path / "out")]
+    assert main(command) == 2
+    assert "seen by nobody" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_unknown_model_is_refused_before_anything_is_made(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["run", "--models", "chanse", "--out", str(tmp_path / "out")]) == 2
+    assert "chance" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
