@@ -88,7 +88,7 @@ def dots(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 
 def accuracy_of_full(dataset: Dataset, folder: Path) -> float:
-    config: Any = EvaluationConfig(("full",), accelerator="cpu", readout=QUICK.readout)
+    config: Any = EvaluationConfig(readouts=("full",), accelerator="cpu", readout=QUICK.readout)
     table = evaluate(dataset, "frozen-encoder", folder, options=TINY, config=config).predictions
     return float((table["Predicted Outcome"] == table["Actual Outcome"]).mean())
 

@@ -100,7 +100,7 @@ def test_a_second_run_does_nothing_and_says_the_same(
 def test_other_dynamics_share_the_features(done: Evaluation, dots: Dataset, work: Path) -> None:
     steps: list[str] = []
     config = EvaluationConfig(
-        ("observed+simulated",), steps=5, accelerator="cpu", readout=QUICK.readout
+        readouts=("observed+simulated",), steps=5, accelerator="cpu", readout=QUICK.readout
     )
     evaluation = evaluate(
         dots, "frozen-encoder", work, options={**TINY, "dynamics": "lstm"}, config=config,
@@ -115,7 +115,11 @@ def test_training_protocols_are_named_in_the_table(
     protocol: str, dots: Dataset, work: Path, done: Evaluation
 ) -> None:
     config = EvaluationConfig(
-        ("observed+simulated",), protocol, steps=3, accelerator="cpu", readout=QUICK.readout
+        readouts=("observed+simulated",),
+        training=protocol,
+        steps=3,
+        accelerator="cpu",
+        readout=QUICK.readout,
     )
     table = evaluate(dots, "frozen-encoder", work, options=TINY, config=config).predictions
     prefix = "no_" if protocol == "all-but" else ""
@@ -148,9 +152,15 @@ def test_a_broken_movie_is_one_clear_error_and_leaves_no_table(tmp_path: Path) -
 
 def test_unknown_and_impossible_readouts_are_refused(dots: Dataset, tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match="observed"):
-        evaluate(dots, "frozen-encoder", tmp_path, options=TINY, config=EvaluationConfig(("obs",)))
+        evaluate(
+            dots,
+            "frozen-encoder",
+            tmp_path,
+            options=TINY,
+            config=EvaluationConfig(readouts=("obs",)),
+        )
     with pytest.raises(BadInputError, match="does not support the readout protocol"):
-        evaluate(dots, "noisy-simulation", tmp_path, config=EvaluationConfig(("full",)))
+        evaluate(dots, "noisy-simulation", tmp_path, config=EvaluationConfig(readouts=("full",)))
     wrong = EvaluationConfig(training="but-all", accelerator="cpu")
     with pytest.raises(UnknownNameError, match="all-but"):
         evaluate(dots, "frozen-encoder", tmp_path, options=TINY, config=wrong)

@@ -20,7 +20,7 @@ from physion.models.build import build_model
 from physion.models.interface import Learns, Model
 from physion.readout.capabilities import choose_readouts
 from physion.readout.folds import plan_folds
-from physion.readout.predictor import Predictor, training_settings
+from physion.readout.predictor import Predictor
 from physion.readout.protocols import Readout
 from physion.readout.settings import EvaluationConfig
 from physion.readout.table import (
@@ -50,44 +50,57 @@ class Evaluation:
 
 def evaluate(
     dataset: Dataset,
-    model: str,
-    folder: Path,
+    model: Model | str,
+    folder: Path | str,
     *,
     options: Mapping[str, Any] | None = None,
     config: EvaluationConfig | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> Evaluation:
-    """Predict every testing trial of ``dataset`` with the model called ``model``.
+    """Train a model and its readout, and predict every testing trial of a dataset.
 
     Parameters
     ----------
     dataset
-        Trials of the splits testing, readout and training (see `plan_folds`).
+        Trials of the splits testing, readout and training. Without readout trials the testing
+        trials are cross-validated.
     model
-        Name in the registry of models.
+        Name of a model (``physion ls models``), ``FILE.py:Class``, or a model.
     folder
         Output folder. The table goes to ``predictions/<model>-<hash>.csv``; caches go to
         ``features/``, ``training/`` and ``rollouts/``. An existing table of the same trials,
         model and config is returned without a new evaluation.
     options
-        Fields of the model's config.
+        Fields of the config of a model that is given by its name.
     config
-        Settings of the evaluation.
+        Protocols, training, readout and device.
     executor
         Runs simulations; by default they run in this process.
     progress
         Called after every finished item.
 
+    Returns
+    -------
+    evaluation
+        Table of predictions with the official column names, a row for each testing trial and
+        protocol; its file; and the reasons of trials that have no prediction.
+
     Raises
     ------
+    UnknownNameError
+        For an unknown model, option, protocol or reader; the message names the closest ones.
     BadInputError
-        If a protocol does not fit the model, or no trial could be predicted.
+        If a protocol does not fit the model, the model raises or returns something wrong, or no
+        trial could be predicted.
     """
     config = config if config is not None else EvaluationConfig()
-    built = build_model(model, **dict(options or {}))
+    if isinstance(model, str):
+        model = build_model(model, **dict(options or {}))
+    elif options:
+        raise BadInputError("options are for a model that is given by its name; this one is built")
     return evaluate_model(
-        dataset, built, folder, config=config, executor=executor, progress=progress
+        dataset, model, Path(folder), config=config, executor=executor, progress=progress
     )
 
 
@@ -140,7 +153,7 @@ def _digest(
     model_config = getattr(model, "config", None)
     options = dataclasses.asdict(model_config) if dataclasses.is_dataclass(model_config) else {}  # type: ignore[arg-type]
     if isinstance(model, Learns):
-        options["training settings"] = dataclasses.asdict(training_settings(model, config))
+        options["training settings"] = dataclasses.asdict(config.apply(model.settings))
     parts = [_VERSION, __version__, settings, dataclasses.asdict(model.provenance())]
     sha = hashlib.sha256(json.dumps([*parts, options], sort_keys=True, default=str).encode())
     sha.update(model.digest().encode())

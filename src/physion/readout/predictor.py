@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -125,14 +124,15 @@ class Predictor:
         from physion.training.train import train_model
 
         # Every fold starts from the same weights.
+        network: Any = model
         if self._initial is None:
-            self._initial = copy.deepcopy(model.state_dict())
-        model.load_state_dict(self._initial)
+            self._initial = copy.deepcopy(network.state_dict())
+        network.load_state_dict(self._initial)
         report = train_model(
             model,
             self._whole,
             fold.train,
-            settings=training_settings(model, self.config),
+            settings=self.config.apply(model.settings),
             seed=self.config.seed,
             name=fold.training.name,
             folder=self._sub("training"),
@@ -341,10 +341,3 @@ class Predictor:
                 "probability"
             )
         return values.astype(np.float64)
-
-
-def training_settings(model: Learns, config: EvaluationConfig) -> Any:
-    """Return the model's settings of training with those that the config sets."""
-    given = {"steps": config.steps, "batch": config.batch, "learning_rate": config.learning_rate}
-    changed = {name: value for name, value in given.items() if value is not None}
-    return dataclasses.replace(model.settings, **changed)

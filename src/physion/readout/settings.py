@@ -6,11 +6,12 @@ from dataclasses import dataclass, field
 
 from physion.errors import BadInputError
 from physion.readout.logistic import ReadoutConfig
+from physion.training.overrides import TrainingOverrides
 
 
-@dataclass(frozen=True)
-class EvaluationConfig:
-    """Settings of an evaluation."""
+@dataclass(frozen=True, kw_only=True)
+class EvaluationConfig(TrainingOverrides):
+    """Settings of an evaluation, and of the training that it needs."""
 
     readouts: tuple[str, ...] = ()
     """Protocols: observed, observed+simulated, full. Default: all that the model supports."""
@@ -18,12 +19,6 @@ class EvaluationConfig:
     """Scenarios that train the model: all, all-but or only the tested one."""
     untrained: bool = False
     """Leave the weights of the model as they are; the table says untrained."""
-    steps: int | None = None
-    """Training steps; default: the model's own setting. So for the next two."""
-    batch: int | None = None
-    """Clips per training step."""
-    learning_rate: float | None = None
-    """Learning rate of the optimiser."""
     reader: str = ""
     """Reader of features or rollouts (physion ls readers); default: the model's own."""
     readout: ReadoutConfig = field(default_factory=ReadoutConfig)
