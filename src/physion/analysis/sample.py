@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, NamedTuple
 
@@ -12,6 +12,7 @@ import numpy.typing as npt
 import pandas as pd
 
 from physion.analysis.people.answers import ScenarioAnswers, mean_over_people
+from physion.analysis.statistics.agreement import pair_difference
 from physion.analysis.statistics.kappa import (
     correctness,
     cross_kappa,
@@ -34,6 +35,8 @@ class Sums(NamedTuple):
     - ``n_people``, ``correct_people``: the first two for the stimuli that people answered as well;
       the sums below are over these stimuli;
     - ``human``: fraction of people who are right;
+    - ``yes``, ``both_yes``: the model's answers yes, and P(yes) where it answers yes;
+    - ``differ``: probability that two people answer differently;
     - ``square``: squared difference of P(contact) and P(yes);
     - ``x``, ``y``, ``xx``, ``yy``, ``xy``: of x = P(contact) - 0.5, y = P(yes) - 0.5 and their
       products. Centring at 0.5 keeps rounding errors small.
@@ -45,6 +48,9 @@ class Sums(NamedTuple):
     n_people: Array
     correct_people: Array
     human: Array
+    yes: Array
+    both_yes: Array
+    differ: Array
     square: Array
     x: Array
     y: Array
@@ -62,6 +68,8 @@ class Sample:
     - ``label``, ``shown`` (s,): the official outcome, and that of the trial the model was shown;
     - ``p_yes``, ``human_accuracy`` (b, s) or (1, s): fraction of people who say yes, and who are
       right; NaN where nobody answered;
+    - ``differ`` (b, s) or (1, s): fraction of pairs of different people who answer differently; NaN
+      where fewer than two answered;
     - ``stimuli`` (b, s): how often each stimulus is drawn;
     - ``answers``, ``people`` (b, n): answers of single participants, and how often each of them is
       drawn; None if only averages are known;
@@ -74,6 +82,7 @@ class Sample:
     shown: Array
     p_yes: Array
     human_accuracy: Array
+    differ: Array
     stimuli: Array
     answers: ScenarioAnswers | None = None
     people: Array | None = None
@@ -94,6 +103,26 @@ class Sample:
             return _total([part.sums_same_outcome for part in self._parts])
         return self._sums((self.label == self.shown).astype(np.float64))
 
+    @cached_property
+    def of_people(self) -> Sample:
+        """The same people with a single model that answers with the official outcome.
+
+        Its sums about people are over all stimuli that people answered, whatever the models
+        predict.
+        """
+        parts = tuple(part.of_people for part in self._parts)
+        return replace(self, p_contact=self.label[None], predicted=self.label[None], _parts=parts)
+
+    @cached_property
+    def sums_by_outcome(self) -> tuple[Sums, Sums]:
+        """Sums over the stimuli with contact, and over those without."""
+        if self._parts:
+            by_part = [part.sums_by_outcome for part in self._parts]
+            return _total([one for one, _ in by_part]), _total([other for _, other in by_part])
+        return self._sums((self.label == 1).astype(np.float64)), self._sums(
+            (self.label == 0).astype(np.float64)
+        )
+
     def _sums(self, mask: Array) -> Sums:
         known = ~np.isnan(self.p_contact)
         has = known * mask
@@ -104,6 +133,7 @@ class Sample:
         w = np.where(answered, self.stimuli, 0.0)
         b = np.where(answered, self.p_yes - 0.5, 0.0)
         human = np.where(answered, self.human_accuracy, 0.0)
+        said_yes = np.nan_to_num(self.predicted) * mask
         weighted = w * b
         xx, yy, xy = w @ (a * a).T, (weighted * b) @ has.T, weighted @ a.T
         square = xx - 2 * xy + yy
@@ -118,6 +148,9 @@ class Sample:
             n_people=w @ has.T,
             correct_people=w @ right.T,
             human=(w * human) @ has.T,
+            yes=w @ said_yes.T,
+            both_yes=(w * np.where(answered, self.p_yes, 0.0)) @ said_yes.T,
+            differ=np.where(w > 0, w * self.differ, 0.0) @ has.T,
             square=np.maximum(square, 0.0),
             x=w @ a.T,
             y=weighted @ has.T,
@@ -176,7 +209,8 @@ def pool(samples: Sequence[Sample]) -> Sample:
     def joined(name: str) -> Array:
         return np.asarray(np.concatenate([getattr(one, name) for one in samples], axis=-1))
 
-    names = ("p_contact", "predicted", "label", "shown", "p_yes", "human_accuracy", "stimuli")
+    names = ("p_contact", "predicted", "label", "shown", "p_yes", "human_accuracy", "differ",
+             "stimuli")  # fmt: skip
     return Sample(**{name: joined(name) for name in names}, _parts=tuple(samples))  # type: ignore[arg-type]
 
 
@@ -186,8 +220,8 @@ def sample_of_rows(rows: pd.DataFrame, stimuli: Array) -> Sample:
     Parameters
     ----------
     rows
-        One row a stimulus with ``p_contact``, ``predicted``, ``label``, ``simulated``, ``p_yes``
-        and ``human_accuracy`` (NaN without people).
+        One row a stimulus with ``p_contact``, ``predicted``, ``label``, ``simulated``, and, NaN
+        without people, ``p_yes``, ``human_accuracy`` and ``count``.
     stimuli
         (b, s): how often each stimulus is drawn.
     """
@@ -202,5 +236,6 @@ def sample_of_rows(rows: pd.DataFrame, stimuli: Array) -> Sample:
         shown=column("simulated"),
         p_yes=column("p_yes")[None],
         human_accuracy=column("human_accuracy")[None],
+        differ=pair_difference(column("p_yes"), column("count"))[None],
         stimuli=stimuli,
     )

@@ -95,7 +95,17 @@ def plain(
     among = [kappa(yes[i], yes[j]) for i in range(len(who)) for j in range(i)
              if who[i] != who[j]]  # fmt: skip
     rmsd = agreement.rmsd(p, share)
+    agreeing = np.mean(np.where(said == 1, share, 1 - share))
+    by_chance = said.mean() * share.mean() + (1 - said.mean()) * (1 - share.mean())
+    average = float((agreeing - by_chance) / (1 - by_chance))
+    skill = (2 * np.mean(said == label) - 1) * (2 * np.mean(right) - 1)
+    x, y, z = (v - np.where(label == 1, v[label == 1].mean(), v[label == 0].mean())
+               for v in (p, share, said))  # fmt: skip
     return {
+        "kappa_from_averages": average,
+        "kappa_beyond_outcome": float(average - skill),
+        "kappa_within_outcomes": float(2 * np.mean(z * y) / (1 - by_chance)),
+        "r_beyond_outcome": agreement.pearson(x, y),
         "accuracy": float(np.mean(said == label)),
         "difference": float(np.mean(said == label) - np.mean(right)),
         "r": agreement.pearson(p, share),
@@ -122,7 +132,9 @@ def test_every_measure_is_what_it_says(models: Models, answers: ScenarioAnswers)
             assert found.loc[measure, "value"] == pytest.approx(value, abs=1e-9, nan_ok=True)
         assert (found["stimuli"] == (23 if name == "gaps" else 25)).all()
     undefined = table[table["value"].isna()]
-    assert set(undefined["model"]) == {"always"} and set(undefined["measure"]) == {"r"}
+    assert set(undefined["model"]) == {"always"} and set(undefined["measure"]) == {
+        "r", "r_beyond_outcome",
+    }  # fmt: skip
     assert undefined["reason"].str.contains("P\\(contact\\) constant").all()
 
 

@@ -109,11 +109,37 @@ def rows_of(pair: Array, seed: int) -> pd.DataFrame:
             "p_contact": pair[0],
             "p_yes": pair[1],
             "human_accuracy": generator.random(n),
+            "count": generator.integers(2, 9, n),
             "predicted": generator.random(n) > 0.5,
             "label": generator.random(n) > 0.5,
             "simulated": generator.random(n) > 0.5,
         }
     )
+
+
+def plain_kappa(said: npt.ArrayLike, p_yes: npt.ArrayLike) -> float:
+    """Kappa with someone drawn for each stimulus, from the four cells of the table of answers."""
+    m, p = np.asarray(said, dtype=np.float64), np.asarray(p_yes, dtype=np.float64)
+    cells = np.array([[(1 - m) @ (1 - p), (1 - m) @ p], [m @ (1 - p), m @ p]]) / len(m)
+    chance = cells.sum(axis=0) @ cells.sum(axis=1)
+    return float((np.trace(cells) - chance) / (1 - chance)) if chance < 1 - 1e-12 else np.nan
+
+
+def plain_within(said: pd.Series, p_yes: pd.Series, outcome: pd.Series) -> float:
+    """Twice the covariance within outcomes, over 1 less the agreement by chance."""
+    m, p = said.astype(float), p_yes.astype(float)
+    apart = [v - v.groupby(outcome).transform("mean") for v in (m, p)]
+    rest = m.mean() * (1 - p.mean()) + p.mean() * (1 - m.mean())
+    return float(2 * (apart[0] * apart[1]).mean() / rest) if rest > 1e-12 else np.nan
+
+
+def plain_partial(x: pd.Series, y: pd.Series, outcome: pd.Series) -> float:
+    """Pearson's r of the deviations from the mean of the same outcome."""
+    groups = outcome.nunique()
+    if len(x) - groups < 2:
+        return float("nan")
+    return agreement.pearson(x - x.groupby(outcome).transform("mean"),
+                             y - y.groupby(outcome).transform("mean"))  # fmt: skip
 
 
 @given(pairs, st.integers(0, 99))
@@ -128,8 +154,17 @@ def test_metrics_from_sums_are_the_plain_ones(pair: Array, seed: int) -> None:
         "r": agreement.pearson(rows["p_contact"], rows["p_yes"]),
         "r_same": agreement.pearson(same["p_contact"], same["p_yes"]),
         "rmsd": agreement.rmsd(rows["p_contact"], rows["p_yes"]),
+        "kappa_from_averages": plain_kappa(rows["predicted"], rows["p_yes"]),
+        "r_beyond_outcome": plain_partial(rows["p_contact"], rows["p_yes"], rows["label"]),
     }
-    expected["difference"] = expected["accuracy"] - expected["human_accuracy"]
+    expected["kappa_within_outcomes"] = plain_within(
+        rows["predicted"], rows["p_yes"], rows["label"]
+    )
+    model, human = expected["accuracy"], expected["human_accuracy"]
+    expected["difference"] = model - human
+    expected["kappa_beyond_outcome"] = expected["kappa_from_averages"] - (
+        (2 * model - 1) * (2 * human - 1)
+    )
     assert found == pytest.approx(expected, abs=1e-7, nan_ok=True)
 
 
@@ -143,6 +178,8 @@ def test_resamples_are_what_drawing_rows_gives(pair: Array, seed: int) -> None:
         drawn = rows.loc[np.repeat(rows.index, weight.astype(int))]
         plain = agreement.pearson(drawn["p_contact"], drawn["p_yes"])
         assert found["r"][number] == pytest.approx(plain, abs=1e-7, nan_ok=True)
+        partial = plain_partial(drawn["p_contact"], drawn["p_yes"], drawn["label"])
+        assert found["r_beyond_outcome"][number] == pytest.approx(partial, abs=1e-7, nan_ok=True)
         assert found["rmsd"][number] == pytest.approx(
             agreement.rmsd(drawn["p_contact"], drawn["p_yes"]), abs=1e-9
         )

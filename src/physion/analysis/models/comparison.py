@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
+from physion.analysis.models.anchors import anchor_scores, kind_of, with_kind
+from physion.analysis.models.observed_contact import SETTING, later_scores, observed_contacts
 from physion.analysis.models.score_tables import people_table, score_table
 from physion.analysis.people.participants import EXCLUDED, LEDGE
 from physion.analysis.statistics.bootstrap import Bootstrap
@@ -26,12 +28,18 @@ NO_SCENARIO = "its scenario is not known"
 class Comparison:
     """Tables that compare models with people.
 
-    - ``scores``: see `score_tables.score_table`.
+    - ``scores``: `score_tables.score_table` of what was predicted, with ``kind``: model, or anchor
+      for models named in `anchors.ANCHOR_MODELS`.
+    - ``anchors``: the same of the anchors that need no predictions (`anchors.COMPUTED`), on the
+      stimuli that any model predicts; empty without people.
+    - ``later``: the rows of both without the trials whose contact was observed, see
+      `observed_contact.later_scores`; empty if that is not known.
     - ``people``: see `score_tables.people_table`, for the stimuli that any model predicts; empty
       without people.
     - ``stimuli``: one row a model and stimulus that both answered: ``agent``, ``model``,
       ``readout``, ``scenario``, ``stimulus``, ``p_contact``, ``predicted``, ``label`` (official),
-      ``simulated``, ``human_accuracy``, ``count``, ``p_yes``, ``gap`` (p_contact - p_yes).
+      ``simulated``, ``human_accuracy``, ``count``, ``p_yes``, ``gap`` (p_contact - p_yes),
+      ``observed_contact`` (True, False, or None if it is not known).
     - ``changed``: the stimuli whose simulated outcome is not the official one, one row each.
     - ``dropped``: excluded stimuli: ``agent`` (empty: excluded for all), ``scenario``, ``reason``,
       ``stimuli`` (count).
@@ -39,6 +47,8 @@ class Comparison:
     """
 
     scores: pd.DataFrame
+    anchors: pd.DataFrame
+    later: pd.DataFrame
     people: pd.DataFrame
     stimuli: pd.DataFrame
     changed: pd.DataFrame
@@ -49,6 +59,18 @@ class Comparison:
     def agents(self) -> list[str]:
         """Names of the models in the order of the predictions."""
         return [str(name) for name in self.stimuli["agent"].unique()]
+
+    @property
+    def models(self) -> list[str]:
+        """Names of the models that are no anchors; if all are, of all."""
+        return [name for name in self.agents if kind_of(name) == "model"] or self.agents
+
+    @property
+    def all_scores(self) -> pd.DataFrame:
+        """The rows of ``scores`` and ``anchors``: models, anchors by models, computed anchors."""
+        parts = [self.scores[self.scores["kind"] == kind] for kind in ("model", "anchor")]
+        parts += [self.anchors]
+        return pd.concat([part for part in parts if len(part)], ignore_index=True)
 
     @property
     def has_people(self) -> bool:
@@ -124,8 +146,12 @@ def compare_scores(
             f"{seen!r}, the predictions name {rows['stimulus'].iloc[0]!r}"
         )
     answered = people[people["stimulus"].isin(stimuli["stimulus"])]
+    scores = with_kind(score_table(stimuli, draws))
+    later, observed = later_scores(stimuli, draws)
     return Comparison(
-        scores=score_table(stimuli, draws),
+        scores=scores,
+        anchors=anchor_scores(stimuli, draws).reindex(columns=scores.columns),
+        later=later.reindex(columns=scores.columns),
         people=people.iloc[:0]
         if humans is None
         else people_table(answered, _whole(zone, people, stimuli), draws),
@@ -133,6 +159,7 @@ def compare_scores(
         changed=_changed(stimuli),
         dropped=pd.concat(dropped, ignore_index=True),
         settings=_settings(humans is not None, unwanted, exclude_ledge, draws)
+        | {SETTING: observed}
         | (_intervals_with_participants(draws) if participants else {})
         | (_describe_zone(zone, zone_origin) if humans is not None else {}),
     )
@@ -185,9 +212,11 @@ def _join(rows: pd.DataFrame, people: pd.DataFrame) -> pd.DataFrame:
     joined = joined.rename(columns={"actual": "simulated", "accuracy": "human_accuracy"})
     joined["label"] = joined["label"].astype(bool)
     joined["gap"] = joined["p_contact"] - joined["p_yes"]
+    observed = joined["stimulus"].map(observed_contacts(rows)).astype(object)
+    joined["observed_contact"] = observed.where(observed.notna(), None)
     columns = ["agent", "model", "readout", "scenario", "stimulus", "p_contact", "predicted"]
     columns += ["label", "simulated", "human_accuracy", "count", "p_yes", "gap"]
-    return joined[columns]
+    return joined[[*columns, "observed_contact"]]
 
 
 def _unmatched(

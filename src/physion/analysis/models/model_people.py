@@ -16,7 +16,11 @@ import numpy.typing as npt
 import pandas as pd
 
 from physion.analysis.metrics import measure_metrics
-from physion.analysis.people.answers import ScenarioAnswers, mean_over_people
+from physion.analysis.people.answers import (
+    ScenarioAnswers,
+    difference_of_pairs,
+    mean_over_people,
+)
 from physion.analysis.people.people import draws_of_people
 from physion.analysis.sample import RESAMPLED, Resampled, Sample
 from physion.analysis.statistics.bootstrap import Bootstrap
@@ -224,6 +228,7 @@ def sample_of_models(
         shown=answers.label,
         p_yes=np.atleast_2d(p_yes),
         human_accuracy=np.atleast_2d(right),
+        differ=np.atleast_2d(difference_of_pairs(answers.yes, people)),
         stimuli=stimuli,
         answers=answers,
         people=everybody if people is None else people,
@@ -242,7 +247,7 @@ def _why(measure: str, k: int, models: Models, answers: ScenarioAnswers) -> str:
     known = ~np.isnan(models.p_contact[k])
     if not known.any():
         return "the model predicts none of the stimuli"
-    if measure == "r":
+    if measure in ("r", "r_beyond_outcome"):
         if known.sum() < 3:
             return "r: fewer than 3 stimuli"
         who = "the model's P(contact)" if np.ptp(models.p_contact[k, known]) < 1e-6 else "people"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,11 @@ from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.tables.stimuli import MEAN, POOLED, in_order
 
 Array = npt.NDArray[np.float64]
+Compute = Callable[[Sample], dict[str, Array]]
+"""Function from a `Sample` to the values of every metric, each of shape (1 + resamples,)."""
+
+Explain = Callable[[pd.DataFrame], dict[str, str]]
+"""Function from rows of stimuli to reasons for what is undefined, by the label of the metric."""
 
 
 def score_table(stimuli: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
@@ -37,7 +43,10 @@ def score_table(stimuli: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
     """
     # Sorted, so that the draws do not depend on the order of the files.
     ordered = stimuli.sort_values("stimulus", kind="stable")
-    parts = [_agent_rows(rows, bootstrap) for _, rows in ordered.groupby("agent", sort=False)]
+    parts = [
+        _agent_rows(rows, bootstrap, _of_models, _why_undefined)
+        for _, rows in ordered.groupby("agent", sort=False)
+    ]
     table = pd.concat(parts, ignore_index=True)
     rank = {agent: position for position, agent in enumerate(stimuli["agent"].unique())}
     return table.sort_values("agent", key=lambda a: a.map(rank), kind="stable").reset_index(
@@ -45,32 +54,40 @@ def score_table(stimuli: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
     )
 
 
-def _agent_rows(rows: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
+def two_people_table(stimuli: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
+    """Return the scores of one person with another, with the columns of `score_table`.
+
+    ``stimuli`` has a row for each stimulus, whose predictions do not matter. Metrics that are not
+    defined for two people are NaN.
+    """
+    ordered = stimuli.sort_values("stimulus", kind="stable")
+    return _agent_rows(ordered, bootstrap, _of_two_people, _why_no_pair)
+
+
+def _agent_rows(
+    rows: pd.DataFrame, bootstrap: Bootstrap, scores: Compute, why: Explain
+) -> pd.DataFrame:
     names = in_order(rows["scenario"])
     parts = [rows[rows["scenario"] == name] for name in names]
     samples = [_sample(part, name, bootstrap) for part, name in zip(parts, names, strict=True)]
-    by_scenario = [_scores(sample) for sample in samples]
+    by_scenario = [scores(sample) for sample in samples]
     mean = {key: np.mean([values[key] for values in by_scenario], axis=0) for key in by_scenario[0]}
+    reasons = [why(part) for part in parts]
     records = [
-        _record(
-            name, part, values_of, bootstrap, agreement.why_no_r(part["p_contact"], part["p_yes"])
-        )
-        for name, part, values_of in zip(names, parts, by_scenario, strict=True)
-    ]
-    undefined = [
-        name
-        for name, values_of in zip(names, by_scenario, strict=True)
-        if np.isnan(values_of["r"][0])
+        _record(name, part, values_of, bootstrap, [*because.values()])
+        for name, part, values_of, because in zip(names, parts, by_scenario, reasons, strict=True)
     ]
     one_class = [name for name, part in zip(names, parts, strict=True) if _one_class(part)]
-    whys = [f"r: undefined in {', '.join(undefined)}"] if undefined else []
+    undefined: dict[str, list[str]] = {}
+    for name, because in zip(names, reasons, strict=True):
+        for label in because:
+            undefined.setdefault(label, []).append(name)
+    whys = [f"{label}: undefined in {', '.join(where)}" for label, where in undefined.items()]
     whys += [f"labels: of one class in {', '.join(one_class)}"] if one_class else []
-    records.append(_record(MEAN, rows, mean, bootstrap, "; ".join(whys)))
+    records.append(_record(MEAN, rows, mean, bootstrap, whys))
     for key in ("ceiling", "floor"):
         records[-1][key] = float(np.mean([record[key] for record in records[:-1]]))
-    pooled = _scores(pool(samples))
-    why = agreement.why_no_r(rows["p_contact"], rows["p_yes"])
-    records.append(_record(POOLED, rows, pooled, bootstrap, why))
+    records.append(_record(POOLED, rows, scores(pool(samples)), bootstrap, [*why(rows).values()]))
     table = pd.DataFrame(records)
     for position, column in enumerate(("agent", "model", "readout")):
         table.insert(position, column, rows[column].iloc[0])
@@ -83,9 +100,29 @@ def _sample(part: pd.DataFrame, stratum: str, bootstrap: Bootstrap) -> Sample:
     return sample_of_rows(part, np.vstack([np.ones(len(part)), weights]))
 
 
-def _scores(sample: Sample) -> dict[str, Array]:
+def _of_models(sample: Sample) -> dict[str, Array]:
     """Return the values of every metric by stimulus, each of shape (1 + resamples,)."""
     return {metric.name: metric(sample)[:, 0] for metric in score_metrics()}
+
+
+def _of_two_people(sample: Sample) -> dict[str, Array]:
+    """Return the values of every metric for one person with another, likewise."""
+    return {metric.name: metric.of_two_people(sample)[:, 0] for metric in score_metrics()}
+
+
+def _why_undefined(rows: pd.DataFrame) -> dict[str, str]:
+    """Return why metrics of a model are undefined, by their label."""
+    if why := agreement.why_no_r(rows["p_contact"], rows["p_yes"]):
+        return {"r": why}
+    why = agreement.why_no_r_within(rows["p_contact"], rows["p_yes"], rows["label"])
+    return {"r beyond the outcome": why} if why else {}
+
+
+def _why_no_pair(rows: pd.DataFrame) -> dict[str, str]:
+    """Return why kappa of two people is undefined."""
+    if (rows["count"] < 2).any():
+        return {"kappa": "kappa: needs two answers to every stimulus"}
+    return {}
 
 
 def _one_class(rows: pd.DataFrame) -> bool:
@@ -94,9 +131,13 @@ def _one_class(rows: pd.DataFrame) -> bool:
 
 
 def _record(
-    name: str, rows: pd.DataFrame, values_of: dict[str, Array], bootstrap: Bootstrap, why: str
+    name: str,
+    rows: pd.DataFrame,
+    values_of: dict[str, Array],
+    bootstrap: Bootstrap,
+    whys: list[str],
 ) -> dict[str, Any]:
-    reasons = [why] if why else []
+    reasons = [*whys]
     if name != MEAN and _one_class(rows):
         word = "contact" if bool(rows["label"].iloc[0]) else "no contact"
         reasons.append(f"labels: all {word}, so accuracy cannot tell knowing from always saying it")

@@ -54,6 +54,21 @@ def mean_over_people(values: Array, weights: npt.ArrayLike | None = None) -> Arr
         return np.where(count > 0, total / count, np.nan)
 
 
+def difference_of_pairs(yes: Array, weights: npt.ArrayLike | None = None) -> Array:
+    """Return the fraction of pairs of different people who answer a stimulus differently.
+
+    ``yes`` (n, s) holds 1, 0 or NaN; shape (s,), or (resamples, s) with ``weights`` (resamples, n),
+    how often each person is drawn. A person who is drawn twice makes no pair with themselves. NaN
+    where fewer than two people answered.
+    """
+    said_yes, said_no = (yes == 1).astype(np.float64), (yes == 0).astype(np.float64)
+    drawn = np.ones(len(yes)) if weights is None else np.asarray(weights, dtype=np.float64)
+    first, second = drawn @ said_yes, drawn @ said_no
+    pairs = (first + second) ** 2 - drawn**2 @ (said_yes + said_no)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(pairs > 0, 2 * first * second / pairs, np.nan)
+
+
 def answers_of(test: pd.DataFrame, scenario: str) -> ScenarioAnswers:
     """Return the answers to one scenario from the test rows of `participants.Responses`.
 

@@ -51,6 +51,15 @@ def sampling_variance(y: npt.ArrayLike, count: npt.ArrayLike) -> Array:
         return np.where(people > 1, fraction * (1 - fraction) / (people - 1), np.nan)
 
 
+def pair_difference(y: npt.ArrayLike, count: npt.ArrayLike) -> Array:
+    """Return the fraction of pairs of different people who answer a stimulus differently, (n,).
+
+    It is 2 y (1 - y) count / (count - 1), the unbiased estimate of the probability that two people
+    answer differently; NaN for one person.
+    """
+    return 2 * np.asarray(count, dtype=np.float64) * sampling_variance(y, count)
+
+
 def reliability(y: npt.ArrayLike, count: npt.ArrayLike, people: float | None = None) -> float:
     """Return the expected r of the average of these people with that of as many others.
 
@@ -103,3 +112,15 @@ def why_no_r(x: npt.ArrayLike, y: npt.ArrayLike) -> str:
     if np.std(a) < CONSTANT:
         return "r: the model's P(contact) is constant"
     return "r: people's answers are constant" if np.std(b) < CONSTANT else ""
+
+
+def why_no_r_within(x: npt.ArrayLike, y: npt.ArrayLike, outcome: npt.ArrayLike) -> str:
+    """Return why r given the outcome is undefined although r is not; empty if it is defined."""
+    a, b, z = (np.asarray(values, dtype=np.float64) for values in (x, y, outcome))
+    kinds = np.unique(z)
+    if len(a) - len(kinds) < FEWEST - 1:
+        return "r beyond the outcome: too few stimuli of each outcome"
+    for values, whose in ((a, "the model's P(contact)"), (b, "people's P(yes)")):
+        if max(np.std(values[z == kind]) for kind in kinds) < CONSTANT:
+            return f"r beyond the outcome: {whose} is constant given the outcome"
+    return ""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 
@@ -49,3 +51,32 @@ def correlation_from_sums(n: Array, x: Array, y: Array, xx: Array, yy: Array, xy
         defined = (n >= FEWEST) & (np.minimum(variance_x, variance_y) >= CONSTANT**2)
         product = np.where(defined, variance_x * variance_y, np.nan)
         return np.asarray((xy / n - (x / n) * (y / n)) / np.sqrt(product))
+
+
+def correlation_within_groups(
+    groups: Sequence[tuple[Array, Array, Array, Array, Array, Array]],
+) -> Array:
+    """Return r of the deviations from the means of each group, from the groups' sums.
+
+    Parameters
+    ----------
+    groups
+        For each group of stimuli the sums (n, x, y, xx, yy, xy) as in `correlation_from_sums`.
+
+    Notes
+    -----
+    With the squares and products S of deviations from the means within the groups,
+    r = S_xy / sqrt(S_xx S_yy): the partial correlation given the group. NaN if either is constant
+    within all groups, or for fewer than two stimuli more than there are groups with stimuli, when
+    the deviations always lie on a line.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        count = np.sum([n for n, *_ in groups], axis=0)
+        used = np.sum([n > 0 for n, *_ in groups], axis=0)
+        xx, yy, xy = (
+            np.sum([np.where(sums[0] > 0, sums[k] - sums[i] * sums[j] / sums[0], 0.0)
+                    for sums in groups], axis=0) / count
+            for k, i, j in ((3, 1, 1), (4, 2, 2), (5, 1, 2))
+        )  # fmt: skip
+        defined = (count - used >= FEWEST - 1) & (np.minimum(xx, yy) >= CONSTANT**2)
+        return np.asarray(xy / np.sqrt(np.where(defined, xx * yy, np.nan)))

@@ -70,7 +70,8 @@ def check_predictions(table: pd.DataFrame, where: str = "predictions") -> pd.Dat
     ``predicted`` and ``actual`` (bool), and those of `DISTINGUISHING` that are present, as text.
     ``actual`` is the outcome of the trial that the model was shown, so for our own simulations the
     simulated outcome; ``recorded`` is the official one if a column *Recorded Outcome* contains it
-    (bool), else None. Raises `BadInputError`.
+    (bool), else None; ``observed_contact`` says likewise, from *Observed Contact*, whether the
+    contact happened in the observed part. Raises `BadInputError`.
     """
     require_columns(table, REQUIRED, where)
     table = table.reset_index(drop=True)
@@ -84,7 +85,8 @@ def check_predictions(table: pd.DataFrame, where: str = "predictions") -> pd.Dat
             "p_contact": as_numbers(table["Predicted Prob_true"], 0, 1, where),
             "predicted": as_booleans(table["Predicted Outcome"], where),
             "actual": as_booleans(table["Actual Outcome"], where),
-            "recorded": _recorded(table, where),
+            "recorded": _optional(table, "Recorded Outcome", where),
+            "observed_contact": _optional(table, "Observed Contact", where),
         }
     )
     blank = (checked["model"] == "") | (checked["stimulus"] == "")
@@ -103,7 +105,7 @@ def name_models(predictions: pd.DataFrame) -> pd.DataFrame:
 
     It is model and readout and, if several models share these, also what distinguishes them
     (training set, seed, ...). Raises `BadInputError` if one model predicts a stimulus twice, or if
-    two models were shown trials of one name but of different outcome.
+    two models were shown trials of one name but of different outcome or observed contact.
     """
     agent = predictions["model"] + " · " + predictions["readout"]
     for column in DISTINGUISHING:
@@ -119,13 +121,15 @@ def name_models(predictions: pd.DataFrame) -> pd.DataFrame:
     if len(twice):
         row = twice.iloc[0]
         raise BadInputError(f"{row['agent']!r} predicts {row['stimulus']!r} twice; keep one row")
-    outcomes = named.groupby("stimulus")["actual"].nunique()
-    if (outcomes > 1).any():
-        name = outcomes[outcomes > 1].index[0]
-        raise BadInputError(
-            f"two models were shown {name!r} with different outcomes; compare models on one set "
-            "of trials"
-        )
+    for column, what in (("actual", "outcomes"), ("observed_contact", "observed contacts")):
+        if column not in named:
+            continue
+        several = named.groupby("stimulus")[column].nunique()
+        if (several > 1).any():
+            raise BadInputError(
+                f"two models were shown {several[several > 1].index[0]!r} with different {what}; "
+                "compare models on one set of trials"
+            )
     return named
 
 
@@ -146,11 +150,12 @@ def _scenarios(table: pd.DataFrame, stimulus: pd.Series) -> pd.Series:
     return pd.Series(result, index=table.index, dtype=object)
 
 
-def _recorded(table: pd.DataFrame, where: str) -> pd.Series:
+def _optional(table: pd.DataFrame, column: str, where: str) -> pd.Series:
+    """Return a column of True and False as bool; None where it is empty or absent."""
     result = pd.Series(None, index=table.index, dtype=object)
-    if "Recorded Outcome" not in table.columns:
+    if column not in table.columns:
         return result
-    words = _text(table["Recorded Outcome"])
+    words = _text(table[column])
     given = words != ""
     result[given] = as_booleans(words[given], where).tolist()
     return result

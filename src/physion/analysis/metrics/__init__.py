@@ -1,0 +1,26 @@
+"""Metrics: one registry, and a module for each kind of number in the order of the tables."""
+
+from physion.analysis.metrics import accuracy, average_person, beyond_outcome, participants
+from physion.analysis.metrics.registry import (
+    Metric,
+    all_metrics,
+    leaderboard_metrics,
+    measure_metrics,
+    metrics,
+    register_metric,
+    score_metrics,
+)
+
+__all__ = [
+    "Metric",
+    "accuracy",
+    "all_metrics",
+    "average_person",
+    "beyond_outcome",
+    "leaderboard_metrics",
+    "measure_metrics",
+    "metrics",
+    "participants",
+    "register_metric",
+    "score_metrics",
+]

@@ -1,0 +1,127 @@
+"""Metrics of a model with the average person: they need P(yes) by stimulus alone."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from physion.analysis.metrics.registry import register_metric
+from physion.analysis.sample import Array, Sample, Sums
+from physion.analysis.statistics.correlation import correlation_from_sums
+
+ROUNDING = 1e-12
+"""Distance from 1 below which agreement by chance counts as 1."""
+
+
+@register_metric(
+    "r",
+    label="r",
+    heading="Pearson r",
+    definition="correlation over stimuli of P(contact) with the fraction of people who say yes, "
+    "that is, with the average person",
+    better="higher",
+    needs="people",
+    in_scores=True,
+    in_measures=True,
+    on_leaderboard=True,
+)
+def pearson_r(sample: Sample) -> Array:
+    """Return Pearson's r of P(contact) with P(yes); NaN if either is constant or for less than 3
+    stimuli.
+    """
+    return _correlation(sample.sums)
+
+
+@register_metric(
+    "r_same",
+    label="r, same outcome",
+    definition="Pearson r without the stimuli whose simulated outcome is not the official one, "
+    "since people and model saw different events there",
+    better="higher",
+    needs="people",
+    in_scores=True,
+)
+def r_same_outcome(sample: Sample) -> Array:
+    """Return Pearson's r over the stimuli whose shown outcome is the official one."""
+    return _correlation(sample.sums_same_outcome)
+
+
+def _kappa_of_two_people(sample: Sample) -> Array:
+    """Return kappa of one person with another: agreement 1 - mean of P(they differ)."""
+    sums = sample.of_people.sums
+    yes = sums.y / sums.n_people + 0.5
+    agreement = 1 - sums.differ / sums.n_people
+    return _kappa(agreement, yes**2 + (1 - yes) ** 2)
+
+
+@register_metric(
+    "kappa_from_averages",
+    label="kappa, from averages",
+    heading="kappa",
+    definition="Cohen's kappa with a person drawn anew for each stimulus, from P(yes) alone",
+    better="higher",
+    needs="people",
+    in_scores=True,
+    in_measures=True,
+    on_leaderboard=True,
+    two_people=_kappa_of_two_people,
+)
+def kappa_from_averages(sample: Sample) -> Array:
+    """Return Cohen's kappa with a person drawn anew for each stimulus, (b, m).
+
+    Notes
+    -----
+    With the model's answer m (1 or 0) and the fraction of people p who say yes, by stimulus::
+
+        kappa = (A - C) / (1 - C)
+        A = mean(m p + (1 - m) (1 - p))                            agreement
+        C = mean(m) mean(p) + (1 - mean(m)) (1 - mean(p))          agreement by chance
+
+    One person with another: A = mean(1 - 2 p (1 - p) n / (n - 1)) with n people, which is the
+    fraction of agreeing pairs of different people, and C = mean(p)^2 + (1 - mean(p))^2. NaN where C
+    is 1. The mean over participants of their kappa (metric ``kappa``) differs a little, because
+    there each participant's own fraction of yes gives C.
+    """
+    sums = sample.sums
+    model, people = sums.yes / sums.n_people, sums.y / sums.n_people + 0.5
+    agreement = 1 - model - people + 2 * sums.both_yes / sums.n_people
+    return _kappa(agreement, model * people + (1 - model) * (1 - people))
+
+
+def _kappa(agreement: Array, expected: Array) -> Array:
+    return np.where(1 - expected > ROUNDING, (agreement - expected) / (1 - expected), np.nan)
+
+
+@register_metric(
+    "rmsd",
+    label="RMSD",
+    definition="square root of the mean squared difference between P(contact) and the fraction of "
+    "people who say yes",
+    better="lower",
+    needs="people",
+    in_scores=True,
+    in_measures=True,
+    on_leaderboard=True,
+)
+def rmsd(sample: Sample) -> Array:
+    """Return the root of the mean squared difference of P(contact) and P(yes)."""
+    return np.sqrt(sample.sums.square / sample.sums.n_people)
+
+
+@register_metric(
+    "euclid_over_n",
+    label="",
+    definition="RMSD divided by the square root of the number of stimuli: the “RMSE” of the "
+    "released notebooks",
+    better="lower",
+    needs="people",
+    in_measures=True,
+)
+def euclid_over_n(sample: Sample) -> Array:
+    """Return the RMSD divided by the root of the number of stimuli, as the released notebooks
+    do.
+    """
+    return rmsd(sample) / np.sqrt(sample.sums.n_people)
+
+
+def _correlation(sums: Sums) -> Array:
+    return correlation_from_sums(sums.n_people, sums.x, sums.y, sums.xx, sums.yy, sums.xy)
