@@ -51,7 +51,9 @@ class TrainingOverrides:
 
     def apply(self, settings: TrainingSettings) -> TrainingSettings:
         """Return ``settings`` with the fields that are not None."""
-        values = dataclasses.asdict(self)
+        # Not of a subclass, which has settings of other things too.
+        names = [field.name for field in dataclasses.fields(TrainingOverrides)]
+        values = {name: getattr(self, name) for name in names}
         return dataclasses.replace(
             settings, **{name: value for name, value in values.items() if value is not None}
         )
