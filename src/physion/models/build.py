@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 from physion.errors import BadInputError, MissingExtraError, PhysionError, UnknownNameError
 from physion.models.from_file import is_file_name, load_from_file
 from physion.models.interface import Model
+from physion.models.raised import describe_raised
 from physion.registry import Registry
 
 C = TypeVar("C")
@@ -43,32 +44,61 @@ models: Registry[ModelFactory] = Registry(
 
 
 def build_model(name: str, **options: Any) -> Model:
-    """Build the model called ``name``, or that of a file: ``FILE.py:Class``.
+    """Build a model by its name.
 
-    ``options`` override the defaults of its config. Raises `UnknownNameError` with the closest
-    names for an unknown model or option, `MissingExtraError` for a model whose libraries are not
-    installed, and `BadInputError` for a model that cannot be built or lacks what every `Model` has.
+    Parameters
+    ----------
+    name
+        Name of a model (``physion ls models``), or ``FILE.py:Class`` for a class or function in a
+        Python file. A class with ``transform`` and ``extract_features``, as the evaluator of
+        Physion 1.5 takes it, becomes a model by `physion.models.extractor.ExtractorModel`.
+    **options
+        Fields of the model's config, which override its defaults; arguments of the class.
+
+    Returns
+    -------
+    model
+        Object with ``spec``, ``provenance``, ``digest`` and some of the methods of
+        `physion.models.interface`.
+
+    Raises
+    ------
+    UnknownNameError
+        For an unknown model or option; the message names the closest ones.
+    MissingExtraError
+        If the libraries of a model of this package are not installed.
+    BadInputError
+        If a library of a plug-in is not installed, or the model cannot be built, or lacks what
+        every model has.
     """
     if is_file_name(name):
         factory: ModelFactory = load_from_file(name)
     else:
         factory = _registered(name)
     try:
-        model = factory(**options)
+        model: Model = _adapted(factory(**options))
     except PhysionError:
         raise
     except ModuleNotFoundError as error:
         raise _missing(name, error) from error
     except Exception as error:
-        raise BadInputError(
-            f"model {name!r} could not be built: {type(error).__name__}: {error}"
-        ) from error
+        raise describe_raised(error, name, "building it") from error
     lacking = [part for part in ("spec", "provenance", "digest") if not hasattr(model, part)]
     if lacking:
         raise BadInputError(
             f"model {name!r} lacks {', '.join(lacking)}; see docs/own-model.md for what a model has"
         )
     return model
+
+
+def _adapted(built: Any) -> Any:
+    """Return a feature extractor as a model, and a model as it is."""
+    methods = ("transform", "extract_features")
+    if hasattr(built, "spec") or not all(callable(getattr(built, m, None)) for m in methods):
+        return built
+    from physion.models.extractor import ExtractorModel
+
+    return ExtractorModel(built)
 
 
 def _registered(name: str) -> ModelFactory:

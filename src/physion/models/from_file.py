@@ -37,9 +37,11 @@ def load_from_file(name: str) -> Any:
 
 
 def _import(path: Path, name: str) -> Any:
-    # A name of its own, so that a user's file called torch.py or physion.py hides nothing; the same
-    # file keeps it, so that objects of its classes can be sent to other processes.
-    known = f"physion_model_{path.stem}_{stable_hash(str(path)) % 2**32:08x}"
+    # A name of its own, so that a user's file called torch.py or physion.py hides nothing. The same
+    # file keeps it, so that objects of its classes can be sent to other processes; a file that was
+    # edited, in a notebook for instance, has another one.
+    content = path.read_bytes().decode(errors="replace")
+    known = f"physion_model_{path.stem}_{stable_hash(str(path), content) % 2**32:08x}"
     if known in sys.modules:
         return sys.modules[known]
     spec = importlib.util.spec_from_file_location(known, path)

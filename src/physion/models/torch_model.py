@@ -8,13 +8,19 @@ from __future__ import annotations
 import hashlib
 import inspect
 import json
+import marshal
 from collections.abc import Iterable
+from functools import cache
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from physion.models.batch import Provenance, Spec
+
+
+_KNOWN_PACKAGES = {"abc", "builtins", "physion", "torch", "typing"}
+"""Packages whose versions, not sources, belong to the digest of a model."""
 
 
 class TorchModel(nn.Module):
@@ -31,7 +37,10 @@ class TorchModel(nn.Module):
         return Provenance(type(self).__name__, self.init, versions=f"torch {torch.__version__}")
 
     def digest(self) -> str:
-        """Return the SHA-256 of the source of the class, its spec, and its weights as they are."""
+        """Return the SHA-256 of the source of the class, its spec, and its weights as they are.
+
+        Add to it what else determines the results, such as code in other files.
+        """
         return digest_of(
             [source_of(type(self)), repr(self.spec), torch.__version__], self.state_dict().items()
         )
@@ -53,10 +62,29 @@ def digest_of(settings: Any, weights: Iterable[tuple[str, Tensor]] = ()) -> str:
     return sha.hexdigest()
 
 
+@cache
 def source_of(kind: type) -> str:
-    """Return the source text of the module of a class; its name where there is no file."""
-    module = inspect.getmodule(kind)
-    try:
-        return inspect.getsource(module) if module is not None else kind.__qualname__
-    except (OSError, TypeError):
-        return kind.__qualname__
+    """Return the source text of the modules of a class and of those that it is derived from.
+
+    Modules of torch and of this package do not count, except that of the class itself. For a class
+    without a file, as in a notebook, it is the compiled code. The text is read once: a file may be
+    edited while its classes, as they were, are at work.
+    """
+    texts = {}
+    for part in kind.__mro__:
+        package = part.__module__.partition(".")[0]
+        if part is not kind and package in _KNOWN_PACKAGES:
+            continue
+        module = inspect.getmodule(part)
+        try:
+            texts[part.__module__] = inspect.getsource(module) if module else _code_of(part)
+        except (OSError, TypeError):
+            texts[f"{part.__module__}.{part.__qualname__}"] = _code_of(part)
+    return "\n".join(texts.values())
+
+
+def _code_of(kind: type) -> str:
+    """Return a text that differs if the functions that a class defines were compiled otherwise."""
+    codes = {name: getattr(value, "__code__", None) for name, value in vars(kind).items()}
+    parts = [f"{name} {marshal.dumps(code).hex()}" for name, code in codes.items() if code]
+    return "\n".join([kind.__qualname__, *parts])
