@@ -17,13 +17,16 @@ from typing import Any
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from physion.physics.rigid.actors import center_of_mass
+from physion.rendering.renderer import Renderer
 from physion.scenes.scene import Cloth
 from physion.trials.official.axes import swap_axes, to_official_euler
 from physion.trials.official.names import RAMPS, ROOMS, TRIAL_FILE, segmentation_colors, split_name
+from physion.trials.official.writing.arrays import GZIP_LEVEL, in_memory_file, put, put_bytes
 from physion.trials.official.writing.flex import flex_groups
-from physion.trials.official.writing.frames import PASSES, FrameWriter, put
+from physion.trials.official.writing.frames import PASSES, FrameWriter
 from physion.trials.official.writing.metadata import trial_record
 from physion.trials.official.writing.objects import OfficialObjects, model_name
 from physion.trials.trial_file import Trial, TrialWriter
@@ -35,48 +38,73 @@ _UNSET_CONTACT = (0.5, 0.5, 0.0)
 _SEED_BITS = 2**63
 
 
-def official_file(trial: Trial) -> tuple[bytes, dict[str, Any]]:
+def official_file(
+    trial: Trial, *, look: str | None = None, images: bool = True
+) -> tuple[bytes, dict[str, Any]]:
     """Return the bytes of a trial's official file and its record for metadata.json.
 
-    Pictures are rendered from the state in the trial's own look. The file is built in memory and
-    has about 0.3 MB per frame at 256 x 256 pixels.
+    Parameters
+    ----------
+    trial
+        The trial; its pictures are rendered from its state.
+    look
+        Colours of objects and pictures; by default the trial's own look.
+    images
+        Whether to write pictures and flow. The file is built in memory and has about 0.3 MB per
+        frame at 256 x 256 pixels with them, and 15 KB without.
     """
-    meta, scene = trial.metadata, trial.shown()
+    meta, scene = trial.metadata, trial.shown(look)
     objects = OfficialObjects(scene, trial.trajectory)
-    # In memory, because a full disk would crash the HDF5 library.
-    file = h5py.File("official", "w", driver="core", backing_store=False, block_size=2**22)
-    with file:
+    with in_memory_file() as file:
         static = _static(trial, objects)
         _write_static(file.create_group("static"), static, objects)
         frames = file.create_group("frames")
         writer = FrameWriter(objects, meta.width, meta.height)
         extra = file.create_group("physion")
-        flow = extra.create_dataset(
-            "flow",
-            (meta.frames, meta.height, meta.width, 2),
-            np.float16,
-            chunks=(1, meta.height, meta.width, 2),
-            compression="gzip",
-            compression_opts=4,
-            shuffle=True,
-        )
-        for frame in range(meta.frames):
-            images = trial.render(frame, PASSES)
-            writer.add(frames, frame, images)
-            assert images.flow is not None
-            with np.errstate(over="ignore"):
-                flow[frame] = images.flow.astype(np.float16)
-        record = {**trial_record(writer, static), "split": meta.split}
+        if images:
+            last = _write_frames(writer, frames, extra, trial, trial.renderer(look=look))
+        else:
+            for frame in range(meta.frames):
+                writer.add(frames, frame, None)
+            last = trial.render(meta.frames - 1, ("ids",)).ids
+        assert last is not None, "ids were asked for"
+        masks = (objects.official_ids(trial.ids), objects.official_ids(last))
+        record = {**trial_record(objects, writer.labels, masks, static), "split": meta.split}
         texts = {"scene": scene.to_json(), "record": json.dumps(record)}
         texts |= {"labels": json.dumps(dataclasses.asdict(trial.labels))}
-        texts |= {"metadata": json.dumps(dataclasses.asdict(meta))}
+        texts |= {"metadata": json.dumps(dataclasses.asdict(meta) | {"look": look or meta.look})}
         for name, text in texts.items():
-            put(extra, name, np.array(text.encode()))
+            put(extra.id, name, np.array(text.encode()))
         whole = TrialWriter(meta, trial.scene, trial.trajectory, trial.labels, trial.ids).finish()
         # Without compression: its arrays are compressed already.
-        file.create_dataset(TRIAL_FILE, data=np.frombuffer(whole, np.uint8))
+        put_bytes(file.id, TRIAL_FILE, whole)
         file.flush()
         return bytes(file.id.get_file_image()), record
+
+
+def _write_frames(
+    writer: FrameWriter, frames: h5py.Group, extra: h5py.Group, trial: Trial, renderer: Renderer
+) -> NDArray[np.int16] | None:
+    """Write all frames with pictures, and the flow in pixels; return the ids of the last frame."""
+    meta = trial.metadata
+    flow = extra.create_dataset(
+        "flow",
+        (meta.frames, meta.height, meta.width, 2),
+        np.float16,
+        chunks=(1, meta.height, meta.width, 2),
+        compression="gzip",
+        compression_opts=GZIP_LEVEL,
+        shuffle=True,
+    )
+    ids = None
+    for frame in range(meta.frames):
+        images = renderer.render(frame, PASSES)
+        writer.add(frames, frame, images)
+        assert images.flow is not None
+        with np.errstate(over="ignore"):
+            flow[frame] = images.flow.astype(np.float16)
+        ids = images.ids
+    return ids
 
 
 def _static(trial: Trial, objects: OfficialObjects) -> dict[str, Any]:
@@ -203,7 +231,7 @@ def _of_stack(objects: OfficialObjects) -> dict[str, Any]:
 
 def _write_static(group: h5py.Group, static: dict[str, Any], objects: OfficialObjects) -> None:
     for name, value in static.items():
-        put(group, name, _plain(value))
+        put(group.id, name, _plain(value))
     things, count = objects.things, len(objects)
     contacts = np.array(
         [
@@ -233,16 +261,16 @@ def _write_static(group: h5py.Group, static: dict[str, Any], objects: OfficialOb
         "bounciness": contacts[:, 2].astype(np.float32),
     }
     for name, values in arrays.items():
-        put(group, name, values)
+        put(group.id, name, values)
     for name, values in flex_groups(objects).items():
         actors = group.create_group(name)
         for key, value in values.items():
-            put(actors, key, value)
+            put(actors.id, key, value)
     mesh = group.create_group("mesh")
     for index in range(count):
         vertices, faces = objects.mesh(index)
-        put(mesh, f"vertices_{index}", vertices.astype(np.float32))
-        put(mesh, f"faces_{index}", faces.astype(np.int32))
+        put(mesh.id, f"vertices_{index}", vertices.astype(np.float32))
+        put(mesh.id, f"faces_{index}", faces.astype(np.int32))
 
 
 def _plain(value: Any) -> Any:

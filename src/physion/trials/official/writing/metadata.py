@@ -15,17 +15,34 @@ from numpy.typing import NDArray
 
 from physion.stimulus_names import CONTROLLERS
 from physion.trials.official.names import ROOMS
-from physion.trials.official.writing.frames import FrameWriter
+from physion.trials.official.writing.frames import Labels
+from physion.trials.official.writing.objects import OfficialObjects
 
 HIDDEN = 0.005
-"""Fraction of the picture below which an object counts as fully occluded."""
+"""Fraction of the picture, rounded to 3 digits as officially, below which an object counts as fully
+occluded."""
 
 
-def trial_record(written: FrameWriter, static: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the record of one trial; ``static`` has the scalars of its static group."""
-    scene, labels = written.objects.scene, written.labels
-    ids, roles = written.objects.ids, scene.roles
-    first, last = written.masks[0], written.masks[len(written.objects.trajectory) - 1]
+def trial_record(
+    objects: OfficialObjects,
+    labels: Labels,
+    masks: tuple[NDArray[np.int16], NDArray[np.int16]],
+    static: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Return the record of one trial.
+
+    Parameters
+    ----------
+    objects, labels
+        Objects of the trial, and the labels of all frames (F, ...) by name.
+    masks
+        Official object ids by pixel (H, W), 0 the room, of the first and the last frame.
+    static
+        Scalars of the static group.
+    """
+    scene, frames = objects.scene, len(objects.trajectory)
+    ids, roles = objects.ids, scene.roles
+    first, last = masks
     target = ids[roles.agent]
     moves = _any(labels, "target_has_moved")
     contact = _any(labels, "target_contacting_zone")
@@ -33,7 +50,7 @@ def trial_record(written: FrameWriter, static: Mapping[str, Any]) -> dict[str, A
         "stimulus_name": static["stimulus_name"],
         "controller_name": CONTROLLERS.get(scene.scenario, scene.scenario),
         "git_commit": static["git_commit"],
-        "num_frames": len(written.objects.trajectory),
+        "num_frames": frames,
         "is_trial_valid": _any(labels, "trial_end"),
         "does_target_move": moves,
         "does_target_contact_zone": contact,
@@ -48,17 +65,17 @@ def trial_record(written: FrameWriter, static: Mapping[str, Any]) -> dict[str, A
         "zone_visible_area": _area(first == ids[roles.patient]),
         "probe_visible_area": _area(first == ids[roles.probe]) if roles.probe else None,
         "is_any_object_fully_occluded": any(
-            float((first == id_).mean()) < HIDDEN for id_ in ids.values()
+            _area(first == id_) < HIDDEN for id_ in ids.values()
         ),
         "room": ROOMS.get(scene.room, scene.room),
         "trial_seed": static["trial_seed"],
         "trial_num": static["trial_num"],
         "push_time": static["push_time"],
-        "num_distractors": len(written.objects.scenery["distractors"]),
-        "num_occluders": len(written.objects.scenery["occluders"]),
+        "num_distractors": len(objects.scenery["distractors"]),
+        "num_occluders": len(objects.scenery["occluders"]),
     }
     if scene.scenario in ("dominoes", "support"):
-        record["num_middle_objects"] = len(written.objects.middle)
+        record["num_middle_objects"] = len(objects.middle)
     if scene.scenario == "dominoes":
         record["remove_middle"] = bool(scene.parameters.get("remove_middle", False))
     if scene.scenario == "support":
@@ -97,16 +114,16 @@ def _three_decimals(value: Any) -> float:
     return round(float(value), 3)
 
 
-def _any(labels: Mapping[str, list[Any]], name: str) -> bool | None:
+def _any(labels: Labels, name: str) -> bool | None:
     return bool(np.any(labels[name])) if name in labels else None
 
 
-def _first(labels: Mapping[str, list[Any]], name: str) -> int | None:
+def _first(labels: Labels, name: str) -> int | None:
     frames = np.flatnonzero(labels.get(name, []))
     return int(frames[0]) if len(frames) else None
 
 
-def _displacement(labels: Mapping[str, list[Any]]) -> dict[str, float] | None:
+def _displacement(labels: Labels) -> dict[str, float] | None:
     if "target_delta_position" not in labels:
         return None
     last = labels["target_delta_position"][-1]

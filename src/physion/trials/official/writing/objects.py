@@ -122,23 +122,30 @@ class OfficialObjects:
             vertices, faces = mesh.vertices, mesh.faces
         return swap_axes(vertices), faces[:, ::-1]
 
-    def boxes(self, frame: int) -> dict[str, Floats]:
-        """Return face centres and centre (N, 3) of the bounding boxes of all objects, by side."""
+    @cached_property
+    def boxes(self) -> dict[str, Floats]:
+        """Face centres and centre (F, N, 3) of the bounding boxes of all objects, by side."""
         positions, rotations = self.poses
-        matrices = rotation_matrices(rotations[frame])
+        matrices = rotation_matrices(rotations)
         low, high = np.moveaxis(self._bounds, 1, 0) * self.scales
         found = {}
         for side, away in _SIDES.items():
             local = (low + high) / 2 + np.array(away) * (high - low) / 2
-            found[side] = positions[frame] + np.einsum("nij,nj->ni", matrices, local)
+            found[side] = positions + (matrices * local[:, None]).sum(axis=-1)
         for index, thing in enumerate(self.things):
             if isinstance(thing, Cloth):
-                points = self.cloth_vertices(self.order[index])[frame]
-                low_, high_ = points.min(axis=0), points.max(axis=0)
+                points = self.cloth_vertices(self.order[index])
+                low_, high_ = points.min(axis=1), points.max(axis=1)
                 for side, away in _SIDES.items():
                     middle = (low_ + high_) / 2
-                    found[side][index] = middle + np.array(away) * (high_ - low_) / 2
+                    found[side][:, index] = middle + np.array(away) * (high_ - low_) / 2
         return found
+
+    def official_ids(self, ids: NDArray[np.int16]) -> NDArray[np.int16]:
+        """Return official object ids by pixel, 0 the room, of ``ids`` (H, W) of the renderer."""
+        table = np.zeros(len(self) + 1, np.int16)
+        table[np.array(self.order) + 1] = np.arange(1, len(self) + 1)
+        return np.asarray(table[ids])
 
     @cached_property
     def _bounds(self) -> Floats:
