@@ -10,7 +10,6 @@ import inspect
 import json
 import marshal
 from collections.abc import Iterable
-from functools import cache
 from typing import Any
 
 import torch
@@ -18,9 +17,10 @@ from torch import Tensor, nn
 
 from physion.models.batch import Provenance, Spec
 
-
 _KNOWN_PACKAGES = {"abc", "builtins", "physion", "torch", "typing"}
 """Packages whose versions, not sources, belong to the digest of a model."""
+_sources: dict[type, str] = {}
+"""What `source_of` has read, by class."""
 
 
 class TorchModel(nn.Module):
@@ -62,7 +62,6 @@ def digest_of(settings: Any, weights: Iterable[tuple[str, Tensor]] = ()) -> str:
     return sha.hexdigest()
 
 
-@cache
 def source_of(kind: type) -> str:
     """Return the source text of the modules of a class and of those that it is derived from.
 
@@ -70,6 +69,8 @@ def source_of(kind: type) -> str:
     without a file, as in a notebook, it is the compiled code. The text is read once: a file may be
     edited while its classes, as they were, are at work.
     """
+    if kind in _sources:
+        return _sources[kind]
     texts = {}
     for part in kind.__mro__:
         package = part.__module__.partition(".")[0]
@@ -80,7 +81,8 @@ def source_of(kind: type) -> str:
             texts[part.__module__] = inspect.getsource(module) if module else _code_of(part)
         except (OSError, TypeError):
             texts[f"{part.__module__}.{part.__qualname__}"] = _code_of(part)
-    return "\n".join(texts.values())
+    _sources[kind] = "\n".join(texts.values())
+    return _sources[kind]
 
 
 def _code_of(kind: type) -> str:
