@@ -16,13 +16,8 @@ from statsmodels.stats.contingency_tables import mcnemar
 from statsmodels.stats.multitest import multipletests
 
 from physion.analysis.metrics import measure_metrics
-from physion.analysis.models.model_people import (
-    Models,
-    measure_models,
-    measure_table,
-    model_pairs,
-    models_of,
-)
+from physion.analysis.models.measures import measure_models, measure_table
+from physion.analysis.models.model_people import Models, model_pairs, models_of
 from physion.analysis.models.people_comparison import PeopleComparison, compare_everywhere
 from physion.analysis.models.zones import RELEASED_R, human_zones, released_r_zone, released_zone
 from physion.analysis.people.answers import ScenarioAnswers, answers_of
@@ -135,7 +130,7 @@ def test_every_measure_is_what_it_says(models: Models, answers: ScenarioAnswers)
     assert set(undefined["model"]) == {"always"} and set(undefined["measure"]) == {
         "r", "r_beyond_outcome",
     }  # fmt: skip
-    assert undefined["reason"].str.contains("P\\(contact\\) constant").all()
+    assert undefined["reason"].str.contains("P\\(contact\\) is constant").all()
 
 
 def test_intervals_are_those_of_drawing_people_stimuli_or_both(

@@ -80,11 +80,11 @@ def anchor_scores(stimuli: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
     return with_kind(pd.concat(parts, ignore_index=True))
 
 
-def with_kind(scores: pd.DataFrame) -> pd.DataFrame:
-    """Return a table of scores with the column ``kind`` after that of the agent."""
-    kinds = [kind_of(str(agent)) for agent in scores["agent"]]
+def with_kind(scores: pd.DataFrame, names: str = "agent") -> pd.DataFrame:
+    """Return a table with the column ``kind`` after that of the names of models."""
     table = scores.copy()
-    table.insert(list(table.columns).index("agent") + 1, "kind", kinds)
+    kinds = [kind_of(str(name)) for name in scores[names]]
+    table.insert(list(table.columns).index(names) + 1, "kind", kinds)
     return table
 
 

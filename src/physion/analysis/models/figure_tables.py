@@ -79,8 +79,9 @@ def kappa_table(comparison: Comparison, with_people: PeopleComparison) -> pd.Dat
     rows = with_people.scores[with_people.scores["measure"] == "kappa"].rename(
         columns={"model": "agent", "scenario": "panel", "low_both": "low", "high_both": "high"}
     )[["panel", "agent", "value", "low", "high", "reason"]]
+    rows = rows[rows["agent"].isin(comparison.agents)]
     kinds = comparison.scores.drop_duplicates("agent").set_index("agent")["readout"]
-    rows["kind"] = rows["agent"].map(kinds)
+    rows = rows.assign(kind=rows["agent"].map(kinds))
     zones = with_people.zones
     subset = zones[(zones["measure"] == "kappa") & (zones["of"] == "participants")]
     people = subset.set_index("scenario")[["mean"]].set_axis(["people"], axis=1)

@@ -1,29 +1,20 @@
-"""Models compared with single participants of one scenario: every measure and its intervals.
-
-A *measure* of a model compares it with the people of the scenario; the *zone* of a measure is the
-range of single people (or pairs, or halves of them) from the 2.5th to the 97.5th percentile.
-Intervals draw people, stimuli, or both; they answer different questions, so each is named.
-"""
+"""Models and the single participants of one scenario as arrays over the same stimuli."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from physion.analysis.metrics import measure_metrics
 from physion.analysis.people.answers import (
     ScenarioAnswers,
     difference_of_pairs,
     mean_over_people,
 )
-from physion.analysis.people.people import draws_of_people
-from physion.analysis.sample import RESAMPLED, Resampled, Sample
-from physion.analysis.statistics.bootstrap import Bootstrap
+from physion.analysis.sample import Resampled, Sample
 from physion.analysis.statistics.calibration import check_probabilities
 from physion.analysis.statistics.kappa import (
     correctness,
@@ -32,12 +23,6 @@ from physion.analysis.statistics.kappa import (
 from physion.errors import BadInputError
 
 Array = npt.NDArray[np.float64]
-
-TABLE_COLUMNS = (
-    *("model", "scenario", "measure", "stimuli", "value"),
-    *(f"{end}_{what}" for what in RESAMPLED for end in ("low", "high")),
-    *("pair_low", "pair_median", "pair_high", "undefined", "reason"),
-)
 
 
 @dataclass(frozen=True)
@@ -105,106 +90,6 @@ def models_of(
     return Models(names, grids[0], grids[1]), dropped
 
 
-# --- the measures -------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Measured:
-    """Measures of models in one scenario, with the resamples for their intervals.
-
-    ``values[measure]`` (m,); ``pairs[measure]`` (people, m), for measures with a value for each
-    participant; ``draws[what][measure]`` (resamples, m) for each of `sample.RESAMPLED`, absent if
-    the measure does not depend on the draw.
-    """
-
-    models: Models
-    answers: ScenarioAnswers
-    values: dict[str, Array]
-    pairs: dict[str, Array]
-    draws: dict[Resampled, dict[str, Array]]
-
-
-def measure_models(models: Models, answers: ScenarioAnswers, bootstrap: Bootstrap) -> Measured:
-    """Compute every measure of every model, and its resamples."""
-    sample = sample_of_models(models, answers)
-    values, pairs = {}, {}
-    for metric in measure_metrics():
-        values[metric.name] = metric(sample)[0]
-        if metric.by_participant is not None:
-            pairs[metric.name] = metric.by_participant(sample)
-    draws: dict[Resampled, dict[str, Array]] = {
-        what: {m.name: m(resamples) for m in measure_metrics() if what in m.resampled}
-        for what, resamples in _samples(models, answers, bootstrap).items()
-    }
-    return Measured(models, answers, values, pairs, draws)
-
-
-def measure_table(measured: Measured, bootstrap: Bootstrap) -> pd.DataFrame:
-    """Return one row a model and measure.
-
-    Columns: ``model``, ``scenario``, ``measure``, ``stimuli``, ``value``; ``low`` and ``high`` with
-    ``_people``, ``_stimuli``, ``_both`` (interval by what is drawn); for measures by participant
-    also ``pair_low``, ``pair_median``, ``pair_high`` (percentiles over participants) and
-    ``undefined`` (participants for whom it is NaN); ``reason``.
-    """
-    models, records = measured.models, []
-    for k, name in enumerate(models.names):
-        for measure in measured.values:
-            value = float(measured.values[measure][k])
-            draws = {what: measured.draws[what].get(measure) for what in RESAMPLED}
-            of_model = {
-                what: None if drawn is None else drawn[:, k] for what, drawn in draws.items()
-            }
-            record, reasons = interval_columns(value, of_model, bootstrap)
-            if not np.isfinite(value):
-                reasons.insert(0, _why(measure, k, models, measured.answers))
-            if measure in measured.pairs:
-                record |= _over_people(measured.pairs[measure][:, k])
-            records.append(
-                {
-                    "model": name,
-                    "scenario": measured.answers.scenario,
-                    "measure": measure,
-                    "stimuli": int(np.sum(~np.isnan(models.p_contact[k]))),
-                    **record,
-                    "reason": "; ".join(reasons),
-                }
-            )
-    return pd.DataFrame(records).reindex(columns=list(TABLE_COLUMNS))
-
-
-def interval_columns(
-    value: float, draws: Mapping[Resampled, Array | None], bootstrap: Bootstrap
-) -> tuple[dict[str, Any], list[str]]:
-    """Return ``value`` with ``low_`` and ``high_`` by what is drawn, and reasons for what is
-    NaN.
-    """
-    record: dict[str, Any] = {"value": value}
-    reasons = []
-    for what in RESAMPLED:
-        low, high = np.nan, np.nan
-        drawn = draws[what]
-        if drawn is None:
-            reasons.append(f"no interval over {what}: they do not enter")
-        elif np.isfinite(value):
-            low, high = bootstrap.interval(drawn)
-            if np.isnan(low):
-                reasons.append(f"no interval over {what}: undefined in most resamples")
-        record |= {f"low_{what}": low, f"high_{what}": high}
-    return record, reasons
-
-
-def _samples(models: Models, answers: ScenarioAnswers, draws: Bootstrap) -> dict[Resampled, Sample]:
-    """Return the resamples for the intervals, by what is drawn."""
-    people = draws_of_people(answers, draws)
-    stimuli = draws.weights(answers.scenario, len(answers.stimuli))
-    return {
-        "people": sample_of_models(models, answers, None, people, "people"),
-        "stimuli": sample_of_models(models, answers, stimuli, None, "stimuli"),
-        "both": sample_of_models(models, answers, stimuli, people, "both"),
-    }
-
-
 def sample_of_models(
     models: Models,
     answers: ScenarioAnswers,
@@ -234,28 +119,6 @@ def sample_of_models(
         people=everybody if people is None else people,
         drawn=drawn,
     )
-
-
-def _over_people(values: Array) -> dict[str, float]:
-    known = values[np.isfinite(values)]
-    low, median, high = np.percentile(known, [2.5, 50, 97.5]) if len(known) else [np.nan] * 3
-    return {"pair_low": float(low), "pair_median": float(median), "pair_high": float(high),
-            "undefined": len(values) - len(known)}  # fmt: skip
-
-
-def _why(measure: str, k: int, models: Models, answers: ScenarioAnswers) -> str:
-    known = ~np.isnan(models.p_contact[k])
-    if not known.any():
-        return "the model predicts none of the stimuli"
-    if measure in ("r", "r_beyond_outcome"):
-        if known.sum() < 3:
-            return "r: fewer than 3 stimuli"
-        who = "the model's P(contact)" if np.ptp(models.p_contact[k, known]) < 1e-6 else "people"
-        return f"r: {who} constant"
-    return f"{measure}: it and the people always give the same one answer"
-
-
-# --- models among themselves --------------------------------------------------------------------
 
 
 def model_pairs(models: Models, answers: ScenarioAnswers) -> pd.DataFrame:

@@ -10,7 +10,8 @@ import numpy.typing as npt
 import pandas as pd
 
 from physion.analysis.models.comparison import Comparison
-from physion.analysis.models.model_people import Measured
+from physion.analysis.models.model_people import Models
+from physion.analysis.people.answers import ScenarioAnswers
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.statistics.calibration import calibration_table
 from physion.analysis.statistics.kappa import correctness
@@ -46,17 +47,20 @@ def permutations_of(pairs: int) -> int:
     return min(20_000, max(2_000, 40 * pairs))
 
 
-def pool_measured(measured: Sequence[Measured]) -> PooledStimuli:
-    """Pool the stimuli of several scenarios that single participants answered."""
+def pool_scenarios(scored: Sequence[tuple[Models, ScenarioAnswers]]) -> PooledStimuli:
+    """Pool the stimuli of several scenarios that single participants answered.
+
+    ``scored`` holds the same models with the answers of people for each scenario.
+    """
     return PooledStimuli(
-        names=measured[0].models.names,
-        p_contact=np.concatenate([one.models.p_contact for one in measured], axis=1),
+        names=scored[0][0].names,
+        p_contact=np.concatenate([models.p_contact for models, _ in scored], axis=1),
         correct=np.concatenate(
-            [correctness(one.models.predicted, one.answers.label) for one in measured], axis=1
+            [correctness(models.predicted, answers.label) for models, answers in scored], axis=1
         ),
-        label=np.concatenate([one.answers.label for one in measured]),
-        p_yes=np.concatenate([one.answers.p_yes() for one in measured]),
-        scenario=tuple(one.answers.scenario for one in measured for _ in one.answers.stimuli),
+        label=np.concatenate([answers.label for _, answers in scored]),
+        p_yes=np.concatenate([answers.p_yes() for _, answers in scored]),
+        scenario=tuple(answers.scenario for _, answers in scored for _ in answers.stimuli),
     )
 
 

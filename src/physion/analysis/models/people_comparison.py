@@ -2,36 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import pandas as pd
 
-from physion.analysis.models.model_people import (
-    Measured,
-    interval_columns,
-    measure_models,
-    measure_table,
-    model_pairs,
-    models_of,
-)
-from physion.analysis.models.model_tests import calibration_scores, paired_tests, pool_measured
+from physion.analysis.models.anchors import TWO_PEOPLE, add_anchors, with_kind
+from physion.analysis.models.measures import mean_measures, measure_models, measure_table
+from physion.analysis.models.model_people import model_pairs, models_of
+from physion.analysis.models.model_tests import calibration_scores, paired_tests, pool_scenarios
 from physion.analysis.models.zones import human_zones, released_r_zone
 from physion.analysis.people.people import HALVES, all_answers, split_halves
-from physion.analysis.sample import RESAMPLED
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.tables.csv_table import require_columns
-from physion.analysis.tables.stimuli import MEAN
 
 
 @dataclass(frozen=True)
 class PeopleComparison:
     """Tables that compare models with single participants.
 
-    - ``scores``: `model_people.measure_table` of every scenario, then of their mean with equal
-      weights (NaN if one of them is undefined), with ``zone_low``, ``zone_high`` (of single
-      participants) and ``in_zone`` (yes, no, or empty if either is undefined).
+    - ``scores``: `measures.measure_table` of every scenario, then of their mean with equal
+      weights (NaN if one of them is undefined), with ``kind`` (model or anchor; the computed
+      anchors come last in each scenario), ``zone_low``, ``zone_high`` (of single participants) and
+      ``in_zone`` (yes, no, or empty if either is undefined).
     - ``zones``: `zones.human_zones` of every scenario, and for several scenarios also the paper's
       band of r (`zones.released_r_zone`), whose scenario is the mean.
     - ``pairs``: `model_people.model_pairs` of every scenario.
@@ -79,12 +71,15 @@ def compare_everywhere(
     rows = predictions[columns].assign(scenario=predictions["stimulus"].map(scenario_by_stimulus))
     agents = list(rows["agent"].unique())
     dropped = [_unseen(rows)]
-    measured, zones, pairs = [], [], []
+    measured, scored, zones, pairs = [], [], [], []
     for answers in all_answers(test):
         subset = rows[rows["scenario"] == answers.scenario]
         models, unmatched = models_of(subset, answers, agents)
         dropped.append(unmatched.assign(scenario=answers.scenario))
-        measured.append(measure_models(models, answers, draws))
+        scored.append((models, answers))
+        measured.append(
+            measure_models(add_anchors(models, answers), answers, draws, two_people=TWO_PEOPLE)
+        )
         zones.append(human_zones(answers, split_halves(answers.yes, halves, draws.seed)))
         pairs.append(model_pairs(models, answers).assign(scenario=answers.scenario))
     zone = pd.concat(zones, ignore_index=True)
@@ -92,10 +87,10 @@ def compare_everywhere(
         zone = pd.concat([zone, released_r_zone(zone)], ignore_index=True)
     tables = [measure_table(one, draws) for one in measured]
     if len(measured) > 1:
-        tables.append(_mean_table(measured, draws))
-    pooled = pool_measured(measured)
+        tables.append(measure_table(mean_measures(measured), draws))
+    pooled = pool_scenarios(scored)
     return PeopleComparison(
-        scores=_with_zone(pd.concat(tables, ignore_index=True), zone),
+        scores=with_kind(_with_zone(pd.concat(tables, ignore_index=True), zone), "model"),
         zones=zone,
         pairs=pd.concat(pairs, ignore_index=True),
         tests=paired_tests(pooled, draws, permutations),
@@ -108,36 +103,6 @@ def _unseen(rows: pd.DataFrame) -> pd.DataFrame:
     counts = rows[rows["scenario"].isna()].groupby("agent", sort=False).size()
     table = pd.DataFrame({"agent": counts.index, "stimuli": counts.to_numpy()})
     return table.assign(scenario="unknown", reason="people did not see it")
-
-
-def _mean_table(measured: Sequence[Measured], bootstrap: Bootstrap) -> pd.DataFrame:
-    """Return the mean over scenarios; their people and stimuli are drawn independently."""
-    records = []
-    for k, name in enumerate(measured[0].models.names):
-        for measure in measured[0].values:
-            values = [float(one.values[measure][k]) for one in measured]
-            draws = {}
-            for what in RESAMPLED:
-                parts = [one.draws[what].get(measure) for one in measured]
-                known = [part[:, k] for part in parts if part is not None]
-                draws[what] = np.mean(known, axis=0) if len(known) == len(parts) else None
-            record, reasons = interval_columns(float(np.mean(values)), draws, bootstrap)
-            undefined = [one.answers.scenario for one, value in zip(measured, values, strict=True)
-                         if not np.isfinite(value)]  # fmt: skip
-            if undefined:
-                reasons.insert(0, f"undefined in {', '.join(undefined)}")
-            stimuli = sum(int(np.sum(~np.isnan(one.models.p_contact[k]))) for one in measured)
-            records.append(
-                {
-                    "model": name,
-                    "scenario": MEAN,
-                    "measure": measure,
-                    "stimuli": stimuli,
-                    **record,
-                    "reason": "; ".join(reasons),
-                }
-            )
-    return pd.DataFrame(records)
 
 
 def _with_zone(scores: pd.DataFrame, zones: pd.DataFrame) -> pd.DataFrame:
