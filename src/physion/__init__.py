@@ -1,3 +1,71 @@
-"""Physion: physical scenes, people and models. Will the red object touch the yellow one?"""
+"""Physion: physical scenes, people and models. Will the red object touch the yellow one?
+
+The public names are imported when they are first used, so that ``import physion`` takes no time:
+
+- `sample_scene`: sample a scene of a scenario. `simulate`: compute its motion. `label_contact`:
+  find out whether agent and patient touch. `Renderer`: render any pass of any frame.
+- `generate`: make a dataset of trials. `Dataset`: read it; `Dataset.clips` gives clips to torch.
+- `build_model`: build a model. `train`: train it. `evaluate`: predict the trials of a dataset.
+- `compare`: compare predictions with people.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 from physion.version import __version__
+
+if TYPE_CHECKING:
+    from physion.analysis.results import compare
+    from physion.models.build import build_model
+    from physion.physics.engine import simulate
+    from physion.physics.labels import label_contact
+    from physion.readout.evaluate import evaluate
+    from physion.readout.trainings import train
+    from physion.rendering.renderer import Renderer
+    from physion.scenes.sampling.sample import sample_scene
+    from physion.trials.dataset import Dataset
+    from physion.trials.generate import generate
+
+__all__ = [
+    "Dataset",
+    "Renderer",
+    "__version__",
+    "build_model",
+    "compare",
+    "evaluate",
+    "generate",
+    "label_contact",
+    "sample_scene",
+    "simulate",
+    "train",
+]
+
+_MODULES = {
+    "Dataset": "physion.trials.dataset",
+    "Renderer": "physion.rendering.renderer",
+    "build_model": "physion.models.build",
+    "compare": "physion.analysis.results",
+    "evaluate": "physion.readout.evaluate",
+    "generate": "physion.trials.generate",
+    "label_contact": "physion.physics.labels",
+    "sample_scene": "physion.scenes.sampling.sample",
+    "simulate": "physion.physics.engine",
+    "train": "physion.readout.trainings",
+}
+"""Module of each public name."""
+
+
+def __getattr__(name: str) -> Any:
+    """Import the module of a public name when it is first used (PEP 562)."""
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module
+
+    value = globals()[name] = getattr(import_module(_MODULES[name]), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    """Return the public names, whether or not they were used."""
+    return sorted(__all__)

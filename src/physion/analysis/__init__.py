@@ -8,13 +8,12 @@ from physion.analysis.tables.predictions import read_predictions
 from physion.analysis.tables.responses import read_human_zone, read_humans, read_labels
 
 if TYPE_CHECKING:
-    from physion.analysis.results import ComparisonResults, compare
+    from physion.analysis.results import ComparisonResults
 
 __all__ = [
     "Bootstrap",
     "Comparison",
     "ComparisonResults",
-    "compare",
     "compare_scores",
     "read_human_zone",
     "read_humans",
@@ -25,8 +24,8 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     """Import what needs the mixed models, which take seconds to import, when it is asked for."""
-    if name in ("ComparisonResults", "compare"):
-        from physion.analysis import results
+    if name == "ComparisonResults":
+        from physion.analysis.results import ComparisonResults
 
-        return getattr(results, name)
+        return ComparisonResults
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -72,6 +72,12 @@ def compare(
     exclude, exclude_ledge, bootstrap
         As in `compare_scores`.
 
+    Returns
+    -------
+    results
+        Scores by model and scenario with intervals, differences of models, calibration, mixed
+        models, and, with ``people``, models next to single participants.
+
     Raises
     ------
     BadInputError

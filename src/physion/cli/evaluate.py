@@ -13,7 +13,8 @@ import tyro
 from physion.cli.model_options import parse_options
 from physion.cli.output import Stages, console
 from physion.compute.local import LocalExecutor
-from physion.readout import EvaluationConfig, evaluate
+from physion.readout.evaluate import evaluate
+from physion.readout.settings import EvaluationConfig
 from physion.trials.dataset import Dataset
 
 

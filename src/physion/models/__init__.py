@@ -4,4 +4,4 @@ from physion.models.batch import Batch, Motion, Provenance, Rollout, Spec
 from physion.models.build import build_model, models
 from physion.models.interface import Model
 
-__all__ = ["Batch", "Model", "Motion", "Provenance", "Rollout", "Spec", "build_model", "models"]
+__all__ = ["Batch", "Model", "Motion", "Provenance", "Rollout", "Spec", "models"]

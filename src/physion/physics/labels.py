@@ -49,7 +49,27 @@ def contact_frames(scene: Scene, trajectory: Trajectory) -> Ints:
 
 
 def label_contact(scene: Scene, trajectory: Trajectory) -> Labels:
-    """Return the labels of a trajectory, from its `contact_frames`."""
+    """Return whether and when agent and patient of a scene touch.
+
+    Parameters
+    ----------
+    scene
+        The scene, which names agent and patient.
+    trajectory
+        Its motion, as `physion.simulate` gives it.
+
+    Returns
+    -------
+    labels
+        Contact or not, its first frame, and whether it lies in the observed part.
+
+    Examples
+    --------
+    >>> from physion import sample_scene, simulate
+    >>> scene = sample_scene("collide", 3)
+    >>> label_contact(scene, simulate(scene)).contact
+    True
+    """
     frames = contact_frames(scene, trajectory)
     agent, patient = scene.index(scene.roles.agent), scene.index(scene.roles.patient)
     gaps = trajectory.cloth_distance

@@ -4,4 +4,4 @@ from physion.readout.evaluate import Evaluation, evaluate, evaluate_model
 from physion.readout.protocols import Readout
 from physion.readout.settings import EvaluationConfig
 
-__all__ = ["Evaluation", "EvaluationConfig", "Readout", "evaluate", "evaluate_model"]
+__all__ = ["Evaluation", "EvaluationConfig", "Readout", "evaluate_model"]

@@ -13,6 +13,7 @@ import pandas as pd
 from physion.compute.progress import Progress
 from physion.errors import BadInputError, MissingExtraError, UnknownNameError
 from physion.models.build import build_model
+from physion.models.interface import Model
 from physion.readout.features.feature_store import FeatureStore
 from physion.readout.folds import READOUT, TESTING, TRAINING, plan_folds
 from physion.training.overrides import TrainingOverrides
@@ -58,15 +59,15 @@ class PlannedTraining:
 
 def train(
     dataset: Dataset,
-    model: str,
-    folder: Path,
+    model: Model | str,
+    folder: Path | str,
     *,
     options: Mapping[str, Any] | None = None,
     settings: TrainingOverrides | None = None,
     config: TrainConfig | None = None,
     progress: Progress | None = None,
 ) -> list[TrainedModel]:
-    """Train the model called ``model`` as `evaluate` would, which then finds the result.
+    """Train a model without labels, as `evaluate` would, which then finds the result.
 
     Parameters
     ----------
@@ -74,11 +75,12 @@ def train(
         Trials. The split training is used, or readout where there is none, but no trial with the
         physics of a testing trial.
     model
-        Name in the registry of models, or ``FILE.py:Class``.
+        Name of a model (``physion ls models``), ``FILE.py:Class``, or a model. It keeps its
+        initial weights, so that `evaluate` finds the trainings, whose weights it loads.
     folder
         Output folder of `evaluate`; each training has a folder in ``training/``.
     options
-        Fields of the model's config.
+        Fields of the config of a model that is given by its name.
     settings
         Optimiser and schedule, where they are not to be those of the model.
     config
@@ -98,7 +100,9 @@ def train(
     """
     config = config if config is not None else TrainConfig()
     planned = plan_trainings(dataset.index, config)
-    built: Any = build_model(model, **dict(options or {}))
+    if not isinstance(model, str) and options:
+        raise BadInputError("options are for a model that is given by its name; this one is built")
+    built: Any = build_model(model, **dict(options or {})) if isinstance(model, str) else model
     try:
         from physion.training.devices import Devices, make_fabric
         from physion.training.train import check_trainable, train_model
@@ -110,7 +114,7 @@ def train(
     fabric = make_fabric(devices, chosen.precision)
     shown = progress if fabric.is_global_zero else None
     source = whole_source(dataset, built.spec, rendered=config.rendered)
-    store = FeatureStore(folder / "features", batch=config.encoder_batch)
+    store = FeatureStore(Path(folder) / "features", batch=config.encoder_batch)
     initial = copy.deepcopy(built.state_dict())
     trained = []
     for plan in planned:
@@ -122,7 +126,7 @@ def train(
                 plan.trials,
                 seed=config.seed,
                 name=plan.name,
-                folder=folder / "training",
+                folder=Path(folder) / "training",
                 settings=chosen,
                 features=lambda trials: store.encoded(
                     built, source, trials, "whole", shown
@@ -131,6 +135,7 @@ def train(
                 progress=shown,
             )
         )
+    built.load_state_dict(initial)
     return trained
 
 

@@ -92,9 +92,31 @@ class RenderSettings:
 
 
 class Renderer:
-    """Renderer of the frames of one trial at ``width`` x ``height`` pixels.
+    """Renderer of the frames of one trial.
 
     It keeps working arrays: use one renderer for each thread.
+
+    Parameters
+    ----------
+    scene, trajectory
+        What is rendered: any frame of the motion, from the scene's camera.
+    width, height
+        Size of the pictures in pixels.
+    settings
+        What is kept between frames; the pictures are the same either way.
+
+    Raises
+    ------
+    BadInputError
+        If the size is below one pixel, or the trajectory is not one of the scene.
+
+    Examples
+    --------
+    >>> from physion import sample_scene, simulate
+    >>> scene = sample_scene("collide", 3)
+    >>> frame = Renderer(scene, simulate(scene), 64, 64).render(30, ("color", "depth"))
+    >>> frame.color.shape, frame.depth.dtype
+    ((64, 64, 3), dtype('float32'))
     """
 
     def __init__(

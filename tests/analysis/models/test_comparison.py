@@ -9,9 +9,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from physion.analysis import Bootstrap, compare, compare_scores, read_predictions
+from physion.analysis import Bootstrap, compare_scores, read_predictions
 from physion.analysis.models.comparison import NO_LABEL, NOT_PREDICTED, NOT_SEEN
 from physion.analysis.people.participants import EXCLUDED, LEDGE
+from physion.analysis.results import compare
 from physion.analysis.tables.predictions import check_predictions, name_models
 from physion.analysis.tables.responses import read_humans, read_labels
 from physion.analysis.tables.stimuli import MEAN, POOLED
