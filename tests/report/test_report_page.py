@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import re
 from collections.abc import Callable
@@ -19,8 +18,8 @@ from physion.errors import BadInputError
 from physion.report import ReportInputs, build_report, compare_files
 from physion.report.inputs import EXPECTED_METHODS
 from physion.report.page.document import Picture
-from physion.report.page.movies import widest_gaps
 from physion.report.page.page import render_page
+from physion.report.page.trials import shown_stimuli
 
 Maker = Callable[..., Comparison]
 VOID = {"meta", "img", "source", "br", "hr", "link", "input"}
@@ -184,35 +183,11 @@ def test_numbers_for_machines_are_those_of_the_tables(
 # --- movies --------------------------------------------------------------------------------------
 
 
-def test_widest_gaps_take_turns_and_pass_over_changed_trials(make_comparison: Maker) -> None:
-    comparison = make_comparison()
-    chosen = widest_gaps(comparison, 6)
-    assert list(chosen["agent"]) == comparison.agents * 3
-    assert chosen["stimulus"].is_unique
-    assert not set(chosen["stimulus"]) & set(comparison.changed["stimulus"])
-    same = comparison.stimuli[comparison.stimuli["label"] == comparison.stimuli["simulated"]]
-    own = same[same["agent"] == comparison.agents[0]]
-    assert chosen["size"].iloc[0] == own["gap"].abs().max()
-    assert len(widest_gaps(comparison, 1000)) == 23
-    assert widest_gaps(comparison, 0).empty
-
-
-def test_movies_are_inside_and_within_their_budget(make_comparison: Maker, movie: Path) -> None:
-    comparison = make_comparison()
-    movies = dict.fromkeys(comparison.stimuli["stimulus"], movie)
-    budget = 3 * movie.stat().st_size + 5
-    inputs = ReportInputs(comparison, movies=movies, movie_bytes=budget)
-    page = render(inputs)
-    videos = [attrs["src"] for tag, attrs in page.tags if tag == "video"]
-    assert len(videos) == 3
-    prefix = "data:video/mp4;base64,"
-    assert base64.b64decode(str(videos[0]).removeprefix(prefix)) == movie.read_bytes()
-    assert page.text.count("the page would grow too large") == 5
-
-
 def test_changed_trials_link_to_their_movies(make_comparison: Maker, tmp_path: Path) -> None:
     comparison = make_comparison()
     name = comparison.changed["stimulus"].iloc[0]
+    (tmp_path / "trials").mkdir()
+    (tmp_path / "trials" / "it's.mp4").write_bytes(b"a movie")
     inputs = ReportInputs(comparison, movies={name: tmp_path / "trials" / "it's.mp4"})
     text = render_page(inputs, [Picture(n, BLANK, BLANK) for n in FIGURES], tmp_path / "report")
     assert "../trials/it's.mp4" in Page(text).links()
@@ -224,6 +199,10 @@ def test_bad_movies_are_refused_and_no_page_is_left(make_comparison: Maker, tmp_
         movies = dict.fromkeys(comparison.stimuli["stimulus"], tmp_path / name)
         with pytest.raises(BadInputError, match=message):
             build_report(ReportInputs(comparison, movies=movies), tmp_path / "out")
+    hidden = set(comparison.stimuli["stimulus"]) - set(shown_stimuli(ReportInputs(comparison)))
+    bad = ReportInputs(comparison, movies={hidden.pop(): tmp_path / "none.mp4"}, trial_pages=True)
+    with pytest.raises(BadInputError, match="is not there"):
+        build_report(bad, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 

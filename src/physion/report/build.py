@@ -27,11 +27,14 @@ from physion.report.figures.registry import make_plots
 from physion.report.inputs import ReportInputs
 from physion.report.page.movies import check_movies
 from physion.report.page.page import render_page
+from physion.report.page.trial_pages import FOLDER, trial_pages
+from physion.report.page.trials import shown_stimuli
 from physion.report.settings_text import (
     describe_attributes,
     describe_expected,
     describe_people,
     people_from_files,
+    read_model_inputs,
 )
 from physion.report.write import prepare_folder, write_csv, write_plot
 
@@ -50,17 +53,22 @@ _LOOKS = {
 def build_report(inputs: ReportInputs, folder: Path) -> Path:
     """Write ``report.html``, ``report.json``, ``tables/*.csv`` and ``figures/*.{svg,png,csv}``.
 
+    With ``inputs.trial_pages`` also ``trials/*.html``, a page for each stimulus and their list.
     Returns the path of the page, which needs none of the other files. Every file is complete or
     absent, the page is written last, and the same inputs give the same bytes. Raises
     `BadInputError`, before anything is written, if ``folder`` is a file or a movie is not readable.
     """
-    check_movies(inputs)
+    check_movies(inputs.movies, shown_stimuli(inputs))
     pictures = prepare_folder(folder)
     for name, table in inputs.tables().items():
         write_csv(folder / "tables" / f"{name}.csv", table)
     shown = [write_plot(plot, pictures) for plot in make_plots(inputs)]
     text = json.dumps(report_numbers(inputs), indent=1, ensure_ascii=False, allow_nan=False)
     write_atomic(folder / "report.json", f"{text}\n".encode())
+    if inputs.trial_pages:
+        (folder / FOLDER).mkdir(exist_ok=True)
+        for name, content in trial_pages(inputs):
+            write_atomic(folder / FOLDER / name, content.encode())
     page = folder / "report.html"
     write_atomic(page, render_page(inputs, shown, folder).encode())
     return page
@@ -99,6 +107,8 @@ def compare_files(
     bootstrap: Bootstrap | None = None,
     methods: Mapping[str, str] | None = None,
     movies: Mapping[str, Path] | None = None,
+    question: str | None = None,
+    trial_pages: bool = False,
 ) -> Path:
     """Compare predictions in CSV files with people, write the report and return the page's path.
 
@@ -136,7 +146,7 @@ def compare_files(
         Which people count for Dominoes in ``humans``.
     bootstrap
         Draws for the intervals.
-    methods, movies
+    methods, movies, question, trial_pages
         See `ReportInputs`.
 
     Raises
@@ -175,7 +185,14 @@ def compare_files(
             rows, humans, labels, zone, dominoes, {**settings, "bootstrap": draws}
         )
         choices = {**words, **choices}
-    inputs = ReportInputs.of(results, methods=choices, movies=movies or {})
+    inputs = ReportInputs.of(
+        results,
+        methods=choices,
+        movies=movies or {},
+        model_inputs=read_model_inputs(predictions),
+        trial_pages=trial_pages,
+        **({"question": question} if question else {}),
+    )
     return build_report(inputs, folder)
 
 

@@ -23,15 +23,22 @@ class ReportInputs(ComparisonResults):
     - ``methods``: settings made outside the analysis, as text; those of `EXPECTED_METHODS` that
       are absent are printed as not stated.
     - ``movies``: file by stimulus (mp4, webm, gif, png or jpg); other files are ignored.
-    - ``movie_count``, ``movie_bytes``: largest number of movies, and of bytes of all of them.
+    - ``question``: what people and models were asked, for the movies.
+    - ``model_inputs``: what a model was given, by its name: values of the column *Inputs*.
+    - ``movie_count``: largest number of disagreements that are shown as movies.
+    - ``page_bytes``: size of the page up to which movies are added; what does not fit is left out.
+    - ``trial_pages``: whether a page for each stimulus is written, to ``trials/``.
     - ``scatter_limit``: largest number of models in the scatter figure; the caption names the rest.
     """
 
     title: str = "Models and people on physical prediction"
     methods: Mapping[str, str] = field(default_factory=dict)
     movies: Mapping[str, Path] = field(default_factory=dict)
+    question: str = "Will the agent touch the patient?"
+    model_inputs: Mapping[str, str] = field(default_factory=dict)
     movie_count: int = 8
-    movie_bytes: int = 20_000_000
+    page_bytes: int = 15_000_000
+    trial_pages: bool = False
     scatter_limit: int = 12
 
     @classmethod

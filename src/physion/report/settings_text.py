@@ -1,4 +1,4 @@
-"""Settings about participants as text, for the page."""
+"""Settings about participants and inputs of models as text, for the page."""
 
 from __future__ import annotations
 
@@ -15,7 +15,23 @@ from physion.analysis.people.results import (
     rules_called,
 )
 from physion.analysis.statistics.bootstrap import Bootstrap
+from physion.analysis.tables.csv_table import read_csv
 from physion.report.words import plural
+
+
+def read_model_inputs(paths: Sequence[Path]) -> dict[str, str]:
+    """Return the column *Inputs* of files of predictions by model, for those files that have it.
+
+    A model whose rows differ has all values, joined by ``or``.
+    """
+    found: dict[str, dict[str, None]] = {}
+    for path in paths:
+        table = read_csv(path, ["Model"])
+        if "Inputs" in table.columns:
+            for model, given in zip(table["Model"], table["Inputs"], strict=True):
+                if given:
+                    found.setdefault(model.strip(), {})[given] = None
+    return {model: " or ".join(values) for model, values in found.items()}
 
 
 def people_from_files(

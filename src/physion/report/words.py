@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 import pandas as pd
 
@@ -15,6 +16,11 @@ def plural(count: int, noun: str) -> str:
     """Return count and noun, such as ``1 model``, ``2 models``, ``2 stimuli``."""
     many = noun.removesuffix("us") + "i" if noun.endswith("us") else noun + "s"
     return f"{count} {noun if count == 1 else many}"
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names with commas and, before the last one, ``and``."""
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
 
 def number(value: float, digits: int = 2) -> str:

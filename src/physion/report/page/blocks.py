@@ -15,9 +15,6 @@ from physion.analysis.models.comparison import Comparison
 from physion.analysis.tables.stimuli import MEAN, POOLED, in_order
 from physion.report.words import number, plural
 
-MOST_BARS = 8
-"""Largest number of models that a card shows singly; of more it shows one and the others' mean."""
-
 
 def details(title: str, content: str) -> str:
     """Return a part that opens on a click; ``content`` is HTML."""
@@ -279,34 +276,6 @@ def dropped(comparison: Comparison) -> str:
         for _, row in totals.iterrows()
     ]
     return table(["whose", "reason", "stimuli"], cells)
-
-
-def card(comparison: Comparison, row: pd.Series, movie: str) -> str:
-    """Return one stimulus: its movie (HTML), outcome, and the answers of people and every model."""
-    subset = comparison.stimuli[comparison.stimuli["stimulus"] == row["stimulus"]]
-    bars = [_bar("people say yes", row["p_yes"], "human")]
-    named = subset["agent"] == row["agent"]
-    if len(subset) <= MOST_BARS:
-        for _, answer in subset.iterrows():
-            kind = "model named" if answer["agent"] == row["agent"] else "model"
-            bars.append(_bar(str(answer["agent"]), answer["p_contact"], kind))
-    else:
-        bars.append(_bar(str(row["agent"]), row["p_contact"], "model named"))
-        others = subset.loc[~named, "p_contact"]
-        bars.append(_bar(f"mean of {len(others)} other models", others.mean(), "model"))
-    return (
-        f"<article>{movie}<h3>{escape(row['scenario'])}: {_outcome(row['label'])}</h3>"
-        f"<p><code>{escape(row['stimulus'])}</code></p>{''.join(bars)}</article>"
-    )
-
-
-def _bar(name: str, value: float, kind: str) -> str:
-    """Return a labelled bar; browsers would colour a ``meter`` as good or bad."""
-    width = number(100 * value, 0)
-    return (
-        f'<div class="bar {kind}"><span>{escape(name)}</span><b>{percent(value)}</b>'
-        f'<i style="width:{width}%"></i></div>'
-    )
 
 
 def _outcome(value: bool) -> str:

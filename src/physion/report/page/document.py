@@ -44,13 +44,13 @@ def page_kind(figure: Mapping[str, bytes]) -> str:
 
 
 def render_document(title: str, lead: str, sections: Sequence[Section]) -> str:
-    """Return the page as text: heading, ``lead`` (HTML), contents, sections."""
+    """Return the page as text: heading, ``lead`` (HTML), contents if there are sections, these."""
     links = "".join(f'<li><a href="#{s.anchor}">{escape(s.title)}</a></li>' for s in sections)
     parts = [
         f'<section id="{s.anchor}"><h2>{escape(s.title)}</h2>\n{s.content}</section>'
         for s in sections
     ]
-    nav = f'<nav aria-label="Contents"><ol>{links}</ol></nav>'
+    nav = f'<nav aria-label="Contents"><ul>{links}</ul></nav>' if links else ""
     return _TEMPLATE.format(
         title=escape(title), style=_style(), body="\n".join([lead, nav, *parts])
     )

@@ -1,17 +1,18 @@
-"""Stimuli that a page shows, and their movies within a limit of bytes."""
+"""Movies inside a page, within its limit of bytes, each with a still picture."""
 
 from __future__ import annotations
 
+import io
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
-import pandas as pd
+from PIL import Image
 
-from physion.analysis.models.comparison import Comparison
 from physion.errors import BadInputError
-from physion.report.inputs import ReportInputs
-from physion.report.page import blocks
 from physion.report.page.document import data_uri
+from physion.scenes.scene import OBSERVED_FRAMES
 from physion.stimulus_names import canonical_name
 
 _MIME = {
@@ -21,6 +22,8 @@ _MIME = {
     ".png": "image/png",
     ".jpg": "image/jpeg",
 }
+_POSTER_SIDE = 256
+"""Largest side of a still picture in pixels."""
 
 
 def movies_of(folder: Path) -> dict[str, Path]:
@@ -37,60 +40,94 @@ def movies_of(folder: Path) -> dict[str, Path]:
     return {canonical_name(trial): dataset.paths(trial).movie for trial in trials}
 
 
-def widest_gaps(comparison: Comparison, count: int) -> pd.DataFrame:
-    """Return the stimuli on which a model and people differ most, at most ``count`` rows.
-
-    Models alternate: each adds the stimulus with its largest |P(contact) - P(yes)| that is not yet
-    chosen; ties are resolved by name. Stimuli whose simulated outcome is not the official one are
-    skipped, since there the physics differs and not the model. The result has rows of
-    ``comparison.stimuli``, each of the model that added it.
-    """
-    rows = comparison.stimuli
-    rows = rows[(rows["label"] == rows["simulated"]) & rows["gap"].notna()]
-    rows = rows.assign(size=rows["gap"].abs())
-    ranked = rows.sort_values(["size", "stimulus"], ascending=[False, True], kind="stable")
-    queues = [list(subset.index) for _, subset in ranked.groupby("agent", sort=False)]
-    queues.sort(key=lambda queue: comparison.agents.index(rows.loc[queue[0], "agent"]))
-    chosen: list[int] = []
-    seen: set[str] = set()
-    while len(chosen) < count and any(queues):
-        for queue in queues:
-            while queue and rows.loc[queue[0], "stimulus"] in seen:
-                queue.pop(0)
-            if queue and len(chosen) < count:
-                chosen.append(queue.pop(0))
-                seen.add(str(rows.loc[chosen[-1], "stimulus"]))
-    return rows.loc[chosen]
-
-
-def gaps(inputs: ReportInputs) -> str:
-    """Return a card for each of the largest differences, with its movie within the limit of
-    bytes.
-    """
-    chosen = widest_gaps(inputs.comparison, inputs.movie_count)
-    if chosen.empty:
-        return "<p>None: every simulated outcome differs from the official one.</p>"
-    cards, left = [], inputs.movie_bytes
-    for _, row in chosen.iterrows():
-        movie, used = _movie(inputs.movies.get(row["stimulus"]), row["stimulus"], left)
-        left -= used
-        cards.append(blocks.card(inputs.comparison, row, movie))
-    words = (
-        "The stimuli of the largest difference between P(contact) and the share of people who say "
-        "yes, models taking turns; only stimuli whose simulated outcome is the official one."
-    )
-    kind = "cards" if left < inputs.movie_bytes else "cards bare"
-    return f'<p>{escape(words)}</p><div class="{kind}">{"".join(cards)}</div>'
-
-
-def check_movies(inputs: ReportInputs) -> None:
+def check_movies(movies: Mapping[str, Path], stimuli: Iterable[str]) -> None:
     """Raise `BadInputError` for a movie to be shown that is absent or of a wrong kind."""
-    if not inputs.comparison.has_people:
-        return
-    for stimulus in widest_gaps(inputs.comparison, inputs.movie_count)["stimulus"]:
-        path = inputs.movies.get(stimulus)
+    for stimulus in stimuli:
+        path = movies.get(stimulus)
         if path is not None and _mime(path) and not path.is_file():
             raise BadInputError(f"the movie of {stimulus!r} is not there: {path}")
+
+
+@dataclass
+class PageMovies:
+    """Movies of one page as HTML.
+
+    - ``files``: file by stimulus.
+    - ``left``: bytes of HTML that the page may still take; each movie that is shown takes some.
+    """
+
+    files: Mapping[str, Path]
+    left: int
+
+    def show(self, stimulus: str, description: str) -> str:
+        """Return the movie of a stimulus; a picture or a sentence if it cannot be shown.
+
+        ``description``: for readers who do not see it. It plays without sound while it is in
+        view. Returns "" if no movie of any stimulus was given. Raises `BadInputError` if its file
+        cannot be read or is no movie.
+        """
+        if not self.files:
+            return ""
+        path = self.files.get(stimulus)
+        if path is None:
+            return '<p class="none">no movie given</p>'
+        poster = make_poster(path)
+        for html in (_element(path, stimulus, description, poster), _still(poster, description)):
+            if html and len(html) <= self.left:
+                self.left -= len(html)
+                return html
+        return f'<p class="none">{_TOO_LARGE}</p>'
+
+
+_TOO_LARGE = "movie left out: the page would grow too large"
+
+
+def _element(path: Path, stimulus: str, description: str, poster: bytes) -> str:
+    mime = _mime(path)
+    try:
+        data = data_uri(mime, path.read_bytes())
+    except OSError as error:
+        raise BadInputError(f"the movie of {stimulus!r} cannot be read: {error}") from error
+    label = escape(description)
+    if mime.startswith("image/"):
+        return f'<img src="{data}" alt="{label}" loading="lazy">'
+    still = f'poster="{data_uri("image/jpeg", poster)}" ' if poster else ""
+    # Browsers start a movie without sound when it comes into view; before, nothing is decoded.
+    return (
+        f'<video src="{data}" {still}autoplay preload="none" controls loop muted playsinline '
+        f'aria-label="{label}"></video>'
+    )
+
+
+def _still(poster: bytes, description: str) -> str:
+    if not poster:
+        return ""
+    picture = data_uri("image/jpeg", poster)
+    return (
+        f'<div class="still"><img src="{picture}" alt="{escape(description)}">'
+        f"<small>{_TOO_LARGE}</small></div>"
+    )
+
+
+def make_poster(path: Path) -> bytes:
+    """Return the last observed picture of a movie as JPEG: what people saw when they answered.
+
+    A shorter movie gives its last picture; a file that is no movie, or one that cannot be decoded
+    here (a browser may still play it), gives b"".
+    """
+    from physion.trials.video import count_frames, read_chosen
+
+    if not _mime(path).startswith("video/"):
+        return b""
+    try:
+        last = max(0, min(OBSERVED_FRAMES, count_frames(path)) - 1)
+        picture = Image.fromarray(read_chosen(path, [last])[0])
+    except BadInputError:
+        return b""
+    picture.thumbnail((_POSTER_SIDE, _POSTER_SIDE))
+    buffer = io.BytesIO()
+    picture.save(buffer, format="JPEG", quality=80)
+    return buffer.getvalue()
 
 
 def _mime(path: Path) -> str:
@@ -98,20 +135,3 @@ def _mime(path: Path) -> str:
     if mime is None:
         raise BadInputError(f"{path} is no movie for a page; use one of {', '.join(_MIME)}")
     return mime
-
-
-def _movie(path: Path | None, stimulus: str, budget: int) -> tuple[str, int]:
-    """Return a movie or picture as HTML, and its bytes; text instead if it cannot be shown."""
-    if path is None:
-        return '<p class="none">no movie given</p>', 0
-    mime = _mime(path)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise BadInputError(f"the movie of {stimulus!r} cannot be read: {error}") from error
-    if len(data) > budget:
-        return '<p class="none">movie left out: the page would grow too large</p>', 0
-    uri = data_uri(mime, data)
-    if mime.startswith("image/"):
-        return f'<img src="{uri}" alt="{escape(stimulus)}">', len(data)
-    return f'<video src="{uri}" controls loop muted playsinline preload="auto"></video>', len(data)

@@ -12,7 +12,10 @@ from physion.report.figures.registry import BY_SCENARIO, BY_STIMULUS, TRAINING, 
 from physion.report.inputs import EXPECTED_METHODS, ReportInputs
 from physion.report.page import blocks, people_blocks, session_blocks, tests_of_models
 from physion.report.page.document import Picture, Section, figure, render_document
-from physion.report.page.movies import gaps
+from physion.report.page.model_inputs import inputs_sentence
+from physion.report.page.movies import PageMovies
+from physion.report.page.trial_pages import FOLDER, page_name
+from physion.report.page.trials import gaps, opening
 from physion.report.words import plural, protocol_names
 
 
@@ -22,7 +25,8 @@ def render_page(
     """Return the page as text; the same inputs give the same text. Raises `BadInputError` for a
     movie.
 
-    ``folder``: the folder of the page, for links to the movies that it does not contain.
+    It starts with one trial of each scenario. Movies are added last, as many as the size of the
+    page allows. ``folder``: the folder of the page, for links to the movies that it lacks.
     """
     shown = {picture.name: figure(picture) for picture in pictures}
     links = _links(inputs, folder)
@@ -31,7 +35,7 @@ def render_page(
         Section(BY_SCENARIO, _by_scenario(inputs, shown)),
         Section(TRAINING, _figures(TRAINING, shown, {})),
         Section(BY_STIMULUS, _stimuli(inputs, shown, links)),
-        Section("Where model and people differ most", _gaps(inputs)),
+        Section(DISAGREE, ""),
         Section("People", people_blocks.people(inputs, shown)),
         Section("Sessions left out", session_blocks.sessions(inputs)),
         Section("Tests", tests_of_models.tests(inputs)),
@@ -39,12 +43,38 @@ def render_page(
         Section("How this was made", _methods(inputs)),
         Section("What was left out", _left_out(inputs)),
     ]
-    page = render_document(inputs.title, _summary(inputs), [s for s in sections if s.content])
+    lead = _summary(inputs)
+    # Once without movies, for the size of all else.
+    texts = [
+        lead,
+        *(one.content for one in _with_trials(inputs, sections, PageMovies({}, 0), links)),
+    ]
+    left = inputs.page_bytes - _FRAME_BYTES - sum(len(text.encode()) for text in texts)
+    sections = _with_trials(inputs, sections, PageMovies(inputs.movies, left), links)
+    page = render_document(inputs.title, lead, [one for one in sections if one.content])
     return protocol_names(page)  # here, so that all tables and captions use the same names
 
 
+OPENING = "One trial of each scenario"
+DISAGREE = "What people and models disagree on"
+_FRAME_BYTES = 50_000
+"""Bytes kept for style, headings and contents of the page."""
+
+
+def _with_trials(
+    inputs: ReportInputs, sections: Sequence[Section], movies: PageMovies, links: Mapping[str, str]
+) -> list[Section]:
+    """Return the sections, after that of the opening trials and with the disagreements."""
+    first = Section(OPENING, opening(inputs, movies, links))
+    shows = Section(DISAGREE, gaps(inputs, movies, links))
+    return [first, *(shows if one.title == DISAGREE else one for one in sections)]
+
+
 def _links(inputs: ReportInputs, folder: Path | None) -> Mapping[str, str]:
-    """Return the addresses of the movies by stimulus, relative to the page."""
+    """Return the addresses by stimulus, relative to the page: of its own page, or its movie."""
+    if inputs.trial_pages:
+        names = inputs.comparison.stimuli["stimulus"].unique()
+        return {name: f"{FOLDER}/{page_name(name)}" for name in names}
     if folder is None:
         return {}
     base = folder.resolve()
@@ -58,8 +88,10 @@ def _summary(inputs: ReportInputs) -> str:
     comparison = inputs.comparison
     stimuli = comparison.stimuli["stimulus"].nunique()
     scenarios = in_order(comparison.stimuli["scenario"])
+    models, rows = comparison.stimuli["model"].nunique(), len(comparison.agents)
+    each = f" (with their readouts and trainings {rows} rows)" if rows > models else ""
     words = [
-        f"{plural(len(comparison.agents), 'model')} on {plural(stimuli, 'stimulus')} "
+        f"{plural(models, 'model')}{each} on {plural(stimuli, 'stimulus')} "
         f"of {plural(len(scenarios), 'scenario')} ({', '.join(scenarios)})."
     ]
     if comparison.has_people:
@@ -81,7 +113,9 @@ def _summary(inputs: ReportInputs) -> str:
             f"In {len(comparison.changed)} of these stimuli the simulated outcome is not the "
             "official one; accuracy is given against both."
         )
-    return f'<p class="lead">{escape(" ".join(words))}</p>'
+    given = inputs_sentence(inputs)
+    more = f'<p class="given">{escape(given)}</p>' if given else ""
+    return f'<p class="lead">{escape(" ".join(words))}</p>{more}'
 
 
 def _scores(inputs: ReportInputs) -> str:
@@ -119,10 +153,6 @@ def _stimuli(inputs: ReportInputs, shown: Mapping[str, str], links: Mapping[str,
     if inputs.comparison.has_people:
         below["difficulty"] = people_blocks.fooled(inputs, links)
     return _figures(BY_STIMULUS, shown, below)
-
-
-def _gaps(inputs: ReportInputs) -> str:
-    return gaps(inputs) if inputs.comparison.has_people else ""
 
 
 def _methods(inputs: ReportInputs) -> str:
