@@ -15,9 +15,13 @@ none (each actor is stopped at most once in a step):
   of u, and go on with their new velocities by .15 of the smaller threshold, so that they do not
   stick.
 
-After PhysX 4 (``PxsCCD.cpp``: ``sweepAdvanceToToi``), with one pass. Deviations: one list of pairs
-takes the place of its islands and of its estimated times, with equal results; a pair of which one
-has stopped starts from a path that is straight in place of one that is rotated evenly.
+Bodies that do not rotate gain no energy; one that spins may, because u holds the velocity that the
+rotation gives its origin.
+
+After PhysX 4 (``PxsCCD.cpp``: ``sweepAdvanceToToi``), with one pass. Deviations: the first hit of
+all pairs is looked for anew after each stop, in place of islands with sorted times; the rest of a
+way is swept along a straight line in place of the origin's arc; what does not move never counts as
+stopped.
 """
 
 from __future__ import annotations
