@@ -55,6 +55,35 @@ def test_the_solution_is_that_of_converged_scikit_learn(n: int, d: int) -> None:
         assert ours <= theirs * (1 + 1e-7) + 1e-9
 
 
+def test_weak_penalties_are_solved_exactly() -> None:
+    """Compared with Newton's method on the features themselves, gradients in extended precision."""
+    features, labels = problem(60, 400, seed=7)
+    fitted = np.arange(40)
+    kernel = gram(features, fitted)
+    weights, intercepts = solve_path(kernel[fitted], labels[fitted], C_GRID)
+    scaled = StandardScaler().fit(features[fitted]).transform(features)
+    axes, triangle = np.linalg.qr(scaled[fitted].T)
+    design = np.column_stack([triangle.T, np.ones(40)]).astype(np.longdouble)
+    others = np.column_stack([scaled[40:] @ axes, np.ones(20)])
+    signs = np.where(labels[fitted], 1, -1).astype(np.longdouble)
+    x = np.zeros(41, np.longdouble)
+    for k, c in enumerate(C_GRID):
+        penalty = np.full(41, 1 / np.longdouble(c))
+        penalty[-1] = 0
+        for _ in range(60):
+            error = 1 / (1 + np.exp(signs * (design @ x)))
+            gradient = penalty * x - design.T @ (signs * error)
+            hessian = ((design * (error * (1 - error))[:, None]).T @ design).astype(float)
+            hessian += np.diag(penalty.astype(float))
+            # Equal scales of all directions keep the linear equations well conditioned.
+            scale = 1 / np.sqrt(np.diag(hessian))
+            right = (scale * gradient).astype(float)
+            x = x - scale * np.linalg.solve(hessian * scale[:, None] * scale, right)
+        expected = 1 / (1 + np.exp(-(others @ x).astype(float)))
+        answers = 1 / (1 + np.exp(-(kernel[40:] @ weights[:, k] + intercepts[k])))
+        assert answers == pytest.approx(expected, abs=1e-8), f"C = {c}"
+
+
 def test_the_whole_readout_is_that_of_a_converged_grid_search() -> None:
     features, labels = problem(70, 300, seed=2)
     train, test, answers = features[:50], features[50:], labels[:50]
