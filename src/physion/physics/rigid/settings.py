@@ -26,8 +26,8 @@ class RigidSettings:
       (PhysX: 3).
     - ``persistent_manifolds``: contact points are kept from step to step (Unity 2019).
     - ``continuous``: bodies that could pass through each other in a step are swept, and stop where
-      they hit (`physion.physics.rigid.collision.impacts`; Unity's mode ``continuous_dynamic``). Off,
-      because the recorded scenes are not predicted better with it.
+      they hit (`physion.physics.rigid.collision.impacts`; Unity's mode ``continuous_dynamic``).
+      Off, because the recorded scenes are not predicted better with it.
     - ``friction_doubling``: each of a patch's two anchors may bear the whole friction force, so
       that flat contacts have twice the friction of Coulomb's law. The official simulator behaves
       so (Unity's "improved patch friction" is off); with False the anchors divide the force.

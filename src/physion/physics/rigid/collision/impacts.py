@@ -124,7 +124,7 @@ def _respond(
     speed -= DEPENETRATION * hit[DEPTH]
     if speed >= -LEAST_SPEED:
         return 0.0
-    impulse = -(1.0 + restitution) * speed / (bodies.inv_mass[a] + bodies.inv_mass[b])
+    impulse: float = -(1.0 + restitution) * speed / (bodies.inv_mass[a] + bodies.inv_mass[b])
     for k in range(3):
         bodies.v[a, k] += impulse * bodies.inv_mass[a] * normal[k]
         bodies.v[b, k] -= impulse * bodies.inv_mass[b] * normal[k]
