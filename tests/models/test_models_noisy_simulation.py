@@ -12,15 +12,11 @@ import pytest
 from physion.compute.local import LocalExecutor
 from physion.errors import BadInputError
 from physion.models import Batch, Motion, build_model
-from physion.models.noisy_simulation import (
-    NoisySimulation,
-    NoisySimulationConfig,
-    add_noise,
-    cut_trial,
-)
+from physion.models.noisy_simulation import NoisySimulation, NoisySimulationConfig, cut_trial
+from physion.models.state_noise import add_noise, simulate_contacts
 from physion.numerics.elementary import exp_of
 from physion.numerics.random_normals import standard_normal
-from physion.physics.engine import simulate
+from physion.physics.engine import make_engine, simulate
 from physion.physics.trajectory import Contacts, State, Trajectory
 from physion.scenes.scene import Body, Camera, Cloth, Joint, Push, Roles, Scene
 from physion.seeds import child_generator, trial_seed
@@ -167,7 +163,7 @@ def test_noise_has_the_stated_size_and_spares_what_cannot_move() -> None:
     trial = scene()
     question = cut_trial(trial, StraightEngine().simulate(trial))
     config = NoisySimulationConfig(position=0.1, velocity=0.3, mass=0.2)
-    pairs = [add_noise(question, config, 2.0, sample) for sample in range(400)]
+    pairs = [add_noise(question, config, 2.0, sample, 0) for sample in range(400)]
     places = np.array([state.positions for _, state in pairs]) - question.state.positions
     speeds = np.array([state.velocities for _, state in pairs]) - question.state.velocities
     masses = np.log([[body.mass for body in noisy.bodies] for noisy, _ in pairs])
@@ -185,7 +181,7 @@ def test_joined_bodies_move_together_and_a_cloth_moves_whole() -> None:
     base = StraightEngine().simulate(replace(trial, cloths=()))
     truth = replace(base, cloth_vertices=np.zeros((FRAMES, 9, 3), np.float32))
     question = cut_trial(trial, truth)
-    _, state = add_noise(question, NoisySimulationConfig(), 1.0, 0)
+    _, state = add_noise(question, NoisySimulationConfig(), 1.0, 0, 0)
     moved = state.positions - question.state.positions
     assert moved[0] == pytest.approx(moved[1]) and moved[0].any()
     cloth = state.cloth_vertices - question.state.cloth_vertices
@@ -193,12 +189,105 @@ def test_joined_bodies_move_together_and_a_cloth_moves_whole() -> None:
     assert not np.isclose(cloth[0, :2], moved[0, :2]).any()
 
 
+def test_noise_of_the_pose_is_that_of_bodies_in_the_air() -> None:
+    trial = scene()
+    question = cut_trial(trial, StraightEngine().simulate(trial))
+    config = NoisySimulationConfig(
+        vertical=0.1, rotation=0.2, angular_velocity=0.5, friction=0.3, position=0.0
+    )
+    pairs = [add_noise(question, config, 2.0, sample, 0) for sample in range(400)]
+    rise = np.array([state.positions[:, 2] for _, state in pairs]) - question.state.positions[:, 2]
+    assert rise[:, 0].std() == pytest.approx(0.2, rel=0.15), "the ball flies"
+    assert not rise[:, 1:].any(), "box and wall stand"
+    turned = np.array([state.rotations for _, state in pairs])
+    angles = 2 * np.arccos(np.clip(turned[..., 0], -1, 1))
+    assert (angles[:, 0] ** 2).mean() == pytest.approx(3 * 0.4**2, rel=0.2), "about any axis"
+    assert (angles[:, 1] ** 2).mean() == pytest.approx(0.4**2, rel=0.2), "about the vertical"
+    assert turned[:, 0, 1:3].any() and not turned[:, 1, 1:3].any() and not angles[:, 2].any()
+    spins = np.array([state.angular_velocities for _, state in pairs])
+    assert spins[:, :2].std(0) == pytest.approx(np.full((2, 3), 1.0), rel=0.15)
+    assert not spins[:, 2].any()
+    grip = np.log([noisy.bodies[1].contact.static_friction / 0.5 for noisy, _ in pairs])
+    assert grip.std() == pytest.approx(0.6, rel=0.15)
+    assert np.linalg.norm(turned, axis=-1) == pytest.approx(np.ones((400, 3)))
+
+
+def test_bodies_that_touch_something_are_not_lifted() -> None:
+    trial = scene()
+    question = cut_trial(trial, StraightEngine().simulate(trial))
+    resting = replace(question, touching=frozenset({0}))
+    config = NoisySimulationConfig(vertical=0.1, rotation=0.2)
+    _, state = add_noise(resting, config, 1.0, 0, 0)
+    assert (state.positions[:, 2] == question.state.positions[:, 2]).all()
+    assert not state.rotations[0, 1:3].any() and state.rotations[0, 3] != 0
+
+
+def test_a_level_of_zero_leaves_the_random_numbers_of_the_others() -> None:
+    trial = scene()
+    question = cut_trial(trial, StraightEngine().simulate(trial))
+    _, base = add_noise(question, NoisySimulationConfig(), 1.0, 3, 0)
+    _, more = add_noise(question, NoisySimulationConfig(vertical=0.1, friction=0.2), 1.0, 3, 0)
+    assert np.array_equal(base.velocities, more.velocities)
+    assert np.array_equal(base.positions[:, :2], more.positions[:, :2])
+    assert np.array_equal(base.rotations, question.state.rotations)
+
+
+def test_lapses_are_answers_at_random() -> None:
+    trial = scene(0.0)
+    question = cut_trial(trial, StraightEngine().simulate(trial))
+    found = {
+        lapse: np.mean(
+            simulate_contacts(
+                question,
+                NoisySimulationConfig(scale=0.0, lapse=lapse),
+                0.0,
+                1000,
+                0,
+                StraightEngine(),
+            )
+        )
+        for lapse in (0.0, 0.4, 1.0)
+    }
+    assert found[0.0] == 1.0
+    assert found[0.4] == pytest.approx(0.8, abs=0.04) and found[1.0] == pytest.approx(0.5, abs=0.05)
+
+
+def relayed() -> Scene:
+    """Return a scene in which a pushed ball hits another one, which then rolls into a box."""
+    return Scene(
+        "relayed",
+        "collide",
+        (
+            Body("first", "sphere", (-6.5, 0.0, 0.0), (0.3, 0.3, 0.3)),
+            Body("second", "sphere", (0.0, 0.0, 0.0), (0.3, 0.3, 0.3)),
+            Body("box", "cube", (1.6, 0.0, 0.0), (0.3, 0.3, 0.3)),
+        ),
+        Roles("second", "box"),
+        Camera((3.0, 0.0, 1.0)),
+        pushes=(Push("first", (16.0, 0.0, 0.0)),),
+    )
+
+
+def test_noise_at_contacts_acts_where_bodies_meet() -> None:
+    """Without a contact nothing changes; after one, the paths spread."""
+    still = NoisySimulationConfig(position=0.0, velocity=0.0, mass=0.0)
+    noisy = replace(still, contact=0.4)
+    missed, hit = rolling(3.0), relayed()
+    engine = make_engine("physion")
+    for trial, changes in ((missed, False), (hit, True)):
+        question = cut_trial(trial, simulate(trial))
+        found = [simulate_contacts(question, c, 1.0, 24, 0, engine) for c in (still, noisy)]
+        assert len(set(found[0])) == 1
+        assert (found[0] != found[1]) is changes
+    assert found[1] == simulate_contacts(question, noisy, 1.0, 24, 0, engine)
+
+
 def test_noise_depends_on_seed_trial_and_sample_alone() -> None:
     truth = StraightEngine().simulate(scene())
 
     def state(seed: int, name: str, sample: int) -> list[float]:
         question = cut_trial(scene(name=name), truth)
-        _, noisy = add_noise(question, NoisySimulationConfig(seed=seed), 1.0, sample)
+        _, noisy = add_noise(question, NoisySimulationConfig(), 1.0, sample, seed)
         return noisy.positions.ravel().tolist()
 
     assert state(0, "a", 0) == state(0, "a", 0)
@@ -212,7 +301,7 @@ def test_noise_is_that_of_the_platform_independent_functions() -> None:
     trial = scene()
     question = cut_trial(trial, StraightEngine().simulate(trial))
     config = NoisySimulationConfig(position=0.1, velocity=0.3, mass=0.2)
-    noisy, state = add_noise(question, config, 2.0, 7)
+    noisy, state = add_noise(question, config, 2.0, 7, config.seed)
     rng = child_generator(trial_seed(config.seed, trial.scenario, trial.name, 7), "noise")
     shift, kick = standard_normal(rng, (3, 2)), standard_normal(rng, (3, 3))
     mass = standard_normal(rng, 3)
@@ -245,7 +334,9 @@ def test_seed_and_scale_of_the_rollouts_are_those_of_the_call() -> None:
     assert contacts(0) != contacts(1) and contacts(0) != contacts(0, scale=9.0)
 
 
-@pytest.mark.parametrize("wrong", [{"samples": 0}, {"position": -1.0}, {"scales": ()}])
+@pytest.mark.parametrize(
+    "wrong", [{"samples": 0}, {"position": -1.0}, {"scales": ()}, {"lapse": 1.5}, {"contact": -1.0}]
+)
 def test_impossible_settings_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(BadInputError):
         NoisySimulationConfig(**wrong)

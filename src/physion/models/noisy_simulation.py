@@ -1,15 +1,9 @@
 """Noisy simulation: the physics engine, started from the true state with noise added.
 
-At the last observed frame, normal noise is added to positions, velocities and masses, and the
+At the last observed frame, normal noise is added to the state (`models.state_noise`), and the
 engine simulates the rest of the trial. P(contact) is the fraction of such simulations in which
-agent and patient touch. The model has no weights and needs no torch.
-
-- Noise of positions (bodies, 2): metres, along x and y only, because vertical noise would push
-  objects on the floor into it or drop them. Bodies connected by joints move together, and a cloth
-  moves as a whole.
-- Noise of velocities (bodies, 3): metres per second.
-- Noise of masses (bodies,): of the logarithm, so that 0.1 is about 10 %.
-- P(contact): in 0..1, a multiple of 1 / samples; 1 if the contact was already observed.
+agent and patient touch, a multiple of 1 / samples; 1 if the contact was already observed. The model
+has no weights and needs no torch.
 
 All noise levels use the same normal random numbers, multiplied by the level. Noise and fit of the
 scale compute with `physion.numerics`, so that predictions are the same on every machine.
@@ -20,23 +14,20 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from physion.errors import BadInputError
 from physion.models.batch import Batch, Provenance, Rollout, Spec
 from physion.models.build import make_config
 from physion.models.observed import cut_to_observed
-from physion.numerics.elementary import exp
-from physion.numerics.random_normals import standard_normal
-from physion.physics.engine import DEFAULT_ENGINE, Engine, make_engine, simulate_many
+from physion.models.state_noise import NoiseLevels, ObservedTrial, simulate_contacts
+from physion.physics.engine import DEFAULT_ENGINE, Engine, make_engine
 from physion.physics.labels import label_contact
-from physion.physics.trajectory import State, Trajectory
+from physion.physics.trajectory import Trajectory
 from physion.scenes.scene import OBSERVED_FRAMES, Scene
-from physion.seeds import child_generator, trial_seed
 from physion.version import __version__
 
 LAST_OBSERVED = OBSERVED_FRAMES - 1
@@ -46,19 +37,15 @@ NOISE_VERSION = 2
 
 
 @dataclass(frozen=True, slots=True)
-class NoisySimulationConfig:
-    """Settings of `NoisySimulation`.
+class NoisySimulationConfig(NoiseLevels):
+    """Settings of `NoisySimulation`: the levels of the noise, and others.
 
-    - ``position`` (metres), ``velocity`` (metres per second), ``mass`` (relative): standard
-      deviations of the noise. ``scale`` multiplies all three.
+    - ``scale``: factor of all standard deviations.
     - ``scales``: values of ``scale`` among which a reader chooses; with one value nothing is
       fitted.
     - ``samples``: simulations per trial. ``engine``: name of the engine. ``seed``: of the noise.
     """
 
-    position: float = 0.01
-    velocity: float = 0.1
-    mass: float = 0.1
     scale: float = 1.0
     scales: tuple[float, ...] = (0.5, 1.0, 2.0)
     samples: int = 20
@@ -66,19 +53,11 @@ class NoisySimulationConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if min(self.position, self.velocity, self.mass, self.scale, *self.scales) < 0:
-            raise BadInputError("noise levels and scales must not be negative")
+        self.check("noisy-simulation")
+        if min((self.scale, *self.scales)) < 0:
+            raise BadInputError("noisy-simulation: scales must not be negative")
         if self.samples < 1 or not self.scales:
             raise BadInputError("noisy-simulation needs at least one sample and one scale")
-
-
-@dataclass(frozen=True)
-class ObservedTrial:
-    """Trial as the model receives it: the scene and its state at the last observed frame."""
-
-    scene: Scene
-    state: State
-    observed_contact: bool
 
 
 def cut_trial(scene: Scene, trajectory: Trajectory) -> ObservedTrial:
@@ -91,41 +70,13 @@ def cut_trial(scene: Scene, trajectory: Trajectory) -> ObservedTrial:
         raise BadInputError(
             f"trial {scene.name!r} was imported without motion ({trajectory.engine})"
         )
-    return ObservedTrial(scene, seen.state(LAST_OBSERVED), label_contact(scene, seen).contact)
-
-
-def add_noise(
-    trial: ObservedTrial, config: NoisySimulationConfig, scale: float, sample: int
-) -> tuple[Scene, State]:
-    """Return scene and state with noise added.
-
-    The noise is a function of the config's seed, the scene's name and ``sample``.
-    """
-    scene, state = trial.scene, trial.state
-    rng = child_generator(trial_seed(config.seed, scene.scenario, scene.name, sample), "noise")
-    count = len(scene.bodies)
-    cloths = len(scene.cloths)
-    shift = np.zeros((count + cloths, 3))
-    shift[:, :2] = standard_normal(rng, (count + cloths, 2)) * config.position * scale
-    kick = standard_normal(rng, (count + cloths, 3)) * config.velocity * scale
-    factors = exp(standard_normal(rng, count) * config.mass * scale)
-    roots = _joint_roots(scene)
-    still = np.array([b.kinematic or b.scenery for b in scene.bodies] + [False] * cloths)
-    shift, kick, still = shift[roots], kick[roots], still[roots]
-    shift[still] = kick[still] = 0.0
-    owner = np.repeat(np.arange(cloths), [cloth.resolution**2 for cloth in scene.cloths])
-    bodies = tuple(
-        body if still[i] else replace(body, mass=body.mass * float(factors[i]))
-        for i, body in enumerate(scene.bodies)
+    last = seen.contacts.frame == LAST_OBSERVED
+    return ObservedTrial(
+        scene,
+        seen.state(LAST_OBSERVED),
+        label_contact(scene, seen).contact,
+        frozenset(int(body) for body in seen.contacts.bodies[last].ravel() if body >= 0),
     )
-    noisy = replace(
-        state,
-        positions=state.positions + shift[: len(state.positions)],
-        velocities=state.velocities + kick[: len(state.velocities)],
-        cloth_vertices=state.cloth_vertices + shift[count:][owner],
-        cloth_velocities=state.cloth_velocities + kick[count:][owner],
-    )
-    return replace(scene, bodies=bodies), noisy
 
 
 class NoisySimulation:
@@ -160,7 +111,14 @@ class NoisySimulation:
         scale = knobs.get("scale", self.config.scale)
         assert context.state is not None, "the spec asks for states"
         found = [
-            self._simulate(cut_trial(motion.scene, motion.trajectory), samples, seed, scale)
+            simulate_contacts(
+                cut_trial(motion.scene, motion.trajectory),
+                self.config,
+                scale,
+                samples,
+                seed,
+                self.engine,
+            )
             for motion in context.state
         ]
         return Rollout(contact=np.array(found, np.bool_).reshape(len(found), samples))
@@ -168,7 +126,7 @@ class NoisySimulation:
     def digest(self) -> str:
         """Return the SHA-256 of engine and noise; scales and number of samples are no part."""
         config = dataclasses.asdict(self.config)
-        settings = {name: config[name] for name in ("position", "velocity", "mass")}
+        settings = {field.name: config[field.name] for field in dataclasses.fields(NoiseLevels)}
         parts = [NOISE_VERSION, self.engine.name, settings]
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
@@ -186,45 +144,7 @@ class NoisySimulation:
         """Leave the engine behind that another process can build from its name."""
         return {**self.__dict__, "_built": None}
 
-    def _simulate(self, trial: ObservedTrial, samples: int, seed: int, scale: float) -> list[bool]:
-        if trial.observed_contact:
-            return [True] * samples
-        config = replace(self.config, seed=seed)
-        starts = [_noisy_start(trial, config, scale, sample) for sample in range(samples)]
-        scenes, states = zip(*starts, strict=True)
-        paths = simulate_many(scenes, engine=self.engine, starts=states, until_contact=True)
-        return [
-            label_contact(scene, path).contact for scene, path in zip(scenes, paths, strict=True)
-        ]
-
 
 def noisy_simulation(**options: Any) -> NoisySimulation:
     """Build the model; ``options`` are the fields of `NoisySimulationConfig`."""
     return NoisySimulation(make_config(NoisySimulationConfig, "noisy-simulation", options))
-
-
-def _noisy_start(
-    trial: ObservedTrial, config: NoisySimulationConfig, scale: float, sample: int
-) -> tuple[Scene, State]:
-    """Return scene and state of one simulation, whose ending counts from the state on."""
-    scene, state = add_noise(trial, config, scale, sample)
-    # The scene's limits of length count from its frame 0; the simulation starts later.
-    ending = replace(
-        scene.ending,
-        min_frames=max(1, scene.ending.min_frames - state.frame),
-        max_frames=max(2, scene.ending.max_frames - state.frame),
-    )
-    return replace(scene, ending=ending), state
-
-
-def _joint_roots(scene: Scene) -> NDArray[np.int64]:
-    """Return for each body and cloth the index of the root of its chain of joints, or its own."""
-    parents = {joint.child: joint.parent for joint in scene.joints}
-    roots = []
-    for name in scene.names():
-        seen = {name}
-        while name in parents and parents[name] not in seen:
-            name = parents[name]
-            seen.add(name)
-        roots.append(scene.index(name))
-    return np.array(roots, dtype=np.int64)
