@@ -157,6 +157,7 @@ def test_every_option_of_a_comparison_reaches_the_report(
     assert all(row["reason"] for row in plain["people_hypotheses"] if row["hypothesis"] == "H1")
     command += ["--expected", str(own.expected), "--attributes", str(own.dataset)]
     command += ["--movies", str(own.dataset), "--rules", "official-code", "--seed", "5"]
+    command += ["--trial-pages"]
     assert main(command) == 0
     found = json.loads(capsys.readouterr().out)
     assert not any(row["incomplete"] for row in found["people_flags"])
@@ -173,6 +174,8 @@ def test_every_option_of_a_comparison_reaches_the_report(
     assert {row["elements"] for row in found["people_attributes"]} == {1, 2, 3}
     page = Path(found["report"]).read_text(encoding="utf-8")
     assert "<video" in page
+    pages = {path.name for path in (Path(found["report"]).parent / "trials").iterdir()}
+    assert len(pages) == 1 + 32 and "index.html" in pages
     assert "32 by the table that was given" in page
 
 
@@ -327,14 +330,36 @@ def test_leaderboard_prints_and_writes(
     assert lines[1].split()[:2] == ["1", "good"] and "made up 1" in lines[1]
     assert "left out" in lines[-1]
     table = pd.read_csv(tmp_path / "out" / "leaderboard.csv")
-    assert list(table["model"]) == ["good", "weak"] and set(table["stimuli"]) == {1144}
+    anchors = ["recorded outcome", "majority of people", "one person with another"]
+    assert list(table["model"]) == ["good", "weak", *anchors]
+    assert list(table["kind"]) == ["model"] * 2 + ["anchor"] * 3
+    assert set(table["stimuli"]) == {1144}
+    below = lines[lines.index("Anchors: what a score is worth") + 2 :]
+    assert [line[:20].strip() for line in below[:3]] == [name[:20] for name in anchors]
     written = json.loads((tmp_path / "out" / "leaderboard.json").read_text())
+    assert [row["model"] for row in written["anchors"]] == anchors
     assert written["rows"][0]["kappa"] is None and written["rows"][0]["accuracy"] > 0.8
     assert main([*command, "--sort", "rmsd", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["rows"]
     assert rows[0]["rmsd"] < rows[1]["rmsd"]
     assert main([*command, "--sort", "accuracy", "--ascending", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["rows"][0]["model"] == "weak"
+
+
+def test_leaderboard_of_later_contacts_needs_their_column(
+    official: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = predictions(official, tmp_path / "m.csv")
+    command = ["compare", "leaderboard", str(file), "--later", "--json"]
+    assert main(command) == 2
+    assert "Observed Contact" in capsys.readouterr().err
+    rows = pd.read_csv(file)
+    rows["Observed Contact"] = rows["Actual Outcome"] & (np.arange(len(rows)) % 3 == 0)
+    rows.to_csv(file, index=False)
+    assert main(command) == 0
+    (row,) = json.loads(capsys.readouterr().out)["rows"]
+    ledge = rows["Stimulus Name"].str.contains("ledge")
+    assert row["stimuli"] == (~rows["Observed Contact"] & ~ledge).sum()
 
 
 def test_leaderboard_goes_on_without_a_bad_file(

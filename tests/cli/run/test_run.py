@@ -46,7 +46,7 @@ def test_the_first_command_compares_models_with_people(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     few = ["--models", "noisy-simulation,state-classifier,chance"]
-    command = ["run", "--out", str(tmp_path), *SMALL, *few, "--json"]
+    command = ["run", "--out", str(tmp_path), *SMALL, *few, "--trial-pages", "--json"]
     assert main(command) == 0
     answer = json.loads(capsys.readouterr().out)
     scores = pd.DataFrame(answer["scores"])
@@ -55,6 +55,12 @@ def test_the_first_command_compares_models_with_people(
     assert rows["stimuli"].item() >= 14  # two a scenario; Roll trials with a ledge may be left out
     assert 0.5 < rows["human_accuracy"].item() < 1
     stimuli = pd.read_csv(Path(answer["report"]).parent / "tables" / "stimuli.csv")
+    page = Path(answer["report"]).read_text()
+    assert page.count("<video") >= 8 and "Will the red object touch the yellow one?" in page
+    assert "noisy-simulation and state-classifier: the true state of the scene" in page
+    assert "chance: nothing of the trial" in page
+    pages = list((tmp_path / "report" / "trials").iterdir())
+    assert len(pages) == stimuli["stimulus"].nunique() + 1
     index = pd.read_parquet(tmp_path / "trials" / "index.parquet").set_index("trial")
     for row in stimuli.itertuples():
         assert row.label == index.loc[row.stimulus, "recorded_contact"]

@@ -52,6 +52,8 @@ class Options:
     given, by official names."""
     movies: Path | None = None
     """Dataset whose testing trials' movies the page shows."""
+    trial_pages: bool = False
+    """Also write a page for each stimulus, to trials/ in the folder of the report."""
     zone: Path | None = None
     """Official percentiles of participants; if not given, looked for next to the people."""
     dominoes: Literal["plain", "redyellow", "pooled"] | None = None
@@ -98,7 +100,7 @@ def _given(options: Options) -> dict[str, Any]:
     from physion.report.page.movies import movies_of
 
     same = ("responses", "sessions", "rules", "expected", "attributes", "zone", "dominoes",
-            "exclude")  # fmt: skip
+            "exclude", "trial_pages")  # fmt: skip
     found = {name: getattr(options, name) for name in same if getattr(options, name)}
     draws = {"resamples": options.resamples, "seed": options.seed}
     try:

@@ -46,5 +46,7 @@ class Options:
     """Engine of the trials and of noisy-simulation (physion ls engines); mujoco has no cloth."""
     workers: int = os.cpu_count() or 1
     """Number of processes."""
+    trial_pages: bool = False
+    """Also write a page for each stimulus, to trials/ in the folder of the report."""
     json: bool = False
     """Print one JSON object instead of lines."""

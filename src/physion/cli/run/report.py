@@ -30,6 +30,8 @@ def write_report(
         folder / "report",
         methods=methods(options, dataset.index),
         movies=movies_of(dataset.folder),
+        question="Will the red object touch the yellow one?",
+        trial_pages=options.trial_pages,
     )
     scores = pd.read_csv(page.parent / "tables" / "comparison.csv")
     return page, json.loads(scores.to_json(orient="records"))
