@@ -32,9 +32,17 @@ PICTURES = "images/_img"
 
 
 def neighbouring_file(path: Path, folder: str, name: str) -> Path | None:
-    """Return the file ``name`` in ``folder`` next to the folder of ``path``, or None if absent."""
-    found = path.parent.parent / folder / name
-    return found if found.is_file() and not found.is_symlink() else None
+    """Return the file ``name`` in ``folder`` next to the folder of ``path``, or None if absent.
+
+    Our exports keep configurations apart: ``configurations/Drop/<config>/0000.hdf5`` has its
+    neighbours in ``Drop/<folder>``.
+    """
+    scenario = path.parent.parent
+    for place in (scenario, scenario.parent.parent / scenario.name):
+        found = place / folder / name
+        if found.is_file() and not found.is_symlink():
+            return found
+    return None
 
 
 class SourceMovie:

@@ -92,7 +92,7 @@ def edited(exported: Path, tmp_path: Path) -> Callable[..., Path]:
 
     def make(
         edit: Edit,
-        config: str = "Collide/collide_testing",
+        config: str = "configurations/Collide/collide_testing",
         number: str = "0003",
         ours: bool = False,
     ) -> Path:
@@ -333,7 +333,7 @@ def test_what_was_changed_since_is_read_and_not_what_was_stored(
 
 def test_changed_cloth_is_read(edited: Callable[..., Path]) -> None:
     change = _set("frames/0020/particles/2", (7, 1), 2.0)
-    folder = edited(change, "Drape/drape_testing", "0000", ours=True)
+    folder = edited(change, "configurations/Drape/drape_testing", "0000", ours=True)
     notes = bring(folder).notes[CLOTH]
     assert any(note.startswith("the cloth differs") for note in notes) or any(
         note.startswith("the motion differs") for note in notes
@@ -470,7 +470,7 @@ def test_an_unknown_model_gets_a_prop_of_its_size(edited: Callable[..., Path]) -
     cone = mesh * (0.2, 0.3, 0.4)
     low, high = shape("prop:vase").bounds * body.scale
     np.testing.assert_allclose(high - low, np.ptp(cone, axis=0), atol=2e-2)
-    with h5py.File(folder / "Collide/collide_testing/0003.hdf5") as file:
+    with h5py.File(folder / "configurations/Collide/collide_testing/0003.hdf5") as file:
         pivot = file["frames/0030/objects/positions"][1][[0, 2, 1]]
     turn = rotation_matrix(trial.trajectory.rotations[30, place])
     wanted = pivot + turn @ np.array([*(cone.min(0) + cone.max(0))[:2] / 2, cone[:, 2].min()])
@@ -526,7 +526,7 @@ def test_cloth_particles_of_any_order_and_number(
             del frame["particles/2"]
             frame["particles/2"] = values
 
-    folder = edited(edit, "Drape/drape_testing", "0000")
+    folder = edited(edit, "configurations/Drape/drape_testing", "0000")
     assert not bring(folder).failed
     one = Dataset(dataset).trial(CLOTH).trajectory.cloth_vertices
     other = trial_of(folder, CLOTH).trajectory.cloth_vertices
@@ -640,9 +640,11 @@ def test_broken_fields_are_named(edited: Callable[..., Path], path: str) -> None
 def test_a_cut_file_fails_alone(exported: Path, tmp_path: Path) -> None:
     folder = tmp_path / "mixed"
     shutil.copytree(exported, folder)
-    path = folder / "Collide/collide_testing/0003.hdf5"
+    path = folder / "configurations/Collide/collide_testing/0003.hdf5"
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    (folder / "Collide/collide_testing/0004.hdf5").write_bytes(b"nothing of the kind")
+    (folder / "configurations/Collide/collide_testing/0004.hdf5").write_bytes(
+        b"nothing of the kind"
+    )
     report = bring(folder)
     assert report.made == (CLOTH,) and report.exit_code == 1
     assert set(report.failed) == {RIGID, "collide_testing_0004"}
@@ -653,7 +655,7 @@ def test_a_cut_file_fails_alone(exported: Path, tmp_path: Path) -> None:
 def test_symbolic_links_are_not_followed(exported: Path, tmp_path: Path) -> None:
     folder = tmp_path / "links"
     folder.mkdir()
-    (folder / "0003.hdf5").symlink_to(exported / "Collide/collide_testing/0003.hdf5")
+    (folder / "0003.hdf5").symlink_to(exported / "configurations/Collide/collide_testing/0003.hdf5")
     with pytest.raises(BadInputError, match="no official HDF5 file"):
         bring(folder)
 
@@ -673,7 +675,7 @@ def test_refusals(exported: Path, dataset: Path, tmp_path: Path) -> None:
 def test_a_scenario_that_no_name_tells(exported: Path, tmp_path: Path) -> None:
     folder = tmp_path / "some"
     folder.mkdir()
-    shutil.copy(exported / "Collide/collide_testing/0003.hdf5", folder / "0003.hdf5")
+    shutil.copy(exported / "configurations/Collide/collide_testing/0003.hdf5", folder / "0003.hdf5")
     assert "--scenario" in bring(folder).failed["0003.hdf5"]
     report = import_official(
         folder, tmp_path / "out", scenario="collide", executor=SerialExecutor()
@@ -689,7 +691,7 @@ def core(exported: Path, tmp_path: Path) -> Path:
     """PhysionTest-Core: the export without HDF5 files and configurations."""
     folder = tmp_path / "Physion"
     shutil.copytree(exported, folder)
-    for path in folder.glob("*/*_testing"):
+    for path in folder.glob("configurations/*/*_testing"):
         shutil.rmtree(path)
     return folder
 
@@ -733,7 +735,7 @@ def test_a_configuration_of_movies_has_labels_in_its_metadata(
     exported: Path, tmp_path: Path
 ) -> None:
     folder = tmp_path / "configs/Collide/collide_testing"
-    shutil.copytree(exported / "Collide/collide_testing", folder)
+    shutil.copytree(exported / "configurations/Collide/collide_testing", folder)
     (folder / "0003.hdf5").unlink()
     report = bring(tmp_path / "configs")
     assert report.made == (RIGID,)
@@ -796,9 +798,14 @@ def test_the_verb(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(import_verb, "LocalExecutor", lambda workers: SerialExecutor())
-    options = import_verb.Options(exported / "Drape", tmp_path / "out", workers=1, json=True)
+    options = import_verb.Options(
+        exported / "configurations/Drape", tmp_path / "out", workers=1, json=True
+    )
     assert import_verb.main(options) == 0
     said = json.loads(capsys.readouterr().out)
     assert said["made"] == [CLOTH] and not said["failed"]
-    assert import_verb.main(import_verb.Options(exported / "Drape", tmp_path / "out")) == 0
+    assert (
+        import_verb.main(import_verb.Options(exported / "configurations/Drape", tmp_path / "out"))
+        == 0
+    )
     assert "0 made, 1 kept, 0 failed" in capsys.readouterr().out.replace("\n", " ")

@@ -31,7 +31,10 @@ from physion.trials.trial_file import Trial
 from physion.trials.video import count_frames
 from support.official_hand_made import CLOTH, FRAMES, PART, RIGID, SIZE, TOUCH, make_dataset
 
-CONFIGS = {"collide": "Collide/collide_testing/0003", "drape": "Drape/drape_testing/0000"}
+CONFIGS = {
+    "collide": "configurations/Collide/collide_testing/0003",
+    "drape": "configurations/Drape/drape_testing/0000",
+}
 
 
 @pytest.fixture(scope="module")
@@ -379,7 +382,7 @@ def test_core_folders_hold_both_looks(exported: Path, dataset: Path) -> None:
     assert (core / f"mp4s/{RIGID}_img.mp4").read_bytes() == free
     marked = core / "mp4s-redyellow/collide_testing-redyellow_0003_img.mp4"
     assert marked.read_bytes() == own
-    assert (core / "collide_testing/0003_img.mp4").read_bytes() == own
+    assert (exported / f"{CONFIGS['collide']}_img.mp4").read_bytes() == own
     assert (core / f"maps/{RIGID}_map.png").read_bytes() == paths.map.read_bytes()
     rows = list(csv.reader((exported / "labels.csv").open()))
     assert rows == [
@@ -415,7 +418,7 @@ def test_a_missing_movie_is_rendered_and_a_bad_trial_fails_alone(
     report = export_official(copy, out, executor=SerialExecutor())
     assert report.made == (CLOTH,) and set(report.failed) == {RIGID} and report.exit_code == 1
     assert not (out / "Collide").exists()
-    assert count_frames(out / "Drape/drape_testing/0000_img.mp4") == FRAMES
+    assert count_frames(out / f"{CONFIGS['drape']}_img.mp4") == FRAMES
 
 
 def test_choices_and_refusals(dataset: Path, tmp_path: Path) -> None:

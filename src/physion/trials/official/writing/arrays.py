@@ -11,7 +11,7 @@ from typing import Any
 
 import h5py
 import numpy as np
-from h5py import h5d, h5g, h5p, h5s, h5t
+from h5py import h5d, h5g, h5o, h5p, h5s, h5t
 from numpy.typing import NDArray
 
 _SMALL = 1024
@@ -25,19 +25,29 @@ def new_group(parent: Any, name: str) -> Any:
     return h5g.create(parent, name.encode())
 
 
-def put(group: Any, name: str, values: Any) -> None:
-    """Write an array or a scalar into a group of h5py's lower layer; compress larger arrays."""
+def link(parent: Any, name: str, target: Any) -> None:
+    """Enter an existing array into another group too (hard link).
+
+    Readers find an equal array there. What frames have in common is stored once so.
+    """
+    h5o.link(target, parent, name.encode())
+
+
+def put(group: Any, name: str, values: Any) -> Any:
+    """Write an array or a scalar into a group of h5py's lower layer, and return the new array.
+
+    Larger arrays are compressed.
+    """
     array = np.asarray(values, order="C")
     space = _space(array.shape)
-    if array.ndim and array.nbytes > _SMALL:
-        layout = _compressed(array.shape)
-    else:
-        # The values of small arrays stand in their headers.
-        layout = _compact()
+    large = array.ndim and array.nbytes > _SMALL
+    # The values of small arrays stand in their headers.
+    layout = _compressed(array.shape) if large else _compact()
     kind = _type(array.dtype)
     made = h5d.create(group, name.encode(), kind, space, layout)
     if array.size:
         made.write(h5s.ALL, h5s.ALL, array, mtype=kind)
+    return made
 
 
 def put_bytes(group: Any, name: str, data: bytes) -> None:

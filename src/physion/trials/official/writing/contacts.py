@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from physion.physics.trajectory import ENVIRONMENT
 from physion.trials.official.axes import swap_axes
-from physion.trials.official.writing.arrays import new_group, put
+from physion.trials.official.writing.arrays import link, new_group, put
 from physion.trials.official.writing.objects import OfficialObjects
 
 
@@ -34,6 +34,8 @@ class ContactRecords:
         outside = np.array([row for rows in environment for row in rows], np.int64)
         self._pairs = _pair_arrays(objects, rows, at, states)
         self._environment = _environment_arrays(objects, outside)
+        # One empty array serves all frames without contacts.
+        self._empty: dict[tuple[str, str], Any] = {}
         self._pair_ends = np.cumsum([0, *map(len, pairs)])
         self._environment_ends = np.cumsum([0, *map(len, environment)])
 
@@ -43,9 +45,15 @@ class ContactRecords:
             ("collisions", self._pairs, self._pair_ends),
             ("env_collisions", self._environment, self._environment_ends),
         ):
+            start, end = ends[frame : frame + 2]
             group = new_group(frame_group, name)
             for key, values in arrays.items():
-                put(group, key, values[ends[frame] : ends[frame + 1]])
+                if start == end and (name, key) in self._empty:
+                    link(group, key, self._empty[name, key])
+                    continue
+                made = put(group, key, values[start:end])
+                if start == end:
+                    self._empty[name, key] = made
 
 
 def _rows_by_frame(

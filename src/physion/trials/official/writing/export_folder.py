@@ -1,115 +1,93 @@
-"""Export of a dataset in the folder layouts of the original study, for code written for those.
-
-::
-
-    OUT/labels.csv                          as in PhysionTest-Core: <stimulus>_img, True or False
-    OUT/stimulus_names_and_labels.csv       as published; URLs are paths below OUT, and the
-                                            responses of people ("correct") are empty
-    OUT/Dominoes/maps/<stimulus>_map.png            PhysionTest-Core: the testing split
-    OUT/Dominoes/mp4s/<stimulus>_img.mp4            free colours
-    OUT/Dominoes/mp4s-redyellow/<config>-redyellow_0000_img.mp4
-    OUT/Dominoes/<config>/0000.hdf5         as the generator writes a configuration, every split;
-                         /0000_img.mp4      in the trial's own look
-                         /metadata.json
-                         /trial_stats.json
-
-A trial called ``dominoes_testing_0007`` is number 0007 of the configuration ``dominoes_testing``.
-Scenario folders are capitalised, as in the published archives.
-"""
+"""Export of a dataset in the folder layouts that published code reads (see `layouts`)."""
 
 from __future__ import annotations
 
-import csv
-import io
+import dataclasses
+import hashlib
 import json
-from collections import defaultdict
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from physion.atomic import folder_for_writing, remove_leftovers, write_atomic
 from physion.compute.executor import Executor
 from physion.compute.progress import Progress
 from physion.compute.run_tasks import RunReport, run_tasks
-from physion.errors import BadInputError
-from physion.stimulus_names import FOLDERS
+from physion.errors import BadInputError, UnknownNameError
 from physion.trials.dataset import Dataset
 from physion.trials.files import encode_png
 from physion.trials.layout import TrialPaths
-from physion.trials.official.names import TRIAL_FILE, redyellow_name, split_name
+from physion.trials.official.names import TRIAL_FILE
 from physion.trials.official.read_hdf5 import OfficialFile
-from physion.trials.official.writing.metadata import trial_stats
+from physion.trials.official.writing.layouts import LAYOUTS, Content, Files
 from physion.trials.trial_file import Metadata, Trial
-from physion.trials.video import MovieEncoder, count_frames
+from physion.trials.video import MovieEncoder
 
-CORE_SPLIT = "testing"
-"""Split that PhysionTest-Core consists of."""
 _SAME = ("digest", "look", "width", "height", "playback_rate", "package")
 """Metadata that an exported file must share with its trial to be kept."""
+_IMAGE = "frames/0000/images/_img"
 
 
 @dataclass(frozen=True)
 class ExportJob:
-    """One trial to export: paths of its files, and the folder to write into."""
+    """One trial to export.
+
+    Parameters
+    ----------
+    paths
+        Files of the trial.
+    out, files
+        Folder to write into, and contents by path below it; the last is written last.
+    sha256
+        SHA-256 in the index of the trial's own movie and of that in free colours, by column.
+    images
+        Whether HDF5 files get pictures.
+    """
 
     paths: TrialPaths
     out: Path
+    files: Files
+    sha256: Mapping[str, str | None]
+    images: bool = True
 
     @property
-    def stimulus(self) -> str:
-        """Official name of the trial: configuration and number."""
-        return "_".join(split_name(self.paths.trial))
-
-    @property
-    def folder(self) -> Path:
-        """Folder of the scenario."""
-        return self.out / FOLDERS.get(self.paths.scenario, self.paths.scenario)
-
-    @property
-    def hdf5(self) -> Path:
-        """Path of the HDF5 file, in the folder of the configuration."""
-        config, number = split_name(self.paths.trial)
-        return self.folder / config / f"{number}.hdf5"
-
-    def movies(self) -> dict[Path, str | None]:
-        """Return the looks of the movies to write by path; None is the trial's own look."""
-        found: dict[Path, str | None] = {self.hdf5.with_name(f"{self.hdf5.stem}_img.mp4"): None}
-        if self.paths.split == CORE_SPLIT:
-            found[self.folder / "mp4s" / f"{self.stimulus}_img.mp4"] = "free"
-            redyellow = f"{redyellow_name(self.stimulus)}_img.mp4"
-            found[self.folder / "mp4s-redyellow" / redyellow] = "redyellow"
-        return found
-
-    def map(self) -> Path | None:
-        """Return the path of the map; None if the trial is not in `CORE_SPLIT`."""
-        if self.paths.split != CORE_SPLIT:
-            return None
-        return self.folder / "maps" / f"{self.stimulus}_map.png"
+    def last(self) -> tuple[Path, Content]:
+        """Path and content of the file that is written last."""
+        name, content = list(self.files.items())[-1]
+        return self.out / name, content
 
 
 def export_official(
     dataset: Path,
     out: Path,
     *,
+    layout: str = "official",
     split: str | None = None,
     scenario: str | None = None,
+    images: bool = True,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> RunReport:
-    """Export trials of a dataset in the official layouts, as shown at the top of the module.
+    """Export trials of a dataset in a layout of published code.
 
-    Exported trials with the same motion and look are kept. Lists and statistics are then written
-    for everything in ``out``. An error in one trial is reported and does not stop the others.
+    Exported trials with the same motion and look are kept. Lists are then written for everything
+    in ``out``. An error in one trial is reported and does not stop the others.
 
     Parameters
     ----------
     dataset, out
         Folder of the dataset, and folder to write into, outside the dataset.
+    layout
+        One of `LAYOUTS`. Trials that have no place in it are named in the notes.
     split, scenario
         Trials to export; by default all.
+    images
+        Whether HDF5 files get pictures; without, they are made 20 times as fast.
     executor
         Where to run; by default one process per core.
     progress
@@ -120,14 +98,25 @@ def export_official(
     BadInputError
         If ``dataset`` is not a dataset, it has no such trials, two trials would have the same
         name, or ``out`` cannot be written.
+    UnknownNameError
+        For an unknown layout.
     """
+    if layout not in LAYOUTS:
+        raise UnknownNameError("layout", layout, LAYOUTS)
     source = Dataset(dataset)
     names = source.trials(split, scenario)
     if not names:
         raise BadInputError(
             f"{dataset} has no trial of split {split or 'any'!r} and scenario {scenario or 'any'!r}"
         )
-    jobs = {name: ExportJob(source.paths(name), out) for name in names}
+    rows = source.index.set_index("trial")
+    planned = {
+        name: _job(source.paths(name), rows.loc[name], out, layout, images) for name in names
+    }
+    jobs = {name: job for name, job in planned.items() if job.files}
+    notes = _without_place(planned, layout)
+    if not jobs:
+        raise BadInputError(f"{dataset}: {notes[layout][0]}")
     _check(jobs, dataset, out)
     with folder_for_writing(out):
         remove_leftovers(out)
@@ -141,46 +130,94 @@ def export_official(
             executor=executor,
             progress=progress,
         )
-        index, broken = _write_lists(out)
+        index, broken = LAYOUTS[layout].write_lists(out)
     in_order = tuple(name for name in jobs if name in kept)
-    return RunReport(tuple(made), in_order, {**failed, **broken}, index)
+    return RunReport(tuple(made), in_order, {**failed, **broken}, index, notes)
+
+
+def _job(paths: TrialPaths, row: pd.Series[Any], out: Path, layout: str, images: bool) -> ExportJob:
+    columns = {name: row[f"{name}_sha256"] for name in ("movie", "free_movie")}
+    sha256 = {name: None if pd.isna(value) else str(value) for name, value in columns.items()}
+    return ExportJob(paths, out, LAYOUTS[layout].files(paths), sha256, images)
+
+
+def _without_place(planned: Mapping[str, ExportJob], layout: str) -> dict[str, tuple[str, ...]]:
+    """Return a note on the trials that the layout has no files for, by name of the layout."""
+    left = Counter(
+        f"{job.paths.split} {job.paths.scenario}" for job in planned.values() if not job.files
+    )
+    if not left:
+        return {}
+    kinds = ", ".join(f"{count} {kind}" for kind, count in left.items())
+    return {layout: (f"{left.total()} trials have no place in this layout ({kinds})",)}
 
 
 def export_trial(job: ExportJob) -> str:
-    """Write all files of one trial, the HDF5 file last; return the name of its stimulus."""
-    # Imported late: loading engine and renderer takes time.
-    from physion.rendering.renderer import role_map
-    from physion.trials.official.writing.hdf5 import official_file
-
+    """Write all files of one trial; return its name."""
     trial = Trial.open(job.paths.trial_file)
-    if not np.isfinite(trial.trajectory.positions).all():
+    if not np.isfinite(trial.trajectory.positions).all() and "state" in _kinds(job):
         raise BadInputError(
             f"the motion of trial {job.paths.trial!r} is unknown (it was imported from a movie "
             "alone), and official files require it"
         )
-    data, _ = official_file(trial)
-    map_path = job.map()
-    for path in (*job.movies(), job.hdf5, *([map_path] if map_path else [])):
+    made = {name: _content(job, trial, content) for name, content in job.files.items()}
+    for name, data in made.items():
+        path = job.out / name
         path.parent.mkdir(parents=True, exist_ok=True)
-    for path, look in job.movies().items():
-        write_atomic(path, _movie(job.paths, trial, look or trial.metadata.look))
-    if map_path is not None:
-        write_atomic(map_path, encode_png(role_map(trial.ids, trial.scene)))
-    write_atomic(job.hdf5, data)
-    return job.stimulus
+        write_atomic(path, data)
+    return job.paths.trial
 
 
-def _movie(paths: TrialPaths, trial: Trial, look: str) -> bytes:
-    """Return the movie of the trial in a look: a copy if there is one, else rendered."""
+def _kinds(job: ExportJob) -> set[str]:
+    return {content.kind for content in job.files.values()}
+
+
+def _content(job: ExportJob, trial: Trial, content: Content) -> bytes:
+    """Return the bytes of one file."""
+    # Imported late: loading engine and renderer takes time.
+    from physion.rendering.renderer import role_map
+    from physion.trials.official.writing.hdf5 import official_file
+
+    if content.kind == "state":
+        return official_file(trial, look=content.look, images=job.images)[0]
+    if content.kind == "map":
+        return encode_png(role_map(trial.ids, trial.scene))
+    if content.kind == "record":
+        return json.dumps(_record(trial.metadata, content) | _label(trial)).encode()
+    return _movie(job, trial, content.look or trial.metadata.look)
+
+
+def _record(meta: Metadata, content: Content) -> dict[str, Any]:
+    values = dataclasses.asdict(meta) | {"look": content.look or meta.look}
+    return {name: values[name] for name in _SAME}
+
+
+def _label(trial: Trial) -> dict[str, Any]:
+    labels = trial.labels
+    first = labels.first_frame if labels.contact else None
+    frame = trial.metadata.frames // 2 if first is None else first
+    return {"label": labels.contact, "contact_frame_label": frame}
+
+
+def _movie(job: ExportJob, trial: Trial, look: str) -> bytes:
+    """Return the movie of the trial in a look: that of the index if there is one, else rendered."""
     meta = trial.metadata
-    own = paths.movie if look == meta.look else paths.free_movie
-    if (meta.movies if look == meta.look else look == "free" and meta.free_movies) and (
-        count_frames(own) == meta.frames
-    ):
-        return own.read_bytes()
+    column = "movie" if look == meta.look else "free_movie" if look == "free" else None
+    if column is not None and (sha256 := job.sha256[column]) is not None:
+        path: Path = getattr(job.paths, column)
+        data = path.read_bytes() if path.is_file() else b""
+        if hashlib.sha256(data).hexdigest() != sha256:
+            raise BadInputError(f"{path} is not the file of the index; run `physion verify` on it")
+        return data
+    if not np.isfinite(trial.trajectory.positions).all():
+        raise BadInputError(
+            f"trial {job.paths.trial!r} has no movie in the look {look!r}, and its motion is "
+            "unknown, so none can be rendered"
+        )
     encoder = MovieEncoder(meta.width, meta.height, meta.frames, rate=meta.playback_rate)
+    renderer = trial.renderer(look=look)
     for frame in range(meta.frames):
-        color = trial.render(frame, look=look).color
+        color = renderer.render(frame).color
         assert color is not None
         encoder.add(color)
     return encoder.finish()
@@ -193,88 +230,30 @@ def _check(jobs: Mapping[str, ExportJob], dataset: Path, out: Path) -> None:
     seen: dict[str, str] = {}
     for name, job in jobs.items():
         # Some file systems do not distinguish upper and lower case.
-        other = seen.setdefault(str(job.hdf5).lower(), name)
+        other = seen.setdefault(str(job.last[0]).lower(), name)
         if other != name:
             raise BadInputError(
-                f"trials {other!r} and {name!r} would both be {job.hdf5}; export them by --split "
-                "or --scenario into different folders"
+                f"trials {other!r} and {name!r} would both be {job.last[0]}; export them by "
+                "--split or --scenario into different folders"
             )
 
 
 def _is_done(job: ExportJob) -> bool:
-    """Return whether all files of the trial exist and its HDF5 file has its motion and look."""
-    map_path = job.map()
-    files = [job.hdf5, *job.movies(), *([map_path] if map_path else [])]
-    if not all(path.is_file() for path in files):
+    """Return whether all files of the trial exist and the last one has its motion and look."""
+    if not all((job.out / name).is_file() for name in job.files):
         return False
+    path, content = job.last
     try:
-        wanted: Metadata = Trial.open(job.paths.trial_file).metadata
-        with OfficialFile.open(job.hdf5) as file:
-            found = json.loads(file.text("physion/metadata")) if file.has(TRIAL_FILE) else None
-    except (BadInputError, ValueError):
+        wanted = _record(Trial.open(job.paths.trial_file).metadata, content)
+        found = json.loads(path.read_bytes()) if content.kind == "record" else _stored(path, job)
+    except (BadInputError, OSError, ValueError):
         return False
-    return isinstance(found, dict) and all(
-        found.get(name) == getattr(wanted, name) for name in _SAME
-    )
+    return isinstance(found, dict) and all(found.get(name) == wanted[name] for name in _SAME)
 
 
-def _write_lists(out: Path) -> tuple[Path, dict[str, str]]:
-    """Write metadata.json, trial_stats.json and the lists of all trials in ``out``.
-
-    Returns the path of ``labels.csv``, and errors by path of unreadable files.
-    """
-    by_folder: dict[Path, list[dict[str, Any]]] = defaultdict(list)
-    failed = {}
-    for path in _files(out):
-        try:
-            with OfficialFile.open(path) as file:
-                by_folder[path.parent].append(json.loads(file.text("physion/record")))
-        except (BadInputError, ValueError) as error:
-            failed[str(path.relative_to(out))] = f"{error}; delete it to make it again"
-    rows = []
-    for folder, records in by_folder.items():
-        write_atomic(folder / "metadata.json", _json(records))
-        write_atomic(folder / "trial_stats.json", _json(trial_stats(records)))
-        rows += [row for record in records if (row := _list_row(out, folder, record))]
-    labels = [("", "ground truth outcome")]
-    labels += [(f"{row['stim_ID']}_img", row["label"]) for row in rows]
-    write_atomic(out / "labels.csv", _csv(labels))
-    columns = ("stim_ID", "scenario", "stim_url", "map_url", "hdf5_url", "correct", "label")
-    table = [columns, *(tuple(row[column] for column in columns) for row in rows)]
-    write_atomic(out / "stimulus_names_and_labels.csv", _csv(table))
-    return out / "labels.csv", failed
-
-
-def _files(out: Path) -> list[Path]:
-    return sorted(out.glob("*/*/[0-9][0-9][0-9][0-9].hdf5"))
-
-
-def _list_row(out: Path, folder: Path, record: Mapping[str, Any]) -> dict[str, str] | None:
-    """Return the row of a trial in the lists of PhysionTest-Core; None for other trials."""
-    stimulus = str(record["stimulus_name"])
-    movie = folder.parent / "mp4s" / f"{stimulus}_img.mp4"
-    if not movie.is_file():
-        return None
-    files = {
-        "stim_url": movie,
-        "map_url": folder.parent / "maps" / f"{stimulus}_map.png",
-        "hdf5_url": folder / f"{split_name(stimulus)[1]}.hdf5",
-    }
-    titles = {title: name for name, title in FOLDERS.items()}
-    return {
-        "stim_ID": stimulus,
-        "scenario": titles.get(folder.parent.name, folder.parent.name),
-        **{column: path.relative_to(out).as_posix() for column, path in files.items()},
-        "correct": "",
-        "label": str(bool(record["does_target_contact_zone"])),
-    }
-
-
-def _json(value: Any) -> bytes:
-    return (json.dumps(value, indent=4) + "\n").encode()
-
-
-def _csv(rows: list[Any]) -> bytes:
-    buffer = io.StringIO()
-    csv.writer(buffer, lineterminator="\n").writerows(rows)
-    return buffer.getvalue().encode()
+def _stored(path: Path, job: ExportJob) -> Any:
+    """Return the metadata in an exported HDF5 file; None if it lacks wanted pictures."""
+    with OfficialFile.open(path) as file:
+        if not file.has(TRIAL_FILE) or (job.images and not file.has(_IMAGE)):
+            return None
+        return json.loads(file.text("physion/metadata"))

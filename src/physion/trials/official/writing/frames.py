@@ -23,7 +23,7 @@ from physion.trials.official.axes import (
     to_official_rotation,
 )
 from physion.trials.official.names import CLOTH_DISTANCE, segmentation_colors
-from physion.trials.official.writing.arrays import new_group, put
+from physion.trials.official.writing.arrays import link, new_group, put
 from physion.trials.official.writing.contacts import ContactRecords
 from physion.trials.official.writing.objects import OfficialObjects
 from physion.trials.official.writing.particles import ParticleArrays
@@ -52,6 +52,7 @@ class FrameWriter:
         )
         self._view = axes(objects.scene.camera)
         camera, projection = to_official_camera(objects.scene.camera, width, height)
+        self._written: dict[str, Any] = {}
         self._matrices = {
             "camera_matrix": camera.astype(np.float32).ravel(),
             "projection_matrix": projection.astype(np.float32).ravel(),
@@ -71,7 +72,11 @@ class FrameWriter:
         self._contacts.write(group, frame)
         matrices = new_group(group, "camera_matrices")
         for name, matrix in self._matrices.items():
-            put(matrices, name, matrix)
+            if name in self._written:
+                # The camera stands still: one array serves all frames.
+                link(matrices, name, self._written[name])
+            else:
+                self._written[name] = put(matrices, name, matrix)
         labels = new_group(group, "labels")
         for name, values in self.labels.items():
             put(labels, name, values[frame])

@@ -51,7 +51,8 @@ def official_file(
         Colours of objects and pictures; by default the trial's own look.
     images
         Whether to write pictures and flow. The file is built in memory and has about 0.3 MB per
-        frame at 256 x 256 pixels with them, and 15 KB without.
+        frame at 256 x 256 pixels with them, and 10 KB without. Without them nothing is rendered,
+        and ``final_target_mask_displacement`` of the record is None.
     """
     meta, scene = trial.metadata, trial.shown(look)
     objects = OfficialObjects(scene, trial.trajectory)
@@ -66,10 +67,10 @@ def official_file(
         else:
             for frame in range(meta.frames):
                 writer.add(frames, frame, None)
-            last = trial.render(meta.frames - 1, ("ids",)).ids
-        assert last is not None, "ids were asked for"
-        masks = (objects.official_ids(trial.ids), objects.official_ids(last))
-        record = {**trial_record(objects, writer.labels, masks, static), "split": meta.split}
+            last = None
+        first = objects.official_ids(trial.ids)
+        last = None if last is None else objects.official_ids(last)
+        record = {**trial_record(objects, writer.labels, first, last, static), "split": meta.split}
         texts = {"scene": scene.to_json(), "record": json.dumps(record)}
         texts |= {"labels": json.dumps(dataclasses.asdict(trial.labels))}
         texts |= {"metadata": json.dumps(dataclasses.asdict(meta) | {"look": look or meta.look})}

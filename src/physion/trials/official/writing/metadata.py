@@ -26,7 +26,8 @@ occluded."""
 def trial_record(
     objects: OfficialObjects,
     labels: Labels,
-    masks: tuple[NDArray[np.int16], NDArray[np.int16]],
+    first: NDArray[np.int16],
+    last: NDArray[np.int16] | None,
     static: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Return the record of one trial.
@@ -35,14 +36,14 @@ def trial_record(
     ----------
     objects, labels
         Objects of the trial, and the labels of all frames (F, ...) by name.
-    masks
-        Official object ids by pixel (H, W), 0 the room, of the first and the last frame.
+    first, last
+        Official object ids by pixel (H, W), 0 the room, of the first and the last frame; the last
+        may be None, if nothing was rendered.
     static
         Scalars of the static group.
     """
     scene, frames = objects.scene, len(objects.trajectory)
     ids, roles = objects.ids, scene.roles
-    first, last = masks
     target = ids[roles.agent]
     moves = _any(labels, "target_has_moved")
     contact = _any(labels, "target_contacting_zone")
@@ -60,13 +61,13 @@ def trial_record(
         "first_target_contact_zone_frame": _first(labels, "target_contacting_zone"),
         "first_target_hit_ground_frame": _first(labels, "target_on_ground"),
         "final_target_displacement": _displacement(labels),
-        "final_target_mask_displacement": _shift(first == target, last == target),
+        "final_target_mask_displacement": None
+        if last is None
+        else _shift(first == target, last == target),
         "target_visible_area": _area(first == target),
         "zone_visible_area": _area(first == ids[roles.patient]),
         "probe_visible_area": _area(first == ids[roles.probe]) if roles.probe else None,
-        "is_any_object_fully_occluded": any(
-            _area(first == id_) < HIDDEN for id_ in ids.values()
-        ),
+        "is_any_object_fully_occluded": any(_area(first == id_) < HIDDEN for id_ in ids.values()),
         "room": ROOMS.get(scene.room, scene.room),
         "trial_seed": static["trial_seed"],
         "trial_num": static["trial_num"],

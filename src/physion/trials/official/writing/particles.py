@@ -15,7 +15,7 @@ import numpy as np
 from physion.physics.particles import particles_over_time
 from physion.scenes.scene import FRAME_TIME
 from physion.trials.official.axes import swap_axes
-from physion.trials.official.writing.arrays import new_group, put
+from physion.trials.official.writing.arrays import link, new_group, put
 from physion.trials.official.writing.objects import OfficialObjects
 
 
@@ -27,6 +27,7 @@ class ParticleArrays:
         bodies = tuple(replace(body, scenery=False) for body in scene.bodies)
         cloud = particles_over_time(replace(scene, bodies=bodies), objects.trajectory)
         self._positions, self._velocities = {}, {}
+        self._written: dict[tuple[str, str], Any] = {}
         for index, thing in zip(objects.order, objects.things, strict=True):
             mask = cloud.things == index
             now = swap_axes(cloud.positions[:, mask])
@@ -40,8 +41,12 @@ class ParticleArrays:
         """Write both groups of a frame into its group, of h5py's lower layer.
 
         ``particles/<id>`` is (P, 4): position in metres, inverse mass; ``velocities/<id>`` (P, 3).
+        What does not change is stored once; frames must be written in order.
         """
         for name, arrays in (("particles", self._positions), ("velocities", self._velocities)):
             group = new_group(frame_group, name)
             for id_, values in arrays.items():
-                put(group, id_, values[frame])
+                if frame and np.array_equal(values[frame], values[frame - 1]):
+                    link(group, id_, self._written[name, id_])
+                else:
+                    self._written[name, id_] = put(group, id_, values[frame])
