@@ -12,11 +12,8 @@ import pytest
 from sklearn.metrics import cohen_kappa_score
 
 from physion.analysis import Bootstrap, compare_scores, read_predictions
-from physion.analysis.models.leaderboard import (
-    columns,
-    leaderboard,
-    sort_leaderboard,
-)
+from physion.analysis.models.leaderboard import leaderboard
+from physion.analysis.models.leaderboard_order import columns, sort_leaderboard
 from physion.analysis.models.leaderboard_rows import sidecar_versions
 from physion.analysis.people.exclusions import ExclusionRules
 from physion.analysis.people.participants import Responses, clean

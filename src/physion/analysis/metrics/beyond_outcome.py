@@ -103,6 +103,7 @@ def _within_of_two_people(sample: Sample) -> Array:
     needs="people",
     in_scores=True,
     in_measures=True,
+    on_leaderboard=True,
     two_people=_within_of_two_people,
 )
 def kappa_within_outcomes(sample: Sample) -> Array:

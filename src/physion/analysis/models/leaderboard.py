@@ -3,7 +3,7 @@
 Each file is compared separately, on the stimuli that people saw and it predicts, so that files made
 on different sets of trials can be in one table; the column ``stimuli`` counts them. A file that
 cannot be compared is listed in `Leaderboard.refused` with the reason. A model that lacks stimuli
-ranks after those that lack none, whatever its scores.
+ranks after those that lack none, whatever its scores. Anchors of the files follow the models.
 """
 
 from __future__ import annotations
@@ -11,14 +11,22 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pandas as pd
 
-from physion.analysis.metrics import leaderboard_metrics
-from physion.analysis.models.comparison import NOT_PREDICTED, compare_scores
-from physion.analysis.models.leaderboard_rows import read_submission, score_models
+from physion.analysis.models.comparison import compare_scores
+from physion.analysis.models.leaderboard_order import (
+    columns,
+    required_stimuli,
+    sort_leaderboard,
+    with_required,
+)
+from physion.analysis.models.leaderboard_rows import (
+    read_submission,
+    score_anchors,
+    score_models,
+)
+from physion.analysis.models.observed_contact import observed_contacts
 from physion.analysis.people.exclusions import (
     PREREGISTERED,
     ExclusionRules,
@@ -32,37 +40,15 @@ from physion.analysis.tables.stimuli import MEAN, POOLED
 from physion.errors import BadInputError, UnknownNameError
 from physion.stimulus_names import SCENARIOS
 
-FIRST_COLUMNS = (
-    "rank",
-    "model",
-    "readout",
-    "training",
-    "file",
-    "scenarios",
-    "of_scenarios",
-    "stimuli",
-    "of_stimuli",
-)
-LAST_COLUMNS = ("versions", "agent", "reason")
-
-
-def columns() -> list[str]:
-    """Return the columns of the table: each metric with ``_low`` and ``_high`` between the names.
-
-        ``scenarios`` and ``stimuli`` count what the scores rest on, out of
-    ``of_scenarios`` and ``of_stimuli``: what people saw or, without people, what all files name.
-    ``agent`` is the name by which the file's own rows are told apart; ``reason`` says what a score
-    rests on where that is not everything, and why a score is NaN.
-    """
-    scores = [f"{one.name}{end}" for one in leaderboard_metrics() for end in ("", "_low", "_high")]
-    return [*FIRST_COLUMNS, *scores, *LAST_COLUMNS]
-
 
 @dataclass(frozen=True)
 class Leaderboard:
     """Ranked table of models.
 
-    - ``table``: see `columns`.
+    - ``table``: the models of the files, and the anchors among them; see
+      `leaderboard_order.columns`.
+    - ``anchors``: those that are computed on the stimuli of all files (`anchors.COMPUTED`), with
+      the same columns; no file contains them. Empty without people.
     - ``dropped``: what was left out of each file: ``file``, ``agent``, ``scenario``, ``reason``,
       ``stimuli``.
     - ``refused``: files that could not be compared: ``file``, ``reason``.
@@ -72,6 +58,7 @@ class Leaderboard:
     """
 
     table: pd.DataFrame
+    anchors: pd.DataFrame
     dropped: pd.DataFrame
     refused: pd.DataFrame
     dropped_answers: pd.DataFrame | None
@@ -89,9 +76,10 @@ def leaderboard(
     scenario: str = MEAN,
     exclude: Iterable[str] = (),
     exclude_ledge: bool = True,
+    later: bool = False,
     bootstrap: Bootstrap | None = None,
 ) -> Leaderboard:
-    """Score every model of every file, best accuracy first; see `sort_leaderboard`.
+    """Score every model of every file, best accuracy first (`sort_leaderboard`).
 
     Parameters
     ----------
@@ -106,30 +94,33 @@ def leaderboard(
         As in `exclusions.flag_sessions`.
     scenario
         One of the eight, *mean* (with equal weights) or *pooled*.
+    later
+        Whether to exclude the trials whose contact was observed, or not known to be observed or
+        not (`observed_contact`).
     bootstrap
         Draws for the intervals.
 
     Raises
     ------
     BadInputError
-        If no file is given or none can be compared, no session is left, or the outcomes of the
-        responses contradict ``labels``.
+        If no file is given or none can be compared, no session is left, the outcomes of the
+        responses contradict ``labels``, or ``later`` is asked of files that do not contain it.
     """
     if not files:
         raise BadInputError("no file of predictions was given")
     if scenario not in (*SCENARIOS, MEAN, POOLED):
         raise UnknownNameError("scenario", scenario, (*SCENARIOS, MEAN, POOLED))
     draws = bootstrap or Bootstrap()
-    unwanted = tuple(exclude)
     kept, flagging = _unflagged(responses, rules, expected, labels)
     test = None if kept is None else kept.test
     people, outcomes = _people(humans, labels, test)
     answers = {} if test is None else {each.scenario: each for each in all_answers(test)}
-    tables, dropped, refused, answered = [], [], [], []
+    read, refused = _read(files)
+    unwanted = (*exclude, *(_not_later(read) if later else ()))
+    tables, dropped, answered = [], [], []
     settings: Mapping[str, str] = {}
-    for path in files:
+    for path, (rows, versions) in read.items():
         try:
-            rows, versions = read_submission(path)
             comparison = compare_scores(
                 rows,
                 people,
@@ -140,27 +131,56 @@ def leaderboard(
             )
             scored = score_models(comparison, rows, answers, scenario, draws)
         except BadInputError as error:
-            refused.append({"file": str(path), "reason": str(error)})
+            refused[path] = str(error)
             continue
         tables.append(scored.assign(file=str(path), versions=scored["agent"].map(versions)))
         dropped.append(comparison.dropped.assign(file=str(path)))
-        answered.append(
-            comparison.stimuli[["agent", "scenario", "stimulus"]].assign(file=str(path))
-        )
+        answered.append(comparison.stimuli.assign(file=str(path)))
         settings = comparison.settings
     if not tables:
-        raise BadInputError(f"no file can be compared: {refused[0]['reason']}")
-    left_out = pd.concat(dropped, ignore_index=True)
-    required = _required_stimuli(pd.concat(answered, ignore_index=True), left_out)
-    table = _with_required(pd.concat(tables, ignore_index=True), required, scenario)
+        raise BadInputError(f"no file can be compared: {next(refused[path] for path in files)}")
+    left_out, stimuli = pd.concat(dropped, ignore_index=True), pd.concat(answered)
+    anchors = score_anchors(stimuli, answers, scenario, draws)
+    required = required_stimuli(stimuli, left_out)
+    table = with_required(pd.concat(tables, ignore_index=True), required, scenario)
     order = ["file", "agent", "scenario", "reason", "stimuli"]
     return Leaderboard(
         sort_leaderboard(table.reindex(columns=columns())),
+        with_required(anchors, required, scenario).reindex(columns=columns()),
         left_out[order],
-        pd.DataFrame(refused, columns=["file", "reason"]),
+        pd.DataFrame(
+            [(str(path), refused[path]) for path in files if path in refused],
+            columns=["file", "reason"],
+        ),
         None if kept is None else kept.dropped,
         {**settings, **_describe_scores(scenario, test is not None), **flagging},
     )
+
+
+def _read(
+    files: Sequence[Path],
+) -> tuple[dict[Path, tuple[pd.DataFrame, dict[str, str]]], dict[Path, str]]:
+    """Return the checked rows and versions of each file, and why others were refused."""
+    read, refused = {}, {}
+    for path in files:
+        try:
+            read[path] = read_submission(path)
+        except BadInputError as error:
+            refused[path] = str(error)
+    return read, refused
+
+
+def _not_later(read: Mapping[Path, tuple[pd.DataFrame, dict[str, str]]]) -> list[str]:
+    """Return the stimuli whose contact was observed, or not known to be observed or not."""
+    if not read:
+        return []
+    rows = pd.concat([rows for rows, _ in read.values()], ignore_index=True)
+    known = observed_contacts(rows)
+    if known.empty:
+        raise BadInputError(
+            "which contacts were observed is not known: no file has a column Observed Contact"
+        )
+    return sorted(set(rows["stimulus"]) - set(known.index[~known]))
 
 
 def _unflagged(
@@ -180,66 +200,6 @@ def _unflagged(
         f"“{rules.name}” and left out"
     )
     return without_flagged(responses, flags), {"Exclusions": words}
-
-
-def _required_stimuli(answered: pd.DataFrame, dropped: pd.DataFrame) -> pd.Series:
-    """Return the number of stimuli of a complete submission, by scenario.
-
-    With people, what they saw: what a model predicted of it and what it lacks. Without people, what
-    all files contain together.
-    """
-    keys = ["file", "agent", "scenario"]
-    lacking = dropped[dropped["reason"] == NOT_PREDICTED].groupby(keys)["stimuli"].sum()
-    seen = answered.groupby(keys)["stimulus"].nunique().add(lacking, fill_value=0)
-    named = answered.groupby("scenario")["stimulus"].nunique()
-    most = pd.concat([seen.groupby("scenario").max(), named], axis=1).max(axis=1)
-    return most.astype(int)
-
-
-def _with_required(table: pd.DataFrame, required: pd.Series, scenario: str) -> pd.DataFrame:
-    """Add ``of_scenarios`` and ``of_stimuli``, and a reason if a model lacks some of them."""
-    whole = required if scenario in (MEAN, POOLED) else required[[scenario]]
-    table = table.assign(of_scenarios=len(whole), of_stimuli=int(whole.sum()))
-    for index, row in table.iterrows():
-        if not _is_partial(row):
-            continue
-        over = "mean over" if scenario == MEAN else "over"
-        why = f"{over} {row['scenarios']} of {len(whole)} scenarios"
-        if row["scenarios"] == len(whole):
-            why = f"over {row['stimuli']} of {row['of_stimuli']} stimuli"
-        table.loc[index, "reason"] = "; ".join(filter(None, [why, row["reason"]]))
-    return table
-
-
-def _is_partial(rows: Any) -> Any:
-    """Return whether a row, or each row of a table, is about fewer stimuli than there are."""
-    return rows["stimuli"] < rows["of_stimuli"]
-
-
-def sort_leaderboard(
-    table: pd.DataFrame, by: str = "accuracy", ascending: bool | None = None
-) -> pd.DataFrame:
-    """Sort the table by any column; ``rank`` follows that order, NaN last, ties by model and file.
-
-    By a metric, models that lack stimuli come after those that lack none, since means over other
-    scenarios are not comparable. ``ascending`` None puts the best first: large scores, small RMSD,
-    text alphabetically. Raises `UnknownNameError` with the closest columns.
-    """
-    if by not in table.columns or by == "rank":
-        raise UnknownNameError("column", by, [name for name in table.columns if name != "rank"])
-    scores = {metric.name: metric for metric in leaderboard_metrics()}
-    metric = scores.get(by.removesuffix("_low").removesuffix("_high"))
-    if ascending is None:
-        numeric = pd.api.types.is_numeric_dtype(table[by])
-        ascending = not numeric or (metric is not None and metric.better == "lower")
-    ties = [name for name in ("model", "readout", "training", "file", "agent") if name != by]
-    order = table.sort_values(ties, kind="stable").sort_values(
-        by, ascending=ascending, kind="stable", na_position="last"
-    )
-    if metric is not None:
-        after = _is_partial(order).astype(int).mask(order[by].isna(), 2)
-        order = order.loc[after.sort_values(kind="stable").index]
-    return order.assign(rank=np.arange(1, len(order) + 1)).reset_index(drop=True)
 
 
 def _people(

@@ -10,6 +10,12 @@ import numpy as np
 import pandas as pd
 
 from physion.analysis.metrics import Metric, leaderboard_metrics
+from physion.analysis.models.anchors import (
+    OUTCOME,
+    TWO_PEOPLE,
+    anchor_scores,
+    anchor_stimuli,
+)
 from physion.analysis.models.comparison import Comparison
 from physion.analysis.models.model_people import models_of, sample_of_models
 from physion.analysis.people.answers import ScenarioAnswers
@@ -64,8 +70,42 @@ def score_models(
     scenario: str,
     draws: Bootstrap,
 ) -> pd.DataFrame:
-    """Return one row for each model of one file."""
-    chosen = comparison.scores[comparison.scores["scenario"] == scenario]
+    """Return one row for each model of one file, whose checked rows are ``rows``."""
+    table = _scored(comparison.scores, comparison.stimuli, answers, scenario, draws)
+    training = rows.drop_duplicates("agent").set_index("agent")["Dynamics Training Dataset"]
+    return table.assign(training=table["agent"].map(training))
+
+
+def score_anchors(
+    stimuli: pd.DataFrame,
+    answers: Mapping[str, ScenarioAnswers],
+    scenario: str,
+    draws: Bootstrap,
+) -> pd.DataFrame:
+    """Return one row for each anchor of `anchors.COMPUTED`; empty without people.
+
+    ``stimuli``: `Comparison.stimuli` of all files; the anchors answer each stimulus once.
+    """
+    scores, given = anchor_scores(stimuli, draws), anchor_stimuli(stimuli)
+    if scores.empty:
+        return scores
+    # One person with another is about the same stimuli as the recorded outcome.
+    seen = given[given["agent"] == OUTCOME].assign(agent=TWO_PEOPLE)
+    rows = pd.concat([given, seen], ignore_index=True)
+    return _scored(scores, rows, answers, scenario, draws).assign(
+        rank=pd.Series(dtype="Int64"), training="", file="", versions=""
+    )
+
+
+def _scored(
+    scores: pd.DataFrame,
+    stimuli: pd.DataFrame,
+    answers: Mapping[str, ScenarioAnswers],
+    scenario: str,
+    draws: Bootstrap,
+) -> pd.DataFrame:
+    """Return the scores of one scenario, or of a mean, with the metrics of participants added."""
+    chosen = scores[scores["scenario"] == scenario]
     if chosen.empty:
         raise BadInputError(f"nothing of scenario {scenario!r} can be compared")
     scored = [
@@ -74,19 +114,18 @@ def score_models(
         if metric.in_scores
         for end in ("", "_low", "_high")
     ]
-    table = chosen[["agent", "model", "readout", "stimuli", "reason", *scored]].copy()
-    counts = comparison.stimuli.groupby("agent")["scenario"].nunique()
+    names = ["agent", "kind", "model", "readout", "stimuli", "reason"]
+    table = chosen[[*names, *scored]].copy()
+    counts = stimuli.groupby("agent")["scenario"].nunique()
     table["scenarios"] = table["agent"].map(counts) if scenario in (MEAN, POOLED) else 1
-    training = rows.drop_duplicates("agent").set_index("agent")["Dynamics Training Dataset"]
-    table["training"] = table["agent"].map(training)
-    if not comparison.has_people:
+    if stimuli["p_yes"].isna().all():
         return table
     for metric in leaderboard_metrics():
         if metric.in_scores:
             continue
         table[[metric.name, f"{metric.name}_low", f"{metric.name}_high"]] = np.nan
         if answers:
-            _add_metric(table, metric, comparison, answers, scenario, draws)
+            _add_metric(table, metric, stimuli, answers, scenario, draws)
         else:
             why = f"{metric.name}: needs the answers of single participants"
             table["reason"] = _also(table["reason"], why)
@@ -96,7 +135,7 @@ def score_models(
 def _add_metric(
     table: pd.DataFrame,
     metric: Metric,
-    comparison: Comparison,
+    stimuli: pd.DataFrame,
     answers: Mapping[str, ScenarioAnswers],
     scenario: str,
     draws: Bootstrap,
@@ -104,7 +143,8 @@ def _add_metric(
     """Add a metric with participants: mean over scenarios, interval by drawing participants."""
     key = metric.name
     for index, agent in table["agent"].items():
-        subset = comparison.stimuli[comparison.stimuli["agent"] == agent]
+        subset = stimuli[stimuli["agent"] == agent]
+        compute = metric.of_two_people if agent == TWO_PEOPLE else metric
         names = subset["scenario"].unique() if scenario in (MEAN, POOLED) else [scenario]
         if scenario == POOLED or any(name not in answers for name in names):
             why = f"{key}: pooled over scenarios nobody answered all stimuli"
@@ -115,10 +155,10 @@ def _add_metric(
         values, resampled = [], []
         for name in names:
             models, _ = models_of(subset[subset["scenario"] == name], answers[name])
-            values.append(float(metric(sample_of_models(models, answers[name]))[0, 0]))
+            values.append(float(compute(sample_of_models(models, answers[name]))[0, 0]))
             people = draws_of_people(answers[name], draws)
             sample = sample_of_models(models, answers[name], None, people, "people")
-            resampled.append(metric(sample)[:, 0])
+            resampled.append(compute(sample)[:, 0])
         low, high = draws.interval(np.mean(resampled, axis=0))
         table.loc[index, [key, f"{key}_low", f"{key}_high"]] = [np.mean(values), low, high]
         if not np.isfinite(np.mean(values)):

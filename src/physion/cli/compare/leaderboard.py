@@ -43,6 +43,8 @@ class Options:
     """File of stimuli to exclude, one a line."""
     ledge: bool = False
     """Keep the Roll stimuli with a ledge, which the study excluded."""
+    later: bool = False
+    """Only trials whose contact, if any, is later than the observed part."""
     scenario: str = "mean"
     """One scenario, or mean (with equal weights), or pooled."""
     sort: str = "accuracy"
@@ -64,7 +66,7 @@ def main(options: Options) -> int:
     if options.json:
         print(json_module.dumps(record))
     else:
-        _print(board.table)
+        _print(_rows(board))
         _print_notes(board)
     return 1 if len(board.refused) else 0
 
@@ -72,7 +74,8 @@ def main(options: Options) -> int:
 def _board(options: Options) -> Leaderboard:
     from dataclasses import replace
 
-    from physion.analysis.models.leaderboard import leaderboard, sort_leaderboard
+    from physion.analysis.models.leaderboard import leaderboard
+    from physion.analysis.models.leaderboard_order import sort_leaderboard
     from physion.analysis.tables.responses import (
         LABELS_FILE,
         find_next_to,
@@ -91,6 +94,7 @@ def _board(options: Options) -> Leaderboard:
         scenario=options.scenario,
         exclude=() if options.exclude is None else read_stimulus_list(options.exclude),
         exclude_ledge=not options.ledge,
+        later=options.later,
         **_people(options),
     )
     ascending = True if options.ascending else None
@@ -118,7 +122,8 @@ def _people(options: Options) -> dict[str, Any]:
 
 def _record(board: Leaderboard) -> dict[str, Any]:
     """Return the board as JSON values; NaN is null."""
-    tables = {"rows": board.table, "dropped": board.dropped, "refused": board.refused}
+    tables = {"rows": board.table, "anchors": board.anchors, "dropped": board.dropped}
+    tables["refused"] = board.refused
     if board.dropped_answers is not None:
         tables["dropped_answers"] = board.dropped_answers
     record: dict[str, Any] = {
@@ -128,21 +133,44 @@ def _record(board: Leaderboard) -> dict[str, Any]:
     return {**record, "settings": dict(board.settings)}
 
 
+def _rows(board: Leaderboard) -> pd.DataFrame:
+    """Return the models, the anchors of the files, and the computed anchors."""
+    import pandas as pd
+
+    parts = [part for part in (board.table, board.anchors) if len(part)]
+    return pd.concat(parts, ignore_index=True)
+
+
 def _write(board: Leaderboard, record: dict[str, Any], folder: Path) -> None:
     from physion.cli.output import write_text
 
-    table = board.table.to_csv(index=False, lineterminator="\n")
+    table = _rows(board).to_csv(index=False, lineterminator="\n")
     write_text(folder / "leaderboard.csv", table)
     write_text(folder / "leaderboard.json", json_module.dumps(record, indent=1) + "\n")
 
 
 def _print(table: pd.DataFrame) -> None:
-    from physion.analysis.metrics import leaderboard_metrics
     from physion.cli.output import console
     from physion.cli.text_table import text_table
 
-    # To keep lines short: the difference is accuracy less that of people.
-    metrics = [one.name for one in leaderboard_metrics() if one.name != "difference"]
+    shown = _shown(table)
+    anchors = (table["kind"] == "anchor").to_numpy()
+    text = [text_table(shown[~anchors])] if not anchors.all() else []
+    if anchors.any():
+        named = shown[anchors].drop(columns=["rank"], errors="ignore")
+        text.append(text_table(named, "Anchors: what a score is worth"))
+    console.print("\n\n".join(text), markup=False, soft_wrap=True)
+
+
+def _shown(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the columns for the console as text; those that are empty in all rows are left out."""
+    from physion.analysis.metrics import leaderboard_metrics
+
+    # To keep lines short: what is nearly another column is in the files alone.
+    hidden = {"difference", "kappa_within_outcomes"}
+    if table["kappa"].notna().any():
+        hidden.add("kappa_from_averages")
+    metrics = [one.name for one in leaderboard_metrics() if one.name not in hidden]
     shown = table[[*SHOWN, *metrics, "versions", "file"]].copy()
     for name in ("scenarios", "stimuli"):
         shown[name] = [
@@ -154,8 +182,7 @@ def _print(table: pd.DataFrame) -> None:
     for name in metrics:
         shown[name] = [_interval(row, name) for row in table.to_dict("records")]
     empty = [name for name in shown.columns if shown[name].isin(["", None]).all()]
-    text = text_table(shown.drop(columns=empty))
-    console.print(text, markup=False, soft_wrap=True)
+    return shown.drop(columns=empty)
 
 
 def _print_notes(board: Leaderboard) -> None:

@@ -1,0 +1,390 @@
+"""Anchors: closed forms, the official people, and that models and anchors stay apart."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+import pytest
+from sklearn.metrics import cohen_kappa_score
+
+from physion.analysis import Bootstrap, Comparison, compare_scores
+from physion.analysis.metrics import metrics
+from physion.analysis.models.anchors import (
+    ANCHOR_MODELS,
+    COMPUTED,
+    MAJORITY,
+    OUTCOME,
+    TWO_PEOPLE,
+    kind_of,
+)
+from physion.analysis.models.leaderboard import leaderboard
+from physion.analysis.models.observed_contact import SETTING
+from physion.analysis.models.people_comparison import compare_everywhere
+from physion.analysis.sample import sample_of_rows
+from physion.analysis.tables.responses import read_humans, read_labels
+from physion.analysis.tables.stimuli import MEAN, POOLED
+from physion.errors import BadInputError
+from support.simulated_people import study
+
+Array = npt.NDArray[np.float64]
+QUICK = Bootstrap(resamples=200)
+BEYOND = ("r_beyond_outcome", "kappa_beyond_outcome", "kappa_within_outcomes")
+STEMS = {"collide": "pilot_it2_collision_simple_box", "drop": "pilot_it2_drop_simple_box"}
+NAMES = [(scenario, f"{stem}_{i:04d}") for scenario, stem in STEMS.items() for i in range(12)]
+LABELS = {name: k % 2 == 0 for k, (_, name) in enumerate(NAMES)}
+
+
+def humans(accuracy: npt.ArrayLike | None = None, count: float = 20.0) -> pd.DataFrame:
+    drawn = np.random.default_rng(0).integers(5, 20, len(NAMES)) / 20
+    table = pd.DataFrame(NAMES, columns=["scenario", "stimulus"])
+    return table.assign(accuracy=drawn if accuracy is None else accuracy, count=count)
+
+
+def predictions(model: str = "m", seed: int = 1, **columns: object) -> pd.DataFrame:
+    p = np.random.default_rng(seed).random(len(NAMES))
+    table = {
+        "Model": model,
+        "Readout Type": "C",
+        "Predicted Prob_true": p,
+        "Predicted Outcome": p > 0.5,
+        "Actual Outcome": list(LABELS.values()),
+        "Stimulus Name": list(LABELS),
+        **columns,
+    }
+    return pd.DataFrame(table)
+
+
+def compared(given: pd.DataFrame | None = None, people: pd.DataFrame | None = None) -> Comparison:
+    given = predictions() if given is None else given
+    return compare_scores(given, humans() if people is None else people, LABELS, bootstrap=QUICK)
+
+
+def row_of(table: pd.DataFrame, agent: str, scenario: str = MEAN) -> pd.Series:
+    (row,) = table[(table["agent"] == agent) & (table["scenario"] == scenario)].iloc
+    return row
+
+
+# --- closed forms --------------------------------------------------------------------------------
+
+
+def test_the_outcome_is_right_and_its_kappa_that_of_the_table_of_answers() -> None:
+    people, truth = humans(), np.array(list(LABELS.values()), dtype=float)
+    row = row_of(compared().anchors, OUTCOME, POOLED)
+    right = people["accuracy"].to_numpy()
+    p_yes = np.where(truth == 1, right, 1 - right)
+    assert row["accuracy"] == 1 and row["human_accuracy"] == pytest.approx(right.mean())
+    assert row["r"] == pytest.approx(np.corrcoef(truth, p_yes)[0, 1])
+    # As single answers of 20 people to each stimulus, and the outcome 20 times.
+    said = np.concatenate([np.arange(20) < round(20 * p) for p in p_yes])
+    expected = cohen_kappa_score(np.repeat(truth == 1, 20), said)
+    assert row["kappa_from_averages"] == pytest.approx(expected)
+
+
+def test_the_outcome_has_no_r_beyond_itself_and_says_why() -> None:
+    table = compared().anchors
+    row = row_of(table, OUTCOME, "collide")
+    assert np.isnan(row["r_beyond_outcome"]) and np.isnan(row["r_beyond_outcome_low"])
+    assert "P(contact) is constant given the outcome" in row["reason"]
+    assert "r beyond the outcome: undefined in collide, drop" in row_of(table, OUTCOME)["reason"]
+    assert row_of(table, OUTCOME)["kappa_within_outcomes"] == pytest.approx(0, abs=1e-12)
+
+
+def test_no_other_yes_or_no_agrees_more_often_than_the_majority() -> None:
+    people, truth = humans(), np.array(list(LABELS.values()))
+    p_yes = np.where(truth, people["accuracy"], 1 - people["accuracy"])
+    row = row_of(compared().anchors, MAJORITY, POOLED)
+    assert row["accuracy"] == pytest.approx(np.mean((p_yes > 0.5) == truth))
+
+    def agreement(said: npt.NDArray[np.bool_]) -> float:
+        return float(np.mean(np.where(said, p_yes, 1 - p_yes)))
+
+    rng = np.random.default_rng(1)
+    best = agreement(p_yes > 0.5)
+    assert all(agreement(rng.random(len(truth)) > 0.5) <= best for _ in range(500))
+    said, yes = (p_yes > 0.5).mean(), p_yes.mean()
+    chance = said * yes + (1 - said) * (1 - yes)
+    assert row["kappa_from_averages"] == pytest.approx((best - chance) / (1 - chance))
+
+
+def test_two_people_agree_as_all_pairs_of_them_do() -> None:
+    people, truth = humans(count=20), np.array(list(LABELS.values()))
+    p_yes = np.where(truth, people["accuracy"], 1 - people["accuracy"])
+    row = row_of(compared().anchors, TWO_PEOPLE, POOLED)
+    agreeing = []
+    for p in p_yes:
+        answers = np.arange(20) < round(20 * p)
+        pairs = [answers[i] == answers[j] for i in range(20) for j in range(i)]
+        agreeing.append(np.mean(pairs))
+    chance = p_yes.mean() ** 2 + (1 - p_yes.mean()) ** 2
+    expected = (np.mean(agreeing) - chance) / (1 - chance)
+    assert row["kappa_from_averages"] == pytest.approx(expected)
+    human = people["accuracy"].mean()
+    assert row["accuracy"] == pytest.approx(human)
+    assert row["kappa_beyond_outcome"] == pytest.approx(expected - (2 * human - 1) ** 2)
+    assert row[["r", "rmsd", "r_beyond_outcome", "difference"]].isna().all()
+    low, high = row[["kappa_from_averages_low", "kappa_from_averages_high"]]
+    assert low < expected < high
+
+
+def test_one_person_alone_makes_no_pair() -> None:
+    people = humans(np.arange(24) % 3 / 2, count=1)
+    row = row_of(compared(people=people).anchors, TWO_PEOPLE)
+    assert np.isnan(row["kappa_from_averages"]) and np.isfinite(row["accuracy"])
+    assert "kappa: undefined in collide, drop" in row["reason"]
+
+
+# --- beyond the outcome --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("contacts", [60, 110])
+def test_independent_errors_give_no_kappa_beyond_the_outcome(contacts: int) -> None:
+    """Draw models of accuracy .8 and people of .7 whose errors do not depend on each other."""
+    rng = np.random.default_rng(contacts)
+    truth = np.arange(120) < contacts
+    drawn = []
+    for _ in range(300):
+        said = (rng.random(120) < 0.8) == truth
+        human = rng.binomial(30, np.clip(rng.normal(0.7, 0.15, 120), 0, 1)) / 30
+        rows = pd.DataFrame(
+            {"p_contact": np.where(said, 0.8, 0.2) + rng.uniform(-0.2, 0.2, 120),
+             "predicted": said, "label": truth, "simulated": truth, "human_accuracy": human,
+             "p_yes": np.where(truth, human, 1 - human), "count": 30}
+        )  # fmt: skip
+        sample = sample_of_rows(rows, np.ones((1, 120)))
+        drawn.append([metrics.get(name)(sample).item() for name in BEYOND])
+    mean, error = np.mean(drawn, axis=0), np.std(drawn, axis=0) / np.sqrt(300)
+    r, beyond, within = mean
+    assert abs(r) < 3 * error[0] and abs(within) < 3 * error[2]
+    # The plain difference takes half of the answers of one of the two to be yes.
+    model, people = (np.where(truth, a, 1 - a).mean() for a in (0.8, 0.7))
+    by_chance = model * people + (1 - model) * (1 - people)
+    expected = (0.8 * 0.7 + 0.2 * 0.3 - by_chance) / (1 - by_chance) - (0.6 * 0.4)
+    assert beyond == pytest.approx(expected, abs=3 * error[1] + 0.005)
+    assert (beyond < -0.1) == (contacts == 110)
+
+
+def test_people_themselves_are_wholly_beyond_the_outcome() -> None:
+    people, truth = humans(), np.array(list(LABELS.values()))
+    p_yes = np.where(truth, people["accuracy"], 1 - people["accuracy"])
+    given = predictions(**{"Predicted Prob_true": p_yes, "Predicted Outcome": p_yes > 0.5})
+    row = row_of(compared(given).scores, "m · observed")
+    assert row["r_beyond_outcome"] == pytest.approx(1)
+    assert row["kappa_beyond_outcome"] > 0.1 and row["kappa_within_outcomes"] > 0.1
+
+
+def test_partial_r_is_that_of_the_textbook() -> None:
+    people, truth = humans(), np.array(list(LABELS.values()), dtype=float)
+    given = predictions()
+    row = row_of(compared(given).scores, "m · observed", POOLED)
+    x = given["Predicted Prob_true"].to_numpy()
+    y = np.where(truth == 1, people["accuracy"], 1 - people["accuracy"])
+    r = np.corrcoef([x, y, truth])
+    expected = (r[0, 1] - r[0, 2] * r[1, 2]) / np.sqrt((1 - r[0, 2] ** 2) * (1 - r[1, 2] ** 2))
+    assert row["r_beyond_outcome"] == pytest.approx(expected)
+    assert row["r_beyond_outcome_low"] < expected < row["r_beyond_outcome_high"]
+
+
+def test_of_one_outcome_alone_partial_r_is_r() -> None:
+    always = dict.fromkeys(LABELS, True)
+    given = predictions(**{"Actual Outcome": True})
+    scores = compare_scores(given, humans(), always, bootstrap=QUICK).scores
+    row = row_of(scores, "m · observed", "drop")
+    assert row["r_beyond_outcome"] == pytest.approx(row["r"])
+
+
+# --- models and anchors --------------------------------------------------------------------------
+
+
+def test_anchors_that_come_as_predictions_are_marked_and_follow_the_models() -> None:
+    given = pd.concat([predictions("state-classifier", 2), predictions("m"), predictions("z", 3)])
+    found = compared(given)
+    assert found.agents[0] == "state-classifier · observed"
+    assert found.models == ["m · observed", "z · observed"]
+    order = list(dict.fromkeys(found.all_scores["agent"]))
+    assert order == [*found.models, "state-classifier · observed", *COMPUTED]
+    kinds = found.all_scores.drop_duplicates("agent").set_index("agent")["kind"]
+    assert set(kinds[found.models]) == {"model"}
+    assert set(kinds[["state-classifier · observed", *COMPUTED]]) == {"anchor"}
+    assert kind_of("my outcome · observed") == "model" and kind_of("outcome · full") == "anchor"
+
+
+def test_every_anchor_of_the_package_is_known_by_name() -> None:
+    """The analysis may not import the models, so it has their names a second time."""
+    folder = Path(__file__).parents[3] / "src" / "physion" / "models" / "anchors"
+    sources = [path.read_text() for path in sorted(folder.glob("*.py"))]
+    packaged = {
+        name for text in sources for name in re.findall(r'^NAME\b.* = "([\w-]+)"', text, re.M)
+    }
+    assert {"outcome", "constant-motion"} <= packaged <= ANCHOR_MODELS
+
+
+def test_anchors_are_about_the_stimuli_that_any_model_predicts() -> None:
+    half = predictions().iloc[:12]
+    other = predictions("other", 2).iloc[6:18]
+    found = compared(pd.concat([half, other]))
+    assert row_of(found.anchors, OUTCOME, POOLED)["stimuli"] == 18
+    alone = compared(half)
+    assert row_of(alone.anchors, OUTCOME, POOLED)["stimuli"] == 12
+
+
+def test_without_people_there_is_no_anchor() -> None:
+    found = compare_scores(predictions(), None, LABELS, bootstrap=QUICK)
+    assert found.anchors.empty and list(found.anchors.columns) == list(found.scores.columns)
+    assert list(found.all_scores["agent"].unique()) == ["m · observed"]
+
+
+def test_the_order_of_rows_changes_no_anchor() -> None:
+    given = pd.concat([predictions(), predictions("other", 2)])
+    plain = compared(given)
+    mixed = compare_scores(
+        given.sample(frac=1, random_state=3), humans().sample(frac=1, random_state=4), LABELS,
+        bootstrap=QUICK,
+    )  # fmt: skip
+    pd.testing.assert_frame_equal(plain.anchors, mixed.anchors)
+
+
+# --- contacts in the observed part ---------------------------------------------------------------
+
+
+def observed() -> Array:
+    return np.array([k % 6 == 0 for k in range(len(NAMES))])
+
+
+def test_scores_without_observed_contacts_are_those_of_the_other_stimuli() -> None:
+    given = predictions(**{"Observed Contact": observed()})
+    found = compared(given)
+    rest = compare_scores(
+        predictions()[~observed()], humans()[~observed()], LABELS, bootstrap=QUICK
+    )
+    expected = pd.concat([rest.scores, rest.anchors], ignore_index=True)
+    pd.testing.assert_frame_equal(found.later, expected)
+    assert found.settings[SETTING] == "4 of 24 stimuli (collide 2 of 12, drop 2 of 12)"
+
+
+def test_one_model_that_knows_the_observed_contacts_suffices() -> None:
+    knows = predictions(**{"Observed Contact": observed()})
+    found = compared(pd.concat([predictions("other", 2), knows]))
+    assert set(found.later["agent"]) == {"m · observed", "other · observed", *COMPUTED}
+    odd = predictions("other", 2, **{"Observed Contact": ~observed()})
+    with pytest.raises(BadInputError, match="different observed contacts"):
+        compared(pd.concat([knows, odd]))
+
+
+def test_stimuli_without_a_known_observed_contact_are_left_out_and_counted() -> None:
+    words = np.where(observed(), "True", "False").astype(object)
+    words[[1, 2]] = ""
+    found = compared(predictions(**{"Observed Contact": words}))
+    assert row_of(found.later, "m · observed", POOLED)["stimuli"] == 18
+    assert "not known for 2 more" in found.settings[SETTING]
+
+
+def test_where_observed_contacts_are_not_known_the_settings_say_so() -> None:
+    found = compared()
+    assert found.later.empty and "no column Observed Contact" in found.settings[SETTING]
+    everything = compared(predictions(**{"Observed Contact": True}))
+    assert everything.later.empty and "none is left" in everything.settings[SETTING]
+
+
+# --- single participants and the leaderboard -----------------------------------------------------
+
+
+def test_with_participants_anchors_stand_next_to_models() -> None:
+    test = study(people=8, stimuli=16, scenarios=("collide", "roll"), seed=2).test
+    stimuli = test.drop_duplicates("stimulus")["stimulus"]
+    p = np.random.default_rng(0).random(len(stimuli))
+    given = pd.DataFrame({"agent": "m", "stimulus": stimuli, "p_contact": p, "predicted": p > 0.5})
+    found = compare_everywhere(given, test, QUICK, halves=10, permutations=20)
+    scores = found.scores.set_index(["scenario", "model", "measure"])
+    assert list(found.scores["model"].unique()) == ["m", *COMPUTED]
+    kinds = found.scores.drop_duplicates("model").set_index("model")["kind"]
+    assert kinds.to_dict() == {"m": "model"} | dict.fromkeys(COMPUTED, "anchor")
+    zones = found.zones.set_index(["scenario", "measure", "of"])
+    row = scores.loc[("collide", TWO_PEOPLE, "kappa")]
+    assert row["value"] == pytest.approx(zones.loc[("collide", "kappa", "pairs"), "mean"])
+    for what in ("people", "stimuli", "both"):
+        assert row[f"low_{what}"] < row["value"] < row[f"high_{what}"]
+    right = test[test["scenario"] == "roll"]["correct"].mean()
+    assert scores.loc[("roll", TWO_PEOPLE, "accuracy"), "value"] == pytest.approx(right)
+    assert scores.loc[("mean", OUTCOME, "accuracy"), "value"] == 1
+    best = scores.xs("kappa", level="measure").loc["mean", "value"]
+    assert best.idxmax() == MAJORITY
+    # Tests of models against each other are about what was predicted.
+    assert found.tests.empty and found.pairs.empty and len(found.calibration) == 1
+
+
+def test_the_leaderboard_has_anchors_over_the_stimuli_of_all_files(tmp_path: Path) -> None:
+    files = []
+    for name, rows in (("m", slice(0, 16)), ("n", slice(8, 24)), ("constant-motion", slice(0, 24))):
+        predictions(name, len(name)).iloc[rows].to_csv(tmp_path / f"{name}.csv", index=False)
+        files.append(tmp_path / f"{name}.csv")
+    board = leaderboard(files, humans(), LABELS, bootstrap=QUICK)
+    assert list(board.table["kind"]) == ["model", "model", "anchor"]
+    assert board.table["rank"].tolist() == [1, 2, pd.NA]
+    assert list(board.anchors["model"]) == list(COMPUTED)
+    assert set(board.anchors["stimuli"]) == {24} and list(board.anchors) == list(board.table)
+    expected = row_of(compared().anchors, MAJORITY)
+    found = board.anchors.set_index("model").loc[MAJORITY]
+    for column in ("accuracy", "kappa_from_averages", "r_low", "kappa_beyond_outcome_high"):
+        assert found[column] == expected[column]
+    assert leaderboard(files, bootstrap=QUICK).anchors.empty
+
+
+def test_the_leaderboard_has_kappa_of_people_with_each_other(tmp_path: Path) -> None:
+    responses = study(people=8, stimuli=16, scenarios=("collide", "roll"), seed=2)
+    one = responses.test.drop_duplicates("stimulus")
+    table = {"Model": "m", "Readout Type": "C", "Predicted Prob_true": 0.7,
+             "Predicted Outcome": True, "Actual Outcome": one["label"],
+             "Readout Test Data": one["scenario"], "Stimulus Name": one["stimulus"]}  # fmt: skip
+    pd.DataFrame(table).to_csv(tmp_path / "m.csv", index=False)
+    board = leaderboard([tmp_path / "m.csv"], None, None, responses, bootstrap=QUICK)
+    test = responses.test
+    values = []
+    for _, part in test.groupby("scenario"):
+        yes = part.pivot(index="session", columns="stimulus", values="yes").to_numpy()
+        values.append(np.mean([cohen_kappa_score(yes[i], yes[j])
+                               for i in range(len(yes)) for j in range(i)]))  # fmt: skip
+    row = board.anchors.set_index("model").loc[TWO_PEOPLE]
+    assert row["kappa"] == pytest.approx(np.mean(values))
+    assert row["kappa_low"] < row["kappa"] < row["kappa_high"]
+
+
+# --- official data -------------------------------------------------------------------------------
+
+
+def test_anchors_of_the_official_people(official: Path) -> None:
+    people = read_humans(official / "humans")
+    labels = read_labels(official / "stimuli" / "stimulus_names_and_labels.csv")
+    truth = people["stimulus"].map(labels).astype(bool)
+    given = pd.DataFrame(
+        {"Model": "m", "Readout Type": "C", "Predicted Prob_true": 0.5, "Predicted Outcome": False,
+         "Actual Outcome": truth, "Stimulus Name": people["stimulus"]}
+    )  # fmt: skip
+    anchors = compare_scores(given, people, labels, bootstrap=QUICK).anchors
+    two = row_of(anchors, TWO_PEOPLE)
+    assert two["accuracy"] == pytest.approx(0.745, abs=0.0005)
+    outcome = row_of(anchors, OUTCOME)
+    assert outcome["kappa_from_averages"] == pytest.approx(0.49, abs=0.005)
+    assert row_of(anchors, OUTCOME, POOLED)["r"] == pytest.approx(0.683, abs=0.0005)
+    majority = row_of(anchors, MAJORITY)
+    # .808 where the two stimuli with as many yes as no count as yes; here they count as no.
+    assert majority["accuracy"] == pytest.approx(0.808, abs=0.002)
+    assert majority["kappa_from_averages"] == pytest.approx(0.64, abs=0.006)
+    # The released kappas are medians over pairs of the participants that passed the stricter
+    # exclusion, with each one's own fraction of yes: about .02 higher than from the averages.
+    released = pd.read_csv(official / "results" / "human_pairwiseCohensKs_by_scenario.csv")
+    assert released["corr_med"].mean() == pytest.approx(0.50, abs=0.005)
+    assert two["kappa_from_averages"] == pytest.approx(released["corr_med"].mean(), abs=0.02)
+    names = {"clothiness": "drape", "collision": "collide", "containment": "contain",
+             "linking": "link", "rollingsliding": "roll", "towers": "support"}  # fmt: skip
+    medians = released.set_index(released["scenario"].replace(names))["corr_med"]
+    for scenario, median in medians.items():
+        row = row_of(anchors, TWO_PEOPLE, str(scenario))
+        assert row["kappa_from_averages"] == pytest.approx(median, abs=0.03)
+    accuracy = pd.read_csv(official / "results" / "human_accuracy_by_scenario.csv")
+    for name, mean in zip(accuracy["scenario"], accuracy["obs_mean"], strict=True):
+        row = row_of(anchors, TWO_PEOPLE, names.get(name, name))
+        assert row["accuracy"] == pytest.approx(mean, abs=0.005)
