@@ -77,8 +77,11 @@ class JoinedFeatures:
             width = _width(part)
             first, last = max(start, 0), min(stop, width)
             if first < last:
-                stored = isinstance(part, StoredFeatures)
-                pieces.append(part.columns(first, last) if stored else part[:, first:last])
+                pieces.append(
+                    part.columns(first, last)
+                    if isinstance(part, StoredFeatures)
+                    else part[:, first:last]
+                )
             start, stop = start - width, stop - width
         values = pieces[0] if len(pieces) == 1 else np.concatenate(pieces, axis=1)
         bad = np.flatnonzero(~np.isfinite(values).all(axis=1))

@@ -25,7 +25,11 @@ from numpy.typing import NDArray
 from physion.atomic import write_atomic
 from physion.errors import BadInputError
 
-_DTYPES = {"F32": np.dtype("<f4"), "F64": np.dtype("<f8"), "BOOL": np.dtype("?")}
+_DTYPES: dict[str, np.dtype[Any]] = {
+    "F32": np.dtype("<f4"),
+    "F64": np.dtype("<f8"),
+    "BOOL": np.dtype("?"),
+}
 _NAMES = {dtype: name for name, dtype in _DTYPES.items()}
 _ALIGNMENT = 64
 """The arrays start at a multiple of this many bytes."""
