@@ -88,7 +88,7 @@ def _card(options: Options) -> int:
     given = {name: getattr(options, name) for name in CARD_TERMS}
     terms = {name: value for name, value in given.items() if value is not None}
     card = write_card(options.folder, options.out, **terms)
-    paths = [card.readme, card.metadata]
+    paths = [card.readme, card.metadata, *card.tables]
     if options.json:
         print(json_module.dumps({"made": [str(path) for path in paths]}))
         return 0

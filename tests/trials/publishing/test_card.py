@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from physion.cli.main import main as cli
@@ -42,7 +44,7 @@ SCHEMA_ORG_WORDS = {
     "name", "description", "url", "license", "version", "datePublished", "creator", "keywords",
     "distribution", "contentUrl", "contentSize", "encodingFormat", "sha256",
 }  # fmt: skip
-TYPES = {"sc:Text", "sc:Integer", "sc:Float", "sc:Boolean"}
+TYPES = {"sc:Text", "sc:Integer", "sc:Float", "sc:Boolean", "sc:VideoObject"}
 
 
 def _make(folder: Path, split: str, trial: str, **changes: Any) -> None:
@@ -100,7 +102,56 @@ def test_the_front_matter_is_what_the_hub_reads(dataset: Path, tmp_path: Path) -
     assert front["pretty_name"] == "Physion: mine"
     assert front["size_categories"] == ["n<1K"]
     assert front["task_categories"] == ["video-classification"]
-    assert front["configs"] == [{"config_name": "index", "data_files": "index.parquet"}]
+    assert [config["config_name"] for config in front["configs"]] == ["index", "videos"]
+    assert [config.get("default", False) for config in front["configs"]] == [True, False]
+
+
+def load_dataset(folder: Path, name: str) -> dict[str, pa.Table]:
+    """What ``datasets.load_dataset(folder, name)`` reads: the files of each split in the card.
+
+    As in ``MetadataConfigs`` and ``sanitize_patterns`` of ``datasets``: ``data_files`` that are a
+    list of ``split`` and ``path`` give these splits; a path alone would give ``train``.
+    """
+    front = _front_matter((folder / "README.md").read_text())
+    (config,) = [item for item in front["configs"] if item["config_name"] == name]
+    assert isinstance(config["data_files"], list)
+    return {item["split"]: pq.read_table(folder / item["path"]) for item in config["data_files"]}
+
+
+def test_tests_are_never_training_rows(dataset: Path, tmp_path: Path) -> None:
+    card = write_card(dataset, tmp_path)
+    found = load_dataset(tmp_path, "index")
+    assert {split: table["trial"].to_pylist() for split, table in found.items()} == {
+        "train": ["train0", "train1", "train2", "train3"],
+        "test": ["test0", "test1"],
+    }
+    files = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.parquet")}
+    front = _front_matter(card.readme.read_text())
+    assert files == {item["path"] for config in front["configs"] for item in config["data_files"]}
+    assert set(card.tables) == set(tmp_path.rglob("*.parquet"))
+
+
+def test_videos_hold_the_observed_movie_and_no_answer(dataset: Path, tmp_path: Path) -> None:
+    write_card(dataset, tmp_path)
+    found = load_dataset(tmp_path, "videos")
+    assert {split: table.num_rows for split, table in found.items()} == {"train": 4, "test": 2}
+    for table in found.values():
+        assert set(table["video"].to_pylist()[0]) == {"bytes", "path"}
+        assert all(video["bytes"] == b"observed" for video in table["video"].to_pylist())
+        hub = json.loads(table.schema.metadata[b"huggingface"])["info"]["features"]
+        assert list(hub) == table.column_names and hub["video"] == {"_type": "Video"}
+        seen = {"trial", "dataset", "scenario", "split", "look", "width", "height"}
+        assert set(hub) == seen | {"observed_frames", "video"}
+
+
+def test_croissant_gives_the_movies_themselves(metadata: dict[str, Any]) -> None:
+    sets = {item["@id"]: item for item in metadata["distribution"]}
+    for name in ("observed-movies", "movies"):
+        records = next(r for r in metadata["recordSet"] if r["@id"] == f"{name}-content")
+        content = next(field for field in records["field"] if field["name"] == "content")
+        assert content["dataType"] == "sc:VideoObject"
+        assert content["source"]["fileSet"]["@id"] in sets
+        assert content["source"]["extract"] == {"fileProperty": "content"}
 
 
 def test_counts_and_rates_are_those_of_the_index(dataset: Path, tmp_path: Path) -> None:

@@ -105,7 +105,7 @@ def test_samples_hold_the_files_of_their_trial(dataset: Path, tmp_path: Path) ->
     training = read_samples(tmp_path / "out" / report.shards[1].name)
     assert list(testing) == ["test_a", "test_b"]
     assert list(training) == ["train_a", "train_b_v1_5", "train_c"]
-    everything = {"full.mp4", "json", "map.png", "observed.mp4", "outcome.json", "trial.h5"}
+    everything = {"full.mp4", "json", "map.png", "observed.mp4", "outcome.json", "trial.hdf5"}
     assert set(training["train_a"]) == everything
     assert set(testing["test_a"]) == everything | {"free_full.mp4", "free_observed.mp4"}
     paths = TrialPaths(dataset, "testing", "drop", "test_a")
@@ -115,10 +115,10 @@ def test_samples_hold_the_files_of_their_trial(dataset: Path, tmp_path: Path) ->
         "free_full.mp4": paths.free_movie,
         "free_observed.mp4": paths.free_observed_movie,
         "map.png": paths.map,
-        "trial.h5": paths.trial_file,
+        "trial.hdf5": paths.trial_file,
     }.items():
         assert testing["test_a"][ending] == path.read_bytes(), ending
-    assert Trial(training["train_a"]["trial.h5"], "a sample").metadata.trial == "train_a"
+    assert Trial(training["train_a"]["trial.hdf5"], "a sample").metadata.trial == "train_a"
 
 
 def test_what_may_be_seen_says_nothing_of_the_future(dataset: Path, tmp_path: Path) -> None:
@@ -294,7 +294,7 @@ def test_long_names_are_kept(tmp_path: Path) -> None:
     _index(tmp_path / "dataset")
     report = export_shards(tmp_path / "dataset", tmp_path / "out")
     with tarfile.open(tmp_path / "out" / report.shards[0].name) as archive:
-        assert f"{name}.trial.h5" in archive.getnames()
+        assert f"{name}.trial.hdf5" in archive.getnames()
 
 
 def test_bad_arguments_say_so(dataset: Path, tmp_path: Path) -> None:
@@ -340,3 +340,18 @@ def test_the_verb_writes_what_may_be_seen(dataset: Path, tmp_path: Path) -> None
         with tarfile.open(path) as shard:
             names |= {name.partition(".")[2] for name in shard.getnames()}
     assert {"json", "observed.mp4"} <= names <= set(SEEN_PARTS)
+
+
+IMAGE_EXTENSIONS = (
+    "blp bmp dib bufr cur pcx dcx dds ps eps fit fits fli flc ftc ftu gbr gif grib h5 hdf png apng "
+    "jp2 j2k jpc jpf jpx j2c icns ico im iim tif tiff jfif jpe jpg jpeg mpg mpeg msp pcd pxr pbm "
+    "pgm ppm pnm psd bw rgb rgba sgi ras tga icb vda vst webp wmf emf xbm xpm"
+)
+"""Extensions that webdataset 1.0.2 takes for pictures (its ``autodecode.py``)."""
+
+
+def test_pictures_alone_are_decoded_as_pictures() -> None:
+    """The part of a key after its last dot decides, as in ``ImageHandler`` of webdataset."""
+    pictures = IMAGE_EXTENSIONS.split()
+    taken = [part for part in shards_module.PARTS if part.split(".")[-1] in pictures]
+    assert taken == ["map.png"]

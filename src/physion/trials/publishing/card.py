@@ -1,4 +1,4 @@
-"""Card of a dataset: a README for people, and `croissant.json` for machines."""
+"""Card of a dataset: a README for people, `croissant.json` for machines, a table for each split."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from physion.trials.publishing.facts import (
     DatasetFacts,
     read_facts,
 )
+from physion.trials.publishing.split_tables import FOLDER, table_configs, write_split_tables
 
 CARD = "README.md"
 METADATA = "croissant.json"
@@ -43,10 +44,11 @@ CITATION = """@inproceedings{bear2021physion,
 
 @dataclass(frozen=True)
 class Card:
-    """Paths of the two files, and the ``facts`` that they are made from."""
+    """Paths of the files, and the ``facts`` that they are made from."""
 
     readme: Path
     metadata: Path
+    tables: tuple[Path, ...]
     facts: DatasetFacts
 
 
@@ -60,7 +62,7 @@ def write_card(
     url: str | None = None,
     published: str | None = None,
 ) -> Card:
-    """Write `README.md` and `croissant.json` for the dataset in ``folder``.
+    """Write `README.md`, `croissant.json` and ``data/`` for the dataset in ``folder``.
 
     All counts come from the current index: write the card again after the dataset has changed.
 
@@ -88,11 +90,12 @@ def write_card(
     text = json.dumps(metadata, indent=1, ensure_ascii=False) + "\n"
     try:
         target.mkdir(parents=True, exist_ok=True)
+        tables = write_split_tables(folder, facts.index, target)
         write_atomic(target / METADATA, text.encode())
         write_atomic(target / CARD, card_text(facts, terms).encode())
     except OSError as error:
         raise BadInputError(f"cannot write into {target}: {error.strerror or error}") from error
-    return Card(target / CARD, target / METADATA, facts)
+    return Card(target / CARD, target / METADATA, tuple(tables), facts)
 
 
 def _check_target(target: Path) -> None:
@@ -147,8 +150,9 @@ def card_text(facts: DatasetFacts, terms: PublicationTerms) -> str:
         f"## Scenarios\n{_meanings('scenario', SCENARIO_MEANINGS, facts)}",
         f"## Files\nOne folder for each split, in it one for each scenario. `{INDEX}` has one row "
         "for each trial, with the path, size and SHA-256 of its files; together they have "
-        f"{facts.total_bytes() / 1e6:.1f} MB. `{METADATA}` is the machine-readable form. A model "
-        "or participant that predicts may use the observed movies and the maps, and nothing "
+        f"{facts.total_bytes() / 1e6:.1f} MB. `{METADATA}` is the machine-readable form. "
+        f"`{FOLDER}/` has the index by split, and tables of the observed movies (`videos`). A "
+        "model or participant that predicts may use the observed movies and the maps, and nothing "
         "else: the index, the trial files and the full movies contain the answers.",
         f"## Columns of the index\n{_table(_columns(facts))}",
         "## Biases\n" + _list(facts.biases()),
@@ -167,7 +171,7 @@ def _front_matter(facts: DatasetFacts, terms: PublicationTerms) -> str:
         "annotations_creators": ["machine-generated"],
         "size_categories": [_size_category(len(facts.index))],
         "tags": ["physics", "intuitive-physics", "video", "simulation", "croissant"],
-        "configs": [{"config_name": "index", "data_files": INDEX}],
+        "configs": table_configs(facts.index),
     }
     lines = [f"{name}: {json.dumps(value, ensure_ascii=False)}" for name, value in values.items()]
     return "\n".join(["---", *lines, "---"])

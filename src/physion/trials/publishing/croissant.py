@@ -90,7 +90,7 @@ def croissant(
         "citeAs": citation,
         "keywords": ["physics", "video", "prediction", "cognitive science", "benchmark"],
         "distribution": _distribution(facts),
-        "recordSet": [*_enumerations(facts), _trials()],
+        "recordSet": [*_enumerations(facts), _trials(), *_movies(facts)],
         **responsible(facts),
     }
 
@@ -205,6 +205,37 @@ def _trials() -> dict[str, Any]:
         "description": "One record per trial.",
         "key": {"@id": "trials/trial"},
         "field": [_field(name, column) for name, column in INDEX_COLUMNS.items()],
+    }
+
+
+def _movies(facts: DatasetFacts) -> list[dict[str, Any]]:
+    """Return the record sets of the files of each kind of movie, with the movie as content."""
+    kinds = {"observed-movies": "observed_movie", "movies": "movie"}
+    return [
+        {
+            "@type": "cr:RecordSet",
+            "@id": f"{name}-content",
+            "name": f"{name}-content",
+            "description": f"One record per file: its name, as in the column {column} of the "
+            f"index, and the movie itself: {FILES[column]}.",
+            "key": {"@id": f"{name}-content/filename"},
+            "field": [
+                _file_field(name, "filename", "sc:Text"),
+                _file_field(name, "content", "sc:VideoObject"),
+            ],
+        }
+        for name, column in kinds.items()
+        if facts.index[column].notna().any()
+    ]
+
+
+def _file_field(file_set: str, name: str, kind: str) -> dict[str, Any]:
+    return {
+        "@type": "cr:Field",
+        "@id": f"{file_set}-content/{name}",
+        "name": name,
+        "dataType": kind,
+        "source": {"fileSet": {"@id": file_set}, "extract": {"fileProperty": name}},
     }
 
 

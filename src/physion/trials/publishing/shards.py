@@ -8,7 +8,9 @@ use and information about the outcome are in separate files:
 - ``observed.mp4``, ``free_observed.mp4``: the observed frames alone, in the trial's look and free.
 - ``map.png``: agent and patient in the first frame.
 - ``outcome.json``: label, length, seed and all other columns of the index: the answer.
-- ``full.mp4``, ``free_full.mp4``, ``trial.h5``: the future.
+- ``full.mp4``, ``free_full.mp4``, ``trial.hdf5``: the future. The last is the trial's ``.h5``
+  file; webdataset takes an extension ``h5`` for a picture (``IMAGE_EXTENSIONS`` in its
+  ``autodecode.py``) and fails at it with ``decode("pil")``.
 
 Equal datasets and options give equal bytes.
 """
@@ -37,7 +39,7 @@ from physion.trials.layout import TrialPaths
 MANIFEST = "shards.json"
 """File that lists the shards of a folder; rewritten with every shard, ``complete`` at the end."""
 SHARD_BYTES = 2**28
-LAYOUT = 1
+LAYOUT = 2
 """Version of names and contents of the files in a sample."""
 
 FILE_PARTS: Mapping[str, str] = {
@@ -46,7 +48,7 @@ FILE_PARTS: Mapping[str, str] = {
     "free_observed.mp4": "free_observed_movie",
     "map.png": "map",
     "observed.mp4": "observed_movie",
-    "trial.h5": "trial_file",
+    "trial.hdf5": "trial_file",
 }
 """Columns of the index that name the files of a sample, by the extension in the sample."""
 _NAMES, _PICTURE = ("trial", "dataset", "scenario", "split"), ("look", "width", "height")
