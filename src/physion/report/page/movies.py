@@ -92,7 +92,7 @@ def _element(path: Path, stimulus: str, description: str, poster: bytes) -> str:
     if mime.startswith("image/"):
         return f'<img src="{data}" alt="{label}" loading="lazy">'
     still = f'poster="{data_uri("image/jpeg", poster)}" ' if poster else ""
-    # Browsers start a movie without sound when it comes into view; before, nothing is decoded.
+    # Browsers start a movie without sound when it comes into view.
     return (
         f'<video src="{data}" {still}autoplay preload="none" controls loop muted playsinline '
         f'aria-label="{label}"></video>'

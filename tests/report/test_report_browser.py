@@ -1,0 +1,87 @@
+"""The report and the pages of its trials in a real browser, wide and narrow, light and dark."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from physion.analysis import Comparison
+from physion.report import ReportInputs, build_report
+from physion.report.page.choose_trials import opening_trials
+from physion.report.page.trial_pages import page_name
+from physion.trials.video import encode_movie
+from support.browser import Browser
+
+pytestmark = pytest.mark.slow
+Maker = Callable[..., Comparison]
+SIZES = ((1280, 900), (400, 900))
+MODEL = "a model with a name that is far too long for one line of a card of the page"
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    found = Browser(tmp_path_factory.mktemp("profile"))
+    yield found
+    found.close()
+
+
+@pytest.fixture
+def page(make_comparison: Maker, tmp_path: Path) -> Path:
+    """A report with trial pages; its movies become brighter from picture to picture."""
+    grey = np.arange(60, dtype=np.uint8)[:, None, None, None]
+    movie = tmp_path / "movie.mp4"
+    movie.write_bytes(encode_movie(np.broadcast_to(40 + 3 * grey, (60, 64, 64, 3)).copy()))
+    comparison = make_comparison(model=MODEL)
+    movies = dict.fromkeys(comparison.stimuli["stimulus"], movie)
+    inputs = ReportInputs(comparison, movies=movies, trial_pages=True)
+    return build_report(inputs, tmp_path / "report")
+
+
+def test_movies_in_view_play_and_nothing_else_is_asked_for(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    seen = "[...document.querySelectorAll('#one-trial-of-each-scenario video')]"
+    browser.until(f"{seen}.length === 2 && {seen}.every(v => v.currentTime > 0.1 && v.muted)")
+    far = "[...document.querySelectorAll('#what-people-and-models-disagree-on video')]"
+    assert browser.ask(f"{far}.length") == 8
+    assert browser.ask(f"{far}.every(v => v.paused && v.currentTime === 0)"), "not yet in view"
+    assert browser.complaints() == []
+    assert browser.requests() == [page.resolve().as_uri()]
+
+
+def test_no_page_is_wider_than_the_screen(
+    browser: Browser, page: Path, make_comparison: Maker
+) -> None:
+    stimulus = opening_trials(make_comparison())[0]
+    trials = page.parent / "trials"
+    for path in (page, trials / "index.html", trials / page_name(stimulus)):
+        for size in SIZES:
+            for dark in (False, True):
+                browser.open(path, size=size, dark=dark)
+                assert browser.ask("document.documentElement.scrollWidth") <= size[0], path
+                assert (browser.picture()[5, 5].mean() < 128) == dark
+                assert browser.complaints() == []
+
+
+def test_bars_have_the_length_of_the_answers(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    lengths = browser.ask(
+        "[...document.querySelectorAll('#one-trial-of-each-scenario .human')].map(item => ["
+        "parseFloat(item.querySelector('b').textContent) / 100,"
+        "item.querySelector('s').getBoundingClientRect().width"
+        " / item.querySelector('i').getBoundingClientRect().width])"
+    )
+    assert len(lengths) == 2
+    assert all(length == pytest.approx(said, abs=0.01) for said, length in lengths)
+
+
+def test_a_name_leads_to_the_page_of_its_trial_and_back(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    name = browser.ask("document.querySelector('.name a').textContent")
+    browser.ask("document.querySelector('.name a').click()")
+    browser.until(f"document.querySelector('h1').textContent === {name!r}")
+    browser.until("document.querySelector('video').currentTime > 0.1")
+    browser.ask("document.querySelector('.ways a').click()")
+    browser.until("document.querySelectorAll('video').length === 10")
