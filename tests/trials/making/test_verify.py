@@ -178,6 +178,39 @@ def test_a_trial_made_again_is_indexed_again(sampled: Path, tmp_path: Path) -> N
     assert len(report.made) == 1 and verify_dataset(folder, again=0).faults == []
 
 
+@pytest.mark.parametrize("name", ["movie", "observed_movie", "free_movie", "free_observed_movie"])
+def test_swapped_movies_are_found_where_the_index_agrees(
+    sampled: Path, tmp_path: Path, name: str
+) -> None:
+    folder = tmp_path / "d"
+    shutil.copytree(sampled, folder)
+    dataset = Dataset(folder)
+    one, other = (getattr(dataset.paths(trial), name) for trial in dataset.trials())
+    if not one.is_file():
+        pytest.skip(f"these trials have no {name}")
+    first, second = one.read_bytes(), other.read_bytes()
+    one.write_bytes(second)
+    other.write_bytes(first)
+    table, problems = build_index(folder)
+    assert not problems
+    write_index(folder, table)
+    faults = verify_dataset(folder, again=0).faults
+    assert len(faults) == 2 and all("does not show its trial" in fault for fault in faults)
+    assert str(one) in faults[0] and str(other) in faults[1]
+
+
+def test_a_movie_with_another_end_is_found(sampled: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "d"
+    shutil.copytree(sampled, folder)
+    path = Dataset(folder).paths(Dataset(folder).trials()[0]).movie
+    frames = read_frames(path)
+    frames[-1] = frames[-1, :, ::-1]
+    path.write_bytes(encode_movie(frames))
+    write_index(folder, build_index(folder)[0])
+    (fault,) = verify_dataset(folder, again=0).faults
+    assert f"frame {len(frames) - 1} differs" in fault
+
+
 def test_trials_of_another_version_are_no_faults(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

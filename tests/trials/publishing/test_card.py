@@ -144,14 +144,18 @@ def test_videos_hold_the_observed_movie_and_no_answer(dataset: Path, tmp_path: P
         assert set(hub) == seen | {"observed_frames", "video"}
 
 
-def test_croissant_gives_the_movies_themselves(metadata: dict[str, Any]) -> None:
-    sets = {item["@id"]: item for item in metadata["distribution"]}
-    for name in ("observed-movies", "movies"):
-        records = next(r for r in metadata["recordSet"] if r["@id"] == f"{name}-content")
-        content = next(field for field in records["field"] if field["name"] == "content")
-        assert content["dataType"] == "sc:VideoObject"
-        assert content["source"]["fileSet"]["@id"] in sets
-        assert content["source"]["extract"] == {"fileProperty": "content"}
+def test_croissant_gives_the_movies_themselves(dataset: Path, metadata: dict[str, Any]) -> None:
+    records = next(r for r in metadata["recordSet"] if r["@id"] == "videos")
+    fields = {field["name"]: field for field in records["field"]}
+    assert fields["video"]["dataType"] == "sc:VideoObject"
+    (files,) = [item for item in metadata["distribution"] if item["@id"] == "video-tables"]
+    paths = sorted(dataset.glob(files["includes"]))
+    assert [path.name for path in paths] == ["videos-test.parquet", "videos-train.parquet"]
+    for name, field in fields.items():
+        assert field["source"]["extract"] == {"column": name}
+        for path in paths:
+            assert name in pq.read_table(path).column_names
+    assert fields["video"]["source"]["transform"] == {"jsonPath": "bytes"}
 
 
 def test_counts_and_rates_are_those_of_the_index(dataset: Path, tmp_path: Path) -> None:
@@ -284,6 +288,7 @@ def test_the_file_of_the_index_is_described_truly(dataset: Path, metadata: dict[
 
 def test_file_sets_hold_the_files_that_they_say(dataset: Path, metadata: dict[str, Any]) -> None:
     sets = {item["@id"]: item for item in metadata["distribution"][1:]}
+    del sets["video-tables"]
     assert set(sets) == {"trial-files", "movies", "observed-movies", "maps"}
     files = [p.relative_to(dataset).as_posix() for p in dataset.rglob("*.*") if p.is_file()]
     found = {

@@ -60,8 +60,9 @@ def verify_dataset(
     """Check a dataset against its index and for consistency, and make some trials again.
 
     Checked are: every file against its SHA-256 in the index, the index against the trial files,
-    labels against contacts, lengths of movies against those of trials, trajectories against their
-    digests, and that no two sampled trials have the same physics.
+    labels against contacts, lengths of movies against those of trials, a few frames of each movie
+    against the rendered state, trajectories against their digests, and that no two sampled trials
+    have the same physics.
 
     Parameters
     ----------
@@ -98,6 +99,7 @@ def verify_dataset(
         try:
             result.faults += _compare(row, paths)
             result.faults += _check_trial(paths)
+            _check_movies(paths, result)
             result.faults += _check_split(row, settings)
             if row["trial"] in remade:
                 _make_again(paths, settings, result)
@@ -219,6 +221,16 @@ def _check_trial(paths: TrialPaths) -> list[str]:
                 f"{paths.trial_file}: labels/{name} is {stored}, by its contacts it is {computed}"
             )
     return faults
+
+
+def _check_movies(paths: TrialPaths, result: Verification) -> None:
+    """Add movies that do not show the state of their trial; those of other renderers may not."""
+    from physion.trials.making.make import RENDERER
+    from physion.trials.making.movie_check import foreign_movies
+
+    trial = Trial.open(paths.trial_file)
+    if trial.metadata.renderer != "imported":
+        result.add(foreign_movies(paths, trial), trial.metadata.renderer, RENDERER)
 
 
 def _make_again(paths: TrialPaths, settings: Mapping[str, Any], result: Verification) -> None:

@@ -25,6 +25,7 @@ _FILES = {
     "observed-movies": ("*/*/*_observed.mp4", "video/mp4", "observed_movie"),
     "maps": ("*/*/*_map.png", "image/png", "map"),
 }
+VIDEO_TABLES = "video-tables"
 _MINE = """citeAs column extract field fileProperty fileObject fileSet format includes isLiveDataset
 jsonPath key md5 parentField path recordSet references regex repeated replace separator source
 subField transform"""
@@ -90,7 +91,7 @@ def croissant(
         "citeAs": citation,
         "keywords": ["physics", "video", "prediction", "cognitive science", "benchmark"],
         "distribution": _distribution(facts),
-        "recordSet": [*_enumerations(facts), _trials(), *_movies(facts)],
+        "recordSet": [*_enumerations(facts), _trials(), *_videos(facts)],
         **responsible(facts),
     }
 
@@ -163,6 +164,17 @@ def _distribution(facts: DatasetFacts) -> list[dict[str, Any]]:
         for name, (pattern, kind, column) in _FILES.items()
         if facts.index[column].notna().any()
     ]
+    if facts.index["observed_movie"].notna().any():
+        sets.append(
+            {
+                "@type": "cr:FileSet",
+                "@id": VIDEO_TABLES,
+                "name": VIDEO_TABLES,
+                "description": "Observed movies in tables, one for each split.",
+                "encodingFormat": "application/x-parquet",
+                "includes": "data/videos-*.parquet",
+            }
+        )
     return [index_file, *sets]
 
 
@@ -208,34 +220,38 @@ def _trials() -> dict[str, Any]:
     }
 
 
-def _movies(facts: DatasetFacts) -> list[dict[str, Any]]:
-    """Return the record sets of the files of each kind of movie, with the movie as content."""
-    kinds = {"observed-movies": "observed_movie", "movies": "movie"}
+def _videos(facts: DatasetFacts) -> list[dict[str, Any]]:
+    """Return the record set of the observed movies, with each movie as content.
+
+    They are taken from the tables, because the reference reader opens no MP4 files.
+    """
+    if facts.index["observed_movie"].isna().all():
+        return []
+    fields = {"trial": "sc:Text", "scenario": "sc:Text", "split": "sc:Text"}
     return [
         {
             "@type": "cr:RecordSet",
-            "@id": f"{name}-content",
-            "name": f"{name}-content",
-            "description": f"One record per file: its name, as in the column {column} of the "
-            f"index, and the movie itself: {FILES[column]}.",
-            "key": {"@id": f"{name}-content/filename"},
+            "@id": "videos",
+            "name": "videos",
+            "description": "One record per trial with movies: what may be seen of it. The observed "
+            "movie itself is in video, MP4.",
+            "key": {"@id": "videos/trial"},
             "field": [
-                _file_field(name, "filename", "sc:Text"),
-                _file_field(name, "content", "sc:VideoObject"),
+                *(_video_field(name, kind, {}) for name, kind in fields.items()),
+                _video_field("video", "sc:VideoObject", {"transform": {"jsonPath": "bytes"}}),
             ],
         }
-        for name, column in kinds.items()
-        if facts.index[column].notna().any()
     ]
 
 
-def _file_field(file_set: str, name: str, kind: str) -> dict[str, Any]:
+def _video_field(name: str, kind: str, transform: dict[str, Any]) -> dict[str, Any]:
+    source = {"fileSet": {"@id": VIDEO_TABLES}, "extract": {"column": name}, **transform}
     return {
         "@type": "cr:Field",
-        "@id": f"{file_set}-content/{name}",
+        "@id": f"videos/{name}",
         "name": name,
         "dataType": kind,
-        "source": {"fileSet": {"@id": file_set}, "extract": {"fileProperty": name}},
+        "source": source,
     }
 
 
