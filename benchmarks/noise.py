@@ -11,8 +11,9 @@ simulations touching, P(contact) is (1 - l) (k + 1/2) / (n + 1) + l / 2 with the
   fraction y of whom said yes (binomial likelihood; the division changes no maximum).
 
 The search changes one level at a time to the values of its list, for ``--rounds`` rounds. All
-values use the same random numbers. The test half gives accuracy, r with people, and r beyond the outcome
-(partial correlation given the recorded outcome) with a 95 % bootstrap interval over stimuli.
+values use the same random numbers. The test half gives accuracy, r with people, and r beyond the
+outcome (partial correlation given the recorded outcome) with a 95 % bootstrap interval over
+stimuli.
 """
 
 from __future__ import annotations

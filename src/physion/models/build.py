@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 from physion.errors import BadInputError, MissingExtraError, PhysionError, UnknownNameError
+from physion.models.batch import Spec
 from physion.models.from_file import is_file_name, load_from_file
 from physion.models.interface import Model
 from physion.models.raised import describe_raised
@@ -34,7 +35,7 @@ models: Registry[ModelFactory] = Registry(
         "majority-of-people": "physion.models.anchors.majority_of_people:majority_of_people",
         "state-classifier": "physion.models.anchors.state_classifier:state_classifier",
         "already-touched": "physion.models.anchors.already_touched:already_touched",
-        "chance": "physion.models.anchors.chance:chance",
+        "chance": "physion.models.anchors.base_rate:base_rate",
         "constant-motion": "physion.models.anchors.constant_motion:constant_motion",
         "blob-centroids": "physion.models.anchors.blob_centroids:blob_centroids",
         "copy-last-frame": "physion.models.anchors.copy_last_frame:copy_last_frame",
@@ -83,11 +84,7 @@ def build_model(name: str, **options: Any) -> Model:
         raise _missing(name, error) from error
     except Exception as error:
         raise describe_raised(error, name, "building it") from error
-    lacking = [part for part in ("spec", "provenance", "digest") if not hasattr(model, part)]
-    if lacking:
-        raise BadInputError(
-            f"model {name!r} lacks {', '.join(lacking)}; see docs/own-model.md for what a model has"
-        )
+    _check_parts(model, name)
     return model
 
 
@@ -99,6 +96,20 @@ def _adapted(built: Any) -> Any:
     from physion.models.extractor import ExtractorModel
 
     return ExtractorModel(built)
+
+
+def _check_parts(model: Any, name: str) -> None:
+    """Raise `BadInputError` if a model lacks what every model has."""
+    advice = "see docs/own-model.md for what a model has"
+    lacking = [part for part in ("spec", "provenance", "digest") if not hasattr(model, part)]
+    if lacking:
+        raise BadInputError(f"model {name!r} lacks {', '.join(lacking)}; {advice}")
+    if not isinstance(model.spec, Spec):
+        kind = type(model.spec).__name__
+        raise BadInputError(f"model {name!r}: spec is a {kind}, expected a Spec; {advice}")
+    for part in ("provenance", "digest"):
+        if not callable(getattr(model, part)):
+            raise BadInputError(f"model {name!r}: {part} must be a method; {advice}")
 
 
 def _registered(name: str) -> ModelFactory:

@@ -4,11 +4,47 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from importlib.abc import ExecutionLoader
 from pathlib import Path
 from typing import Any
 
 from physion.errors import BadInputError, UnknownNameError
 from physion.seeds import stable_hash
+
+_loaded: dict[str, tuple[Path, str]] = {}
+"""Path and text of the files that were loaded, by name of the module."""
+
+
+class FileLoader(ExecutionLoader):
+    """Loader of a module from a text, which was read from ``path`` and may differ from it now."""
+
+    def __init__(self, path: Path, text: str) -> None:
+        self.path, self.text = path, text
+
+    def get_filename(self, fullname: str) -> str:
+        """Return the path, for tracebacks and ``__file__``."""
+        return str(self.path)
+
+    def get_source(self, fullname: str) -> str:
+        """Return the text."""
+        return self.text
+
+
+class LoadedFiles:
+    """The files that were loaded; whatever process unpickles this object loads them, too.
+
+    Pickled before a model, it makes the classes of the model known where it is unpickled.
+    """
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _load_again, (dict(_loaded),)
+
+
+def _load_again(files: dict[str, tuple[Path, str]]) -> LoadedFiles:
+    for known, (path, text) in files.items():
+        if known not in sys.modules:
+            _run(known, path, text)
+    return LoadedFiles()
 
 
 def is_file_name(name: str) -> bool:
@@ -37,34 +73,44 @@ def load_from_file(name: str) -> Any:
 
 
 def _import(path: Path, name: str) -> Any:
-    # A name of its own, so that a user's file called torch.py or physion.py hides nothing. The same
-    # file keeps it, so that objects of its classes can be sent to other processes; a file that was
-    # edited, in a notebook for instance, has another one.
-    content = path.read_bytes().decode(errors="replace")
-    known = f"physion_model_{path.stem}_{stable_hash(str(path), content) % 2**32:08x}"
+    # A name of its own, so that a user's file called torch.py or physion.py hides nothing. It
+    # depends on the text: a file that was edited, in a session that goes on, is another module.
+    try:
+        text = importlib.util.decode_source(path.read_bytes())
+    except (OSError, SyntaxError, UnicodeDecodeError) as error:
+        raise BadInputError(f"model {name!r}: {path} cannot be read: {error}") from error
+    known = f"physion_model_{path.stem}_{stable_hash(str(path), text) % 2**32:08x}"
     if known in sys.modules:
         return sys.modules[known]
-    spec = importlib.util.spec_from_file_location(known, path)
-    if spec is None or spec.loader is None:
-        raise BadInputError(f"model {name!r}: {path} cannot be imported")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[known] = module
-    sys.path.insert(0, str(path.parent))
     try:
-        spec.loader.exec_module(module)
+        return _run(known, path, text)
     except ModuleNotFoundError as error:
-        del sys.modules[known]
         raise BadInputError(
             f"model {name!r} needs the library {error.name!r}, which is not installed"
         ) from error
     except Exception as error:
-        del sys.modules[known]
         where = _line_in(error, path)
         raise BadInputError(
             f"model {name!r}: {path.name}{where} raised {type(error).__name__}: {error}"
         ) from error
+
+
+def _run(known: str, path: Path, text: str) -> Any:
+    """Run the text of a file as the module ``known``; leave no module behind if it fails."""
+    loader = FileLoader(path, text)
+    spec = importlib.util.spec_from_loader(known, loader)
+    assert spec is not None, "there is a loader"
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[known] = module
+    sys.path.insert(0, str(path.parent))
+    try:
+        loader.exec_module(module)
+    except BaseException:
+        del sys.modules[known]
+        raise
     finally:
         sys.path.remove(str(path.parent))
+    _loaded[known] = path, text
     return module
 
 

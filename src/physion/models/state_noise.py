@@ -97,7 +97,7 @@ def add_noise(
     # Numbers of their own, so that the ones above do not depend on these levels.
     more = _generator(scene, seed, sample, "noise of the pose")
     rise = standard_normal(more, count + cloths) * levels.vertical * scale
-    turns = standard_normal(more, (count, 3)) * levels.rotation * scale
+    rotations = standard_normal(more, (count, 3)) * levels.rotation * scale
     spins = standard_normal(more, (count, 3)) * levels.angular_velocity * scale
     grips = exp(standard_normal(more, count) * levels.friction * scale)
     roots = joint_roots(scene)
@@ -107,9 +107,9 @@ def add_noise(
     shift[~airborne, 2] = 0.0
     still = fixed_bodies(scene)[roots]
     shift[still] = kick[still] = 0.0
-    turns[~airborne[:count], :2] = 0.0
+    rotations[~airborne[:count], :2] = 0.0
     fixed = still[:count] | _jointed(roots)[:count]
-    turns[fixed] = spins[fixed] = 0.0
+    rotations[fixed] = spins[fixed] = 0.0
     owner = np.repeat(np.arange(cloths), [cloth.resolution**2 for cloth in scene.cloths])
     bodies = tuple(
         body
@@ -125,7 +125,7 @@ def add_noise(
         state,
         positions=state.positions + shift[: len(state.positions)],
         velocities=state.velocities + kick[: len(state.velocities)],
-        rotations=_turned(state.rotations, turns),
+        rotations=_rotated(state.rotations, rotations),
         angular_velocities=state.angular_velocities + spins,
         cloth_vertices=state.cloth_vertices + shift[count:][owner],
         cloth_velocities=state.cloth_velocities + kick[count:][owner],
@@ -205,20 +205,20 @@ def _rougher(material: SurfaceMaterial, factor: float) -> SurfaceMaterial:
     )
 
 
-def _turned(rotations: F64, vectors: F64) -> F64:
+def _rotated(rotations: F64, vectors: F64) -> F64:
     """Return quaternions (N, 4) after rotations by rotation vectors (N, 3), in world axes.
 
     The quaternion of a rotation vector v is (cos(|v| / 2), sin(|v| / 2) v / |v|).
     """
     angles = norm(vectors)
-    turned: F64 = rotations.copy()
+    rotated: F64 = rotations.copy()
     rows = np.flatnonzero(angles > 0)
     if len(rows):
         half = angles[rows] / 2
         axes = vectors[rows] / angles[rows, None]
         change = np.column_stack([cos(half), axes * sin(half)[:, None]])
-        turned[rows] = multiply_quaternions(change, rotations[rows])
-    return turned
+        rotated[rows] = multiply_quaternions(change, rotations[rows])
+    return rotated
 
 
 def _simulate(scenes: Sequence[Scene], states: Sequence[State], engine: Engine) -> list[Trajectory]:

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from physion.models.batch import Provenance, Spec
+from physion.models.from_file import FileLoader
 
 _KNOWN_PACKAGES = {"abc", "builtins", "physion", "torch", "typing"}
 """Packages whose versions, not sources, belong to the digest of a model."""
@@ -77,8 +78,13 @@ def source_of(kind: type) -> str:
         if part is not kind and package in _KNOWN_PACKAGES:
             continue
         module = inspect.getmodule(part)
+        loader = getattr(module, "__loader__", None)
         try:
-            texts[part.__module__] = inspect.getsource(module) if module else _code_of(part)
+            if isinstance(loader, FileLoader):
+                text = loader.text
+            else:
+                text = inspect.getsource(module) if module else _code_of(part)
+            texts[part.__module__] = text
         except (OSError, TypeError):
             texts[f"{part.__module__}.{part.__qualname__}"] = _code_of(part)
     _sources[kind] = "\n".join(texts.values())

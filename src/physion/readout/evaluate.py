@@ -20,6 +20,7 @@ from physion.models.build import build_model
 from physion.models.interface import Learns, Model
 from physion.readout.capabilities import choose_readouts
 from physion.readout.folds import plan_folds
+from physion.readout.model_calls import check_identity
 from physion.readout.predictor import Predictor
 from physion.readout.protocols import Readout
 from physion.readout.settings import EvaluationConfig
@@ -138,7 +139,7 @@ def evaluate_model(
 
 def _provenance(model: Model) -> Provenance:
     """Return the provenance of a model, with the inputs of its `Spec` if it names no others."""
-    known = model.provenance()
+    known = check_identity(model)
     return dataclasses.replace(known, inputs=known.inputs or ", ".join(model.spec.inputs))
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.errors import BadInputError, PhysionError
-from physion.models.batch import Batch
+from physion.models.batch import Batch, Provenance
 from physion.models.interface import Model
 from physion.models.raised import OutOfMemoryError, describe_raised, is_out_of_memory
 
@@ -54,6 +54,27 @@ def call_model(model: Model, method: str, batch: Batch, /, *arguments: Any, **op
         raise
     except Exception as error:
         raise _explain(error, model, method, batch) from error
+
+
+def check_identity(model: Model) -> Provenance:
+    """Return the provenance of a model, after it and the digest were found to be well formed.
+
+    Raises `BadInputError` if one of the methods raises or returns something else.
+    """
+    name = type(model).__name__
+    for method, kind in (("digest", str), ("provenance", Provenance)):
+        try:
+            value: Any = getattr(model, method)()
+        except PhysionError:
+            raise
+        except Exception as error:
+            raise describe_raised(error, name, method) from error
+        if not isinstance(value, kind) or not value:
+            raise BadInputError(
+                f"model {name!r}: {method} gave {value!r}, expected a {kind.__name__}"
+            )
+    provenance: Provenance = value
+    return provenance
 
 
 def is_network(model: object) -> bool:

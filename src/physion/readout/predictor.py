@@ -278,6 +278,11 @@ class Predictor:
         found = self._imagined_outcomes([*split.fit, *split.test])
         fit = tuple(trial for trial in split.fit if trial not in self.problems)
         test = tuple(trial for trial in split.test if trial not in self.problems)
+        if split.fit and not fit:
+            reason = self.problems[split.fit[0]]
+            raise BadInputError(f"no trial of {split.scenario} to fit on was imagined: {reason}")
+        if not test:
+            return Reading(np.empty(0), _UNKNOWN), fit, test, reader.labels
         labels = self._labels(fit, reader.labels)
         near: dict[Knobs, Outcomes] = stack_outcomes(found, fit)
         tested: dict[Knobs, Outcomes] = stack_outcomes(found, test)

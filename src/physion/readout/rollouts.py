@@ -23,6 +23,7 @@ from physion.compute.executor import Executor
 from physion.compute.progress import Progress
 from physion.errors import BadInputError
 from physion.models.batch import Batch, Rollout
+from physion.models.from_file import LoadedFiles
 from physion.readout.model_calls import call_model, check_finite, to_array
 from physion.training.sources.source import ObservedSource
 
@@ -66,8 +67,12 @@ class Outcomes:
 
 @dataclass(frozen=True, eq=False)
 class _Request:
-    """One trial at one value of the knobs: what a worker process needs."""
+    """One trial at one value of the knobs: what a worker process needs.
 
+    ``files`` comes before ``model``, whose class may stand in one of them.
+    """
+
+    files: LoadedFiles
     model: Any
     context: Batch
     samples: int
@@ -153,7 +158,7 @@ class RolloutStore:
                 continue
             for value, path in wanted:
                 name = " ".join([trial, *(f"{knob}={level:g}" for knob, level in value)])
-                requests[name] = _Request(model, context, samples, seed, value)
+                requests[name] = _Request(LoadedFiles(), model, context, samples, seed, value)
                 cells[name] = (trial, value, path)
         for outcome in self._executor.map(_run, requests):
             yield (*cells[outcome.key], outcome.error if outcome.error else outcome.value)
@@ -174,16 +179,21 @@ def all_knobs(knobs: Mapping[str, Sequence[float]]) -> list[Knobs]:
 
 
 def stack_outcomes(
-    found: Mapping[Knobs, Mapping[str, Any]], trials: Sequence[str]
+    imagined: Mapping[Knobs, Mapping[str, Any]], trials: Sequence[str]
 ) -> dict[Knobs, Outcomes]:
     """Return the outcomes of ``trials``, in order, for every value of the knobs."""
     stacked = {}
-    for value, by_trial in found.items():
+    shape = (len(trials), -1) if trials else (0, 1)
+    for value, by_trial in imagined.items():
         contacts = [by_trial[trial][0] for trial in trials]
         gaps = [by_trial[trial][1] for trial in trials]
         stacked[value] = Outcomes(
-            None if None in contacts else np.array(contacts, np.bool_).reshape(len(trials), -1),
-            None if None in gaps else np.array(gaps, np.float64).reshape(len(trials), -1),
+            None
+            if any(c is None for c in contacts)
+            else np.array(contacts, np.bool_).reshape(shape),
+            None
+            if any(g is None for g in gaps)
+            else np.array(gaps, np.float64).reshape(shape),
         )
     return stacked
 

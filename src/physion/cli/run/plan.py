@@ -74,7 +74,7 @@ def plan_official(scenes: Path, humans: Path | None, limit: int | None) -> RunPl
 
 
 def balanced_trials(trials: Iterable[ImportedTrial], limit: int | None) -> list[ImportedTrial]:
-    """Return at most ``limit`` trials a scenario, with and without recorded contact in turn.
+    """Return at most ``limit`` trials a scenario, with and without contact alternately.
 
     The choice depends on names and outcomes alone; a larger limit includes the trials of a smaller
     one. Without a limit all trials are returned.
@@ -89,12 +89,12 @@ def balanced_trials(trials: Iterable[ImportedTrial], limit: int | None) -> list[
     return [
         trial
         for place, scenario in enumerate(ordered)
-        for trial in _in_turn(groups[scenario], first=place % 2 == 0)[:limit]
+        for trial in _alternating(groups[scenario], first=place % 2 == 0)[:limit]
     ]
 
 
-def _in_turn(trials: Sequence[ImportedTrial], *, first: bool) -> list[ImportedTrial]:
-    """Return trials with the outcome ``first`` and with the other in turn.
+def _alternating(trials: Sequence[ImportedTrial], *, first: bool) -> list[ImportedTrial]:
+    """Return trials with the outcome ``first`` and with the other, alternately.
 
     What is left of the more frequent kind comes last.
     """

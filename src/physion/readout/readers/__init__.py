@@ -1,4 +1,4 @@
-"""Readers, which turn features or rollouts of a model into P(contact)."""
+"""Readers, which predict P(contact) from features or rollouts of a model."""
 
 from physion.readout.readers.reader import FeatureReader, Reading, RolloutReader, readers
 

@@ -18,11 +18,11 @@ NAME, VERSION = "chance", 1
 
 
 @dataclass(frozen=True, slots=True)
-class ChanceConfig:
-    """`Chance` has no settings."""
+class BaseRateConfig:
+    """`BaseRate` has no settings."""
 
 
-class Chance:
+class BaseRate:
     """Model that gives every trial of a scenario the same probability.
 
     P(contact) is (k + 1) / (n + 2) with k contacts among the n fitted trials (Laplace's rule of
@@ -31,13 +31,13 @@ class Chance:
 
     answers = "observed"
 
-    def __init__(self, config: ChanceConfig) -> None:
+    def __init__(self, config: BaseRateConfig) -> None:
         self.config = config
         self.spec = Spec(inputs=("state",), stride=1, context=1, future=0, anchor="end")
 
-    def fit(self, batch: Batch, labels: NDArray[np.bool_], seed: int) -> BaseRate:
+    def fit(self, batch: Batch, labels: NDArray[np.bool_], seed: int) -> FittedBaseRate:
         """Return the model with the base rate of the outcomes (B,); trials and seed are unused."""
-        return BaseRate((int(np.count_nonzero(labels)) + 1) / (len(labels) + 2))
+        return FittedBaseRate((int(np.count_nonzero(labels)) + 1) / (len(labels) + 2))
 
     def provenance(self) -> Provenance:
         """Return name and versions for the table of predictions."""
@@ -50,8 +50,8 @@ class Chance:
 
 
 @dataclass(frozen=True, slots=True)
-class BaseRate:
-    """`Chance` with a base rate in 0..1."""
+class FittedBaseRate:
+    """`BaseRate` of some trials, in 0..1."""
 
     base_rate: float
     answers: str = "observed"
@@ -61,6 +61,6 @@ class BaseRate:
         return np.full(len(batch), self.base_rate)
 
 
-def chance(**options: Any) -> Chance:
+def base_rate(**options: Any) -> BaseRate:
     """Build the model, which has no options."""
-    return Chance(make_config(ChanceConfig, NAME, options))
+    return BaseRate(make_config(BaseRateConfig, NAME, options))
