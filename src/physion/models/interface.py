@@ -141,7 +141,7 @@ class Fits(Protocol):
 
 @runtime_checkable
 class SeesOutcomes(Protocol):
-    """Model that is given the outcomes, for rows to compare others with; it answers under *full*."""
+    """Model that is given the outcomes, to compare others with; it answers under *full*."""
 
     def with_outcomes(self, outcomes: Mapping[str, bool]) -> Model:
         """Return the model with the outcomes of all trials by name."""
