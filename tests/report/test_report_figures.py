@@ -21,6 +21,7 @@ from PIL import Image
 
 from physion.analysis import Comparison
 from physion.analysis.models import figure_tables
+from physion.analysis.models.anchors import COMPUTED
 from physion.analysis.models.mixed_fits import fits_of_models
 from physion.analysis.people.difficulty import below_chance_level
 from physion.analysis.tables.stimuli import MEAN
@@ -31,7 +32,7 @@ from physion.report.figures.measures import measure_figure
 from physion.report.figures.registry import all_figures, make_plots
 from physion.report.figures.training.generalization import generalization_figure
 from physion.report.inputs import ReportInputs
-from physion.report.page import blocks
+from physion.report.page import blocks, scores
 from physion.report.page.document import Picture
 from physion.report.page.page import render_page
 from physion.report.words import number, protocol_names
@@ -164,8 +165,7 @@ def trained(make_comparison: Maker, trainings: list[str]) -> tuple[Comparison, p
     """The comparison with both models as one, trained in as many ways."""
     comparison = make_comparison()
     stimuli = comparison.stimuli.assign(model="one", readout="observed")
-    comparison = Comparison(comparison.scores, comparison.people, stimuli, comparison.changed,
-                            comparison.dropped, comparison.settings)  # fmt: skip
+    comparison = dataclasses.replace(comparison, stimuli=stimuli)
     column = dict(zip(comparison.agents, trainings, strict=True))
     rows = stimuli[["agent", "stimulus"]]
     return comparison, rows.assign(**{"Dynamics Training Dataset": rows["agent"].map(column)})
@@ -262,18 +262,20 @@ def test_columns_of_simulated_outcomes_stand_only_where_these_differ(
     stimuli = comparison.stimuli.assign(simulated=comparison.stimuli["label"])
     same = dataclasses.replace(comparison, changed=comparison.changed.iloc[:0], stimuli=stimuli)
     for own, there in ((comparison, True), (same, False)):
-        text = blocks.overall_table(own, MEAN) + blocks.definitions(own)
+        plain = scores.shown_metrics(own, beyond=False)
+        text = scores.scores_table(own.all_scores, MEAN, plain) + scores.definitions(own)
         assert ("against simulated outcome" in text) is there
         assert ("same outcome" in text) is there
-        assert text.count("<td>") % text.count('<th scope="row">') == 0
-        assert text.count('scope="col"') - 1 == text.count("<td>") / len(own.agents)
+        assert text.count('<th scope="row">') == len(own.agents) + len(COMPUTED)
+        cells = text.count("<td>") / text.count('<th scope="row">')
+        assert text.count('scope="col"') - 1 == cells
 
 
 def test_counts_and_gaps_are_written_in_one_way(make_comparison: Maker) -> None:
     column = blocks.PageColumn("rows", "rows", "count")
     assert column.cell(pd.Series({"rows": 120000})) == "120000"
     comparison = make_comparison()
-    assert "–" not in blocks.people(comparison) + blocks.matrix(comparison, "r")
+    assert "–" not in blocks.people(comparison) + scores.matrix(comparison, "r")
 
 
 def test_models_are_held_against_the_first_in_the_files(make_comparison: Maker) -> None:

@@ -54,7 +54,8 @@ class ReportInputs(ComparisonResults):
         """Every table by the name of its file."""
         comparison = self.comparison
         found: dict[str, pd.DataFrame | None] = {
-            "comparison": comparison.scores,
+            "comparison": comparison.all_scores,
+            "comparison_later": comparison.later if len(comparison.later) else None,
             "people": comparison.people,
             "stimuli": comparison.stimuli,
             "changed_outcomes": comparison.changed,
@@ -63,7 +64,7 @@ class ReportInputs(ComparisonResults):
             "calibration_scores": self.calibration,
             "comparison_with_flagged": None
             if self.comparison_all is None
-            else self.comparison_all.scores,
+            else self.comparison_all.all_scores,
         }
         if self.beside is not None:
             found |= {

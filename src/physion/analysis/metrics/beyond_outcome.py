@@ -14,6 +14,9 @@ from physion.analysis.metrics.registry import metrics, register_metric
 from physion.analysis.sample import Array, Sample, Sums
 from physion.analysis.statistics.correlation import correlation_within_groups
 
+BEYOND_OUTCOME = ("r_beyond_outcome", "kappa_beyond_outcome", "kappa_within_outcomes")
+"""Names of the metrics of this module."""
+
 
 @register_metric(
     "r_beyond_outcome",

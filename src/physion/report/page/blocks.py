@@ -10,10 +10,12 @@ from typing import Literal
 import numpy as np
 import pandas as pd
 
-from physion.analysis.metrics import Metric, score_metrics
 from physion.analysis.models.comparison import Comparison
-from physion.analysis.tables.stimuli import MEAN, POOLED, in_order
+from physion.analysis.tables.stimuli import in_order
 from physion.report.words import number, plural
+
+ANCHORS = "Anchors: what a score is worth"
+"""Heading of the rows of anchors in a table."""
 
 
 def details(title: str, content: str) -> str:
@@ -77,9 +79,17 @@ class PageColumn:
 def rows_table(rows: pd.DataFrame, columns: Sequence[PageColumn], caption: str = "") -> str:
     """Return a table of some columns of ``rows``, with reasons of undefined numbers listed below
     it.
+
+    Rows whose ``kind`` is anchor, if there is such a column, follow the others as a group.
     """
     cells = [[column.cell(row) for column in columns] for _, row in rows.iterrows()]
-    return table([column.heading for column in columns], cells, caption) + notes(rows, columns)
+    is_anchor = [kind == "anchor" for kind in rows.get("kind", [""] * len(rows))]
+    first, anchors = (
+        [line for line, anchor in zip(cells, is_anchor, strict=True) if anchor is which]
+        for which in (False, True)
+    )
+    headings = [column.heading for column in columns]
+    return table(headings, first, caption, (ANCHORS, anchors)) + notes(rows, columns)
 
 
 def notes(rows: pd.DataFrame, columns: Sequence[PageColumn]) -> str:
@@ -106,92 +116,37 @@ def paragraph(text: str) -> str:
     return f"<p>{escape(text)}</p>"
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]], caption: str = "") -> str:
-    """Return a table; the header and the caption are text, the cells are HTML."""
+def table(
+    header: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    caption: str = "",
+    below: tuple[str, Sequence[Sequence[str]]] = ("", ()),
+) -> str:
+    """Return a table; the header and the caption are text, the cells are HTML.
+
+    ``below``: a second group of rows under a heading of its own (text), if it has rows.
+    """
     head = "".join(f'<th scope="col">{escape(name)}</th>' for name in header)
+    above = f"<caption>{escape(caption)}</caption>" if caption else ""
+    heading, further = below
+    group = ""
+    if further:
+        words = (
+            f'<th scope="rowgroup" colspan="{len(header)}"><small>{escape(heading)}</small></th>'
+        )
+        group = f"<tbody>\n<tr>{words}</tr>\n{_lines(further)}\n</tbody>"
+    return (
+        f'<div class="wide"><table>{above}<thead><tr>{head}</tr></thead>\n'
+        f"<tbody>\n{_lines(rows)}\n</tbody>{group}</table></div>\n"
+    )
+
+
+def _lines(rows: Sequence[Sequence[str]]) -> str:
     lines = []
     for first, *rest in rows:
         cells = "".join(f"<td>{cell}</td>" for cell in rest)
         lines.append(f'<tr><th scope="row">{first}</th>{cells}</tr>')
-    above = f"<caption>{escape(caption)}</caption>" if caption else ""
-    body = "\n".join(lines)
-    return (
-        f'<div class="wide"><table>{above}<thead><tr>{head}</tr></thead>\n'
-        f"<tbody>\n{body}\n</tbody></table></div>\n"
-    )
-
-
-def shown_metrics(comparison: Comparison) -> list[Metric]:
-    """Return the metrics of the table of scores that say something about this comparison.
-
-    Without people those that need them are left out, and those about simulated outcomes if all
-    simulated outcomes are the official ones.
-    """
-    simulated = ("accuracy_simulated", "r_same")
-    return [
-        metric
-        for metric in score_metrics()
-        if (comparison.has_people or metric.needs == "outcome")
-        and not (comparison.changed.empty and metric.name in simulated)
-    ]
-
-
-def overall_table(comparison: Comparison, which: str, caption: str = "") -> str:
-    """Return the table of scores: a row a model, the metrics, and the noise ceiling of r."""
-    rows = comparison.scores[comparison.scores["scenario"] == which]
-    shown = shown_metrics(comparison)
-    header = ["model", "readout", "stimuli", *(metric.heading for metric in shown)]
-    ceiling = header.index("RMSD") if comparison.has_people else None
-    if ceiling is not None:
-        header.insert(ceiling, "ceiling of r")
-    cells = []
-    for _, row in rows.iterrows():
-        line = [escape(_describe_model(row)), escape(row["readout"]), str(row["stimuli"])]
-        line += [interval(row, metric.name) for metric in shown]
-        if ceiling is not None:
-            line.insert(ceiling, number(row["ceiling"]))
-        cells.append(line)
-    reasons = [
-        f"<li>{escape(row['agent'])}: {escape(row['reason'])}</li>"
-        for _, row in rows.iterrows()
-        if row["reason"]
-    ]
-    notes = f'<ul class="notes">{"".join(reasons)}</ul>' if reasons else ""
-    return table(header, cells, caption) + notes
-
-
-def _describe_model(row: pd.Series) -> str:
-    """Return the model's name with what distinguishes it from others, but without the readout."""
-    head = f"{row['model']} · {row['readout']}"
-    return str(row["model"]) + str(row["agent"]).removeprefix(head)
-
-
-def matrix(comparison: Comparison, key: str) -> str:
-    """Return a score by model (rows) and scenario (columns), people on top."""
-    scores = comparison.scores
-    columns = [*in_order(comparison.stimuli["scenario"]), MEAN, POOLED]
-    rows = []
-    if comparison.has_people:
-        rows.append([f"<em>{_people_title(key)}</em>", *_people_cells(comparison, key, columns)])
-    for agent in comparison.agents:
-        subset = scores[scores["agent"] == agent].set_index("scenario")
-        cells = [
-            interval(subset.loc[name], key) if name in subset.index else undefined("no predictions")
-            for name in columns
-        ]
-        rows.append([escape(agent), *cells])
-    return table(["", *columns], rows)
-
-
-def _people_title(key: str) -> str:
-    return "people" if key == "accuracy" else "ceiling"
-
-
-def _people_cells(comparison: Comparison, key: str, columns: Sequence[str]) -> list[str]:
-    people = comparison.people.set_index("scenario").assign(reason="")
-    if key == "accuracy":
-        return [interval(people.loc[name], key) if name in people.index else "" for name in columns]
-    return [number(people.loc[name, "ceiling"]) if name in people.index else "" for name in columns]
+    return "\n".join(lines)
 
 
 _NO_ZONE = "known only of scenarios of which all stimuli that single participants saw are predicted"
@@ -217,17 +172,6 @@ def people(comparison: Comparison) -> str:
             ]
         )
     return table([*header, "reliability", "ceiling of r"], rows, "People")
-
-
-def definitions(comparison: Comparison) -> str:
-    """Return the definitions of the columns that `overall_table` shows."""
-    meaning = {metric.heading: metric.definition for metric in shown_metrics(comparison)}
-    meaning |= {
-        "NaN": "undefined; the reason is below the table or shown on hovering",
-        "all, all-but, only": "a model's training: on all scenarios, on all but the tested one, on "
-        "the tested one alone; in the files the last two are “all but this” and “same”",
-    }
-    return f"<h3>What the numbers mean</h3>{definition_list(meaning)}"
 
 
 def changed(comparison: Comparison, links: Mapping[str, str] | None = None) -> str:

@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 
-from physion.analysis.tables.stimuli import MEAN, POOLED, in_order
+from physion.analysis.tables.stimuli import MEAN, in_order
 from physion.report.figures.registry import BY_SCENARIO, BY_STIMULUS, TRAINING, all_figures
 from physion.report.inputs import EXPECTED_METHODS, ReportInputs
-from physion.report.page import blocks, people_blocks, session_blocks, tests_of_models
+from physion.report.page import blocks, people_blocks, scores, session_blocks, tests_of_models
 from physion.report.page.document import Picture, Section, figure, render_document
 from physion.report.page.model_inputs import inputs_sentence
 from physion.report.page.movies import PageMovies
@@ -31,7 +31,7 @@ def render_page(
     shown = {picture.name: figure(picture) for picture in pictures}
     links = _links(inputs, folder)
     sections = [
-        Section("Scores", _scores(inputs)),
+        Section("Scores", scores.scores(inputs.comparison)),
         Section(BY_SCENARIO, _by_scenario(inputs, shown)),
         Section(TRAINING, _figures(TRAINING, shown, {})),
         Section(BY_STIMULUS, _stimuli(inputs, shown, links)),
@@ -118,13 +118,6 @@ def _summary(inputs: ReportInputs) -> str:
     return f'<p class="lead">{escape(" ".join(words))}</p>{more}'
 
 
-def _scores(inputs: ReportInputs) -> str:
-    comparison = inputs.comparison
-    return blocks.overall_table(comparison, MEAN, "Mean over scenarios") + blocks.details(
-        "All stimuli pooled", blocks.overall_table(comparison, POOLED)
-    )
-
-
 def _figures(section: str, shown: Mapping[str, str], below: Mapping[str, str]) -> str:
     """Return the figures of a section with their headings; ``below``: HTML below a figure."""
     parts = []
@@ -138,12 +131,12 @@ def _figures(section: str, shown: Mapping[str, str], below: Mapping[str, str]) -
 def _by_scenario(inputs: ReportInputs, shown: Mapping[str, str]) -> str:
     comparison = inputs.comparison
     below = {
-        "accuracy": blocks.details("Accuracy as a table", blocks.matrix(comparison, "accuracy")),
+        "accuracy": blocks.details("Accuracy as a table", scores.matrix(comparison, "accuracy")),
         "kappa": people_blocks.measures(inputs),
     }
     if comparison.has_people:
         below["r"] = blocks.details(
-            "Pearson r by scenario, as a table", blocks.matrix(comparison, "r")
+            "Pearson r by scenario, as a table", scores.matrix(comparison, "r")
         )
     return _figures(BY_SCENARIO, shown, below)
 
@@ -158,7 +151,7 @@ def _stimuli(inputs: ReportInputs, shown: Mapping[str, str], links: Mapping[str,
 def _methods(inputs: ReportInputs) -> str:
     stated = dict.fromkeys(EXPECTED_METHODS, "not stated") | dict(inputs.methods)
     choices = {**stated, **inputs.comparison.settings, **session_blocks.methods(inputs)}
-    return blocks.definition_list(choices) + blocks.definitions(inputs.comparison)
+    return blocks.definition_list(choices) + scores.definitions(inputs.comparison)
 
 
 def _left_out(inputs: ReportInputs) -> str:

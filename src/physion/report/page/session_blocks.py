@@ -6,11 +6,19 @@ from html import escape
 
 import pandas as pd
 
+from physion.analysis.models.anchors import TWO_PEOPLE
 from physion.analysis.people.exclusions import RULES, ExclusionRules
 from physion.analysis.people.results import PeopleResults
 from physion.analysis.tables.stimuli import MEAN, in_order
 from physion.report.inputs import ReportInputs
-from physion.report.page.blocks import PageColumn, paragraph, rows_table, table, undefined
+from physion.report.page.blocks import (
+    ANCHORS,
+    PageColumn,
+    paragraph,
+    rows_table,
+    table,
+    undefined,
+)
 
 
 def sessions(inputs: ReportInputs) -> str:
@@ -75,17 +83,17 @@ def _with_and_without(inputs: ReportInputs) -> str:
     result = table(header, cells, "Accuracy of people without flagged sessions and with them")
     if inputs.comparison_all is None:
         return result
-    with_all = inputs.comparison_all.scores
-    cells = []
-    for _, row in inputs.comparison.scores.iterrows():
-        if row["scenario"] != MEAN:
+    with_all = inputs.comparison_all.all_scores
+    grouped: dict[str, list[list[str]]] = {"model": [], "anchor": []}
+    for _, row in inputs.comparison.all_scores.iterrows():
+        if row["scenario"] != MEAN or row["agent"] == TWO_PEOPLE:
             continue
         other = with_all[(with_all["agent"] == row["agent"]) & (with_all["scenario"] == MEAN)]
         line = [escape(str(row["agent"]))]
         for key in ("difference", "r"):
             for subset in (row, other.iloc[0]):
                 line.append(PageColumn("", key, "interval").cell(subset))
-        cells.append(line)
+        grouped[row["kind"]].append(line)
     header = [
         "model",
         "less people, unflagged",
@@ -94,7 +102,10 @@ def _with_and_without(inputs: ReportInputs) -> str:
         "with all complete",
     ]
     return result + table(
-        header, cells, "Models, mean over scenarios: accuracy less people's, and r"
+        header,
+        grouped["model"],
+        "Models, mean over scenarios: accuracy less people's, and r",
+        (ANCHORS, grouped["anchor"]),
     )
 
 

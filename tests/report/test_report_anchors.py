@@ -1,0 +1,117 @@
+"""The page's tables of scores: anchors below the models, beyond the outcome, later contacts."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Callable
+from html import unescape
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from physion.analysis import Bootstrap, Comparison, compare_scores
+from physion.analysis.metrics import score_metrics
+from physion.analysis.models.anchors import COMPUTED, MAJORITY, OUTCOME, TWO_PEOPLE
+from physion.analysis.tables.stimuli import MEAN, POOLED
+from physion.report import ReportInputs, build_report
+from physion.report.page import scores
+from physion.report.page.blocks import ANCHORS
+
+Maker = Callable[..., Comparison]
+
+
+def groups(table: str) -> list[list[list[str]]]:
+    """The cells of each group of rows of a table as text."""
+    bodies = re.findall(r"<tbody>(.*?)</tbody>", table, flags=re.S)
+    return [
+        [
+            [unescape(re.sub(r"<[^>]+>", " ", cell)).strip() for cell in cells]
+            for line in re.findall(r"<tr>(.*?)</tr>", body, flags=re.S)
+            if (cells := re.findall(r"<t[hd][ >].*?</t[hd]>|<td>.*?</td>", line, flags=re.S))
+        ]
+        for body in bodies
+    ]
+
+
+@pytest.fixture
+def with_anchor(make_comparison: Maker) -> Comparison:
+    """A comparison whose first model is an anchor of the package."""
+    return make_comparison(model="constant-motion")
+
+
+def test_anchors_are_a_group_of_their_own(with_anchor: Comparison) -> None:
+    plain = scores.shown_metrics(with_anchor, beyond=False)
+    models, anchors = groups(scores.scores_table(with_anchor.all_scores, MEAN, plain))
+    assert [line[0] for line in models] == ["encoder"]
+    assert [line[0] for line in anchors] == [ANCHORS, "constant-motion", *COMPUTED]
+    for key in ("accuracy", "r", "kappa_within_outcomes"):
+        models, anchors = groups(scores.matrix(with_anchor, key))
+        assert models[-1][0] == "encoder · observed+simulated"
+        assert [line[0] for line in anchors][:4] == [
+            ANCHORS, "constant-motion · observed", OUTCOME, MAJORITY,
+        ]  # fmt: skip
+
+
+def test_the_cells_are_the_scores_and_empty_where_two_people_have_none(
+    with_anchor: Comparison,
+) -> None:
+    metrics = score_metrics()
+    _, anchors = groups(scores.scores_table(with_anchor.all_scores, POOLED, metrics))
+    names = ["", "readout", "stimuli"]
+    for metric in metrics:
+        names += [metric.name, "ceiling"] if metric.name == "r" else [metric.name]
+    two = dict(zip(names, anchors[-1], strict=True))
+    table = with_anchor.anchors.set_index(["agent", "scenario"])
+    row = table.loc[(TWO_PEOPLE, POOLED)]
+    assert two["kappa_from_averages"].split()[0] == f"{row['kappa_from_averages']:.2f}"
+    assert two["accuracy"].split()[0] == f"{row['accuracy']:.2f}"
+    assert two["r"] == two["rmsd"] == two["r_beyond_outcome"] == two["difference"] == ""
+    outcome = dict(zip(names, anchors[-3], strict=True))
+    assert outcome["r_beyond_outcome"] == "NaN" and outcome["r"] != "NaN"
+
+
+def test_reasons_stand_below_the_table_that_they_are_about(with_anchor: Comparison) -> None:
+    text = {
+        beyond: scores.scores_table(
+            with_anchor.all_scores, MEAN, scores.shown_metrics(with_anchor, beyond=beyond)
+        )
+        for beyond in (False, True)
+    }
+    why = f"{OUTCOME}: r beyond the outcome: undefined in collide, drop"
+    assert why in text[True] and "r beyond" not in text[False]
+
+
+def test_the_page_has_both_tables_and_says_why_one_is_missing(
+    with_anchor: Comparison, make_comparison: Maker
+) -> None:
+    text = scores.scores(with_anchor)
+    assert "Beyond the outcome" in text
+    assert "Not known: the predictions have no column Observed Contact" in text
+    alone = scores.scores(make_comparison(with_people=False))
+    assert "Beyond the outcome" not in alone and ANCHORS not in alone
+    assert OUTCOME not in alone.lower()
+
+
+def test_later_contacts_have_a_table_and_a_file(tmp_path: Path) -> None:
+    names = [f"pilot_it2_drop_simple_box_{i:04d}" for i in range(12)]
+    p = np.random.default_rng(0).random(12)
+    given = pd.DataFrame(
+        {"Model": "m", "Readout Type": "C", "Predicted Prob_true": p, "Predicted Outcome": p > 0.5,
+         "Actual Outcome": np.arange(12) % 2 == 0, "Stimulus Name": names,
+         "Observed Contact": np.arange(12) % 4 == 0}
+    )  # fmt: skip
+    people = pd.DataFrame(
+        {"stimulus": names, "scenario": "drop", "accuracy": np.arange(8, 20) / 20, "count": 20.0}
+    )
+    labels = {name: i % 2 == 0 for i, name in enumerate(names)}
+    comparison = compare_scores(given, people, labels, bootstrap=Bootstrap(50))
+    text = scores.scores(comparison)
+    assert "Left out: 3 of 12 stimuli (drop 3 of 12)" in text
+    build_report(ReportInputs(comparison), tmp_path)
+    later = pd.read_csv(tmp_path / "tables" / "comparison_later.csv")
+    assert set(later["stimuli"]) == {9} and set(later["kind"]) == {"model", "anchor"}
+    without = dataclasses.replace(comparison, later=comparison.later.iloc[:0])
+    assert "comparison_later" not in ReportInputs(without).tables()
