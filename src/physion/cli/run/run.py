@@ -36,7 +36,7 @@ def main(options: Options) -> int:
     else:
         for failure in answer["failures"]:
             console.print(f"failed: {failure}", markup=False, soft_wrap=True)
-        models = len({row["model"] for row in answer["scores"]})
+        models = len({row["model"] for row in answer["scores"] if row["kind"] == "model"})
         console.print(
             f"report of {models} models: {answer['report']}", markup=False, soft_wrap=True
         )
