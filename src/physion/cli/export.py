@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json as json_module
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -21,15 +22,22 @@ class Options:
     """Options of ``physion export``."""
 
     folder: Annotated[Path, tyro.conf.Positional]
-    """Folder of a dataset."""
+    """Folder of a dataset; for result-tables, the folder that `physion evaluate` wrote."""
     out: Annotated[Path | None, tyro.conf.Positional] = None
     """Output folder; the default for a card is the dataset's folder."""
     layout: Literal[
-        "official", "physion-particles", "physopt", "physion-evaluator", "webdataset", "card"
+        "official",
+        "physion-particles",
+        "physopt",
+        "physion-evaluator",
+        "webdataset",
+        "card",
+        "result-tables",
     ] = "official"
     """official: HDF5 files, movies and PhysionTest-Core folders of the study; physion-particles,
     physopt, physion-evaluator: folders that this published code reads; webdataset: tar shards;
-    card: README with Croissant metadata."""
+    card: README with Croissant metadata and a table for each split; result-tables: predictions with
+    the names of scenarios that the notebooks of the study use."""
     split: Literal["training", "readout", "testing", "familiarization"] | None = None
     """Export this split alone."""
     scenario: str | None = None
@@ -75,6 +83,8 @@ def main(options: Options) -> int:
         return _card(options)
     if options.out is None:
         raise BadInputError(f"--layout {options.layout} needs a folder to write into")
+    if options.layout == "result-tables":
+        return _result_tables(options, options.out)
     if options.layout == "webdataset":
         return _webdataset(options, options.out)
     return _official(options, options.out)
@@ -88,8 +98,21 @@ def _card(options: Options) -> int:
     given = {name: getattr(options, name) for name in CARD_TERMS}
     terms = {name: value for name, value in given.items() if value is not None}
     card = write_card(options.folder, options.out, **terms)
-    paths = [card.readme, card.metadata, *card.tables]
-    if options.json:
+    return _print_paths([card.readme, card.metadata, *card.tables], options.json)
+
+
+def _result_tables(options: Options, out: Path) -> int:
+    from physion.trials.publishing.result_tables import export_result_tables
+
+    if options.split or options.scenario:
+        raise BadInputError(
+            "tables of results are exported whole: leave out --split and --scenario"
+        )
+    return _print_paths(export_result_tables(options.folder, out), options.json)
+
+
+def _print_paths(paths: Sequence[Path], as_json: bool) -> int:
+    if as_json:
         print(json_module.dumps({"made": [str(path) for path in paths]}))
         return 0
     for path in paths:

@@ -1,0 +1,107 @@
+"""Tables of predictions for the notebooks of the study."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from physion.cli.main import main as cli
+from physion.errors import BadInputError
+from physion.trials.publishing.result_tables import export_result_tables
+
+DATASET_COLUMNS = ("Encoder Training Dataset", "Dynamics Training Dataset", "Readout Train Data")
+NOTEBOOK_SCENARIOS = {
+    "collide": "collision",
+    "contain": "containment",
+    "dominoes": "dominoes",
+    "drape": "clothiness",
+    "drop": "drop",
+    "link": "linking",
+    "roll": "rollingsliding",
+    "support": "towers",
+}
+
+
+def table(path: Path, **changes: object) -> Path:
+    rows = [
+        {
+            "Model": "m",
+            "Readout Train Data": ours,
+            "Readout Test Data": ours,
+            "Predicted Prob_true": "0.6666666666666666",
+            "Predicted Outcome": True,
+            "Actual Outcome": number % 2 == 0,
+            "Stimulus Name": f"{ours}_testing_0000",
+            "Encoder Training Dataset": "",
+            "Dynamics Training Dataset": f"no_{ours}" if number % 2 else ours,
+            "Protocol": "full",
+            **changes,
+        }
+        for number, ours in enumerate(NOTEBOOK_SCENARIOS)
+    ]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pd.DataFrame(rows).to_csv(path, index=False)
+    return path
+
+
+def process_model_dataframe(frame: pd.DataFrame) -> pd.DataFrame:
+    """``process_model_dataframe`` of ``analysis/analysis_helpers.py`` of the study, its selections.
+
+    cogtoolslab/physics-benchmarking-neurips2021 at commit fd02f3f.
+    """
+    frame["correct"] = frame["Actual Outcome"] == frame["Predicted Outcome"]
+    frame = frame.replace("rollslide", "rollingsliding").replace("cloth", "clothiness")
+    frame["Canon Stimulus Name"] = frame["Stimulus Name"].apply(
+        lambda name: "".join(name.split("-redyellow"))
+    )
+    for col in DATASET_COLUMNS:
+        frame[col + " Type"] = frame[col]
+        frame.loc[frame[col] == frame["Readout Test Data"], col + " Type"] = "same"
+        others = ["no_" + name for name in frame["Readout Test Data"]]
+        frame.loc[frame[col] == others, col + " Type"] = "all_but_this"
+    return frame
+
+
+def test_the_notebooks_find_every_scenario(tmp_path: Path) -> None:
+    source = table(tmp_path / "evaluated/predictions/m.csv")
+    (made,) = export_result_tables(tmp_path / "evaluated", tmp_path / "models")
+    frame = pd.read_csv(made)
+    # pandas 1.5, for which it was written, changes the type of an empty column by itself.
+    found = process_model_dataframe(frame.astype(dict.fromkeys(DATASET_COLUMNS, object)))
+    for number, (ours, theirs) in enumerate(NOTEBOOK_SCENARIOS.items()):
+        (row,) = found[found["Readout Test Data"] == theirs].to_dict("records")
+        assert row["Canon Stimulus Name"] == f"{ours}_testing_0000"
+        assert row["Readout Train Data Type"] == "same"
+        wanted = "all_but_this" if number % 2 else "same"
+        assert row["Dynamics Training Dataset Type"] == wanted
+        assert row["correct"] == (number % 2 == 0)
+    text = source.read_text().splitlines()
+    assert made.read_text().splitlines()[0] == text[0]
+    assert "0.6666666666666666" in made.read_text()  # digits stay
+
+
+def test_other_files_are_left_out_and_clashes_named(tmp_path: Path) -> None:
+    (tmp_path / "e").mkdir()
+    (tmp_path / "e/other.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(BadInputError, match="no table of predictions"):
+        export_result_tables(tmp_path / "e", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    table(tmp_path / "e/one/m.csv")
+    table(tmp_path / "e/two/m.csv")
+    with pytest.raises(BadInputError, match="same name"):
+        export_result_tables(tmp_path / "e", tmp_path / "out")
+    with pytest.raises(BadInputError, match="outside"):
+        export_result_tables(tmp_path / "e", tmp_path / "e/out")
+    (tmp_path / "e/empty.csv").write_text("")
+    with pytest.raises(BadInputError, match=r"empty\.csv is not a table"):
+        export_result_tables(tmp_path / "e", tmp_path / "out")
+
+
+def test_the_verb(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table(tmp_path / "e/predictions/m.csv")
+    words = ["export", str(tmp_path / "e"), str(tmp_path / "out"), "--layout", "result-tables"]
+    assert cli(words) == 0
+    assert "m.csv" in capsys.readouterr().out and (tmp_path / "out/m.csv").is_file()
+    assert cli([*words, "--split", "testing"]) == 2
