@@ -13,7 +13,7 @@ arguments or left out.
 """
 
 # The transcribed loaders use paths as their sources do.
-# ruff: noqa: PTH
+# ruff: noqa: PTH118, PTH119, PTH120, PTH123, PTH207, PTH208
 
 from __future__ import annotations
 
