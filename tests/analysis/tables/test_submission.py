@@ -63,6 +63,7 @@ def test_what_cannot_be_checked_is_said(tmp_path: Path) -> None:
         ("Predicted Prob_false", 2, "0.5", "probability"),
         ("Predicted Outcome", 2, "maybe", "outcome"),
         ("Actual Outcome", 2, "", "outcome"),
+        ("Observed Contact", 2, "maybe", "outcome"),
         ("Model", 2, " ", "blank"),
         ("Stimulus Name", 2, "", "blank"),
     ],
@@ -70,7 +71,7 @@ def test_what_cannot_be_checked_is_said(tmp_path: Path) -> None:
 def test_a_bad_value_is_named_with_row_and_stimulus(
     tmp_path: Path, column: str, row: int, value: str, kind: str
 ) -> None:
-    rows = table().astype(str)
+    rows = table().astype(str).assign(**{"Observed Contact": ""})
     rows.loc[row, column] = value
     found = check(tmp_path, rows)
     assert found.errors == 1

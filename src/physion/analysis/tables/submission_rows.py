@@ -124,6 +124,10 @@ def outcomes(table: pd.DataFrame, stimulus: pd.Series) -> list[Fault]:
     for column in ("Predicted Outcome", "Actual Outcome"):
         bad = booleans(table[column]).isna()
         faults += each(bad, table, stimulus, "outcome", column, "True or False")
+    for column in ("Recorded Outcome", "Observed Contact"):
+        if column in table.columns:
+            bad = booleans(table[column]).isna() & (table[column].str.strip() != "")
+            faults += each(bad, table, stimulus, "outcome", column, "True, False or nothing")
     p = pd.to_numeric(table["Predicted Prob_true"], errors="coerce")
     predicted = booleans(table["Predicted Outcome"])
     against = predicted.notna() & (p != 0.5) & p.between(0, 1) & ((p > 0.5) != (predicted == True))  # noqa: E712
