@@ -90,8 +90,9 @@ def _import(path: Path, name: str) -> Any:
         ) from error
     except Exception as error:
         where = _line_in(error, path)
+        what = error.msg if isinstance(error, SyntaxError) else error
         raise BadInputError(
-            f"model {name!r}: {path.name}{where} raised {type(error).__name__}: {error}"
+            f"model {name!r}: {path.name}{where} raised {type(error).__name__}: {what}"
         ) from error
 
 

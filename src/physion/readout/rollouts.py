@@ -22,9 +22,9 @@ from physion.atomic import write_atomic
 from physion.compute.executor import Executor
 from physion.compute.progress import Progress
 from physion.errors import BadInputError
-from physion.models.batch import Batch, Rollout
+from physion.models.batch import Batch
 from physion.models.from_file import LoadedFiles
-from physion.readout.model_calls import call_model, check_finite, to_array
+from physion.readout.features.model_outputs import CONTACT, GAP, imagine_clips
 from physion.training.sources.source import ObservedSource
 
 Cell = tuple[list[bool] | None, list[float] | None]
@@ -200,24 +200,17 @@ def stack_outcomes(
 
 def _run(request: _Request) -> Cell:
     """Return contacts and gaps of one trial."""
-    model, samples = request.model, request.samples
-    rollout: Rollout = call_model(
-        model, "imagine", request.context, samples, request.seed, **dict(request.knobs)
+    (arrays,) = imagine_clips(
+        request.model, request.context, request.samples, request.seed, dict(request.knobs)
     )
-    contact = gap = None
-    if rollout.contact is not None:
-        row = to_array(rollout.contact, model, "imagine gave contacts", (1, samples), ("bool",))
-        contact = [bool(value) for value in row[0]]
-    if rollout.gap is not None:
-        kinds = ("float64", "float32")
-        row = to_array(rollout.gap, model, "imagine gave gaps", (1, samples), kinds)
-        check_finite(row, model, "imagine gave gaps", request.context.trials)
-        gap = [float(value) for value in row[0]]
-    if contact is None and gap is None:
-        raise BadInputError(
-            f"model {model.provenance().model!r}: imagine gave neither contacts nor gaps"
-        )
-    return contact, gap
+    if CONTACT not in arrays and GAP not in arrays:
+        name = request.model.provenance().model
+        raise BadInputError(f"model {name!r}: imagine gave neither gap nor contact")
+    contact, gap = arrays.get(CONTACT), arrays.get(GAP)
+    return (
+        None if contact is None else [bool(value) for value in contact],
+        None if gap is None else [float(value) for value in gap],
+    )
 
 
 def _read(path: Path | None, samples: int) -> Cell | None:
