@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
+import importlib.util
+import inspect
 from collections.abc import Callable, Iterator
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Generic, TypeVar
 
 from physion.errors import PhysionError, UnknownNameError
@@ -63,6 +67,18 @@ class Registry(Generic[T]):
         self._read_plugins()
         return sorted(self._values.keys() | self._lazy.keys())
 
+    def describe(self, name: str) -> str:
+        """Return the first line of the docstring of the value ``name``, without importing it.
+
+        The line is empty where there is no docstring or no source file.
+        """
+        if name in self._values or name not in self._lazy:
+            text = inspect.getdoc(self.get(name)) or ""
+        else:
+            module, _, attribute = self._lazy[name].partition(":")
+            text = _docstring(module, attribute)
+        return text.partition("\n")[0]
+
     def _read_plugins(self) -> None:
         if self._plugins_read:
             return
@@ -75,3 +91,17 @@ class Registry(Generic[T]):
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.names())
+
+
+def _docstring(module: str, attribute: str) -> str:
+    """Return the docstring of a function or class from the source file of its module."""
+    try:
+        found = importlib.util.find_spec(module)
+    except ModuleNotFoundError:
+        return ""
+    if found is None or found.origin is None or not found.origin.endswith(".py"):
+        return ""
+    for node in ast.parse(Path(found.origin).read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef) and node.name == attribute:
+            return ast.get_docstring(node) or ""
+    return ""

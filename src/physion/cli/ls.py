@@ -1,4 +1,4 @@
-"""List the available scenarios, presets, shapes, props, materials, models and engines."""
+"""List the available scenarios, presets, shapes, props, materials, models, readers and engines."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from physion.compute.executor import executors
 from physion.errors import BadInputError
 from physion.models import models
 from physion.physics.engine import engines
+from physion.registry import Registry
 from physion.scenes.looks import MATERIALS
 from physion.scenes.sampling.parameters import describe_limits
 from physion.scenes.sampling.preset import Preset, get_preset, load_presets
@@ -29,9 +30,26 @@ LISTS: Mapping[str, Callable[[], Names]] = {
     "props": lambda: sorted(NATURAL_SIZES),
     "materials": lambda: {family: list(names) for family, names in MATERIALS.items()},
     "models": models.names,
+    "readers": lambda: _readers().names(),
     "engines": engines.names,
     "executors": executors.names,
 }
+
+
+DESCRIBED: Mapping[str, Callable[[], Registry[Any]]] = {
+    "models": lambda: models,
+    "readers": lambda: _readers(),
+    "engines": lambda: engines,
+    "executors": lambda: executors,
+}
+"""Lists that are printed with a line for each name, when they are asked for alone."""
+
+
+def _readers() -> Registry[Any]:
+    # Imported late: it takes time.
+    from physion.readout.readers.reader import readers
+
+    return readers
 
 
 @dataclass(frozen=True)
@@ -47,6 +65,7 @@ class Options:
             "props",
             "materials",
             "models",
+            "readers",
             "engines",
             "executors",
         ],
@@ -74,6 +93,9 @@ def main(options: Options) -> int:
     if options.json:
         print(json_module.dumps(names))
         return 0
+    if options.what in DESCRIBED:
+        _print_described(DESCRIBED[options.what]())
+        return 0
     for kind, members in names.items():
         if isinstance(members, list):
             print(f"{kind}: {', '.join(members)}")
@@ -83,6 +105,14 @@ def main(options: Options) -> int:
             for group, entries in members.items():
                 print(f"{group} ({len(entries)}): {', '.join(entries)}")
     return 0
+
+
+def _print_described(registry: Registry[Any]) -> None:
+    """Print a line for every name of a registry: what it is, from its docstring."""
+    for name in registry.names():
+        text = registry.describe(name).removeprefix("Build ").removeprefix("Return ")
+        line = f"{name}: {text}" if text else name
+        console.print(line, markup=False, soft_wrap=True, highlight=False)
 
 
 def _print_presets(scenario: str, as_json: bool) -> int:

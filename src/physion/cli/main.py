@@ -24,7 +24,7 @@ VERBS = {
     "import": "convert official HDF5 files and movies to trials",
     "import-official": "convert a checkout of the original study: scenes, outcomes, people",
     "verify": "check every byte, label and motion of a dataset",
-    "ls": "list scenarios, presets, shapes, props, materials, models, engines",
+    "ls": "list scenarios, presets, shapes, props, materials, models, readers, engines",
     "doctor": "check this machine and print what to install",
 }
 

@@ -146,5 +146,8 @@ class NoisySimulation:
 
 
 def noisy_simulation(**options: Any) -> NoisySimulation:
-    """Build the model; ``options`` are the fields of `NoisySimulationConfig`."""
+    """Build simulations that start from the true state with noise added.
+
+    ``options`` are the fields of `NoisySimulationConfig`.
+    """
     return NoisySimulation(make_config(NoisySimulationConfig, "noisy-simulation", options))

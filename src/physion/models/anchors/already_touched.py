@@ -86,7 +86,10 @@ class TouchedOrBaseRate:
 
 
 def already_touched(**options: Any) -> AlreadyTouched:
-    """Build the model; ``options`` are the fields of `AlreadyTouchedConfig`."""
+    """Build a model that is certain if the contact was seen, and else gives the base rate.
+
+    ``options`` are the fields of `AlreadyTouchedConfig`.
+    """
     return AlreadyTouched(make_config(AlreadyTouchedConfig, NAME, options))
 
 

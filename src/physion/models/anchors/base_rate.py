@@ -62,5 +62,8 @@ class FittedBaseRate:
 
 
 def base_rate(**options: Any) -> BaseRate:
-    """Build the model, which has no options."""
+    """Build a model that gives the base rate of the fitted trials, whatever the trial.
+
+    It has no options.
+    """
     return BaseRate(make_config(BaseRateConfig, NAME, options))

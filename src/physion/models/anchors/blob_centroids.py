@@ -107,5 +107,8 @@ def _centroid(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
 
 
 def blob_centroids(**options: Any) -> BlobCentroids:
-    """Build the model; ``options`` are the fields of `BlobCentroidsConfig`."""
+    """Build features that say where the red and the yellow pixels are.
+
+    ``options`` are the fields of `BlobCentroidsConfig`.
+    """
     return BlobCentroids(make_config(BlobCentroidsConfig, NAME, options))

@@ -84,5 +84,8 @@ class ConstantMotion:
 
 
 def constant_motion(**options: Any) -> ConstantMotion:
-    """Build the model; ``options`` are the fields of `ConstantMotionConfig`."""
+    """Build a model in which bodies go on as they move at the last observed frame.
+
+    ``options`` are the fields of `ConstantMotionConfig`.
+    """
     return ConstantMotion(make_config(ConstantMotionConfig, NAME, options))

@@ -93,7 +93,10 @@ def pictures(batch: Batch, size: int, model: str) -> NDArray[np.uint8]:
 
 
 def copy_last_frame(**options: Any) -> CopyLastFrame:
-    """Build the model; ``options`` are the fields of `CopyLastFrameConfig`."""
+    """Build small pictures as features, with a future that looks like the last one.
+
+    ``options`` are the fields of `CopyLastFrameConfig`.
+    """
     return CopyLastFrame(make_config(CopyLastFrameConfig, NAME, options))
 
 

@@ -72,7 +72,10 @@ class MajorityOfPeople:
 
 
 def majority_of_people(**options: Any) -> MajorityOfPeople:
-    """Build the model; ``options`` are the fields of `MajorityOfPeopleConfig`."""
+    """Build a model that answers a stimulus as people did.
+
+    ``options`` are the fields of `MajorityOfPeopleConfig`.
+    """
     return MajorityOfPeople(make_config(MajorityOfPeopleConfig, NAME, options))
 
 

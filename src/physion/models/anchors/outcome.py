@@ -91,7 +91,10 @@ def read_outcomes(outcomes: Mapping[str, bool]) -> dict[str, bool]:
 
 
 def outcome(**options: Any) -> Outcome:
-    """Build the model; ``options`` are the fields of `OutcomeConfig`."""
+    """Build a model that answers with the outcome itself, as a perfect simulator would.
+
+    ``options`` are the fields of `OutcomeConfig`.
+    """
     return Outcome(make_config(OutcomeConfig, NAME, options))
 
 

@@ -109,7 +109,10 @@ class FittedTrees:
 
 
 def state_classifier(**options: Any) -> StateClassifier:
-    """Build the model; ``options`` are the fields of `StateClassifierConfig`."""
+    """Build extremely randomised trees on the state at the last observed frame.
+
+    ``options`` are the fields of `StateClassifierConfig`.
+    """
     return StateClassifier(make_config(StateClassifierConfig, NAME, options))
 
 
