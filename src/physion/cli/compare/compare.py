@@ -35,7 +35,8 @@ class Options:
     predictions: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Prediction files with the official column names."""
     humans: Path | None = None
-    """Folder with human_accuracy-*.csv."""
+    """Answers of people by stimulus: official (those of the package), a folder made by
+    import-official, or one with human_accuracy-*.csv."""
     labels: Path | None = None
     """Official outcomes (stim_ID, label); if not given, looked for next to the folder of people."""
     responses: tuple[Path, ...] = ()
@@ -74,12 +75,13 @@ class Options:
 
 def main(options: Options) -> int:
     """Write the report and print its path."""
+    from physion.cli.official.read import humans_folder
     from physion.cli.output import console
     from physion.report.build import compare_files
 
     page = compare_files(
         list(options.predictions),
-        options.humans,
+        None if options.humans is None else humans_folder(options.humans),
         options.labels,
         options.out,
         exclude_ledge=not options.ledge,
