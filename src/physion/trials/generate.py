@@ -46,7 +46,8 @@ def generate(
     settings
         How trials are chosen, rendered and stored.
     executor
-        Where to run; by default one process per core.
+        Where to run; by default one process per core, for which a script needs
+        ``if __name__ == "__main__":``.
     progress
         Called with (stage, done, total) after every trial.
 
