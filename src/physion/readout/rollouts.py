@@ -191,9 +191,7 @@ def stack_outcomes(
             None
             if any(c is None for c in contacts)
             else np.array(contacts, np.bool_).reshape(shape),
-            None
-            if any(g is None for g in gaps)
-            else np.array(gaps, np.float64).reshape(shape),
+            None if any(g is None for g in gaps) else np.array(gaps, np.float64).reshape(shape),
         )
     return stacked
 
