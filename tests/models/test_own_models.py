@@ -17,6 +17,8 @@ from physion.errors import BadInputError, PhysionError
 from physion.models import Batch
 from physion.readout import EvaluationConfig
 from physion.readout.logistic import ReadoutConfig
+from physion.readout.trainings import TrainConfig
+from physion.training.overrides import TrainingOverrides
 from physion.trials.dataset import Dataset
 from physion.trials.making.plan import GenerateSettings
 from support.moving_dots import make_dots
@@ -62,6 +64,27 @@ def test_the_examples_predict_every_trial(
     assert done.predictions["Predicted Prob_true"].between(0, 1).all()
     trained = "Dynamics" in name
     assert len(list(tmp_path.glob("training/*"))) == (QUICK.folds if trained else 0)
+
+
+def test_evaluation_finds_what_was_trained_before(made: Dataset, tmp_path: Path) -> None:
+    model: Any = physion.build_model(f"{EXAMPLES / 'my_dynamics.py'}:MyDynamics", channels=4)
+    initial = model.digest()
+    given: dict[str, Any] = {"settings": TrainingOverrides(steps=5)}
+    given["config"] = TrainConfig(folds=2, accelerator="cpu")
+    trained = physion.train(made, model, tmp_path, **given)
+    assert len(trained) == 2 and not any(result.loaded for result in trained)
+    assert model.digest() == initial, "the weights stay the initial ones"
+    assert all(result.loaded for result in physion.train(made, model, tmp_path, **given))
+    steps: list[str] = []
+    done = physion.evaluate(
+        made, model, tmp_path, config=QUICK, progress=lambda what, *rest: steps.append(what)
+    )
+    assert "observed+simulated" in set(done.predictions["Protocol"])
+    assert not [what for what in steps if what.startswith("training")]
+    assert model.digest() != initial, "the weights are those of the last training"
+    for function in (physion.train, physion.evaluate):
+        with pytest.raises(BadInputError, match="options are for a model that is given by its"):
+            function(made, model, tmp_path, options={"channels": 4})  # type: ignore[operator]
 
 
 def test_the_examples_are_short() -> None:
