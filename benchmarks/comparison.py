@@ -24,7 +24,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from physion.report import assembly, build
+from physion.analysis import results
+from physion.report import build, settings_text
 from physion.stimulus_names import SCENARIOS
 
 RESULTS = Path(__file__).parent / "results"
@@ -128,13 +129,13 @@ def write_study(folder: Path, seed: int = 0) -> tuple[Path, Path, Path]:
 
 
 PARTS: tuple[tuple[Any, str], ...] = (
-    (assembly, "read_any_responses"),
-    (assembly, "analyse_people"),
-    (assembly, "compare_everywhere"),
-    (assembly, "compare"),
-    (assembly, "paired_table"),
-    (assembly, "fits_of_people"),
-    (assembly, "fits_of_models"),
+    (settings_text, "read_any_responses"),
+    (settings_text, "analyse_people"),
+    (results, "compare_everywhere"),
+    (results, "compare_scores"),
+    (results, "paired_tests"),
+    (results, "fits_of_people"),
+    (results, "fits_of_models"),
     (build, "write_plot"),
     (build, "render_page"),
 )

@@ -24,12 +24,14 @@ import datetime
 import os
 import platform
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from physion.analysis.statistics.correlation import correlation_within_groups
 from physion.analysis.tables.responses import read_humans
 from physion.compute.local import LocalExecutor
 from physion.data import official
@@ -89,13 +91,13 @@ def log_likelihood(p: NDArray[np.float64], y: NDArray[np.float64], m: NDArray[np
 
 
 def partial_r(x: NDArray[np.float64], y: NDArray[np.float64], z: NDArray[np.float64]) -> float:
-    """Return the correlation of x and y after their means by outcome z are taken out."""
-    x, y = x.copy(), y.copy()
+    """Return the correlation of x and y given the outcome z (0 or 1)."""
+    groups = []
     for outcome in (0.0, 1.0):
-        rows = z == outcome
-        x[rows] -= x[rows].mean()
-        y[rows] -= y[rows].mean()
-    return float(np.sum(x * y) / np.sqrt(np.sum(x * x) * np.sum(y * y)))
+        u, v = x[z == outcome], y[z == outcome]
+        sums = (len(u), u.sum(), v.sum(), u @ u, v @ v, u @ v)
+        groups.append(tuple(np.array([value], np.float64) for value in sums))
+    return float(correlation_within_groups(groups)[0])  # type: ignore[arg-type]
 
 
 class Search:
@@ -121,12 +123,21 @@ class Search:
         self._known: dict[NoiseLevels, NDArray[np.float64]] = {}
 
     def fractions(self, levels: NoiseLevels) -> NDArray[np.float64]:
-        """Return the fractions of all scenes, simulated once for each set of levels."""
-        if levels not in self._known:
-            tasks = {s.name: Task(s, levels, self.samples) for s in self.scenes}
-            done = {o.key: o.value for o in self.executor.map(fraction, tasks)}
-            self._known[levels] = np.array([done[scene.name] for scene in self.scenes])
+        """Return the fractions of all scenes."""
+        self.simulate([levels])
         return self._known[levels]
+
+    def simulate(self, wanted: Sequence[NoiseLevels]) -> None:
+        """Simulate all scenes with the levels that are not known yet, in one go."""
+        missing = [levels for levels in dict.fromkeys(wanted) if levels not in self._known]
+        tasks = {
+            f"{place} {scene.name}": Task(scene, levels, self.samples)
+            for place, levels in enumerate(missing)
+            for scene in self.scenes
+        }
+        done = {o.key: o.value for o in self.executor.map(fraction, tasks)} if tasks else {}
+        for place, levels in enumerate(missing):
+            self._known[levels] = np.array([done[f"{place} {s.name}"] for s in self.scenes])
 
     def fit(self, target: str, half: int, rounds: int) -> tuple[dict[str, float], float]:
         """Return the levels and the lapse rate with the highest likelihood on a half."""
@@ -135,6 +146,7 @@ class Search:
         for _ in range(rounds):
             before = best
             for name, values in GRID.items():
+                self.simulate([levels_of({**chosen, name: value}) for value in values])
                 for value in values:
                     trial = {**chosen, name: value}
                     score, rate = self._score(trial, target, half)

@@ -61,7 +61,8 @@ def _run(options: Options, folder: Path) -> dict[str, Any]:
     failures += problems
     answer = {"report": str(page), "scores": scores, "failures": failures}
     if not failures:
-        files = [folder / "trials" / INDEX, *predictions, page, *page.parent.rglob("*.csv")]
+        written = [path for path in page.parent.rglob("*") if path.suffix in (".html", ".csv")]
+        files = [folder / "trials" / INDEX, *predictions, *written]
         record_finished(options, folder, files, answer)
     return answer
 

@@ -54,7 +54,7 @@ TOLERANCE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class FlyingBody:
-    """Points of a body that goes on with its velocities.
+    """Points of a body that keeps its velocity and its angular velocity.
 
     - ``points`` (P, 3): metres, in the body's frame, from its centre of mass.
     - ``center`` (3,): of mass; ``rotation`` (3, 3); both at the start.

@@ -18,7 +18,7 @@ from physion.report.page.movies import PageMovies
 from physion.report.words import number, protocol_names
 
 FOLDER = "trials"
-"""Folder of the pages, beside the report."""
+"""Name of the folder that holds one page for each stimulus; it lies next to ``report.html``."""
 
 
 def page_name(stimulus: str) -> str:

@@ -338,3 +338,31 @@ def closest_points(
                 return OVERLAPPING, size, 0.0
             return CLOSE, size, np.sqrt(squared)
     return CLOSE, size, np.sqrt(squared)
+
+
+@in_place_kernel
+def fill_closest(simplex: Simplex, size: int, distance: float, closest: F64) -> None:
+    """Fill in the closest points that `closest_points` found for two hulls that are apart.
+
+    With the weights w_k of the corners a_k - b_k of the simplex, and c = sum w_k (a_k - b_k), the
+    closest point of A is sum w_k a_k, that of B is sum w_k b_k, and c / |c| points from B to A.
+
+    Parameters
+    ----------
+    simplex : Simplex
+        As `closest_points` left it.
+    size : int
+        Number of its corners.
+    distance : float
+        Metres between the hulls, |c|.
+    closest : (10,)
+        Output: direction from B to A, point of A, point of B, depth, which is -distance.
+    """
+    for i in range(3):
+        closest[i] = simplex.closest[i] / distance
+        closest[3 + i] = 0.0
+        closest[6 + i] = 0.0
+        for k in range(size):
+            closest[3 + i] += simplex.weight[k] * simplex.point[k, 3 + i]
+            closest[6 + i] += simplex.weight[k] * simplex.point[k, 6 + i]
+    closest[9] = -distance

@@ -14,6 +14,7 @@ from physion.physics.rigid.collision.closest_points import (
     OVERLAPPING,
     Simplex,
     closest_points,
+    fill_closest,
     new_simplex,
 )
 from physion.physics.rigid.collision.facing_faces import ClipSpace, new_clip_space
@@ -94,14 +95,7 @@ def find_closest(hulls: Hulls, manifolds: Manifolds, s: int, reach: float, space
                 manifolds.apart_rot[s, i, j] = space.rot[i, j]
         return APART
     if result == CLOSE:
-        for i in range(3):
-            closest[i] = simplex.closest[i] / distance
-            closest[3 + i] = 0.0
-            closest[6 + i] = 0.0
-            for k in range(size):
-                closest[3 + i] += simplex.weight[k] * simplex.point[k, 3 + i]
-                closest[6 + i] += simplex.weight[k] * simplex.point[k, 6 + i]
-        closest[9] = -distance
+        fill_closest(simplex, size, distance, closest)
         return CLOSE
     if penetration(
         hulls.vertices, span, space.rot, space.shift, simplex, size, space.polytope, closest

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.numerics.kernel import in_place_kernel
-from physion.physics.rigid.collision.closest_points import OVERLAPPING, closest_points
+from physion.physics.rigid.collision.closest_points import OVERLAPPING, closest_points, fill_closest
 from physion.physics.rigid.collision.hull_records import Hulls
 from physion.physics.rigid.collision.pair_distance import PairSpace
 from physion.physics.rigid.collision.penetration import penetration
@@ -75,14 +75,7 @@ def time_of_impact(
             if time == 0.0:
                 _fill_overlap(hulls, motion, size, space)
             return time
-        for i in range(3):
-            closest[i] = simplex.closest[i] / distance
-            closest[3 + i] = 0.0
-            closest[6 + i] = 0.0
-            for k in range(size):
-                closest[3 + i] += simplex.weight[k] * simplex.point[k, 3 + i]
-                closest[6 + i] += simplex.weight[k] * simplex.point[k, 6 + i]
-        closest[9] = -distance
+        fill_closest(simplex, size, distance, closest)
         if distance <= gap:
             return time
         nearing = -(closest[0] * motion[0] + closest[1] * motion[1] + closest[2] * motion[2])
