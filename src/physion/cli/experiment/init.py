@@ -1,4 +1,4 @@
-"""Create a study folder from a generated dataset, or from official stimulus lists and movies.
+"""Create a study folder from a generated dataset, official scenes, or official lists and movies.
 
 Movies are cut to their observed frames. Texts, settings and stimuli are files that can be edited.
 An interrupted command can be repeated and continues. The experimenter's password is shown once.
@@ -7,6 +7,7 @@ An interrupted command can be repeated and continues. The experimenter's passwor
 from __future__ import annotations
 
 import json as json_module
+import os
 import secrets
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,12 @@ class Options:
     """Folder of the study; new or empty."""
     trials: Path | None = None
     """Dataset from which testing and familiarization trials are drawn."""
+    scenes: Path | None = None
+    """Instead of --trials: official scenes, which are rendered first: those of the package
+    (official), a folder made by import-official, or one with command logs."""
+    rendered: Path | None = None
+    """Folder of the trials that --scenes makes; existing ones are kept. Default: next to the study,
+    with -trials after its name."""
     stimuli: tuple[Path, ...] = ()
     """Instead of --trials: official stimulus lists (JSON or CSV), one per scenario."""
     familiarization: tuple[Path, ...] = ()
@@ -41,9 +48,10 @@ class Options:
     maps: Path | None = None
     """Folder with the maps of the lists. Default: searched for next to the movies."""
     scenario: tuple[str, ...] = ()
-    """Scenarios of --trials. Default: all that have testing trials."""
+    """Scenarios of --trials or --scenes. Default: all that have testing trials."""
     test: int | None = None
-    """Test trials per session, half with contact. Default: 150, or the whole lists."""
+    """Test trials per session, half with contact. Default: 150 or as many as there are, or the
+    whole lists."""
     practice: int = 10
     """Familiarization trials drawn from a dataset, half with contact."""
     look: Literal["free", "redyellow"] = "free"
@@ -60,6 +68,8 @@ class Options:
     """Languages whose texts are copied into the study."""
     seed: int = 0
     """Seed of the draw of trials and of all trial orders."""
+    workers: int = os.cpu_count() or 1
+    """Processes that render the trials of --scenes."""
     password_file: Path | None = None
     """File with the experimenter's password. Default: a random one is created and shown."""
     json: bool = False
@@ -84,25 +94,69 @@ def main(options: Options) -> int:
 
 
 def _choose(options: Options) -> StimulusSelection:
-    """Select the stimuli from the dataset or the lists."""
+    """Select the stimuli from the dataset, the official scenes or the lists."""
+    given = [bool(options.trials), bool(options.scenes), bool(options.stimuli)]
+    if sum(given) != 1:
+        raise BadInputError(
+            "give either --trials DATASET, --scenes official, or --stimuli LISTS with --movies DIR"
+        )
+    if options.rendered is not None and options.scenes is None:
+        raise BadInputError("--rendered goes with --scenes, whose trials are rendered first")
+    if options.stimuli:
+        return _choose_listed(options)
+    for name in ("familiarization", "familiarization_trials", "movies", "maps"):
+        if getattr(options, name):
+            raise BadInputError(f"--{name.replace('_', '-')} goes with --stimuli alone")
+    if options.trials is not None:
+        return _choose_made(options, options.trials, options.scenario)
+    return _choose_official(options)
+
+
+def _choose_made(options: Options, trials: Path, scenario: tuple[str, ...]) -> StimulusSelection:
+    """Select the stimuli from a dataset."""
     from physion.experiment.study.init.generated_trials import TEST, choose_trials
 
-    if (options.trials is None) == (not options.stimuli):
-        raise BadInputError("give either --trials DATASET or --stimuli LISTS with --movies DIR")
-    if options.trials is None:
-        return _choose_listed(options)
-    given = ("familiarization", "familiarization_trials", "movies", "maps")
-    for name in given:
-        if getattr(options, name):
-            raise BadInputError(f"--{name.replace('_', '-')} goes with --stimuli, not --trials")
     return choose_trials(
-        options.trials,
-        scenarios=options.scenario,
+        trials,
+        scenarios=scenario,
         test=TEST if options.test is None else options.test,
         practice=options.practice,
         look=options.look,
         seed=options.seed,
     )
+
+
+def _choose_official(options: Options) -> StimulusSelection:
+    """Select official scenes, render the trials that are missing, and take the stimuli of them."""
+    from physion.analysis.tables.responses import read_humans
+    from physion.cli.official.read import official_data, read_trials
+    from physion.cli.output import Stages
+    from physion.compute.local import LocalExecutor
+    from physion.experiment.study.init.generated_trials import TEST
+    from physion.experiment.study.init.official_scenes import SIZE, choose_official
+    from physion.trials.making.generate import make_trials
+    from physion.trials.making.plan import GenerateSettings
+
+    assert options.scenes is not None
+    data, logs = official_data(options.scenes), read_trials(options.scenes)
+    logs.require_trials()
+    executor = LocalExecutor(workers=options.workers)
+    folder = options.rendered or options.folder.with_name(f"{options.folder.name}-trials")
+    with Stages() as stages:
+        chosen = choose_official(
+            logs.trials,
+            None if data is None else set(read_humans(data.humans)["stimulus"]),
+            scenarios=options.scenario,
+            test=TEST if options.test is None else options.test,
+            practice=options.practice,
+            executor=executor,
+            progress=stages,
+        )
+        settings = GenerateSettings(SIZE, SIZE, options.look, jitters=0)
+        report = make_trials(folder, chosen.tasks, settings, executor=executor, progress=stages)
+    failures = [f"left out: {name}: {reason}" for name, reason in report.failed.items()]
+    made = _choose_made(options, folder, tuple(dict.fromkeys(t.scenario for t in chosen.tasks)))
+    return type(made)(made.sources, (*chosen.notes, *failures, *made.notes))
 
 
 def _choose_listed(options: Options) -> StimulusSelection:

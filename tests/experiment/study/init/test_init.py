@@ -280,7 +280,7 @@ def test_the_command_takes_a_password_and_prints_json(
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ([], "give either --trials DATASET or --stimuli"),
+        ([], "give either --trials DATASET, --scenes official"),
         (["--trials", "DATA", "--stimuli", "a.json"], "give either"),
         (["--trials", "DATA", "--movies", "."], "--movies goes with --stimuli"),
         (["--stimuli", "a.json"], "--stimuli needs --movies"),

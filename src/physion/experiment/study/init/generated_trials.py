@@ -126,10 +126,15 @@ def _draw(
     half = min(count // 2, *map(len, by_label))
     if half == 0:
         lacking = "with" if len(by_label[0]) == 0 else "without"
+        imported = dataset.index["recorded_contact"].notna().any()
+        advice = (
+            "for official scenes give --scenes official in place of --trials"
+            if imported
+            else f"to make some: physion generate {dataset.folder} --scenario {scenario} "
+            f"--split {split} --count {count}"
+        )
         raise BadInputError(
-            f"{dataset.folder} has no {split} trial of {scenario} {lacking} contact; to make some: "
-            f"physion generate {dataset.folder} --scenario {scenario} --split {split} "
-            f"--count {count}"
+            f"{dataset.folder} has no {split} trial of {scenario} {lacking} contact; {advice}"
         )
     # Separate random streams for trials with and without contact: adding trials with one label
     # does not change which trials with the other label are drawn.
