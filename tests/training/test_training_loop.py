@@ -15,9 +15,9 @@ from torch import Tensor
 from physion.atomic import folder_lock
 from physion.errors import BadInputError, PhysionError
 from physion.models.batch import Batch
+from physion.models.checkpoints.checkpoint import read_checkpoint
 from physion.models.raised import OutOfMemoryError
 from physion.models.settings import TrainingSettings
-from physion.training.checkpoint import read_checkpoint
 from physion.training.devices import Devices, make_fabric
 from physion.training.folder import CARD, CHECKPOINT, PREVIOUS, WEIGHTS
 from physion.training.loop import TrainingStoppedError

@@ -114,6 +114,30 @@ class HasBaseline(Protocol):
 
 
 @runtime_checkable
+class Calibrates(Protocol):
+    """Model that sets some of its buffers after training, such as a threshold on its rollouts.
+
+    ``calibration_trials``: largest number of training trials that it is given.
+    """
+
+    calibration_trials: int
+
+    def calibrate(self, whole: Batch) -> None:
+        """Set buffers from whole training trials; they are stored with the weights."""
+        ...
+
+
+@runtime_checkable
+class Trained(Protocol):
+    """Model that may come with weights that were trained before.
+
+    ``trained``: they were, and the harness does not train it again before it predicts.
+    """
+
+    trained: bool
+
+
+@runtime_checkable
 class Predicts(Protocol):
     """Model that gives P(contact) itself, without a readout.
 

@@ -23,6 +23,7 @@ from physion.models.interface import (
     Learns,
     Model,
     SeesOutcomes,
+    Trained,
 )
 from physion.readout.capabilities import Way, build_reader, reader_name
 from physion.readout.features.feature_store import FeatureStore
@@ -118,6 +119,8 @@ class Predictor:
         """Train the model from its initial weights on the training trials of a fold."""
         model = self.model
         if self.config.untrained or not (is_network(model) and isinstance(model, Learns)):
+            return None
+        if isinstance(model, Trained) and model.trained:
             return None
         if model.diet == "features" and Readout.OBSERVED_SIMULATED not in self.ways:
             return None

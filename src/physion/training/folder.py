@@ -10,7 +10,7 @@ from typing import Any
 from torch import Tensor
 
 from physion.atomic import remove_leftovers, write_atomic
-from physion.training.checkpoint import (
+from physion.models.checkpoints.checkpoint import (
     DamagedFileError,
     check_same,
     read_checkpoint,

@@ -19,10 +19,10 @@ from torch import Tensor
 
 from physion.errors import BadInputError, PhysionError
 from physion.models.batch import Batch
+from physion.models.checkpoints.checkpoint import load_tensors, tensors_of
 from physion.models.interface import HasBaseline
 from physion.models.settings import TrainingSettings
 from physion.seeds import stable_hash
-from physion.training.checkpoint import load_tensors, tensors_of
 from physion.training.folder import CheckpointContent, TrainingFolder
 from physion.training.losses import (
     LOSS,

@@ -66,7 +66,7 @@ def model_card(
             "## Use\nBuild the model with the same options, then load the weights:\n\n"
             "```python\n"
             "from pathlib import Path\n\n"
-            "from physion.training.checkpoint import load_weights\n\n"
+            "from physion.models.checkpoints.checkpoint import load_weights\n\n"
             f'load_weights(Path("{WEIGHTS}"), model)\n'
             "```\n",
         ]

@@ -20,10 +20,10 @@ from torch import nn
 from physion.atomic import folder_lock
 from physion.compute.progress import Progress
 from physion.errors import BadInputError
-from physion.models.interface import Learns, features_digest
+from physion.models.checkpoints.checkpoint import hash_config, load_tensors, tensors_of, versions
+from physion.models.interface import Calibrates, Learns, features_digest
 from physion.models.settings import TrainingSettings
-from physion.seeds import stable_hash
-from physion.training.checkpoint import hash_config, load_tensors, tensors_of, versions
+from physion.seeds import generator, stable_hash
 from physion.training.devices import Devices, make_fabric, memory_advice
 from physion.training.folder import TrainingFolder
 from physion.training.loop import TrainingData, TrainingLoop
@@ -161,6 +161,7 @@ def train_model(
         if stored is not None:
             loop.resume(stored)
         loop.run()
+        _calibrate(model, source, data.training.trials, seed, fabric)
         if kept is not None and fabric.is_global_zero:
             card = model_card(model, name, trials, settings, seed, metadata, loop.state)
             kept.finish(tensors_of(model), loop.metadata(), card)
@@ -241,6 +242,21 @@ def _prepare(model: Any, data: TrainingData, seed: int, fabric: Fabric) -> None:
     with evaluating(model, fabric):
         torch.manual_seed(stable_hash("prepare", seed) % 2**63)
         call(model, "prepare", data.training.sample(seed).to(fabric.device))
+
+
+def _calibrate(
+    model: Any, source: WholeSource, trials: Sequence[str], seed: int, fabric: Fabric
+) -> None:
+    """Let the model set what depends on its trained weights from whole training trials."""
+    if not isinstance(model, Calibrates):
+        return
+    network: Any = model
+    order = generator("calibrate", seed).permutation(len(trials))[: model.calibration_trials]
+    chosen = source.whole([trials[row] for row in np.sort(order)])
+    with evaluating(network, fabric):
+        torch.manual_seed(stable_hash("calibrate", seed) % 2**63)
+        call(network, "calibrate", chosen)
+    network.eval()
 
 
 def _named(progress: Progress | None, what: str) -> Callable[[int, int], None] | None:

@@ -73,13 +73,7 @@ def radius_edges_on_device(points: Tensor, scene: Tensor, radius: float) -> tupl
     _check(points, scene, radius)
     if len(points) == 0:
         return scene.new_zeros(0), scene.new_zeros(0)
-    points = points.double()
-    found = []
-    for first, second in _candidates(points, scene, radius, None):
-        apart = points[first] - points[second]
-        near = (apart * apart).sum(1) <= radius * radius
-        found.append((first[near], second[near]))
-    return _sorted(found, len(points))
+    return _sorted(list(_close_pairs(points.double(), scene, radius, None)), len(points))
 
 
 def swept_edges_on_device(
@@ -116,9 +110,9 @@ def swept_edges_on_device(
     slow = (lengths <= SLOW * radius).nonzero()[:, 0]
     found = []
     if len(slow):
-        reach = radius + float(lengths[slow].max())
+        reach = (radius + float(lengths[slow].max())) * MARGIN
         middle = points[slow] + displacements[slow] / 2
-        for first, second in _candidates(middle, scene[slow], reach, None):
+        for first, second in _close_pairs(middle, scene[slow], reach, None):
             found.append(_that_meet(points, displacements, (slow[first], slow[second]), radius))
     if len(fast):
         found += _swept_by(fast, points, displacements, scene, radius, float(lengths.max()))
@@ -131,11 +125,11 @@ def _swept_by(
 ) -> list[tuple[Tensor, Tensor]]:  # fmt: skip
     """Return the swept pairs with a fast particle, in both directions, some of them repeatedly."""
     moments = min(math.ceil(2 * longest / radius), MOMENTS)
-    reach = radius + longest / moments
+    reach = (radius + longest / moments) * MARGIN
     found = []
     for moment in range(moments):
         there = points + displacements * ((moment + 0.5) / moments)
-        for pairs in _candidates(there, scene, reach, fast):
+        for pairs in _close_pairs(there, scene, reach, fast):
             first, second = _that_meet(points, displacements, pairs, radius)
             found += [(first, second), (second, first)]
     return found
@@ -158,12 +152,12 @@ def _that_meet(
     return first[near], second[near]
 
 
-def _candidates(
+def _close_pairs(
     points: Tensor, scene: Tensor, reach: float, queries: Tensor | None
 ) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yield blocks of pairs that hold all particles within ``reach`` of the queries.
+    """Yield, in blocks, the pairs of a query and another particle of its scene within ``reach``.
 
-    A pair is a query and another particle of its scene. By default all particles are queries.
+    By default all particles are queries.
     """
     cells = _cells(points, scene, reach)
     own = torch.arange(len(points), device=points.device) if queries is None else queries
@@ -171,7 +165,7 @@ def _candidates(
     low = torch.searchsorted(cells.ordered, middle - 1)
     counts = torch.searchsorted(cells.ordered, middle + 1, right=True) - low
     ends = counts.sum(1).cumsum(0)
-    start = 0
+    farthest, start = reach * reach, 0
     while start < len(own):
         done = int(ends[start - 1]) if start else 0
         stop = int(torch.searchsorted(ends, done + CANDIDATES_AT_ONCE, right=True))
@@ -183,8 +177,9 @@ def _candidates(
         row = torch.arange(total, device=points.device)
         second = cells.order[row + torch.repeat_interleave(before, each, output_size=total)]
         first = torch.repeat_interleave(own[rows], counts[rows].sum(1), output_size=total)
-        other = first != second
-        yield first[other], second[other]
+        apart = points.index_select(0, first).sub_(points.index_select(0, second))
+        near = (apart.square_().sum(1) <= farthest) & (first != second)
+        yield first[near], second[near]
         start = stop
 
 
@@ -221,8 +216,7 @@ def _compressed(values: Tensor) -> tuple[Tensor, int]:
 
 def _sorted(found: list[tuple[Tensor, Tensor]], count: int) -> tuple[Tensor, Tensor]:
     """Return receivers and senders sorted, each pair once."""
-    codes = [first * count + second for first, second in found]
-    code = torch.unique(torch.cat(codes)) if codes else torch.zeros(0, dtype=torch.int64)
+    code = torch.unique(torch.cat([first * count + second for first, second in found]))
     return code // count, code % count
 
 

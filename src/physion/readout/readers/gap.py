@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.errors import BadInputError
+from physion.models.threshold import best_threshold
 from physion.readout.logistic import ReadoutConfig
 from physion.readout.readers.reader import Reading
 from physion.readout.rollouts import Knobs, Outcomes
@@ -48,21 +49,6 @@ class GapReader:
         return Reading(
             _probability(tested, threshold), accuracy, fitted={**dict(knobs), "gap": threshold}
         )
-
-
-def best_threshold(gaps: NDArray[np.float64], labels: NDArray[np.bool_]) -> float:
-    """Return the threshold (m) under which ``gap <= threshold`` equals most ``labels`` (n,).
-
-    The candidates are 0 and the middles between neighbouring gaps.
-    """
-    values = np.unique(gaps[np.isfinite(gaps)])
-    candidates = np.concatenate([[0.0], (values[1:] + values[:-1]) / 2])
-    if len(labels) == 0:
-        return 0.0
-    hits = (gaps[None, :] <= candidates[:, None]) == labels[None, :]
-    right = hits.sum(axis=1)
-    best = candidates[right == right.max()]
-    return float(best[np.argmin(np.abs(best))])
 
 
 def _probability(gaps: NDArray[np.float64], threshold: float) -> NDArray[np.float64]:

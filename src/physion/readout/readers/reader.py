@@ -73,6 +73,7 @@ readers: Registry[ReaderFactory] = Registry(
         "logistic": "physion.readout.readers.logistic_reader:LogisticReader",
         "released": "physion.readout.readers.logistic_reader:released_reader",
         "gap": "physion.readout.readers.gap:GapReader",
+        "touch": "physion.readout.readers.touch:TouchReader",
         "noise": "physion.readout.readers.noise:NoiseReader",
     },
 )

@@ -15,9 +15,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from physion.errors import BadInputError
-from physion.models.settings import TrainingSettings
-from physion.training import folder as folder_module
-from physion.training.checkpoint import (
+from physion.models.checkpoints.checkpoint import (
     DamagedFileError,
     check_same,
     load_weights,
@@ -25,6 +23,8 @@ from physion.training.checkpoint import (
     tensors_of,
     write_checkpoint,
 )
+from physion.models.settings import TrainingSettings
+from physion.training import folder as folder_module
 from physion.training.devices import Devices, make_fabric
 from physion.training.folder import CHECKPOINT, PREVIOUS, WEIGHTS
 from physion.training.train import TrainedModel, train_model
@@ -236,7 +236,7 @@ def test_a_broken_or_foreign_file_is_one_clear_line(kind: str, tmp_path: Path) -
 
 
 def test_a_file_of_a_later_format_is_refused(tmp_path: Path, monkeypatch: Any) -> None:
-    from physion.training import checkpoint
+    from physion.models.checkpoints import checkpoint
 
     path = tmp_path / "file.safetensors"
     monkeypatch.setattr(checkpoint, "_VERSION", 2)

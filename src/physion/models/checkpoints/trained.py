@@ -1,0 +1,68 @@
+"""Weights of models that this package trained: those that come with it, and those of a user."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from importlib.resources import as_file, files
+from pathlib import Path
+
+from torch import nn
+
+from physion.errors import BadInputError
+from physion.models.checkpoints.checkpoint import DamagedFileError, load_weights
+
+FOLDER = "shipped"
+"""Folder of the shipped weights, beside this module."""
+DIGESTS = "sha256.json"
+"""File with the SHA-256 of every shipped file by the name of the model."""
+
+
+def shipped_digests() -> dict[str, str]:
+    """Return the SHA-256 of the shipped weights by model."""
+    text = (files(__package__) / FOLDER / DIGESTS).read_text()
+    return {str(name): str(value) for name, value in json.loads(text).items()}
+
+
+def load_shipped(model: nn.Module, name: str) -> str:
+    """Load the weights that come with the package, and return their origin for the tables.
+
+    Raises
+    ------
+    BadInputError
+        If there are none for the model.
+    DamagedFileError
+        If the file was changed.
+    """
+    digests = shipped_digests()
+    if name not in digests:
+        raise BadInputError(f"no weights are shipped for {name}, only for {', '.join(digests)}")
+    with as_file(files(__package__) / FOLDER / f"{name}.safetensors") as path:
+        found = _sha256(path) if path.is_file() else "no file"
+        if found != digests[name]:
+            raise DamagedFileError(
+                f"the weights {path} that come with the package are damaged or changed; install "
+                "the package again"
+            )
+        load_weights(path, model)
+    return f"shipped:{digests[name][:12]}"
+
+
+def load_file(model: nn.Module, file: str) -> str:
+    """Load a ``model.safetensors`` of ``physion train``, and return its origin for the tables.
+
+    Raises `BadInputError` for a file that is missing or holds other weights.
+    """
+    path = Path(file)
+    if not path.is_file():
+        raise BadInputError(
+            f"there are no weights at {path}; give random, shipped, or the model.safetensors of "
+            "a training"
+        )
+    load_weights(path, model)
+    return f"local:{_sha256(path)[:12]}"
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,1 @@
+"""Particle models: GNS, GNS-RANSAC and DPI-Net, which learn how particles of objects move."""

@@ -1,0 +1,248 @@
+"""Objects of a scene as particles, and their motion.
+
+Rigid and kinematic bodies are particles that are fixed to a pose, cloths are their vertices.
+Scenery is left out, since it takes part in no collision, and so are bodies that are absent.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from physion.errors import BadInputError
+from physion.models.batch import Motion
+from physion.models.particles.surface import surface_points
+from physion.numerics.rotations import rotation_matrices
+from physion.physics.particles import sample_particles
+from physion.scenes.scene import Body, Scene
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+RIGID, KINEMATIC, CLOTH = 0, 1, 2
+"""Kinds of objects."""
+Fill = Literal["surface", "volume"]
+
+MAX_PARTICLES = 200_000
+"""Largest number of particles of one scene."""
+
+
+@dataclass(frozen=True)
+class ParticleSettings:
+    """How objects become particles.
+
+    - ``spacing``: metres between particles. ``limit``: largest number for one body.
+    - ``fill``: ``volume``, as the original study, or ``surface``.
+    - ``cloth_step``: every how many vertices of a cloth, along both sides, is a particle.
+    """
+
+    spacing: float = 0.10
+    limit: int = 100
+    fill: Fill = "surface"
+    cloth_step: int = 3
+
+    def __post_init__(self) -> None:
+        counts = min(self.limit, self.cloth_step)
+        if not self.spacing > 0 or counts < 1 or self.fill not in ("surface", "volume"):
+            raise BadInputError(
+                "particles: the spacing must be above 0 m, limit and cloth_step at least 1, and "
+                f"fill surface or volume, not {self.spacing}, {self.limit}, {self.cloth_step} and "
+                f"{self.fill!r}"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class SceneParticles:
+    """Particles of one scene: K objects, P particles in blocks by object.
+
+    - ``things`` (K,): index of each object in `Scene.names`.
+    - ``kinds`` (K,): `RIGID`, `KINEMATIC` or `CLOTH`.
+    - ``owners`` (P,): row of the object of each particle.
+    - ``shape`` (P, 3): metres, offset of each particle from the mean of its object's particles, in
+      the body's frame; 0 for cloth.
+    - ``pivots`` (K, 3): the mean of the particles in the body's frame; 0 for cloth.
+    - ``vertices`` (C,): row in `Trajectory.cloth_vertices` of each particle of a cloth.
+    - ``links`` (2, L): neighbours along the sides and diagonals of the grid of a cloth, rows of
+      particles; both ways.
+    - ``floor``: height of the floor, metres.
+    - ``agent``, ``patient``: rows of objects, -1 for one that is absent.
+    """
+
+    name: str
+    things: I64
+    kinds: I64
+    owners: I64
+    shape: F64
+    pivots: F64
+    vertices: I64
+    links: I64
+    floor: float
+    agent: int
+    patient: int
+
+    @property
+    def loose(self) -> NDArray[np.bool_]:
+        """Which particles (P,) move on their own: those of cloths."""
+        return np.asarray(self.kinds[self.owners] == CLOTH)
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Motion of the objects of one scene over T frames.
+
+    - ``centers`` (T, K, 3): metres, mean of the particles of each object.
+    - ``rotations`` (T, K, 3, 3): of bodies; the identity for cloths.
+    - ``loose`` (T, C, 3): positions of the particles of cloths.
+    """
+
+    centers: F64
+    rotations: F64
+    loose: F64
+
+
+_Key = tuple[int, ParticleSettings, tuple[bool, ...]]
+_kept: OrderedDict[_Key, tuple[Scene, SceneParticles]] = OrderedDict()
+"""Particles of the scenes that were asked for last, and the scenes, so that their ids stay."""
+_KEPT = 4096
+
+
+def scene_particles(
+    scene: Scene, settings: ParticleSettings, present: Sequence[bool] | None = None
+) -> SceneParticles:
+    """Return the particles of the objects of a scene.
+
+    Parameters
+    ----------
+    scene
+        The scene.
+    settings
+        Spacing, limit and fill.
+    present
+        Which bodies and cloths are there, in the order of `Scene.names`; by default all.
+
+    Raises
+    ------
+    BadInputError
+        If no object is left, or there are more than `MAX_PARTICLES`.
+    """
+    there = tuple(present) if present is not None else (True,) * len(scene.names())
+    key = (id(scene), settings, there)
+    if key not in _kept:
+        _kept[key] = scene, _sample(scene, settings, there)
+        while len(_kept) > _KEPT:
+            _kept.popitem(last=False)
+    return _kept[key][1]
+
+
+def poses_of(particles: SceneParticles, motion: Motion, frames: Sequence[int]) -> Poses:
+    """Return the motion of the objects of a scene in the given frames.
+
+    Raises `BadInputError` for a motion that is not known, as of a trial imported from a movie.
+    """
+    scene, trajectory = motion.scene, motion.trajectory
+    rows = np.asarray(frames, np.int64)
+    bodies = particles.things < len(scene.bodies)
+    things = particles.things[bodies]
+    positions = trajectory.positions[np.ix_(rows, things)].astype(np.float64)
+    if not np.isfinite(positions).all():
+        raise BadInputError(
+            f"trial {scene.name!r} has no motion ({trajectory.engine}), which particles need"
+        )
+    count = len(particles.things)
+    rotations = np.broadcast_to(np.eye(3), (len(rows), count, 3, 3)).copy()
+    rotations[:, bodies] = rotation_matrices(
+        trajectory.rotations[np.ix_(rows, things)].astype(np.float64)
+    )
+    centers = np.zeros((len(rows), count, 3))
+    shift = (rotations[:, bodies] @ particles.pivots[bodies][None, :, :, None])[..., 0]
+    centers[:, bodies] = positions + shift
+    loose = trajectory.cloth_vertices[np.ix_(rows, particles.vertices)].astype(np.float64)
+    owners = particles.owners[particles.loose]
+    for row in np.flatnonzero(~bodies):
+        centers[:, row] = loose[:, owners == row].mean(axis=1)
+    return Poses(centers, rotations, loose)
+
+
+def join_poses_in_time(first: Poses, second: Poses) -> Poses:
+    """Return a motion followed by another one of the same objects."""
+    return Poses(
+        np.concatenate([first.centers, second.centers]),
+        np.concatenate([first.rotations, second.rotations]),
+        np.concatenate([first.loose, second.loose]),
+    )
+
+
+def _sample(scene: Scene, settings: ParticleSettings, present: tuple[bool, ...]) -> SceneParticles:
+    things, kinds, shapes, pivots = [], [], [], []
+    vertices, links = [np.zeros(0, np.int64)], [np.zeros((2, 0), np.int64)]
+    for index, body in enumerate(scene.bodies):
+        if body.scenery or not present[index]:
+            continue
+        points = _points(body, settings)
+        pivot = points.mean(axis=0)
+        things.append(index)
+        kinds.append(KINEMATIC if body.kinematic else RIGID)
+        pivots.append(pivot)
+        shapes.append(points - pivot)
+    for number, cloth in enumerate(scene.cloths):
+        things.append(len(scene.bodies) + number)
+        kinds.append(CLOTH)
+        pivots.append(np.zeros(3))
+        rows, grid = _grid(cloth.resolution, settings.cloth_step)
+        before = sum(sheet.resolution**2 for sheet in scene.cloths[:number])
+        links.append(grid + sum(len(points) for points in shapes))
+        vertices.append(rows + before)
+        shapes.append(np.zeros((len(rows), 3)))
+    if not things:
+        raise BadInputError(f"scene {scene.name!r} has no object that can become particles")
+    counts = [len(points) for points in shapes]
+    if sum(counts) > MAX_PARTICLES:
+        raise BadInputError(
+            f"scene {scene.name!r} has {sum(counts)} particles, at most {MAX_PARTICLES}: use a "
+            "larger spacing or a smaller limit"
+        )
+    row_of = {thing: row for row, thing in enumerate(things)}
+    agent, patient = (scene.index(name) for name in (scene.roles.agent, scene.roles.patient))
+    return SceneParticles(
+        name=scene.name,
+        things=np.array(things, np.int64),
+        kinds=np.array(kinds, np.int64),
+        owners=np.repeat(np.arange(len(things)), counts),
+        shape=np.concatenate(shapes),
+        pivots=np.array(pivots),
+        vertices=np.concatenate(vertices),
+        links=np.concatenate(links, axis=1),
+        floor=scene.floor,
+        agent=row_of.get(agent, -1),
+        patient=row_of.get(patient, -1),
+    )
+
+
+def _grid(resolution: int, step: int) -> tuple[I64, I64]:
+    """Return which vertices (C,) of a square sheet are particles, and their links (2, L)."""
+    along = np.arange(0, resolution, step)
+    rows = (along[:, None] * resolution + along[None, :]).ravel()
+    count = len(along)
+    number = np.arange(count * count).reshape(count, count)
+    pairs = [
+        (number[1:], number[:-1]),
+        (number[:, 1:], number[:, :-1]),
+        (number[1:, 1:], number[:-1, :-1]),
+        (number[1:, :-1], number[:-1, 1:]),
+    ]
+    first = np.concatenate([a.ravel() for a, _ in pairs])
+    second = np.concatenate([b.ravel() for _, b in pairs])
+    links = np.stack([np.concatenate([first, second]), np.concatenate([second, first])])
+    return rows.astype(np.int64), links.astype(np.int64)
+
+
+def _points(body: Body, settings: ParticleSettings) -> F64:
+    if settings.fill == "surface":
+        return surface_points(body.shape, body.scale, settings.spacing, settings.limit)
+    points = sample_particles(body.shape, body.scale, settings.spacing, settings.limit)
+    return points.astype(np.float64)

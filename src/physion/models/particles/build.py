@@ -1,0 +1,49 @@
+"""Building of the particle models by name, with random, shipped or given weights."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from physion.errors import BadInputError
+from physion.models.build import make_config
+from physion.models.checkpoints.trained import load_file, load_shipped
+from physion.models.particles.config import RANDOM, SHIPPED, ParticleOptions, own_config
+from physion.models.particles.simulator import ParticleSimulator
+
+
+def gns(**options: Any) -> ParticleSimulator:
+    """Build a graph network simulator (GNS); ``options`` are those of `ParticleOptions`."""
+    chosen = make_config(ParticleOptions, "gns", options)
+    return _weighted(ParticleSimulator("gns", own_config("messages", chosen), chosen))
+
+
+def gns_ransac(**options: Any) -> ParticleSimulator:
+    """Build a GNS that keeps bodies rigid by a robust fit; ``options`` as `gns`."""
+    chosen = make_config(ParticleOptions, "gns-ransac", options)
+    config = replace(own_config("messages", chosen), rigid="robust")
+    return _weighted(ParticleSimulator("gns-ransac", config, chosen))
+
+
+def dpi(**options: Any) -> ParticleSimulator:
+    """Build a DPI-Net; ``options`` are those of `ParticleOptions`."""
+    chosen = make_config(ParticleOptions, "dpi", options)
+    return _weighted(ParticleSimulator("dpi", own_config("objects", chosen), chosen))
+
+
+def _weighted(model: ParticleSimulator) -> ParticleSimulator:
+    """Return a model with the weights that its options name."""
+    options = model.options
+    if options.weights == RANDOM:
+        return model
+    if options.weights == SHIPPED:
+        if options.size != "small" or not options.swept or options.stride != 3:
+            raise BadInputError(
+                "weights of particle models are shipped for size=small, swept=true and stride=3; "
+                "train others with physion train"
+            )
+        model.init = load_shipped(model, model.name)
+    else:
+        model.init = load_file(model, options.weights)
+    model.trained = True
+    return model

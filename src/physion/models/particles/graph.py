@@ -1,0 +1,177 @@
+"""Inputs of the networks: what nodes, edges and objects know of their motion.
+
+All of it is relative: positions of particles count from the centre of their object, from one
+another and from the floor, so that a shift of a scene along the floor changes nothing.
+
+With the last two states of an object, centre c and rotation R, its velocity and spin a step are
+
+    v = c1 - c0,    w = log(R1 R0^T)
+
+and if it goes on like this (*drift*), a particle at offset r from its centre moves in the next step
+by
+
+    u = v + (exp(w) - 1) r
+
+A particle of a cloth moves by its last displacement.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from physion.models.particles.bodies import KINEMATIC
+from physion.models.particles.layout import Layout, ObjectState, with_loose
+from physion.models.particles.neighbours import swept_edges
+from physion.models.particles.rigid_motion import (
+    mean_by,
+    rotation_from_vector,
+    vector_from_rotation,
+)
+
+NODE, EDGE, OBJECT = 11, 13, 11
+"""Sizes of the inputs of nodes, edges and objects."""
+_SPIN = 0.1
+"""Unit of spins, radians a step."""
+
+
+@dataclass(frozen=True, eq=False)
+class Drift:
+    """Motion of the last step, and where it leads.
+
+    - ``velocity``, ``spin`` (K, 3): metres and radians a step.
+    - ``positions`` (P, 3): now. ``moves`` (P, 3): displacement in the next step.
+    """
+
+    velocity: Tensor
+    spin: Tensor
+    positions: Tensor
+    moves: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Graph:
+    """Inputs of a network, float32: P nodes, E edges, K objects.
+
+    ``receivers``, ``senders`` (E,), ``owners`` (P,). ``nodes`` (P, `NODE`), ``edges`` (E, `EDGE`),
+    ``things`` (K, `OBJECT`).
+    """
+
+    receivers: Tensor
+    senders: Tensor
+    owners: Tensor
+    nodes: Tensor
+    edges: Tensor
+    things: Tensor
+
+
+def drift_of(layout: Layout, before: ObjectState, now: ObjectState) -> Drift:
+    """Return velocities and spins of the last step, and displacements of the next."""
+    velocity = now.centers - before.centers
+    spin = vector_from_rotation(now.rotations @ before.rotations.transpose(-1, -2))
+    positions = now.positions(layout)
+    offsets = positions - now.centers[layout.owners]
+    turned = (rotation_from_vector(spin)[layout.owners] @ offsets[..., None])[..., 0]
+    moves = velocity[layout.owners] + turned - offsets
+    moves = moves.index_copy(0, layout.loose, now.loose - before.loose)
+    still = (layout.kinds == KINEMATIC)[layout.owners]
+    return Drift(velocity, spin, positions, moves.masked_fill(still[:, None], 0.0))
+
+
+def move(
+    layout: Layout, now: ObjectState, drift: Drift, change: Tensor, turn: Tensor
+) -> ObjectState:
+    """Return the state after a step in which velocity and spin of bodies change.
+
+    ``change`` (K, 3) metres a step, ``turn`` (K, 3) radians a step. Kinematic bodies stay; cloths
+    keep their particles.
+    """
+    free = (layout.kinds != KINEMATIC)[:, None]
+    centers = now.centers + torch.where(free, drift.velocity + change, 0.0)
+    rotations = rotation_from_vector(torch.where(free, drift.spin + turn, 0.0)) @ now.rotations
+    return ObjectState(centers, rotations, now.loose)
+
+
+def move_loose(layout: Layout, state: ObjectState, drift: Drift, change: Tensor) -> ObjectState:
+    """Return a state whose particles of cloths moved, with changes (C, 3) of displacements."""
+    loose = state.loose + drift.moves[layout.loose] + change
+    return with_loose(layout, state.centers, state.rotations, loose)
+
+
+def make_graph(layout: Layout, drift: Drift, radius: float, unit: float, *, swept: bool) -> Graph:
+    """Return the graph of a state.
+
+    Parameters
+    ----------
+    layout, drift
+        Objects and their motion.
+    radius : float
+        Metres within which particles of different objects are neighbours.
+    unit : float
+        Unit of displacements, metres a step.
+    swept : bool
+        Whether particles that come within the radius during the step are neighbours too.
+    """
+    positions, moves = drift.positions, drift.moves
+    reach = moves if swept else torch.zeros_like(moves)
+    receivers, senders = swept_edges(
+        positions.cpu().numpy(),
+        reach.cpu().numpy(),
+        layout.starts,
+        layout.scene_array,
+        layout.moves,
+        radius,
+    )
+    device = positions.device
+    outer = torch.from_numpy(np.stack([receivers, senders])).to(device)
+    pairs = torch.cat([outer, layout.links], dim=1)
+    nodes = _node_inputs(layout, drift, radius, unit)
+    edges = _edge_inputs(drift, pairs, outer.shape[1], radius, unit)
+    return Graph(
+        pairs[0], pairs[1], layout.owners, nodes, edges, _object_inputs(layout, drift, radius, unit)
+    )
+
+
+def _node_inputs(layout: Layout, drift: Drift, radius: float, unit: float) -> Tensor:
+    """Return displacement, offset from the centre, heights now and after the step, and kind."""
+    centers = mean_by(drift.positions, layout.owners, layout.objects)
+    offsets = (drift.positions - centers[layout.owners]) / radius
+    height = drift.positions[:, 2] - layout.floor[layout.owners]
+    heights = torch.stack([height, height + drift.moves[:, 2]], -1) / radius
+    kinds = torch.nn.functional.one_hot(layout.kinds, 3)[layout.owners]
+    parts = [drift.moves / unit, offsets, heights.clamp(-2, 1), kinds.double()]
+    return torch.cat(parts, dim=-1).float()
+
+
+def _edge_inputs(drift: Drift, pairs: Tensor, outer: int, radius: float, unit: float) -> Tensor:
+    """Return distance now, relative motion, and distance when closest in the step."""
+    receivers, senders = pairs
+    apart = drift.positions[senders] - drift.positions[receivers]
+    relative = drift.moves[senders] - drift.moves[receivers]
+    squared = relative.pow(2).sum(-1)
+    moment = (-(apart * relative).sum(-1) / squared.clamp_min(1e-12)).clamp(0, 1)
+    closest = apart + moment[:, None] * relative
+    within = torch.zeros_like(moment)
+    within[outer:] = 1
+    parts = [
+        apart / radius,
+        apart.norm(dim=-1, keepdim=True) / radius,
+        relative / unit,
+        closest / radius,
+        closest.norm(dim=-1, keepdim=True) / radius,
+        moment[:, None],
+        within[:, None],
+    ]
+    return torch.cat(parts, dim=-1).float()
+
+
+def _object_inputs(layout: Layout, drift: Drift, radius: float, unit: float) -> Tensor:
+    """Return velocity, spin, size, speed of the rim, and kind."""
+    kinds = torch.nn.functional.one_hot(layout.kinds, 3).double()
+    spin = drift.spin / _SPIN
+    rim = drift.spin.norm(dim=-1, keepdim=True) * layout.size[:, None] / unit
+    parts = [drift.velocity / unit, spin, layout.size[:, None] / radius, rim, kinds]
+    return torch.cat(parts, dim=-1).float()

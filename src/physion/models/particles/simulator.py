@@ -1,0 +1,297 @@
+"""Learned simulators of particles: GNS, GNS-RANSAC and DPI-Net in this package's own form.
+
+Of every object a simulator knows the last two poses, of a cloth the last two positions of its
+particles. If it goes on as it moved, a particle at x moves by u (`graph`). The network predicts
+what is added to this motion:
+
+- GNS: a change a of the displacement of every particle, x' = x + u + a. Bodies are kept rigid by
+  the rigid motion that fits the x' of their particles best; GNS-RANSAC fits those particles alone
+  that agree with one another.
+- DPI-Net: changes of velocity and spin of every body, and of the displacements of the particles of
+  cloths.
+
+The loss is the squared distance of the predicted particles from where they went, in units of the
+standard deviation of a, averaged over the particles of an object, then over objects; above
+``knee`` it grows linearly (`_softened`).
+
+Source: paper, section 4 and supplement; docs/official-system.md, section 6. It differs from the
+published code (`released_gns`, `released_dpi`) in what the module `graph` says, and in particles
+that lie on surfaces, where contacts happen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from physion.errors import BadInputError
+from physion.models.batch import LAST_OBSERVED, Batch, Motion, Provenance, Rollout, Spec
+from physion.models.interface import Diet
+from physion.models.observed import cut_to_observed
+from physion.models.particles.bodies import (
+    CLOTH,
+    KINEMATIC,
+    Poses,
+    SceneParticles,
+    join_poses_in_time,
+    poses_of,
+    scene_particles,
+)
+from physion.models.particles.config import ParticleConfig, ParticleOptions
+from physion.models.particles.gap import smallest_distance
+from physion.models.particles.graph import Drift, Graph, drift_of, make_graph, move, move_loose
+from physion.models.particles.layout import Layout, ObjectState
+from physion.models.particles.networks import MessageNetwork, ObjectNetwork
+from physion.models.particles.rigid_motion import fit_rigid, fit_robust, mean_by
+from physion.models.particles.rollout import Start, disturbed_start, roll_out
+from physion.models.particles.windows import Window, disturbed, read_window, turned
+from physion.models.threshold import best_threshold
+from physion.models.torch_model import TorchModel, digest_of
+from physion.physics.labels import label_contact
+from physion.seeds import generator, stable_hash
+
+VERSION = 1
+"""To be raised with every change of what equal weights predict, or of the training."""
+_INLIER = 0.1
+"""Distance in spacings within which a particle agrees with a rigid motion."""
+
+F64 = NDArray[np.float64]
+
+
+class ParticleSimulator(TorchModel):
+    """Model that learns how particles move, and imagines by moving them step by step.
+
+    ``unit``, ``change``: root mean squares of displacements in a step and of their changes, metres.
+    ``touch`` (2,): metres; agent and patient touch if they come at most this close, two bodies and
+    a cloth and a body. It is fitted after training (`calibrate`) and stored with the weights.
+    """
+
+    diet: Diet = "states"
+    window = 3
+    calibration_trials = 256
+    unit: Tensor
+    change: Tensor
+    touch: Tensor
+
+    def __init__(self, name: str, config: ParticleConfig, options: ParticleOptions) -> None:
+        super().__init__()
+        self.config, self.options = config, options
+        self.name = f"{name}-{options.size}"
+        self.settings = config.training
+        self.trained = False
+        self.samples, self.seed = options.samples, options.seed
+        self.knobs: Mapping[str, tuple[float, ...]] = {}
+        stride = options.stride
+        self.spec = Spec(
+            inputs=("state",),
+            stride=stride,
+            context=LAST_OBSERVED // stride + 1,
+            future=0,
+            anchor="end",
+        )
+        kind = MessageNetwork if config.network == "messages" else ObjectNetwork
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(stable_hash("particle model", options.seed) % 2**63)
+            self.network = kind(config.width, config.rounds)
+        self.register_buffer("unit", torch.tensor(0.02, dtype=torch.float64))
+        self.register_buffer("change", torch.tensor(0.005, dtype=torch.float64))
+        self.register_buffer("touch", torch.zeros(2, dtype=torch.float64))
+
+    @property
+    def reader(self) -> str:
+        """Name of the reader: a fitted threshold, or the one that came with the weights."""
+        return "touch" if self.trained else "gap"
+
+    def provenance(self) -> Provenance:
+        """Return name, size and origin of the weights."""
+        return Provenance(
+            model=self.name,
+            init=self.init,
+            encoder_type="true state",
+            dynamics_type="particles",
+            dynamics_training_task="next positions",
+            versions=f"torch {torch.__version__}",
+        )
+
+    def digest(self) -> str:
+        """Return the SHA-256 of settings and weights; the number of futures is no part."""
+        config = asdict(self.config)
+        config.pop("training")
+        parts = [VERSION, config, self.options.stride, self.options.spread, torch.__version__]
+        return digest_of(parts, self.state_dict().items())
+
+    def prepare(self, sample: Batch) -> None:
+        """Set the units of displacements and of their changes from training clips."""
+        window = self._read(sample)
+        layout, drift = window.layout, drift_of(window.layout, window.before, window.now)
+        free = (layout.kinds != KINEMATIC)[layout.owners]
+        error = (window.after.positions(layout) - drift.positions - drift.moves)[free]
+        if not len(error):
+            return
+        self.unit.copy_(drift.moves[free].pow(2).sum(-1).mean().sqrt().clamp_min(1e-3))
+        self.change.copy_(error.pow(2).sum(-1).mean().sqrt().clamp_min(1e-4))
+
+    def loss(self, batch: Batch) -> dict[str, Tensor]:
+        """Return the loss of a batch of windows of three frames."""
+        config = self.config
+        window = turned(self._read(batch))
+        window = disturbed(window, config.velocity_noise, config.position_noise)
+        layout = window.layout
+        drift = drift_of(layout, window.before, window.now)
+        graph = self._graph(layout, drift)
+        if isinstance(self.network, MessageNetwork):
+            predicted = drift.positions + drift.moves + self._changes(graph)
+        else:
+            predicted = self._move_objects(layout, window.now, drift, graph).positions(layout)
+        return {"loss": self._error(window, predicted)}
+
+    def baseline(self, batch: Batch) -> Tensor:
+        """Return the loss if everything goes on as it moved."""
+        window = self._read(batch)
+        drift = drift_of(window.layout, window.before, window.now)
+        return self._error(window, drift.positions + drift.moves)
+
+    @torch.no_grad()
+    def calibrate(self, whole: Batch) -> None:
+        """Fit ``touch`` on rollouts of training trials, which start from the observed part.
+
+        Trials with a contact in the observed part do not count.
+        """
+        self.touch.zero_()
+        motions, labels, cloth = [], [], []
+        for motion in whole.state or ():
+            label = label_contact(motion.scene, motion.trajectory)
+            if not label.observed:
+                cut = cut_to_observed(motion.scene, motion.trajectory)
+                motions.append(Motion(motion.scene, cut))
+                labels.append(label.contact)
+                roles = motion.scene.roles
+                things = [motion.scene.index(name) for name in (roles.agent, roles.patient)]
+                cloth.append(max(things) >= len(motion.scene.bodies))
+        if not motions:
+            return
+        gaps, touching, soft = self._gaps(motions, 1, 0)[:, 0], np.array(labels), np.array(cloth)
+        for row, which in enumerate((~soft, soft)):
+            self.touch[row] = best_threshold(gaps[which], touching[which])
+
+    @torch.no_grad()
+    def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
+        """Return the smallest gap (B, S) of agent and patient, less the fitted ``touch``.
+
+        It counts the observed part, steps that are imagined, and the time between steps.
+        """
+        if context.state is None:
+            raise BadInputError("a particle model imagines from motions, which the batch lacks")
+        return Rollout(gap=self._gaps(context.state, samples, seed))
+
+    @torch.no_grad()
+    def futures(
+        self, motions: Sequence[Motion], samples: int, seed: int
+    ) -> list[list[tuple[SceneParticles, Poses]]]:
+        """Return particles, and motion from frame 0 to the end, of every motion and sample.
+
+        Rows are ``spec.stride`` frames apart; the last observed one is frame 44.
+        """
+        stride = self.options.stride
+        frames = range(LAST_OBSERVED % stride, LAST_OBSERVED + 1, stride)
+        starts: list[Start] = []
+        for motion in motions:
+            scene = motion.scene
+            own = scene_particles(scene, self.config.particles, scene.present(LAST_OBSERVED))
+            limit = scene.ending.frame_limits()[1] - 1 - LAST_OBSERVED
+            start = Start(own, poses_of(own, motion, frames), limit // stride)
+            for sample in range(samples):
+                rng = generator("particle future", seed, scene.name, sample)
+                spread = self.options.spread * 0.01 * stride if samples > 1 else 0.0
+                starts.append(disturbed_start(start, spread, rng))
+        was_training = self.training
+        self.eval()
+        imagined = roll_out(starts, self.step, self.device, self.config.inner_radius)
+        self.train(was_training)
+        joined = [
+            (start.particles, join_poses_in_time(start.poses, later))
+            for start, later in zip(starts, imagined, strict=True)
+        ]
+        return [joined[row : row + samples] for row in range(0, len(joined), samples)]
+
+    def step(self, layout: Layout, before: ObjectState, now: ObjectState) -> ObjectState:
+        """Return the state after the next step."""
+        drift = drift_of(layout, before, now)
+        graph = self._graph(layout, drift)
+        if not isinstance(self.network, MessageNetwork):
+            return self._move_objects(layout, now, drift, graph)
+        changes = self._changes(graph)
+        goal = drift.positions + drift.moves + changes
+        rotations, centers = self._fit(layout, goal)
+        rigid = (layout.kinds != KINEMATIC) & (layout.kinds != CLOTH)
+        state = ObjectState(
+            torch.where(rigid[:, None], centers, now.centers),
+            torch.where(rigid[:, None, None], rotations, now.rotations),
+            now.loose,
+        )
+        return move_loose(layout, state, drift, changes[layout.loose])
+
+    def _gaps(self, motions: Sequence[Motion], samples: int, seed: int) -> F64:
+        config = self.config
+        touch = self.touch.cpu().numpy()
+        gaps = np.zeros((len(motions), samples))
+        futures = self.futures(motions, samples, seed)
+        for row, (motion, own) in enumerate(zip(motions, futures, strict=True)):
+            for column, (particles, poses) in enumerate(own):
+                distance = smallest_distance(
+                    motion.scene, particles, poses, config.gap_spacing, config.gap_limit
+                )
+                pair = [particles.agent, particles.patient]
+                soft = min(pair) >= 0 and CLOTH in particles.kinds[pair]
+                gaps[row, column] = distance - touch[int(soft)]
+        return gaps
+
+    def _read(self, batch: Batch) -> Window:
+        config = self.config
+        return read_window(batch, config.particles, config.inner_radius, self.device)
+
+    def _graph(self, layout: Layout, drift: Drift) -> Graph:
+        config = self.config
+        return make_graph(layout, drift, config.radius, float(self.unit), swept=config.swept)
+
+    def _changes(self, graph: Graph) -> Tensor:
+        """Return the changes of displacements (P, 3) that GNS predicts, metres."""
+        return cast(Tensor, self.network(graph)).double() * self.change
+
+    def _move_objects(
+        self, layout: Layout, now: ObjectState, drift: Drift, graph: Graph
+    ) -> ObjectState:
+        """Return the next state as DPI-Net predicts it."""
+        velocity, rim, loose = (value.double() * self.change for value in self.network(graph))
+        state = move(layout, now, drift, velocity, rim / layout.size[:, None])
+        return move_loose(layout, state, drift, loose[layout.loose])
+
+    def _fit(self, layout: Layout, goal: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the rotations and centres of the rigid motions that fit the particles."""
+        if self.config.rigid == "fit":
+            return fit_rigid(layout.shape, goal, layout.owners, layout.objects)
+        rng = torch.Generator(goal.device).manual_seed(0)
+        tolerance = _INLIER * self.config.particles.spacing
+        rotations, centers, _ = fit_robust(
+            layout.shape, goal, layout.owners, layout.objects, tolerance, rng
+        )
+        return rotations, centers
+
+    def _error(self, window: Window, predicted: Tensor) -> Tensor:
+        layout = window.layout
+        target = window.after.positions(layout)
+        squares = ((predicted - target) / self.change).pow(2).sum(-1)
+        errors = _softened(mean_by(squares, layout.owners, layout.objects), self.config.knee)
+        free = (layout.kinds != KINEMATIC).double()
+        return ((errors * free).sum() / free.sum().clamp_min(1)).float()
+
+
+def _softened(squares: Tensor, knee: float) -> Tensor:
+    """Return 2 k^2 (sqrt(1 + s / k^2) - 1): about s for s << k^2, about 2 k sqrt(s) beyond."""
+    return 2 * knee**2 * ((1 + squares / knee**2).sqrt() - 1)

@@ -1,0 +1,103 @@
+"""Training examples: three successive states of the objects of each clip, turned and disturbed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from physion.errors import BadInputError
+from physion.models.batch import Batch
+from physion.models.particles.bodies import KINEMATIC, ParticleSettings, poses_of, scene_particles
+from physion.models.particles.layout import (
+    Layout,
+    ObjectState,
+    join_poses,
+    join_scenes,
+    turn_scenes,
+)
+from physion.models.particles.rigid_motion import rotation_from_vector
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """Objects of several clips, and their states in three successive steps."""
+
+    layout: Layout
+    before: ObjectState
+    now: ObjectState
+    after: ObjectState
+
+
+def read_window(
+    batch: Batch, settings: ParticleSettings, inner_radius: float, device: torch.device
+) -> Window:
+    """Return the objects of the clips that are there in all three frames, and their states."""
+    if batch.state is None or batch.frames.shape[1] != 3:
+        raise BadInputError("a particle model is trained on motions in windows of 3 frames")
+    frames = batch.frames.cpu().numpy()
+    particles, poses = [], []
+    for motion, shown in zip(batch.state, frames, strict=True):
+        present = np.all([motion.scene.present(int(frame)) for frame in shown], axis=0)
+        own = scene_particles(motion.scene, settings, present.tolist())
+        particles.append(own)
+        poses.append(poses_of(own, motion, shown))
+    layout = join_scenes(particles, device, inner_radius)
+    before, now, after = (join_poses(poses, row, device) for row in range(3))
+    return Window(layout, before, now, after)
+
+
+def turned(window: Window) -> Window:
+    """Return a window whose scenes are turned about the vertical by random angles.
+
+    Gravity and floor do not change under such a turn, so it gives other examples of the same laws.
+    """
+    layout = window.layout
+    angle = 2 * math.pi * torch.rand(layout.scenes, dtype=torch.float64, device=layout.shape.device)
+    zero = torch.zeros_like(angle)
+    turns = rotation_from_vector(torch.stack([zero, zero, angle], -1))
+    states = (window.before, window.now, window.after)
+    return Window(layout, *(turn_scenes(state, layout, turns) for state in states))
+
+
+def disturbed(window: Window, velocity_noise: float, position_noise: float) -> Window:
+    """Return a window with noise, so that a network learns to correct its own errors.
+
+    The first state alone is moved by the velocity noise: the last velocity is wrong, and the third
+    state, which is to be predicted, is not (Sanchez-Gonzalez et al. 2020, section 3.3). All three
+    are moved by the position noise, which a network is not to correct at once. The noise of a
+    rotation moves the rim of a body as far as that of its centre moves the centre.
+
+    Parameters
+    ----------
+    window
+        The window.
+    velocity_noise, position_noise : float
+        Standard deviations by axis, metres a step and metres.
+    """
+    layout = window.layout
+    free = (layout.kinds != KINEMATIC).double()[:, None]
+
+    def noise(like: Tensor, scale: float) -> Tensor:
+        return scale * torch.randn_like(like)
+
+    def shift_of(scale: float) -> tuple[Tensor, Tensor, Tensor]:
+        angles = noise(window.now.centers, scale) / layout.size[:, None]
+        return (
+            noise(window.now.centers, scale) * free,
+            rotation_from_vector(angles * free),
+            noise(window.now.loose, scale),
+        )
+
+    def moved(state: ObjectState, shift: tuple[Tensor, Tensor, Tensor]) -> ObjectState:
+        center, rotation, loose = shift
+        return ObjectState(state.centers + center, rotation @ state.rotations, state.loose + loose)
+
+    place = shift_of(position_noise)
+    before, now, after = (
+        moved(state, place) for state in (window.before, window.now, window.after)
+    )
+    return Window(layout, moved(before, shift_of(velocity_noise)), now, after)
