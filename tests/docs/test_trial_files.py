@@ -15,7 +15,7 @@ import pytest
 from physion.physics.labels import Labels
 from physion.trials import state
 from physion.trials.columns import INDEX_COLUMNS
-from physion.trials.schema import FIELDS, PASSES, SCHEMA, Field
+from physion.trials.schema import FIELDS, GEOMETRY, PASSES, SCHEMA, Field
 from physion.trials.trial_file import Metadata, Trial
 from support.paths import ROOT
 
@@ -70,7 +70,7 @@ def _rows(fields: Mapping[str, Field], folder: str = "") -> list[str]:
 
 
 def test_every_array_is_listed() -> None:
-    for row in _rows(FIELDS) + _rows(PASSES, "passes/"):
+    for row in _rows(FIELDS) + _rows(GEOMETRY) + _rows(PASSES, "passes/"):
         assert row in PAGE
     assert f"PHYSION TRIAL {SCHEMA}\n" in PAGE
 

@@ -31,6 +31,8 @@ MAX_CHUNK_BYTES = 2**28
 """Largest chunk that is read, in bytes of memory."""
 WHOLE_BYTES = 2**20
 """Fields up to this many bytes are stored as one chunk, larger ones as one chunk per frame."""
+TALL = 64
+"""Rows from which a chunk for each column of a table saves more than it costs."""
 
 _MAGIC = b"PHYSION TRIAL"
 _ZSTD = 32015
@@ -77,6 +79,17 @@ FIELDS: Mapping[str, Field] = {
 }
 """Fields that every trial file has, by their path."""
 
+GEOMETRY: Mapping[str, Field] = {
+    "camera/intrinsics": Field("<f8", (3, 3), "camera coordinates to pixels, as in OpenCV"),
+    "camera/extrinsics": Field("<f8", (4, 4), "world to camera: x right, y down, z forward"),
+    "meshes/vertices": Field("<f4", ("corner", 3), "all shapes one after the other, unit scale, m"),
+    "meshes/faces": Field("<i4", ("face", 3), "rows of vertices, counter-clockwise from outside"),
+    "meshes/ranges": Field("<i4", ("thing", 4), "first and end row of vertices, then of faces"),
+    "meshes/scale": Field("<f4", ("thing", 3), "factors of the vertices; 1 for cloth"),
+}
+"""Fields that follow from the scene and the size of the pictures, for readers without this package.
+Files that were made before they existed lack all of them."""
+
 PASSES: Mapping[str, Field] = {
     "color": Field("|u1", ("frame", "row", "column", 3), "sRGB"),
     "depth": Field("<f4", ("frame", "row", "column"), "distance along the view axis, m"),
@@ -85,6 +98,7 @@ PASSES: Mapping[str, Field] = {
     "flow": Field("<f2", ("frame", "row", "column", 2), "(right, down), pixels"),
 }
 """Image passes that can be stored under ``passes/``, one chunk per frame."""
+_ARRAYS = {**FIELDS, **GEOMETRY, **{f"passes/{name}": field for name, field in PASSES.items()}}
 
 
 def seal(content: bytes) -> bytes:
@@ -118,7 +132,9 @@ def check_seal(data: bytes, where: str) -> None:
         )
 
 
-def storage(array_shape: tuple[int, ...], dtype: np.dtype[Any], compatible: bool) -> dict[str, Any]:
+def storage(
+    array_shape: tuple[int, ...], dtype: np.dtype[Any], compatible: bool, *, columns: bool = False
+) -> dict[str, Any]:
     """Return the options with which h5py stores an array: chunks, compression, checksum.
 
     Parameters
@@ -128,11 +144,15 @@ def storage(array_shape: tuple[int, ...], dtype: np.dtype[Any], compatible: bool
     compatible
         Compress with gzip, which every HDF5 reader has, instead of zstd, which reads five times
         faster.
+    columns
+        Store each column of a table with many rows as one chunk. Meshes compress to half the size.
     """
     size = int(np.prod(array_shape)) * dtype.itemsize
     if size == 0:
         return {}
     chunks = array_shape if size <= WHOLE_BYTES else (1, *array_shape[1:])
+    if columns and array_shape[0] >= TALL:
+        chunks = (array_shape[0], 1)
     packed = {"compression": "gzip", "compression_opts": 4}
     zstd: Mapping[str, Any] = hdf5plugin.Zstd(clevel=3)
     return {
@@ -161,7 +181,7 @@ class FieldReader(GuardedHdf5):
 
     def array(self, path: str) -> NDArray[Any]:
         """Return the whole array of the declared field at ``path``."""
-        dataset = self._dataset(path, FIELDS[path])
+        dataset = self._dataset(path, _ARRAYS[path])
         return np.asarray(self.guard(path, lambda: dataset[()]))
 
     def image(self, name: str, frame: int) -> NDArray[Any]:
@@ -179,9 +199,13 @@ class FieldReader(GuardedHdf5):
             raise self.bad("passes", "is not a group")
         return self.guard("passes", lambda: tuple(name for name in PASSES if name in group))
 
+    def has_geometry(self) -> bool:
+        """Return whether the file holds any of `GEOMETRY`; then it must hold all."""
+        return self.find("camera") is not None or self.find("meshes") is not None
+
     def check(self, path: str) -> None:
         """Check the field at ``path`` against its declaration without reading its values."""
-        self._dataset(path, FIELDS[path] if path in FIELDS else PASSES[path.split("/")[1]])
+        self._dataset(path, _ARRAYS[path])
 
     def _dataset(self, path: str, field: Field) -> h5py.Dataset:
         """Return the array at ``path``, checked against ``field`` the first time it is used."""

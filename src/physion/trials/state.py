@@ -23,14 +23,13 @@ from numpy.typing import NDArray
 
 from physion.errors import BadInputError
 from physion.numerics.rotations import rotate_vectors
-from physion.physics.cloth.sheet import sheet_triangles, sheet_vertices
 from physion.physics.particles import Particles, particles_over_time
 from physion.physics.rigid.hulls import collision_hulls
 from physion.physics.rigid.mass import hull_mass
 from physion.physics.trajectory import ENVIRONMENT
 from physion.rendering.camera import intrinsics, view_matrix
 from physion.scenes.scene import FRAME_TIME, Body, Cloth, Scene, SurfaceMaterial, Vec3
-from physion.scenes.shapes.primitives import shape
+from physion.trials.geometry import mesh_of
 from physion.trials.trial_file import Trial
 
 Floats = NDArray[np.float32]
@@ -178,12 +177,13 @@ def meshes(trial: Trial) -> dict[str, ThingMesh]:
     """Return the rendered surface of every object by name."""
     found = {}
     for body in trial.scene.bodies:
-        mesh = shape(body.shape).mesh
-        scaled = mesh.moved(body.scale).vertices
-        found[body.name] = ThingMesh(mesh.vertices.copy(), scaled, mesh.faces.copy())
+        vertices, faces = mesh_of(body)
+        found[body.name] = ThingMesh(
+            vertices.copy(), vertices * np.asarray(body.scale), faces.copy()
+        )
     for cloth in trial.scene.cloths:
-        flat = sheet_vertices(cloth) - np.asarray(cloth.position)
-        found[cloth.name] = ThingMesh(flat, flat, sheet_triangles(cloth.resolution).copy())
+        flat, faces = mesh_of(cloth)
+        found[cloth.name] = ThingMesh(flat, flat, faces.copy())
     return found
 
 

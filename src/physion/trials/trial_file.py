@@ -27,9 +27,11 @@ from physion.physics.labels import Labels
 from physion.physics.trajectory import Contacts, Trajectory
 from physion.scenes.looks import in_look
 from physion.scenes.scene import Scene
+from physion.trials.geometry import geometry_arrays
 from physion.trials.guarded_hdf5 import open_hdf5
 from physion.trials.schema import (
     FIELDS,
+    GEOMETRY,
     PASSES,
     SCHEMA,
     SEAL_BYTES,
@@ -168,6 +170,8 @@ class TrialWriter:
         for path, values in _arrays(trajectory, ids, len(scene.names())).items():
             array = np.asarray(values).astype(FIELDS[path].dtype)
             self._create(path, FIELDS[path].meaning, array.shape, array.dtype, array)
+        for path, array in geometry_arrays(scene, metadata.width, metadata.height).items():
+            self._create(path, GEOMETRY[path].meaning, array.shape, array.dtype, array)
         self._frames, self._added = len(trajectory), 0
         self._passes = {
             name: self._pass(name, len(trajectory), ids.shape) for name in sorted(set(passes))
@@ -214,7 +218,7 @@ class TrialWriter:
     def _create(
         self, path: str, meaning: str, shape: tuple[int, ...], dtype: np.dtype[Any], array: Any
     ) -> None:
-        options = storage(shape, dtype, self._compatible)
+        options = storage(shape, dtype, self._compatible, columns=path in GEOMETRY)
         dataset = self._file.create_dataset(path, data=array, **options)
         dataset.attrs["meaning"] = np.bytes_(meaning.encode())
 
@@ -257,7 +261,7 @@ class Trial:
         self._where = where
         self._renderers: dict[tuple[int, int, str], Renderer] = {}
         self._reader = FieldReader(open_hdf5(io.BytesIO(data), where), where)
-        for path in FIELDS:
+        for path in (*FIELDS, *(GEOMETRY if self._reader.has_geometry() else ())):
             self._reader.check(path)
         for name in self.pass_names:
             self._reader.check(f"passes/{name}")
@@ -335,6 +339,13 @@ class Trial:
     def pixel_fractions(self) -> NDArray[np.float32]:
         """Fraction of the pixels of frame 0 that show each object of `Scene.names`: (N,), 0..1."""
         return self._reader.array("first_frame/shares")
+
+    @cached_property
+    def geometry(self) -> dict[str, NDArray[Any]] | None:
+        """Camera matrices and meshes by path (`GEOMETRY`); None for a file made without them."""
+        if not self._reader.has_geometry():
+            return None
+        return {path: self._reader.array(path) for path in GEOMETRY}
 
     @cached_property
     def pass_names(self) -> tuple[str, ...]:

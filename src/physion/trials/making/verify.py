@@ -19,6 +19,7 @@ from physion.physics.labels import label_contact
 from physion.scenes.sampling.preset import load_presets
 from physion.seeds import stable_hash
 from physion.trials.columns import FILES
+from physion.trials.geometry import geometry_arrays
 from physion.trials.index import COLUMNS, as_table, index_bytes, index_row, read_index
 from physion.trials.layout import CHOICES, INDEX, SETTINGS, TrialPaths, find_trials
 from physion.trials.making.choose import BALANCED, robustness, split_of, wanted_contact
@@ -211,6 +212,13 @@ def _check_trial(paths: TrialPaths) -> list[str]:
         faults.append(f"{paths.trial_file}: field 'trajectory' does not match its digest")
     if trial.scene.physics_digest() != meta.scene_digest:
         faults.append(f"{paths.trial_file}: field 'scene' does not match its digest")
+    if trial.geometry is not None:
+        wanted = geometry_arrays(trial.scene, meta.width, meta.height)
+        faults += [
+            f"{paths.trial_file}: field {path!r} is not that of the scene"
+            for path, array in trial.geometry.items()
+            if not np.array_equal(array, wanted[path])
+        ]
     if meta.engine.startswith("imported"):
         return faults  # labels and movies are those of another simulator
     labels = label_contact(trial.scene, trial.trajectory)

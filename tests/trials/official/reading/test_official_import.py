@@ -30,6 +30,7 @@ from physion.trials.layout import TrialPaths
 from physion.trials.making.verify import verify_dataset
 from physion.trials.official.reading.import_folder import import_official
 from physion.trials.official.writing.export_folder import export_official
+from physion.trials.schema import seal, storage
 from physion.trials.trial_file import Trial, TrialWriter
 from physion.trials.video import count_frames, encode_movie, read_frames
 from support.official_hand_made import (
@@ -365,7 +366,14 @@ def _other(data: bytes) -> bytes:
     bodies = tuple(dataclasses.replace(body, shape="no such shape") for body in trial.scene.bodies)
     scene = dataclasses.replace(trial.scene, bodies=bodies)
     meta = dataclasses.replace(trial.metadata, scene_digest=scene.physics_digest())
-    return TrialWriter(meta, scene, trial.trajectory, trial.labels, trial.ids).finish()
+    texts = {"scene": scene.to_json(), "metadata": json.dumps(dataclasses.asdict(meta))}
+    buffer = io.BytesIO(data)
+    with h5py.File(buffer, "r+") as file:
+        for name, text in texts.items():
+            del file[name]
+            array = np.array([text.encode()])
+            file.create_dataset(name, data=array, **storage((1,), array.dtype, compatible=False))
+    return seal(buffer.getvalue())
 
 
 def _half_drawn(data: bytes) -> bytes:
