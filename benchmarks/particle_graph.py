@@ -34,15 +34,11 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from physion import seeds
-from physion.models.particles import released_dpi, released_gns
 from physion.models.particles.cell_list import radius_edges_on_device
 from physion.models.particles.neighbours import radius_edges
-from physion.models.particles.propagation import EdgeBlock
-from physion.models.particles.released_networks import (
-    ReleasedGraph,
-    StageLayers,
-    released_graph,
-)
+from physion.models.particles.released import ReleasedGraph, dpi, gns, released_graph
+from physion.models.particles.released.layers import StageLayers
+from physion.models.particles.released.propagation import EdgeBlock
 
 RESULTS = Path(__file__).parent / "results"
 PARTICLES, SPACING, RADIUS, APART = 3190, 0.05, 0.08, 1.5
@@ -72,7 +68,7 @@ def plain_stage(
     layers: StageLayers, states: Tensor, edges: EdgeBlock, features: Tensor, relation: Tensor,
     own: Tensor, steps: int,
 ) -> Tensor:  # fmt: skip
-    """Return what `released_networks.run_stage` returns, relation by relation."""
+    """Return what `layers.run_stage` returns, relation by relation."""
     r = edges.receivers + edges.receiving.start
     s = edges.senders + edges.sending.start
     joined = [features[r], features[s], relation.expand(len(r), -1)]
@@ -193,8 +189,8 @@ def main() -> None:
     )
     search = time_search(points)
     rows = [
-        time_network("GNS", released_gns, released_gns.ReleasedGNS, graph),
-        time_network("DPI", released_dpi, released_dpi.ReleasedDPI, graph),
+        time_network("GNS", gns, gns.ReleasedGNS, graph),
+        time_network("DPI", dpi, dpi.ReleasedDPI, graph),
     ]
     text = "\n".join(
         [

@@ -214,9 +214,9 @@ def _compressed(values: Tensor) -> tuple[Tensor, int]:
     return ranks[places], int(ranks[-1]) + 1
 
 
-def _sorted(found: list[tuple[Tensor, Tensor]], count: int) -> tuple[Tensor, Tensor]:
+def _sorted(pairs: list[tuple[Tensor, Tensor]], count: int) -> tuple[Tensor, Tensor]:
     """Return receivers and senders sorted, each pair once."""
-    code = torch.unique(torch.cat([first * count + second for first, second in found]))
+    code = torch.unique(torch.cat([first * count + second for first, second in pairs]))
     return code // count, code % count
 
 

@@ -5,23 +5,24 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from physion.models.particles.propagation import EdgeBlock
-from physion.models.particles.released_networks import (
+from physion.models.particles.released.graph import ReleasedGraph, object_means
+from physion.models.particles.released.inputs import (
     FEATURES,
     NODE_ATTRIBUTE,
     STATE,
     Normalisation,
+    leaf_features,
+    without_position,
+)
+from physion.models.particles.released.layers import (
     Propagator,
-    ReleasedGraph,
     ReluLayers,
     StageLayers,
     ThreeLayers,
     Widths,
-    leaf_features,
-    object_means,
     run_stage,
-    without_position,
 )
+from physion.models.particles.released.propagation import EdgeBlock
 
 STAGES = 4
 """Particles to particles, particles to their object, object to itself, object to its particles."""
@@ -36,7 +37,7 @@ RIGID_OUTPUTS = 7
 class ReleasedDPI(nn.Module):
     """Next velocity of each particle; follows the class GNSRigidH of models/GNSRigidH.py.
 
-    Four stages, each with weights of its own, `released_networks.run_stage`, from effects of 0:
+    Four stages, each with weights of its own, `layers.run_stage`, from effects of 0:
     particles and floor to particles, particles to the node of their object, that node to itself,
     and it to the particles. With the published widths it has 1,978,810 weights; they have the
     published names. Inputs of a relation are the features of both ends and the relation attribute.
@@ -49,7 +50,7 @@ class ReleasedDPI(nn.Module):
 
     A particle of cloth gets its velocity from its own effect.
 
-    Defects kept beside those of `released_networks`:
+    Defects kept, besides those of `graph` and `inputs`:
 
     - Relations have no relative position: positions are masked, and there is only the offset to the
       centre of the own object. A particle of cloth has no position at all.
@@ -57,7 +58,9 @@ class ReleasedDPI(nn.Module):
       the predicted displacement, and does not stay rigid when it rotates. The copy in
       neuroailab/physics-models, ``physion/models/particle.py``, divides by 0.03 s: pass it as
       ``head_seconds``.
-    - The third stage joins no two objects; see `released_networks`.
+    - The third stage joins no two objects: ``make_hierarchy`` in data.py pairs the nodes within an
+      object, and there is one.
+    - The relation attribute is 0 in the first stage and 1 in the others: a second bias.
 
     Parameters
     ----------

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from physion.errors import BadInputError
-from physion.models.particles import propagation
-from physion.models.particles.propagation import EdgeBlock, StepWeights, propagate
+from physion.models.particles.released import propagation
+from physion.models.particles.released.propagation import EdgeBlock, StepWeights, propagate
 
 NODES, WIDTH, EDGES = 9, 4, 30
 

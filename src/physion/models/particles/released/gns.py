@@ -5,18 +5,20 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from physion.models.particles.released_networks import (
+from physion.models.particles.released.graph import ReleasedGraph
+from physion.models.particles.released.inputs import (
     ATTRIBUTES,
     FEATURES,
     STATE,
     Normalisation,
+    leaf_features,
+)
+from physion.models.particles.released.layers import (
     Propagator,
-    ReleasedGraph,
     ReluLayers,
     StageLayers,
     ThreeLayers,
     Widths,
-    leaf_features,
     run_stage,
 )
 
@@ -29,22 +31,21 @@ RELATION = 5
 class ReleasedGNS(nn.Module):
     """Next velocity of each particle; follows the class GNS of models/GNS.py, with its defects.
 
-    One stage of 10 steps among particles, `released_networks.run_stage`, from effects of 0, then
+    One stage of 10 steps among particles, `layers.run_stage`, from effects of 0, then
     three layers from the effect of a particle to its next velocity. With the published widths it
     has 532,603 weights; they have the published names. Inputs of a relation are, for both ends,
     the attributes and the offset of the state to the mean of the object; and
 
         x_receiver - x_sender (3),  |x_receiver - x_sender|,  relation attribute 0
 
-    Defects kept beside those of `released_networks`:
+    Defects kept, besides those of `graph` and `inputs`:
 
     - The output is the next velocity and not the acceleration, so that a particle at rest has to be
       learned too.
     - There is no layer norm, and no encoder or decoder per step as in the GNS of Sanchez-Gonzalez
       et al. (2020), from which the name comes.
     - Relations contain no velocities, only the offset of each particle's velocity to the mean of
-      its own object; of two rigid objects that come towards each other, a relation knows nothing
-      until messages have brought the velocity of the particles.
+      its own object: how fast two objects approach each other is no input of a relation.
     - The relation attribute is always 0: its weights are never trained.
 
     Parameters

@@ -12,10 +12,10 @@ from torch import Tensor, nn
 from physion import seeds
 from physion.errors import BadInputError
 from physion.models.particles.neighbours import radius_edges
-from physion.models.particles.released_dpi import ReleasedDPI
-from physion.models.particles.released_gns import ReleasedGNS
-from physion.models.particles.released_networks import (
+from physion.models.particles.released import (
     Normalisation,
+    ReleasedDPI,
+    ReleasedGNS,
     ReleasedGraph,
     released_graph,
 )

@@ -1,6 +1,7 @@
 """Steps of message passing between particles, for CPU and GPU, with gradients.
 
-One step of the networks of this folder, for the edge e from sender s to receiver r, is
+One step of the networks of the published particle code is, for the edge e from sender s to
+receiver r,
 
     a_e = E_e + W_r h_r + W_s h_s              E: part that is the same in every step
     m_r = sum over the edges e into r of max(a_e, 0)
