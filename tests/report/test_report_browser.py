@@ -51,6 +51,23 @@ def test_movies_in_view_play_and_nothing_else_is_asked_for(browser: Browser, pag
     assert browser.requests() == [page.resolve().as_uri()]
 
 
+def test_with_reduced_motion_a_movie_plays_only_on_request(browser: Browser, page: Path) -> None:
+    browser.open(page, reduced_motion=True)
+    first = "document.querySelector('#one-trial-of-each-scenario .movie')"
+    assert browser.ask(f"{first}.querySelector('img').getBoundingClientRect().width > 100")
+    browser.ask("new Promise(done => setTimeout(done, 1500))")
+    movies = "[...document.querySelectorAll('video')]"
+    assert browser.ask(f"{movies}.length") == 10
+    assert browser.ask(f"{movies}.every(v => v.paused && v.currentTime === 0)")
+    browser.ask(f"{first}.querySelector('input').click()")
+    browser.until(f"{first}.querySelector('video').currentTime > 0.1")
+    assert browser.ask(f"getComputedStyle({first}.querySelector('img')).display") == "none"
+    others = f"{movies}.filter(v => v !== {first}.querySelector('video'))"
+    assert browser.ask(f"{others}.every(v => v.currentTime === 0)")
+    browser.open(page)
+    assert browser.ask(f"getComputedStyle({first}.querySelector('label')).display") == "none"
+
+
 def test_no_page_is_wider_than_the_screen(
     browser: Browser, page: Path, make_comparison: Maker
 ) -> None:
@@ -81,7 +98,7 @@ def test_a_name_leads_to_the_page_of_its_trial_and_back(browser: Browser, page: 
     browser.open(page)
     name = browser.ask("document.querySelector('.name a').textContent")
     browser.ask("document.querySelector('.name a').click()")
-    browser.until(f"document.querySelector('h1').textContent === {name!r}")
-    browser.until("document.querySelector('video').currentTime > 0.1")
+    browser.until(f"document.querySelector('h1')?.textContent === {name!r}")
+    browser.until("document.querySelector('video')?.currentTime > 0.1")
     browser.ask("document.querySelector('.ways a').click()")
     browser.until("document.querySelectorAll('video').length === 10")

@@ -97,14 +97,18 @@ class Browser:
         return dict(json.loads(line))
 
     def open(self, page: Path, fragment: str = "", *, size: tuple[int, int] = (1024, 600),
-             dark: bool = False) -> None:  # fmt: skip
+             dark: bool = False, reduced_motion: bool = False) -> None:  # fmt: skip
         width, height = size
         self.send(
             "Emulation.setDeviceMetricsOverride",
             width=width, height=height, deviceScaleFactor=1, mobile=False,
         )  # fmt: skip
-        scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
-        self.send("Emulation.setEmulatedMedia", features=scheme)
+        asked = {
+            "prefers-color-scheme": "dark" if dark else "light",
+            "prefers-reduced-motion": "reduce" if reduced_motion else "no-preference",
+        }
+        features = [{"name": name, "value": value} for name, value in asked.items()]
+        self.send("Emulation.setEmulatedMedia", features=features)
         self.send("Page.navigate", url="about:blank")
         self.events.clear()
         self.send("Page.navigate", url=page.resolve().as_uri() + fragment)

@@ -63,8 +63,9 @@ class PageMovies:
         """Return the movie of a stimulus; a picture or a sentence if it cannot be shown.
 
         ``description``: for readers who do not see it. It plays without sound while it is in
-        view. Returns "" if no movie of any stimulus was given. Raises `BadInputError` if its file
-        cannot be read or is no movie.
+        view; for people who ask for reduced motion it plays when they mark a box. Returns "" if no
+        movie of any stimulus was given. Raises `BadInputError` if its file cannot be read or is no
+        movie.
         """
         if not self.files:
             return ""
@@ -91,11 +92,15 @@ def _element(path: Path, stimulus: str, description: str, poster: bytes) -> str:
     label = escape(description)
     if mime.startswith("image/"):
         return f'<img src="{data}" alt="{label}" loading="lazy">'
-    still = f'poster="{data_uri("image/jpeg", poster)}" ' if poster else ""
-    # Browsers start a movie without sound when it comes into view.
+    still = data_uri("image/jpeg", poster) if poster else ""
+    shown = f'poster="{still}" ' if still else ""
+    # Browsers start a movie without sound when it comes into view. For people who ask for less
+    # motion the style sheet hides it behind the picture until they mark the box.
+    picture = f'<img src="{still}" alt="{label}" loading="lazy">' if still else ""
     return (
-        f'<video src="{data}" {still}autoplay preload="none" controls loop muted playsinline '
-        f'aria-label="{label}"></video>'
+        f'<div class="movie"><label><input type="checkbox"> play the movie</label>{picture}'
+        f'<video src="{data}" {shown}autoplay preload="none" controls loop muted playsinline '
+        f'aria-label="{label}"></video></div>'
     )
 
 
