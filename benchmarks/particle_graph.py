@@ -9,10 +9,10 @@ gathers by index; the published code multiplies by sparse matrices of zeros and 
 Neighbours: the tree of `neighbours` and the cell list of `cell_list`, next to the published way,
 which asks a tree for the neighbours of all particles and joins them in a Python loop.
 
-Median of 5 runs in turns, one thread, after one that is not timed. The run stops with an error if
-outputs differ by more than 1e-4 of the largest, the whole gradient by more than 1e-4 of its norm,
-or searches at all. Gradients differ more than outputs do: where a sum of float32 numbers before one
-of some 100 million ReLUs is almost 0, rounding decides about a whole term of the gradient.
+CPU seconds, median of 5 runs in turns, one thread, after one that is not timed. The run stops with
+an error if outputs differ by more than 1e-4 of the largest, the whole gradient by more than 1e-4 of
+its norm, or searches at all. Gradients differ more than outputs do: where a float32 number before
+one of some 100 million ReLUs is almost 0, rounding decides about a whole term of the gradient.
 """
 
 from __future__ import annotations
@@ -97,14 +97,14 @@ def loop_over_particles(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def medians(functions: dict[str, Callable[[], Any]]) -> dict[str, float]:
-    """Return the median seconds of functions that run in turns."""
+    """Return the median CPU seconds of functions that run in turns."""
     times: dict[str, list[float]] = {name: [] for name in functions}
     for run in range(REPEATS + 1):
         for name, function in functions.items():
-            start = time.perf_counter()
+            start = time.process_time()
             function()
             if run:
-                times[name].append(time.perf_counter() - start)
+                times[name].append(time.process_time() - start)
     return {name: statistics.median(values) for name, values in times.items()}
 
 
@@ -197,11 +197,11 @@ def main() -> None:
             "# Networks `released` on a graph of particles",
             f"{datetime.now(UTC).date()}, AMD EPYC, 2 cores, one thread, Python "
             f"{platform.python_version()}, torch {torch.__version__}, "
-            "`python benchmarks/particle_graph.py --write`.",
+            "`python benchmarks/particle_graph.py --write`. Other programs ran at the same time.",
             f"{len(points)} particles of {len(graph.rigid)} objects, {len(receivers)} pairs of "
             f"neighbours, {len(graph.receivers)} relations with the floor and each particle "
-            f"itself. Seconds, median of {REPEATS}; differences as part of the largest output and "
-            "of the norm of the whole gradient.",
+            f"itself. CPU seconds, median of {REPEATS}; differences as part of the largest output "
+            "and of the norm of the whole gradient.",
             TO_REACH,
             "",
             "| network | forward, plain | ours | times faster | forward and backward, plain | ours "
@@ -209,7 +209,7 @@ def main() -> None:
             "|---|---|---|---|---|---|---|---|---|",
             *("| " + " | ".join(row) + " |" for row in rows),
             "",
-            "| search of neighbours | ms | times the Python loop's speed |",
+            "| search of neighbours | CPU ms | times the Python loop's speed |",
             "|---|---|---|",
             *(
                 f"| {name} | {1e3 * s:.1f} | {search['Python loop'] / s:.1f} |"
