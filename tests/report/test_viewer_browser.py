@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from physion.report.viewer.imagined import ImaginedTrial
 from physion.report.viewer.write_viewer import ViewerOptions, build_viewer
 from physion.trials.video import read_frames
 from support.browser import Browser
@@ -290,3 +291,61 @@ def test_policy_stops_what_gets_in_all_the_same(browser: Browser, page: Path) ->
         "stopped"
     )
     assert len([text for text in browser.complaints() if "Content Security Policy" in text]) >= 2
+
+
+def resting(count: int = 6) -> ImaginedTrial:
+    """A model by which the ball and the plate stay where they were at the start."""
+    side = np.linspace(-0.2, 0.2, count)
+    square = np.stack(np.meshgrid(side, side, [0.0], indexing="ij"), -1).reshape(-1, 3)
+    ball, plate = square + np.array([0, 0, 1.2]), 3 * square + np.array([0, 0, 0.3])
+    once = np.concatenate([ball, plate]).astype(np.float32)
+    shown = {"particles": np.stack([once] * 5), "things": np.repeat([0, 1], count**2)}
+    frames = 44 + 3 * np.arange(1, 6)
+    return ImaginedTrial("standstill", "untrained", frames, shown, probability=0.0, gap=0.7)
+
+
+def of_colour(picture: np.ndarray, color: tuple[float, float, float]) -> np.ndarray:
+    """Rows of the pixels that have a colour of 0..1."""
+    distance = np.abs(picture.astype(int) - 255 * np.array(color)).max(axis=2)
+    return np.nonzero(distance < 12)[0]
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_imagined_particles_are_shown_next_to_the_true_motion(
+    browser: Browser, tmp_path: Path, dark: bool
+) -> None:
+    red, yellow = (0.88, 0.08, 0.08), (0.93, 0.72, 0)
+    folder = make_dataset(tmp_path / "set", (Plan("drop_0"), Plan("drop_1")))
+    options = ViewerOptions(details=2, card_size=32, pass_size=32, stride=6)
+    imagined = {"drop_0": [resting()], "drop_1": [resting()]}
+    page = build_viewer(folder, tmp_path / "v.html", options, imagine=lambda _: imagined).page
+    browser.open(page, "#trial=drop_0", dark=dark)
+    click(browser, "play")
+    browser.ask("document.querySelector('#view3d input').click()")  # hides paths
+    seek(browser, 44)
+    assert not len(of_colour(browser.picture("#scene3d"), red))
+    seek(browser, 45)
+    rows = of_colour(browser.picture("#scene3d"), red)
+    assert len(rows) > 100 and len(of_colour(browser.picture("#scene3d"), yellow)) > 100
+    seek(browser, 59)  # the true ball has fallen on, the imagined one has not
+    assert np.abs(of_colour(browser.picture("#scene3d"), red).mean() - rows.mean()) < 1
+    words = browser.ask("document.querySelector('#view3d .imagined').textContent")
+    assert "from frame 45 on: imagined by standstill (untrained): P(contact) 0.00" in words
+    assert "smallest gap 0.700 m" in words
+    low = browser.ask("document.getElementById('time').getBoundingClientRect().bottom")
+    assert low <= 600, "the time line is seen without scrolling"
+    browser.key("i", 73, "i")
+    browser.ask("new Promise(done => setTimeout(done, 100))")
+    assert not len(of_colour(browser.picture("#scene3d"), red))
+    assert browser.ask("document.querySelector('#view3d .imagined').textContent") == ""
+    browser.key("n", 78, "n")  # the choice stays for the next trial
+    click(browser, "play")
+    assert browser.ask("document.getElementById('imagined-by').value") == "-1"
+    choose(browser, "imagined-by", "0")
+    browser.ask("document.getElementById('imagined-by').dispatchEvent(new Event('change'))")
+    seek(browser, 59)
+    assert len(of_colour(browser.picture("#scene3d"), red)) > 100
+    click(browser, "labels")
+    text = browser.ask("document.getElementById('view3d').innerText")
+    assert "standstill" not in text and "contact" not in text
+    assert browser.complaints() == []

@@ -10,8 +10,12 @@ from typing import Annotated
 
 import tyro
 
+from physion.cli.model_options import parse_options
 from physion.cli.output import Stages, console
+from physion.errors import BadInputError
+from physion.report.viewer.imagined import Imagine
 from physion.report.viewer.write_viewer import ViewerOptions, build_viewer
+from physion.trials.dataset import Dataset
 
 
 @dataclass(frozen=True)
@@ -30,6 +34,11 @@ class Options:
     """Show this scenario alone."""
     split: str | None = None
     """Show this split alone."""
+    predictions: tuple[str, ...] = ()
+    """Models whose imagined motion is shown in 3D next to the true one: names (physion ls models)
+    or FILE.py:Class."""
+    option: tuple[str, ...] = ()
+    """Fields of the config of these models as NAME=VALUE, such as weights=shipped."""
     open: bool = False
     """Open the page in the browser."""
     json: bool = False
@@ -41,7 +50,8 @@ def main(options: Options) -> int:
     wanted = ViewerOptions(options.trials, options.details, options.scenario, options.split)
     out = options.out if options.out is not None else options.folder / "view.html"
     with Stages() as stages:
-        report = build_viewer(options.folder, out, wanted, progress=stages)
+        imagine = _imagine(options, stages)
+        report = build_viewer(options.folder, out, wanted, imagine=imagine, progress=stages)
     if options.json:
         values = {"page": str(report.page), "bytes": report.size}
         print(json_module.dumps(values | {"shown": report.shown, "left_out": report.left_out}))
@@ -51,3 +61,18 @@ def main(options: Options) -> int:
     if options.open:
         webbrowser.open(report.page.resolve().as_uri())
     return 0
+
+
+def _imagine(options: Options, stages: Stages) -> Imagine | None:
+    """Return the function that asks the models of ``--predictions``; None without them."""
+    if not options.predictions:
+        if options.option:
+            raise BadInputError("--option is for the models of --predictions, which names none")
+        return None
+    # Models need libraries that a page without them does not.
+    from physion.cli.imagined_trials import imagine_with
+
+    if options.details < 1:
+        raise BadInputError("--predictions are shown in 3D: --details must be at least 1")
+    chosen = parse_options(options.option)
+    return imagine_with(Dataset(options.folder), options.predictions, chosen, stages)

@@ -8,6 +8,11 @@ const CAPTIONS = {
   flow: ({ flow }) => ["Flow", `up to ${flow.toFixed(1)} px per frame`],
 };
 
+// Say what a model imagined, and how it is shown.
+const describeImagined = ({ caption, particles }) => particles
+  ? `Points from frame ${particles.from} on: imagined by ${caption} Agent red, patient yellow, others grey; what is true is paler.`
+  : `Imagined by ${caption}`;
+
 class Detail {
   /**
    * @param {any[]} cards Data of the trials.
@@ -19,6 +24,8 @@ class Detail {
     this.shapes = undefined;
     this.dialog = byId("detail");
     this.labelsShown = true;
+    /** Index of the model whose prediction is shown, -1 for none. */
+    this.imaginedBy = 0;
     this.dialog.addEventListener("close", () => {
       this.clear();
       onClose();
@@ -105,7 +112,8 @@ class Detail {
       "aria-label": "Scene in 3D. Arrow keys rotate it, with shift they move it, plus and minus zoom, 0 returns to the camera of the trial.",
     });
     this.shapes ??= readData("shapes");
-    this.scene = new Scene3D(canvas, detail.motion, this.shapes);
+    const imagined = detail.imagined ?? [];
+    this.scene = new Scene3D(canvas, detail.motion, this.shapes, imagined);
     if (!this.scene.gl) {
       this.scene = null;
       container.replaceChildren(
@@ -126,7 +134,35 @@ class Detail {
     const boxes = [checkbox("paths and touch points", "paths")];
     if (detail.motion.bodies.some((body) => body.scenery)) boxes.push(checkbox("scenery", "scenery"));
     const hint = createElement("span", {}, "drag to rotate, wheel to zoom");
-    container.replaceChildren(canvas, createElement("div", { class: "controls" }, camera, ...boxes, hint));
+    const chosen = imagined.length ? this.buildImagined(imagined) : { controls: [], caption: [] };
+    const controls = createElement("div", { class: "controls" }, camera, ...boxes, ...chosen.controls, hint);
+    container.replaceChildren(canvas, controls, ...chosen.caption);
+  }
+
+  // Return the choice of the model whose prediction is shown, and the caption that describes it.
+  buildImagined(imagined) {
+    const options = ["none", ...imagined.map(({ model }) => model)].map((label, row) =>
+      createElement("option", { value: row - 1 }, label));
+    const select = createElement("select", { id: "imagined-by", title: "Next prediction (I)" }, ...options);
+    const text = createElement("p", { class: "imagined answer", "aria-live": "polite" });
+    const update = () => {
+      this.imaginedBy = this.scene.imaginedBy = Number(select.value);
+      text.textContent = this.imaginedBy < 0 ? "" : describeImagined(imagined[this.imaginedBy]);
+      this.scene.draw();
+    };
+    select.onchange = update;
+    select.value = Math.min(this.imaginedBy, imagined.length - 1);
+    update();
+    const label = createElement("label", { class: "answer" }, "prediction ", select);
+    return { controls: [label], caption: [text] };
+  }
+
+  // Show the prediction of the next model, after the last one none.
+  nextPrediction() {
+    const select = document.getElementById("imagined-by");
+    if (!(select instanceof HTMLSelectElement)) return;
+    select.selectedIndex = (select.selectedIndex + 1) % select.length;
+    select.dispatchEvent(new Event("change"));
   }
 
   buildTables(tables) {
@@ -195,6 +231,7 @@ class Detail {
     else if (event.key === "ArrowRight") this.step(frames);
     else if (event.key === "Home") this.player.seek(0);
     else if (event.key === "End") this.player.seek(this.player.limit - 1);
+    else if (event.key === "i" || event.key === "I") this.nextPrediction();
     else if (event.key === "n" || event.key === "N") byId("next").click();
     else if (event.key === "p" || event.key === "P") byId("previous").click();
     else return;

@@ -33,18 +33,7 @@ class Motion {
 
   // Return the vertices of a cloth, interpolated linearly between the stored instants.
   clothVertices(cloth, frame) {
-    const { instants, points, side } = cloth;
-    let k = 0;
-    while (k < instants.length - 2 && instants[k + 1] <= frame) k++;
-    const next = Math.min(k + 1, instants.length - 1);
-    const span = instants[next] - instants[k];
-    const weight = span > 0 ? clamp((frame - instants[k]) / span, 0, 1) : 0;
-    const size = 3 * side * side;
-    const out = new Float32Array(size);
-    for (let i = 0; i < size; i++) {
-      out[i] = (1 - weight) * points[k * size + i] + weight * points[next * size + i];
-    }
-    return out;
+    return interpolate(cloth.points, cloth.instants, frame);
   }
 
   // Return the path of the object with a role, one point per frame; null if it does not move.
@@ -64,6 +53,22 @@ class Motion {
     for (let i = 0; i < points.length; i++) sum[i % 3] += points[i];
     return times(sum, 3 / points.length);
   }
+}
+
+// Return points at a frame, linearly from those stored at some frames: between them and before the
+// first one, and the last ones afterwards.
+function interpolate(points, frames, frame) {
+  let k = 0;
+  while (k < frames.length - 2 && frames[k + 1] <= frame) k++;
+  const next = Math.min(k + 1, frames.length - 1);
+  const span = frames[next] - frames[k];
+  const weight = span > 0 ? Math.min((frame - frames[k]) / span, 1) : 0;
+  const size = points.length / frames.length;
+  const out = new Float32Array(size);
+  for (let i = 0; i < size; i++) {
+    out[i] = (1 - weight) * points[k * size + i] + weight * points[next * size + i];
+  }
+  return out;
 }
 
 // Return the triangles of a square grid of vertices.

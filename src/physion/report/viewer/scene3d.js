@@ -4,7 +4,7 @@
 const PATH_COLORS = { agent: [0.9, 0.15, 0.15], patient: [0.85, 0.68, 0], probe: [0.5, 0.35, 0.9] };
 
 class Scene3D {
-  constructor(canvas, data, shapes) {
+  constructor(canvas, data, shapes, imagined = []) {
     this.canvas = canvas;
     this.motion = new Motion(data, shapes);
     this.data = data;
@@ -12,10 +12,13 @@ class Scene3D {
     this.limit = data.frames;
     this.scenery = true;
     this.paths = true;
+    /** Index of the model whose particles are shown, -1 for none. */
+    this.imaginedBy = -1;
     this.gl = canvas.getContext("webgl2", { antialias: true, alpha: false });
     this.reset();
     if (!this.gl) return;
     this.build(shapes);
+    this.imagined = imagined.map(({ particles }) => particles && new ImaginedParticles(this.gl, particles));
     this.addListeners();
     this.observer = new ResizeObserver(() => this.draw());
     this.observer.observe(canvas);
@@ -99,30 +102,40 @@ class Scene3D {
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
     gl.viewport(0, 0, width, height);
     const dark = matchMedia("(prefers-color-scheme: dark)").matches;
-    gl.clearColor(...(dark ? [0.12, 0.135, 0.16] : [0.93, 0.945, 0.96]), 1);
+    const background = dark ? [0.12, 0.135, 0.16] : [0.93, 0.945, 0.96];
+    gl.clearColor(...background, 1);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     const eye = this.eye();
     const far = this.distance + 60;
     const projection = perspective(this.fov, width / height, Math.max(0.02, far / 5000), far);
     const view = multiply(projection, lookAt(eye, this.target));
-    this.paintBodies(gl, view, eye);
+    this.paintBodies(gl, view, eye, background);
     this.paintLines(gl, view, dark, pixelRatio);
   }
 
-  paintBodies(gl, view, eye) {
+  // Return the particles to be shown at this frame, if there are any.
+  shownParticles() {
+    const particles = this.imagined[this.imaginedBy];
+    return particles && this.frame >= particles.from ? particles : null;
+  }
+
+  paintBodies(gl, view, eye, background) {
     const { uniforms, program } = this.meshProgram;
     gl.useProgram(program);
     gl.uniformMatrix4fv(uniforms.view, false, view);
     gl.uniform3fv(uniforms.eye, eye);
+    // What is true is paler while imagined particles are shown, which have the same colours.
+    const faded = this.shownParticles() !== null;
+    const shade = (color) => (faded ? add(times(color, 0.35), times(background, 0.65)) : color);
     this.data.bodies.forEach((body, i) => {
       if (body.scenery && !this.scenery) return;
       const { position, rotation } = this.motion.pose(i, this.frame);
-      this.paintMesh(gl, this.meshes[body.shape], body.color, body.scale, position, rotation);
+      this.paintMesh(gl, this.meshes[body.shape], shade(body.color), body.scale, position, rotation);
     });
     for (const { cloth, faces, buffers } of this.clothMeshes) {
       const points = this.motion.clothVertices(cloth, this.frame);
       buffers.update(points, clothNormals(points, faces));
-      this.paintMesh(gl, buffers, cloth.color, [1, 1, 1], [0, 0, 0], [1, 0, 0, 0]);
+      this.paintMesh(gl, buffers, shade(cloth.color), [1, 1, 1], [0, 0, 0], [1, 0, 0, 0]);
     }
   }
 
@@ -148,10 +161,21 @@ class Scene3D {
       gl.drawArrays(mode, first, count);
     };
     paint(this.floor, gl.LINES, dark ? [1, 1, 1, 0.14] : [0, 0, 0, 0.14], 1, 0, this.floor.count);
-    if (!this.paths) return;
+    const particles = this.shownParticles();
+    if (this.paths) this.paintPaths(gl, paint, dark, particles === null);
+    if (!particles) return;
+    // In front of all that is true, so that nothing of it hides them.
+    gl.clear(gl.DEPTH_BUFFER_BIT);
+    particles.paint(this.frame, dark, (buffers, color, first, count) => {
+      paint(buffers, gl.POINTS, [...color, 1], 3.5, first, count);
+    });
+  }
+
+  paintPaths(gl, paint, dark, dots) {
     for (const { color, buffers } of this.pathLines) {
       const reached = this.frame + 1;
       paint(buffers, gl.LINE_STRIP, [...color, 1], 1, 0, reached);
+      if (!dots) continue;
       paint(buffers, gl.POINTS, [...color, 1], 4, 0, reached);
       paint(buffers, gl.POINTS, [...color, 0.35], 2.5, reached, this.limit - reached);
     }

@@ -25,6 +25,7 @@ SCRIPTS = (
     "matrix",
     "webgl",
     "motion",
+    "imagined",
     "scene3d",
     "grid",
     "detail",

@@ -86,6 +86,7 @@ class Buffers {
   update(points, normals) {
     const { gl } = this;
     for (const [buffer, values] of [[this.points, points], [this.normals, normals]]) {
+      if (!buffer) continue;
       gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
       gl.bufferSubData(gl.ARRAY_BUFFER, 0, values);
     }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from physion.errors import BadInputError, UnknownNameError
 from physion.report.viewer import facts as viewer_facts
 from physion.report.viewer import motion as viewer_motion
 from physion.report.viewer import viewer_movies
+from physion.report.viewer.imagined import Imagine, ImaginedTrial, pack_imagined
 from physion.report.viewer.text import TrialData, render_viewer
 from physion.trials.dataset import Dataset
 
@@ -62,14 +64,16 @@ def build_viewer(
     out: Path,
     options: ViewerOptions | None = None,
     *,
+    imagine: Imagine | None = None,
     progress: Progress | None = None,
 ) -> ViewerReport:
     """Write the page of the dataset in ``folder`` to the file ``out``, whole or not at all.
 
     The page needs no other file and no network. The same trials and options give the same bytes.
-    Raises `BadInputError` where there is no dataset, a trial is damaged, or ``out`` is a folder or
-    cannot be written, and `UnknownNameError` for a scenario or split that the dataset does not
-    hold.
+    ``imagine`` is called once with the names of the trials that are shown in 3D; what it returns is
+    shown next to their true motions. Raises `BadInputError` where there is no dataset, a trial is
+    damaged, an imagined trial cannot be shown, or ``out`` is a folder or cannot be written, and
+    `UnknownNameError` for a scenario or split that the dataset does not hold.
     """
     options = options or ViewerOptions()
     dataset = Dataset(folder)
@@ -82,10 +86,12 @@ def build_viewer(
         raise _unwritable(out, "the folder is read-only")
     chosen, totals = choose_trials(dataset.index, options)
     rows = [row for _, row in chosen.iterrows()]
+    detailed = [str(row["trial"]) for row in rows if row["detailed"]]
+    imagined = imagine(detailed) if imagine is not None else {}
     shapes: set[str] = set()
     found = []
     for row in tracked(rows, "viewing", len(rows), progress):
-        data, names = _trial_data(dataset, row, options)
+        data, names = _trial_data(dataset, row, options, imagined.get(row["trial"], ()))
         found.append(data)
         shapes |= names
     title = ", ".join(sorted(set(dataset.index["dataset"].astype(str)))) or "no trials"
@@ -126,7 +132,7 @@ def choose_trials(
 
 
 def _trial_data(
-    dataset: Dataset, row: pd.Series, options: ViewerOptions
+    dataset: Dataset, row: pd.Series, options: ViewerOptions, imagined: Sequence[ImaginedTrial]
 ) -> tuple[TrialData, set[str]]:
     """Return the data of one trial, and the shapes that its 3D view needs."""
     paths = dataset.paths(row["trial"])
@@ -144,6 +150,8 @@ def _trial_data(
         detail["passes"] = strip.as_record()
         detail["ranges"] = {"near": ranges.near, "far": ranges.far, "flow": ranges.flow}
         detail["motion"] = viewer_motion.pack_motion(trial.shown("redyellow"), trial.trajectory)
+        frames = trial.metadata.frames
+        detail["imagined"] = [pack_imagined(one, trial.scene, frames) for one in imagined]
         shapes = {body.shape for body in trial.scene.bodies}
     movie = viewer_movies.small_movie(paths.movie, trial, options.card_size)
     size = {"width": movie.width, "height": movie.height}

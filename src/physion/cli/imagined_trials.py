@@ -1,0 +1,173 @@
+"""What models imagine of trials, as the viewer shows it (`physion view --predictions`)."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from physion.compute.progress import Progress, tracked
+from physion.errors import BadInputError
+from physion.models.batch import Batch, Rollout
+from physion.models.build import build_model
+from physion.models.interface import Encodes, HasReader, Imagines, Learns, Model, Trained
+from physion.readout.model_calls import call_model, check_identity, is_network, model_name, to_array
+from physion.readout.readers.touch import probability_of
+from physion.readout.rollouts import Outcomes
+from physion.report.viewer.imagined import SHOWABLE, Imagine, ImaginedTrial
+from physion.training.sources.open_source import observed_source
+from physion.training.sources.source import ObservedSource
+from physion.trials.dataset import Dataset
+
+Arrays = NDArray[Any]
+
+_TRIALS = 8
+"""Trials that a model imagines at a time."""
+
+
+def imagine_with(
+    dataset: Dataset,
+    names: Sequence[str],
+    options: Mapping[str, Any],
+    progress: Progress | None = None,
+) -> Imagine:
+    """Return the function by which the viewer asks models what they imagine.
+
+    Parameters
+    ----------
+    dataset
+        The dataset, of which models get the observed part.
+    names
+        Names of models; ``options`` are fields of the config of every one.
+    progress
+        Called after every group of trials.
+
+    Raises
+    ------
+    UnknownNameError
+        For an unknown model or option.
+    BadInputError
+        For a model that cannot imagine, or is named twice. The function itself raises it for a
+        model that imagines nothing that can be shown.
+    """
+    models = [build_model(name, **options) for name in names]
+    for model in models:
+        check_identity(model)
+        if not isinstance(model, Imagines):
+            raise BadInputError(
+                f"model {model_name(model)!r} imagines no future (it has no method imagine), so "
+                "that no prediction can be shown; choose a model that does, such as dpi"
+            )
+    labels = [model_name(model) for model in models]
+    if len(set(labels)) < len(labels):
+        raise BadInputError(f"--predictions names a model twice: {', '.join(labels)}")
+
+    def imagine(trials: Sequence[str]) -> dict[str, list[ImaginedTrial]]:
+        imagined: dict[str, list[ImaginedTrial]] = {trial: [] for trial in trials}
+        for model in models:
+            for trial, one in _imagine_trials(dataset, model, trials, progress).items():
+                imagined[trial].append(one)
+        return imagined
+
+    return imagine
+
+
+def describe_weights(model: Model) -> str:
+    """Return where the weights of a model come from, or that they are untrained."""
+    init = model.provenance().init
+    if isinstance(model, Learns) and not (isinstance(model, Trained) and model.trained):
+        return f"untrained, weights {init}"
+    return "no weights" if init == "none" else f"weights {init}"
+
+
+def _imagine_trials(
+    dataset: Dataset, model: Model, trials: Sequence[str], progress: Progress | None
+) -> dict[str, ImaginedTrial]:
+    """Return what one model imagines of the trials."""
+    if is_network(model):
+        from physion.training.devices import Devices, make_fabric
+
+        network: Any = model
+        make_fabric(Devices(), "32-true").to_device(network)
+    source = observed_source(dataset, model.spec)
+    groups = [trials[row : row + _TRIALS] for row in range(0, len(trials), _TRIALS)]
+    imagined: dict[str, ImaginedTrial] = {}
+    for group in tracked(groups, f"predictions of {model_name(model)}", len(groups), progress):
+        imagined |= zip(group, _imagine_batch(model, _context(model, source, group)), strict=True)
+    return imagined
+
+
+def _context(model: Model, source: ObservedSource, trials: Sequence[str]) -> Batch:
+    """Return the context of trials, with its features if the model also encodes."""
+    batch = source.context(trials)
+    if not isinstance(model, Encodes):
+        return batch
+    features = call_model(model, "encode", batch)
+    what, shape = "encode gave features", (len(batch), None, None)
+    return dataclasses.replace(batch, features=to_array(features, model, what, shape, ("float32",)))
+
+
+def _imagine_batch(model: Model, batch: Batch) -> list[ImaginedTrial]:
+    """Return what a model imagines of each trial of a batch; the first future is shown."""
+    samples, seed = (model.samples, model.seed) if isinstance(model, HasReader) else (1, 0)
+    rollout = call_model(model, "imagine", batch, samples, seed, show=1.0)
+    if not isinstance(rollout, Rollout):
+        raise BadInputError(
+            f"model {model_name(model)!r}: imagine gave {type(rollout).__name__}, expected Rollout"
+        )
+    shown, steps = _shown_arrays(model, rollout, len(batch), samples)
+    probability, gap = _outcomes(model, rollout, len(batch), samples)
+    frames = model.spec.context_frames()[-1] + model.spec.stride * np.arange(1, steps + 1)
+    return [
+        ImaginedTrial(
+            model=model_name(model),
+            weights=describe_weights(model),
+            frames=frames,
+            shown={name: value[row] for name, value in shown.items()},
+            probability=float(probability[row]),
+            gap=float(gap[row]),
+            futures=samples,
+        )
+        for row in range(len(batch))
+    ]
+
+
+def _shown_arrays(
+    model: Model, rollout: Rollout, clips: int, samples: int
+) -> tuple[dict[str, Arrays], int]:
+    """Return the arrays (B, F, ...) of the first future that can be shown, and F."""
+    known = [name for name in SHOWABLE if name in rollout.shown]
+    if not known:
+        gave = ", ".join(sorted(rollout.shown)) or "features or outcomes alone"
+        raise BadInputError(
+            f"model {model_name(model)!r} imagines nothing that can be shown: the viewer shows "
+            f"{', '.join(SHOWABLE)}, and it gave {gave}"
+        )
+    particles = _array(model, rollout, "particles", (clips, samples, None, None, 3), "float32")
+    things = _array(model, rollout, "things", (clips, particles.shape[3]), "int64")
+    return {"particles": particles[:, 0], "things": things}, particles.shape[2]
+
+
+def _array(
+    model: Model, rollout: Rollout, name: str, shape: tuple[int | None, ...], dtype: str
+) -> Arrays:
+    value = rollout.shown.get(name)
+    return to_array(value, model, f"imagine gave {name}", shape, (dtype,))
+
+
+def _outcomes(model: Model, rollout: Rollout, clips: int, samples: int) -> tuple[Arrays, Arrays]:
+    """Return P(contact) (B,) over all futures, and the gap (B,) of the first; NaN if unknown."""
+    shape, unknown = (clips, samples), np.full(clips, np.nan)
+    gap, contact = (
+        None if value is None else to_array(value, model, f"imagine gave {name}", shape, dtypes)
+        for name, value, dtypes in (
+            ("gap", rollout.gap, ("float64", "float32")),
+            ("contact", rollout.contact, ("bool",)),
+        )
+    )
+    known = gap is not None or contact is not None
+    probability = probability_of(Outcomes(contact, gap)) if known else unknown
+    return probability, unknown if gap is None else gap[:, 0]

@@ -1,0 +1,151 @@
+"""physion view --predictions: what models imagine, as plain arrays for the viewer."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from physion.cli.imagined_trials import imagine_with
+from physion.cli.main import main
+from physion.errors import BadInputError, UnknownNameError
+from physion.trials.dataset import Dataset
+from support.viewer_dataset import make_dataset
+
+STANDSTILL = '''
+"""A simulator in which everything stays where it is; half of its futures have a contact."""
+import numpy as np
+from physion.models import Provenance, Rollout, Spec
+
+
+class Standstill:
+    spec = Spec(inputs=("state",), stride=3, context=15, future=0, anchor="end")
+    reader, samples, seed, knobs = "touch", 4, 0, {}
+    dtype = np.float32
+
+    def provenance(self):
+        return Provenance("standstill", "none")
+
+    def digest(self):
+        return "0" * 64
+
+    def imagine(self, context, samples, seed, **knobs):
+        assert knobs == {"show": 1.0}
+        places = [motion.trajectory.positions[44] for motion in context.state]
+        assert all(len(motion.trajectory) == 45 for motion in context.state)
+        most = max(len(place) for place in places)
+        particles = np.full((len(places), samples, 5, most, 3), np.nan, self.dtype)
+        things = np.full((len(places), most), -1)
+        for row, place in enumerate(places):
+            particles[row, :, :, : len(place)] = place
+            things[row, : len(place)] = np.arange(len(place))
+        gap = np.tile([0.5, -0.1, 0.2, 0.0], (len(places), 1))
+        return Rollout(gap=gap, shown={"particles": particles, "things": things})
+
+
+class Rough(Standstill):
+    dtype = np.float64
+
+
+class Silent(Standstill):
+    def imagine(self, context, samples, seed, **knobs):
+        return Rollout(gap=np.zeros((len(context), samples)))
+
+
+class Answers:
+    spec = Standstill.spec
+    provenance, digest = Standstill.provenance, Standstill.digest
+    answers = "observed"
+
+    def predict(self, batch):
+        return np.zeros(len(batch))
+'''
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_dataset(tmp_path_factory.mktemp("data") / "set")
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("model") / "still.py"
+    path.write_text(STANDSTILL)
+    return path
+
+
+def test_a_model_gives_plain_arrays_of_its_first_future(folder: Path, file: Path) -> None:
+    dataset = Dataset(folder)
+    imagined = imagine_with(dataset, [f"{file}:Standstill"], {})(["drop_0", "drape_0"])
+    (ball,), (cloth,) = imagined["drop_0"], imagined["drape_0"]
+    assert (ball.model, ball.weights, ball.futures) == ("standstill", "no weights", 4)
+    assert ball.frames.tolist() == [47, 50, 53, 56, 59]
+    assert ball.shown["particles"].shape == cloth.shown["particles"].shape == (5, 3, 3)
+    truth = dataset.trial("drop_0").trajectory.positions[44]
+    assert np.array_equal(ball.shown["particles"], np.stack([truth] * 5))
+    assert cloth.shown["things"].tolist() == [0, 1, -1]
+    # Two of four futures touch; the gap is that of the first, which is shown.
+    assert ball.probability == pytest.approx(2.5 / 5) and ball.gap == 0.5
+
+
+def test_particle_models_are_called_untrained(folder: Path) -> None:
+    imagined = imagine_with(Dataset(folder), ["dpi"], {"samples": 1})(["drop_0", "drape_0"])
+    for trial, name, agent in (("drop_0", "ball", 0), ("drape_0", "sheet", 2)):
+        (one,) = imagined[trial]
+        assert one.model == "dpi-small" and one.weights == "untrained, weights random"
+        assert one.probability in (0, 1) and np.isfinite(one.gap), name
+        assert (one.shown["things"] == agent).sum() > 10
+        assert one.frames[0] == 47 and len(one.frames) == len(one.shown["particles"])
+
+
+def test_the_verb_puts_them_into_the_page(folder: Path, file: Path, tmp_path: Path) -> None:
+    out = tmp_path / "v.html"
+    wanted = ["--trials", "1", "--details", "1", "--scenario", "drape"]
+    models = ["--predictions", f"{file}:Standstill", "dpi", "--out", str(out)]
+    assert main(["view", str(folder), *wanted, *models]) == 0
+    (text,) = re.findall(r'id="detail-0">(.*?)</script>', out.read_text())
+    first, second = json.loads(text)["imagined"]
+    assert first["caption"].startswith("standstill (no weights): P(contact) 0.50 from 4 futures")
+    assert second["caption"].startswith("dpi-small (untrained, weights random): P(contact) ")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ["--predictions", "{}:Silent"],
+            "nothing that can be shown: .* features or outcomes alone",
+        ),
+        (["--predictions", "copy-last-frame"], "nothing that can be shown: .* it gave rgb"),
+        (
+            ["--predictions", "{}:Rough"],
+            r"particles as float64 \(1, 4, 5, 2, 3\), expected float32",
+        ),
+        (["--predictions", "{}:Answers"], "imagines no future .* such as dpi"),
+        (["--predictions", "dpi", "dpi"], "names a model twice: dpi-small, dpi-small"),
+        (["--predictions", "dpi", "--details", "0"], "--details must be at least 1"),
+        (["--option", "samples=4"], "names none"),
+        (["--predictions", "dpii"], "unknown model 'dpii'; closest: dpi"),
+        (["--predictions", "dpi", "--option", "sample=4"], "'sample'; closest: samples"),
+    ],
+)
+def test_errors_are_one_clear_line(
+    folder: Path, file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    arguments: list[str], message: str,
+) -> None:  # fmt: skip
+    out = tmp_path / "v.html"
+    given = [argument.format(file) for argument in arguments]
+    assert main(["view", str(folder), "--scenario", "drape", "--out", str(out), *given]) == 2
+    printed = capsys.readouterr().err
+    assert re.search(message, printed), printed
+    assert printed.strip().count("\n") == 0 and not out.exists()
+
+
+def test_errors_have_types(folder: Path, file: Path) -> None:
+    with pytest.raises(UnknownNameError):
+        imagine_with(Dataset(folder), ["dpii"], {})
+    with pytest.raises(BadInputError):
+        imagine_with(Dataset(folder), [f"{file}:Silent"], {})(["drop_0"])
