@@ -62,6 +62,37 @@ def test_dots_stand_at_the_accuracies(make_comparison: Maker) -> None:
     assert titles == ["collide", "drop", "mean over scenarios"]
 
 
+def test_anchors_stand_below_the_models_lighter_and_hollow(make_comparison: Maker) -> None:
+    comparison = make_comparison(model="constant-motion")
+    given, model = "constant-motion · observed", "encoder · observed+simulated"
+    table = figure_tables.accuracy_table(comparison)
+    assert set(table.loc[table["kind"] != figure_tables.ANCHOR, "agent"]) == {model}
+    figure = measure_figure(table, "accuracy")
+    names = [text.get_text() for text in figure.axes[0].get_yticklabels()]
+    assert names == [protocol_names(name) for name in (model, given, *COMPUTED)]
+    inks = [text.get_color() for text in figure.axes[0].get_yticklabels()]
+    assert inks == [theme.LIGHT.ink, *[theme.LIGHT.faint] * 4]
+    marks = [line for line in figure.axes[0].lines if line.get_marker() not in ("None", None)]
+    hollow = [line.get_markerfacecolor() == theme.LIGHT.paper for line in marks]
+    assert hollow == [False, True, True, True, True]
+    assert [text.get_text() for text in figure.legends[0].get_texts()].count("anchor") == 1
+    # One person with another has no r: the row would be empty.
+    assert list(figure_tables.r_table(comparison)["agent"].unique()) == [
+        model,
+        given,
+        *COMPUTED[:2],
+    ]
+    thirds = figure_tables.thirds_table(comparison)
+    assert next(iter(thirds["agent"].unique())) == model
+
+
+def test_figures_of_single_answers_show_models_alone(make_comparison: Maker) -> None:
+    comparison = make_comparison(model="constant-motion")
+    model = ["encoder · observed+simulated"]
+    assert list(figure_tables.calibration_table(comparison)["agent"].unique()) == model
+    assert ReportInputs(comparison).scatter_agents() == model
+
+
 def test_zones_of_participants_and_of_scenarios_look_different(make_comparison: Maker) -> None:
     table = figure_tables.accuracy_table(make_comparison())
     assert set(table.loc[table["zone_low"].notna(), "panel"]) == {"collide"}
@@ -75,6 +106,7 @@ def test_zones_of_participants_and_of_scenarios_look_different(make_comparison: 
 
 def test_undefined_values_are_called_nan_in_the_figure(make_comparison: Maker) -> None:
     table = figure_tables.r_table(make_comparison(constant=True))
+    table = table[table["kind"] != figure_tables.ANCHOR]
     assert table["value"].isna().all() and table["reason"].str.contains("undefined|constant").all()
     words = [text.get_text() for text in measure_figure(table, "r").axes[0].texts]
     assert words == ["NaN", "NaN"]

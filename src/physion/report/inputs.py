@@ -48,7 +48,7 @@ class ReportInputs(ComparisonResults):
 
     def scatter_agents(self) -> list[str]:
         """The models of the scatter figure: the first ones, in the order of the predictions."""
-        return self.comparison.agents[: self.scatter_limit]
+        return self.comparison.models[: self.scatter_limit]
 
     def tables(self) -> dict[str, pd.DataFrame]:
         """Every table by the name of its file."""

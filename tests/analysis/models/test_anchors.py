@@ -212,6 +212,45 @@ def test_anchors_that_come_as_predictions_are_marked_and_follow_the_models() -> 
     assert kind_of("my outcome · observed") == "model" and kind_of("outcome · full") == "anchor"
 
 
+@pytest.mark.parametrize(
+    ("name", "computed"), [("outcome", OUTCOME), ("majority-of-people", MAJORITY)]
+)
+def test_predictions_of_an_anchor_take_the_place_of_the_computed_one(
+    name: str, computed: str
+) -> None:
+    given = compared(pd.concat([predictions("m"), predictions(name, 2)]))
+    others = [other for other in COMPUTED if other != computed]
+    assert list(given.anchors["agent"].unique()) == others
+    assert list(given.all_scores["agent"].unique()) == [
+        "m · observed",
+        f"{name} · observed",
+        *others,
+    ]
+    before = compared(predictions("m")).anchors
+    for other in others:
+        assert row_of(given.anchors, other)["accuracy"] == row_of(before, other)["accuracy"]
+
+
+def test_predictions_of_both_anchors_leave_one_person_with_another(tmp_path: Path) -> None:
+    names = ("m", "outcome", "majority-of-people")
+    parts = [predictions(name, k) for k, name in enumerate(names)]
+    assert list(compared(pd.concat(parts)).anchors["agent"].unique()) == [TWO_PEOPLE]
+    files = [tmp_path / f"{name}.csv" for name in names]
+    for path, part in zip(files, parts, strict=True):
+        part.to_csv(path, index=False)
+    board = leaderboard(files, humans(), LABELS, bootstrap=QUICK)
+    assert list(board.anchors["model"]) == [TWO_PEOPLE]
+    test = study(people=8, stimuli=16, scenarios=("collide",), seed=2).test
+    stimuli = test.drop_duplicates("stimulus")["stimulus"]
+    rows = [
+        pd.DataFrame({"agent": f"{name} · full", "stimulus": stimuli, "p_contact": 1.0,
+                      "predicted": True})
+        for name in names
+    ]  # fmt: skip
+    found = compare_everywhere(pd.concat(rows), test, QUICK, halves=10, permutations=20)
+    assert list(found.scores["model"].unique()) == [*(f"{n} · full" for n in names), TWO_PEOPLE]
+
+
 def test_every_anchor_of_the_package_is_known_by_name() -> None:
     """The analysis may not import the models, so it has their names a second time."""
     folder = Path(__file__).parents[3] / "src" / "physion" / "models" / "anchors"

@@ -1,5 +1,6 @@
 """Tables of the figures: each figure draws exactly its table.
 
+Tables of scores (`MEASURE_COLUMNS`) have models, then anchors; the others have models alone.
 Each function returns one table, plain rows and columns, that is written next to the figure as CSV.
 """
 
@@ -11,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
+from physion.analysis.models.anchors import COMPUTED, anchor_stimuli, kind_of
 from physion.analysis.models.comparison import Comparison
 from physion.analysis.models.people_comparison import PeopleComparison
 from physion.analysis.models.zones import released_zone
@@ -35,12 +37,15 @@ SCENARIO_ZONE = "paper's band: bootstrap of scenario means"
 HALVES_ZONE = "paper's band: r of halves, mean over scenarios"
 """What the zone of a row is, in words of the figure's key."""
 
+ANCHOR = "anchor"
+"""``kind`` of anchors in the tables of scores."""
+
 MEASURE_COLUMNS = (
     "panel", "agent", "kind", "value", "low", "high", "people", "people_is", "zone_low",
     "zone_high", "zone", "reason",
 )  # fmt: skip
-"""``panel``: scenario or `MEAN`; ``kind``: what the mark says (the readout); ``people`` and
-``people_is``: the dashed line and its name; ``zone``: what the band is."""
+"""``panel``: scenario or `MEAN`; ``kind``: what the mark says: the readout, or `ANCHOR`; ``people``
+and ``people_is``: the dashed line and its name; ``zone``: what the band is."""
 
 GROUPED_COLUMNS = ("panel", "agent", "group", "value", "low", "high", "people", "stimuli", "reason")
 
@@ -79,9 +84,9 @@ def kappa_table(comparison: Comparison, with_people: PeopleComparison) -> pd.Dat
     rows = with_people.scores[with_people.scores["measure"] == "kappa"].rename(
         columns={"model": "agent", "scenario": "panel", "low_both": "low", "high_both": "high"}
     )[["panel", "agent", "value", "low", "high", "reason"]]
-    rows = rows[rows["agent"].isin(comparison.agents)]
-    kinds = comparison.scores.drop_duplicates("agent").set_index("agent")["readout"]
-    rows = rows.assign(kind=rows["agent"].map(kinds))
+    readouts = comparison.scores.drop_duplicates("agent").set_index("agent")["readout"]
+    rows = rows[rows["agent"].isin([*comparison.agents, *COMPUTED])]
+    rows = rows.assign(kind=rows["agent"].map(readouts).fillna(""))
     zones = with_people.zones
     subset = zones[(zones["measure"] == "kappa") & (zones["of"] == "participants")]
     people = subset.set_index("scenario")[["mean"]].set_axis(["people"], axis=1)
@@ -92,10 +97,19 @@ def kappa_table(comparison: Comparison, with_people: PeopleComparison) -> pd.Dat
 
 
 def _scores(comparison: Comparison, key: str) -> pd.DataFrame:
-    rows = comparison.scores[comparison.scores["scenario"] != POOLED]
+    table = comparison.all_scores
+    rows = table[table["scenario"] != POOLED].drop(columns="kind")
     names = {"scenario": "panel", "readout": "kind", key: "value", f"{key}_low": "low",
              f"{key}_high": "high"}  # fmt: skip
     return rows[["agent", *names, "reason"]].rename(columns=names)
+
+
+def _anchors_last(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows of models, then of anchors, which are marked; undefined ones are left out."""
+    anchor = rows["agent"].map(kind_of) == "anchor"
+    defined = rows["agent"].isin(rows.loc[rows["value"].notna(), "agent"])
+    marked = rows.assign(kind=rows["kind"].mask(anchor, ANCHOR))
+    return pd.concat([marked[~anchor], marked[anchor & defined]], ignore_index=True)
 
 
 def _accuracy_of_people(comparison: Comparison) -> pd.DataFrame:
@@ -132,7 +146,7 @@ def _with_zone(
 
 
 def _measure(rows: pd.DataFrame, people: pd.DataFrame, people_is: str) -> pd.DataFrame:
-    table = rows.join(people, on="panel")
+    table = _anchors_last(rows).join(people, on="panel")
     table = table.assign(people_is=people_is, zone=table["zone"].fillna(""))
     names = [*in_order(table.loc[table["panel"] != MEAN, "panel"]), MEAN]
     if len(names) == 2:
@@ -178,7 +192,8 @@ def calibration_table(comparison: Comparison) -> pd.DataFrame:
     The outcome is the official one.
     """
     parts = []
-    for agent, rows in comparison.stimuli.groupby("agent", sort=False):
+    chosen = comparison.stimuli[comparison.stimuli["agent"].isin(comparison.models)]
+    for agent, rows in chosen.groupby("agent", sort=False):
         truth = rows["label"].to_numpy(dtype=np.float64)
         curve = reliability_curve(rows["p_contact"], truth)
         curve.insert(0, "agent", agent)
@@ -198,14 +213,17 @@ def thirds_table(
     """
     draws = bootstrap or Bootstrap()
     people = _halves_by_third(comparison, answers)
+    stimuli = pd.concat([comparison.stimuli, anchor_stimuli(comparison.stimuli)])
     parts = []
     for name, words in THIRD_WORDS.items():
         rows = [
             {"agent": agent, "kind": subset["readout"].iloc[0]} | _third(subset, name, draws)
-            for agent, subset in comparison.stimuli.groupby("agent", sort=False)
+            for agent, subset in stimuli.groupby("agent", sort=False)
         ]
         parts.append(pd.DataFrame(rows).assign(panel=words, **people[name]))
-    table = pd.concat(parts, ignore_index=True)
+    table = _anchors_last(pd.concat(parts, ignore_index=True))
+    order = table["panel"].map({words: at for at, words in enumerate(THIRD_WORDS.values())})
+    table = table.assign(order=order).sort_values("order", kind="stable", ignore_index=True)
     return table[[*MEASURE_COLUMNS, "stimuli"]]
 
 
@@ -289,7 +307,7 @@ _READOUT_ORDER = tuple(READOUTS[letter] for letter in "CBA")
 
 
 def _with_training(comparison: Comparison, predictions: pd.DataFrame) -> pd.DataFrame:
-    """Return the stimuli of a comparison with ``trained`` (as in the predictions) and
+    """Return the stimuli of the models with ``trained`` (as in the predictions) and
     ``training``.
     """
     result = pd.Series("", index=predictions.index, dtype=object)
@@ -297,7 +315,8 @@ def _with_training(comparison: Comparison, predictions: pd.DataFrame) -> pd.Data
         if column in predictions:
             result = result.where(result != "", predictions[column])
     subset = predictions[["agent", "stimulus"]].assign(trained=result)
-    rows = comparison.stimuli.merge(subset, on=["agent", "stimulus"], how="left")
+    chosen = comparison.stimuli[comparison.stimuli["agent"].isin(comparison.models)]
+    rows = chosen.merge(subset, on=["agent", "stimulus"], how="left")
     ours = rows["trained"].map(lambda name: OFFICIAL_SCENARIOS.get(str(name).lower(), name))
     rows["trained"] = ours.where(ours != "same", rows["scenario"]).replace("all but this", ALL_BUT)
     rows["training"] = rows["trained"].where(~rows["trained"].isin(SCENARIOS), ANOTHER)

@@ -11,10 +11,10 @@ import pandas as pd
 
 from physion.analysis.metrics import Metric, leaderboard_metrics
 from physion.analysis.models.anchors import (
-    OUTCOME,
     TWO_PEOPLE,
     anchor_scores,
     anchor_stimuli,
+    seen_stimuli,
 )
 from physion.analysis.models.comparison import Comparison
 from physion.analysis.models.model_people import models_of, sample_of_models
@@ -89,9 +89,7 @@ def score_anchors(
     scores, given = anchor_scores(stimuli, draws), anchor_stimuli(stimuli)
     if scores.empty:
         return scores
-    # One person with another is about the same stimuli as the recorded outcome.
-    seen = given[given["agent"] == OUTCOME].assign(agent=TWO_PEOPLE)
-    rows = pd.concat([given, seen], ignore_index=True)
+    rows = pd.concat([given, seen_stimuli(stimuli)], ignore_index=True)
     return _scored(scores, rows, answers, scenario, draws).assign(
         rank=pd.Series(dtype="Int64"), training="", file="", versions=""
     )

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from physion.analysis.models.figure_tables import HALVES_ZONE, SCENARIO_ZONE
+from physion.analysis.models.figure_tables import ANCHOR, HALVES_ZONE, SCENARIO_ZONE
 from physion.analysis.tables.stimuli import MEAN
 from physion.report.figures.theme import LIGHT, Theme, label, legend, panels, style, title
 from physion.report.words import number
@@ -30,6 +30,9 @@ LABELS = {
     "kappa": "Cohen's kappa with participants",
 }
 """Names on the axis, by measure."""
+
+ANCHOR_MARKER = "d"
+"""Mark of anchors; no readout has it."""
 
 RELEASED_ZONES = (SCENARIO_ZONE, HALVES_ZONE)
 """Names of zones; those of the paper are hatched, as they say nothing about participants."""
@@ -46,11 +49,14 @@ def measure_figure(table: pd.DataFrame, measure: str, theme: Theme = LIGHT) -> F
     band.
 
     ``table``: see `figure_tables.MEASURE_COLUMNS`. One panel a scenario and one for the mean; the
-    dotted line is chance.
+    dotted line is chance. Anchors stand below the models, lighter and hollow.
     """
     names = list(table["panel"].unique())
     agents = list(table["agent"].unique())
-    kinds = {kind: theme.mark(place) for place, kind in enumerate(table["kind"].unique())}
+    readouts = [kind for kind in table["kind"].unique() if kind != ANCHOR]
+    kinds = {kind: theme.mark(place) for place, kind in enumerate(readouts)}
+    anchors = set(table.loc[table["kind"] == ANCHOR, "agent"])
+    kinds |= {ANCHOR: (theme.faint, ANCHOR_MARKER)} if anchors else {}
     row_height = 0.3 if len(agents) <= 8 else 0.2
     low, high = _limits(table, CHANCE[measure])
     with matplotlib.rc_context(style(theme)):
@@ -65,6 +71,11 @@ def measure_figure(table: pd.DataFrame, measure: str, theme: Theme = LIGHT) -> F
             labels = [label(agent, 48) for agent in agents]
             small = 9 if row_height == 0.3 else 8
             axis.set_yticks(range(len(agents)), labels if place % 3 == 0 else [], fontsize=small)
+            for text, agent in zip(axis.get_yticklabels(), agents, strict=False):
+                text.set_color(theme.faint if agent in anchors else theme.ink)
+            if 0 < len(anchors) < len(agents):
+                first = len(agents) - len(anchors)
+                axis.axhline(first - 0.5, color=theme.zone, linewidth=0.8, zorder=0)
             # No ticks here: they would look like labels of the values in the panel to the left.
             axis.tick_params(axis="y", left=place % 3 == 0)
             axis.set_ylim(len(agents) - 0.4, -0.6)
@@ -98,14 +109,23 @@ def _dots(
                       color=theme.faint, transform=axis.get_yaxis_transform())  # fmt: skip
             continue
         row = rows.loc[agent]
-        colour, marker = kinds[row["kind"]]
         if np.isfinite(row["low"]):
-            axis.plot([row["low"], row["high"]], [place, place], color=colour, linewidth=1.4)
-        axis.plot(row["value"], place, marker=marker, color=colour, markersize=5.5,
-                  markeredgecolor=theme.ink, markeredgewidth=0.6, linestyle="")  # fmt: skip
-        words = number(row["value"])
+            axis.plot([row["low"], row["high"]], [place, place], color=kinds[row["kind"]][0],
+                      linewidth=1.4)  # fmt: skip
+        axis.plot(row["value"], place, linestyle="", **_mark(row["kind"], kinds, theme))
+        words, anchor = number(row["value"]), row["kind"] == ANCHOR
         axis.text(0.995, place, words, va="center", ha="right", fontsize=7.5,
+                  color=theme.faint if anchor else theme.ink,
                   transform=axis.get_yaxis_transform())  # fmt: skip
+
+
+def _mark(kind: str, kinds: dict[str, tuple[str, str]], theme: Theme) -> dict[str, Any]:
+    """Return the properties of a mark; those of anchors are hollow."""
+    colour, marker = kinds[kind]
+    properties = {"marker": marker, "color": colour, "markersize": 5.5, "markeredgewidth": 0.6}
+    if kind == ANCHOR:
+        return {**properties, "markerfacecolor": theme.paper, "markeredgewidth": 1.0}
+    return {**properties, "markeredgecolor": theme.ink}
 
 
 def _human_marks(axis: Axes, rows: pd.DataFrame, theme: Theme) -> None:
@@ -128,9 +148,7 @@ def _measure_handles(
     table: pd.DataFrame, kinds: dict[str, tuple[str, str]], theme: Theme
 ) -> list[Any]:
     handles: list[Any] = [
-        Line2D([], [], color=colour, marker=marker, markeredgecolor=theme.ink, label=kind)
-        for kind, (colour, marker) in kinds.items()
-        if kind
+        Line2D([], [], label=kind, **_mark(kind, kinds, theme)) for kind in kinds if kind
     ]
     if table["people"].notna().any():
         words = table.loc[table["people"].notna(), "people_is"].iloc[0]

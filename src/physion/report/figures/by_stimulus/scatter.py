@@ -36,7 +36,7 @@ def scatter(inputs: ReportInputs) -> Plot | None:
     )
     if len(comparison.changed):
         caption += " Hollow: the simulated outcome is not the official one."
-    rest = comparison.agents[inputs.scatter_limit :]
+    rest = comparison.models[inputs.scatter_limit :]
     if rest:
         caption += f" Not drawn, but in tables/stimuli.csv: {', '.join(map(str, rest))}."
     return Plot("scatter", caption, tables.scatter_table(comparison, shown), scatter_figure)
