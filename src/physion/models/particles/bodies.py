@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from physion.errors import BadInputError
 from physion.models.batch import Motion
 from physion.models.particles.surface import surface_points
+from physion.numerics.linear_algebra import norm
 from physion.numerics.rotations import rotation_matrices
 from physion.physics.particles import sample_particles
 from physion.scenes.scene import Body, Scene
@@ -36,23 +37,25 @@ MAX_PARTICLES = 200_000
 class ParticleSettings:
     """How objects become particles.
 
-    - ``spacing``: metres between particles. ``limit``: largest number for one body.
+    - ``spacing``: metres between particles. ``limit``: largest number for one body,
+      ``still_limit``: for a kinematic one, which may be large.
     - ``fill``: ``volume``, as the original study, or ``surface``.
     - ``cloth_step``: every how many vertices of a cloth, along both sides, is a particle.
     """
 
     spacing: float = 0.10
     limit: int = 100
+    still_limit: int = 600
     fill: Fill = "surface"
     cloth_step: int = 3
 
     def __post_init__(self) -> None:
-        counts = min(self.limit, self.cloth_step)
+        counts = min(self.limit, self.still_limit, self.cloth_step)
         if not self.spacing > 0 or counts < 1 or self.fill not in ("surface", "volume"):
             raise BadInputError(
-                "particles: the spacing must be above 0 m, limit and cloth_step at least 1, and "
-                f"fill surface or volume, not {self.spacing}, {self.limit}, {self.cloth_step} and "
-                f"{self.fill!r}"
+                "particles: the spacing must be above 0 m, limits and cloth_step at least 1, and "
+                f"fill surface or volume, not {self.spacing}, {self.limit}, {self.still_limit}, "
+                f"{self.cloth_step} and {self.fill!r}"
             )
 
 
@@ -63,6 +66,8 @@ class SceneParticles:
     - ``things`` (K,): index of each object in `Scene.names`.
     - ``kinds`` (K,): `RIGID`, `KINEMATIC` or `CLOTH`.
     - ``owners`` (P,): row of the object of each particle.
+    - ``normals`` (P, 3): outward unit normals in the body's frame; 0 where there is none, as in
+      cloths and volumes.
     - ``shape`` (P, 3): metres, offset of each particle from the mean of its object's particles, in
       the body's frame; 0 for cloth.
     - ``pivots`` (K, 3): the mean of the particles in the body's frame; 0 for cloth.
@@ -78,6 +83,7 @@ class SceneParticles:
     kinds: I64
     owners: I64
     shape: F64
+    normals: F64
     pivots: F64
     vertices: I64
     links: I64
@@ -155,9 +161,8 @@ def poses_of(particles: SceneParticles, motion: Motion, frames: Sequence[int]) -
         )
     count = len(particles.things)
     rotations = np.broadcast_to(np.eye(3), (len(rows), count, 3, 3)).copy()
-    rotations[:, bodies] = rotation_matrices(
-        trajectory.rotations[np.ix_(rows, things)].astype(np.float64)
-    )
+    quaternions = trajectory.rotations[np.ix_(rows, things)].astype(np.float64)
+    rotations[:, bodies] = rotation_matrices(quaternions / norm(quaternions)[..., None])
     centers = np.zeros((len(rows), count, 3))
     shift = (rotations[:, bodies] @ particles.pivots[bodies][None, :, :, None])[..., 0]
     centers[:, bodies] = positions + shift
@@ -177,13 +182,23 @@ def join_poses_in_time(first: Poses, second: Poses) -> Poses:
     )
 
 
+def particle_positions(particles: SceneParticles, poses: Poses) -> F64:
+    """Return the positions (T, P, 3) of all particles in every row of a motion, metres."""
+    rotations = poses.rotations[:, particles.owners]
+    turned = (rotations @ particles.shape[None, :, :, None])[..., 0]
+    positions = poses.centers[:, particles.owners] + turned
+    positions[:, particles.loose] = poses.loose
+    return positions
+
+
 def _sample(scene: Scene, settings: ParticleSettings, present: tuple[bool, ...]) -> SceneParticles:
-    things, kinds, shapes, pivots = [], [], [], []
+    things, kinds, shapes, normals, pivots = [], [], [], [], []
     vertices, links = [np.zeros(0, np.int64)], [np.zeros((2, 0), np.int64)]
     for index, body in enumerate(scene.bodies):
         if body.scenery or not present[index]:
             continue
-        points = _points(body, settings)
+        points, outward = _points(body, settings)
+        normals.append(outward)
         pivot = points.mean(axis=0)
         things.append(index)
         kinds.append(KINEMATIC if body.kinematic else RIGID)
@@ -198,6 +213,7 @@ def _sample(scene: Scene, settings: ParticleSettings, present: tuple[bool, ...])
         links.append(grid + sum(len(points) for points in shapes))
         vertices.append(rows + before)
         shapes.append(np.zeros((len(rows), 3)))
+        normals.append(np.zeros((len(rows), 3)))
     if not things:
         raise BadInputError(f"scene {scene.name!r} has no object that can become particles")
     counts = [len(points) for points in shapes]
@@ -214,6 +230,7 @@ def _sample(scene: Scene, settings: ParticleSettings, present: tuple[bool, ...])
         kinds=np.array(kinds, np.int64),
         owners=np.repeat(np.arange(len(things)), counts),
         shape=np.concatenate(shapes),
+        normals=np.concatenate(normals),
         pivots=np.array(pivots),
         vertices=np.concatenate(vertices),
         links=np.concatenate(links, axis=1),
@@ -241,8 +258,10 @@ def _grid(resolution: int, step: int) -> tuple[I64, I64]:
     return rows.astype(np.int64), links.astype(np.int64)
 
 
-def _points(body: Body, settings: ParticleSettings) -> F64:
+def _points(body: Body, settings: ParticleSettings) -> tuple[F64, F64]:
+    """Return particles of a body and their normals."""
+    limit = settings.still_limit if body.kinematic else settings.limit
     if settings.fill == "surface":
-        return surface_points(body.shape, body.scale, settings.spacing, settings.limit)
-    points = sample_particles(body.shape, body.scale, settings.spacing, settings.limit)
-    return points.astype(np.float64)
+        return surface_points(body.shape, body.scale, settings.spacing, limit)
+    points = sample_particles(body.shape, body.scale, settings.spacing, limit).astype(np.float64)
+    return points, np.zeros_like(points)

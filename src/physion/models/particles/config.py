@@ -61,8 +61,8 @@ class ParticleConfig:
     - ``rigid``: how GNS keeps bodies rigid: ``fit`` to all particles, or ``robust`` (RANSAC).
     - ``velocity_noise``, ``position_noise``: metres a step and metres; standard deviations of the
       noise in training, drawn for every rigid body and for every particle of a cloth.
-    - ``knee``: errors of an object count squared up to this many standard deviations of the changes
-      of displacements, and linearly beyond.
+    - ``knee``: errors of an object count squared up to this many units (``simulator.CHANGE``), and
+      linearly beyond.
     - ``gap_spacing``, ``gap_limit``: of the particles by which distances are measured.
     - ``training``: optimiser and schedule.
     """
@@ -77,7 +77,7 @@ class ParticleConfig:
     rigid: Literal["fit", "robust"] = "fit"
     velocity_noise: float = 2e-3
     position_noise: float = 2e-3
-    knee: float = 1.0
+    knee: float = 3.0
     gap_spacing: float = 0.04
     gap_limit: int = 300
     training: TrainingSettings = field(default_factory=TrainingSettings)

@@ -1,43 +1,114 @@
-"""Smallest distance of agent and patient over a motion, between its steps too."""
+"""Smallest distance of agent and patient over a motion, between its steps too.
+
+Between two rows of a motion a body goes from one pose to the next with constant velocity and
+angular velocity. Bodies are compared by their convex pieces; a cloth and a body by the particles of
+the cloth and points on the surface of the body, which go along straight lines.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from physion.models.anchors.smallest_gap import FAR, TOLERANCE, gap_of_hulls, minimise
 from physion.models.particles.bodies import CLOTH, Poses, SceneParticles
 from physion.models.particles.neighbours import gap_over_time
+from physion.models.particles.rigid_motion import rotation_from_vector, vector_from_rotation
 from physion.models.particles.surface import surface_points
-from physion.scenes.scene import Scene
+from physion.physics.rigid.collision.closest_points import new_simplex
+from physion.physics.rigid.hulls import collision_hulls
+from physion.scenes.scene import FRAME_TIME, Scene
 
 F64 = NDArray[np.float64]
-
-FAR = 10.0
-"""Largest distance that is reported, metres; also that of a thing that is absent."""
 
 
 def smallest_distance(
     scene: Scene, particles: SceneParticles, poses: Poses, spacing: float, limit: int
 ) -> float:
-    """Return the smallest distance of agent and patient, metres, at most `FAR`.
+    """Return the smallest distance of agent and patient, metres, 0 where they overlap.
+
+    It is at most `FAR`, also if one of them is absent, and at most `TOLERANCE` too large.
 
     Parameters
     ----------
     scene, particles
         The scene and its particles.
     poses
-        Motion over T frames; particles move along straight lines between frames.
+        Motion over T rows.
     spacing, limit
-        Of the particles on the surfaces of agent and patient, by which the distance is measured.
-        They may be finer than those that move: poses are known for every point of a body. A cloth
-        is measured by its own particles.
+        Of the points on the surface of a body that is compared with a cloth. They may be finer
+        than the particles that move, since the pose of a body gives the place of each of its
+        points.
     """
     rows = (particles.agent, particles.patient)
     if min(rows) < 0 or not len(poses.centers):
         return FAR
-    first, second = (_points(scene, particles, poses, row, spacing, limit) for row in rows)
-    distance = gap_over_time(first, second)
-    return min(distance, FAR) if np.isfinite(distance) else FAR
+    if CLOTH in particles.kinds[list(rows)]:
+        first, second = (_points(scene, particles, poses, row, spacing, limit) for row in rows)
+        return min(gap_over_time(first, second), FAR)
+    return min(_distance_of_bodies(scene, particles, poses, rows), FAR)
+
+
+def _distance_of_bodies(
+    scene: Scene, particles: SceneParticles, poses: Poses, rows: tuple[int, int]
+) -> float:
+    """Return the smallest distance of two bodies.
+
+    In a step their distance changes by at most the sum of what any point of each moves, s, so with
+    the distances g0 and g1 at its ends it is at least (g0 + g1 - s) / 2. Steps in which this is not
+    below the smallest distance so far are not searched.
+    """
+    centers = poses.centers[:, rows]
+    rotations = poses.rotations[:, rows]
+    steps = np.diff(centers, axis=0)
+    turns = vector_from_rotation(
+        torch.from_numpy(rotations[1:] @ rotations[:-1].swapaxes(-1, -2))
+    ).numpy()
+    between, reach = _pair(scene, particles, rows)
+    gaps = [between(centers[row], rotations[row]) for row in range(len(centers))]
+    best = min(gaps)
+    lengths = np.linalg.norm(steps, axis=-1) + np.linalg.norm(turns, axis=-1) * reach
+    moved = lengths.sum(axis=1)
+    for row in range(len(steps)):
+        if best <= 0 or (gaps[row] + gaps[row + 1] - moved[row]) / 2 >= best - TOLERANCE:
+            continue
+
+        def during(seconds: float, row: int = row) -> float:
+            part = seconds / FRAME_TIME
+            turned = rotation_from_vector(torch.from_numpy(part * turns[row])).numpy()
+            return between(centers[row] + part * steps[row], turned @ rotations[row])
+
+        best = min(best, minimise(during, float(moved[row]) / FRAME_TIME, 1))
+    return best
+
+
+def _pair(
+    scene: Scene, particles: SceneParticles, rows: tuple[int, int]
+) -> tuple[Callable[[F64, F64], float], F64]:
+    """Return the distance as a function of centres (2, 3) and rotations (2, 3, 3), and reaches.
+
+    The reach (2,) of a body is the largest distance of its points from its centre.
+    """
+    corners = []
+    for row in rows:
+        body = scene.bodies[int(particles.things[row])]
+        hulls = collision_hulls(body.shape, body.scale)
+        corners.append([hull.corners - particles.pivots[row] for hull in hulls])
+    parts = [part for own in corners for part in own]
+    vertices = np.ascontiguousarray(np.concatenate(parts), np.float64)
+    ends = np.cumsum([0, *(len(part) for part in parts)]).astype(np.int64)
+    pieces, simplex = len(corners[0]), new_simplex()
+
+    def between(centers: F64, rotations: F64) -> float:
+        to_second = np.ascontiguousarray(rotations[1].T)
+        shift = to_second @ (centers[0] - centers[1])
+        return float(gap_of_hulls(vertices, ends, pieces, to_second @ rotations[0], shift, simplex))
+
+    reach = [max(float(np.linalg.norm(part, axis=1).max()) for part in own) for own in corners]
+    return between, np.array(reach)
 
 
 def _points(
@@ -48,6 +119,6 @@ def _points(
         owners = particles.owners[particles.loose]
         return np.ascontiguousarray(poses.loose[:, owners == row])
     body = scene.bodies[int(particles.things[row])]
-    points = surface_points(body.shape, body.scale, spacing, limit) - particles.pivots[row]
-    turned = points[None] @ poses.rotations[:, row].transpose(0, 2, 1)
+    points, _ = surface_points(body.shape, body.scale, spacing, limit)
+    turned = (points - particles.pivots[row])[None] @ poses.rotations[:, row].transpose(0, 2, 1)
     return np.ascontiguousarray(turned + poses.centers[:, row, None])

@@ -32,7 +32,7 @@ from physion.models.particles.rigid_motion import (
     vector_from_rotation,
 )
 
-NODE, EDGE, OBJECT = 11, 13, 11
+NODE, EDGE, OBJECT = 14, 17, 11
 """Sizes of the inputs of nodes, edges and objects."""
 _SPIN = 0.1
 """Unit of spins, radians a step."""
@@ -43,22 +43,30 @@ class Drift:
     """Motion of the last step, and where it leads.
 
     - ``velocity``, ``spin`` (K, 3): metres and radians a step.
-    - ``positions`` (P, 3): now. ``moves`` (P, 3): displacement in the next step.
+    - ``positions``, ``normals`` (P, 3): now. ``moves`` (P, 3): displacement in the next step.
     """
 
     velocity: Tensor
     spin: Tensor
     positions: Tensor
+    normals: Tensor
     moves: Tensor
 
 
 @dataclass(frozen=True, eq=False)
 class Graph:
-    """Inputs of a network, float32: P nodes, E edges, K objects.
+    """Inputs of a network, float32: N nodes, E edges, K objects.
 
-    ``receivers``, ``senders`` (E,), ``owners`` (P,). ``nodes`` (P, `NODE`), ``edges`` (E, `EDGE`),
-    ``things`` (K, `OBJECT`).
+    Nodes are the particles of all objects that can move, and those of kinematic bodies that have
+    an edge: the others would change nothing.
+
+    - ``particles``: P. ``rows`` (N,): particle of each node. ``owners`` (N,): its object.
+    - ``receivers``, ``senders`` (E,): nodes.
+    - ``nodes`` (N, `NODE`), ``edges`` (E, `EDGE`), ``things`` (K, `OBJECT`).
     """
+
+    particles: int
+    rows: Tensor
 
     receivers: Tensor
     senders: Tensor
@@ -77,8 +85,9 @@ def drift_of(layout: Layout, before: ObjectState, now: ObjectState) -> Drift:
     turned = (rotation_from_vector(spin)[layout.owners] @ offsets[..., None])[..., 0]
     moves = velocity[layout.owners] + turned - offsets
     moves = moves.index_copy(0, layout.loose, now.loose - before.loose)
-    still = (layout.kinds == KINEMATIC)[layout.owners]
-    return Drift(velocity, spin, positions, moves.masked_fill(still[:, None], 0.0))
+    moves = moves.masked_fill((layout.kinds == KINEMATIC)[layout.owners][:, None], 0.0)
+    normals = (now.rotations[layout.owners] @ layout.normals[..., None])[..., 0]
+    return Drift(velocity, spin, positions, normals, moves)
 
 
 def move(
@@ -128,32 +137,45 @@ def make_graph(layout: Layout, drift: Drift, radius: float, unit: float, *, swep
     device = positions.device
     outer = torch.from_numpy(np.stack([receivers, senders])).to(device)
     pairs = torch.cat([outer, layout.links], dim=1)
-    nodes = _node_inputs(layout, drift, radius, unit)
-    edges = _edge_inputs(drift, pairs, outer.shape[1], radius, unit)
+    used = (layout.kinds != KINEMATIC)[layout.owners]
+    used[pairs[0]] = True
+    rows = used.nonzero()[:, 0]
+    node_of = used.long().cumsum(0) - 1
     return Graph(
-        pairs[0], pairs[1], layout.owners, nodes, edges, _object_inputs(layout, drift, radius, unit)
+        particles=len(layout.owners),
+        rows=rows,
+        receivers=node_of[pairs[0]],
+        senders=node_of[pairs[1]],
+        owners=layout.owners[rows],
+        nodes=_node_inputs(layout, drift, radius, unit)[rows],
+        edges=_edge_inputs(drift, pairs, outer.shape[1], radius, unit),
+        things=_object_inputs(layout, drift, radius, unit),
     )
 
 
 def _node_inputs(layout: Layout, drift: Drift, radius: float, unit: float) -> Tensor:
-    """Return displacement, offset from the centre, heights now and after the step, and kind."""
+    """Return displacement, offset from the centre, normal, heights now and after, and kind."""
     centers = mean_by(drift.positions, layout.owners, layout.objects)
     offsets = (drift.positions - centers[layout.owners]) / radius
+    # Nothing depends on where the middle of a kinematic body is, which may be metres away.
+    offsets = offsets.masked_fill((layout.kinds == KINEMATIC)[layout.owners][:, None], 0.0)
     height = drift.positions[:, 2] - layout.floor[layout.owners]
     heights = torch.stack([height, height + drift.moves[:, 2]], -1) / radius
     kinds = torch.nn.functional.one_hot(layout.kinds, 3)[layout.owners]
-    parts = [drift.moves / unit, offsets, heights.clamp(-2, 1), kinds.double()]
+    parts = [drift.moves / unit, offsets, drift.normals, heights.clamp(-2, 1), kinds.double()]
     return torch.cat(parts, dim=-1).float()
 
 
 def _edge_inputs(drift: Drift, pairs: Tensor, outer: int, radius: float, unit: float) -> Tensor:
-    """Return distance now, relative motion, and distance when closest in the step."""
+    """Return distance now, relative motion, distance when closest, and both along the normals."""
     receivers, senders = pairs
     apart = drift.positions[senders] - drift.positions[receivers]
     relative = drift.moves[senders] - drift.moves[receivers]
     squared = relative.pow(2).sum(-1)
     moment = (-(apart * relative).sum(-1) / squared.clamp_min(1e-12)).clamp(0, 1)
     closest = apart + moment[:, None] * relative
+    normals = torch.stack([drift.normals[receivers], drift.normals[senders]], 1)
+    along = torch.cat([(normals * vector[:, None]).sum(-1) for vector in (apart, closest)], -1)
     within = torch.zeros_like(moment)
     within[outer:] = 1
     parts = [
@@ -162,6 +184,7 @@ def _edge_inputs(drift: Drift, pairs: Tensor, outer: int, radius: float, unit: f
         relative / unit,
         closest / radius,
         closest.norm(dim=-1, keepdim=True) / radius,
+        along / radius,
         moment[:, None],
         within[:, None],
     ]

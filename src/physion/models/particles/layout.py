@@ -26,6 +26,7 @@ class Layout:
     """What does not change in time: K objects with P particles of B scenes.
 
     - ``shape`` (P, 3) float64: offset of a particle from the centre of its object at rest, metres.
+    - ``normals`` (P, 3) float64: outward unit normals at rest; 0 where there are none.
     - ``owners`` (P,), ``kinds`` (K,), ``scene`` (K,): see `bodies.SceneParticles`.
     - ``loose`` (C,): rows of the particles of cloths.
     - ``links`` (2, L): edges within objects that never change: receivers and senders.
@@ -35,6 +36,7 @@ class Layout:
     """
 
     shape: Tensor
+    normals: Tensor
     owners: Tensor
     kinds: Tensor
     scene: Tensor
@@ -108,6 +110,7 @@ def join_scenes(
     scene_array = np.repeat(np.arange(len(scenes)), objects)
     return Layout(
         shape=tensor(shape),
+        normals=tensor(np.concatenate([scene.normals for scene in scenes])),
         owners=tensor(owners),
         kinds=tensor(kinds),
         scene=tensor(scene_array),

@@ -42,7 +42,9 @@ def radius_edges(points: F64, scene: I64, radius: float) -> Edges:
     span = float(np.ptp(points[:, 0])) + 2 * radius + 1.0
     apart = points.copy()
     apart[:, 0] += span * scene
-    pairs = cKDTree(apart).query_pairs(radius, output_type="ndarray")
+    # A tree that is quick to build is searched once.
+    tree = cKDTree(apart, balanced_tree=False, compact_nodes=False)
+    pairs = tree.query_pairs(radius, output_type="ndarray")
     return _both_ways(pairs[:, 0], pairs[:, 1])
 
 
@@ -106,10 +108,12 @@ def gap_over_time(a: F64, b: F64) -> float:
 
 
 def _both_ways(first: I64, second: I64) -> Edges:
-    receivers = np.concatenate([first, second]).astype(np.int64)
-    senders = np.concatenate([second, first]).astype(np.int64)
-    order = np.lexsort((senders, receivers))
-    return receivers[order], senders[order]
+    """Return both directions of pairs, sorted by receiver, then sender."""
+    a, b = first.astype(np.int64), second.astype(np.int64)
+    # Both rows in one number, which sorts faster than two.
+    codes = np.concatenate([a << 32 | b, b << 32 | a])
+    codes.sort()
+    return codes >> 32, codes & 0xFFFFFFFF
 
 
 @kernel

@@ -10,8 +10,8 @@ what is added to this motion:
 - DPI-Net: changes of velocity and spin of every body, and of the displacements of the particles of
   cloths.
 
-The loss is the squared distance of the predicted particles from where they went, in units of the
-standard deviation of a, averaged over the particles of an object, then over objects; above
+The loss is the squared distance of the predicted particles from where they went, in units of
+`CHANGE`, averaged over the particles of an object, then over objects; above
 ``knee`` it grows linearly (`_softened`).
 
 Source: paper, section 4 and supplement; docs/official-system.md, section 6. It differs from the
@@ -40,6 +40,7 @@ from physion.models.particles.bodies import (
     Poses,
     SceneParticles,
     join_poses_in_time,
+    particle_positions,
     poses_of,
     scene_particles,
 )
@@ -58,16 +59,20 @@ from physion.seeds import generator, stable_hash
 
 VERSION = 1
 """To be raised with every change of what equal weights predict, or of the training."""
+UNIT, CHANGE = 0.03, 0.01
+"""Metres a step: units of displacements, and of their changes. A body that falls for 0.03 s changes
+its displacement by 0.009 m, one that moves at 1 m/s moves 0.03 m."""
 _INLIER = 0.1
 """Distance in spacings within which a particle agrees with a rigid motion."""
 
 F64 = NDArray[np.float64]
+Futures = list[tuple[SceneParticles, Poses]]
+"""Particles and motion of every sample of a trial."""
 
 
 class ParticleSimulator(TorchModel):
     """Model that learns how particles move, and imagines by moving them step by step.
 
-    ``unit``, ``change``: root mean squares of displacements in a step and of their changes, metres.
     ``touch`` (2,): metres; agent and patient touch if they come at most this close, two bodies and
     a cloth and a body. It is fitted after training (`calibrate`) and stored with the weights.
     """
@@ -75,8 +80,6 @@ class ParticleSimulator(TorchModel):
     diet: Diet = "states"
     window = 3
     calibration_trials = 256
-    unit: Tensor
-    change: Tensor
     touch: Tensor
 
     def __init__(self, name: str, config: ParticleConfig, options: ParticleOptions) -> None:
@@ -99,8 +102,6 @@ class ParticleSimulator(TorchModel):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(stable_hash("particle model", options.seed) % 2**63)
             self.network = kind(config.width, config.rounds)
-        self.register_buffer("unit", torch.tensor(0.02, dtype=torch.float64))
-        self.register_buffer("change", torch.tensor(0.005, dtype=torch.float64))
         self.register_buffer("touch", torch.zeros(2, dtype=torch.float64))
 
     @property
@@ -127,15 +128,11 @@ class ParticleSimulator(TorchModel):
         return digest_of(parts, self.state_dict().items())
 
     def prepare(self, sample: Batch) -> None:
-        """Set the units of displacements and of their changes from training clips."""
-        window = self._read(sample)
-        layout, drift = window.layout, drift_of(window.layout, window.before, window.now)
-        free = (layout.kinds != KINEMATIC)[layout.owners]
-        error = (window.after.positions(layout) - drift.positions - drift.moves)[free]
-        if not len(error):
-            return
-        self.unit.copy_(drift.moves[free].pow(2).sum(-1).mean().sqrt().clamp_min(1e-3))
-        self.change.copy_(error.pow(2).sum(-1).mean().sqrt().clamp_min(1e-4))
+        """Do nothing: the units do not depend on the clips.
+
+        A few collisions decide the standard deviation of changes, so that a sample of clips would
+        give another loss for every seed.
+        """
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
         """Return the loss of a batch of windows of three frames."""
@@ -176,7 +173,8 @@ class ParticleSimulator(TorchModel):
                 cloth.append(max(things) >= len(motion.scene.bodies))
         if not motions:
             return
-        gaps, touching, soft = self._gaps(motions, 1, 0)[:, 0], np.array(labels), np.array(cloth)
+        gaps = self._gaps(motions, self.futures(motions, 1, 0))[:, 0]
+        touching, soft = np.array(labels), np.array(cloth)
         for row, which in enumerate((~soft, soft)):
             self.touch[row] = best_threshold(gaps[which], touching[which])
 
@@ -184,16 +182,19 @@ class ParticleSimulator(TorchModel):
     def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
         """Return the smallest gap (B, S) of agent and patient, less the fitted ``touch``.
 
-        It counts the observed part, steps that are imagined, and the time between steps.
+        It counts the observed part, steps that are imagined, and the time between steps. With the
+        knob ``show`` above 0, ``shown`` holds the imagined particles (B, S, F, P, 3) and the object
+        of each, ``things`` (B, P), its index in `Scene.names`; NaN and -1 where a trial has fewer
+        frames or particles than another. The frames are 44 + s, 44 + 2 s, ... with the stride s.
         """
         if context.state is None:
             raise BadInputError("a particle model imagines from motions, which the batch lacks")
-        return Rollout(gap=self._gaps(context.state, samples, seed))
+        futures = self.futures(context.state, samples, seed)
+        shown = _shown(futures, self.spec.context) if knobs.get("show", 0) > 0 else {}
+        return Rollout(gap=self._gaps(context.state, futures), shown=shown)
 
     @torch.no_grad()
-    def futures(
-        self, motions: Sequence[Motion], samples: int, seed: int
-    ) -> list[list[tuple[SceneParticles, Poses]]]:
+    def futures(self, motions: Sequence[Motion], samples: int, seed: int) -> list[Futures]:
         """Return particles, and motion from frame 0 to the end, of every motion and sample.
 
         Rows are ``spec.stride`` frames apart; the last observed one is frame 44.
@@ -237,11 +238,11 @@ class ParticleSimulator(TorchModel):
         )
         return move_loose(layout, state, drift, changes[layout.loose])
 
-    def _gaps(self, motions: Sequence[Motion], samples: int, seed: int) -> F64:
+    def _gaps(self, motions: Sequence[Motion], futures: Sequence[Futures]) -> F64:
+        """Return the smallest gaps (B, S) of agent and patient, less ``touch``."""
         config = self.config
         touch = self.touch.cpu().numpy()
-        gaps = np.zeros((len(motions), samples))
-        futures = self.futures(motions, samples, seed)
+        gaps = np.zeros((len(motions), len(futures[0])))
         for row, (motion, own) in enumerate(zip(motions, futures, strict=True)):
             for column, (particles, poses) in enumerate(own):
                 distance = smallest_distance(
@@ -258,19 +259,26 @@ class ParticleSimulator(TorchModel):
 
     def _graph(self, layout: Layout, drift: Drift) -> Graph:
         config = self.config
-        return make_graph(layout, drift, config.radius, float(self.unit), swept=config.swept)
+        return make_graph(layout, drift, config.radius, UNIT, swept=config.swept)
 
     def _changes(self, graph: Graph) -> Tensor:
         """Return the changes of displacements (P, 3) that GNS predicts, metres."""
-        return cast(Tensor, self.network(graph)).double() * self.change
+        return self._of_particles(graph, cast(Tensor, self.network(graph)))
+
+    def _of_particles(self, graph: Graph, values: Tensor) -> Tensor:
+        """Return values of nodes (N, 3), in units of changes, as metres of particles (P, 3)."""
+        metres = values.double() * CHANGE
+        return metres.new_zeros(graph.particles, 3).index_copy(0, graph.rows, metres)
 
     def _move_objects(
         self, layout: Layout, now: ObjectState, drift: Drift, graph: Graph
     ) -> ObjectState:
         """Return the next state as DPI-Net predicts it."""
-        velocity, rim, loose = (value.double() * self.change for value in self.network(graph))
-        state = move(layout, now, drift, velocity, rim / layout.size[:, None])
-        return move_loose(layout, state, drift, loose[layout.loose])
+        velocity, rim, changes = self.network(graph)
+        linear, angular = (value.double() * CHANGE for value in (velocity, rim))
+        state = move(layout, now, drift, linear, angular / layout.size[:, None])
+        loose = self._of_particles(graph, changes)[layout.loose]
+        return move_loose(layout, state, drift, loose)
 
     def _fit(self, layout: Layout, goal: Tensor) -> tuple[Tensor, Tensor]:
         """Return the rotations and centres of the rigid motions that fit the particles."""
@@ -286,10 +294,29 @@ class ParticleSimulator(TorchModel):
     def _error(self, window: Window, predicted: Tensor) -> Tensor:
         layout = window.layout
         target = window.after.positions(layout)
-        squares = ((predicted - target) / self.change).pow(2).sum(-1)
+        squares = ((predicted - target) / CHANGE).pow(2).sum(-1)
         errors = _softened(mean_by(squares, layout.owners, layout.objects), self.config.knee)
         free = (layout.kinds != KINEMATIC).double()
         return ((errors * free).sum() / free.sum().clamp_min(1)).float()
+
+
+def _shown(futures: Sequence[Futures], observed: int) -> dict[str, NDArray[np.generic]]:
+    """Return the particles of the frames after the first ``observed`` ones; see `imagine`."""
+    clouds = [
+        [particle_positions(particles, poses)[observed:] for particles, poses in own]
+        for own in futures
+    ]
+    samples, parts = len(futures[0]), [cloud for own in clouds for cloud in own]
+    frames, count = (max(cloud.shape[axis] for cloud in parts) for axis in (0, 1))
+    shape = (len(futures), samples, frames, count, 3)
+    positions = np.full(shape, np.nan, np.float32)
+    things = np.full((len(futures), count), -1, np.int64)
+    for row, own in enumerate(clouds):
+        particles = futures[row][0][0]
+        things[row, : len(particles.owners)] = particles.things[particles.owners]
+        for sample, cloud in enumerate(own):
+            positions[row, sample, : cloud.shape[0], : cloud.shape[1]] = cloud
+    return {"particles": positions, "things": things}
 
 
 def _softened(squares: Tensor, knee: float) -> Tensor:

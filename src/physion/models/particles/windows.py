@@ -38,7 +38,7 @@ def read_window(
     """Return the objects of the clips that are there in all three frames, and their states."""
     if batch.state is None or batch.frames.shape[1] != 3:
         raise BadInputError("a particle model is trained on motions in windows of 3 frames")
-    frames = batch.frames.cpu().numpy()
+    frames = torch.as_tensor(batch.frames).cpu().numpy()
     particles, poses = [], []
     for motion, shown in zip(batch.state, frames, strict=True):
         present = np.all([motion.scene.present(int(frame)) for frame in shown], axis=0)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import threading
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,8 @@ from physion.models.batch import Motion
 from physion.training.sources.motions import cut_motion
 from physion.trials.trial_file import Trial
 
-_KEPT_BYTES = 2**28
-"""Motions that were read last are kept in memory up to this size."""
+_LEAST_BYTES, _FRACTION = 2**28, 8
+"""Motions that were read last are kept in memory up to one eighth of it, or this size."""
 
 
 class TrialMotions(Mapping[str, Motion]):
@@ -61,8 +62,18 @@ class TrialMotions(Mapping[str, Motion]):
             return
         self._kept[trial] = motion
         self._bytes += _size(motion)
-        while self._bytes > _KEPT_BYTES and len(self._kept) > 1:
+        while self._bytes > _kept_bytes() and len(self._kept) > 1:
             self._bytes -= _size(self._kept.popitem(last=False)[1])
+
+
+@cache
+def _kept_bytes() -> int:
+    """Return how many bytes of motions are kept in memory."""
+    names = ("SC_PAGE_SIZE", "SC_PHYS_PAGES")
+    if not all(name in getattr(os, "sysconf_names", {}) for name in names):
+        return _LEAST_BYTES
+    page, pages = (os.sysconf(name) for name in names)
+    return max(_LEAST_BYTES, page * pages // _FRACTION)
 
 
 def _size(motion: Motion) -> int:

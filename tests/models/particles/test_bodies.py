@@ -1,0 +1,118 @@
+"""Particles of objects: where they lie, their normals, their motion, and bad input."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from tests.support.rendered_scenes import body, scene_of, tumbling
+
+from physion.errors import BadInputError
+from physion.models.batch import Motion
+from physion.models.particles.bodies import (
+    CLOTH,
+    KINEMATIC,
+    RIGID,
+    ParticleSettings,
+    particle_positions,
+    poses_of,
+    scene_particles,
+)
+from physion.models.particles.surface import surface_points
+from physion.physics.particles import particles_over_time
+from physion.scenes.scene import Cloth, Roles
+from physion.scenes.shapes.primitives import shapes
+
+
+def test_points_lie_on_the_box_with_its_corners_and_normals() -> None:
+    points, normals = surface_points("cube", (0.4, 0.6, 0.8), 0.1, 10_000)
+    low, high = points.min(axis=0), points.max(axis=0)
+    assert np.allclose(high - low, (0.4, 0.6, 0.8))
+    on = np.isclose(points, low) | np.isclose(points, high)
+    assert on.any(axis=1).all(), "every point is on a face"
+    assert (on.sum(axis=1) == 3).sum() == 8, "all corners are points"
+    inside = on.sum(axis=1) == 1
+    outward = np.where(np.isclose(points, high), 1.0, -1.0) * on
+    assert np.allclose(normals[inside], outward[inside])
+    assert np.allclose(np.linalg.norm(normals, axis=1), 1)
+
+
+@pytest.mark.parametrize("name", [n for n in sorted(shapes.names()) if ":" not in n])
+def test_points_cover_every_shape(name: str) -> None:
+    """No point of the surface is farther than the spacing from a particle."""
+    points, normals = surface_points(name, (0.3, 0.3, 0.3), 0.1, 10_000)
+    fine, _ = surface_points(name, (0.3, 0.3, 0.3), 0.02, 10_000)
+    assert cKDTree(points).query(fine)[0].max() <= 0.1 + 0.02
+    assert len(points) == 1 or cKDTree(points).query(points, 2)[0][:, 1].min() >= 0.0999
+    assert np.isfinite(normals).all()
+
+
+def test_a_limit_thins_evenly() -> None:
+    points, _ = surface_points("cube", (1.0, 1.0, 1.0), 0.02, 50)
+    fine, _ = surface_points("cube", (1.0, 1.0, 1.0), 0.1, 10_000)
+    assert len(points) == 50
+    # 50 points on 6 m^2 are sqrt(.12) = .35 m apart in a square grid.
+    assert cKDTree(points).query(fine)[0].max() < 0.35
+
+
+@pytest.mark.parametrize(("spacing", "limit"), [(0.0, 5), (-1.0, 5), (np.nan, 5), (0.1, 0)])
+def test_bad_spacings_and_limits_are_named(spacing: float, limit: int) -> None:
+    with pytest.raises(BadInputError, match="spacing above 0 m and a limit of at least 1"):
+        surface_points("cube", (1.0, 1.0, 1.0), spacing, limit)
+    with pytest.raises(BadInputError, match="particles: the spacing"):
+        ParticleSettings(spacing=spacing, limit=limit)
+
+
+def test_kinds_scenery_and_absent_bodies() -> None:
+    scene = scene_of(body("a"), body("b", kinematic=True), body("c", scenery=True), body("d"))
+    own = scene_particles(scene, ParticleSettings())
+    assert own.things.tolist() == [0, 1, 3] and own.kinds.tolist() == [RIGID, KINEMATIC, RIGID]
+    assert own.agent == 0
+    without = scene_particles(scene, ParticleSettings(), (False, True, True, True))
+    assert without.things.tolist() == [1, 3] and without.agent == -1
+    with pytest.raises(BadInputError, match="no object"):
+        scene_particles(scene, ParticleSettings(), (False,) * 4)
+
+
+@pytest.mark.parametrize("fill", ["surface", "volume"])
+def test_particles_move_with_their_bodies(fill: str) -> None:
+    scene, trajectory = tumbling()
+    settings = ParticleSettings(0.1, 500, 500, fill, cloth_step=1)  # type: ignore[arg-type]
+    own = scene_particles(scene, settings)
+    frames = range(len(trajectory))
+    positions = particle_positions(own, poses_of(own, Motion(scene, trajectory), frames))
+    if fill == "volume":
+        expected = particles_over_time(scene, trajectory, 0.1, limit=500)
+        assert np.allclose(positions, expected.positions, atol=1e-5)
+    for row in np.flatnonzero(own.kinds != CLOTH):
+        mine = positions[:, own.owners == row]
+        apart = np.linalg.norm(mine[:, :1] - mine, axis=-1)
+        assert np.allclose(apart, apart[:1], atol=1e-6), "a body stays rigid"
+
+
+def test_a_cloth_is_a_grid_of_its_vertices() -> None:
+    cloth = Cloth("sheet", (0.0, 0.0, 1.0), resolution=7)
+    scene = dataclasses.replace(scene_of(body("a")), cloths=(cloth,))
+    own = scene_particles(scene, ParticleSettings(cloth_step=3))
+    rows = own.owners == 1
+    assert own.kinds[1] == CLOTH and rows.sum() == 9
+    assert own.vertices.tolist() == [0, 3, 6, 21, 24, 27, 42, 45, 48]
+    first = int(np.flatnonzero(rows)[0])
+    middle = own.links[1][own.links[0] == first + 4] - first
+    assert sorted(middle) == [0, 1, 2, 3, 5, 6, 7, 8], "sides and diagonals"
+
+
+def test_a_motion_that_is_not_known_is_refused() -> None:
+    scene, trajectory = tumbling()
+    unknown = dataclasses.replace(trajectory, positions=np.full_like(trajectory.positions, np.nan))
+    own = scene_particles(scene, ParticleSettings())
+    with pytest.raises(BadInputError, match="has no motion"):
+        poses_of(own, Motion(scene, unknown), [0])
+
+
+def test_roles_are_found_among_the_objects() -> None:
+    scene = dataclasses.replace(scene_of(body("a"), body("b"), body("c")), roles=Roles("c", "b"))
+    own = scene_particles(scene, ParticleSettings())
+    assert (own.agent, own.patient) == (2, 1)
