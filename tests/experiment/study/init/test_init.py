@@ -26,7 +26,7 @@ from physion.experiment.study.init.generated_trials import choose_familiarizatio
 from physion.experiment.study.init.media import StimulusSource, import_stimulus
 from physion.experiment.study.init.study_folder import JOURNAL, make_study
 from physion.experiment.study.study import Study, load_study
-from physion.trials.index import write_index
+from physion.trials.index import read_index, write_index
 from physion.trials.video import read_frames
 from support.experiment.tiny_dataset import is_marked, make_tiny_dataset
 from support.experiment.tiny_study import OBSERVED, make_tiny_study, read_number
@@ -88,6 +88,17 @@ def test_a_scenario_without_one_kind_is_refused(dataset: Path, tmp_path: Path) -
     with pytest.raises(BadInputError, match="no familiarization trial of collide without") as e:
         choose_trials(tmp_path)
     assert "physion generate" in str(e.value) and "--split familiarization" in str(e.value)
+
+
+def test_imported_trials_without_familiarization_name_the_official_scenes(
+    dataset: Path, tmp_path: Path
+) -> None:
+    _changed(dataset, tmp_path, lambda t: t["split"] != "familiarization")
+    table = read_index(tmp_path)
+    table["recorded_contact"] = table["contact"]
+    write_index(tmp_path, table)
+    with pytest.raises(BadInputError, match="give --scenes official in place of --trials"):
+        choose_trials(tmp_path)
 
 
 def test_datasets_without_testing_trials_are_refused(dataset: Path, tmp_path: Path) -> None:
