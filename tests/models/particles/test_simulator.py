@@ -19,7 +19,7 @@ from physion.models.observed import cut_to_observed
 from physion.models.particles.bodies import KINEMATIC, poses_of, scene_particles
 from physion.models.particles.gap import smallest_distance
 from physion.models.particles.graph import drift_of, make_graph
-from physion.models.particles.layout import ObjectState, join_poses, join_scenes, turn_scenes
+from physion.models.particles.layout import ObjectState, join_poses, join_scenes, rotate_scenes
 from physion.models.particles.rigid_motion import rotation_from_vector
 from physion.models.particles.simulator import ParticleSimulator
 from physion.physics.engine import simulate
@@ -81,18 +81,18 @@ def test_a_shift_along_the_floor_shifts_the_prediction(name: str, collide: Motio
     assert (after - now.positions(layout)).abs().max() > 1e-4, "something moves"
 
 
-def test_a_turn_about_the_vertical_is_learned_not_built_in(collide: Motion) -> None:
+def test_a_rotation_about_the_vertical_is_learned_not_built_in(collide: Motion) -> None:
     """The error of rotation is reported by the benchmark; it is not 0 in an untrained network."""
     model = model_of("dpi")
     layout, before, now = last_states(model, collide)
     angle = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
-    turns = rotation_from_vector(angle)
+    rotations = rotation_from_vector(angle)
     with torch.no_grad():
-        turned_after = turn_scenes(model.step(layout, before, now), layout, turns)
-        after_turned = model.step(
-            layout, turn_scenes(before, layout, turns), turn_scenes(now, layout, turns)
+        rotated_after = rotate_scenes(model.step(layout, before, now), layout, rotations)
+        after_rotated = model.step(
+            layout, rotate_scenes(before, layout, rotations), rotate_scenes(now, layout, rotations)
         )
-    assert (turned_after.centers - after_turned.centers).abs().max() > 0
+    assert (rotated_after.centers - after_rotated.centers).abs().max() > 0
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -185,8 +185,8 @@ def join_poses_in_time(first: Poses, second: Poses) -> Poses:
 def particle_positions(particles: SceneParticles, poses: Poses) -> F64:
     """Return the positions (T, P, 3) of all particles in every row of a motion, metres."""
     rotations = poses.rotations[:, particles.owners]
-    turned = (rotations @ particles.shape[None, :, :, None])[..., 0]
-    positions = poses.centers[:, particles.owners] + turned
+    rotated = (rotations @ particles.shape[None, :, :, None])[..., 0]
+    positions = poses.centers[:, particles.owners] + rotated
     positions[:, particles.loose] = poses.loose
     return positions
 

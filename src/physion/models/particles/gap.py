@@ -64,13 +64,13 @@ def _distance_of_bodies(
     centers = poses.centers[:, rows]
     rotations = poses.rotations[:, rows]
     steps = np.diff(centers, axis=0)
-    turns = vector_from_rotation(
+    rotation = vector_from_rotation(
         torch.from_numpy(rotations[1:] @ rotations[:-1].swapaxes(-1, -2))
     ).numpy()
     between, reach = _pair(scene, particles, rows)
     gaps = [between(centers[row], rotations[row]) for row in range(len(centers))]
     best = min(gaps)
-    lengths = np.linalg.norm(steps, axis=-1) + np.linalg.norm(turns, axis=-1) * reach
+    lengths = np.linalg.norm(steps, axis=-1) + np.linalg.norm(rotation, axis=-1) * reach
     moved = lengths.sum(axis=1)
     for row in range(len(steps)):
         if best <= 0 or (gaps[row] + gaps[row + 1] - moved[row]) / 2 >= best - TOLERANCE:
@@ -78,8 +78,8 @@ def _distance_of_bodies(
 
         def during(seconds: float, row: int = row) -> float:
             part = seconds / FRAME_TIME
-            turned = rotation_from_vector(torch.from_numpy(part * turns[row])).numpy()
-            return between(centers[row] + part * steps[row], turned @ rotations[row])
+            rotated = rotation_from_vector(torch.from_numpy(part * rotation[row])).numpy()
+            return between(centers[row] + part * steps[row], rotated @ rotations[row])
 
         best = min(best, minimise(during, float(moved[row]) / FRAME_TIME, 1))
     return best
@@ -120,5 +120,5 @@ def _points(
         return np.ascontiguousarray(poses.loose[:, owners == row])
     body = scene.bodies[int(particles.things[row])]
     points, _ = surface_points(body.shape, body.scale, spacing, limit)
-    turned = (points - particles.pivots[row])[None] @ poses.rotations[:, row].transpose(0, 2, 1)
-    return np.ascontiguousarray(turned + poses.centers[:, row, None])
+    rotated = (points - particles.pivots[row])[None] @ poses.rotations[:, row].transpose(0, 2, 1)
+    return np.ascontiguousarray(rotated + poses.centers[:, row, None])

@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from physion.models.particles.bodies import KINEMATIC
-from physion.models.particles.layout import Layout, ObjectState, with_loose
+from physion.models.particles.layout import ObjectState, SceneLayout, with_loose
 from physion.models.particles.neighbours import swept_edges
 from physion.models.particles.rigid_motion import (
     mean_by,
@@ -76,14 +76,14 @@ class Graph:
     things: Tensor
 
 
-def drift_of(layout: Layout, before: ObjectState, now: ObjectState) -> Drift:
+def drift_of(layout: SceneLayout, before: ObjectState, now: ObjectState) -> Drift:
     """Return velocities and spins of the last step, and displacements of the next."""
     velocity = now.centers - before.centers
     spin = vector_from_rotation(now.rotations @ before.rotations.transpose(-1, -2))
     positions = now.positions(layout)
     offsets = positions - now.centers[layout.owners]
-    turned = (rotation_from_vector(spin)[layout.owners] @ offsets[..., None])[..., 0]
-    moves = velocity[layout.owners] + turned - offsets
+    rotated = (rotation_from_vector(spin)[layout.owners] @ offsets[..., None])[..., 0]
+    moves = velocity[layout.owners] + rotated - offsets
     moves = moves.index_copy(0, layout.loose, now.loose - before.loose)
     moves = moves.masked_fill((layout.kinds == KINEMATIC)[layout.owners][:, None], 0.0)
     normals = (now.rotations[layout.owners] @ layout.normals[..., None])[..., 0]
@@ -91,26 +91,30 @@ def drift_of(layout: Layout, before: ObjectState, now: ObjectState) -> Drift:
 
 
 def move(
-    layout: Layout, now: ObjectState, drift: Drift, change: Tensor, turn: Tensor
+    layout: SceneLayout, now: ObjectState, drift: Drift, change: Tensor, spin: Tensor
 ) -> ObjectState:
     """Return the state after a step in which velocity and spin of bodies change.
 
-    ``change`` (K, 3) metres a step, ``turn`` (K, 3) radians a step. Kinematic bodies stay; cloths
+    ``change`` (K, 3) metres a step, ``spin`` (K, 3) radians a step. Kinematic bodies stay; cloths
     keep their particles.
     """
     free = (layout.kinds != KINEMATIC)[:, None]
     centers = now.centers + torch.where(free, drift.velocity + change, 0.0)
-    rotations = rotation_from_vector(torch.where(free, drift.spin + turn, 0.0)) @ now.rotations
+    rotations = rotation_from_vector(torch.where(free, drift.spin + spin, 0.0)) @ now.rotations
     return ObjectState(centers, rotations, now.loose)
 
 
-def move_loose(layout: Layout, state: ObjectState, drift: Drift, change: Tensor) -> ObjectState:
+def move_loose(
+    layout: SceneLayout, state: ObjectState, drift: Drift, change: Tensor
+) -> ObjectState:
     """Return a state whose particles of cloths moved, with changes (C, 3) of displacements."""
     loose = state.loose + drift.moves[layout.loose] + change
     return with_loose(layout, state.centers, state.rotations, loose)
 
 
-def make_graph(layout: Layout, drift: Drift, radius: float, unit: float, *, swept: bool) -> Graph:
+def make_graph(
+    layout: SceneLayout, drift: Drift, radius: float, unit: float, *, swept: bool
+) -> Graph:
     """Return the graph of a state.
 
     Parameters
@@ -153,7 +157,7 @@ def make_graph(layout: Layout, drift: Drift, radius: float, unit: float, *, swep
     )
 
 
-def _node_inputs(layout: Layout, drift: Drift, radius: float, unit: float) -> Tensor:
+def _node_inputs(layout: SceneLayout, drift: Drift, radius: float, unit: float) -> Tensor:
     """Return displacement, offset from the centre, normal, heights now and after, and kind."""
     centers = mean_by(drift.positions, layout.owners, layout.objects)
     offsets = (drift.positions - centers[layout.owners]) / radius
@@ -191,7 +195,7 @@ def _edge_inputs(drift: Drift, pairs: Tensor, outer: int, radius: float, unit: f
     return torch.cat(parts, dim=-1).float()
 
 
-def _object_inputs(layout: Layout, drift: Drift, radius: float, unit: float) -> Tensor:
+def _object_inputs(layout: SceneLayout, drift: Drift, radius: float, unit: float) -> Tensor:
     """Return velocity, spin, size, speed of the rim, and kind."""
     kinds = torch.nn.functional.one_hot(layout.kinds, 3).double()
     spin = drift.spin / _SPIN

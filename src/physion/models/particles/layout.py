@@ -22,7 +22,7 @@ I64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
+class SceneLayout:
     """What does not change in time: K objects with P particles of B scenes.
 
     - ``shape`` (P, 3) float64: offset of a particle from the centre of its object at rest, metres.
@@ -63,7 +63,7 @@ class Layout:
 
 @dataclass(frozen=True, eq=False)
 class ObjectState:
-    """Where the objects of a `Layout` are; float64, metres.
+    """Where the objects of a `SceneLayout` are; float64, metres.
 
     - ``centers`` (K, 3): means of the particles. ``rotations`` (K, 3, 3): of bodies.
     - ``loose`` (C, 3): particles of cloths.
@@ -73,15 +73,15 @@ class ObjectState:
     rotations: Tensor
     loose: Tensor
 
-    def positions(self, layout: Layout) -> Tensor:
+    def positions(self, layout: SceneLayout) -> Tensor:
         """Return the positions of all particles (P, 3)."""
-        turned = (self.rotations[layout.owners] @ layout.shape[..., None])[..., 0]
-        return (self.centers[layout.owners] + turned).index_copy(0, layout.loose, self.loose)
+        rotated = (self.rotations[layout.owners] @ layout.shape[..., None])[..., 0]
+        return (self.centers[layout.owners] + rotated).index_copy(0, layout.loose, self.loose)
 
 
 def join_scenes(
     scenes: Sequence[SceneParticles], device: torch.device, inner_radius: float
-) -> Layout:
+) -> SceneLayout:
     """Return the layout of several scenes.
 
     ``inner_radius``: metres within which particles of one rigid body are linked; 0 for no links.
@@ -108,7 +108,7 @@ def join_scenes(
         return torch.from_numpy(np.ascontiguousarray(values)).to(device)
 
     scene_array = np.repeat(np.arange(len(scenes)), objects)
-    return Layout(
+    return SceneLayout(
         shape=tensor(shape),
         normals=tensor(np.concatenate([scene.normals for scene in scenes])),
         owners=tensor(owners),
@@ -139,9 +139,9 @@ def join_poses(poses: Sequence[Poses], frame: int, device: torch.device) -> Obje
     return ObjectState(centers, rotations, loose)
 
 
-def turn_scenes(state: ObjectState, layout: Layout, turns: Tensor) -> ObjectState:
-    """Return a state whose scenes are rotated about the vertical axis by ``turns`` (B, 3, 3)."""
-    by_object = turns[layout.scene]
+def rotate_scenes(state: ObjectState, layout: SceneLayout, rotations: Tensor) -> ObjectState:
+    """Return a state whose scenes rotate about the vertical axis by ``rotations`` (B, 3, 3)."""
+    by_object = rotations[layout.scene]
     by_loose = by_object[layout.owners[layout.loose]]
     return ObjectState(
         (by_object @ state.centers[..., None])[..., 0],
@@ -150,7 +150,9 @@ def turn_scenes(state: ObjectState, layout: Layout, turns: Tensor) -> ObjectStat
     )
 
 
-def with_loose(layout: Layout, centers: Tensor, rotations: Tensor, loose: Tensor) -> ObjectState:
+def with_loose(
+    layout: SceneLayout, centers: Tensor, rotations: Tensor, loose: Tensor
+) -> ObjectState:
     """Return a state in which the centre of a cloth is the mean of its particles."""
     if len(loose):
         means = mean_by(loose, layout.owners[layout.loose], layout.objects)

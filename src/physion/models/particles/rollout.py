@@ -10,11 +10,11 @@ import torch
 from numpy.typing import NDArray
 
 from physion.models.particles.bodies import KINEMATIC, Poses, SceneParticles
-from physion.models.particles.layout import Layout, ObjectState, join_poses, join_scenes
+from physion.models.particles.layout import ObjectState, SceneLayout, join_poses, join_scenes
 from physion.models.particles.rigid_motion import rotation_from_vector
 
 F64 = NDArray[np.float64]
-Step = Callable[[Layout, ObjectState, ObjectState], ObjectState]
+Step = Callable[[SceneLayout, ObjectState, ObjectState], ObjectState]
 """Function of the layout and the last two states that returns the next state."""
 
 REST = 2e-4
@@ -96,7 +96,7 @@ def _last(start: Start, records: list[tuple[F64, F64, F64]]) -> Poses:
     return Poses(np.stack(centers), np.stack(rotations), np.stack(loose))
 
 
-def _largest_moves(layout: Layout, before: ObjectState, now: ObjectState) -> F64:
+def _largest_moves(layout: SceneLayout, before: ObjectState, now: ObjectState) -> F64:
     """Return the largest displacement in the last step in every scene, metres (B,)."""
     moves = (now.positions(layout) - before.positions(layout)).norm(dim=-1)
     moves = moves.masked_fill((layout.kinds == KINEMATIC)[layout.owners], 0.0)
@@ -106,7 +106,7 @@ def _largest_moves(layout: Layout, before: ObjectState, now: ObjectState) -> F64
 
 
 def _record(
-    layout: Layout,
+    layout: SceneLayout,
     now: ObjectState,
     running: Sequence[int],
     done: NDArray[np.bool_],

@@ -47,11 +47,11 @@ from physion.models.particles.bodies import (
 from physion.models.particles.config import ParticleConfig, ParticleOptions
 from physion.models.particles.gap import smallest_distance
 from physion.models.particles.graph import Drift, Graph, drift_of, make_graph, move, move_loose
-from physion.models.particles.layout import Layout, ObjectState
+from physion.models.particles.layout import ObjectState, SceneLayout
 from physion.models.particles.networks import MessageNetwork, ObjectNetwork
 from physion.models.particles.rigid_motion import fit_rigid, fit_robust, mean_by
 from physion.models.particles.rollout import Start, disturbed_start, roll_out
-from physion.models.particles.windows import Window, disturbed, read_window, turned
+from physion.models.particles.windows import Window, disturbed, read_window, rotated
 from physion.models.threshold import best_threshold
 from physion.models.torch_model import TorchModel, digest_of
 from physion.physics.labels import label_contact
@@ -137,7 +137,7 @@ class ParticleSimulator(TorchModel):
     def loss(self, batch: Batch) -> dict[str, Tensor]:
         """Return the loss of a batch of windows of three frames."""
         config = self.config
-        window = turned(self._read(batch))
+        window = rotated(self._read(batch))
         window = disturbed(window, config.velocity_noise, config.position_noise)
         layout = window.layout
         drift = drift_of(layout, window.before, window.now)
@@ -221,7 +221,7 @@ class ParticleSimulator(TorchModel):
         ]
         return [joined[row : row + samples] for row in range(0, len(joined), samples)]
 
-    def step(self, layout: Layout, before: ObjectState, now: ObjectState) -> ObjectState:
+    def step(self, layout: SceneLayout, before: ObjectState, now: ObjectState) -> ObjectState:
         """Return the state after the next step."""
         drift = drift_of(layout, before, now)
         graph = self._graph(layout, drift)
@@ -257,7 +257,7 @@ class ParticleSimulator(TorchModel):
         config = self.config
         return read_window(batch, config.particles, config.inner_radius, self.device)
 
-    def _graph(self, layout: Layout, drift: Drift) -> Graph:
+    def _graph(self, layout: SceneLayout, drift: Drift) -> Graph:
         config = self.config
         return make_graph(layout, drift, config.radius, UNIT, swept=config.swept)
 
@@ -271,7 +271,7 @@ class ParticleSimulator(TorchModel):
         return metres.new_zeros(graph.particles, 3).index_copy(0, graph.rows, metres)
 
     def _move_objects(
-        self, layout: Layout, now: ObjectState, drift: Drift, graph: Graph
+        self, layout: SceneLayout, now: ObjectState, drift: Drift, graph: Graph
     ) -> ObjectState:
         """Return the next state as DPI-Net predicts it."""
         velocity, rim, changes = self.network(graph)
@@ -280,7 +280,7 @@ class ParticleSimulator(TorchModel):
         loose = self._of_particles(graph, changes)[layout.loose]
         return move_loose(layout, state, drift, loose)
 
-    def _fit(self, layout: Layout, goal: Tensor) -> tuple[Tensor, Tensor]:
+    def _fit(self, layout: SceneLayout, goal: Tensor) -> tuple[Tensor, Tensor]:
         """Return the rotations and centres of the rigid motions that fit the particles."""
         if self.config.rigid == "fit":
             return fit_rigid(layout.shape, goal, layout.owners, layout.objects)

@@ -1,4 +1,4 @@
-"""Training examples: three successive states of the objects of each clip, turned and disturbed."""
+"""Training examples: three successive states of the objects of each clip, rotated and disturbed."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from physion.errors import BadInputError
 from physion.models.batch import Batch
 from physion.models.particles.bodies import KINEMATIC, ParticleSettings, poses_of, scene_particles
 from physion.models.particles.layout import (
-    Layout,
     ObjectState,
+    SceneLayout,
     join_poses,
     join_scenes,
-    turn_scenes,
+    rotate_scenes,
 )
 from physion.models.particles.rigid_motion import rotation_from_vector
 
@@ -26,7 +26,7 @@ from physion.models.particles.rigid_motion import rotation_from_vector
 class Window:
     """Objects of several clips, and their states in three successive steps."""
 
-    layout: Layout
+    layout: SceneLayout
     before: ObjectState
     now: ObjectState
     after: ObjectState
@@ -50,17 +50,18 @@ def read_window(
     return Window(layout, before, now, after)
 
 
-def turned(window: Window) -> Window:
-    """Return a window whose scenes are turned about the vertical by random angles.
+def rotated(window: Window) -> Window:
+    """Return a window whose scenes are rotated about the vertical by random angles.
 
-    Gravity and floor do not change under such a turn, so it gives other examples of the same laws.
+    Gravity and floor do not change under such a rotation, so it gives other examples of the same
+    laws.
     """
     layout = window.layout
     angle = 2 * math.pi * torch.rand(layout.scenes, dtype=torch.float64, device=layout.shape.device)
     zero = torch.zeros_like(angle)
-    turns = rotation_from_vector(torch.stack([zero, zero, angle], -1))
+    rotations = rotation_from_vector(torch.stack([zero, zero, angle], -1))
     states = (window.before, window.now, window.after)
-    return Window(layout, *(turn_scenes(state, layout, turns) for state in states))
+    return Window(layout, *(rotate_scenes(state, layout, rotations) for state in states))
 
 
 def disturbed(window: Window, velocity_noise: float, position_noise: float) -> Window:
