@@ -34,6 +34,8 @@ class Options:
         default_factory=EvaluationConfig
     )
     """Readouts, training protocol, optimiser and cross-validation."""
+    rollout_error: bool = False
+    """Also write how far imagined motion is from the true one over time, for particle models."""
     workers: int = os.cpu_count() or 1
     """Number of processes for simulations."""
     json: bool = False
@@ -49,15 +51,21 @@ def main(options: Options) -> int:
             options.out,
             options=parse_options(options.option),
             config=options.config,
+            rollout_errors=options.rollout_error,
             executor=LocalExecutor(workers=options.workers),
             progress=stages,
         )
     if options.json:
         values = {"predictions": str(result.path), "problems": dict(result.problems)}
+        if result.rollout_errors is not None:
+            values["rollout_errors"] = str(result.rollout_errors)
         print(json_module.dumps(values))
         return 1 if result.problems else 0
     for trial, reason in result.problems.items():
         console.print(f"no prediction: {trial}: {reason}", markup=False, soft_wrap=True)
     count = len(result.predictions)
     console.print(f"{count} predictions: {result.path}", markup=False, soft_wrap=True)
+    if result.rollout_errors is not None:
+        line = f"errors of imagined motion: {result.rollout_errors}"
+        console.print(line, markup=False, soft_wrap=True)
     return 1 if result.problems else 0

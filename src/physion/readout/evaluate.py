@@ -23,6 +23,7 @@ from physion.readout.folds import plan_folds
 from physion.readout.model_calls import check_identity
 from physion.readout.predictor import Predictor
 from physion.readout.protocols import Readout
+from physion.readout.rollout_error import check_moves_objects, rollout_error
 from physion.readout.settings import EvaluationConfig
 from physion.readout.table import (
     ScenarioPredictions,
@@ -42,11 +43,15 @@ _VERSION = 5
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Table of predictions, its file, and the reasons of trials that have none."""
+    """Table of predictions, its file, and the reasons of trials that have none.
+
+    ``rollout_errors``: file of the errors of imagined motion, if they were asked for.
+    """
 
     predictions: pd.DataFrame
     path: Path
     problems: Mapping[str, str]
+    rollout_errors: Path | None = None
 
 
 def evaluate(
@@ -56,6 +61,7 @@ def evaluate(
     *,
     options: Mapping[str, Any] | None = None,
     config: EvaluationConfig | None = None,
+    rollout_errors: bool = False,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> Evaluation:
@@ -76,6 +82,9 @@ def evaluate(
         Fields of the config of a model that is given by its name.
     config
         Protocols, training, readout and device.
+    rollout_errors
+        Also write the errors of imagined motion over time (`rollout_error`) to
+        ``rollout-errors/``, in a file of the same name; for models that move objects.
     executor
         Runs simulations; by default they run in this process.
     progress
@@ -101,7 +110,13 @@ def evaluate(
     elif options:
         raise BadInputError("options are for a model that is given by its name; this one is built")
     return evaluate_model(
-        dataset, model, Path(folder), config=config, executor=executor, progress=progress
+        dataset,
+        model,
+        Path(folder),
+        config=config,
+        rollout_errors=rollout_errors,
+        executor=executor,
+        progress=progress,
     )
 
 
@@ -111,6 +126,7 @@ def evaluate_model(
     folder: Path,
     *,
     config: EvaluationConfig,
+    rollout_errors: bool = False,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> Evaluation:
@@ -119,13 +135,22 @@ def evaluate_model(
     chosen = choose_readouts(model, config.readouts, config.reader)
     name = f"{file_name(provenance.model)}-{_digest(dataset, model, config, chosen)[:12]}.csv"
     path = folder / "predictions" / name
-    if is_complete(path):
-        return Evaluation(read_table(path), path, {})
+    errors_path = folder / "rollout-errors" / name if rollout_errors else None
+    if errors_path is not None:
+        check_moves_objects(model)
+    if is_complete(path) and (errors_path is None or is_complete(errors_path)):
+        return Evaluation(read_table(path), path, {}, errors_path)
     folds = plan_folds(dataset.index, Training.named(config.training), config.folds, config.seed)
     predictor = Predictor(dataset, model, chosen, config, folder, executor, progress)
     predictions: list[ScenarioPredictions] = []
+    errors: list[pd.DataFrame] = []
     for fold in tracked(folds, "folds", len(folds), progress):
         predictions += predictor.predict(fold)
+        if errors_path is not None:
+            # Now, since the model has the weights that were trained for this fold.
+            tested = [t for split in fold.scenarios for t in split.test]
+            known = [t for t in tested if t not in predictor.problems]
+            errors.append(rollout_error(dataset, model, known, progress=progress))
     problems = predictor.problems
     if not any(part.trials for part in predictions):
         reason = next(iter(problems.values()), "there is no trial to predict")
@@ -134,7 +159,10 @@ def evaluate_model(
     # Another name than a complete table has, so that the next run retries the missing trials.
     path = path.with_suffix(".partial.csv") if problems else path
     write_table(table, path)
-    return Evaluation(read_table(path), path, problems)
+    if errors_path is not None:
+        errors_path = errors_path.with_name(path.name)
+        write_table(pd.concat(errors, ignore_index=True).round(6), errors_path)
+    return Evaluation(read_table(path), path, problems, errors_path)
 
 
 def _provenance(model: Model) -> Provenance:

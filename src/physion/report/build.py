@@ -16,6 +16,7 @@ from physion.analysis import (
     read_labels,
     read_predictions,
 )
+from physion.analysis.models.rollout_errors import read_rollout_errors, rollout_error_table
 from physion.analysis.people.exclusions import PREREGISTERED
 from physion.analysis.people.results import read_attributes, read_expected
 from physion.analysis.results import ComparisonResults, compare
@@ -109,6 +110,7 @@ def compare_files(
     movies: Mapping[str, Path] | None = None,
     question: str | None = None,
     trial_pages: bool = False,
+    rollout_errors: Sequence[Path] = (),
 ) -> Path:
     """Compare predictions in CSV files with people, write the report and return the page's path.
 
@@ -148,6 +150,8 @@ def compare_files(
         Draws for the intervals.
     methods, movies, question, trial_pages
         See `ReportInputs`.
+    rollout_errors
+        Files of ``physion evaluate --rollout-error``, for a figure of them.
 
     Raises
     ------
@@ -156,6 +160,7 @@ def compare_files(
     """
     draws = bootstrap or Bootstrap()
     rows = read_predictions(predictions)
+    errors = read_rollout_errors(rollout_errors) if rollout_errors else None
     excluded = read_stimulus_list(exclude) if exclude is not None else []
     choices = dict(methods or {})
     if responses:
@@ -191,6 +196,7 @@ def compare_files(
         movies=movies or {},
         model_inputs=read_model_inputs(predictions),
         trial_pages=trial_pages,
+        rollout_errors=None if errors is None else rollout_error_table(errors, draws),
         **({"question": question} if question else {}),
     )
     return build_report(inputs, folder)

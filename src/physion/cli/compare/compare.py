@@ -53,6 +53,8 @@ class Options:
     given, by official names."""
     movies: Path | None = None
     """Dataset whose testing trials' movies the page shows."""
+    rollout_error: tuple[Path, ...] = ()
+    """Files of evaluate --rollout-error: a figure of the errors of imagined motion over time."""
     trial_pages: bool = False
     """Also write a page for each stimulus, to trials/ in the folder of the report."""
     zone: Path | None = None
@@ -104,6 +106,8 @@ def _given(options: Options) -> dict[str, Any]:
     same = ("responses", "sessions", "rules", "expected", "attributes", "zone", "dominoes",
             "exclude", "trial_pages")  # fmt: skip
     found = {name: getattr(options, name) for name in same if getattr(options, name)}
+    if options.rollout_error:
+        found["rollout_errors"] = options.rollout_error
     draws = {"resamples": options.resamples, "seed": options.seed}
     try:
         chosen = {name: value for name, value in draws.items() if value is not None}

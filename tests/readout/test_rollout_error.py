@@ -1,0 +1,181 @@
+"""Error of imagined motion over time: closed forms, what counts, what is refused."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from physion.cli.main import main
+from physion.errors import BadInputError
+from physion.models.batch import Motion, Provenance, Spec
+from physion.models.particles.bodies import (
+    ParticleSettings,
+    Poses,
+    SceneParticles,
+    poses_of,
+    scene_particles,
+)
+from physion.readout import EvaluationConfig, evaluate
+from physion.readout.rollout_error import COLUMNS, motion_error, rollout_error
+from physion.scenes.scene import BodyEvent
+from physion.trials.dataset import Dataset
+from support.viewer_dataset import FRAMES, PLANS, make_dataset, make_scene, make_trajectory
+
+SPEED = 0.8 / (FRAMES - 1)
+"""Metres a frame at which the ball of the hand-made trials falls, from frame 0 to the last, 59."""
+STRIDE, NOW = 3, 14
+
+
+def true_motion(plan: int = 0, **changes: Any) -> Motion:
+    scene = make_scene(PLANS[plan])
+    trajectory = make_trajectory(scene, PLANS[plan])
+    # The mean of the ball's particles is not its pivot, and a rotation would move it.
+    still = np.zeros_like(trajectory.rotations) + np.array([1, 0, 0, 0], np.float32)
+    trajectory = dataclasses.replace(trajectory, rotations=still)
+    return Motion(scene, dataclasses.replace(trajectory, **changes))
+
+
+def start_of(motion: Motion, frames: Sequence[int]) -> tuple[SceneParticles, Poses]:
+    particles = scene_particles(motion.scene, ParticleSettings())
+    return particles, poses_of(particles, motion, frames)
+
+
+def standing_still(poses: Poses, rows: int) -> Poses:
+    """A motion that stays as it is in its last row, for so many rows in all."""
+    kept = np.minimum(np.arange(rows), NOW)
+    return Poses(poses.centers[kept], poses.rotations[kept], poses.loose[kept])
+
+
+class Standstill:
+    """Model in which everything stays where it is."""
+
+    spec = Spec(inputs=("state",), stride=STRIDE, context=NOW + 1, future=0, anchor="end")
+    rows = 80
+
+    def __init__(self) -> None:
+        self.asked: list[Motion] = []
+
+    def provenance(self) -> Provenance:
+        return Provenance("standstill", "none")
+
+    def digest(self) -> str:
+        return "0" * 64
+
+    def futures(
+        self, motions: Sequence[Motion], samples: int, seed: int
+    ) -> list[list[tuple[SceneParticles, Poses]]]:
+        self.asked += motions
+        results = []
+        for motion in motions:
+            particles, poses = start_of(motion, range(2, 45, STRIDE))
+            results.append([(particles, standing_still(poses, self.rows))] * samples)
+        return results
+
+
+def test_constant_motion_has_no_error_by_constant_velocity_and_standing_still_a_linear_one() -> (
+    None
+):
+    motion = true_motion()
+    particles, poses = start_of(motion, range(2, 45, STRIDE))
+    table = motion_error(motion, particles, standing_still(poses, 60), STRIDE, 105)
+    assert table["Frames"].tolist() == list(range(3, 106, 3))
+    fallen = np.minimum(table["Frames"], 15) * SPEED
+    assert table["Error"].to_numpy() == pytest.approx(fallen.to_numpy(), abs=1e-6)
+    # After frame 59 the ball is at rest, and constant velocity goes on.
+    beyond = (table["Frames"] * SPEED - fallen).to_numpy()
+    assert beyond[:5] == pytest.approx(0) and beyond[-1] == pytest.approx(90 * SPEED)
+    assert table["Constant Velocity Error"].to_numpy() == pytest.approx(beyond, abs=1e-5)
+
+
+def test_cloth_counts_by_the_mean_of_its_particles() -> None:
+    motion = true_motion(3)
+    particles, poses = start_of(motion, range(2, 45, STRIDE))
+    table = motion_error(motion, particles, standing_still(poses, 60), STRIDE, 15)
+    assert table["Error"].to_numpy() == pytest.approx(np.arange(3, 16, 3) / (FRAMES - 1), abs=1e-6)
+    assert table["Constant Velocity Error"].to_numpy() == pytest.approx(0, abs=1e-5)
+
+
+def test_the_truth_has_no_error_also_if_it_is_held_at_its_end() -> None:
+    motion = true_motion()
+    particles, poses = start_of(motion, range(2, FRAMES, STRIDE))
+    table = motion_error(motion, particles, poses, STRIDE, 60)
+    assert len(table) == 20 and table["Error"].max() == pytest.approx(0, abs=1e-6)
+
+
+def test_a_trial_that_was_cut_has_no_later_frames() -> None:
+    motion = true_motion(completed=False)
+    particles, poses = start_of(motion, range(2, 45, STRIDE))
+    still = standing_still(poses, 60)
+    assert motion_error(motion, particles, still, STRIDE, 105)["Frames"].tolist() == [
+        *(3, 6, 9, 12, 15),
+    ]
+    trajectory = motion.trajectory
+    names = ("positions", "rotations", "velocities", "angular_velocities", "cloth_vertices")
+    parts = {name: getattr(trajectory, name)[:45] for name in names}
+    cut = Motion(motion.scene, dataclasses.replace(trajectory, **parts))
+    assert motion_error(cut, particles, still, STRIDE, 105).empty
+
+
+def test_objects_count_while_they_are_there_and_can_move() -> None:
+    motion = true_motion()
+    vanishing = dataclasses.replace(motion.scene, events=(BodyEvent(54, "ball", "vanish"),))
+    particles, poses = start_of(motion, range(2, 45, STRIDE))
+    still = standing_still(poses, 60)
+    gone = motion_error(Motion(vanishing, motion.trajectory), particles, still, STRIDE, 105)
+    assert gone["Frames"].tolist() == [3, 6, 9]
+    bodies = tuple(dataclasses.replace(body, kinematic=True) for body in motion.scene.bodies)
+    fixed = dataclasses.replace(motion.scene, bodies=bodies)
+    particles = scene_particles(fixed, ParticleSettings())
+    assert motion_error(Motion(fixed, motion.trajectory), particles, still, STRIDE, 105).empty
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return Dataset(make_dataset(tmp_path_factory.mktemp("data") / "set"))
+
+
+def test_errors_of_a_dataset_come_from_the_observed_part_alone(dataset: Dataset) -> None:
+    model = Standstill()
+    table = rollout_error(dataset, model, ["drop_0", "drape_0"], horizon=15)
+    assert tuple(table.columns) == COLUMNS and len(table) == 10
+    assert set(table["Model"]) == {"standstill"} and table["Scenario"][9] == "drape"
+    assert table["Error"][4] == pytest.approx(15 * SPEED, abs=1e-4)
+    assert [len(motion.trajectory) for motion in model.asked] == [45, 45]
+
+
+def test_what_cannot_have_an_error_is_refused(dataset: Dataset) -> None:
+    class Lost(Standstill):
+        def futures(self, *rest: Any) -> Any:
+            results = super().futures(*rest)
+            results[0][0][1].centers[30] = np.nan
+            return results
+
+    with pytest.raises(BadInputError, match="trial 'drop_0': positions that are not finite"):
+        rollout_error(dataset, Lost(), ["drop_0"])
+    arguments = ["evaluate", str(dataset.folder), "constant-motion", "--rollout-error"]
+    assert main(arguments) == 2
+    with pytest.raises(BadInputError, match=r"imagines no motion of objects.*such as dpi"):
+        evaluate(dataset, "constant-motion", "nowhere", rollout_errors=True)
+
+
+def test_evaluate_writes_them_beside_the_predictions(dataset: Dataset, tmp_path: Path) -> None:
+    config = EvaluationConfig(untrained=True, folds=2, accelerator="cpu")
+    without = evaluate(dataset, "dpi", tmp_path, config=config)
+    assert without.rollout_errors is None and not (tmp_path / "rollout-errors").exists()
+    result = evaluate(dataset, "dpi", tmp_path, config=config, rollout_errors=True)
+    assert result.rollout_errors == tmp_path / "rollout-errors" / result.path.name
+    written = pd.read_csv(result.rollout_errors)
+    assert tuple(written.columns) == COLUMNS and set(written["Model"]) == {"dpi-small"}
+    assert sorted(set(written["Stimulus Name"])) == sorted(result.predictions["Stimulus Name"])
+    first = written[(written["Stimulus Name"] == "drop_1") & (written["Frames"] <= 15)]
+    assert len(first) == 5 and first["Constant Velocity Error"].max() < 1e-3
+    before = result.rollout_errors.stat().st_mtime_ns
+    again = evaluate(dataset, "dpi", tmp_path, config=config, rollout_errors=True)
+    assert again.rollout_errors == result.rollout_errors
+    assert result.rollout_errors.stat().st_mtime_ns == before
