@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from physion.models.particles.bodies import KINEMATIC
+from physion.models.particles.cell_list import swept_edges_on_device
 from physion.models.particles.layout import ObjectState, SceneLayout, with_loose
 from physion.models.particles.neighbours import swept_edges
 from physion.models.particles.rigid_motion import (
@@ -128,18 +129,11 @@ def make_graph(
     swept : bool
         Whether particles that come within the radius during the step are neighbours too.
     """
-    positions, moves = drift.positions, drift.moves
-    reach = moves if swept else torch.zeros_like(moves)
-    receivers, senders = swept_edges(
-        positions.cpu().numpy(),
-        reach.cpu().numpy(),
-        layout.starts,
-        layout.scene_array,
-        layout.moves,
-        radius,
+    moves = drift.moves if swept else torch.zeros_like(drift.moves)
+    on_cpu = moves.device.type == "cpu"
+    outer = (outer_edges if on_cpu else outer_edges_on_device)(
+        layout, drift.positions, moves, radius
     )
-    device = positions.device
-    outer = torch.from_numpy(np.stack([receivers, senders])).to(device)
     pairs = torch.cat([outer, layout.links], dim=1)
     used = (layout.kinds != KINEMATIC)[layout.owners]
     used[pairs[0]] = True
@@ -155,6 +149,29 @@ def make_graph(
         edges=_edge_inputs(drift, pairs, outer.shape[1], radius, unit),
         things=_object_inputs(layout, drift, radius, unit),
     )
+
+
+def outer_edges(layout: SceneLayout, positions: Tensor, moves: Tensor, radius: float) -> Tensor:
+    """Return the swept pairs (2, E) of particles of different objects, by `neighbours`.
+
+    One of the two objects can move. Both directions, sorted by receiver, then sender; `neighbours`
+    says what is swept by ``moves`` (P, 3), metres in the step.
+    """
+    receivers, senders = swept_edges(
+        positions.numpy(), moves.numpy(), layout.starts, layout.scene_array, layout.moves, radius
+    )
+    return torch.from_numpy(np.stack([receivers, senders]))
+
+
+def outer_edges_on_device(
+    layout: SceneLayout, positions: Tensor, moves: Tensor, radius: float
+) -> Tensor:
+    """Return what `outer_edges` returns, by `cell_list`, on the device of the positions."""
+    owners = layout.owners
+    pairs = torch.stack(swept_edges_on_device(positions, moves, layout.scene[owners], radius))
+    first, second = owners[pairs]
+    free = layout.kinds != KINEMATIC
+    return pairs[:, (first != second) & (free[first] | free[second])]
 
 
 def _node_inputs(layout: SceneLayout, drift: Drift, radius: float, unit: float) -> Tensor:

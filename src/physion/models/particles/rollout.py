@@ -73,10 +73,12 @@ def roll_out(
         poses = [_last(starts[row], recorded[row]) for row in running]
         before, now = (join_poses(poses, frame, device) for frame in (-2, -1))
         while done[running].sum() * 2 < len(running):
-            before, now = now, step(layout, before, now)
-            moves = _largest_moves(layout, before, now)
+            after = step(layout, before, now)
+            moves = _largest_moves(layout, now, after)
             # An object that is lost leaves its scene as it was before.
-            done[running] |= ~(moves <= LIMIT)
+            lost = ~(moves <= LIMIT)
+            done[running] |= lost
+            before, now = now, _without(layout, now, after, lost) if lost.any() else after
             _record(layout, now, running, done, recorded)
             for place, row in enumerate(running):
                 quiet[row] = quiet[row] + 1 if moves[place] < REST else 0
@@ -103,6 +105,22 @@ def _largest_moves(layout: SceneLayout, before: ObjectState, now: ObjectState) -
     scene = layout.scene[layout.owners]
     largest = moves.new_zeros(layout.scenes).scatter_reduce(0, scene, moves, "amax")
     return np.asarray(largest.cpu().numpy())
+
+
+def _without(
+    layout: SceneLayout, now: ObjectState, after: ObjectState, lost: NDArray[np.bool_]
+) -> ObjectState:
+    """Return the state ``after``, but ``now`` for the scenes (B,) that are lost.
+
+    They stay in the graph for a while, in which their numbers must not grow without limit.
+    """
+    old = torch.from_numpy(lost).to(layout.scene.device)[layout.scene]
+    loose = old[layout.owners[layout.loose]][:, None]
+    return ObjectState(
+        torch.where(old[:, None], now.centers, after.centers),
+        torch.where(old[:, None, None], now.rotations, after.rotations),
+        torch.where(loose, now.loose, after.loose),
+    )
 
 
 def _record(
