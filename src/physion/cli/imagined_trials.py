@@ -24,6 +24,10 @@ from physion.trials.dataset import Dataset
 
 Arrays = NDArray[Any]
 
+_FUTURES: dict[str, tuple[tuple[int | None, ...], str]] = {
+    "particles": ((None, None, 3), "float32")
+}
+"""Shape after the axes of trials and futures, and type, of what the viewer shows (`SHOWABLE`)."""
 _TRIALS = 8
 """Trials that a model imagines at a time."""
 
@@ -146,9 +150,14 @@ def _shown_arrays(
             f"model {model_name(model)!r} imagines nothing that can be shown: the viewer shows "
             f"{', '.join(SHOWABLE)}, and it gave {gave}"
         )
-    particles = _array(model, rollout, "particles", (clips, samples, None, None, 3), "float32")
-    things = _array(model, rollout, "things", (clips, particles.shape[3]), "int64")
-    return {"particles": particles[:, 0], "things": things}, particles.shape[2]
+    shown = {}
+    for name in known:
+        shape, dtype = _FUTURES[name]
+        shown[name] = _array(model, rollout, name, (clips, samples, *shape), dtype)[:, 0]
+    if "particles" in shown:
+        count = shown["particles"].shape[2]
+        shown["things"] = _array(model, rollout, "things", (clips, count), "int64")
+    return shown, shown[known[0]].shape[1]
 
 
 def _array(
