@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -25,8 +25,9 @@ from physion.scenes.scene import Body, Scene
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
-RIGID, KINEMATIC, CLOTH = 0, 1, 2
-"""Kinds of objects."""
+RIGID, KINEMATIC, CLOTH, FREE = 0, 1, 2, 3
+"""Kinds of objects. Those from `CLOTH` on consist of particles that move on their own; `FREE` are
+bodies that nothing keeps rigid, in the published form alone."""
 Fill = Literal["surface", "volume"]
 
 MAX_PARTICLES = 200_000
@@ -41,6 +42,8 @@ class ParticleSettings:
       ``still_limit``: for a kinematic one, which may be large.
     - ``fill``: ``volume``, as the original study, or ``surface``.
     - ``cloth_step``: every how many vertices of a cloth, along both sides, is a particle.
+    - ``cloth_spacing``: metres between particles of bodies in scenes with cloth; by default as in
+      the others.
     """
 
     spacing: float = 0.10
@@ -48,10 +51,12 @@ class ParticleSettings:
     still_limit: int = 600
     fill: Fill = "surface"
     cloth_step: int = 3
+    cloth_spacing: float | None = None
 
     def __post_init__(self) -> None:
         counts = min(self.limit, self.still_limit, self.cloth_step)
-        if not self.spacing > 0 or counts < 1 or self.fill not in ("surface", "volume"):
+        spacing = min(self.spacing, self.cloth_spacing or self.spacing)
+        if not spacing > 0 or counts < 1 or self.fill not in ("surface", "volume"):
             raise BadInputError(
                 "particles: the spacing must be above 0 m, limits and cloth_step at least 1, and "
                 f"fill surface or volume, not {self.spacing}, {self.limit}, {self.still_limit}, "
@@ -64,7 +69,7 @@ class SceneParticles:
     """Particles of one scene: K objects, P particles in blocks by object.
 
     - ``things`` (K,): index of each object in `Scene.names`.
-    - ``kinds`` (K,): `RIGID`, `KINEMATIC` or `CLOTH`.
+    - ``kinds`` (K,): `RIGID`, `KINEMATIC`, `CLOTH` or `FREE`.
     - ``owners`` (P,): row of the object of each particle.
     - ``normals`` (P, 3): outward unit normals in the body's frame; 0 where there is none, as in
       cloths and volumes.
@@ -93,8 +98,8 @@ class SceneParticles:
 
     @property
     def loose(self) -> NDArray[np.bool_]:
-        """Which particles (P,) move on their own: those of cloths."""
-        return np.asarray(self.kinds[self.owners] == CLOTH)
+        """Which particles (P,) move on their own: those of cloths and free bodies."""
+        return np.asarray(self.kinds[self.owners] >= CLOTH)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,8 +107,8 @@ class Poses:
     """Motion of the objects of one scene over T frames.
 
     - ``centers`` (T, K, 3): metres, mean of the particles of each object.
-    - ``rotations`` (T, K, 3, 3): of bodies; the identity for cloths.
-    - ``loose`` (T, C, 3): positions of the particles of cloths.
+    - ``rotations`` (T, K, 3, 3): of bodies; the identity for cloths and free bodies.
+    - ``loose`` (T, C, 3): positions of the particles that move on their own.
     """
 
     centers: F64
@@ -192,6 +197,8 @@ def particle_positions(particles: SceneParticles, poses: Poses) -> F64:
 
 
 def _sample(scene: Scene, settings: ParticleSettings, present: tuple[bool, ...]) -> SceneParticles:
+    if scene.cloths and settings.cloth_spacing is not None:
+        settings = replace(settings, spacing=settings.cloth_spacing)
     things, kinds, shapes, normals, pivots = [], [], [], [], []
     vertices, links = [np.zeros(0, np.int64)], [np.zeros((2, 0), np.int64)]
     for index, body in enumerate(scene.bodies):

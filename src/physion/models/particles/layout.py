@@ -28,7 +28,7 @@ class SceneLayout:
     - ``shape`` (P, 3) float64: offset of a particle from the centre of its object at rest, metres.
     - ``normals`` (P, 3) float64: outward unit normals at rest; 0 where there are none.
     - ``owners`` (P,), ``kinds`` (K,), ``scene`` (K,): see `bodies.SceneParticles`.
-    - ``loose`` (C,): rows of the particles of cloths.
+    - ``loose`` (C,): rows of the particles that move on their own.
     - ``links`` (2, L): edges within objects that never change: receivers and senders.
     - ``floor`` (K,): height of the floor, metres. ``size`` (K,): root mean square of ``shape``.
     - ``starts`` (K + 1,), ``scene_array`` (K,), ``moves`` (K,): for `neighbours`, numpy.
@@ -66,7 +66,7 @@ class ObjectState:
     """Where the objects of a `SceneLayout` are; float64, metres.
 
     - ``centers`` (K, 3): means of the particles. ``rotations`` (K, 3, 3): of bodies.
-    - ``loose`` (C, 3): particles of cloths.
+    - ``loose`` (C, 3): particles that move on their own.
     """
 
     centers: Tensor
@@ -114,7 +114,7 @@ def join_scenes(
         owners=tensor(owners),
         kinds=tensor(kinds),
         scene=tensor(scene_array),
-        loose=tensor(np.flatnonzero(kinds[owners] == CLOTH)),
+        loose=tensor(np.flatnonzero(kinds[owners] >= CLOTH)),
         links=tensor(np.concatenate(links, axis=1)),
         floor=tensor(np.repeat([scene.floor for scene in scenes], objects)),
         size=tensor(np.maximum(sizes, 1e-3)),
@@ -153,8 +153,11 @@ def rotate_scenes(state: ObjectState, layout: SceneLayout, rotations: Tensor) ->
 def with_loose(
     layout: SceneLayout, centers: Tensor, rotations: Tensor, loose: Tensor
 ) -> ObjectState:
-    """Return a state in which the centre of a cloth is the mean of its particles."""
+    """Return a state in which centres of cloths and free bodies are the means of their particles.
+
+    The other arguments are as in `ObjectState`.
+    """
     if len(loose):
         means = mean_by(loose, layout.owners[layout.loose], layout.objects)
-        centers = torch.where((layout.kinds == CLOTH)[:, None], means, centers)
+        centers = torch.where((layout.kinds >= CLOTH)[:, None], means, centers)
     return ObjectState(centers, rotations, loose)

@@ -28,7 +28,7 @@ from typing import cast
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from physion.errors import BadInputError
 from physion.models.batch import LAST_OBSERVED, Batch, Motion, Provenance, Rollout, Spec
@@ -98,10 +98,9 @@ class ParticleSimulator(TorchModel):
             future=0,
             anchor="end",
         )
-        kind = MessageNetwork if config.network == "messages" else ObjectNetwork
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(stable_hash("particle model", options.seed) % 2**63)
-            self.network = kind(config.width, config.rounds)
+            self.network = self._make_network()
         self.register_buffer("touch", torch.zeros(2, dtype=torch.float64))
 
     @property
@@ -203,21 +202,18 @@ class ParticleSimulator(TorchModel):
         frames = range(LAST_OBSERVED % stride, LAST_OBSERVED + 1, stride)
         starts: list[Start] = []
         for motion in motions:
-            scene = motion.scene
-            own = scene_particles(scene, self.config.particles, scene.present(LAST_OBSERVED))
-            limit = scene.ending.frame_limits()[1] - 1 - LAST_OBSERVED
-            start = Start(own, poses_of(own, motion, frames), limit // stride)
+            start = self._start(motion, frames)
             for sample in range(samples):
-                rng = generator("particle future", seed, scene.name, sample)
+                rng = generator("particle future", seed, motion.scene.name, sample)
                 spread = self.options.spread * 0.01 * stride if samples > 1 else 0.0
                 starts.append(disturbed_start(start, spread, rng))
         was_training = self.training
         self.eval()
-        imagined = roll_out(starts, self.step, self.device, self.config.inner_radius)
+        known, imagined = self._roll_out(starts)
         self.train(was_training)
         joined = [
             (start.particles, join_poses_in_time(start.poses, later))
-            for start, later in zip(starts, imagined, strict=True)
+            for start, later in zip(known, imagined, strict=True)
         ]
         return [joined[row : row + samples] for row in range(0, len(joined), samples)]
 
@@ -237,6 +233,22 @@ class ParticleSimulator(TorchModel):
             now.loose,
         )
         return move_loose(layout, state, drift, changes[layout.loose])
+
+    def _make_network(self) -> nn.Module:
+        config = self.config
+        kind = MessageNetwork if config.network == "messages" else ObjectNetwork
+        return kind(config.width, config.rounds)
+
+    def _start(self, motion: Motion, frames: range) -> Start:
+        """Return what is known of a scene in the given frames, and how long it goes on."""
+        scene = motion.scene
+        own = scene_particles(scene, self.config.particles, scene.present(LAST_OBSERVED))
+        limit = scene.ending.frame_limits()[1] - 1 - LAST_OBSERVED
+        return Start(own, poses_of(own, motion, frames), limit // self.options.stride)
+
+    def _roll_out(self, starts: Sequence[Start]) -> tuple[Sequence[Start], list[Poses]]:
+        """Return the starts, and what the model imagines to follow each."""
+        return starts, roll_out(starts, self.step, self.device, self.config.inner_radius)
 
     def _gaps(self, motions: Sequence[Motion], futures: Sequence[Futures]) -> F64:
         """Return the smallest gaps (B, S) of agent and patient, less ``touch``."""
