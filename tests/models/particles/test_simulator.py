@@ -61,7 +61,7 @@ def last_states(model: ParticleSimulator, *motions: Motion):  # type: ignore[no-
     """Return layout and the last two observed states."""
     particles = [scene_particles(m.scene, model.config.particles) for m in motions]
     poses = [poses_of(p, m, [41, 44]) for p, m in zip(particles, motions, strict=True)]
-    layout = join_scenes(particles, model.device, model.config.inner_radius)
+    layout = join_scenes(particles, model.device)
     return layout, join_poses(poses, 0, model.device), join_poses(poses, 1, model.device)
 
 

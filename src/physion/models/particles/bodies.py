@@ -13,6 +13,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from physion.errors import BadInputError
 from physion.models.batch import Motion
@@ -41,6 +42,7 @@ class ParticleSettings:
     - ``spacing``: metres between particles. ``limit``: largest number for one body,
       ``still_limit``: for a kinematic one, which may be large.
     - ``fill``: ``volume``, as the original study, or ``surface``.
+    - ``inner``: how many of the nearest particles of its own rigid body a particle is linked to.
     - ``cloth_step``: every how many vertices of a cloth, along both sides, is a particle.
     - ``cloth_spacing``: metres between particles of bodies in scenes with cloth; by default as in
       the others.
@@ -51,6 +53,7 @@ class ParticleSettings:
     still_limit: int = 600
     fill: Fill = "surface"
     cloth_step: int = 3
+    inner: int = 0
     cloth_spacing: float | None = None
 
     def __post_init__(self) -> None:
@@ -77,8 +80,8 @@ class SceneParticles:
       the body's frame; 0 for cloth.
     - ``pivots`` (K, 3): the mean of the particles in the body's frame; 0 for cloth.
     - ``vertices`` (C,): row in `Trajectory.cloth_vertices` of each particle of a cloth.
-    - ``links`` (2, L): neighbours along the sides and diagonals of the grid of a cloth, rows of
-      particles; both ways.
+    - ``links`` (2, L): edges within objects, rows of particles, both ways: along the sides and
+      diagonals of the grid of a cloth, and between near particles of a rigid body.
     - ``floor``: height of the floor, metres.
     - ``agent``, ``patient``: rows of objects, -1 for one that is absent.
     """
@@ -199,7 +202,8 @@ def particle_positions(particles: SceneParticles, poses: Poses) -> F64:
 def _sample(scene: Scene, settings: ParticleSettings, present: tuple[bool, ...]) -> SceneParticles:
     if scene.cloths and settings.cloth_spacing is not None:
         settings = replace(settings, spacing=settings.cloth_spacing)
-    things, kinds, shapes, normals, pivots = [], [], [], [], []
+    things, kinds, normals, pivots = [], [], [], []
+    shapes: list[F64] = []
     vertices, links = [np.zeros(0, np.int64)], [np.zeros((2, 0), np.int64)]
     for index, body in enumerate(scene.bodies):
         if body.scenery or not present[index]:
@@ -209,6 +213,8 @@ def _sample(scene: Scene, settings: ParticleSettings, present: tuple[bool, ...])
         pivot = points.mean(axis=0)
         things.append(index)
         kinds.append(KINEMATIC if body.kinematic else RIGID)
+        if not body.kinematic and settings.inner:
+            links.append(_nearest(points, settings.inner) + sum(len(part) for part in shapes))
         pivots.append(pivot)
         shapes.append(points - pivot)
     for number, cloth in enumerate(scene.cloths):
@@ -245,6 +251,17 @@ def _sample(scene: Scene, settings: ParticleSettings, present: tuple[bool, ...])
         agent=row_of.get(agent, -1),
         patient=row_of.get(patient, -1),
     )
+
+
+def _nearest(points: F64, count: int) -> I64:
+    """Return the links (2, L), both ways, of each point (P, 3) to the ``count`` nearest ones."""
+    others = min(count, len(points) - 1)
+    if others < 1:
+        return np.zeros((2, 0), np.int64)
+    near = cKDTree(points).query(points, others + 1)[1][:, 1:]
+    pairs = np.stack([np.repeat(np.arange(len(points)), others), near.ravel()], axis=1)
+    both = np.unique(np.concatenate([pairs, pairs[:, ::-1]]), axis=0)
+    return np.asarray(both[both[:, 0] != both[:, 1]].T, np.int64)
 
 
 def _grid(resolution: int, step: int) -> tuple[I64, I64]:

@@ -2,33 +2,49 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 from physion.errors import BadInputError
 from physion.models.build import make_config
 from physion.models.checkpoints.trained import load_file, load_shipped
 from physion.models.particles.config import RANDOM, SHIPPED, ParticleOptions, own_config
+from physion.models.particles.released.config import released_config
+from physion.models.particles.released.simulator import ReleasedSimulator
 from physion.models.particles.simulator import ParticleSimulator
 
 
 def gns(**options: Any) -> ParticleSimulator:
     """Build a graph network simulator (GNS); ``options`` are those of `ParticleOptions`."""
-    chosen = make_config(ParticleOptions, "gns", options)
-    return _weighted(ParticleSimulator("gns", own_config("messages", chosen), chosen))
+    return _build("gns", "messages", options)
 
 
 def gns_ransac(**options: Any) -> ParticleSimulator:
     """Build a GNS that keeps bodies rigid by a robust fit; ``options`` as `gns`."""
-    chosen = make_config(ParticleOptions, "gns-ransac", options)
-    config = replace(own_config("messages", chosen), rigid="robust")
-    return _weighted(ParticleSimulator("gns-ransac", config, chosen))
+    return _build("gns-ransac", "messages", options, robust=True)
 
 
 def dpi(**options: Any) -> ParticleSimulator:
     """Build a DPI-Net; ``options`` are those of `ParticleOptions`."""
-    chosen = make_config(ParticleOptions, "dpi", options)
-    return _weighted(ParticleSimulator("dpi", own_config("objects", chosen), chosen))
+    return _build("dpi", "objects", options)
+
+
+def _build(
+    name: str,
+    network: Literal["messages", "objects"],
+    options: Mapping[str, Any],
+    *,
+    robust: bool = False,
+) -> ParticleSimulator:
+    chosen = make_config(ParticleOptions, name, options)
+    if chosen.size == "released":
+        published = released_config(network, keep_rigid=robust)
+        return _weighted(ReleasedSimulator(name, published, chosen))
+    config = own_config(network, chosen)
+    if robust:
+        config = replace(config, rigid="robust")
+    return _weighted(ParticleSimulator(name, config, chosen))
 
 
 def _weighted(model: ParticleSimulator) -> ParticleSimulator:

@@ -17,11 +17,12 @@ RANDOM, SHIPPED = "random", "shipped"
 class ParticleOptions:
     """What a user chooses of a particle model.
 
-    - ``size``: ``small`` or ``paper`` of this package's own form, or ``released``, the network and
-      inputs of the published code.
+    - ``size``: ``small`` or ``paper`` of this package's own form, or ``released``, the networks,
+      inputs and decision of the published code (`released.simulator`).
     - ``weights``: ``random``, to be trained; ``shipped``, those that come with the package (size
       small alone); or the path of a ``model.safetensors`` that ``physion train`` wrote.
-    - ``swept``: whether particles that come close during a step are neighbours; False as released.
+    - ``swept``: whether particles that come close during a step are neighbours; those of the size
+      released never are.
     - ``samples``: futures of a trial, and ``spread``: standard deviation of the noise on their
       initial velocities, m/s. One future has no noise.
     - ``stride``: frames of 0.01 s in one step.
@@ -56,8 +57,7 @@ class ParticleConfig:
     - ``network``: ``messages`` (GNS) or ``objects`` (DPI-Net), with ``width`` and ``rounds``.
     - ``particles``: how objects become particles.
     - ``radius``: metres within which particles of different objects are neighbours; with ``swept``
-      also those that come so close during a step. ``inner_radius``: within a rigid body; 0 for no
-      edges there.
+      also those that come so close during a step.
     - ``rigid``: how GNS keeps bodies rigid: ``fit`` to all particles, or ``robust`` (RANSAC).
     - ``velocity_noise``, ``position_noise``: metres a step and metres; standard deviations of the
       noise in training, drawn for every rigid body and for every particle of a cloth.
@@ -72,12 +72,11 @@ class ParticleConfig:
     rounds: int = 3
     particles: ParticleSettings = field(default_factory=ParticleSettings)
     radius: float = 0.12
-    inner_radius: float = 0.0
     swept: bool = True
     rigid: Literal["fit", "robust"] = "fit"
     velocity_noise: float = 2e-3
     position_noise: float = 2e-3
-    knee: float = 3.0
+    knee: float = 1.0
     gap_spacing: float = 0.04
     gap_limit: int = 300
     training: TrainingSettings = field(default_factory=TrainingSettings)
@@ -89,7 +88,7 @@ _SMALL = TrainingSettings(
     learning_rate=2e-3,
     schedule="cosine",
     warmup=100,
-    clip=1.0,
+    clip=0.0,
     validate_every=500,
     log_every=50,
     checkpoint_every=500,
@@ -103,16 +102,18 @@ def own_config(network: Literal["messages", "objects"], options: ParticleOptions
     inner = network == "messages"
     if options.size == "small":
         config = ParticleConfig(
-            network, rounds=4 if inner else 3, inner_radius=0.2 if inner else 0.0, training=_SMALL
+            network,
+            rounds=5 if inner else 3,
+            particles=ParticleSettings(limit=50, inner=6) if inner else ParticleSettings(),
+            training=_SMALL,
         )
     else:
         config = ParticleConfig(
             network,
             width=128,
             rounds=10 if inner else 4,
-            particles=_FINE,
+            particles=replace(_FINE, inner=10 if inner else 0),
             radius=0.08,
-            inner_radius=0.08 if inner else 0.0,
             gap_spacing=0.03,
             gap_limit=1000,
             training=_PAPER,

@@ -14,8 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from physion.models.particles.bodies import CLOTH, RIGID, Poses, SceneParticles
-from physion.models.particles.neighbours import radius_edges
+from physion.models.particles.bodies import CLOTH, Poses, SceneParticles
 from physion.models.particles.rigid_motion import mean_by
 
 I64 = NDArray[np.int64]
@@ -79,14 +78,8 @@ class ObjectState:
         return (self.centers[layout.owners] + rotated).index_copy(0, layout.loose, self.loose)
 
 
-def join_scenes(
-    scenes: Sequence[SceneParticles], device: torch.device, inner_radius: float
-) -> SceneLayout:
-    """Return the layout of several scenes.
-
-    ``inner_radius``: metres within which particles of one rigid body are linked; 0 for no links.
-    Kinematic bodies are not linked, since nothing moves them.
-    """
+def join_scenes(scenes: Sequence[SceneParticles], device: torch.device) -> SceneLayout:
+    """Return the layout of several scenes."""
     counts = np.array([len(scene.owners) for scene in scenes], np.int64)
     objects = np.array([len(scene.kinds) for scene in scenes], np.int64)
     ends, object_ends = (np.concatenate([[0], np.cumsum(n)]) for n in (counts, objects))
@@ -96,10 +89,6 @@ def join_scenes(
     shape = np.concatenate([scene.shape for scene in scenes])
     kinds = np.concatenate([scene.kinds for scene in scenes])
     links = [scene.links + start for scene, start in zip(scenes, ends[:-1], strict=True)]
-    if inner_radius > 0:
-        rigid = np.flatnonzero(kinds[owners] == RIGID)
-        receivers, senders = radius_edges(shape[rigid], owners[rigid], inner_radius)
-        links.append(np.stack([rigid[receivers], rigid[senders]]))
     total = len(kinds)
     squares = np.bincount(owners, (shape**2).sum(axis=1), total)
     sizes = np.sqrt(squares / np.bincount(owners, minlength=total))

@@ -57,9 +57,7 @@ def disturbed_start(start: Start, spread: float, rng: np.random.Generator) -> St
     return replace(start, poses=Poses(centers, rotations, loose))
 
 
-def roll_out(
-    starts: Sequence[Start], step: Step, device: torch.device, inner_radius: float
-) -> list[Poses]:
+def roll_out(starts: Sequence[Start], step: Step, device: torch.device) -> list[Poses]:
     """Return the imagined motion of every scene, from the step after its last known one.
 
     A scene that is over is taken out of the graph when half of its fellows are over too.
@@ -69,7 +67,7 @@ def roll_out(
     quiet = np.zeros(len(starts), np.int64)
     done = np.array([start.steps <= 0 for start in starts])
     while running:
-        layout = join_scenes([starts[row].particles for row in running], device, inner_radius)
+        layout = join_scenes([starts[row].particles for row in running], device)
         poses = [_last(starts[row], recorded[row]) for row in running]
         before, now = (join_poses(poses, frame, device) for frame in (-2, -1))
         while done[running].sum() * 2 < len(running):

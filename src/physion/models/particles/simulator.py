@@ -59,7 +59,7 @@ from physion.seeds import generator, stable_hash
 
 VERSION = 1
 """To be raised with every change of what equal weights predict, or of the training."""
-UNIT, CHANGE = 0.03, 0.01
+UNIT, CHANGE = 0.06, 0.02
 """Metres a step: units of displacements, and of their changes. A body that falls for 0.03 s changes
 its displacement by 0.009 m, one that moves at 1 m/s moves 0.03 m."""
 _INLIER = 0.1
@@ -248,7 +248,7 @@ class ParticleSimulator(TorchModel):
 
     def _roll_out(self, starts: Sequence[Start]) -> tuple[Sequence[Start], list[Poses]]:
         """Return the starts, and what the model imagines to follow each."""
-        return starts, roll_out(starts, self.step, self.device, self.config.inner_radius)
+        return starts, roll_out(starts, self.step, self.device)
 
     def _gaps(self, motions: Sequence[Motion], futures: Sequence[Futures]) -> F64:
         """Return the smallest gaps (B, S) of agent and patient, less ``touch``."""
@@ -267,7 +267,7 @@ class ParticleSimulator(TorchModel):
 
     def _read(self, batch: Batch) -> Window:
         config = self.config
-        return read_window(batch, config.particles, config.inner_radius, self.device)
+        return read_window(batch, config.particles, self.device)
 
     def _graph(self, layout: SceneLayout, drift: Drift) -> Graph:
         config = self.config

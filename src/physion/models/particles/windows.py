@@ -32,9 +32,7 @@ class Window:
     after: ObjectState
 
 
-def read_window(
-    batch: Batch, settings: ParticleSettings, inner_radius: float, device: torch.device
-) -> Window:
+def read_window(batch: Batch, settings: ParticleSettings, device: torch.device) -> Window:
     """Return the objects of the clips that are there in all three frames, and their states."""
     if batch.state is None or batch.frames.shape[1] != 3:
         raise BadInputError("a particle model is trained on motions in windows of 3 frames")
@@ -45,7 +43,7 @@ def read_window(
         own = scene_particles(motion.scene, settings, present.tolist())
         particles.append(own)
         poses.append(poses_of(own, motion, shown))
-    layout = join_scenes(particles, device, inner_radius)
+    layout = join_scenes(particles, device)
     before, now, after = (join_poses(poses, row, device) for row in range(3))
     return Window(layout, before, now, after)
 
