@@ -1,6 +1,7 @@
 """Fit the noise of `noisy-simulation` to outcomes or to people, and test it on other scenes.
 
-    python benchmarks/noise.py [--samples 12] [--rounds 2] [--limit N] [--workers 2] [--write]
+    nice -n 15 python benchmarks/noise.py [--sets 32] [--samples 10] [--scenes N] [--cache FILE]
+        [--write]
 
 Scenes are the official ones of the package that people saw. Configurations are divided into two
 halves by a hash of their names: levels are fitted on one half and tested on the other. With k of n
@@ -10,10 +11,18 @@ simulations touching, P(contact) is (1 - l) (k + 1/2) / (n + 1) + l / 2 with the
 - Fitted to people: the sum of m (y log P + (1 - y) log(1 - P)) / 10 over stimuli with m people, a
   fraction y of whom said yes (binomial likelihood; the division changes no maximum).
 
-The search changes one level at a time to the values of its list, for ``--rounds`` rounds. All
-values use the same random numbers. The test half gives accuracy, r with people, and r beyond the
-outcome (partial correlation given the recorded outcome) with a 95 % bootstrap interval over
-stimuli.
+The search is successive halving, since one set of levels on all scenes takes minutes. Sets are the
+default, each level of `GRID` alone, and random ones. All are simulated on the smallest subset of
+`STAGES`, the best of every fit again on the next one, and the last few on all scenes (or on a
+subset of ``--scenes``, which is then also the one of the test). Subsets have equally many scenes of
+every half, scenario and outcome, and none with cloth, which would take most of the time. All sets
+use the same random numbers.
+
+The test half gives accuracy, r with people, r beyond the outcome (partial correlation given the
+recorded outcome), and the same given outcome and scenario, with 95 % intervals of a bootstrap over
+configurations. Rows of both halves have every scene once, with the levels fitted on the half it is
+not in. In the ablation the same levels are used, but log density and log friction of movable bodies
+are drawn from their distribution over the official scenes that are not tested.
 """
 
 from __future__ import annotations
@@ -21,7 +30,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import datetime
-import os
 import platform
 import time
 from collections.abc import Sequence
@@ -31,45 +39,37 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from noise_simulations import F64, Simulations
 from physion.analysis.statistics.correlation import correlation_within_groups
-from physion.analysis.tables.responses import read_humans
-from physion.compute.local import LocalExecutor
-from physion.data import official
-from physion.models.noisy_simulation import cut_trial
-from physion.models.state_noise import NoiseLevels, simulate_contacts
-from physion.physics.engine import make_engine, simulate
-from physion.scenes.scene import Scene
-from physion.seeds import generator, stable_hash
-from physion.stimulus_names import canonical_name
+from physion.models.state_noise import NoiseLevels
+from physion.seeds import generator
 
 RESULTS = Path(__file__).parent / "results" / "noise.md"
 GRID = {
-    "velocity": (0.1, 0.0, 0.05, 0.2, 0.4, 0.8, 1.6),
+    "velocity": (0.1, 0.0, 0.05, 0.2, 0.4, 0.8),
     "position": (0.01, 0.0, 0.02, 0.05, 0.1, 0.2),
     "contact": (0.0, 0.1, 0.2, 0.4, 0.8),
     "angular_velocity": (0.0, 0.5, 1.0, 2.0, 4.0),
     "rotation": (0.0, 0.05, 0.1, 0.2),
     "friction": (0.0, 0.1, 0.3, 1.0),
 }
-"""Values of the levels that are fitted, the default first. Mass has the same level as friction, and
-height that of position."""
+"""Values of the levels that are fitted, the default first. Mass has the same level as friction (at
+least 0.1), and height that of position."""
 LAPSES = tuple(np.round(np.linspace(0.0, 0.9, 46), 3))
+STAGES = ((112, 6, 4), (224, 6, 1))
+"""Scenes and simulations per scene of the stages before the last, and how many sets of levels of
+each fit go on to the next stage."""
+FITS = tuple((target, half) for target in ("outcomes", "people") for half in (0, 1))
 
 
 @dataclass(frozen=True)
-class Task:
-    """Simulations of one scene with one set of levels."""
+class Fit:
+    """Levels and lapse rate fitted to a target on a half of the configurations."""
 
-    scene: Scene
+    target: str
+    half: int
     levels: NoiseLevels
-    samples: int
-
-
-def fraction(task: Task) -> float:
-    """Return the fraction of simulations of a scene in which agent and patient touch."""
-    engine = make_engine("physion")
-    trial = cut_trial(task.scene, simulate(task.scene, engine=engine))
-    return float(np.mean(simulate_contacts(trial, task.levels, 1.0, task.samples, 0, engine)))
+    lapse: float
 
 
 def levels_of(chosen: dict[str, float]) -> NoiseLevels:
@@ -78,160 +78,202 @@ def levels_of(chosen: dict[str, float]) -> NoiseLevels:
     return NoiseLevels(**chosen, **tied)
 
 
-def probabilities(
-    fractions: NDArray[np.float64], samples: int, lapse: float
-) -> NDArray[np.float64]:
+def first_sets(number: int) -> list[NoiseLevels]:
+    """Return ``number`` sets of levels: the default, levels changed alone, then random ones."""
+    default = {name: values[0] for name, values in GRID.items()}
+    sets = [{**default, name: values[-2]} for name, values in GRID.items()]
+    rng = generator("noise levels")
+    while len(sets) < number:
+        sets.append({name: values[rng.integers(len(values))] for name, values in GRID.items()})
+    return [NoiseLevels(), *dict.fromkeys(levels_of(chosen) for chosen in sets[: number - 1])]
+
+
+def probabilities(fractions: F64, samples: int, lapse: float) -> F64:
     """Return P(contact) of every scene."""
     return (1 - lapse) * (fractions * samples + 0.5) / (samples + 1) + lapse / 2
 
 
-def log_likelihood(p: NDArray[np.float64], y: NDArray[np.float64], m: NDArray[np.float64]) -> float:
+def log_likelihood(p: F64, y: F64, m: F64) -> float:
     """Return the sum of m (y log p + (1 - y) log(1 - p))."""
     return float(np.sum(m * (y * np.log(p) + (1 - y) * np.log(1 - p))))
 
 
-def partial_r(x: NDArray[np.float64], y: NDArray[np.float64], z: NDArray[np.float64]) -> float:
-    """Return the correlation of x and y given the outcome z (0 or 1)."""
-    groups = []
-    for outcome in (0.0, 1.0):
-        u, v = x[z == outcome], y[z == outcome]
-        sums = (len(u), u.sum(), v.sum(), u @ u, v @ v, u @ v)
-        groups.append(tuple(np.array([value], np.float64) for value in sums))
-    return float(correlation_within_groups(groups)[0])  # type: ignore[arg-type]
+def partial_r(x: F64, y: F64, groups: NDArray[np.str_]) -> float:
+    """Return the correlation of the deviations of x and y from their means over each group."""
+    sums = []
+    for group in np.unique(groups):
+        u, v = x[groups == group], y[groups == group]
+        values = (len(u), u.sum(), v.sum(), u @ u, v @ v, u @ v)
+        sums.append(tuple(np.array([value], np.float64) for value in values))
+    return float(correlation_within_groups(sums)[0])  # type: ignore[arg-type]
 
 
 class Search:
-    """Scenes, answers, and the fractions of all levels tried so far."""
+    """Successive halving over sets of levels, for all fits together."""
 
-    def __init__(self, samples: int, workers: int, limit: int | None) -> None:
-        data = official()
-        humans = read_humans(data.humans).set_index("stimulus")
-        trials = [
-            trial for trial in data.trials if canonical_name(trial.scene.name) in humans.index
-        ]
-        trials.sort(key=lambda trial: stable_hash("noise", trial.scene.name))
-        trials = trials[:limit]
-        names = [canonical_name(trial.scene.name) for trial in trials]
-        self.scenes = [trial.scene for trial in trials]
-        self.outcome = np.array([float(trial.outcome.contact) for trial in trials])
-        accuracy = humans.loc[names, "accuracy"].to_numpy(float)
-        self.people = np.where(self.outcome == 1, accuracy, 1 - accuracy)
-        self.count = humans.loc[names, "count"].to_numpy(float)
-        configurations = [str(trial.scene.parameters.get("configuration")) for trial in trials]
-        self.half = np.array([stable_hash("half", name) % 2 for name in configurations])
-        self.samples, self.executor = samples, LocalExecutor(workers=workers)
-        self._known: dict[NoiseLevels, NDArray[np.float64]] = {}
+    def __init__(self, simulations: Simulations, places: NDArray[np.int64], samples: int) -> None:
+        self.simulations, self.places, self.samples = simulations, places, samples
+        self.start = time.time()
 
-    def fractions(self, levels: NoiseLevels) -> NDArray[np.float64]:
-        """Return the fractions of all scenes."""
-        self.simulate([levels])
-        return self._known[levels]
+    def run(self, sets: Sequence[NoiseLevels]) -> list[Fit]:
+        """Return the best levels of every fit."""
+        for size, samples, kept in STAGES:
+            places = self.simulations.subset(size)
+            scored = self._scores(sets, places, samples)
+            best = [levels for fit in FITS for _, _, levels in scored[fit][:kept]]
+            sets = list(dict.fromkeys([sets[0], *best]))
+        scored = self._scores(sets, self.places, self.samples)
+        return [Fit(*fit, levels=scored[fit][0][2], lapse=scored[fit][0][1]) for fit in FITS]
 
-    def simulate(self, wanted: Sequence[NoiseLevels]) -> None:
-        """Simulate all scenes with the levels that are not known yet, in one go."""
-        missing = [levels for levels in dict.fromkeys(wanted) if levels not in self._known]
-        tasks = {
-            f"{place} {scene.name}": Task(scene, levels, self.samples)
-            for place, levels in enumerate(missing)
-            for scene in self.scenes
-        }
-        done = {o.key: o.value for o in self.executor.map(fraction, tasks)} if tasks else {}
-        for place, levels in enumerate(missing):
-            self._known[levels] = np.array([done[f"{place} {s.name}"] for s in self.scenes])
+    def _scores(
+        self, sets: Sequence[NoiseLevels], places: NDArray[np.int64], samples: int
+    ) -> dict[tuple[str, int], list[tuple[float, float, NoiseLevels]]]:
+        """Return for each fit likelihood, lapse rate and levels of all sets, the best first."""
+        scores: dict[tuple[str, int], list[tuple[float, float, NoiseLevels]]]
+        scores = {fit: [] for fit in FITS}
+        for number, levels in enumerate(sets, start=1):
+            fractions = self.simulations.fractions(places, levels, samples)
+            for fit in FITS:
+                scores[fit].append((*self._score(fractions, places, samples, *fit), levels))
+            best = ", ".join(f"{scores[fit][-1][0]:.1f}" for fit in FITS)
+            print(
+                f"{time.time() - self.start:6.0f} s, {len(places)} scenes, set {number} of "
+                f"{len(sets)}: {best}; {describe(levels)}",
+                flush=True,
+            )
+        return {fit: sorted(rows, key=lambda row: -row[0]) for fit, rows in scores.items()}
 
-    def fit(self, target: str, half: int, rounds: int) -> tuple[dict[str, float], float]:
-        """Return the levels and the lapse rate with the highest likelihood on a half."""
-        chosen = {name: values[0] for name, values in GRID.items()}
-        best, lapse = self._score(chosen, target, half)
-        for _ in range(rounds):
-            before = best
-            for name, values in GRID.items():
-                self.simulate([levels_of({**chosen, name: value}) for value in values])
-                for value in values:
-                    trial = {**chosen, name: value}
-                    score, rate = self._score(trial, target, half)
-                    if score > best:
-                        best, chosen, lapse = score, trial, rate
-            print(f"  {target}, half {half}: {best:.1f} {chosen} lapse {lapse}", flush=True)
-            if best == before:
-                break
-        return chosen, lapse
-
-    def _score(self, chosen: dict[str, float], target: str, half: int) -> tuple[float, float]:
-        rows = self.half == half
-        fractions = self.fractions(levels_of(chosen))[rows]
-        y = (self.people if target == "people" else self.outcome)[rows]
-        m = self.count[rows] / 10 if target == "people" else np.ones(rows.sum())
-        scores = [
-            (log_likelihood(probabilities(fractions, self.samples, lapse), y, m), lapse)
+    def _score(
+        self, fractions: F64, places: NDArray[np.int64], samples: int, target: str, half: int
+    ) -> tuple[float, float]:
+        answers = self.simulations.answers
+        rows = answers.half[places] == half
+        chosen = places[rows]
+        y = (answers.people if target == "people" else answers.outcome)[chosen]
+        m = answers.count[chosen] / 10 if target == "people" else np.ones(len(chosen))
+        return max(
+            (log_likelihood(probabilities(fractions[rows], samples, lapse), y, m), lapse)
             for lapse in LAPSES
-            if target == "people" or lapse <= 0.5
-        ]
-        return max(scores)
-
-    def row(self, target: str, chosen: dict[str, float], lapse: float, half: int) -> str:
-        """Return a line of the table: fitted on ``half``, tested on the other one."""
-        rows = self.half != half
-        p = probabilities(self.fractions(levels_of(chosen))[rows], self.samples, lapse)
-        y, z = self.people[rows], self.outcome[rows]
-        rng = generator("noise bootstrap", half)
-        draws = [rng.integers(len(p), size=len(p)) for _ in range(2000)]
-        beyond = [partial_r(p[d], y[d], z[d]) for d in draws]
-        low, high = np.quantile(beyond, [0.025, 0.975])
-        levels = ", ".join(f"{name} {value:g}" for name, value in chosen.items() if value)
-        right = np.mean((p > 0.5) == (z == 1))
-        r = np.corrcoef(p, y)[0, 1]
-        return (
-            f"| {target} | {half} | {levels}, lapse {lapse:g} | {rows.sum()} | {right:.3f} | "
-            f"{r:.3f} | {partial_r(p, y, z):.3f} ({low:.3f} to {high:.3f}) |"
         )
+
+
+def describe(levels: NoiseLevels) -> str:
+    """Return the levels that are not 0."""
+    return ", ".join(f"{k} {v:g}" for k, v in dataclasses.asdict(levels).items() if v)
+
+
+class Tests:
+    """Scores of fitted levels on the configurations they were not fitted on."""
+
+    def __init__(self, simulations: Simulations, places: NDArray[np.int64], samples: int) -> None:
+        self.simulations, self.places, self.samples = simulations, places, samples
+        self.answers = simulations.answers.at(places)
+
+    def predict(self, levels: NoiseLevels, lapse: float, *, prior: bool) -> F64:
+        """Return P(contact) of all tested scenes."""
+        fractions = self.simulations.fractions(self.places, levels, self.samples, prior=prior)
+        return probabilities(fractions, self.samples, lapse)
+
+    def rows(self, name: str, fits: Sequence[Fit], *, prior: bool = False) -> list[str]:
+        """Return a line for each half of the tested configurations, and one for both."""
+        p = np.zeros(len(self.places))
+        lines = []
+        for fit in fits:
+            tested = self.answers.half != fit.half
+            p[tested] = self.predict(fit.levels, fit.lapse, prior=prior)[tested]
+            text = f"{describe(fit.levels)}; lapse {fit.lapse:g}"
+            if not prior:
+                lines.append(self._row(name, f"{fit.half}", text, p, tested))
+        both = np.ones(len(p), np.bool_)
+        return [*lines, self._row(name, "the other", "as above", p, both)]
+
+    def _row(self, name: str, half: str, text: str, p: F64, tested: NDArray[np.bool_]) -> str:
+        answers = self.answers
+        p, y, z = p[tested], answers.people[tested], answers.outcome[tested]
+        both = np.char.add(answers.scenario[tested], z.astype(str))
+        names = answers.configuration[tested]
+        beyond = self._interval(p, y, z.astype(str), names)
+        within = self._interval(p, y, both, names)
+        right, r = np.mean((p > 0.5) == (z == 1)), np.corrcoef(p, y)[0, 1]
+        return (
+            f"| {name} | {half} | {text} | {len(p)} | {right:.3f} | {r:.3f} | {beyond} | {within} |"
+        )
+
+    def _interval(self, p: F64, y: F64, groups: NDArray[np.str_], names: NDArray[np.str_]) -> str:
+        """Return r within groups and its interval, of a bootstrap over configurations."""
+        members = [np.flatnonzero(names == name) for name in np.unique(names)]
+        rng = generator("noise bootstrap")
+        values = []
+        for _ in range(2000):
+            drawn = rng.integers(len(members), size=len(members))
+            rows = np.concatenate([members[i] for i in drawn])
+            values.append(partial_r(p[rows], y[rows], groups[rows]))
+        low, high = np.nanquantile(values, [0.025, 0.975])
+        return f"{partial_r(p, y, groups):.3f} ({low:.3f} to {high:.3f})"
+
+
+HEAD = """\
+| fitted to | fitted on half | levels | test stimuli | accuracy | r with people | r beyond the \
+outcome | r beyond outcome and scenario |
+|---|---|---|---|---|---|---|---|"""
+
+
+def table(tests: Tests, fits: Sequence[Fit]) -> str:
+    """Return the lines of the table: default, fits, and the ablation."""
+    default = [Fit("", half, NoiseLevels(), 0.0) for half in (0, 1)]
+    lines = [HEAD, *tests.rows("nothing (default)", default)]
+    for target in ("outcomes", "people"):
+        lines += tests.rows(target, [fit for fit in fits if fit.target == target])
+    lines += tests.rows("nothing; masses and frictions from priors", default, prior=True)
+    for target in ("outcomes", "people"):
+        chosen = [fit for fit in fits if fit.target == target]
+        lines += tests.rows(f"{target}; masses and frictions from priors", chosen, prior=True)
+    return "\n".join(lines)
 
 
 def main() -> None:
     """Fit to outcomes and to people on each half, and print or write the table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--samples", type=int, default=12)
-    parser.add_argument("--rounds", type=int, default=2)
-    parser.add_argument("--limit", type=int)
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--sets", type=int, default=32)
+    parser.add_argument("--samples", type=int, default=10)
+    parser.add_argument("--scenes", type=int)
+    parser.add_argument("--cache", type=Path)
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
-    start = time.time()
-    search = Search(options.samples, options.workers, options.limit)
-    default = {name: values[0] for name, values in GRID.items()}
-    lines = [
-        "| fitted to | half | levels | test stimuli | accuracy | r | r beyond the outcome |",
-        "|---|---|---|---|---|---|---|",
-        *(search.row("default, not fitted", default, 0.0, half) for half in (0, 1)),
-    ]
-    for target in ("outcomes", "people"):
-        for half in (0, 1):
-            chosen, lapse = search.fit(target, half, options.rounds)
-            lines.append(search.row(target, chosen, lapse, half))
-    table = "\n".join(lines)
-    command = " ".join(
-        f"--{name} {value}" for name, value in vars(options).items() if name != "write"
+    start = time.process_time()
+    simulations = Simulations(options.cache)
+    places = np.arange(len(simulations.scenes))
+    if options.scenes is not None:
+        places = simulations.subset(options.scenes)
+    fits = Search(simulations, places, options.samples).run(first_sets(options.sets))
+    lines = table(Tests(simulations, places, options.samples), fits)
+    prior = ", ".join(f"{k} {v:.3f}" for k, v in dataclasses.asdict(simulations.prior).items())
+    stages = "; ".join(
+        f"{size} scenes without cloth, {samples} simulations each, {kept} best of each fit go on"
+        for size, samples, kept in STAGES
     )
+    subset = "" if options.scenes is None else f" --scenes {options.scenes}"
+    which = "all" if options.scenes is None else f"{len(places)} (without cloth)"
     text = (
-        f"\n## {datetime.date.today()}, {platform.machine()}, "
-        f"`python benchmarks/noise.py {command}`"
-        f"\n\n{len(search.scenes)} scenes, {len(search._known)} sets of levels, "
-        f"{time.time() - start:.0f} s\n\n{table}\n"
+        f"\n## {datetime.date.today()}, {platform.machine()}, `python benchmarks/noise.py "
+        f"--sets {options.sets} --samples {options.samples}{subset}`\n\n"
+        f"{len(simulations.scenes)} scenes that people saw; {options.sets} sets of levels. "
+        f"Stages: {stages}; at last, and in the test, {which} scenes, {options.samples} "
+        f"simulations each. {simulations.number} simulations, {simulations.made} of them in this "
+        f"process ({time.process_time() - start:.0f} s of one core), the others from the cache of "
+        f"an earlier one. Prior of the logarithms: {prior}.\n\n{lines}\n"
     )
     print(text)
     if options.write:
         RESULTS.parent.mkdir(exist_ok=True)
-        head = (
-            RESULTS.read_text() if RESULTS.exists() else f"# Noise of noisy-simulation\n{_intro()}"
-        )
+        head = RESULTS.read_text() if RESULTS.exists() else _intro()
         RESULTS.write_text(head + text)
 
 
 def _intro() -> str:
-    fields = ", ".join(field.name for field in dataclasses.fields(NoiseLevels))
     return (
-        "# Noise of noisy-simulation\n\nWhat is fitted and how: `benchmarks/noise.py`. Levels (see "
-        f"`physion.models.state_noise.NoiseLevels`): {fields}.\n"
+        "# Noise of noisy-simulation\n\nWhat is fitted and how: `benchmarks/noise.py`. Levels: see "
+        "`physion.models.state_noise.NoiseLevels`.\n"
     )
 
 

@@ -16,6 +16,8 @@ FROZEN = [
 OPTIONS: dict[str, dict[str, Any]] = {
     **dict.fromkeys(FROZEN, TINY),
     "noisy-simulation": {"samples": 3},
+    "noisy-simulation-outcomes": {"samples": 3},
+    "noisy-simulation-people": {"samples": 3},
 }
 """Options by name of the model; other models have none."""
 

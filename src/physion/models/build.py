@@ -34,6 +34,8 @@ models: Registry[ModelFactory] = Registry(
         "gns-ransac": "physion.models.particles.build:gns_ransac",
         "dpi": "physion.models.particles.build:dpi",
         "noisy-simulation": "physion.models.noisy_simulation:noisy_simulation",
+        "noisy-simulation-outcomes": "physion.models.noisy_simulation:noise_of_outcomes",
+        "noisy-simulation-people": "physion.models.noisy_simulation:noise_of_people",
         "outcome": "physion.models.anchors.outcome:outcome",
         "majority-of-people": "physion.models.anchors.majority_of_people:majority_of_people",
         "state-classifier": "physion.models.anchors.state_classifier:state_classifier",

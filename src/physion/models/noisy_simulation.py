@@ -15,13 +15,14 @@ import dataclasses
 import hashlib
 import json
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from physion.errors import BadInputError
+from physion.errors import BadInputError, UnknownNameError
 from physion.models.batch import Batch, Provenance, Rollout, Spec
 from physion.models.build import make_config
+from physion.models.fitted_noise import FITTED, fitted_levels
 from physion.models.observed import cut_to_observed
 from physion.models.state_noise import NoiseLevels, ObservedTrial, simulate_contacts
 from physion.physics.engine import DEFAULT_ENGINE, Engine, make_engine
@@ -40,12 +41,15 @@ NOISE_VERSION = 2
 class NoisySimulationConfig(NoiseLevels):
     """Settings of `NoisySimulation`: the levels of the noise, and others.
 
+    - ``levels``: ``given``, the levels of this config, or those fitted to ``outcomes`` or to
+      ``people`` (`physion.models.fitted_noise`), which no other level may be given with.
     - ``scale``: factor of all standard deviations.
     - ``scales``: values of ``scale`` among which a reader chooses; with one value nothing is
       fitted.
     - ``samples``: simulations per trial. ``engine``: name of the engine. ``seed``: of the noise.
     """
 
+    levels: Literal["given", "outcomes", "people"] = "given"
     scale: float = 1.0
     scales: tuple[float, ...] = (0.5, 1.0, 2.0)
     samples: int = 20
@@ -54,6 +58,17 @@ class NoisySimulationConfig(NoiseLevels):
 
     def __post_init__(self) -> None:
         self.check("noisy-simulation")
+        if self.levels not in ("given", *FITTED):
+            raise UnknownNameError("levels of noisy-simulation", self.levels, ("given", *FITTED))
+        changed = [
+            field.name
+            for field in dataclasses.fields(NoiseLevels)
+            if getattr(self, field.name) != field.default
+        ]
+        if self.levels != "given" and changed:
+            raise BadInputError(
+                f"noisy-simulation: levels={self.levels} sets all levels; leave out {changed[0]}"
+            )
         if min((self.scale, *self.scales)) < 0:
             raise BadInputError("noisy-simulation: scales must not be negative")
         if self.samples < 1 or not self.scales:
@@ -102,6 +117,12 @@ class NoisySimulation:
             self._built = self._given or make_engine(self.config.engine)
         return self._built
 
+    def levels_for(self, scene: Scene) -> NoiseLevels:
+        """Return the levels of the noise for a scene."""
+        if self.config.levels == "given":
+            return self.config
+        return fitted_levels(self.config.levels, scene)
+
     def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
         """Simulate every trial ``samples`` times; ``contact`` says whether agent and patient touch.
 
@@ -113,7 +134,7 @@ class NoisySimulation:
         found = [
             simulate_contacts(
                 cut_trial(motion.scene, motion.trajectory),
-                self.config,
+                self.levels_for(motion.scene),
                 scale,
                 samples,
                 seed,
@@ -127,16 +148,20 @@ class NoisySimulation:
         """Return the SHA-256 of engine and noise; scales and number of samples are no part."""
         config = dataclasses.asdict(self.config)
         settings = {field.name: config[field.name] for field in dataclasses.fields(NoiseLevels)}
-        parts = [NOISE_VERSION, self.engine.name, settings]
+        parts: list[Any] = [NOISE_VERSION, self.engine.name, settings]
+        if self.config.levels != "given":
+            parts += [dataclasses.asdict(levels) for levels in FITTED[self.config.levels]]
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
     def provenance(self) -> Provenance:
-        """Return name and versions for the table of predictions."""
+        """Return name and versions for the table of predictions, and what noise was fitted to."""
+        fitted = self.config.levels != "given"
         return Provenance(
-            model="noisy-simulation",
+            model=f"noisy-simulation-{self.config.levels}" if fitted else "noisy-simulation",
             init="none",
             encoder_type="true state",
             dynamics_type="physics engine",
+            dynamics_training_task=f"noise fitted to {self.config.levels}" if fitted else "",
             versions=f"{self.engine.name}, physion {__version__}",
         )
 
@@ -148,6 +173,23 @@ class NoisySimulation:
 def noisy_simulation(**options: Any) -> NoisySimulation:
     """Build simulations that start from the true state with noise added.
 
-    ``options`` are the fields of `NoisySimulationConfig`.
+    ``options`` are the fields of `NoisySimulationConfig`. Fitted levels have one scale, 1, unless
+    ``scales`` are given.
     """
-    return NoisySimulation(make_config(NoisySimulationConfig, "noisy-simulation", options))
+    return _build("noisy-simulation", options)
+
+
+def noise_of_outcomes(**options: Any) -> NoisySimulation:
+    """Build simulations whose noise was fitted to outcomes of other configurations."""
+    return _build("noisy-simulation-outcomes", {**options, "levels": "outcomes"})
+
+
+def noise_of_people(**options: Any) -> NoisySimulation:
+    """Build simulations whose noise was fitted to people's answers to other configurations."""
+    return _build("noisy-simulation-people", {**options, "levels": "people"})
+
+
+def _build(name: str, options: dict[str, Any]) -> NoisySimulation:
+    if options.get("levels", "given") != "given":
+        options = {"scales": (1.0,), **options}
+    return NoisySimulation(make_config(NoisySimulationConfig, name, options))

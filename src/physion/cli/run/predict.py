@@ -20,6 +20,7 @@ OFFICIAL_MODELS = (
     "chance",
 )
 """Models of a run on official scenes, in the order of the report."""
+SIMULATIONS = ("noisy-simulation", "noisy-simulation-outcomes", "noisy-simulation-people")
 SAMPLED_MODELS = ("frozen-encoder", "noisy-simulation")
 
 
@@ -36,7 +37,7 @@ def chosen_models(options: Options) -> dict[str, dict[str, Any]]:
         # Frames of the size of the movies: enlarging them would only take time.
         "pEffNetLite0-mlp": {"image_size": options.size},
         "pEffNetLite0-lstm": {"image_size": options.size},
-        "noisy-simulation": {"samples": options.samples, "engine": options.engine},
+        **{name: {"samples": options.samples, "engine": options.engine} for name in SIMULATIONS},
     }
     return {name: known.get(name, {}) for name in dict.fromkeys(names)}
 
