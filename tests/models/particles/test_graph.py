@@ -24,7 +24,7 @@ def test_a_device_gets_the_edges_of_the_cpu(swept: bool) -> None:
         motions.append(Motion(scene, simulate(scene)))
     particles = [scene_particles(m.scene, ParticleSettings()) for m in motions]
     poses = [poses_of(p, m, [41, 44]) for p, m in zip(particles, motions, strict=True)]
-    layout = join_scenes(particles, CPU, 0.0)
+    layout = join_scenes(particles, CPU)
     drift = drift_of(layout, join_poses(poses, 0, CPU), join_poses(poses, 1, CPU))
     moves = drift.moves if swept else torch.zeros_like(drift.moves)
     expected = outer_edges(layout, drift.positions, moves, 0.3)
