@@ -19,8 +19,9 @@ from physion.compute.progress import Progress
 from physion.errors import BadInputError
 from physion.models.batch import LAST_OBSERVED, Motion, Spec
 from physion.models.interface import HasReader, Model
-from physion.models.particles.bodies import KINEMATIC, Poses, SceneParticles, poses_of
+from physion.models.particles.bodies import Poses, SceneParticles, poses_of
 from physion.readout.model_calls import model_name
+from physion.scenes.scene import Scene
 from physion.training.sources.open_source import observed_source, whole_source
 from physion.trials.dataset import Dataset
 
@@ -157,7 +158,8 @@ def motion_error(
     reached = centers[np.minimum(now + steps, len(centers) - 1)]
     constant = centers[now] + steps[:, None, None] * (centers[now] - centers[now - 1])
     present = [np.array(scene.present(int(frame)))[particles.things] for frame in frames]
-    free = particles.kinds != KINEMATIC
+    # Not by the kinds of particles: some models predict kinematic bodies too.
+    free = np.array([not _kinematic(scene, thing) for thing in particles.things])
     counted = np.array(present, bool).reshape(len(frames), len(free)) & free
     some = counted.any(axis=1)
     return pd.DataFrame(
@@ -167,6 +169,10 @@ def motion_error(
             "Constant Velocity Error": _mean_distance(constant, truth, counted)[some],
         }
     )
+
+
+def _kinematic(scene: Scene, thing: int) -> bool:
+    return thing < len(scene.bodies) and scene.bodies[thing].kinematic
 
 
 def _mean_distance(first: F64, second: F64, counted: NDArray[np.bool_]) -> F64:

@@ -31,6 +31,7 @@ from physion.models.particles.released.config import released_config
 from physion.models.particles.released.contact import contact_distance, particle_distance
 from physion.models.particles.released.simulator import ReleasedSimulator
 from physion.physics.engine import simulate
+from physion.readout.rollout_error import motion_error
 
 NAMES = ("gns", "gns-ransac", "dpi")
 
@@ -220,6 +221,19 @@ def test_constant_velocity_goes_straight_on(drape: Motion) -> None:
     size = (graph.positions.amax(0) - graph.positions.amin(0)).numpy()
     assert np.allclose(size, np.ptp(poses.loose[14], axis=0) * 0.05 / 0.035, atol=1e-4)
     assert graph.rigid.tolist() == (particles.kinds != CLOTH).tolist()
+
+
+def test_the_error_of_the_motion_counts_what_can_move(drape: Motion) -> None:
+    """Not the kinematic bodies, though they are predicted; constant velocity has its own error."""
+    model = tiny("gns")
+    model.network = ConstantVelocity()
+    particles, poses = future(model, drape)
+    rows = motion_error(drape, particles, poses, 3, 9)
+    assert rows["Error"].to_list() == pytest.approx(rows["Constant Velocity Error"], abs=1e-5)
+    assert (rows["Error"] > 1e-4).all()
+    still = next(row for row, body in enumerate(drape.scene.bodies) if body.kinematic)
+    poses.centers[:, np.flatnonzero(particles.things == still)] += 9.0
+    assert motion_error(drape, particles, poses, 3, 9).equals(rows)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -154,7 +154,7 @@ def scene_particles(
 
 
 def poses_of(particles: SceneParticles, motion: Motion, frames: Sequence[int]) -> Poses:
-    """Return the motion of the objects of a scene in the given frames.
+    """Return the motion of the objects of a scene in the given frames; of free bodies the poses.
 
     Raises `BadInputError` for a motion that is not known, as of a trial imported from a movie.
     """
@@ -175,7 +175,7 @@ def poses_of(particles: SceneParticles, motion: Motion, frames: Sequence[int]) -
     shift = (rotations[:, bodies] @ particles.pivots[bodies][None, :, :, None])[..., 0]
     centers[:, bodies] = positions + shift
     loose = trajectory.cloth_vertices[np.ix_(rows, particles.vertices)].astype(np.float64)
-    owners = particles.owners[particles.loose]
+    owners = particles.owners[(particles.kinds == CLOTH)[particles.owners]]
     for row in np.flatnonzero(~bodies):
         centers[:, row] = loose[:, owners == row].mean(axis=1)
     return Poses(centers, rotations, loose)
