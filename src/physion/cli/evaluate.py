@@ -28,6 +28,8 @@ class Options:
     """Name of a model; physion ls models lists them."""
     out: Path = Path("runs/models")
     """Folder for predictions and caches."""
+    weights: str = ""
+    """Weights of the model, the same as --option weights=...: shipped, a file, or random."""
     option: tuple[str, ...] = ()
     """Fields of the model's config as NAME=VALUE, such as encoder=resnet50 weights=imagenet."""
     config: Annotated[EvaluationConfig, tyro.conf.arg(name="")] = field(
@@ -49,7 +51,7 @@ def main(options: Options) -> int:
             Dataset(options.dataset),
             options.model,
             options.out,
-            options=parse_options(options.option),
+            options=parse_options(options.option, options.weights),
             config=options.config,
             rollout_errors=options.rollout_error,
             executor=LocalExecutor(workers=options.workers),

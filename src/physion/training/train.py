@@ -161,7 +161,9 @@ def train_model(
         if stored is not None:
             loop.resume(stored)
         loop.run()
-        _calibrate(model, source, data.training.trials, seed, fabric)
+        with evaluating(model, fabric):
+            calibrate(model, source, data.training.trials, seed)
+        model.eval()
         if kept is not None and fabric.is_global_zero:
             card = model_card(model, name, trials, settings, seed, metadata, loop.state)
             kept.finish(tensors_of(model), loop.metadata(), card)
@@ -244,19 +246,17 @@ def _prepare(model: Any, data: TrainingData, seed: int, fabric: Fabric) -> None:
         call(model, "prepare", data.training.sample(seed).to(fabric.device))
 
 
-def _calibrate(
-    model: Any, source: WholeSource, trials: Sequence[str], seed: int, fabric: Fabric
-) -> None:
-    """Let the model set what depends on its trained weights from whole training trials."""
+def calibrate(model: Any, source: WholeSource, trials: Sequence[str], seed: int) -> None:
+    """Let a model set what depends on its trained weights from whole training trials.
+
+    Nothing happens to a model that is not `physion.models.interface.Calibrates`.
+    """
     if not isinstance(model, Calibrates):
         return
-    network: Any = model
     order = generator("calibrate", seed).permutation(len(trials))[: model.calibration_trials]
     chosen = source.whole([trials[row] for row in np.sort(order)])
-    with evaluating(network, fabric):
-        torch.manual_seed(stable_hash("calibrate", seed) % 2**63)
-        call(network, "calibrate", chosen)
-    network.eval()
+    torch.manual_seed(stable_hash("calibrate", seed) % 2**63)
+    call(model, "calibrate", chosen)
 
 
 def _named(progress: Progress | None, what: str) -> Callable[[int, int], None] | None:

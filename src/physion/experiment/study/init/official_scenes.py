@@ -149,7 +149,7 @@ def find_fault(trial: ImportedTrial) -> str:
     motion = simulate(scene)
     if label_contact(scene, motion).contact != trial.outcome.contact:
         return OTHER_OUTCOME
-    ids = Renderer(scene, motion, SIZE, SIZE).render(0, ("ids",)).ids
+    ids = np.asarray(Renderer(scene, motion, SIZE, SIZE).render(0, ("ids",)).ids)
     roles = (scene.roles.agent, scene.roles.patient)
     return "" if np.isin([scene.index(role) + 1 for role in roles], ids).all() else HIDDEN
 

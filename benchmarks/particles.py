@@ -1,0 +1,307 @@
+"""What the particle models have learned: contacts, and errors of their rollouts.
+
+    python benchmarks/particles.py data FOLDER               # trials without images
+    python benchmarks/particles.py collide FOLDER --write    # three minutes of learning, 3 seeds
+    python benchmarks/particles.py transfer FOLDER --write   # trained without Collide
+    python benchmarks/particles.py shipped FOLDER --write    # weights of the package
+    python benchmarks/particles.py batched FOLDER --write    # rollouts together and one by one
+
+``collide`` trains DPI-Net (small) on 300 trials of Collide, with swept and with plain edges, and
+tests on 300 balanced trials without observed contact; the state classifier is fitted on the same
+300. Times are processor time; use OMP_NUM_THREADS=1. With --write a section of
+``results/particles.md`` is replaced.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import datetime
+import os
+import platform
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from sklearn.metrics import roc_auc_score
+
+from physion import Dataset, build_model, simulate
+from physion.data import official
+from physion.models.batch import LAST_OBSERVED, Motion
+from physion.models.observed import cut_to_observed
+from physion.models.particles.bodies import KINEMATIC, Poses, SceneParticles, poses_of
+from physion.models.particles.simulator import ParticleSimulator
+from physion.physics.labels import label_contact
+from physion.readout.evaluate import evaluate
+from physion.readout.settings import EvaluationConfig
+from physion.scenes.sampling.registry import scenarios
+from physion.training.sources.open_source import whole_source
+from physion.training.train import train_model
+from physion.trials.making.generate import make_trials
+from physion.trials.making.plan import GenerateSettings, plan_dataset
+
+RESULTS = Path(__file__).parent / "results" / "particles.md"
+HORIZONS = (15, 30, 60, 90)
+"""Frames after the last observed one at which errors are measured."""
+GROUP = 64
+"""Scenes of one rollout."""
+COLLIDE_STEPS = 3000
+TRANSFER_STEPS = 4000
+RIGID = ("dominoes", "support", "collide", "contain", "drop", "link", "roll")
+
+Rows = list[list[str]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Tested:
+    """Smallest gaps and outcomes of n trials, and errors (n, H) at the horizons, metres.
+
+    ``observed`` (n,): contact within the observed part. ``constant``: errors of constant velocity.
+    """
+
+    gaps: NDArray[np.float64]
+    contacts: NDArray[np.bool_]
+    observed: NDArray[np.bool_]
+    errors: NDArray[np.float64]
+    constant: NDArray[np.float64]
+    seconds: float
+
+    def only(self, rows: NDArray[np.bool_]) -> Tested:
+        """Return some of the trials."""
+        names = [f.name for f in dataclasses.fields(self) if f.name != "seconds"]
+        return dataclasses.replace(self, **{name: getattr(self, name)[rows] for name in names})
+
+    def cells(self) -> list[str]:
+        """Return number, accuracy, AUC, and errors after 30 and 60 frames."""
+        right = np.mean((self.gaps <= 0) == self.contacts)
+        both = len(set(self.contacts.tolist())) == 2
+        auc = roc_auc_score(self.contacts, -self.gaps) if both else float("nan")
+        pairs = [
+            f"{np.nanmean(self.errors[:, h]):.3f} / {np.nanmean(self.constant[:, h]):.3f}"
+            for h in (1, 2)
+        ]
+        return [str(len(self.gaps)), f"{right:.3f}", f"{auc:.3f}", *pairs]
+
+
+def test(model: ParticleSimulator, motions: Sequence[Motion], contacts: Iterable[bool]) -> Tested:
+    """Imagine the rest of every motion and compare."""
+    start, gaps, errors, constant, observed = time.process_time(), [], [], [], []
+    for first in range(0, len(motions), GROUP):
+        group = motions[first : first + GROUP]
+        cut = [Motion(m.scene, cut_to_observed(m.scene, m.trajectory)) for m in group]
+        futures = model.futures(cut, 1, 0)
+        gaps += model._gaps(cut, futures)[:, 0].tolist()
+        for motion, ((particles, poses),) in zip(group, futures, strict=True):
+            rows = object_errors(motion, particles, poses, model.spec.context)
+            errors.append(rows[0])
+            constant.append(rows[1])
+            observed.append(label_contact(motion.scene, motion.trajectory).observed)
+    return Tested(
+        np.array(gaps), np.array(list(contacts)), np.array(observed),
+        np.array(errors), np.array(constant), time.process_time() - start,
+    )  # fmt: skip
+
+
+def object_errors(
+    motion: Motion, particles: SceneParticles, poses: Poses, context: int
+) -> tuple[list[float], list[float]]:
+    """Return mean errors of moving objects at the horizons, of the model and of constant velocity.
+
+    NaN after the end of the true motion. A rollout that ended at rest keeps its last pose.
+    """
+    own, other = [], []
+    free = particles.kinds != KINEMATIC
+    for horizon in HORIZONS:
+        if LAST_OBSERVED + horizon >= len(motion.trajectory):
+            own.append(float("nan"))
+            other.append(float("nan"))
+            continue
+        frames = [LAST_OBSERVED - 3, LAST_OBSERVED, LAST_OBSERVED + horizon]
+        before, now, true = poses_of(particles, motion, frames).centers
+        row = min(context - 1 + horizon // 3, len(poses.centers) - 1)
+        straight = now + (now - before) * horizon / 3
+        own.append(float(np.linalg.norm(poses.centers[row] - true, axis=-1)[free].mean()))
+        other.append(float(np.linalg.norm(straight - true, axis=-1)[free].mean()))
+    return own, other
+
+
+def motions_of(dataset: Dataset, trials: Sequence[str]) -> tuple[list[Motion], list[bool]]:
+    """Return motions and outcomes of trials."""
+    files = [dataset.trial(trial) for trial in trials]
+    motions = [Motion(file.scene, file.trajectory) for file in files]
+    return motions, [label_contact(m.scene, m.trajectory).contact for m in motions]
+
+
+def trained(
+    dataset: Dataset, trials: Sequence[str], steps: int, **options: Any
+) -> tuple[ParticleSimulator, float]:
+    """Return a DPI-Net trained on some trials, and the processor time that it took."""
+    model = build_model("dpi", **options)
+    assert isinstance(model, ParticleSimulator)
+    start = time.process_time()
+    train_model(
+        model, whole_source(dataset, model.spec), trials, name="benchmark", folder=None,
+        settings=dataclasses.replace(model.settings, steps=steps), seed=model.options.seed,
+        accelerator="cpu",
+    )  # fmt: skip
+    return model, time.process_time() - start
+
+
+def classifier_accuracy(dataset: Dataset, folder: Path, scenarios: tuple[str, ...]) -> float:
+    """Return the accuracy of the state classifier on the testing trials of a dataset."""
+    table = evaluate(dataset, "state-classifier", folder, config=EvaluationConfig()).predictions
+    chosen = table[table["Scenario"].isin(scenarios)] if "Scenario" in table else table
+    return float((chosen["Predicted Outcome"] == chosen["Actual Outcome"]).mean())
+
+
+def make_data(folder: Path) -> None:
+    """Make trials without images: of Collide, and of all scenarios."""
+    settings = GenerateSettings(movies=False, jitters=0, min_visible=0.0)
+    collide = {"training": 300, "testing": 300}
+    counts = {"training": 220, "readout": 60, "testing": 60}
+    for name, chosen, sizes in (
+        ("collide", ("collide",), collide),
+        ("all", tuple(scenarios.names()), counts),
+    ):
+        report = make_trials(folder / name, plan_dataset("physion", chosen, sizes), settings)
+        print(name, report)
+
+
+def run_collide(folder: Path) -> str:
+    """Return the table of three seeds with swept and with plain edges."""
+    dataset = Dataset(folder / "collide")
+    motions, contacts = motions_of(dataset, dataset.trials("testing"))
+    rows = []
+    for seed in range(3):
+        for swept in (True, False):
+            model, seconds = trained(
+                dataset, dataset.trials("training"), COLLIDE_STEPS, seed=seed, swept=swept
+            )
+            tested = test(model, motions, contacts)
+            ratio = np.nanmean(tested.errors[:, 2]) / np.nanmean(tested.constant[:, 2])
+            rows.append(
+                [str(seed), "swept" if swept else "plain", f"{seconds:.0f}", *tested.cells(),
+                 f"{ratio:.2f}"]
+            )  # fmt: skip
+            print(rows[-1], flush=True)
+    head = ["seed", "edges", "training, s", *HEAD, "of constant"]
+    return table(head, rows)
+
+
+def run_transfer(folder: Path) -> str:
+    """Return the table of a model and a classifier that never saw Collide."""
+    dataset = Dataset(folder / "all")
+    others = [t for t in dataset.trials("training") if not t.startswith("collide")]
+    model, seconds = trained(dataset, others, TRANSFER_STEPS)
+    collide = Dataset(folder / "collide")
+    motions, contacts = motions_of(collide, collide.trials("testing"))
+    tested = test(model, motions, contacts)
+    both, n = tested.contacts.mean(), len(tested.contacts)
+    error = np.sqrt((n + 1) / (12 * n * n * both * (1 - both)))
+    return table(
+        ["model", "training, s", *HEAD], [["dpi-small", f"{seconds:.0f}", *tested.cells()]]
+    ) + (f"\nAn AUC of chance has a standard error of {error:.3f} (Mann and Whitney 1947).\n")
+
+
+def run_shipped(folder: Path) -> str:
+    """Return the tables of the shipped weights on own testing trials and on official scenes."""
+    dataset = Dataset(folder / "all")
+    own = motions_of(dataset, dataset.trials("testing"))
+    known = {trial.scene.name: trial for trial in official().trials}
+    scenes = [trial.scene for name, trial in known.items() if "familiarization" not in name]
+    theirs = [Motion(scene, simulate(scene)) for scene in scenes]
+    recorded = [known[scene.name].outcome.contact for scene in scenes]
+    text = ""
+    for title, (motions, contacts) in (
+        ("Own testing trials, without observed contact", own),
+        ("Official scenes, recorded outcomes", (theirs, recorded)),
+    ):
+        rows: Rows = []
+        names = np.array([motion.scene.scenario for motion in motions])
+        for name in ("dpi", "gns", "gns-ransac"):
+            model = build_model(name, weights="shipped")
+            assert isinstance(model, ParticleSimulator)
+            tested = test(model, motions, contacts)
+            for scenario in sorted(set(names)):
+                rows.append([model.name, scenario, *tested.only(names == scenario).cells()])
+            rigid = np.isin(names, RIGID)
+            rows.append([model.name, "seven rigid", *tested.only(rigid).cells()])
+            rows.append(
+                [model.name, "without observed contact",
+                 *tested.only(rigid & ~tested.observed).cells()]
+            )  # fmt: skip
+            print(rows[-2], f"{tested.seconds:.0f} s", flush=True)
+        text += f"\n**{title}**\n\n" + table(["model", "scenario", *HEAD], rows)
+    return text
+
+
+def run_batched(folder: Path) -> str:
+    """Return the times of rollouts of 64 scenes together and one by one, side by side."""
+    dataset = Dataset(folder / "collide")
+    motions, _ = motions_of(dataset, dataset.trials("testing")[:GROUP])
+    cut = [Motion(m.scene, cut_to_observed(m.scene, m.trajectory)) for m in motions]
+    model = build_model("dpi", weights="shipped")
+    assert isinstance(model, ParticleSimulator)
+    model.futures(cut[:2], 1, 0)
+    rows = []
+    for _ in range(3):
+        start = time.process_time()
+        model.futures(cut, 1, 0)
+        together = time.process_time() - start
+        start = time.process_time()
+        for motion in cut:
+            model.futures([motion], 1, 0)
+        apart = time.process_time() - start
+        rows.append([f"{together:.2f}", f"{apart:.2f}", f"{apart / together:.1f}"])
+    return table(["together, s", "one by one, s", "ratio"], rows)
+
+
+HEAD = ["trials", "accuracy", "AUC", "error 30, m / constant", "error 60, m / constant"]
+
+
+def table(head: list[str], rows: Rows) -> str:
+    """Return a Markdown table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+
+
+def write(section: str, text: str) -> None:
+    """Replace a section of the file of results."""
+    head = "# Particle models\nMade by `benchmarks/particles.py`.\n"
+    old = RESULTS.read_text() if RESULTS.is_file() else head
+    parts = old.split("\n## ")
+    kept = [part for part in parts[1:] if not part.startswith(section + "\n")]
+    made = f"{datetime.date.today()}, {platform.processor() or platform.machine()}, "
+    made += f"{os.cpu_count()} cores, torch {torch.__version__}: "
+    made += f"`OMP_NUM_THREADS=1 python benchmarks/particles.py {section} FOLDER --write`"
+    new = f"{section}\n{made}\n\n{text.strip()}\n"
+    RESULTS.write_text("\n## ".join([parts[0], *sorted([*kept, new])]))
+
+
+def main() -> None:
+    """Run one of the benchmarks."""
+    runs = {
+        "collide": run_collide, "transfer": run_transfer,
+        "shipped": run_shipped, "batched": run_batched,
+    }  # fmt: skip
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("what", choices=["data", *runs])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--write", action="store_true")
+    chosen = parser.parse_args()
+    torch.set_num_threads(1)
+    if chosen.what == "data":
+        make_data(chosen.folder)
+        return
+    text = runs[chosen.what](chosen.folder)
+    print(text)
+    if chosen.write:
+        write(chosen.what, text)
+
+
+if __name__ == "__main__":
+    main()
