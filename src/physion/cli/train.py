@@ -32,7 +32,7 @@ class Options:
     """Folder of a dataset."""
     out: Path = Path("runs/models")
     """Folder for trainings and features, that of physion evaluate."""
-    size: Literal["small", "paper"] | None = None
+    size: Literal["small", "paper", "released"] | None = None
     """Configuration of a model that has several."""
     option: tuple[str, ...] = ()
     """Fields of the model's config as NAME=VALUE, such as encoder=resnet50 weights=imagenet."""
