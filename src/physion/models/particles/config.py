@@ -59,8 +59,10 @@ class ParticleConfig:
     - ``radius``: metres within which particles of different objects are neighbours; with ``swept``
       also those that come so close during a step.
     - ``rigid``: how GNS keeps bodies rigid: ``fit`` to all particles, or ``robust`` (RANSAC).
-    - ``velocity_noise``, ``position_noise``: metres a step and metres; standard deviations of the
-      noise in training, drawn for every rigid body and for every particle of a cloth.
+    - ``velocity_noise``, ``relative_noise``, ``position_noise``: metres a step, fraction of the
+      speed, and metres; standard deviations of the noise in training, drawn for every rigid body
+      and for every particle of a cloth. Noise that is large beside a slow motion teaches that it
+      stops.
     - ``knee``: errors of an object count squared up to this many units (``simulator.CHANGE``), and
       linearly beyond.
     - ``gap_spacing``, ``gap_limit``: of the particles by which distances are measured.
@@ -74,8 +76,9 @@ class ParticleConfig:
     radius: float = 0.12
     swept: bool = True
     rigid: Literal["fit", "robust"] = "fit"
-    velocity_noise: float = 2e-3
-    position_noise: float = 2e-3
+    velocity_noise: float = 7e-4
+    relative_noise: float = 0.02
+    position_noise: float = 1e-3
     knee: float = 1.0
     gap_spacing: float = 0.04
     gap_limit: int = 300

@@ -137,7 +137,9 @@ class ParticleSimulator(TorchModel):
         """Return the loss of a batch of windows of three frames."""
         config = self.config
         window = rotated(self._read(batch))
-        window = disturbed(window, config.velocity_noise, config.position_noise)
+        window = disturbed(
+            window, config.velocity_noise, config.relative_noise, config.position_noise
+        )
         layout = window.layout
         drift = drift_of(layout, window.before, window.now)
         graph = self._graph(layout, drift)

@@ -12,6 +12,7 @@ from torch import Tensor
 from physion.errors import BadInputError
 from physion.models.batch import Batch
 from physion.models.particles.bodies import KINEMATIC, ParticleSettings, poses_of, scene_particles
+from physion.models.particles.graph import drift_of
 from physion.models.particles.layout import (
     ObjectState,
     SceneLayout,
@@ -62,7 +63,9 @@ def rotated(window: Window) -> Window:
     return Window(layout, *(rotate_scenes(state, layout, rotations) for state in states))
 
 
-def disturbed(window: Window, velocity_noise: float, position_noise: float) -> Window:
+def disturbed(
+    window: Window, velocity_noise: float, relative_noise: float, position_noise: float
+) -> Window:
     """Return a window with noise, so that a network learns to correct its own errors.
 
     The first state alone is moved by the velocity noise: the last velocity is wrong, and the third
@@ -74,29 +77,37 @@ def disturbed(window: Window, velocity_noise: float, position_noise: float) -> W
     ----------
     window
         The window.
-    velocity_noise, position_noise : float
-        Standard deviations by axis, metres a step and metres.
+    velocity_noise, relative_noise, position_noise : float
+        Standard deviations by axis: metres a step, a fraction of the speed of the centre and rim of
+        a body or of a particle of a cloth, and metres. The first two are independent.
     """
     layout = window.layout
     free = (layout.kinds != KINEMATIC).double()[:, None]
 
-    def noise(like: Tensor, scale: float) -> Tensor:
-        return scale * torch.randn_like(like)
-
-    def shift_of(scale: float) -> tuple[Tensor, Tensor, Tensor]:
-        angles = noise(window.now.centers, scale) / layout.size[:, None]
+    def shift_of(scale: Tensor, loose: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        angles = scale * torch.randn_like(window.now.centers) / layout.size[:, None]
         return (
-            noise(window.now.centers, scale) * free,
+            scale * torch.randn_like(window.now.centers) * free,
             rotation_from_vector(angles * free),
-            noise(window.now.loose, scale),
+            loose * torch.randn_like(window.now.loose),
         )
 
     def moved(state: ObjectState, shift: tuple[Tensor, Tensor, Tensor]) -> ObjectState:
         center, rotation, loose = shift
         return ObjectState(state.centers + center, rotation @ state.rotations, state.loose + loose)
 
-    place = shift_of(position_noise)
+    def combined(speed: Tensor) -> Tensor:
+        return (velocity_noise**2 + (relative_noise * speed) ** 2).sqrt()
+
+    drift = drift_of(layout, window.before, window.now)
+    rim = drift.spin.norm(dim=-1, keepdim=True) * layout.size[:, None]
+    speed = drift.velocity.norm(dim=-1, keepdim=True) + rim
+    loose_speed = drift.moves[layout.loose].norm(dim=-1, keepdim=True)
+    place = shift_of(
+        torch.full_like(speed, position_noise), torch.full_like(loose_speed, position_noise)
+    )
+    jolt = shift_of(combined(speed), combined(loose_speed))
     before, now, after = (
         moved(state, place) for state in (window.before, window.now, window.after)
     )
-    return Window(layout, moved(before, shift_of(velocity_noise)), now, after)
+    return Window(layout, moved(before, jolt), now, after)
