@@ -160,13 +160,13 @@ def _gap_of_bodies(
         (at, turned), (origin, axes) = first.pose(seconds), second.pose(seconds)
         to_second = np.ascontiguousarray(axes.T)
         rotation, shift = multiply(to_second, turned), apply(to_second, at - origin)
-        return min(gap_of_hulls(vertices, ends, pieces, rotation, shift, simplex), FAR)
+        return min(_gap_of_hulls(vertices, ends, pieces, rotation, shift, simplex), FAR)
 
     return gap, first.top_speed + second.top_speed
 
 
 @kernel
-def gap_of_hulls(
+def _gap_of_hulls(
     vertices: F64, ends: I64, pieces: int, rotation: F64, shift: F64, simplex: Simplex
 ) -> float:
     """Return the smallest distance of the convex pieces of two bodies, 0 if some overlap.

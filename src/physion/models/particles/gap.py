@@ -13,24 +13,35 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from physion.models.anchors.smallest_gap import FAR, TOLERANCE, gap_of_hulls, minimise
+from physion.models.anchors.smallest_gap import FAR, TOLERANCE, minimise
 from physion.models.particles.bodies import CLOTH, Poses, SceneParticles
 from physion.models.particles.neighbours import gap_over_time
 from physion.models.particles.rigid_motion import rotation_from_vector, vector_from_rotation
 from physion.models.particles.surface import surface_points
-from physion.physics.rigid.collision.closest_points import new_simplex
+from physion.numerics.kernel import kernel
+from physion.physics.rigid.collision.closest_points import (
+    CLOSE,
+    OVERLAPPING,
+    Simplex,
+    closest_points,
+    new_simplex,
+)
+from physion.physics.rigid.collision.penetration import Polytope, new_polytope, penetration
 from physion.physics.rigid.hulls import collision_hulls
 from physion.scenes.scene import FRAME_TIME, Scene
 
 F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
 
 
 def smallest_distance(
     scene: Scene, particles: SceneParticles, poses: Poses, spacing: float, limit: int
 ) -> float:
-    """Return the smallest distance of agent and patient, metres, 0 where they overlap.
+    """Return the smallest distance of agent and patient, metres; minus the depth of an overlap.
 
-    It is at most `FAR`, also if one of them is absent, and at most `TOLERANCE` too large.
+    Learned bodies can overlap, and the deeper they do, the surer is the contact. The distance is
+    at most `FAR`, also if one of them is absent, and at most `TOLERANCE` too large; depths are
+    those at the rows of the motion alone.
 
     Parameters
     ----------
@@ -55,7 +66,7 @@ def smallest_distance(
 def _distance_of_bodies(
     scene: Scene, particles: SceneParticles, poses: Poses, rows: tuple[int, int]
 ) -> float:
-    """Return the smallest distance of two bodies.
+    """Return the smallest distance of two bodies, or minus their deepest overlap.
 
     In a step their distance changes by at most the sum of what any point of each moves, s, so with
     the distances g0 and g1 at its ends it is at least (g0 + g1 - s) / 2. Steps in which this is not
@@ -100,15 +111,59 @@ def _pair(
     parts = [part for own in corners for part in own]
     vertices = np.ascontiguousarray(np.concatenate(parts), np.float64)
     ends = np.cumsum([0, *(len(part) for part in parts)]).astype(np.int64)
-    pieces, simplex = len(corners[0]), new_simplex()
+    pieces, simplex, polytope = len(corners[0]), new_simplex(), new_polytope()
 
     def between(centers: F64, rotations: F64) -> float:
         to_second = np.ascontiguousarray(rotations[1].T)
         shift = to_second @ (centers[0] - centers[1])
-        return float(gap_of_hulls(vertices, ends, pieces, to_second @ rotations[0], shift, simplex))
+        rotation = to_second @ rotations[0]
+        return float(_signed_gap(vertices, ends, pieces, rotation, shift, simplex, polytope))
 
     reach = [max(float(np.linalg.norm(part, axis=1).max()) for part in own) for own in corners]
     return between, np.array(reach)
+
+
+@kernel
+def _signed_gap(
+    vertices: F64,
+    ends: I64,
+    pieces: int,
+    rotation: F64,
+    shift: F64,
+    simplex: Simplex,
+    polytope: Polytope,
+) -> float:
+    """Return the smallest distance of the convex pieces of two bodies, or minus the depth.
+
+    Parameters
+    ----------
+    vertices : (V, 3)
+        Corners of the pieces of A, then of B, each in the frame of its body, metres.
+    ends : (K + 1,)
+        Rows at which the pieces begin, and V. ``pieces``: how many of the K belong to A.
+    rotation, shift : (3, 3), (3,)
+        From the frame of A to that of B.
+    simplex, polytope : Simplex, Polytope
+        Work space.
+    """
+    smallest = np.inf
+    span = np.empty(4, np.int64)
+    found = np.empty(10)
+    for i in range(pieces):
+        for j in range(pieces, len(ends) - 1):
+            span[0], span[1], span[2], span[3] = ends[i], ends[i + 1], ends[j], ends[j + 1]
+            reach = max(smallest, 0.0)
+            result, size, distance = closest_points(
+                vertices, span, rotation, shift, reach, simplex, 0
+            )
+            if result == OVERLAPPING:
+                depth = 0.0
+                if penetration(vertices, span, rotation, shift, simplex, size, polytope, found):
+                    depth = found[9]
+                smallest = min(smallest, -depth)
+            elif result == CLOSE:
+                smallest = min(smallest, distance)
+    return smallest
 
 
 def _points(
