@@ -94,7 +94,7 @@ def test(model: ParticleSimulator, motions: Sequence[Motion], contacts: Iterable
         group = motions[first : first + GROUP]
         cut = [Motion(m.scene, cut_to_observed(m.scene, m.trajectory)) for m in group]
         futures = model.futures(cut, 1, 0)
-        gaps += model._gaps(cut, futures)[:, 0].tolist()
+        gaps += model.gaps(cut, futures)[:, 0].tolist()
         for motion, ((particles, poses),) in zip(group, futures, strict=True):
             rows = object_errors(motion, particles, poses, model.spec.context)
             errors.append(rows[0])

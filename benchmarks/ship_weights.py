@@ -27,7 +27,7 @@ from physion.models.checkpoints.checkpoint import (
     tensors_of,
     write_checkpoint,
 )
-from physion.models.checkpoints.trained import DIGESTS, FOLDER
+from physion.models.checkpoints.trained import BUILT_AS, DIGESTS, FOLDER
 from physion.models.particles.simulator import ParticleSimulator
 from physion.training.sources.open_source import whole_source
 from physion.training.train import calibrate
@@ -65,6 +65,7 @@ def ship(dataset: Dataset, trained: Path, name: str) -> None:
     card += f"\n## Contact\nDistance that counts as contact, bodies and cloth, m: {touch}\n"
     card += f"\n## Hardware\n{platform.processor() or platform.machine()}, one thread\n"
     SHIPPED.mkdir(exist_ok=True)
+    metadata = {**metadata, BUILT_AS: model.built_as()}
     write_checkpoint(SHIPPED / f"{name}.safetensors", tensors_of(model), metadata)
     (SHIPPED / f"{name}.md").write_text(card)
     print(name, (SHIPPED / f"{name}.safetensors").stat().st_size, "bytes", touch)

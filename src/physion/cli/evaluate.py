@@ -29,7 +29,7 @@ class Options:
     out: Path = Path("runs/models")
     """Folder for predictions and caches."""
     weights: str = ""
-    """Weights of the model, the same as --option weights=...: shipped, a file, or random."""
+    """Weights of the model, the same as --option weights=...: a file, random, or other names."""
     option: tuple[str, ...] = ()
     """Fields of the model's config as NAME=VALUE, such as encoder=resnet50 weights=imagenet."""
     config: Annotated[EvaluationConfig, tyro.conf.arg(name="")] = field(

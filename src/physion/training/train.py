@@ -21,6 +21,7 @@ from physion.atomic import folder_lock
 from physion.compute.progress import Progress
 from physion.errors import BadInputError
 from physion.models.checkpoints.checkpoint import hash_config, load_tensors, tensors_of, versions
+from physion.models.checkpoints.trained import BUILT_AS
 from physion.models.interface import Calibrates, Learns, features_digest
 from physion.models.settings import TrainingSettings
 from physion.seeds import generator, stable_hash
@@ -138,6 +139,7 @@ def train_model(
         "config_hash": config_hash,
         "versions": versions(),
         "provenance": dataclasses.asdict(model.provenance()),
+        **({BUILT_AS: model.built_as()} if hasattr(model, BUILT_AS) else {}),
     }
     with _writing(kept, fabric), memory_advice(settings):
         stored = kept.resumable() if kept is not None else None

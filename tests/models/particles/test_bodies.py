@@ -7,7 +7,6 @@ import dataclasses
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from tests.support.rendered_scenes import body, scene_of, tumbling
 
 from physion.errors import BadInputError
 from physion.models.batch import Motion
@@ -24,6 +23,7 @@ from physion.models.particles.surface import surface_points
 from physion.physics.particles import particles_over_time
 from physion.scenes.scene import Cloth, Roles
 from physion.scenes.shapes.primitives import shapes
+from support.rendered_scenes import body, scene_of, tumbling
 
 
 def test_points_lie_on_the_box_with_its_corners_and_normals() -> None:

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from physion.models.particles.neighbours import (
     gap_over_time,
     radius_edges,
-    smallest_gap,
     swept_edges,
 )
 
@@ -57,7 +56,8 @@ def test_a_fast_body_meets_what_it_passes() -> None:
     swept = swept_edges(points, steps, starts, scene, moves, 0.08)
     plain = swept_edges(points, 0 * steps, starts, scene, moves, 0.08)
     assert swept[0].tolist() == [0, 1] and swept[1].tolist() == [1, 0] and not len(plain[0])
-    assert smallest_gap(points[:1], steps[:1], points[1:], steps[1:]) == pytest.approx(0.05)
+    moving = np.stack([points, points + steps])
+    assert gap_over_time(moving[:, :1], moving[:, 1:]) == pytest.approx(0.05)
 
 
 @pytest.mark.parametrize("seed", range(4))

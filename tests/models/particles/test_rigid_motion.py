@@ -76,12 +76,32 @@ def test_the_robust_fit_ignores_outliers_and_says_which() -> None:
     spoilt = points.clone()
     wrong = [0, 3, 7, 20, 30, 40]
     spoilt[wrong] += torch.tensor([0.8, -0.5, 0.3], dtype=torch.float64)
-    rng = torch.Generator().manual_seed(0)
-    found, moved, inliers = fit_robust(shape, spoilt, owners, 3, 0.01, rng)
+    draws = torch.rand(16, 4, generator=torch.Generator().manual_seed(0))
+    found, moved, inliers = fit_robust(shape, spoilt, owners, 3, 0.01, draws)
     assert torch.allclose(found, rotation) and torch.allclose(moved, shift)
     assert sorted(np.flatnonzero(~inliers.numpy())) == wrong
     plain, _ = fit_rigid(shape, spoilt, owners, 3)
     assert (plain - rotation).abs().max() > 0.01, "the fit to all particles is wrong"
+
+
+def test_the_robust_fit_of_an_object_does_not_depend_on_the_others() -> None:
+    shape, points, owners, _, _ = bodies(4, 0.05)
+    draws = torch.rand(16, 4, generator=torch.Generator().manual_seed(0))
+    together = fit_robust(shape, points, owners, 3, 0.05, draws)
+    for number in range(3):
+        own = owners == number
+        alone = fit_robust(shape[own], points[own], 0 * owners[own], 1, 0.05, draws)
+        assert torch.allclose(alone[0][0], together[0][number])
+        assert torch.equal(alone[2], together[2][own])
+
+
+@pytest.mark.parametrize("axis", [[1.0, 0, 0], [0, -1, 0], [0.6, 0, 0.8], [-0.48, 0.6, 0.64]])
+@pytest.mark.parametrize("angle", [np.pi, np.pi - 1e-6, np.pi - 1e-3, 3.0])
+def test_a_rotation_by_half_a_turn_is_found(axis: list[float], angle: float) -> None:
+    given = torch.tensor([axis], dtype=torch.float64) * angle
+    rotation = rotation_from_vector(given)
+    again = rotation_from_vector(vector_from_rotation(rotation))
+    assert (again - rotation).abs().max() < 1e-6
 
 
 def test_one_particle_and_coincident_particles_give_a_rotation() -> None:

@@ -11,9 +11,7 @@ from physion.cli.output import Stages
 if TYPE_CHECKING:
     from physion.cli.run.options import Options
 
-PARTICLE_MODELS = ("dpi", "gns", "gns-ransac")
 OFFICIAL_MODELS = (
-    *PARTICLE_MODELS,
     "pEffNetLite0-mlp",
     "noisy-simulation",
     "state-classifier",
@@ -39,7 +37,6 @@ def chosen_models(options: Options) -> dict[str, dict[str, Any]]:
         # Frames of the size of the movies: enlarging them would only take time.
         "pEffNetLite0-mlp": {"image_size": options.size},
         "pEffNetLite0-lstm": {"image_size": options.size},
-        **{name: {"weights": "shipped"} for name in PARTICLE_MODELS},
         **{name: {"samples": options.samples, "engine": options.engine} for name in SIMULATIONS},
     }
     return {name: known.get(name, {}) for name in dict.fromkeys(names)}

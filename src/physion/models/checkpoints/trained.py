@@ -10,10 +10,17 @@ from pathlib import Path
 from torch import nn
 
 from physion.errors import BadInputError
-from physion.models.checkpoints.checkpoint import DamagedFileError, load_weights
+from physion.models.checkpoints.checkpoint import (
+    DamagedFileError,
+    check_same,
+    load_tensors,
+    read_checkpoint,
+)
 
 FOLDER = "shipped"
 """Folder of the shipped weights, beside this module."""
+BUILT_AS = "built_as"
+"""Metadata of weights: what the method of this name said of the model that was trained."""
 DIGESTS = "sha256.json"
 """File with the SHA-256 of every shipped file by the name of the model."""
 
@@ -36,7 +43,10 @@ def load_shipped(model: nn.Module, name: str) -> str:
     """
     digests = shipped_digests()
     if name not in digests:
-        raise BadInputError(f"no weights are shipped for {name}, only for {', '.join(digests)}")
+        known = f"only for {', '.join(digests)}" if digests else "nor for any other model"
+        raise BadInputError(
+            f"no weights are shipped for {name}, {known}; train it with physion train"
+        )
     with as_file(files(__package__) / FOLDER / f"{name}.safetensors") as path:
         found = _sha256(path) if path.is_file() else "no file"
         if found != digests[name]:
@@ -44,14 +54,15 @@ def load_shipped(model: nn.Module, name: str) -> str:
                 f"the weights {path} that come with the package are damaged or changed; install "
                 "the package again"
             )
-        load_weights(path, model)
+        _load(path, model)
     return f"shipped:{digests[name][:12]}"
 
 
 def load_file(model: nn.Module, file: str) -> str:
     """Load a ``model.safetensors`` of ``physion train``, and return its origin for the tables.
 
-    Raises `BadInputError` for a file that is missing or holds other weights.
+    Raises `BadInputError` for a file that is missing, holds other weights, or weights of a model
+    that was built otherwise (`BUILT_AS`).
     """
     path = Path(file)
     if not path.is_file():
@@ -59,8 +70,16 @@ def load_file(model: nn.Module, file: str) -> str:
             f"there are no weights at {path}; give random, shipped, or the model.safetensors of "
             "a training"
         )
-    load_weights(path, model)
+    _load(path, model)
     return f"local:{_sha256(path)[:12]}"
+
+
+def _load(path: Path, model: nn.Module) -> None:
+    tensors, metadata = read_checkpoint(path)
+    built_as = getattr(model, "built_as", None)
+    if built_as is not None:
+        check_same(path, "model", metadata.get(BUILT_AS, {}), built_as())
+    load_tensors(path, tensors, model)
 
 
 def _sha256(path: Path) -> str:

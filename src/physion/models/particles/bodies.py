@@ -6,6 +6,7 @@ Scenery is left out, since it takes part in no collision, and so are bodies that
 
 from __future__ import annotations
 
+import threading
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -122,7 +123,9 @@ class Poses:
 _Key = tuple[int, ParticleSettings, tuple[bool, ...]]
 _kept: OrderedDict[_Key, tuple[Scene, SceneParticles]] = OrderedDict()
 """Particles of the scenes that were asked for last, and the scenes, so that their ids stay."""
-_KEPT = 4096
+_KEPT = 4_000_000
+"""Largest number of particles that are kept, about 0.5 GB."""
+_lock = threading.Lock()
 
 
 def scene_particles(
@@ -146,11 +149,17 @@ def scene_particles(
     """
     there = tuple(present) if present is not None else (True,) * len(scene.names())
     key = (id(scene), settings, there)
-    if key not in _kept:
-        _kept[key] = scene, _sample(scene, settings, there)
-        while len(_kept) > _KEPT:
+    with _lock:
+        found = _kept.get(key)
+        if found is not None:
+            _kept.move_to_end(key)
+            return found[1]
+    particles = _sample(scene, settings, there)
+    with _lock:
+        _kept[key] = scene, particles
+        while len(_kept) > 1 and sum(len(p.owners) for _, p in _kept.values()) > _KEPT:
             _kept.popitem(last=False)
-    return _kept[key][1]
+    return particles
 
 
 def poses_of(particles: SceneParticles, motion: Motion, frames: Sequence[int]) -> Poses:
@@ -179,6 +188,23 @@ def poses_of(particles: SceneParticles, motion: Motion, frames: Sequence[int]) -
     for row in np.flatnonzero(~bodies):
         centers[:, row] = loose[:, owners == row].mean(axis=1)
     return Poses(centers, rotations, loose)
+
+
+def later_poses(poses: Poses, first: int) -> Poses:
+    """Return a motion from row ``first`` on."""
+    return Poses(poses.centers[first:], poses.rotations[first:], poses.loose[first:])
+
+
+def put_by_events(scene: Scene, first: int, last: int) -> list[int]:
+    """Return the things that appear or are moved by an event after frame ``first``, up to ``last``.
+
+    They are where they are without having gone there.
+    """
+    return [
+        scene.index(event.body)
+        for event in scene.events
+        if event.kind != "vanish" and first < event.frame <= last
+    ]
 
 
 def join_poses_in_time(first: Poses, second: Poses) -> Poses:

@@ -19,8 +19,8 @@ class ParticleOptions:
 
     - ``size``: ``small`` or ``paper`` of this package's own form, or ``released``, the networks,
       inputs and decision of the published code (`released.simulator`).
-    - ``weights``: ``random``, to be trained; ``shipped``, those that come with the package (size
-      small alone); or the path of a ``model.safetensors`` that ``physion train`` wrote.
+    - ``weights``: ``random``, to be trained; ``shipped``, those that come with the package (none
+      so far); or the path of a ``model.safetensors`` that ``physion train`` wrote.
     - ``swept``: whether particles that come close during a step are neighbours; those of the size
       released never are.
     - ``samples``: futures of a trial, and ``spread``: standard deviation of the noise on their
@@ -76,9 +76,9 @@ class ParticleConfig:
     radius: float = 0.12
     swept: bool = True
     rigid: Literal["fit", "robust"] = "fit"
-    velocity_noise: float = 7e-4
+    velocity_noise: float = 3e-4
     relative_noise: float = 0.02
-    position_noise: float = 1e-3
+    position_noise: float = 0.0
     knee: float = 1.0
     gap_spacing: float = 0.04
     gap_limit: int = 300

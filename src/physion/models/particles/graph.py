@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from physion.models.particles.bodies import KINEMATIC
+from physion.models.particles.bodies import KINEMATIC, RIGID
 from physion.models.particles.cell_list import swept_edges_on_device
 from physion.models.particles.layout import ObjectState, SceneLayout, with_loose
 from physion.models.particles.neighbours import swept_edges
@@ -96,10 +96,10 @@ def move(
 ) -> ObjectState:
     """Return the state after a step in which velocity and spin of bodies change.
 
-    ``change`` (K, 3) metres a step, ``spin`` (K, 3) radians a step. Kinematic bodies stay; cloths
-    keep their particles.
+    ``change`` (K, 3) metres a step, ``spin`` (K, 3) radians a step. Kinematic bodies and
+    cloths stay: the particles of a cloth move on their own (`move_loose`).
     """
-    free = (layout.kinds != KINEMATIC)[:, None]
+    free = (layout.kinds == RIGID)[:, None]
     centers = now.centers + torch.where(free, drift.velocity + change, 0.0)
     rotations = rotation_from_vector(torch.where(free, drift.spin + spin, 0.0)) @ now.rotations
     return ObjectState(centers, rotations, now.loose)

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from physion.models.particles.bodies import CLOTH, Poses, SceneParticles
+from physion.models.particles.bodies import CLOTH, KINEMATIC, Poses, SceneParticles
 from physion.models.particles.rigid_motion import mean_by
 
 I64 = NDArray[np.int64]
@@ -109,7 +109,7 @@ def join_scenes(scenes: Sequence[SceneParticles], device: torch.device) -> Scene
         size=tensor(np.maximum(sizes, 1e-3)),
         starts=np.searchsorted(owners, np.arange(total + 1)).astype(np.int64),
         scene_array=scene_array,
-        moves=kinds != 1,
+        moves=kinds != KINEMATIC,
         ends=ends,
         object_ends=object_ends,
     )

@@ -85,19 +85,6 @@ def swept_edges(
     return _both_ways(first, second)
 
 
-def smallest_gap(a: F64, a_step: F64, b: F64, b_step: F64) -> float:
-    """Return the smallest distance of two objects during a step, metres.
-
-    Parameters
-    ----------
-    a, a_step : (A, 3)
-        Particles of one object, and where each goes in the step.
-    b, b_step : (B, 3)
-        Those of the other.
-    """
-    return float(_smallest_gap(a, a_step, b, b_step, np.inf))
-
-
 def gap_over_time(a: F64, b: F64) -> float:
     """Return the smallest distance over T frames and between them of particles (T, A or B, 3)."""
     best = np.inf

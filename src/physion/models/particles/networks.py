@@ -60,7 +60,7 @@ class EdgeMessages(nn.Module):
 class MessageNetwork(nn.Module):
     """Network of GNS: from a graph to a change of displacement of every particle.
 
-    Output (P, 3), in units of the standard deviation of such changes.
+    Output (N, 3), in units of the standard deviation of such changes.
     """
 
     def __init__(self, width: int, rounds: int) -> None:
@@ -72,7 +72,7 @@ class MessageNetwork(nn.Module):
         self.head = mlp(width, width, 3, normalized=False)
 
     def forward(self, graph: Graph) -> Tensor:
-        """Return changes of displacements (P, 3)."""
+        """Return changes of displacements (N, 3) of the nodes."""
         nodes = self.node(torch.cat([graph.nodes, graph.things[graph.owners]], -1))
         edges = self.edge(graph.edges)
         for message, update in zip(self.messages, self.updates, strict=True):
@@ -86,7 +86,7 @@ class ObjectNetwork(nn.Module):
     """Network of DPI-Net: from a graph to changes of objects, and of particles of cloths.
 
     Outputs: change of velocity (K, 3), of the motion of the rim by the spin (K, 3), and of the
-    displacement of every particle (P, 3), which counts for cloths; in units of the standard
+    displacement of every node (N, 3), which counts for cloths; in units of the standard
     deviation of changes of displacements.
     """
 

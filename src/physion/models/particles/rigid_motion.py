@@ -53,7 +53,8 @@ def vector_from_rotation(rotation: Tensor) -> Tensor:
     """Return rotation vectors (..., 3) of rotation matrices (..., 3, 3), angles in 0..pi.
 
     The angle t is atan2(|s|, (trace - 1) / 2) with s the axial vector of (R - R^T) / 2, whose
-    length is sin(t). Near pi the axis is not exact; a step does not rotate an object that far.
+    length is sin(t) and whose direction is the axis. Where sin(t) vanishes with t near pi, the axis
+    is the longest column of (R + I) / 2, which is the projection on it.
     """
     axial = torch.stack(
         [
@@ -68,7 +69,18 @@ def vector_from_rotation(rotation: Tensor) -> Tensor:
     cosine = (rotation.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
     angle = torch.atan2(length, cosine)
     factor = torch.where(length < 1e-5, torch.ones_like(length), angle / length)
-    return sine * factor[..., None]
+    vector = sine * factor[..., None]
+    halfway = (length < 1e-4) & (cosine < 0)
+    if bool(halfway.any()):
+        eye = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
+        columns = ((rotation[halfway] + eye) / 2).transpose(-1, -2)
+        rows = columns.pow(2).sum(-1).argmax(-1)
+        axis = columns[torch.arange(len(rows), device=rows.device), rows]
+        axis = axis / axis.norm(dim=-1, keepdim=True)
+        sign = torch.where((axis * sine[halfway]).sum(-1, keepdim=True) < 0, -1.0, 1.0)
+        vector = vector.clone()
+        vector[halfway] = sign * axis * angle[halfway][..., None]
+    return vector
 
 
 def sum_by(values: Tensor, group: Tensor, count: int) -> Tensor:
@@ -130,14 +142,13 @@ def fit_robust(
     owners: Tensor,
     count: int,
     tolerance: float,
-    generator: torch.Generator,
-    hypotheses: int = 16,
+    draws: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Fit a rigid motion to the particles of each object that agree with one another (RANSAC).
 
-    Every hypothesis is fitted to four random particles of each object; its inliers are the
-    particles that it puts within ``tolerance`` of where they are. The one with most inliers, among
-    them the fit to all particles, is fitted again to its inliers.
+    Every hypothesis is fitted to four particles of each object; its inliers are the particles that
+    it puts within ``tolerance`` of where they are. The one with most inliers, among them the fit to
+    all particles, is fitted again to its inliers.
 
     Parameters
     ----------
@@ -145,10 +156,9 @@ def fit_robust(
         As `fit_rigid`.
     tolerance : float
         Metres.
-    generator : torch.Generator
-        Of the random choice of particles, on the device of the points.
-    hypotheses : int
-        Number of random hypotheses.
+    draws : (hypotheses, 4)
+        Random numbers in 0..1 that choose the particles. They are the same for every object, so
+        that the fit of one does not depend on the others.
 
     Returns
     -------
@@ -165,8 +175,7 @@ def fit_robust(
 
     inliers = agree(rotation, shift)
     votes = sum_by(inliers.to(points.dtype), owners, count)
-    for _ in range(hypotheses):
-        draw = torch.rand(count, 4, generator=generator, device=points.device)
+    for draw in draws:
         rows = starts[:, None] + (draw * numbers[:, None]).long().clamp_max(
             (numbers - 1).clamp_min(0)[:, None]
         )

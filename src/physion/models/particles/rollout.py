@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from physion.models.particles.bodies import KINEMATIC, Poses, SceneParticles
+from physion.models.particles.bodies import KINEMATIC, RIGID, Poses, SceneParticles
 from physion.models.particles.layout import ObjectState, SceneLayout, join_poses, join_scenes
 from physion.models.particles.rigid_motion import rotation_from_vector
 
@@ -17,10 +17,10 @@ F64 = NDArray[np.float64]
 Step = Callable[[SceneLayout, ObjectState, ObjectState], ObjectState]
 """Function of the layout and the last two states that returns the next state."""
 
-REST = 2e-4
-"""Metres a step below which a particle counts as resting."""
-REST_STEPS = 8
-"""Steps after which a scene in which everything rests is over."""
+REST = 0.007
+"""Metres a second below which a particle counts as resting."""
+REST_TIME = 0.24
+"""Seconds after which a scene in which everything rests is over."""
 LIMIT = 10.0
 """Metres a step beyond which an object is lost, and its scene over."""
 
@@ -46,7 +46,7 @@ def disturbed_start(start: Start, spread: float, rng: np.random.Generator) -> St
         return start
     particles, poses = start.particles, start.poses
     count = len(particles.kinds)
-    free = (particles.kinds != KINEMATIC)[:, None]
+    free = (particles.kinds == RIGID)[:, None]
     squares = np.bincount(particles.owners, (particles.shape**2).sum(axis=1), count)
     size = np.sqrt(squares / np.bincount(particles.owners, minlength=count)).clip(1e-2)[:, None]
     centers, rotations, loose = (poses.centers.copy(), poses.rotations.copy(), poses.loose.copy())
@@ -57,8 +57,12 @@ def disturbed_start(start: Start, spread: float, rng: np.random.Generator) -> St
     return replace(start, poses=Poses(centers, rotations, loose))
 
 
-def roll_out(starts: Sequence[Start], step: Step, device: torch.device) -> list[Poses]:
+def roll_out(
+    starts: Sequence[Start], step: Step, device: torch.device, seconds: float
+) -> list[Poses]:
     """Return the imagined motion of every scene, from the step after its last known one.
+
+    ``seconds`` is the length of a step.
 
     A scene that is over is taken out of the graph when half of its fellows are over too.
     """
@@ -79,9 +83,9 @@ def roll_out(starts: Sequence[Start], step: Step, device: torch.device) -> list[
             before, now = now, _without(layout, now, after, lost) if lost.any() else after
             _record(layout, now, running, done, recorded)
             for place, row in enumerate(running):
-                quiet[row] = quiet[row] + 1 if moves[place] < REST else 0
-                over = len(recorded[row]) >= starts[row].steps or quiet[row] >= REST_STEPS
-                done[row] |= over
+                quiet[row] = quiet[row] + 1 if moves[place] < REST * seconds else 0
+                rests = quiet[row] * seconds > REST_TIME - seconds / 2
+                done[row] |= len(recorded[row]) >= starts[row].steps or rests
         running = [row for row in running if not done[row]]
     return [_join(records, start) for records, start in zip(recorded, starts, strict=True)]
 

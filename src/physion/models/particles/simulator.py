@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -40,8 +40,10 @@ from physion.models.particles.bodies import (
     Poses,
     SceneParticles,
     join_poses_in_time,
+    later_poses,
     particle_positions,
     poses_of,
+    put_by_events,
     scene_particles,
 )
 from physion.models.particles.config import ParticleConfig, ParticleOptions
@@ -55,13 +57,18 @@ from physion.models.particles.windows import Window, disturbed, read_window, rot
 from physion.models.threshold import best_threshold
 from physion.models.torch_model import TorchModel, digest_of
 from physion.physics.labels import label_contact
+from physion.scenes.scene import FRAME_TIME
 from physion.seeds import generator, stable_hash
 
-VERSION = 1
+VERSION = 2
 """To be raised with every change of what equal weights predict, or of the training."""
 UNIT, CHANGE = 0.06, 0.02
 """Metres a step: units of displacements, and of their changes. A body that falls for 0.03 s changes
 its displacement by 0.009 m, one that moves at 1 m/s moves 0.03 m."""
+_AT_ONCE = 32
+"""Scenes of one graph when the distances are fitted."""
+_HYPOTHESES = 16
+"""Random choices of particles in a robust fit."""
 _INLIER = 0.1
 """Distance in spacings within which a particle agrees with a rigid motion."""
 
@@ -126,6 +133,16 @@ class ParticleSimulator(TorchModel):
         parts = [VERSION, config, self.options.stride, self.options.spread, torch.__version__]
         return digest_of(parts, self.state_dict().items())
 
+    def built_as(self) -> dict[str, Any]:
+        """Return what the weights were made for: name, version, step, edges."""
+        options = self.options
+        return {
+            "model": self.name,
+            "version": VERSION,
+            "stride": options.stride,
+            "swept": options.swept,
+        }
+
     def prepare(self, sample: Batch) -> None:
         """Do nothing: the units do not depend on the clips.
 
@@ -136,10 +153,12 @@ class ParticleSimulator(TorchModel):
     def loss(self, batch: Batch) -> dict[str, Tensor]:
         """Return the loss of a batch of windows of three frames."""
         config = self.config
-        window = rotated(self._read(batch))
-        window = disturbed(
-            window, config.velocity_noise, config.relative_noise, config.position_noise
-        )
+        window = self._read(batch)
+        if self.training:
+            # A validation is without noise, as the loss of the trivial predictor is.
+            window = disturbed(
+                rotated(window), config.velocity_noise, config.relative_noise, config.position_noise
+            )
         layout = window.layout
         drift = drift_of(layout, window.before, window.now)
         graph = self._graph(layout, drift)
@@ -164,6 +183,8 @@ class ParticleSimulator(TorchModel):
         self.touch.zero_()
         motions, labels, cloth = [], [], []
         for motion in whole.state or ():
+            if len(motion.trajectory) <= LAST_OBSERVED:
+                continue
             label = label_contact(motion.scene, motion.trajectory)
             if not label.observed:
                 cut = cut_to_observed(motion.scene, motion.trajectory)
@@ -174,7 +195,8 @@ class ParticleSimulator(TorchModel):
                 cloth.append(max(things) >= len(motion.scene.bodies))
         if not motions:
             return
-        gaps = self._gaps(motions, self.futures(motions, 1, 0))[:, 0]
+        parts = [motions[row : row + _AT_ONCE] for row in range(0, len(motions), _AT_ONCE)]
+        gaps = np.concatenate([self.gaps(part, self.futures(part, 1, 0))[:, 0] for part in parts])
         touching, soft = np.array(labels), np.array(cloth)
         for row, which in enumerate((~soft, soft)):
             self.touch[row] = best_threshold(gaps[which], touching[which])
@@ -183,16 +205,17 @@ class ParticleSimulator(TorchModel):
     def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
         """Return the smallest gap (B, S) of agent and patient, less the fitted ``touch``.
 
-        It counts the observed part, steps that are imagined, and the time between steps. With the
-        knob ``show`` above 0, ``shown`` holds the imagined particles (B, S, F, P, 3) and the object
-        of each, ``things`` (B, P), its index in `Scene.names`; NaN and -1 where a trial has fewer
-        frames or particles than another. The frames are 44 + s, 44 + 2 s, ... with the stride s.
+        It counts steps that are imagined and the time between them; after an observed contact it is
+        0 at most. With the knob ``show`` above 0, ``shown`` holds the imagined particles
+        (B, S, F, P, 3) and the object of each, ``things`` (B, P), its index in `Scene.names`; NaN
+        and -1 where a trial has fewer frames or particles than another. The frames are 44 + s,
+        44 + 2 s, ... with the stride s.
         """
         if context.state is None:
             raise BadInputError("a particle model imagines from motions, which the batch lacks")
         futures = self.futures(context.state, samples, seed)
         shown = _shown(futures, self.spec.context) if knobs.get("show", 0) > 0 else {}
-        return Rollout(gap=self._gaps(context.state, futures), shown=shown)
+        return Rollout(gap=self.gaps(context.state, futures), shown=shown)
 
     @torch.no_grad()
     def futures(self, motions: Sequence[Motion], samples: int, seed: int) -> list[Futures]:
@@ -202,16 +225,18 @@ class ParticleSimulator(TorchModel):
         """
         stride = self.options.stride
         frames = range(LAST_OBSERVED % stride, LAST_OBSERVED + 1, stride)
+        observed: list[Start] = []
         starts: list[Start] = []
         for motion in motions:
             start = self._start(motion, frames)
+            observed += [start] * samples
             for sample in range(samples):
                 rng = generator("particle future", seed, motion.scene.name, sample)
-                spread = self.options.spread * 0.01 * stride if samples > 1 else 0.0
+                spread = self.options.spread * FRAME_TIME * stride if samples > 1 else 0.0
                 starts.append(disturbed_start(start, spread, rng))
         was_training = self.training
         self.eval()
-        known, imagined = self._roll_out(starts)
+        known, imagined = self._prepared(observed), self._roll_out(self._prepared(starts))
         self.train(was_training)
         joined = [
             (start.particles, join_poses_in_time(start.poses, later))
@@ -245,26 +270,44 @@ class ParticleSimulator(TorchModel):
         """Return what is known of a scene in the given frames, and how long it goes on."""
         scene = motion.scene
         own = scene_particles(scene, self.config.particles, scene.present(LAST_OBSERVED))
+        poses = poses_of(own, motion, frames)
+        # What was put somewhere between the last two steps did not move there.
+        put = np.isin(own.things, put_by_events(scene, frames[-2], frames[-1]))
+        poses.centers[-2, put], poses.rotations[-2, put] = (
+            poses.centers[-1, put],
+            poses.rotations[-1, put],
+        )
         limit = scene.ending.frame_limits()[1] - 1 - LAST_OBSERVED
-        return Start(own, poses_of(own, motion, frames), limit // self.options.stride)
+        return Start(own, poses, limit // self.options.stride)
 
-    def _roll_out(self, starts: Sequence[Start]) -> tuple[Sequence[Start], list[Poses]]:
-        """Return the starts, and what the model imagines to follow each."""
-        return starts, roll_out(starts, self.step, self.device)
+    def _prepared(self, starts: Sequence[Start]) -> Sequence[Start]:
+        """Return scenes in the form in which the network moves them."""
+        return starts
 
-    def _gaps(self, motions: Sequence[Motion], futures: Sequence[Futures]) -> F64:
-        """Return the smallest gaps (B, S) of agent and patient, less ``touch``."""
+    def _roll_out(self, starts: Sequence[Start]) -> list[Poses]:
+        """Return what the model imagines to follow each start."""
+        return roll_out(starts, self.step, self.device, FRAME_TIME * self.options.stride)
+
+    def gaps(self, motions: Sequence[Motion], futures: Sequence[Futures]) -> F64:
+        """Return the smallest gaps (B, S) of agent and patient, less ``touch``.
+
+        They count from frame 44 on; a contact that was observed, by the rule of the label, makes
+        them 0 at most.
+        """
         config = self.config
         touch = self.touch.cpu().numpy()
         gaps = np.zeros((len(motions), len(futures[0])))
         for row, (motion, own) in enumerate(zip(motions, futures, strict=True)):
             for column, (particles, poses) in enumerate(own):
+                later = later_poses(poses, self.spec.context - 1)
                 distance = smallest_distance(
-                    motion.scene, particles, poses, config.gap_spacing, config.gap_limit
+                    motion.scene, particles, later, config.gap_spacing, config.gap_limit
                 )
                 pair = [particles.agent, particles.patient]
                 soft = min(pair) >= 0 and CLOTH in particles.kinds[pair]
                 gaps[row, column] = distance - touch[int(soft)]
+            if label_contact(motion.scene, motion.trajectory).observed:
+                gaps[row] = np.minimum(gaps[row], 0.0)
         return gaps
 
     def _read(self, batch: Batch) -> Window:
@@ -298,10 +341,10 @@ class ParticleSimulator(TorchModel):
         """Return the rotations and centres of the rigid motions that fit the particles."""
         if self.config.rigid == "fit":
             return fit_rigid(layout.shape, goal, layout.owners, layout.objects)
-        rng = torch.Generator(goal.device).manual_seed(0)
+        draws = torch.rand(_HYPOTHESES, 4, generator=torch.Generator().manual_seed(0))
         tolerance = _INLIER * self.config.particles.spacing
         rotations, centers, _ = fit_robust(
-            layout.shape, goal, layout.owners, layout.objects, tolerance, rng
+            layout.shape, goal, layout.owners, layout.objects, tolerance, draws.to(goal.device)
         )
         return rotations, centers
 

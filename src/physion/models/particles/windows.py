@@ -11,7 +11,13 @@ from torch import Tensor
 
 from physion.errors import BadInputError
 from physion.models.batch import Batch
-from physion.models.particles.bodies import KINEMATIC, ParticleSettings, poses_of, scene_particles
+from physion.models.particles.bodies import (
+    RIGID,
+    ParticleSettings,
+    poses_of,
+    put_by_events,
+    scene_particles,
+)
 from physion.models.particles.graph import drift_of
 from physion.models.particles.layout import (
     ObjectState,
@@ -41,6 +47,7 @@ def read_window(batch: Batch, settings: ParticleSettings, device: torch.device) 
     particles, poses = [], []
     for motion, shown in zip(batch.state, frames, strict=True):
         present = np.all([motion.scene.present(int(frame)) for frame in shown], axis=0)
+        present[put_by_events(motion.scene, int(shown[0]), int(shown[-1]))] = False
         own = scene_particles(motion.scene, settings, present.tolist())
         particles.append(own)
         poses.append(poses_of(own, motion, shown))
@@ -82,7 +89,7 @@ def disturbed(
         a body or of a particle of a cloth, and metres. The first two are independent.
     """
     layout = window.layout
-    free = (layout.kinds != KINEMATIC).double()[:, None]
+    free = (layout.kinds == RIGID).double()[:, None]
 
     def shift_of(scale: Tensor, loose: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         angles = scale * torch.randn_like(window.now.centers) / layout.size[:, None]

@@ -145,14 +145,16 @@ class ReleasedSimulator(ParticleSimulator):
         steps = rollout_steps(scene) * 3 // self.options.stride
         return Start(own, poses_of(own, motion, frames), steps)
 
-    def _roll_out(self, starts: Sequence[Start]) -> tuple[Sequence[Start], list[Poses]]:
-        free = [_freed(start) for start in starts]
-        imagined: list[Poses] = []
-        for part in _parts(free, PARTICLES_AT_ONCE):
-            imagined += super()._roll_out(part)[1]
-        return free, imagined
+    def _prepared(self, starts: Sequence[Start]) -> Sequence[Start]:
+        return [_freed(start) for start in starts]
 
-    def _gaps(self, motions: Sequence[Motion], futures: Sequence[Futures]) -> NDArray[np.float64]:
+    def _roll_out(self, starts: Sequence[Start]) -> list[Poses]:
+        imagined: list[Poses] = []
+        for part in _parts(starts, PARTICLES_AT_ONCE):
+            imagined += super()._roll_out(part)
+        return imagined
+
+    def gaps(self, motions: Sequence[Motion], futures: Sequence[Futures]) -> NDArray[np.float64]:
         """Return the smallest distances (B, S) of particles, less the published distance."""
         return np.array(
             [

@@ -1,0 +1,148 @@
+"""What DPI-Net (small) learns in a minute: contacts and motion of Collide.
+
+Three seeds and more steps: `benchmarks/particles.py`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from sklearn.metrics import roc_auc_score
+
+from physion.compute.local import LocalExecutor
+from physion.models.batch import LAST_OBSERVED, Motion
+from physion.models.build import build_model
+from physion.models.observed import cut_to_observed
+from physion.models.particles.bodies import KINEMATIC, poses_of
+from physion.models.particles.simulator import ParticleSimulator
+from physion.physics.labels import label_contact
+from physion.seeds import generator
+from physion.training.sources.open_source import whole_source
+from physion.training.train import train_model
+from physion.trials.dataset import Dataset
+from physion.trials.making.generate import make_trials
+from physion.trials.making.plan import GenerateSettings, plan_dataset
+
+pytestmark = pytest.mark.slow
+
+STEPS = 2000
+HORIZON = 60
+"""Frames after the last observed one."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One training."""
+
+    folder: Path
+    seed: int
+    swept: bool
+
+
+@dataclass(frozen=True)
+class Result:
+    """Gaps of the tested trials, and mean errors of the model and of constant velocity, metres."""
+
+    gaps: NDArray[np.float64]
+    error: float
+    constant: float
+
+
+def learn(task: Task) -> Result:
+    """Train a model and imagine the tested trials."""
+    torch.set_num_threads(1)
+    dataset = Dataset(task.folder)
+    model = build_model("dpi", seed=task.seed, swept=task.swept)
+    assert isinstance(model, ParticleSimulator)
+    train_model(
+        model,
+        whole_source(dataset, model.spec),
+        dataset.trials("training"),
+        settings=dataclasses.replace(model.settings, steps=STEPS),
+        seed=task.seed,
+        name="all",
+        folder=None,
+        accelerator="cpu",
+    )
+    motions = [m for m, _ in tested(dataset)]
+    cut = [Motion(m.scene, cut_to_observed(m.scene, m.trajectory)) for m in motions]
+    futures = model.futures(cut, 1, 0)
+    gaps = model.gaps(cut, futures)[:, 0]
+    errors = []
+    for motion, ((particles, poses),) in zip(motions, futures, strict=True):
+        if len(motion.trajectory) <= LAST_OBSERVED + HORIZON:
+            continue
+        frames = [LAST_OBSERVED - 3, LAST_OBSERVED, LAST_OBSERVED + HORIZON]
+        before, now, true = poses_of(particles, motion, frames).centers
+        row = min(model.spec.context - 1 + HORIZON // 3, len(poses.centers) - 1)
+        straight = now + (now - before) * HORIZON / 3
+        apart = [np.linalg.norm(value - true, axis=-1) for value in (poses.centers[row], straight)]
+        errors.append([value[particles.kinds != KINEMATIC].mean() for value in apart])
+    error, constant = np.mean(errors, axis=0)
+    return Result(gaps, float(error), float(constant))
+
+
+def tested(dataset: Dataset) -> list[tuple[Motion, bool]]:
+    """Return the tested motions and whether agent and patient touch; none do while observed."""
+    files = [dataset.trial(trial) for trial in dataset.trials("testing")]
+    labels = [label_contact(file.scene, file.trajectory) for file in files]
+    assert not any(label.observed for label in labels)
+    return [
+        (Motion(file.scene, file.trajectory), label.contact)
+        for file, label in zip(files, labels, strict=True)
+    ]
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    folder = tmp_path_factory.mktemp("learning") / "data"
+    tasks = plan_dataset("physion", ("collide",), {"training": 300, "testing": 300})
+    settings = GenerateSettings(movies=False, jitters=0, min_visible=0.0)
+    assert not make_trials(folder, tasks, settings, executor=LocalExecutor(workers=2)).failed
+    return Dataset(folder)
+
+
+@pytest.fixture(scope="module")
+def results(dataset: Dataset) -> dict[bool, Result]:
+    tasks = {f"swept={swept}": Task(dataset.folder, 0, swept) for swept in (True, False)}
+    done = {outcome.key: outcome for outcome in LocalExecutor(workers=2).map(learn, tasks)}
+    assert not any(outcome.error for outcome in done.values())
+    return {task.swept: done[key].value for key, task in tasks.items()}
+
+
+@pytest.fixture(scope="module")
+def contacts(dataset: Dataset) -> NDArray[np.bool_]:
+    return np.array([contact for _, contact in tested(dataset)])
+
+
+def auc(result: Result, contacts: NDArray[np.bool_]) -> float:
+    return float(roc_auc_score(contacts, -result.gaps))
+
+
+def test_contacts_are_told_from_misses(
+    results: dict[bool, Result], contacts: NDArray[np.bool_]
+) -> None:
+    """The standard error of an AUC of .9 from 300 trials is .02; that of chance is .5."""
+    assert min(auc(result, contacts) for result in results.values()) >= 0.85
+
+
+def test_objects_are_nearer_to_the_truth_than_with_constant_velocity(
+    results: dict[bool, Result],
+) -> None:
+    for result in results.values():
+        assert result.error <= 0.30 * result.constant
+
+
+def test_permuted_labels_are_not_predicted(
+    results: dict[bool, Result], contacts: NDArray[np.bool_]
+) -> None:
+    """For n/2 contacts, the AUC of chance has the variance (n + 1) / (3 n^2)."""
+    n = len(contacts)
+    order = generator("permuted labels", 0).permutation(n)
+    assert abs(auc(results[True], contacts[order]) - 0.5) < 3 * np.sqrt((n + 1) / (3 * n * n))
