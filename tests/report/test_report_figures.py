@@ -220,6 +220,21 @@ def test_one_condition_alone_makes_no_figure(make_comparison: Maker) -> None:
     assert names == {"accuracy", "r", "scatter", "thirds", "calibration", "difficulty"}
 
 
+def test_a_figure_without_a_value_is_left_out(
+    make_comparison: Maker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The correlation of a model that always answers alike is undefined."""
+    inputs = ReportInputs(make_comparison())
+    assert "r" in {plot.name for plot in make_plots(inputs)}
+    table = figure_tables.r_table
+
+    def empty(*given: object) -> pd.DataFrame:
+        return table(*given)[:0]  # type: ignore[arg-type]
+
+    monkeypatch.setattr(figure_tables, "r_table", empty)
+    assert "r" not in {plot.name for plot in make_plots(inputs)}
+
+
 def test_generalization_is_relative_to_people(make_comparison: Maker) -> None:
     comparison, predictions = trained(make_comparison, ["all", "collision"])
     table = figure_tables.generalization_table(comparison, predictions)

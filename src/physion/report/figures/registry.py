@@ -67,6 +67,6 @@ def all_figures() -> list[FigureEntry]:
 
 
 def make_plots(inputs: ReportInputs) -> list[Plot]:
-    """Return the figures that these inputs permit, in order."""
+    """Return the figures that these inputs permit, in order; one without a value is left out."""
     made = [entry.make(inputs) for entry in all_figures()]
-    return [plot for plot in made if plot is not None]
+    return [plot for plot in made if plot is not None and len(plot.table)]
