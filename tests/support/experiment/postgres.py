@@ -42,11 +42,13 @@ class Cluster:
     def start(self) -> None:
         """Start the server and wait until it accepts connections."""
         options = f"-p {self.port} -c listen_addresses=127.0.0.1 -k {self._folder}"
-        self._run("pg_ctl", "start", "-w", "-l", str(self._folder / "log"), "-o", options)
+        self._run(
+            "pg_ctl", "start", "-w", "-t", "300", "-l", str(self._folder / "log"), "-o", options
+        )
 
     def stop(self, mode: str = "fast") -> None:
         """Stop the server; mode ``immediate`` acts like a crash."""
-        self._run("pg_ctl", "stop", "-w", "-m", mode)
+        self._run("pg_ctl", "stop", "-w", "-t", "300", "-m", mode)
 
     def _run(self, program: str, *words: str) -> None:
         command = [str(self._programs / program), "-D", str(self._folder / "data"), *words]
@@ -54,7 +56,7 @@ class Cluster:
             command = ["runuser", "-u", USER, "--", *command]
         done = subprocess.run(
             command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-            cwd=self._folder, check=False, timeout=120,
+            cwd=self._folder, check=False, timeout=330,
         )  # fmt: skip
         if done.returncode:
             raise RuntimeError(f"{program}: {done.stdout.decode(errors='replace')[-2000:]}")
