@@ -15,7 +15,6 @@ from physion.models.batch import Batch, Rollout
 from physion.models.build import build_model
 from physion.models.interface import Encodes, HasReader, Imagines, Learns, Model, Trained
 from physion.readout.model_calls import call_model, check_identity, is_network, model_name, to_array
-from physion.readout.readers.touch import probability_of
 from physion.readout.rollouts import Outcomes
 from physion.report.viewer.imagined import SHOWABLE, Imagine, ImaginedTrial
 from physion.training.sources.open_source import observed_source

@@ -18,7 +18,7 @@ from physion.models.checkpoints.checkpoint import (
 )
 
 FOLDER = "shipped"
-"""Folder of the shipped weights, beside this module."""
+"""Name of the folder with the weights that are installed with the package."""
 BUILT_AS = "built_as"
 """Metadata of weights: what the method of this name said of the model that was trained."""
 DIGESTS = "sha256.json"

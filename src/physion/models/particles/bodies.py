@@ -101,6 +101,13 @@ class SceneParticles:
     patient: int
 
     @property
+    def sizes(self) -> F64:
+        """Root mean square (K,) of the offsets of an object's particles, metres; at least 1 mm."""
+        count = len(self.kinds)
+        squares = np.bincount(self.owners, (self.shape**2).sum(axis=1), count)
+        return np.maximum(np.sqrt(squares / np.bincount(self.owners, minlength=count)), 1e-3)
+
+    @property
     def loose(self) -> NDArray[np.bool_]:
         """Which particles (P,) move on their own: those of cloths and free bodies."""
         return np.asarray(self.kinds[self.owners] >= CLOTH)

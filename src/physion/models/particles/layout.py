@@ -90,8 +90,6 @@ def join_scenes(scenes: Sequence[SceneParticles], device: torch.device) -> Scene
     kinds = np.concatenate([scene.kinds for scene in scenes])
     links = [scene.links + start for scene, start in zip(scenes, ends[:-1], strict=True)]
     total = len(kinds)
-    squares = np.bincount(owners, (shape**2).sum(axis=1), total)
-    sizes = np.sqrt(squares / np.bincount(owners, minlength=total))
 
     def tensor(values: NDArray[np.generic]) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(values)).to(device)
@@ -106,7 +104,7 @@ def join_scenes(scenes: Sequence[SceneParticles], device: torch.device) -> Scene
         loose=tensor(np.flatnonzero(kinds[owners] >= CLOTH)),
         links=tensor(np.concatenate(links, axis=1)),
         floor=tensor(np.repeat([scene.floor for scene in scenes], objects)),
-        size=tensor(np.maximum(sizes, 1e-3)),
+        size=tensor(np.concatenate([scene.sizes for scene in scenes])),
         starts=np.searchsorted(owners, np.arange(total + 1)).astype(np.int64),
         scene_array=scene_array,
         moves=kinds != KINEMATIC,

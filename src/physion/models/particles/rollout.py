@@ -47,11 +47,11 @@ def disturbed_start(start: Start, spread: float, rng: np.random.Generator) -> St
     particles, poses = start.particles, start.poses
     count = len(particles.kinds)
     free = (particles.kinds == RIGID)[:, None]
-    squares = np.bincount(particles.owners, (particles.shape**2).sum(axis=1), count)
-    size = np.sqrt(squares / np.bincount(particles.owners, minlength=count)).clip(1e-2)[:, None]
     centers, rotations, loose = (poses.centers.copy(), poses.rotations.copy(), poses.loose.copy())
     centers[-2] += spread * rng.normal(size=(count, 3)) * free
-    angles = torch.from_numpy(spread * rng.normal(size=(count, 3)) * free / size)
+    angles = torch.from_numpy(
+        spread * rng.normal(size=(count, 3)) * free / particles.sizes[:, None]
+    )
     rotations[-2] = rotation_from_vector(angles).numpy() @ rotations[-2]
     loose[-2] += spread * rng.normal(size=loose[-2].shape)
     return replace(start, poses=Poses(centers, rotations, loose))

@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from physion.errors import BadInputError
+from physion.models.anchors.smallest_gap import FAR
 from physion.models.batch import LAST_OBSERVED, Batch, Motion, Provenance, Rollout, Spec
 from physion.models.interface import Diet
 from physion.models.observed import cut_to_observed
@@ -169,7 +170,7 @@ class ParticleSimulator(TorchModel):
         return {"loss": self._error(window, predicted)}
 
     def baseline(self, batch: Batch) -> Tensor:
-        """Return the loss if everything goes on as it moved."""
+        """Return the loss of a prediction in which every object keeps its velocity."""
         window = self._read(batch)
         drift = drift_of(window.layout, window.before, window.now)
         return self._error(window, drift.positions + drift.moves)
@@ -205,8 +206,8 @@ class ParticleSimulator(TorchModel):
     def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
         """Return the smallest gap (B, S) of agent and patient, less the fitted ``touch``.
 
-        It counts steps that are imagined and the time between them; after an observed contact it is
-        0 at most. With the knob ``show`` above 0, ``shown`` holds the imagined particles
+        It counts steps that are imagined and the time between them; see `gaps` for a contact that
+        was observed. With the knob ``show`` above 0, ``shown`` holds the imagined particles
         (B, S, F, P, 3) and the object of each, ``things`` (B, P), its index in `Scene.names`; NaN
         and -1 where a trial has fewer frames or particles than another. The frames are 44 + s,
         44 + 2 s, ... with the stride s.
@@ -267,7 +268,7 @@ class ParticleSimulator(TorchModel):
         return kind(config.width, config.rounds)
 
     def _start(self, motion: Motion, frames: range) -> Start:
-        """Return what is known of a scene in the given frames, and how long it goes on."""
+        """Return the observed motion of a scene in these frames, and the steps to its end."""
         scene = motion.scene
         own = scene_particles(scene, self.config.particles, scene.present(LAST_OBSERVED))
         poses = poses_of(own, motion, frames)
@@ -291,8 +292,8 @@ class ParticleSimulator(TorchModel):
     def gaps(self, motions: Sequence[Motion], futures: Sequence[Futures]) -> F64:
         """Return the smallest gaps (B, S) of agent and patient, less ``touch``.
 
-        They count from frame 44 on; a contact that was observed, by the rule of the label, makes
-        them 0 at most.
+        They count from frame 44 on. After a contact that was observed, by the rule of the label,
+        they are -`FAR`, below every threshold that a reader can fit.
         """
         config = self.config
         touch = self.touch.cpu().numpy()
@@ -307,7 +308,7 @@ class ParticleSimulator(TorchModel):
                 soft = min(pair) >= 0 and CLOTH in particles.kinds[pair]
                 gaps[row, column] = distance - touch[int(soft)]
             if label_contact(motion.scene, motion.trajectory).observed:
-                gaps[row] = np.minimum(gaps[row], 0.0)
+                gaps[row] = -FAR
         return gaps
 
     def _read(self, batch: Batch) -> Window:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from physion.errors import BadInputError
 from physion.models.threshold import best_threshold
 from physion.readout.logistic import ReadoutConfig
-from physion.readout.readers.reader import Reading
+from physion.readout.readers.reader import Reading, fraction_of_futures
 from physion.readout.rollouts import Knobs, Outcomes
 
 
@@ -20,8 +20,8 @@ from physion.readout.rollouts import Knobs, Outcomes
 class GapReader:
     """Threshold on the gap, in metres, that is right for most of the fit trials.
 
-    P(contact) of n samples, k of them with a gap of at most the threshold, is (k + 1/2) / (n + 1)
-    for n > 1 and k for one sample. Thresholds that are right equally often leave the one that is
+    P(contact) is that of `fraction_of_futures`, where a gap of at most the threshold is a contact.
+    Thresholds that are right equally often leave the one that is
     closest to 0; without fit trials it is 0.
     """
 
@@ -44,14 +44,10 @@ class GapReader:
                 "use the reader 'noise'"
             )
         threshold = best_threshold(np.median(near, axis=1), labels)
-        predicted = _probability(near, threshold) > 0.5
+        predicted = fraction_of_futures(near <= threshold) > 0.5
         accuracy = float(np.mean(predicted == labels)) if len(labels) else float("nan")
         return Reading(
-            _probability(tested, threshold), accuracy, fitted={**dict(knobs), "gap": threshold}
+            fraction_of_futures(tested <= threshold),
+            accuracy,
+            fitted={**dict(knobs), "gap": threshold},
         )
-
-
-def _probability(gaps: NDArray[np.float64], threshold: float) -> NDArray[np.float64]:
-    samples = gaps.shape[1]
-    near: NDArray[np.float64] = (gaps <= threshold).sum(axis=1).astype(np.float64)
-    return near if samples == 1 else (near + 0.5) / (samples + 1)

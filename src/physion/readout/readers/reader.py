@@ -34,6 +34,16 @@ class Reading:
     note: str = ""
 
 
+def fraction_of_futures(touches: Booleans) -> NDArray[np.float64]:
+    """Return P(contact) (m,) from contacts (m, S) in S futures.
+
+    With k contacts it is (k + 1/2) / (S + 1), so that it is never 0 or 1; for one future it is k.
+    """
+    samples = touches.shape[1]
+    count: NDArray[np.float64] = touches.sum(axis=1).astype(np.float64)
+    return count if samples == 1 else (count + 0.5) / (samples + 1)
+
+
 class FeatureReader(Protocol):
     """Reader of features.
 

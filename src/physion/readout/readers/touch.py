@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physion.readout.logistic import ReadoutConfig
-from physion.readout.readers.reader import Reading
+from physion.readout.readers.reader import Reading, fraction_of_futures
 from physion.readout.rollouts import Knobs, Outcomes
 
 
 @dataclass(frozen=True)
 class TouchReader:
-    """Fraction of futures with a contact, or a gap of at most 0. Nothing is fitted.
+    """Fraction of futures with a contact, or a gap of at most 0 (`fraction_of_futures`).
 
-    For n > 1 futures, k of them with a contact, it is (k + 1/2) / (n + 1); for one it is k.
+    Nothing is fitted.
     """
 
     config: ReadoutConfig = field(default_factory=ReadoutConfig)
@@ -33,13 +33,7 @@ class TouchReader:
     ) -> Reading:
         """Read the futures of the tested trials; the fit trials give the accuracy alone."""
         (knobs,) = test
-        known = probability_of(fit[knobs]) > 0.5
+        known = fraction_of_futures(fit[knobs].touches()) > 0.5
         accuracy = float(np.mean(known == labels)) if len(labels) else float("nan")
-        return Reading(probability_of(test[knobs]), accuracy, fitted=dict(knobs))
-
-
-def probability_of(outcomes: Outcomes) -> NDArray[np.float64]:
-    """Return P(contact) of every trial from its futures."""
-    samples = outcomes.samples
-    count: NDArray[np.float64] = outcomes.touches().sum(axis=1).astype(np.float64)
-    return count if samples == 1 else (count + 0.5) / (samples + 1)
+        probability = fraction_of_futures(test[knobs].touches())
+        return Reading(probability, accuracy, fitted=dict(knobs))
