@@ -15,6 +15,7 @@ from physion.models.batch import Batch, Rollout
 from physion.models.build import build_model
 from physion.models.interface import Encodes, HasReader, Imagines, Learns, Model, Trained
 from physion.readout.model_calls import call_model, check_identity, is_network, model_name, to_array
+from physion.readout.readers.reader import fraction_of_futures
 from physion.readout.rollouts import Outcomes
 from physion.report.viewer.imagined import SHOWABLE, Imagine, ImaginedTrial
 from physion.training.sources.open_source import observed_source
@@ -177,5 +178,5 @@ def _outcomes(model: Model, rollout: Rollout, clips: int, samples: int) -> tuple
         )
     )
     known = gap is not None or contact is not None
-    probability = probability_of(Outcomes(contact, gap)) if known else unknown
+    probability = fraction_of_futures(Outcomes(contact, gap).touches()) if known else unknown
     return probability, unknown if gap is None else gap[:, 0]
