@@ -30,6 +30,7 @@ from physion.models.build import make_config
 from physion.models.interface import Diet
 from physion.models.settings import TrainingSettings
 from physion.models.torch_model import digest_of
+from physion.models.vision.pictures import normalized_pictures
 from physion.models.weights import (
     GRID,
     IMAGENET,
@@ -159,20 +160,9 @@ class FrozenEncoder(nn.Module):
     @torch.no_grad()
     def encode(self, batch: Batch) -> Tensor:
         """Return features (B, T, D) of the pictures of a batch, on their device."""
-        frames = batch.rgb
-        size = self.spec.image_size
-        if frames is None or tuple(frames.shape[2:]) != (size, size, 3):
-            found = "none" if frames is None else tuple(frames.shape)
-            raise BadInputError(
-                f"{self.name()}: pictures must be uint8 (batch, time, {size}, {size}, 3), "
-                f"not {found}"
-            )
-        encoder = self._encoder_on(frames.device)
-        mean = torch.tensor(self.spec.mean, device=frames.device).view(3, 1, 1)
-        std = torch.tensor(self.spec.std, device=frames.device).view(3, 1, 1)
-        flat = frames.flatten(0, 1).permute(0, 3, 1, 2).float() / 255
-        features: Tensor = encoder((flat - mean) / std)
-        return features.float().view(frames.shape[0], frames.shape[1], -1)
+        pictures = normalized_pictures(batch, self.spec, self.name())
+        features: Tensor = self._encoder_on(pictures.device)(pictures.flatten(0, 1))
+        return features.float().view(*pictures.shape[:2], -1)
 
     def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
         """Roll the dynamics out from ``context.features`` (B, c, D).

@@ -6,6 +6,7 @@ import hashlib
 import json
 from importlib.resources import as_file, files
 from pathlib import Path
+from typing import Any
 
 from torch import nn
 
@@ -17,6 +18,8 @@ from physion.models.checkpoints.checkpoint import (
     read_checkpoint,
 )
 
+RANDOM, SHIPPED = "random", "shipped"
+"""Names of weights that are no path of a file: those to be trained, and those of the package."""
 FOLDER = "shipped"
 """Name of the folder with the weights that are installed with the package."""
 BUILT_AS = "built_as"
@@ -29,6 +32,30 @@ def shipped_digests() -> dict[str, str]:
     """Return the SHA-256 of the shipped weights by model."""
     text = (files(__package__) / FOLDER / DIGESTS).read_text()
     return {str(name): str(value) for name, value in json.loads(text).items()}
+
+
+def load_named(model: Any, weights: str) -> None:
+    """Load weights into a model by their name, and set its ``init`` and ``trained``.
+
+    Parameters
+    ----------
+    model
+        Torch ``Module`` with a ``name`` and its initial weights.
+    weights
+        `RANDOM`, which leaves the model as it is; `SHIPPED`; or the path of a file.
+
+    Raises
+    ------
+    BadInputError
+        As `load_shipped` and `load_file`.
+    """
+    if weights == RANDOM:
+        return
+    if weights == SHIPPED:
+        model.init = load_shipped(model, model.name)
+    else:
+        model.init = load_file(model, weights)
+    model.trained = True
 
 
 def load_shipped(model: nn.Module, name: str) -> str:

@@ -8,8 +8,8 @@ from typing import Any, Literal
 
 from physion.errors import BadInputError
 from physion.models.build import make_config
-from physion.models.checkpoints.trained import load_file, load_shipped
-from physion.models.particles.config import RANDOM, SHIPPED, ParticleOptions, own_config
+from physion.models.checkpoints.trained import SHIPPED, load_named
+from physion.models.particles.config import ParticleOptions, own_config
 from physion.models.particles.released.config import released_config
 from physion.models.particles.released.simulator import ReleasedSimulator
 from physion.models.particles.simulator import ParticleSimulator
@@ -50,16 +50,11 @@ def _build(
 def _weighted(model: ParticleSimulator) -> ParticleSimulator:
     """Return a model with the weights that its options name."""
     options = model.options
-    if options.weights == RANDOM:
-        return model
-    if options.weights == SHIPPED:
-        if options.size != "small" or not options.swept or options.stride != 3:
-            raise BadInputError(
-                "weights of particle models are shipped for size=small, swept=true and stride=3; "
-                "train others with physion train"
-            )
-        model.init = load_shipped(model, model.name)
-    else:
-        model.init = load_file(model, options.weights)
-    model.trained = True
+    own = options.size == "small" and options.swept and options.stride == 3
+    if options.weights == SHIPPED and not own:
+        raise BadInputError(
+            "weights of particle models are shipped for size=small, swept=true and stride=3; "
+            "train others with physion train"
+        )
+    load_named(model, options.weights)
     return model

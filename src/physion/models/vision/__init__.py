@@ -1,0 +1,1 @@
+"""What the vision models that are trained from pictures have in common."""
