@@ -59,10 +59,15 @@ class ParticleConfig:
     - ``radius``: metres within which particles of different objects are neighbours; with ``swept``
       also those that come so close during a step.
     - ``rigid``: how GNS keeps bodies rigid: ``fit`` to all particles, or ``robust`` (RANSAC).
-    - ``velocity_noise``, ``relative_noise``, ``position_noise``: metres a step, fraction of the
-      speed, and metres; standard deviations of the noise in training, drawn for every rigid body
-      and for every particle of a cloth. Noise that is large beside a slow motion teaches that it
-      stops.
+    - ``velocity_noise``, ``relative_noise``: metres a step, and fraction of the speed; standard
+      deviations of the noise in training, drawn for every rigid body and for every particle of a
+      cloth. Noise that is large beside a slow motion teaches that it stops.
+    - ``pushforward``: steps that follow the first one in training. They start from what the network
+      predicted, without gradient, so that it learns to correct its own errors (Brandstetter et al.
+      2022, section 3.1).
+    - ``rest``: metres a step; in a rollout a body whose centre and rim would move less together
+      stays where it is, as bodies sleep in physics engines. Otherwise small errors, which add up as
+      a velocity, tip what stands.
     - ``knee``: errors of an object count squared up to this many units (``simulator.CHANGE``), and
       linearly beyond.
     - ``gap_spacing``, ``gap_limit``: of the particles by which distances are measured.
@@ -78,7 +83,8 @@ class ParticleConfig:
     rigid: Literal["fit", "robust"] = "fit"
     velocity_noise: float = 3e-4
     relative_noise: float = 0.02
-    position_noise: float = 0.0
+    pushforward: int = 1
+    rest: float = 3e-4
     knee: float = 1.0
     gap_spacing: float = 0.04
     gap_limit: int = 300

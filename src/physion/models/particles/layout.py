@@ -77,6 +77,10 @@ class ObjectState:
         rotated = (self.rotations[layout.owners] @ layout.shape[..., None])[..., 0]
         return (self.centers[layout.owners] + rotated).index_copy(0, layout.loose, self.loose)
 
+    def detached(self) -> ObjectState:
+        """Return this state without gradient."""
+        return ObjectState(self.centers.detach(), self.rotations.detach(), self.loose.detach())
+
 
 def join_scenes(scenes: Sequence[SceneParticles], device: torch.device) -> SceneLayout:
     """Return the layout of several scenes."""

@@ -38,6 +38,7 @@ from physion.models.observed import cut_to_observed
 from physion.models.particles.bodies import (
     CLOTH,
     KINEMATIC,
+    RIGID,
     Poses,
     SceneParticles,
     join_poses_in_time,
@@ -52,7 +53,12 @@ from physion.models.particles.gap import smallest_distance
 from physion.models.particles.graph import Drift, Graph, drift_of, make_graph, move, move_loose
 from physion.models.particles.layout import ObjectState, SceneLayout
 from physion.models.particles.networks import MessageNetwork, ObjectNetwork
-from physion.models.particles.rigid_motion import fit_rigid, fit_robust, mean_by
+from physion.models.particles.rigid_motion import (
+    fit_rigid,
+    fit_robust,
+    mean_by,
+    vector_from_rotation,
+)
 from physion.models.particles.rollout import Start, disturbed_start, roll_out
 from physion.models.particles.windows import Window, disturbed, read_window, rotated
 from physion.models.threshold import best_threshold
@@ -61,7 +67,7 @@ from physion.physics.labels import label_contact
 from physion.scenes.scene import FRAME_TIME
 from physion.seeds import generator, stable_hash
 
-VERSION = 2
+VERSION = 3
 """To be raised with every change of what equal weights predict, or of the training."""
 UNIT, CHANGE = 0.06, 0.02
 """Metres a step: units of displacements, and of their changes. A body that falls for 0.03 s changes
@@ -86,7 +92,6 @@ class ParticleSimulator(TorchModel):
     """
 
     diet: Diet = "states"
-    window = 3
     calibration_trials = 256
     touch: Tensor
 
@@ -95,6 +100,7 @@ class ParticleSimulator(TorchModel):
         self.config, self.options = config, options
         self.name = f"{name}-{options.size}"
         self.settings = config.training
+        self.window = 3 + config.pushforward
         self.trained = False
         self.samples, self.seed = options.samples, options.seed
         self.knobs: Mapping[str, tuple[float, ...]] = {}
@@ -152,28 +158,23 @@ class ParticleSimulator(TorchModel):
         """
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
-        """Return the loss of a batch of windows of three frames."""
+        """Return the loss of a batch of windows, the mean over the steps that are predicted.
+
+        All steps but the first start from what the network predicted, without gradient.
+        """
         config = self.config
         window = self._read(batch)
-        if self.training:
+        if not self.training:
             # A validation is without noise, as the loss of the trivial predictor is.
-            window = disturbed(
-                rotated(window), config.velocity_noise, config.relative_noise, config.position_noise
-            )
-        layout = window.layout
-        drift = drift_of(layout, window.before, window.now)
-        graph = self._graph(layout, drift)
-        if isinstance(self.network, MessageNetwork):
-            predicted = drift.positions + drift.moves + self._changes(graph)
-        else:
-            predicted = self._move_objects(layout, window.now, drift, graph).positions(layout)
-        return {"loss": self._error(window, predicted)}
+            return {"loss": self._loss(window, window.later[:1])}
+        window = disturbed(rotated(window), config.velocity_noise, config.relative_noise)
+        return {"loss": self._loss(window, window.later)}
 
     def baseline(self, batch: Batch) -> Tensor:
         """Return the loss of a prediction in which every object keeps its velocity."""
         window = self._read(batch)
         drift = drift_of(window.layout, window.before, window.now)
-        return self._error(window, drift.positions + drift.moves)
+        return self._error(window.layout, window.later[0], drift.positions + drift.moves)
 
     @torch.no_grad()
     def calibrate(self, whole: Batch) -> None:
@@ -248,19 +249,53 @@ class ParticleSimulator(TorchModel):
     def step(self, layout: SceneLayout, before: ObjectState, now: ObjectState) -> ObjectState:
         """Return the state after the next step."""
         drift = drift_of(layout, before, now)
+        _, after = self._predict_next(layout, now, drift, robust=self.config.rigid == "robust")
+        return self._rested(layout, now, after)
+
+    def _loss(self, window: Window, later: Sequence[ObjectState]) -> Tensor:
+        layout, before, now = window.layout, window.before, window.now
+        total = torch.zeros((), device=layout.shape.device)
+        for target in later:
+            drift = drift_of(layout, before, now)
+            # The fit to all particles: GNS and GNS-RANSAC are trained alike.
+            predicted, after = self._predict_next(layout, now, drift, robust=False)
+            total = total + self._error(layout, target, predicted)
+            before, now = now, self._rested(layout, now, after.detached())
+        return total / len(later)
+
+    def _predict_next(
+        self, layout: SceneLayout, now: ObjectState, drift: Drift, *, robust: bool
+    ) -> tuple[Tensor, ObjectState]:
+        """Return the next positions of particles (P, 3), and the state in which bodies are rigid.
+
+        The state of GNS has no gradient.
+        """
         graph = self._graph(layout, drift)
         if not isinstance(self.network, MessageNetwork):
-            return self._move_objects(layout, now, drift, graph)
+            state = self._move_objects(layout, now, drift, graph)
+            return state.positions(layout), state
         changes = self._changes(graph)
         goal = drift.positions + drift.moves + changes
-        rotations, centers = self._fit(layout, goal)
-        rigid = (layout.kinds != KINEMATIC) & (layout.kinds != CLOTH)
-        state = ObjectState(
-            torch.where(rigid[:, None], centers, now.centers),
-            torch.where(rigid[:, None, None], rotations, now.rotations),
-            now.loose,
+        with torch.no_grad():
+            rotations, centers = self._fit(layout, goal, robust=robust)
+            rigid = layout.kinds == RIGID
+            state = ObjectState(
+                torch.where(rigid[:, None], centers, now.centers),
+                torch.where(rigid[:, None, None], rotations, now.rotations),
+                now.loose,
+            )
+            return goal, move_loose(layout, state, drift, changes[layout.loose])
+
+    def _rested(self, layout: SceneLayout, now: ObjectState, after: ObjectState) -> ObjectState:
+        """Return the next state, but bodies that hardly move stay where they are."""
+        turn = vector_from_rotation(after.rotations @ now.rotations.transpose(-1, -2))
+        moved = (after.centers - now.centers).norm(dim=-1) + turn.norm(dim=-1) * layout.size
+        rests = ((layout.kinds == RIGID) & (moved < self.config.rest))[:, None]
+        return ObjectState(
+            torch.where(rests, now.centers, after.centers),
+            torch.where(rests[:, None], now.rotations, after.rotations),
+            after.loose,
         )
-        return move_loose(layout, state, drift, changes[layout.loose])
 
     def _make_network(self) -> nn.Module:
         config = self.config
@@ -338,9 +373,9 @@ class ParticleSimulator(TorchModel):
         loose = self._of_particles(graph, changes)[layout.loose]
         return move_loose(layout, state, drift, loose)
 
-    def _fit(self, layout: SceneLayout, goal: Tensor) -> tuple[Tensor, Tensor]:
+    def _fit(self, layout: SceneLayout, goal: Tensor, *, robust: bool) -> tuple[Tensor, Tensor]:
         """Return the rotations and centres of the rigid motions that fit the particles."""
-        if self.config.rigid == "fit":
+        if not robust:
             return fit_rigid(layout.shape, goal, layout.owners, layout.objects)
         draws = torch.rand(_HYPOTHESES, 4, generator=torch.Generator().manual_seed(0))
         tolerance = _INLIER * self.config.particles.spacing
@@ -349,10 +384,8 @@ class ParticleSimulator(TorchModel):
         )
         return rotations, centers
 
-    def _error(self, window: Window, predicted: Tensor) -> Tensor:
-        layout = window.layout
-        target = window.after.positions(layout)
-        squares = ((predicted - target) / CHANGE).pow(2).sum(-1)
+    def _error(self, layout: SceneLayout, target: ObjectState, predicted: Tensor) -> Tensor:
+        squares = ((predicted - target.positions(layout)) / CHANGE).pow(2).sum(-1)
         errors = _softened(mean_by(squares, layout.owners, layout.objects), self.config.knee)
         free = (layout.kinds != KINEMATIC).double()
         return ((errors * free).sum() / free.sum().clamp_min(1)).float()

@@ -73,7 +73,7 @@ def released_config(
         radius=RADIUS,
         swept=False,
         velocity_noise=NOISE,
-        position_noise=0.0,
+        pushforward=0,
         training=_TRAINING,
         keep_rigid=keep_rigid,
     )

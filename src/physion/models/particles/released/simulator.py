@@ -169,7 +169,7 @@ class ReleasedSimulator(ParticleSimulator):
         layout = window.layout
         first, second, third = (
             _published(layout, state.positions(layout))
-            for state in (window.before, window.now, window.after)
+            for state in (window.before, window.now, window.later[0])
         )
         return layout, first, (second - first) / self.seconds, (third - second) / self.seconds
 
