@@ -1,0 +1,219 @@
+"""OP3: K slots that explain a picture together, and that predict how they go on.
+
+The steps of `op3.inference` follow a schedule: the slots of the first frame are refined
+``seed_steps`` times; those of each later frame that is seen are predicted, then refined once; those
+of the frames after them are only predicted. With the objective O_i after step i = 1, 2, ..., for
+the picture of its frame,
+
+    loss = sum_i i O_i / sum_i i / pixels
+
+Features are the states of all slots, with the means of their random part: after the refinement for
+frames that are seen, after the prediction for imagined ones. When features are computed, the slots
+of all trials start from the same random numbers, so that a slot tends to hold the same thing.
+
+Source: Veerapaneni et al. 2020, "Entity Abstraction in Visual Model-Based Reinforcement Learning";
+docs/vision-models.md says in what the sizes differ from the published code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from physion.models.batch import Batch, Provenance, Rollout, Spec
+from physion.models.op3.config import Op3Config, Op3Options
+from physion.models.op3.inference import Explained, SlotInference, Slots
+from physion.models.op3.pixels import Decoded
+from physion.models.vision.clips import context_pictures, window_pictures
+from physion.models.vision.model import VisionModel
+from physion.models.vision.moving import copy_error, future_error
+from physion.models.vision.pictures import normalized_pictures
+from physion.seeds import generator, stable_hash
+
+NAME = "op3"
+VERSION = 1
+"""To be raised with every change of what equal weights compute, or of the training."""
+
+Noise = Callable[[], Tensor]
+"""Function that gives standard normal numbers (B, K, Rs), new ones at every call."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingClips:
+    """Objective of training clips, a scalar, with its parts; and the imagined pictures."""
+
+    objective: Tensor
+    nll: Tensor
+    kl: Tensor
+    imagined: Tensor
+
+
+class Op3(VisionModel):
+    """Model of pictures as slots, and of how they move one another."""
+
+    def __init__(self, config: Op3Config, options: Op3Options) -> None:
+        spec = Spec(
+            image_size=config.image_size,
+            mean=(0.0, 0.0, 0.0),
+            std=(1.0, 1.0, 1.0),
+            stride=config.stride_frames,
+            context=config.context,
+            future=config.future,
+            framewise=False,
+        )
+        super().__init__(NAME, VERSION, config, config.training, options, spec)
+        self.config = config
+        if options.slots:
+            self.name += f"-{options.slots}-slots"
+        self.window = config.past + config.imagined
+        self.samples, self.seed = options.samples, options.seed
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(stable_hash("op3", options.seed) % 2**63)
+            self.slots = SlotInference(config)
+
+    def provenance(self) -> Provenance:
+        """Return name, weights and versions for the table of predictions."""
+        encoder = f"{self.config.slots} slots {self.config.image_size} px"
+        return self.origin(encoder, "interaction network", "pictures of slots")
+
+    def encode(self, batch: Batch) -> Tensor:
+        """Return the states of the slots (B, T, K R) after each frame was seen."""
+        return self._watch(normalized_pictures(batch, self.spec, self.name))[0]
+
+    def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
+        """Return the states (B, S, future, K R) of ``samples`` futures; no frame of them is seen.
+
+        They follow from ``seed`` and the name of the trial alone. With the knob ``show`` above 0,
+        ``shown`` holds pictures, ``rgb`` (B, S, future, H, W, 3) uint8, and ``masks``
+        (B, S, future, K, H, W) float32.
+        """
+        _, slots = self._watch(context_pictures(context, self.spec, self.name))
+        config, clips = self.config, len(context)
+        shape = (samples, config.future + 1, config.slots, config.stochastic)
+        draws = [generator(NAME, seed, trial).standard_normal(shape) for trial in context.trials]
+        noise = torch.from_numpy(np.concatenate(draws)).to(slots.mean)
+        features, shown = [], []
+        with torch.no_grad():
+            state = _repeated(slots, samples, noise[:, 0])
+            for step in range(config.future):
+                state = self.slots.predict(state, noise[:, step + 1])
+                features.append(state.features())
+                if knobs.get("show", 0) > 0:
+                    shown.append(self.slots.decoder(state.states))
+        values = torch.stack(features, 1).float().unflatten(0, (clips, samples))
+        return Rollout(features=values, shown=_shown(shown, clips, samples))
+
+    def prepare(self, sample: Batch) -> None:
+        """Do nothing: there are no statistics to set."""
+
+    def loss(self, batch: Batch) -> dict[str, Tensor]:
+        """Return the loss of training clips, and what it consists of.
+
+        Training: ``loss`` in nats a pixel, ``nll``, ``kl`` by clip, and ``error``, the squared
+        error of the imagined frames. In a validation ``loss`` is the squared error of moving pixels
+        of the imagined frames (`physion.models.vision.moving`), ``error`` that of all pixels, and
+        ``objective`` the loss of the training.
+        """
+        pictures = window_pictures(batch, self.spec, self.name, self.window)
+        # A validation is without gradients, which the refinement needs.
+        with torch.enable_grad():
+            clips = self._run(pictures, batch.valid)
+        error = future_error(clips.imagined, pictures, batch.valid)
+        if self.training:
+            parts = {"nll": clips.nll, "kl": clips.kl, "error": error.pixels}
+            return {"loss": clips.objective, **parts}
+        parts = {"error": error.pixels, "objective": clips.objective}
+        return {name: part.detach() for name, part in {"loss": error.moving, **parts}.items()}
+
+    def baseline(self, batch: Batch) -> Tensor:
+        """Return the squared error of moving pixels if the last observed picture is repeated."""
+        pictures = window_pictures(batch, self.spec, self.name, self.window)
+        return copy_error(pictures, self.config.imagined, batch.valid).moving
+
+    def _run(self, pictures: Tensor, valid: Tensor) -> TrainingClips:
+        """Return the objective of training clips (B, T, 3, H, W)."""
+        config, inference = self.config, self.slots
+        clips, frames, _, height, width = pictures.shape
+
+        def noise() -> Tensor:
+            return torch.randn(clips, config.slots, config.stochastic).to(pictures)
+
+        slots, steps, imagined = inference.start(noise()), [], []
+        explained = inference.explain(slots, pictures[:, 0])
+        for frame in range(frames):
+            picture = pictures[:, frame]
+            if frame:
+                explained = inference.explain(inference.predict(explained.slots, noise()), picture)
+                steps.append((frame, explained))
+            if frame >= config.past:
+                imagined.append(explained.decoded.picture())
+                continue
+            for _ in range(1 if frame else config.seed_steps):
+                refined = inference.refine(explained, picture, noise())
+                explained = inference.explain(refined, picture)
+                steps.append((frame, explained))
+        objective, nll, kl = _weighted(steps, valid)
+        pixels = height * width
+        return TrainingClips(objective / pixels, nll / pixels, kl, torch.stack(imagined, 1))
+
+    def _watch(self, pictures: Tensor) -> tuple[Tensor, Slots]:
+        """Return features (B, T, K R) of clips (B, T, 3, H, W), and the beliefs after the last."""
+        config, inference = self.config, self.slots
+        rng = generator(NAME, "slots", self.options.seed)
+        features = []
+        # The refinement needs gradients, which tensors of the inference mode cannot have.
+        with torch.inference_mode(False), torch.enable_grad():
+            seen = pictures.clone()
+            shape = (config.slots, config.stochastic)
+
+            def noise() -> Tensor:
+                values = torch.from_numpy(rng.standard_normal(shape)).to(seen)
+                return values.expand(len(seen), -1, -1)
+
+            slots = inference.start(noise())
+            for frame in range(seen.shape[1]):
+                if frame:
+                    slots = inference.predict(slots, noise())
+                for _ in range(1 if frame else config.seed_steps):
+                    explained = inference.explain(slots.detached(), seen[:, frame])
+                    slots = inference.refine(explained, seen[:, frame], noise())
+                features.append(slots.features().detach())
+            return torch.stack(features, 1).float(), slots.detached()
+
+
+def _weighted(steps: list[tuple[int, Explained]], valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return objective, negative log likelihood and divergence: means over clips and steps.
+
+    Later steps weigh more, in proportion to their number; frames that the movie lacks do not count.
+    """
+    totals = []
+    counted = torch.stack([valid[:, frame] for frame, _ in steps], 1)
+    numbers = torch.arange(1, len(steps) + 1, device=valid.device)
+    weights = (counted * numbers).float()
+    for name in ("objective", "nll", "kl"):
+        values = torch.stack([getattr(explained, name) for _, explained in steps], 1)
+        totals.append((values * weights).sum() / weights.sum().clamp_min(1))
+    return totals[0], totals[1], totals[2]
+
+
+def _repeated(slots: Slots, samples: int, noise: Tensor) -> Slots:
+    """Return the beliefs for ``samples`` futures of every clip, which follow one another."""
+    parts = (slots.deterministic, slots.mean, slots.raw, slots.prior_mean, slots.prior_raw)
+    memory = (noise.new_zeros(0), noise.new_zeros(0))
+    return Slots(*(part.repeat_interleave(samples, 0) for part in parts), noise, memory)
+
+
+def _shown(steps: list[Decoded], clips: int, samples: int) -> dict[str, Tensor]:
+    if not steps:
+        return {}
+    pictures = torch.stack([step.picture() for step in steps], 1).clamp(0, 1)
+    rgb = (pictures.movedim(2, -1) * 255).round().to(torch.uint8)
+    masks = torch.stack([step.masks[:, :, 0] for step in steps], 1).float()
+    return {
+        name: value.unflatten(0, (clips, samples))
+        for name, value in {"rgb": rgb, "masks": masks}.items()
+    }
