@@ -1,0 +1,216 @@
+"""What holds for every vision model that is trained from clips."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from physion.errors import BadInputError
+from physion.models.batch import Batch
+from physion.models.build import build_model
+from physion.models.checkpoints.checkpoint import (
+    DamagedFileError,
+    read_checkpoint,
+    tensors_of,
+    write_checkpoint,
+)
+from physion.models.checkpoints.trained import shipped_digests
+from support.moving_squares import squares, with_arrays
+
+NAMES = ("cswm", "rpin")
+
+
+def model_of(name: str, **options: Any) -> Any:
+    return build_model(name, **options).eval()  # type: ignore[attr-defined]
+
+
+def context_of(model: Any, clips: int = 2, seed: int = 0) -> Batch:
+    return squares(clips, model.spec.context, model.spec, seed)
+
+
+@torch.no_grad()
+def outputs(model: Any, context: Batch) -> tuple[Any, Any]:
+    """Return the features of a context and those of its future."""
+    features = model.encode(context)
+    return features, model.imagine(with_arrays(context, features=features), 2, 0).features
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_features_of_context_and_future_have_one_size(name: str) -> None:
+    model = model_of(name)
+    features, future = outputs(model, context_of(model))
+    assert features.dtype == future.dtype == torch.float32
+    assert features.shape[:2] == (2, model.spec.context)
+    assert future.shape == (2, 2, model.spec.future, features.shape[-1])
+    assert features.isfinite().all() and future.isfinite().all()
+    assert not torch.equal(features[0], features[1]) and not torch.equal(future[0], future[1])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_clip_does_not_depend_on_the_others_of_a_batch(name: str) -> None:
+    model = model_of(name)
+    batch = context_of(model, 3)
+    for one, many in zip(outputs(model, batch.select([1])), outputs(model, batch), strict=True):
+        assert torch.allclose(one[0], many[1], atol=1e-5)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_without_stored_features_a_future_is_imagined_from_the_pictures(name: str) -> None:
+    model = model_of(name)
+    context = context_of(model)
+    with torch.no_grad():
+        from_pictures = model.imagine(context, 2, 0).features
+    assert torch.equal(from_pictures, outputs(model, context)[1])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_follows_the_context_changes_none_of_its_features(name: str) -> None:
+    model = model_of(name)
+    spec = model.spec
+    whole = squares(2, spec.context + 4, spec)
+    noise = np.random.default_rng(0)
+    rgb = whole.rgb.clone()
+    rgb[:, spec.context :] = torch.from_numpy(
+        noise.integers(0, 256, rgb[:, spec.context :].shape, np.uint8)
+    )
+    poisoned = with_arrays(whole, rgb=rgb)
+    if whole.boxes is not None:
+        boxes = whole.boxes.clone()
+        boxes[:, spec.context :] = boxes[:, spec.context :] * 0.3 + 0.5
+        poisoned = with_arrays(poisoned, boxes=boxes)
+    with torch.no_grad():
+        clean, changed = model.encode(whole), model.encode(poisoned)
+        alone = model.encode(whole.steps(slice(0, spec.context)))
+    assert torch.equal(clean[:, : spec.context], changed[:, : spec.context])
+    assert torch.allclose(alone, clean[:, : spec.context], atol=1e-5)
+    assert not torch.equal(clean[:, spec.context :], changed[:, spec.context :])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_seed_determines_the_weights_and_nothing_else_does(name: str) -> None:
+    torch.manual_seed(1)
+    one = model_of(name, seed=4)
+    torch.manual_seed(2)
+    same, other = model_of(name, seed=4), model_of(name, seed=5)
+    assert one.digest() == same.digest() != other.digest()
+    pairs = zip(outputs(one, context_of(one)), outputs(same, context_of(one)), strict=True)
+    assert all(torch.equal(a, b) for a, b in pairs)
+
+
+def steps(model: Any, batch: Batch, count: int, rate: float = 2e-3) -> list[float]:
+    """Train on one batch; return the losses."""
+    model.train()
+    optimizer = torch.optim.Adam(model.parameters(), rate)
+    losses = []
+    for step in range(count):
+        torch.manual_seed(step)
+        optimizer.zero_grad()
+        loss = model.loss(batch)["loss"]
+        loss.backward()
+        optimizer.step()
+        losses.append(float(loss.detach()))
+    return losses
+
+
+@pytest.mark.parametrize(("name", "count"), [("cswm", 60), ("rpin", 60)])
+def test_a_model_overfits_one_batch(name: str, count: int) -> None:
+    model = model_of(name)
+    batch = squares(4, model.window, model.spec)
+    model.prepare(batch)
+    losses = steps(model, batch, count)
+    assert np.mean(losses[-5:]) < 0.3 * losses[0]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_equal_steps_give_equal_weights(name: str) -> None:
+    digests = []
+    for _ in range(2):
+        model = model_of(name)
+        batch = squares(3, model.window, model.spec)
+        model.prepare(batch)
+        steps(model, batch, 3)
+        digests.append(model.digest())
+    assert digests[0] == digests[1] != model_of(name).digest()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_saved_weights_give_the_same_features(name: str, tmp_path: Path) -> None:
+    model = model_of(name, seed=3)
+    steps(model, squares(3, model.window, model.spec), 2)
+    model.eval()
+    path = tmp_path / "model.safetensors"
+    write_checkpoint(path, tensors_of(model), {"built_as": model.built_as()})
+    loaded = model_of(name, weights=str(path))
+    assert loaded.trained and loaded.init.startswith("local:")
+    assert loaded.provenance().model == f"{name}-small" and not model.trained
+    assert loaded.digest() == model.digest() != model_of(name).digest()
+    context = context_of(model)
+    pairs = zip(outputs(model, context), outputs(loaded, context), strict=True)
+    assert all(torch.equal(a, b) for a, b in pairs)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_weights_of_another_architecture_are_refused_by_name(name: str, tmp_path: Path) -> None:
+    model = model_of(name)
+    path = tmp_path / "model.safetensors"
+    built = {**model.built_as(), "model": f"{name}-paper"}
+    write_checkpoint(path, tensors_of(model), {"built_as": built})
+    with pytest.raises(BadInputError, match=f"model was {name}-paper and is {name}-small"):
+        model_of(name, weights=str(path))
+    tensors = tensors_of(model)
+    missing, *_, wider = (key for key, value in tensors.items() if value.ndim > 1)
+    tensors["model/foreign"] = tensors.pop(missing)
+    tensors[wider] = torch.cat([tensors[wider], tensors[wider]])
+    write_checkpoint(path, tensors, {"built_as": model.built_as()})
+    with pytest.raises(BadInputError, match="weights of another network") as caught:
+        model_of(name, weights=str(path))
+    for part in (missing.removeprefix("model/"), "foreign", wider.removeprefix("model/")):
+        assert part in str(caught.value)
+    path.write_bytes(path.read_bytes()[:-7])
+    with pytest.raises(DamagedFileError):
+        model_of(name, weights=str(path))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_shipped_weights_load_or_are_said_to_be_missing(name: str) -> None:
+    digests = shipped_digests()
+    if f"{name}-small" not in digests:
+        with pytest.raises(BadInputError, match=f"no weights are shipped for {name}-small"):
+            model_of(name, weights="shipped")
+    else:
+        assert model_of(name, weights="shipped").init.startswith("shipped:")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_digest_belongs_to_the_size(name: str) -> None:
+    sizes = ("small", "paper", "released")
+    built = {size: model_of(name, size=size) for size in sizes}
+    assert len({model.digest() for model in built.values()}) == 3
+    assert [model.provenance().model for model in built.values()] == [f"{name}-{s}" for s in sizes]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_bad_input_is_named(name: str) -> None:
+    model = model_of(name)
+    context = context_of(model)
+    small = with_arrays(context, rgb=context.rgb[:, :, :32, :32])
+    with pytest.raises(BadInputError, match=f"{name}-small: pictures must be .* 64, 64, 3"):
+        model.encode(small)
+    with pytest.raises(BadInputError, match=f"{name}-small: pictures must be .* not none"):
+        model.encode(with_arrays(context, rgb=None))
+    with pytest.raises(BadInputError, match="sizes small, paper and released"):
+        model_of(name, size="huge")
+    with pytest.raises(BadInputError, match="no weights at"):
+        model_of(name, weights="absent.safetensors")
+
+
+def test_checkpoints_hold_no_code(tmp_path: Path) -> None:
+    model = model_of("cswm")
+    path = tmp_path / "model.safetensors"
+    write_checkpoint(path, tensors_of(model), {})
+    tensors, _ = read_checkpoint(path)
+    assert set(tensors) == {f"model/{name}" for name in model.state_dict()}
