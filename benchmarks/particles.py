@@ -31,15 +31,14 @@ from sklearn.metrics import roc_auc_score
 
 from physion import Dataset, build_model, simulate
 from physion.data import official
-from physion.models.batch import LAST_OBSERVED, Motion
+from physion.models.batch import Motion
+from physion.models.interface import Fits
 from physion.models.observed import cut_to_observed
-from physion.models.particles.bodies import KINEMATIC, Poses, SceneParticles, poses_of
 from physion.models.particles.simulator import ParticleSimulator
 from physion.physics.labels import label_contact
-from physion.readout.evaluate import evaluate
-from physion.readout.settings import EvaluationConfig
+from physion.readout.rollout_error import motion_error
 from physion.scenes.sampling.registry import scenarios
-from physion.training.sources.open_source import whole_source
+from physion.training.sources.open_source import observed_source, whole_source
 from physion.training.train import train_model
 from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import GenerateSettings, plan_dataset
@@ -49,8 +48,8 @@ HORIZONS = (15, 30, 60, 90)
 """Frames after the last observed one at which errors are measured."""
 GROUP = 64
 """Scenes of one rollout."""
-COLLIDE_STEPS = 3000
-TRANSFER_STEPS = 4000
+COLLIDE_STEPS = 2600
+TRANSFER_STEPS = 5000
 RIGID = ("dominoes", "support", "collide", "contain", "drop", "link", "roll")
 
 Rows = list[list[str]]
@@ -96,37 +95,15 @@ def test(model: ParticleSimulator, motions: Sequence[Motion], contacts: Iterable
         futures = model.futures(cut, 1, 0)
         gaps += model.gaps(cut, futures)[:, 0].tolist()
         for motion, ((particles, poses),) in zip(group, futures, strict=True):
-            rows = object_errors(motion, particles, poses, model.spec.context)
-            errors.append(rows[0])
-            constant.append(rows[1])
+            rows = motion_error(motion, particles, poses, model.spec.stride, max(HORIZONS))
+            rows = rows.set_index("Frames").reindex(HORIZONS)
+            errors.append(rows["Error"].tolist())
+            constant.append(rows["Constant Velocity Error"].tolist())
             observed.append(label_contact(motion.scene, motion.trajectory).observed)
     return Tested(
         np.array(gaps), np.array(list(contacts)), np.array(observed),
         np.array(errors), np.array(constant), time.process_time() - start,
     )  # fmt: skip
-
-
-def object_errors(
-    motion: Motion, particles: SceneParticles, poses: Poses, context: int
-) -> tuple[list[float], list[float]]:
-    """Return mean errors of moving objects at the horizons, of the model and of constant velocity.
-
-    NaN after the end of the true motion. A rollout that ended at rest keeps its last pose.
-    """
-    own, other = [], []
-    free = particles.kinds != KINEMATIC
-    for horizon in HORIZONS:
-        if LAST_OBSERVED + horizon >= len(motion.trajectory):
-            own.append(float("nan"))
-            other.append(float("nan"))
-            continue
-        frames = [LAST_OBSERVED - 3, LAST_OBSERVED, LAST_OBSERVED + horizon]
-        before, now, true = poses_of(particles, motion, frames).centers
-        row = min(context - 1 + horizon // 3, len(poses.centers) - 1)
-        straight = now + (now - before) * horizon / 3
-        own.append(float(np.linalg.norm(poses.centers[row] - true, axis=-1)[free].mean()))
-        other.append(float(np.linalg.norm(straight - true, axis=-1)[free].mean()))
-    return own, other
 
 
 def motions_of(dataset: Dataset, trials: Sequence[str]) -> tuple[list[Motion], list[bool]]:
@@ -151,11 +128,19 @@ def trained(
     return model, time.process_time() - start
 
 
-def classifier_accuracy(dataset: Dataset, folder: Path, scenarios: tuple[str, ...]) -> float:
-    """Return the accuracy of the state classifier on the testing trials of a dataset."""
-    table = evaluate(dataset, "state-classifier", folder, config=EvaluationConfig()).predictions
-    chosen = table[table["Scenario"].isin(scenarios)] if "Scenario" in table else table
-    return float((chosen["Predicted Outcome"] == chosen["Actual Outcome"]).mean())
+def classified(
+    dataset: Dataset, fitted_on: Sequence[str], tested: Dataset, trials: Sequence[str]
+) -> tuple[float, float]:
+    """Return accuracy and AUC of the state classifier, fitted on some trials, on others."""
+    model = build_model("state-classifier")
+    assert isinstance(model, Fits)
+    (fit, labels), (test, contacts) = (
+        (observed_source(source, model.spec).context(names), motions_of(source, names)[1])
+        for source, names in ((dataset, fitted_on), (tested, trials))
+    )
+    predicted = model.fit(fit, np.array(labels), 0).predict(test)
+    right = (predicted > 0.5) == np.array(contacts)
+    return float(right.mean()), float(roc_auc_score(contacts, predicted))
 
 
 def make_data(folder: Path) -> None:
@@ -189,7 +174,8 @@ def run_collide(folder: Path) -> str:
             )  # fmt: skip
             print(rows[-1], flush=True)
     head = ["seed", "edges", "training, s", *HEAD, "of constant"]
-    return table(head, rows)
+    scores = classified(dataset, dataset.trials("training"), dataset, dataset.trials("testing"))
+    return table(head, rows) + of_classifier("the same 300 trials", scores)
 
 
 def run_transfer(folder: Path) -> str:
@@ -202,9 +188,20 @@ def run_transfer(folder: Path) -> str:
     tested = test(model, motions, contacts)
     both, n = tested.contacts.mean(), len(tested.contacts)
     error = np.sqrt((n + 1) / (12 * n * n * both * (1 - both)))
-    return table(
-        ["model", "training, s", *HEAD], [["dpi-small", f"{seconds:.0f}", *tested.cells()]]
-    ) + (f"\nAn AUC of chance has a standard error of {error:.3f} (Mann and Whitney 1947).\n")
+    scores = classified(dataset, others, collide, collide.trials("testing"))
+    return (
+        table(["model", "training, s", *HEAD], [["dpi-small", f"{seconds:.0f}", *tested.cells()]])
+        + f"\nAn AUC of chance has a standard error of {error:.3f} (Mann and Whitney 1947).\n"
+        + of_classifier("the same trials of the other scenarios", scores)
+    )
+
+
+def of_classifier(fitted_on: str, scores: tuple[float, float]) -> str:
+    """Return a sentence on the scores of the state classifier."""
+    accuracy, auc = scores
+    return (
+        f"\nThe state classifier, fitted on {fitted_on}: accuracy {accuracy:.3f}, AUC {auc:.3f}.\n"
+    )
 
 
 def run_shipped(folder: Path) -> str:

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from sklearn.metrics import roc_auc_score
 
 from physion.compute.local import LocalExecutor
-from physion.models.batch import LAST_OBSERVED, Motion
+from physion.models.batch import Motion
 from physion.models.build import build_model
 from physion.models.observed import cut_to_observed
-from physion.models.particles.bodies import KINEMATIC, poses_of
 from physion.models.particles.simulator import ParticleSimulator
 from physion.physics.labels import label_contact
+from physion.readout.rollout_error import motion_error
 from physion.seeds import generator
 from physion.training.sources.open_source import whole_source
 from physion.training.train import train_model
@@ -76,15 +76,9 @@ def learn(task: Task) -> Result:
     gaps = model.gaps(cut, futures)[:, 0]
     errors = []
     for motion, ((particles, poses),) in zip(motions, futures, strict=True):
-        if len(motion.trajectory) <= LAST_OBSERVED + HORIZON:
-            continue
-        frames = [LAST_OBSERVED - 3, LAST_OBSERVED, LAST_OBSERVED + HORIZON]
-        before, now, true = poses_of(particles, motion, frames).centers
-        row = min(model.spec.context - 1 + HORIZON // 3, len(poses.centers) - 1)
-        straight = now + (now - before) * HORIZON / 3
-        apart = [np.linalg.norm(value - true, axis=-1) for value in (poses.centers[row], straight)]
-        errors.append([value[particles.kinds != KINEMATIC].mean() for value in apart])
-    error, constant = np.mean(errors, axis=0)
+        rows = motion_error(motion, particles, poses, model.spec.stride, HORIZON)
+        errors.append(rows.iloc[-1][["Error", "Constant Velocity Error"]])
+    error, constant = np.mean(np.array(errors, float), axis=0)
     return Result(gaps, float(error), float(constant))
 
 
