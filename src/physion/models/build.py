@@ -31,6 +31,8 @@ models: Registry[ModelFactory] = Registry(
         "pEffNetLite0-mlp": "physion.models.frozen_encoder:peffnet_mlp",
         "pEffNetLite0-lstm": "physion.models.frozen_encoder:peffnet_lstm",
         "cswm": "physion.models.cswm.build:cswm",
+        "svg": "physion.models.svg.build:svg",
+        "op3": "physion.models.op3.build:op3",
         "gns": "physion.models.particles.build:gns",
         "gns-ransac": "physion.models.particles.build:gns_ransac",
         "dpi": "physion.models.particles.build:dpi",

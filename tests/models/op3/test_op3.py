@@ -1,0 +1,305 @@
+"""OP3: closed forms of its parts, symmetry of the slots, features and futures, bad input."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.distributions import Categorical, Independent, MixtureSameFamily, Normal
+
+from physion.errors import BadInputError
+from physion.models.batch import Batch
+from physion.models.build import build_model
+from physion.models.checkpoints.checkpoint import tensors_of, write_checkpoint
+from physion.models.op3.config import Op3Config, Op3Options, op3_config
+from physion.models.op3.inference import SlotInference, Slots
+from physion.models.op3.model import Op3, _weighted
+from physion.models.op3.networks import BroadcastConv, SlotDecoder, SlotDynamics, coordinates
+from physion.models.op3.pixels import Decoded, log_likelihood, plain_maps, slope_maps
+from support.moving_squares import squares, with_arrays
+
+TINY = Op3Config(
+    image_size=16, slots=3, deterministic=4, stochastic=5, width=6, hidden=8, effect=4,
+    seed_steps=2, past=2, imagined=2, context=3, future=3,
+)  # fmt: skip
+
+
+def tiny(**changes: Any) -> Op3:
+    return Op3(replace(TINY, **changes), Op3Options()).eval()
+
+
+def context_of(model: Op3, clips: int = 2) -> Batch:
+    return squares(clips, model.spec.context, model.spec)
+
+
+def random_decoded(clips: int = 2, slots: int = 3, size: int = 4) -> Decoded:
+    generator = torch.Generator().manual_seed(0)
+    colors = torch.rand(clips, slots, 3, size, size, generator=generator)
+    return Decoded(colors, 2 * torch.randn(clips, slots, 1, size, size, generator=generator))
+
+
+def test_likelihood_is_that_of_a_mixture() -> None:
+    decoded = random_decoded()
+    pictures = torch.rand(2, 3, 4, 4, generator=torch.Generator().manual_seed(1))
+    found = log_likelihood(decoded, pictures, 0.2, "gaussian")
+    colors = decoded.colors.permute(0, 3, 4, 1, 2)
+    mixture = MixtureSameFamily(
+        Categorical(decoded.masks[:, :, 0].permute(0, 2, 3, 1)),
+        Independent(Normal(colors, 0.2), 1),
+    )
+    assert torch.allclose(found.pixels, mixture.log_prob(pictures.permute(0, 2, 3, 1)), atol=1e-4)
+
+
+def test_released_likelihood_is_that_of_the_published_code() -> None:
+    """Far from all colours it is the logarithm of 1e-12."""
+    decoded = random_decoded()
+    pictures = torch.rand(2, 3, 4, 4, generator=torch.Generator().manual_seed(1))
+    squared = (pictures[:, None] - decoded.colors).double().pow(2).sum(2)
+    density = (-squared / (3 * 2 * 0.1**2)).exp() / (math.sqrt(0.1**6) * (2 * math.pi) ** 3)
+    expected = ((decoded.masks[:, :, 0] * density).sum(1) + 1e-12).log()
+    found = log_likelihood(decoded, pictures, 0.1, "released")
+    assert torch.allclose(found.pixels.double(), expected, atol=1e-4)
+    far = log_likelihood(decoded, pictures + 100, 0.1, "released")
+    assert torch.allclose(far.pixels, torch.tensor(math.log(1e-12)))
+
+
+def test_masks_sum_to_one_and_weigh_the_colours() -> None:
+    torch.manual_seed(0)
+    decoded = SlotDecoder(TINY)(torch.randn(2, 3, 9))
+    assert decoded.colors.shape == (2, 3, 3, 16, 16) and decoded.logits.shape == (2, 3, 1, 16, 16)
+    assert torch.allclose(decoded.masks.sum(1), torch.ones(2, 1, 16, 16), atol=1e-6)
+    assert torch.allclose(decoded.log_masks.exp(), decoded.masks, atol=1e-6)
+    alone = Decoded(decoded.colors, torch.tensor([0.0, 200, 0])[None, :, None, None, None])
+    assert torch.equal(alone.picture(), decoded.colors[:, 1])
+
+
+def test_what_the_refinement_sees() -> None:
+    """The gradient by the masks is that of autograd; the likelihood without a slot is the rest."""
+    decoded = random_decoded()
+    pictures = torch.rand(2, 3, 4, 4, generator=torch.Generator().manual_seed(1))
+    found = log_likelihood(decoded, pictures, 0.5, "gaussian")
+    color_slope = torch.randn_like(decoded.colors)
+    slopes = slope_maps(decoded, found, color_slope)
+    masks = decoded.masks.clone().requires_grad_()
+    by_slot = found.by_slot.exp()[:, :, None]
+    (gradient,) = torch.autograd.grad(-(masks * by_slot).sum(1).log().sum(), masks)
+    assert torch.allclose(slopes[:, :, :1], gradient, rtol=1e-4)
+    weighted = masks.detach() * by_slot
+    assert torch.allclose(slopes[:, :, 1:2], weighted.sum(1, keepdim=True), rtol=1e-4)
+    others = weighted.sum(1, keepdim=True) - weighted
+    assert torch.allclose(slopes[:, :, 2:3], others, atol=1e-5)
+    assert torch.equal(slopes[:, :, 3:], color_slope)
+    plain = plain_maps(decoded, found, pictures)
+    assert torch.equal(plain[:, 1, :3], pictures) and torch.equal(plain[:, :, 3:6], decoded.colors)
+    assert torch.allclose(plain[:, :, 8].sum(1), torch.ones(2, 4, 4))
+
+
+@pytest.mark.parametrize("kernel", [3, 5])
+def test_the_broadcast_convolution_is_that_of_broadcast_images(kernel: int) -> None:
+    torch.manual_seed(0)
+    layer = BroadcastConv(7, 4, kernel)
+    values = torch.randn(3, 7)
+    images = values[:, :, None, None].expand(-1, -1, 8, 8)
+    place = coordinates(8, values).expand(3, -1, -1, -1)
+    assert torch.allclose(layer(values, 8), layer.conv(torch.cat([images, place], 1)), atol=1e-5)
+    assert place[0, 0, 0].tolist() == pytest.approx(torch.linspace(-1, 1, 8).tolist())
+    assert place[0, 1, :, 0].tolist() == pytest.approx(torch.linspace(-1, 1, 8).tolist())
+
+
+def test_dynamics_of_permuted_slots_are_permuted() -> None:
+    torch.manual_seed(0)
+    dynamics, states = SlotDynamics(TINY), torch.randn(2, 5, 9)
+    order = [3, 0, 4, 1, 2]
+    for value, permuted in zip(dynamics(states), dynamics(states[:, order]), strict=True):
+        assert torch.allclose(value[:, order], permuted, atol=1e-6)
+
+
+def test_slots_move_one_another_and_not_themselves() -> None:
+    torch.manual_seed(0)
+    dynamics, states = SlotDynamics(TINY), torch.randn(2, 3, 9)
+    changed = states.clone()
+    changed[:, 2] += 1
+    before, after = dynamics(states)[1], dynamics(changed)[1]
+    assert (before - after).abs().amax(-1).min() > 0, "all slots feel the change of one"
+    alone = dynamics(states[:, :1])[1]
+    dynamics.effect.register_forward_hook(lambda _, inputs, out: 0 * out)
+    without = dynamics(states)[1]
+    assert torch.allclose(without[:, :1], alone, atol=1e-6), "a slot alone has no effect"
+    assert not torch.allclose(without, before)
+
+
+def test_beliefs_of_permuted_slots_are_permuted() -> None:
+    torch.manual_seed(0)
+    inference, pictures = SlotInference(TINY), torch.rand(2, 3, 16, 16)
+    noise = torch.randn(3, 2, 3, 5)
+    order = [2, 0, 1]
+
+    def after(numbers: Tensor) -> Slots:
+        slots = inference.start(numbers[0])
+        explained = inference.explain(slots, pictures)
+        refined = inference.refine(explained, pictures, numbers[1])
+        return inference.predict(refined, numbers[2])
+
+    one, other = after(noise), after(noise[:, :, order])
+    assert torch.allclose(one.states[:, order], other.states, atol=1e-5)
+    assert not torch.allclose(one.states[:, 0], one.states[:, 1])
+
+
+def test_divergence_of_the_start_and_of_a_prediction() -> None:
+    """A prediction is its own prior; the start is compared with N(0, 1)."""
+    torch.manual_seed(0)
+    inference = SlotInference(TINY)
+    slots = inference.start(torch.randn(2, 3, 5))
+    variance = nn.functional.softplus(inference.raw) + 1e-5
+    by_component = 0.5 * (variance + inference.mean.pow(2) - 1 - variance.log())
+    assert torch.allclose(slots.divergence(), 3 * by_component.sum().expand(2), rtol=1e-4)
+    assert inference.predict(slots, slots.noise).divergence().abs().max() < 1e-6
+
+
+def test_later_steps_weigh_more_and_missing_frames_do_not_count() -> None:
+    class Step:
+        objective = nll = kl = torch.tensor([0.0, 0.0])
+
+    values = torch.tensor([[1.0, 10.0], [2.0, 20.0], [4.0, 40.0]])
+    steps: list[Any] = []
+    for frame, row in zip((0, 0, 1), values, strict=True):
+        step = Step()
+        step.objective = step.nll = step.kl = row
+        steps.append((frame, step))
+    valid = torch.tensor([[True, True], [True, False]])
+    objective, _, _ = _weighted(steps, valid)
+    expected = (1 * (1 + 10) + 2 * (2 + 20) + 3 * 4) / (2 * 1 + 2 * 2 + 3)
+    assert float(objective) == pytest.approx(expected)
+
+
+def test_sizes_and_their_names() -> None:
+    assert build_model("op3").provenance().model == "op3-small"
+    paper, released = (op3_config(Op3Options(size=size)) for size in ("paper", "released"))
+    assert (paper.slots, paper.deterministic, paper.stochastic) == (8, 64, 64)
+    assert replace(released, density="gaussian") == paper and released.density == "released"
+    assert tiny(density="released").digest() != tiny().digest()
+
+
+def test_weights_fit_any_number_of_slots(tmp_path: Path) -> None:
+    model = build_model("op3", slots=7)
+    assert isinstance(model, Op3) and model.name == "op3-small-7-slots"
+    assert model.encode(squares(1, 2, model.spec)).shape == (1, 2, 7 * 32)
+    assert tensors_of(model).keys() == tensors_of(tiny()).keys()
+
+
+def test_features_are_computed_in_the_mode_without_gradients() -> None:
+    """And leave none in the weights; the beliefs are refined all the same."""
+    model = tiny()
+    context = context_of(model)
+    with torch.inference_mode():
+        features = model.encode(context)
+        future = model.imagine(context, 1, 0).features
+    with torch.no_grad():
+        assert torch.equal(model.encode(context), features)
+    assert not features.requires_grad and not future.requires_grad
+    assert all(weight.grad is None for weight in model.parameters())
+
+
+def test_features_are_of_what_was_seen_so_far() -> None:
+    model = tiny()
+    batch = squares(2, 5, model.spec)
+    whole = model.encode(batch)
+    assert whole.shape == (2, 5, 27) and not model.spec.framewise
+    assert torch.allclose(model.encode(batch.steps(slice(0, 3))), whole[:, :3], atol=1e-5)
+    later = batch.rgb.clone()
+    later[:, 3:] = 0
+    poisoned = model.encode(with_arrays(batch, rgb=later))
+    assert torch.equal(poisoned[:, :3], whole[:, :3])
+    assert not torch.equal(poisoned[:, 3], whole[:, 3])
+
+
+def test_futures_follow_from_seed_and_name_of_the_trial() -> None:
+    model = tiny()
+    context = context_of(model, 3)
+    futures = model.imagine(context, 3, 7, show=1.0)
+    values = futures.features
+    assert values.shape == (3, 3, 3, 27)
+    assert not torch.allclose(values[:, 0], values[:, 1])
+    assert not torch.equal(values, model.imagine(context, 3, 8).features)
+    assert torch.equal(values, model.imagine(context, 3, 7).features)
+    fewer = model.imagine(context.select([2, 0]), 1, 7)
+    assert torch.allclose(fewer.features, values[[2, 0], :1], atol=1e-5)
+    assert fewer.shown == {}
+    rgb, masks = futures.shown["rgb"], futures.shown["masks"]
+    assert rgb.shape == (3, 3, 3, 16, 16, 3) and rgb.dtype == torch.uint8
+    assert masks.shape == (3, 3, 3, 3, 16, 16)
+    assert torch.allclose(masks.sum(3), torch.ones(3, 3, 3, 16, 16), atol=1e-5)
+
+
+def test_a_validation_is_of_frames_that_are_not_seen() -> None:
+    model = tiny()
+    batch = squares(2, model.window, model.spec)
+    later = batch.rgb.clone()
+    later[:, 2:] = 0
+    shown, losses = [], []
+    for rgb in (batch.rgb, later):
+        torch.manual_seed(0)
+        pictures = rgb.permute(0, 1, 4, 2, 3).float() / 255
+        shown.append(model._run(pictures, batch.valid).imagined.detach())
+        torch.manual_seed(0)
+        with torch.no_grad():
+            losses.append(model.loss(with_arrays(batch, rgb=rgb)))
+    assert shown[0].shape == (2, 2, 3, 16, 16) and torch.equal(shown[0], shown[1])
+    assert losses[0]["error"] != losses[1]["error"]
+    true = batch.rgb[:, 2:].permute(0, 1, 4, 2, 3).float() / 255
+    assert losses[0]["error"].item() == pytest.approx(float((shown[0] - true).pow(2).mean()))
+    assert set(losses[0]) == {"loss", "error", "objective"}
+    assert not any(value.requires_grad for value in losses[0].values())
+    assert float(model.baseline(batch)) > 0
+
+
+def test_every_weight_is_trained() -> None:
+    model = tiny().train()
+    model.loss(squares(2, model.window, model.spec))["loss"].backward()
+    assert all(weight.grad is not None for weight in model.parameters())
+
+
+def test_bad_clips_are_refused() -> None:
+    model = tiny()
+    context = context_of(model)
+    with pytest.raises(BadInputError, match=r"op3-small: pictures must be .*16, 16.*48, 48"):
+        model.encode(squares(2, 3, replace(model.spec, image_size=48)))
+    with pytest.raises(BadInputError, match="from a context of 3 frames, not 2"):
+        model.imagine(context.steps(slice(0, 2)), 1, 0)
+    with pytest.raises(BadInputError, match="clips of 4 frames, not 3"):
+        model.loss(context)
+    valid = context.valid.clone()
+    valid[0, 2] = False
+    with pytest.raises(BadInputError, match=r"squares_0000.*up to frame 12"):
+        model.imagine(with_arrays(context, valid=valid), 1, 0)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"slots": -1}, "slots must be a whole number from 0 on"),
+        ({"samples": 0}, "samples must be a whole number from 1 on"),
+        ({"size": "large"}, "sizes small, paper and released"),
+        ({"weights": "shipped", "slots": 9}, "no weights are shipped for op3-small-9-slots"),
+    ],
+)
+def test_wrong_options_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(BadInputError, match=message):
+        build_model("op3", **options)
+
+
+def test_weights_of_another_architecture_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "model.safetensors"
+    model = build_model("op3")
+    assert isinstance(model, Op3)
+    write_checkpoint(path, tensors_of(tiny()), {"built_as": model.built_as()})
+    with pytest.raises(BadInputError, match=r"slots\.deterministic is float32 \(4,\)"):
+        build_model("op3", weights=str(path))
+    write_checkpoint(path, tensors_of(model), {"built_as": {"model": "svg-small", "version": 1}})
+    with pytest.raises(BadInputError, match="model was svg-small and is op3-small"):
+        build_model("op3", weights=str(path))

@@ -1,0 +1,273 @@
+"""SVG: networks as published, what decodes what, sampled futures, bad input."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from physion.errors import BadInputError
+from physion.models.batch import Batch
+from physion.models.build import build_model
+from physion.models.checkpoints.checkpoint import tensors_of, write_checkpoint
+from physion.models.svg.config import SvgConfig, SvgOptions, svg_config
+from physion.models.svg.model import Svg
+from physion.models.svg.networks import CodePredictor, Decoder, Encoder, GaussianPredictor
+from physion.models.vision.moving import copy_error
+from support.moving_squares import squares, with_arrays
+
+TINY = SvgConfig(
+    image_size=16, width=4, code=6, latent=3, hidden=8, past=3, imagined=2, context=4, future=3
+)
+
+
+def tiny(**changes: Any) -> Svg:
+    return Svg(replace(TINY, **changes), SvgOptions()).eval()
+
+
+def context_of(model: Svg, clips: int = 2) -> Batch:
+    return squares(clips, model.spec.context, model.spec)
+
+
+@pytest.mark.parametrize("backbone", ["dcgan", "vgg"])
+@pytest.mark.parametrize("size", [16, 64, 128])
+def test_the_decoder_mirrors_the_encoder(backbone: Any, size: int) -> None:
+    config = replace(TINY, backbone=backbone, image_size=size)
+    codes, skips = Encoder(config)(torch.rand(2, 3, size, size))
+    assert codes.shape == (2, 6) and codes.abs().max() <= 1
+    first = size if backbone == "vgg" else size // 2
+    assert [skip.shape[-1] for skip in skips] == [first >> stage for stage in range(len(skips))]
+    assert skips[-1].shape[-1] == (8 if backbone == "vgg" else 4)
+    pictures = Decoder(config)(codes, skips)
+    assert pictures.shape == (2, 3, size, size) and 0 <= pictures.min() <= pictures.max() <= 1
+
+
+def convolutions(network: nn.Module) -> list[tuple[int, int, int]]:
+    """Return inputs, outputs and kernel of all convolutions in order."""
+    kinds = (nn.Conv2d, nn.ConvTranspose2d)
+    return [
+        (part.in_channels, part.out_channels, part.kernel_size[0])
+        for part in network.modules()
+        if isinstance(part, kinds)
+    ]
+
+
+def test_paper_has_the_published_layers() -> None:
+    """Of vgg_64 and dcgan_128 with one code of 128."""
+    vgg = svg_config(SvgOptions(size="paper"))
+    stages = [(64, 2), (128, 2), (256, 3), (512, 3)]
+    expected, before = [], 3
+    for width, count in stages:
+        for _ in range(count):
+            expected.append((before, width, 3))
+            before = width
+    assert convolutions(Encoder(vgg)) == [*expected, (512, 128, 4)]
+    assert convolutions(Decoder(vgg)) == [
+        (128, 512, 4), (1024, 512, 3), (512, 512, 3), (512, 256, 3), (512, 256, 3), (256, 256, 3),
+        (256, 128, 3), (256, 128, 3), (128, 64, 3), (128, 64, 3), (64, 3, 3),
+    ]  # fmt: skip
+    dcgan = svg_config(SvgOptions(size="paper", backbone="dcgan", image_size=128))
+    assert convolutions(Encoder(dcgan)) == [
+        (3, 64, 4), (64, 128, 4), (128, 256, 4), (256, 512, 4), (512, 512, 4), (512, 128, 4),
+    ]  # fmt: skip
+    assert convolutions(Decoder(dcgan)) == [
+        (128, 512, 4), (1024, 512, 4), (1024, 256, 4), (512, 128, 4), (256, 64, 4), (128, 3, 4),
+    ]  # fmt: skip
+
+
+def test_sizes_and_their_names() -> None:
+    small, released = build_model("svg"), svg_config(SvgOptions(size="released"))
+    assert small.provenance().model == "svg-small" and small.spec.image_size == 64
+    assert released.skip == "before" and svg_config(SvgOptions(size="paper")).skip == "last"
+    named = build_model("svg", backbone="vgg", image_size=32)
+    assert isinstance(named, Svg) and named.name == "svg-small-vgg-32"
+    assert named.encode(squares(1, 2, named.spec)).shape == (1, 2, 64)
+
+
+def test_a_sequence_is_the_same_step_by_step() -> None:
+    torch.manual_seed(0)
+    codes = torch.randn(2, 5, 6)
+    for network in (CodePredictor(6, TINY), GaussianPredictor(TINY)):
+        whole = network(codes)[0]
+        state, steps = None, []
+        for step in range(5):
+            out = network(codes[:, step : step + 1], state)
+            state = out[-1]
+            steps.append(out[0])
+        assert torch.allclose(torch.cat(steps, 1), whole, atol=1e-6)
+
+
+class FirstSkips(nn.Module):
+    """Decoder that keeps the skip connections, and shows gray."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: list[Tensor] = []
+
+    def forward(self, codes: Tensor, skips: list[Tensor]) -> Tensor:
+        self.seen.append(skips[0])
+        return torch.full((len(codes), 3, 16, 16), 0.5) + 0 * codes.sum()
+
+
+@pytest.mark.parametrize(("skip", "rows"), [("last", [0, 1, 2, 2]), ("before", [0, 1, 1, 1])])
+def test_a_frame_is_decoded_with_the_activations_of_a_seen_one(skip: Any, rows: list[int]) -> None:
+    model = tiny(skip=skip)
+    batch = squares(2, model.window, model.spec)
+    model.decoder = decoder = FirstSkips()
+    model.train().loss(batch)
+    inner = model.encoder(batch.rgb.flatten(0, 1).permute(0, 3, 1, 2).float() / 255)[1][0]
+    inner = inner.unflatten(0, (2, model.window))
+    assert torch.equal(decoder.seen[0], inner[:, rows].flatten(0, 1))
+    decoder.seen.clear()
+    with torch.no_grad():
+        model.eval().loss(batch)
+    last = 2 if skip == "last" else 1
+    assert len(decoder.seen) == 3, "the objective, and two imagined frames"
+    assert all(torch.allclose(seen, inner[:, last], atol=1e-4) for seen in decoder.seen[1:])
+
+
+def test_the_loss_is_that_of_the_equations() -> None:
+    """With a gray decoder the error is known, and the weight of the divergence is beta."""
+    model = tiny(beta=0.5)
+    batch = squares(2, model.window, model.spec)
+    model.decoder = FirstSkips()  # type: ignore[assignment]
+    losses = model.train().loss(batch)
+    true = batch.rgb[:, 1:].float() / 255
+    assert losses["error"].item() == pytest.approx(float((true - 0.5).pow(2).mean()), rel=1e-5)
+    assert losses["kl"] > 0
+    expected = losses["error"] + 0.5 * losses["kl"]
+    assert losses["loss"].item() == pytest.approx(expected.item(), rel=1e-6)
+
+
+def test_frames_that_a_movie_lacks_do_not_count() -> None:
+    model = tiny().train()
+    batch = squares(2, model.window, model.spec)
+    valid = batch.valid.clone()
+    valid[:, -1] = False
+    rgb = batch.rgb.clone()
+    rgb[:, -1] = 255
+    losses = []
+    for pictures in (batch.rgb, rgb):
+        torch.manual_seed(0)
+        losses.append(model.loss(with_arrays(batch, rgb=pictures, valid=valid))["error"])
+    assert torch.equal(losses[0], losses[1])
+
+
+def test_a_validation_is_of_what_is_imagined_from_the_observed_frames() -> None:
+    model = tiny()
+    batch = squares(2, model.window, model.spec)
+    later = batch.rgb.clone()
+    later[:, model.config.past :] = 0
+    seen: list[Tensor] = []
+    roll_out = model._roll_out
+
+    def recorded(pictures: Tensor, noise: Tensor) -> Any:
+        out = roll_out(pictures, noise)
+        seen.append(out.pictures)
+        return out
+
+    model._roll_out = recorded  # type: ignore[method-assign]
+    errors = []
+    for rgb in (batch.rgb, later):
+        torch.manual_seed(0)
+        with torch.no_grad():
+            errors.append(model.loss(with_arrays(batch, rgb=rgb)))
+    assert torch.equal(seen[0], seen[1]) and errors[0]["error"] != errors[1]["error"]
+    assert set(errors[0]) == {"loss", "error", "objective"}
+    true = batch.rgb[:, -2:].permute(0, 1, 4, 2, 3).float() / 255
+    assert errors[0]["error"].item() == pytest.approx(float((seen[0] - true).pow(2).mean()))
+    pictures = batch.rgb.permute(0, 1, 4, 2, 3).float() / 255
+    expected = copy_error(pictures, 2, batch.valid).moving
+    assert torch.equal(model.baseline(batch), expected) and expected > 0
+
+
+def test_futures_follow_from_seed_and_name_of_the_trial() -> None:
+    model = tiny()
+    with torch.no_grad():
+        model.prior.mean.bias.normal_()
+        model.predictor.out.weight.normal_()
+        context = context_of(model, 3)
+        futures = model.imagine(context, 3, 7, show=1.0)
+        values = futures.features
+        assert values.shape == (3, 3, 3, 6)
+        assert not torch.allclose(values[:, 0], values[:, 1])
+        assert not torch.equal(values, model.imagine(context, 3, 8).features)
+        assert torch.equal(values, model.imagine(context, 3, 7).features)
+        fewer = model.imagine(context.select([2, 0]), 1, 7)
+    assert torch.allclose(fewer.features, values[[2, 0], :1], atol=1e-5)
+    assert fewer.shown == {}
+    rgb = futures.shown["rgb"]
+    assert rgb.shape == (3, 3, 3, 16, 16, 3) and rgb.dtype == torch.uint8
+
+
+@pytest.mark.parametrize("skip", ["last", "before"])
+def test_a_future_is_that_of_the_equations(skip: Any) -> None:
+    """Step by step, with z at the means: the variances are close to 0."""
+    model = tiny(skip=skip)
+    with torch.no_grad():
+        for network in (model.prior, model.posterior):
+            network.log_variance.weight.zero_()
+            network.log_variance.bias.fill_(-60)
+        model.predictor.out.weight.normal_()
+        context = context_of(model, 1)
+        codes = list(model.encode(context)[0])
+        pictures = context.rgb[0].permute(0, 3, 1, 2).float() / 255
+        skips = model.encoder(pictures)[1]
+        row = 3 if skip == "last" else 2
+        for _ in range(3):
+            history = torch.stack(codes)[None]
+            latents = model.posterior(history[:, 1:4])[0]
+            later = model.prior(history)[0][:, 3:]
+            inputs = torch.cat([history, torch.cat([latents, later], 1)], -1)
+            code = model.predictor(inputs)[0][0, -1]
+            picture = model.decoder(code[None], [skip[row : row + 1] for skip in skips])
+            codes.append(model.encoder(picture)[0][0])
+            predicted = code
+        imagined = model.imagine(context, 1, 0).features[0, 0]
+    assert torch.allclose(imagined[-1], predicted, atol=1e-5)
+
+
+def test_bad_clips_are_refused() -> None:
+    model = tiny()
+    context = context_of(model)
+    with pytest.raises(BadInputError, match=r"svg-small: pictures must be .*16, 16.*48, 48"):
+        model.encode(squares(2, 4, replace(model.spec, image_size=48)))
+    with pytest.raises(BadInputError, match="from a context of 4 frames, not 3"):
+        model.imagine(context.steps(slice(0, 3)), 1, 0)
+    with pytest.raises(BadInputError, match="clips of 5 frames, not 4"):
+        model.loss(context)
+    valid = context.valid.clone()
+    valid[1, 3] = False
+    with pytest.raises(BadInputError, match=r"squares_0001.*up to frame 18"):
+        model.imagine(with_arrays(context, valid=valid), 1, 0)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"backbone": "resnet"}, "backbones dcgan and vgg"),
+        ({"image_size": 48}, "image_size must be 16, 32, 64, 128 or 256, not 48"),
+        ({"samples": 0}, "samples must be a whole number from 1 on"),
+        ({"size": "large"}, "sizes small, paper and released"),
+        ({"weights": "shipped", "image_size": 32}, "no weights are shipped for svg-small-32"),
+    ],
+)
+def test_wrong_options_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(BadInputError, match=message):
+        build_model("svg", **options)
+
+
+def test_weights_of_another_architecture_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "model.safetensors"
+    model = build_model("svg", image_size=16)
+    assert isinstance(model, Svg)
+    write_checkpoint(path, tensors_of(model), {"built_as": model.built_as()})
+    with pytest.raises(BadInputError, match=r"model was svg-small-16 and is svg-small-32"):
+        build_model("svg", image_size=32, weights=str(path))
+    write_checkpoint(path, tensors_of(tiny(code=9)), {"built_as": model.built_as()})
+    with pytest.raises(BadInputError, match=r"encoder\.stages\.0\.0\.weight is float32 \(4, 3"):
+        build_model("svg", image_size=16, weights=str(path))
