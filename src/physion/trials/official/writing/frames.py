@@ -52,7 +52,7 @@ class FrameWriter:
         )
         self._view = axes(objects.scene.camera)
         camera, projection = to_official_camera(objects.scene.camera, width, height)
-        self._written: dict[str, Any] = {}
+        self._written: dict[str, tuple[bytes, Any]] = {}
         self._matrices = {
             "camera_matrix": camera.astype(np.float32).ravel(),
             "projection_matrix": projection.astype(np.float32).ravel(),
@@ -68,20 +68,29 @@ class FrameWriter:
             write_pictures(pictures, images, ids, self._colors, self._view)
         objects = new_group(group, "objects")
         for name, values in self._arrays.items():
-            put(objects, name, values[frame])
+            self._put(objects, name, values[frame])
         self._contacts.write(group, frame)
         matrices = new_group(group, "camera_matrices")
         for name, matrix in self._matrices.items():
-            if name in self._written:
-                # The camera stands still: one array serves all frames.
-                link(matrices, name, self._written[name])
-            else:
-                self._written[name] = put(matrices, name, matrix)
+            self._put(matrices, name, matrix)
         labels = new_group(group, "labels")
         for name, values in self.labels.items():
-            put(labels, name, values[frame])
+            self._put(labels, name, values[frame])
         if self._particles is not None:
             self._particles.write(group, frame)
+
+    def _put(self, group: Any, name: str, values: NDArray[Any]) -> None:
+        """Write an array, or link that of the last frame if it has the same bytes.
+
+        A link takes a fourth of the time. Objects rest, the camera always does, labels hardly ever
+        change.
+        """
+        data = values.tobytes()
+        last = self._written.get(name)
+        if last is not None and last[0] == data:
+            link(group, name, last[1])
+        else:
+            self._written[name] = (data, put(group, name, values))
 
 
 def _object_arrays(objects: OfficialObjects) -> dict[str, NDArray[np.float32]]:
