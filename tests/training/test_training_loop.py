@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from lightning_fabric import Fabric
 from torch import Tensor
 
 from physion.atomic import folder_lock
@@ -325,6 +326,22 @@ def test_settings_that_do_not_fit_together_are_refused(
 ) -> None:
     with pytest.raises(BadInputError, match=message):
         run(NextBrightness(), settings=replace(QUICK, **settings), fabric=None, accelerator="cpu")
+
+
+def test_no_device_without_float64_is_taken_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    def record(accelerator: str, **_: object) -> Fabric:
+        asked.append(accelerator)
+        return CPU
+
+    monkeypatch.setattr("physion.training.devices.Fabric", record)
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    for there in (True, False):
+        monkeypatch.setattr("torch.backends.mps.is_available", lambda there=there: there)
+        make_fabric(Devices("auto"))
+        make_fabric(Devices("mps"))
+    assert asked == ["cpu", "mps", "auto", "mps"]
 
 
 def test_what_cannot_be_trained_is_refused() -> None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any
 
+import torch
 from lightning_fabric import Fabric
 from lightning_fabric.strategies.ddp import DDPStrategy
 from lightning_fabric.utilities.rank_zero import rank_zero_only
@@ -26,7 +27,8 @@ _TIMEOUT = timedelta(hours=6)
 class Devices:
     """Devices of a training.
 
-    - ``accelerator``: Lightning's name: ``auto``, ``cpu``, ``cuda``, ``mps``.
+    - ``accelerator``: Lightning's name: ``auto``, ``cpu``, ``cuda``, ``mps``. ``auto`` never takes
+      Apple's MPS, which has no float64 and therefore cannot run the particle models.
     - ``devices``: of each node; more than one train together, each on a part of every batch.
     - ``nodes``: machines, on each of which the same command is started, as Lightning describes.
     """
@@ -53,7 +55,7 @@ def make_fabric(devices: Devices, precision: str = "32-true") -> Fabric:
         options["strategy"] = DDPStrategy(find_unused_parameters=True, timeout=_TIMEOUT)
     try:
         fabric = Fabric(
-            accelerator=devices.accelerator,
+            accelerator=_accelerator(devices.accelerator),
             devices=devices.devices,
             num_nodes=devices.nodes,
             precision=precision,  # type: ignore[arg-type]
@@ -67,6 +69,12 @@ def make_fabric(devices: Devices, precision: str = "32-true") -> Fabric:
     if options:
         fabric.launch()
     return fabric
+
+
+def _accelerator(name: str) -> str:
+    """Return the name of the accelerator, with the CPU where ``auto`` would take MPS."""
+    only_mps = torch.backends.mps.is_available() and not torch.cuda.is_available()
+    return "cpu" if name == "auto" and only_mps else name
 
 
 def is_first_process() -> bool:
