@@ -190,24 +190,6 @@ def test_unknown_names_get_the_closest_ones() -> None:
         build_model("frozen-encoder", **{**TINY, "dynamics": "gru"})
 
 
-def test_random_weights_never_bear_the_name_of_a_published_model() -> None:
-    model = build_model("pVGG-mlp", weights="random", hidden=4)
-    assert model.provenance().model == "random-vgg19-mlp"
-    assert model.provenance().init == "random"
-    assert model.provenance().encoder_pretraining_task == ""
-    assert build_model("pVGG-lstm", hidden=4).provenance().model == "pVGG-lstm"
-    assert build_model("pDeIT-mlp", hidden=4).provenance().model == "pDeIT-mlp"
-    assert build_model("pDeIT-mlp", hidden=4).provenance().init == "imagenet"
-
-
-def test_published_encoders_have_their_feature_sizes() -> None:
-    sizes = [
-        build_model(name, weights="random", hidden=2).feature_size  # type: ignore[attr-defined]
-        for name in ("pVGG-lstm", "pDeIT-lstm")
-    ]
-    assert sizes == [4096, 768]
-
-
 class _Foreign(nn.Module):
     """Model as another package would define it."""
 

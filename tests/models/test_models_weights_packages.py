@@ -18,8 +18,8 @@ from PIL import Image
 from torch import Tensor
 
 from physion.errors import BadInputError, MissingExtraError, UnknownNameError
+from physion.models.encoders.settings import FAMILIES
 from physion.models.weights import (
-    PUBLISHED_SETTINGS,
     EncoderWeights,
     WeightsPackage,
     create_classifier,
@@ -129,17 +129,15 @@ def test_the_origin_is_named() -> None:
     assert EncoderWeights("random").pretraining() == ("", "")
 
 
-def test_published_settings_fit_together() -> None:
-    assert set(PUBLISHED_SETTINGS) == {"pEffNetLite0", "pEffNetLite2"}
-    for family, settings in PUBLISHED_SETTINGS.items():
-        package = EncoderWeights(settings["weights"]).package
-        assert package is not None
-        assert (package.family, package.encoder) == (family, settings["encoder"])
+def test_models_with_packaged_weights_have_the_network_and_size_of_the_package() -> None:
+    for size in ("small", "paper"):
+        config = FAMILIES["pEffNetLite0"][size].config
+        package = EncoderWeights(config.weights).package
+        assert package is not None and package.encoder == config.encoder
+        assert (config.image_size == package.image_size) is (size == "paper")
+    for package in weights_packages.values():
         own = timm.get_pretrained_cfg(package.encoder)
-        assert (
-            own is not None
-            and own.input_size == (3, settings["image_size"])[:1] + (settings["image_size"],) * 2
-        )
+        assert own is not None and own.input_size == (3, package.image_size, package.image_size)
 
 
 def test_an_absent_package_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -197,7 +195,7 @@ def test_statistics_belong_to_the_weights(monkeypatch: pytest.MonkeyPatch) -> No
     name = "tf_efficientnet_lite0"
     own = input_statistics(name)
     assert input_statistics(name, EncoderWeights("random")) == own
-    other = WeightsPackage("a", "1", "a.pth", "0", name, 224, "pA", (0.1, 0.2, 0.3), (1, 2, 3))
+    other = WeightsPackage("a", "1", "a.pth", "0", name, 224, (0.1, 0.2, 0.3), (1, 2, 3))
     monkeypatch.setattr(packages, "weights_packages", {"a": other})
     assert input_statistics(name, EncoderWeights("package:a")) == ((0.1, 0.2, 0.3), (1, 2, 3))
     assert input_statistics("resnet18")[0] == (0.485, 0.456, 0.406)

@@ -11,10 +11,16 @@ TINY: dict[str, Any] = {
 }  # fmt: skip
 FROZEN = [
     "frozen-encoder", "pVGG-mlp", "pVGG-lstm", "pDeIT-mlp", "pDeIT-lstm", "pEffNetLite0-mlp",
+    "pDINO-mlp", "pDINO-lstm", "pDINOv2-mlp", "pDINOv2-lstm",
     "pEffNetLite0-lstm",
 ]  # fmt: skip
+VIDEO: dict[str, Any] = {
+    "weights": "random", "image_size": 32, "patch": 8, "frames": 4, "width": 24, "depth": 2,
+    "heads": 2, "later": 2,
+}  # fmt: skip
 OPTIONS: dict[str, dict[str, Any]] = {
     **dict.fromkeys(FROZEN, TINY),
+    **dict.fromkeys(("VideoMAE", "V-JEPA2"), VIDEO),
     "noisy-simulation": {"samples": 3},
     "noisy-simulation-outcomes": {"samples": 3},
     "noisy-simulation-people": {"samples": 3},

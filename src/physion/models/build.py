@@ -15,7 +15,11 @@ from physion.registry import Registry
 
 C = TypeVar("C")
 
-_EXTRA_LIBRARIES = ("torch", "torchvision", "timm", "safetensors", "lightning_fabric")
+_EXTRAS = {
+    **dict.fromkeys(("torch", "torchvision", "timm", "safetensors", "lightning_fabric"), "models"),
+    "transformers": "video",
+}
+"""Extra that installs a library, by name of the library."""
 
 ModelFactory = Callable[..., Model]
 """Function that builds a model from the fields of its config."""
@@ -23,16 +27,22 @@ ModelFactory = Callable[..., Model]
 models: Registry[ModelFactory] = Registry(
     "model",
     {
-        "frozen-encoder": "physion.models.frozen_encoder:frozen_encoder",
-        "pVGG-mlp": "physion.models.frozen_encoder:pvgg_mlp",
-        "pVGG-lstm": "physion.models.frozen_encoder:pvgg_lstm",
-        "pDeIT-mlp": "physion.models.frozen_encoder:pdeit_mlp",
-        "pDeIT-lstm": "physion.models.frozen_encoder:pdeit_lstm",
-        "pEffNetLite0-mlp": "physion.models.frozen_encoder:peffnet_mlp",
-        "pEffNetLite0-lstm": "physion.models.frozen_encoder:peffnet_lstm",
+        "frozen-encoder": "physion.models.encoders.build:frozen_encoder",
+        "pVGG-mlp": "physion.models.encoders.build:pvgg_mlp",
+        "pVGG-lstm": "physion.models.encoders.build:pvgg_lstm",
+        "pDeIT-mlp": "physion.models.encoders.build:pdeit_mlp",
+        "pDeIT-lstm": "physion.models.encoders.build:pdeit_lstm",
+        "pEffNetLite0-mlp": "physion.models.encoders.build:peffnet_mlp",
+        "pEffNetLite0-lstm": "physion.models.encoders.build:peffnet_lstm",
         "cswm": "physion.models.cswm.build:cswm",
         "svg": "physion.models.svg.build:svg",
         "op3": "physion.models.op3.build:op3",
+        "pDINO-mlp": "physion.models.encoders.build:pdino_mlp",
+        "pDINO-lstm": "physion.models.encoders.build:pdino_lstm",
+        "pDINOv2-mlp": "physion.models.encoders.build:pdinov2_mlp",
+        "pDINOv2-lstm": "physion.models.encoders.build:pdinov2_lstm",
+        "VideoMAE": "physion.models.encoders.video:videomae",
+        "V-JEPA2": "physion.models.encoders.video:vjepa2",
         "gns": "physion.models.particles.build:gns",
         "gns-ransac": "physion.models.particles.build:gns_ransac",
         "dpi": "physion.models.particles.build:dpi",
@@ -135,8 +145,8 @@ def _registered(name: str) -> ModelFactory:
 def _missing(name: str, error: ModuleNotFoundError) -> Exception:
     """Return the error that names the extra, or the library, that a model needs."""
     library = (error.name or "").partition(".")[0]
-    if library in _EXTRA_LIBRARIES:
-        return MissingExtraError(f"model {name!r}", "models")
+    if library in _EXTRAS:
+        return MissingExtraError(f"model {name!r}", _EXTRAS[library])
     return BadInputError(f"model {name!r} needs the library {error.name!r}, which is not installed")
 
 

@@ -15,8 +15,8 @@ from physion.models.weights.encoder import (
     input_statistics,
 )
 from physion.models.weights.grid import GRID, POOLED, Pooling
-from physion.models.weights.packages import PUBLISHED_SETTINGS, WeightsPackage, weights_packages
-from physion.models.weights.source import IMAGENET, PACKAGE, RANDOM, EncoderWeights
+from physion.models.weights.packages import WeightsPackage, weights_packages
+from physion.models.weights.source import IMAGENET, PACKAGE, RANDOM, TIMM, EncoderWeights
 from physion.models.weights.state_dicts import read_state_dict
 
 __all__ = [
@@ -24,8 +24,8 @@ __all__ = [
     "IMAGENET",
     "PACKAGE",
     "POOLED",
-    "PUBLISHED_SETTINGS",
     "RANDOM",
+    "TIMM",
     "EncoderWeights",
     "Pooling",
     "WeightsPackage",

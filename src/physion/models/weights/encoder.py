@@ -19,7 +19,7 @@ from torch import nn
 from physion.errors import BadInputError, UnknownNameError
 from physion.models.weights.grid import GRID, POOLED, GridFeatures, Pooling, check_pooling
 from physion.models.weights.packages import WeightsPackage, timm_efficientnet_names
-from physion.models.weights.source import IMAGENET, EncoderWeights
+from physion.models.weights.source import IMAGENET, TIMM, EncoderWeights
 from physion.models.weights.state_dicts import first_line, load_fitting, read_state_dict
 from physion.seeds import stable_hash
 
@@ -49,7 +49,7 @@ def create_encoder(
     else:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(stable_hash("encoder", name, weights.seed) % 2**63)
-            encoder = _create(name, image_size, pretrained=weights.source == IMAGENET)
+            encoder = _create(name, image_size, tag=_tag(name, weights))
     if weights.path is not None:
         _load_local(encoder, name, weights.path)
     head = getattr(encoder, "pre_logits", None)
@@ -80,7 +80,7 @@ def feature_size(name: str, image_size: int, pooling: Pooling = POOLED) -> int:
     check_encoder_name(name)
     check_pooling(pooling)
     with torch.device("meta"):
-        encoder = _create(name, image_size, pretrained=False)
+        encoder = _create(name, image_size)
         if pooling == GRID:
             encoder = GridFeatures(encoder, name)
         features = encoder.eval()(torch.zeros(1, 3, image_size, image_size))
@@ -94,13 +94,15 @@ def input_statistics(
 ) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     """Return mean and standard deviation of the channels with which the weights were trained.
 
-    They belong to the weights: a package names its own; timm's are taken for all others.
+    They belong to the weights: a package names its own; timm's are taken for all others. Raises
+    `BadInputError` if timm has no such weights.
     """
     check_encoder_name(name)
     if weights is not None and (package := weights.package) is not None:
         _check_belongs(name, package)
         return package.mean, package.std
-    known = timm.get_pretrained_cfg(name, allow_unregistered=False)
+    tag = "" if weights is None else _tag(name, weights)
+    known = timm.get_pretrained_cfg(f"{name}.{tag}" if tag else name, allow_unregistered=False)
     assert known is not None, "checked above"
     (m0, m1, m2), (s0, s1, s2) = known.mean, known.std
     return (m0, m1, m2), (s0, s1, s2)
@@ -114,24 +116,47 @@ def _check_belongs(name: str, package: WeightsPackage) -> None:
         )
 
 
-def _create(name: str, image_size: int, *, pretrained: bool) -> nn.Module:
+def _tag(name: str, weights: EncoderWeights) -> str:
+    """Return the tag of timm's weights that are wanted, empty for weights of another source.
+
+    Raises `BadInputError` if timm has none, or if its first ones are not those of ImageNet
+    classification but ``imagenet`` is wanted.
+    """
+    if not weights.downloaded:
+        return ""
+    known = timm.get_pretrained_cfg(name, allow_unregistered=False)
+    tags = [full.partition(".")[2] for full in timm.list_pretrained(f"{name}.*")]
+    imagenet = weights.source == IMAGENET
+    tag = str(known.tag or "") if imagenet and known is not None else weights.tag
+    if tag not in tags or (imagenet and "in1k" not in tag):
+        listed = ", ".join(f"{TIMM}{tag}" for tag in tags) or "none"
+        raise BadInputError(
+            f"timm has no weights {weights.source!r} of {name!r}; it has {listed}; use one of "
+            "them, weights=<file> with a state dict, or weights=random (the tables name it)"
+        )
+    return tag
+
+
+def _create(name: str, image_size: int, *, tag: str = "") -> nn.Module:
+    """Build a timm network without its classifier, with timm's weights called ``tag`` if any."""
+    pretrained = bool(tag)
     known = timm.get_pretrained_cfg(name, allow_unregistered=False)
     # Only networks of a fixed input size (transformers) take this argument.
     fixed: dict[str, Any] = (
         {"img_size": image_size} if known is not None and known.fixed_input_size else {}
     )
-    offline = _offline_without_network() if pretrained else contextlib.nullcontext()
+    offline = offline_without_network() if pretrained else contextlib.nullcontext()
     try:
         with offline:
             model: nn.Module = timm.create_model(
-                name, pretrained=pretrained, num_classes=0, **fixed
+                f"{name}.{tag}" if tag else name, pretrained=pretrained, num_classes=0, **fixed
             )
     except Exception as error:
         if not pretrained:
             raise
         # The exceptions of timm's downloader depend on its version.
         raise BadInputError(
-            f"imagenet weights of {name!r} could not be fetched "
+            f"weights {tag!r} of {name!r} could not be fetched "
             f"({type(error).__name__}: {first_line(error)}); use weights=<file> with a state dict"
             ", or weights=random (the tables name it)"
         ) from error
@@ -139,7 +164,7 @@ def _create(name: str, image_size: int, *, pretrained: bool) -> nn.Module:
 
 
 @contextlib.contextmanager
-def _offline_without_network() -> Iterator[None]:
+def offline_without_network() -> Iterator[None]:
     """Use the local cache alone without a network; the hub would retry for most of a minute."""
     host = urlsplit(hub.ENDPOINT).hostname or ""
     proxied = any(name.lower().endswith("s_proxy") for name in os.environ)

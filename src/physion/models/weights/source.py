@@ -10,14 +10,23 @@ import torch
 from physion.models.weights.packages import WeightsPackage, weights_package
 from physion.models.weights.state_dicts import file_sha256
 
-IMAGENET, RANDOM, PACKAGE = "imagenet", "random", "package:"
+IMAGENET, RANDOM, PACKAGE, TIMM = "imagenet", "random", "package:", "timm:"
+TIMM_PRETRAINING = {
+    "dino": ("DINO", "ImageNet"),
+    "mae": ("masked autoencoder", "ImageNet"),
+    "lvd142m": ("DINOv2", "LVD-142M"),
+    "lvd1689m": ("DINOv3", "LVD-1689M"),
+}
+"""Task and data set of some of timm's weights, by tag."""
 
 
 @dataclass(frozen=True, slots=True)
 class EncoderWeights:
     """Weights of an encoder, by their source.
 
-    - ``imagenet``: timm's pretrained weights, downloaded. ``random``: drawn from ``seed``.
+    - ``imagenet``: timm's weights of ImageNet classification, downloaded.
+    - ``timm:TAG``: other weights of timm, downloaded, such as ``timm:dino``.
+    - ``random``: drawn from ``seed``.
     - ``package:NAME``: weights in the Python distribution NAME, one of `weights_packages`.
     - otherwise the path of a state dict, as ``.safetensors`` or as a torch file of plain tensors.
 
@@ -38,16 +47,26 @@ class EncoderWeights:
         return weights_package(self.source.removeprefix(PACKAGE))
 
     @property
+    def tag(self) -> str:
+        """The tag of timm's weights; empty for those of another source, and for ``imagenet``."""
+        return self.source.removeprefix(TIMM) if self.source.startswith(TIMM) else ""
+
+    @property
+    def downloaded(self) -> bool:
+        """Whether timm fetches the weights."""
+        return self.source == IMAGENET or self.source.startswith(TIMM)
+
+    @property
     def path(self) -> Path | None:
         """The file that the user gave, or None."""
-        if self.source in (IMAGENET, RANDOM) or self.package is not None:
+        if self.source == RANDOM or self.downloaded or self.package is not None:
             return None
         return Path(self.source)
 
     def init(self) -> str:
         """Return the value of the column *Init*.
 
-        It is imagenet, random, package:<name>, or local:<start of the file's SHA-256>.
+        It is imagenet, timm:<tag>, random, package:<name>, or local:<start of the file's SHA-256>.
         """
         path = self.path
         return self.source if path is None else f"local:{file_sha256(path)[:12]}"
@@ -59,10 +78,12 @@ class EncoderWeights:
         if package := self.package:
             return f"{self.source}:{package.sha256}"
         path = self.path
-        return IMAGENET if path is None else f"local:{file_sha256(path)}"
+        return self.source if path is None else f"local:{file_sha256(path)}"
 
     def pretraining(self) -> tuple[str, str]:
         """Return task and data set that trained the weights; both are empty if unknown."""
         if package := self.package:
             return package.task, package.dataset
+        if self.tag:
+            return TIMM_PRETRAINING.get(self.tag, ("", self.tag))
         return ("ImageNet classification", "ImageNet") if self.source == IMAGENET else ("", "")

@@ -1,0 +1,250 @@
+"""Video encoders: clips that end with the last observed frame, weights by name or from a file."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import huggingface_hub
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+from torch import Tensor
+
+from physion.errors import BadInputError
+from physion.models import Batch, build_model
+from physion.readout import EvaluationConfig, evaluate
+from physion.readout.logistic import ReadoutConfig
+from support.moving_dots import make_dots
+from support.programs import absent
+from support.tiny_models import VIDEO
+
+try:
+    import transformers
+except ModuleNotFoundError:
+    absent("transformers is not installed: it comes with the extra video")
+
+from physion.models.encoders import video_networks
+from physion.models.encoders.video import VideoEncoder
+
+NAMES = ["VideoMAE", "V-JEPA2"]
+
+
+def make(name: str, **options: Any) -> VideoEncoder:
+    model = build_model(name, **{**VIDEO, **options})
+    assert isinstance(model, VideoEncoder)
+    return model
+
+
+def pictures(frames: int, size: int = 32, seed: int = 0) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randint(0, 256, (2, frames, size, size, 3), dtype=torch.uint8, generator=generator)
+
+
+def batch(rgb: Tensor) -> Batch:
+    shape = rgb.shape[:2]
+    return Batch(
+        ("a", "b"), np.zeros(shape, np.int64), np.ones(shape, np.bool_), rgb=rgb.numpy()
+    ).to("cpu")
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("size", ["small", "paper"])
+def test_the_context_ends_with_the_last_observed_frame(
+    name: str, size: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "physion.models.encoders.video.create_video_encoder",
+        lambda family, config: (torch.nn.Identity(), config.weights),
+    )
+    model = build_model(name, size=size)
+    spec = model.spec
+    assert spec.context_frames() == tuple(range(14, 45, 2)) and not spec.framewise
+    assert len(spec.future_frames()) == 48 and spec.future_frames()[0] == 46
+    provenance = model.provenance()
+    named = provenance.init.startswith("hub:")
+    assert provenance.model == f"{'' if named else 'random-'}{name}-{size}"
+    assert bool(provenance.encoder_pretraining_dataset) is named
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_features_of_a_clip_depend_on_all_its_frames_and_on_no_other_clip(name: str) -> None:
+    model = make(name)
+    rgb = pictures(12)
+    features = model.encode(batch(rgb))
+    assert features.shape == (2, 6, 24) and features.dtype == torch.float32
+    assert torch.equal(model.encode(batch(rgb[:, :4])), features[:, :2])
+    changed = rgb.clone()
+    changed[:, 4:] = pictures(8, seed=1)
+    assert torch.equal(model.encode(batch(changed))[:, :2], features[:, :2])
+    changed = rgb.clone()
+    changed[:, 3] = pictures(1, seed=1)[:, 0]
+    change = (model.encode(batch(changed)) - features).abs().amax((0, 2))
+    assert (change[:2] > 1e-6).all() and (change[2:] == 0).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_tokens_are_averaged_at_one_time_and_in_cells(name: str) -> None:
+    model, grid = make(name), make(name, pooling="grid", image_size=64)
+    small = batch(pictures(4))
+    tokens = model.network(model_input(model, small)).last_hidden_state
+    expected = tokens.view(2, 2, 16, 24).mean(2)
+    assert torch.allclose(model.encode(small), expected, atol=1e-6)
+    large = batch(pictures(4, 64))
+    tokens = grid.network(model_input(grid, large)).last_hidden_state
+    cells = tokens.view(2, 2, 4, 2, 4, 2, 24).mean((3, 5)).reshape(2, 2, -1)
+    assert torch.allclose(grid.encode(large), cells, atol=1e-6)
+    assert grid.name() == f"random-{name}-grid-small"
+
+
+def model_input(model: VideoEncoder, clips: Batch) -> Tensor:
+    mean, std = (torch.tensor(v).view(3, 1, 1) for v in (model.spec.mean, model.spec.std))
+    return (clips.rgb.permute(0, 1, 4, 2, 3).float() / 255 - mean) / std
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_random_weights_follow_the_seed_and_nothing_is_trained(name: str) -> None:
+    torch.manual_seed(1)
+    one = make(name)
+    torch.manual_seed(2)
+    assert make(name).digest() == one.digest() != make(name, seed=1).digest()
+    assert make(name, pooling="grid").digest() != one.digest() != make(name, stride=3).digest()
+    assert not any(p.requires_grad for p in one.parameters()) and not one.network.training
+
+
+def files(folder: Path) -> dict[str, Path]:
+    """Checkpoints as the networks that were trained are published, with all their parts."""
+    tiny: dict[str, Any] = {
+        "image_size": 32, "patch_size": 8, "num_frames": 4, "hidden_size": 24,
+        "num_hidden_layers": 2, "num_attention_heads": 2, "intermediate_size": 96,
+        "decoder_hidden_size": 24, "decoder_num_hidden_layers": 1,
+        "decoder_num_attention_heads": 2, "decoder_intermediate_size": 24,
+    }  # fmt: skip
+    mae = transformers.VideoMAEForPreTraining(
+        transformers.VideoMAEConfig(**tiny, use_mean_pooling=False)
+    )
+    jepa = transformers.VJEPA2ForVideoClassification(
+        transformers.VJEPA2Config(
+            crop_size=32, patch_size=8, frames_per_clip=4, hidden_size=24, num_hidden_layers=2,
+            num_attention_heads=2, pred_num_hidden_layers=1, num_pooler_layers=1,
+        )
+    )  # fmt: skip
+    old = {"attention.query.bias": "attention.q_bias", "attention.value.bias": "attention.v_bias"}
+    state = {}
+    for name, value in mae.state_dict().items():
+        for new, before in old.items():
+            name = name.replace(new, before)
+        state[name] = value
+    assert any(name.endswith("q_bias") for name in state)
+    paths = {"VideoMAE": folder / "mae.safetensors", "V-JEPA2": folder / "jepa.safetensors"}
+    save_file(state, paths["VideoMAE"])
+    save_file(jepa.state_dict(), paths["V-JEPA2"])
+    return paths
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_published_checkpoints_are_read_with_all_tensors(name: str, tmp_path: Path) -> None:
+    path = files(tmp_path)[name]
+    model = make(name, weights=str(path))
+    assert model.provenance().model == f"{name}-small"
+    assert model.provenance().init.startswith("local:")
+    assert model.digest() != make(name).digest()
+    stored = {
+        tuple(v.flatten()[:3].tolist()) for v in video_networks.read_state_dict(path).values()
+    }
+    for value in model.network.state_dict().values():
+        assert tuple(value.flatten()[:3].tolist()) in stored
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_weights_of_another_network_name_the_tensors_that_differ(name: str, tmp_path: Path) -> None:
+    paths = files(tmp_path)
+    other = paths[NAMES[1 - NAMES.index(name)]]
+    with pytest.raises(
+        BadInputError, match=rf"'{name}': its tensors differ, \d+ missing"
+    ) as caught:
+        make(name, weights=str(other))
+    assert "\n" not in str(caught.value)
+    with pytest.raises(BadInputError, match=r"of another shape \('embeddings\.patch"):
+        make(name, weights=str(paths[name]), width=48)
+    with pytest.raises(BadInputError, match="no such file"):
+        make(name, weights=str(tmp_path / "absent.safetensors"))
+
+
+def test_weights_of_the_hub_are_asked_for_by_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = files(tmp_path)["VideoMAE"]
+    asked = []
+
+    def download(name: str, file: str) -> str:
+        asked.append((name, file))
+        return str(path)
+
+    monkeypatch.setattr(video_networks, "hf_hub_download", download)
+    model = make("VideoMAE", weights="hub:someone/some-model")
+    assert asked == [("someone/some-model", "model.safetensors")]
+    assert model.provenance().init == "hub:someone/some-model"
+    assert model.provenance().encoder_pretraining_task == "", "which nobody said"
+    assert model.digest() == make("VideoMAE", weights=str(path)).digest()
+
+
+def test_a_hub_that_cannot_be_reached_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    def download(name: str, file: str) -> str:
+        raise huggingface_hub.errors.LocalEntryNotFoundError("no network\nsecond line")
+
+    monkeypatch.setattr(video_networks, "hf_hub_download", download)
+    with pytest.raises(BadInputError, match=r"'hub:a/b' could not be fetched .*no network.*random"):
+        make("VideoMAE", weights="hub:a/b")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"frames": 3}, "even number of frames, not 3"),
+        ({"image_size": 30}, "not 30 of 8"),
+        ({"heads": 5}, "not 24 of 5"),
+        ({"depth": 0}, "at least 1"),
+        ({"size": "released"}, "has the sizes small, paper, not 'released'"),
+        ({"frames": 24}, "span 47 frames"),
+    ],
+)
+def test_settings_that_make_no_network_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(BadInputError, match=message):
+        make("VideoMAE", **options)
+
+
+def test_clips_of_another_length_are_refused() -> None:
+    with pytest.raises(BadInputError, match="clips of 4 frames, not 6"):
+        make("VideoMAE").encode(batch(pictures(6)))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_it_is_evaluated_under_observed_and_full(name: str, tmp_path: Path) -> None:
+    dots = make_dots(tmp_path / "dots", {"readout": 8, "testing": 4}, ("collide",))
+    config = EvaluationConfig(accelerator="cpu", readout=ReadoutConfig(grid=(1e-2,)))
+    table = evaluate(dots, name, tmp_path, options=VIDEO, config=config).predictions
+    assert set(table["Protocol"]) == {"observed", "full"}
+    assert (table["Model"] == f"random-{name}-small").all() and (table["Init"] == "random").all()
+
+
+def test_without_transformers_the_extra_is_named() -> None:
+    code = """
+import sys
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name == "transformers":
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+sys.meta_path.insert(0, Absent())
+from physion.errors import MissingExtraError
+from physion.models import build_model
+try:
+    build_model("VideoMAE")
+except MissingExtraError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "pip install -e '.[video]'" in done.stdout
