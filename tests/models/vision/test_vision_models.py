@@ -21,7 +21,7 @@ from physion.models.checkpoints.checkpoint import (
 from physion.models.checkpoints.trained import shipped_digests
 from support.moving_squares import squares, with_arrays
 
-NAMES = ("cswm", "rpin")
+NAMES = ("cswm", "rpin", "svg", "op3")
 
 
 def model_of(name: str, **options: Any) -> Any:
@@ -116,7 +116,7 @@ def steps(model: Any, batch: Batch, count: int, rate: float = 2e-3) -> list[floa
     return losses
 
 
-@pytest.mark.parametrize(("name", "count"), [("cswm", 60), ("rpin", 60)])
+@pytest.mark.parametrize(("name", "count"), [("cswm", 60), ("rpin", 60), ("svg", 40), ("op3", 20)])
 def test_a_model_overfits_one_batch(name: str, count: int) -> None:
     model = model_of(name)
     batch = squares(4, model.window, model.spec)
@@ -197,8 +197,9 @@ def test_a_digest_belongs_to_the_size(name: str) -> None:
 def test_bad_input_is_named(name: str) -> None:
     model = model_of(name)
     context = context_of(model)
-    small = with_arrays(context, rgb=context.rgb[:, :, :32, :32])
-    with pytest.raises(BadInputError, match=f"{name}-small: pictures must be .* 64, 64, 3"):
+    size = model.spec.image_size
+    small = with_arrays(context, rgb=context.rgb[:, :, : size // 2, : size // 2])
+    with pytest.raises(BadInputError, match=f"{name}-small: pictures must be .* {size}, {size}, 3"):
         model.encode(small)
     with pytest.raises(BadInputError, match=f"{name}-small: pictures must be .* not none"):
         model.encode(with_arrays(context, rgb=None))

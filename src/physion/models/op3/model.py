@@ -163,7 +163,7 @@ class Op3(VisionModel):
     def _watch(self, pictures: Tensor) -> tuple[Tensor, Slots]:
         """Return features (B, T, K R) of clips (B, T, 3, H, W), and the beliefs after the last."""
         config, inference = self.config, self.slots
-        rng = generator(NAME, "slots", self.options.seed)
+        rng = generator(NAME, "slots")
         features = []
         # The refinement needs gradients, which tensors of the inference mode cannot have.
         with torch.inference_mode(False), torch.enable_grad():
