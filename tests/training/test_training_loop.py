@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from lightning_fabric import Fabric
-from torch import Tensor
+from torch import Tensor, nn
 
 from physion.atomic import folder_lock
 from physion.errors import BadInputError, PhysionError
@@ -96,6 +96,36 @@ def test_resumed_training_is_the_uninterrupted_one_to_the_bit(
     assert equal_weights(model, whole) and result.notes == ()
     assert files_of(tmp_path / "parts") == files_of(tmp_path / "whole")
     assert {Path(name).name for name in files_of(tmp_path)} == {WEIGHTS, CARD, METRICS}
+
+
+class Calibrated(NextBrightness):
+    """Network with a buffer that is set after training; ``killed`` ends the process before it."""
+
+    calibration_trials = 5
+
+    def __init__(self, *, killed: bool = False) -> None:
+        super().__init__()
+        self.killed = killed
+        self.level = nn.Buffer(torch.zeros(()))
+
+    def calibrate(self, whole: Batch) -> None:
+        if self.killed:
+            raise KeyboardInterrupt
+        assert len(whole) == self.calibration_trials
+        self.level.copy_(self.net(self._brightness(whole)[:, :3]).mean() + torch.rand(()))
+
+
+def test_a_training_that_ended_before_its_calibration_is_calibrated(tmp_path: Path) -> None:
+    whole, resumed = Calibrated(), Calibrated()
+    run(whole, tmp_path / "whole")
+    with pytest.raises(KeyboardInterrupt):
+        run(Calibrated(killed=True), tmp_path / "parts")
+    assert not any(Path(name).name == WEIGHTS for name in files_of(tmp_path / "parts"))
+    run(resumed, tmp_path / "parts")
+    assert equal_weights(resumed, whole) and float(resumed.level) != 0
+    assert files_of(tmp_path / "parts") == files_of(tmp_path / "whole")
+    again = Calibrated(killed=True)
+    assert run(again, tmp_path / "parts").loaded and equal_weights(again, whole)
 
 
 def test_a_resumed_training_reads_only_the_batches_that_are_left(tmp_path: Path) -> None:

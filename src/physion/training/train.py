@@ -23,9 +23,10 @@ from physion.errors import BadInputError
 from physion.models.checkpoints.checkpoint import hash_config, load_tensors, tensors_of, versions
 from physion.models.checkpoints.trained import BUILT_AS
 from physion.models.interface import Calibrates, Learns, features_digest
+from physion.models.raised import OutOfMemoryError, is_out_of_memory
 from physion.models.settings import TrainingSettings
 from physion.seeds import generator, stable_hash
-from physion.training.devices import Devices, make_fabric, memory_advice
+from physion.training.devices import Devices, make_fabric, memory_advice, move_to_device
 from physion.training.folder import TrainingFolder
 from physion.training.loop import TrainingData, TrainingLoop
 from physion.training.losses import call, evaluating
@@ -126,7 +127,7 @@ def train_model(
     if folder is not None:
         title = re.sub(r"[^A-Za-z0-9._-]+", "-", f"{model.provenance().model}-{name}")
         kept = TrainingFolder(folder / f"{title}-{config_hash[:12]}", config)
-    fabric.to_device(model)
+    move_to_device(fabric, model)
     done = kept.finished() if kept is not None else None
     if kept is not None and done is not None:
         load_tensors(done.path, done.tensors, model)
@@ -243,9 +244,18 @@ def _windows(
 
 def _prepare(model: Any, data: TrainingData, seed: int, fabric: Fabric) -> None:
     """Let the model set its statistics from training clips."""
+    sample = data.training.sample(seed)
     with evaluating(model, fabric):
         torch.manual_seed(stable_hash("prepare", seed) % 2**63)
-        call(model, "prepare", data.training.sample(seed).to(fabric.device))
+        try:
+            call(model, "prepare", sample.to(fabric.device))
+        except (MemoryError, RuntimeError) as error:
+            if not is_out_of_memory(error):
+                raise
+            raise OutOfMemoryError(
+                f"prepare ran out of memory with {len(sample)} clips; use a smaller image_size or "
+                "size of the model"
+            ) from error
 
 
 def calibrate(model: Any, source: WholeSource, trials: Sequence[str], seed: int) -> None:
@@ -258,7 +268,8 @@ def calibrate(model: Any, source: WholeSource, trials: Sequence[str], seed: int)
     order = generator("calibrate", seed).permutation(len(trials))[: model.calibration_trials]
     chosen = source.whole([trials[row] for row in np.sort(order)])
     torch.manual_seed(stable_hash("calibrate", seed) % 2**63)
-    call(model, "calibrate", chosen)
+    network: Any = model
+    call(model, "calibrate", chosen.to(next(network.parameters()).device))
 
 
 def _named(progress: Progress | None, what: str) -> Callable[[int, int], None] | None:
