@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -12,14 +13,15 @@ from physion.errors import BadInputError
 from physion.models.build import build_model
 from physion.models.cswm.config import cswm_config
 from physion.models.cswm.contrast import (
+    all_pairs_loss,
     energy,
     hinge_loss,
     rank_next_states,
     ranking,
-    states_of_other_clips,
-    states_of_other_steps,
 )
+from physion.models.cswm.model import Cswm
 from physion.models.cswm.networks import SlotExtractor, SlotTransition
+from physion.models.vision.model import VisionOptions
 from support.moving_squares import squares, with_arrays
 
 
@@ -49,7 +51,7 @@ class _Still(nn.Module):
         self.change = change
 
     def forward(self, slots: torch.Tensor) -> torch.Tensor:
-        return torch.full_like(slots, self.change)
+        return torch.full_like(slots[..., :1], self.change)
 
 
 def test_loss_of_states_that_move_by_a_constant() -> None:
@@ -65,30 +67,50 @@ def test_loss_of_states_that_move_by_a_constant() -> None:
     assert model.loss(None)["loss"].item() == pytest.approx(2 * 0.25)
 
 
-def test_without_a_transition_the_loss_is_that_of_the_baseline() -> None:
+def test_an_untrained_network_predicts_that_nothing_changes() -> None:
     model = model_of()
-    model.transition = _Still(0.0)
     batch = squares(3, model.window, model.spec)
-    torch.manual_seed(0)
     loss = model.loss(batch)["loss"].item()
-    torch.manual_seed(0)
     assert model.baseline(batch).item() == pytest.approx(loss)
 
 
-def test_negatives_are_other_clips_and_other_steps() -> None:
-    states = torch.arange(12.0).view(3, 4, 1, 1)
-    for seed in range(20):
-        torch.manual_seed(seed)
-        clips, steps = states_of_other_clips(states), states_of_other_steps(states)
-        assert ((clips - states).abs() % 4 == 0).all() and (clips != states).all()
-        assert torch.equal(steps // 4, states // 4) and (steps != states).all()
-    assert len(states_of_other_clips(states[:1])) == 0
+def test_loss_of_all_pairs_of_given_states() -> None:
+    """Clips (0, 0.5) and (2, 2), energies 2 d^2: 0.5 in the one clip, 0 in the other, 4.5 or more
+    between them; so 0.5 and 1 within clips, and 0 between."""
+    states = torch.tensor([[0.0, 0.5], [2.0, 2.0]])[..., None, None]
+    assert all_pairs_loss(states, 0.5, 1.0).item() == pytest.approx(0.75 / 2, abs=1e-6)
+    assert all_pairs_loss(states[:1], 0.5, 1.0).item() == pytest.approx(0.5, abs=1e-6)
+    assert all_pairs_loss(states[:, :1], 0.5, 1.0).item() == pytest.approx(0, abs=1e-6)
+    assert all_pairs_loss(states[:, :1], 0.5, 9.0).item() == pytest.approx(1.0, abs=1e-6)
 
 
-def test_a_single_clip_has_the_negatives_of_its_other_steps() -> None:
+def test_the_loss_of_all_pairs_is_that_of_the_pairs_one_by_one() -> None:
+    torch.manual_seed(0)
+    states = 0.3 * torch.randn(3, 4, 5, 2)
+    within, between = [], []
+    for a in range(12):
+        for b in range(12):
+            pair = states[a // 4, a % 4], states[b // 4, b % 4]
+            if a != b:
+                (within if a // 4 == b // 4 else between).append(hinge_loss(*pair, 0.5, 1.0))
+    expected = (torch.stack(within).mean() + torch.stack(between).mean()) / 2
+    assert all_pairs_loss(states, 0.5, 1.0).item() == pytest.approx(expected.item(), rel=1e-5)
+
+
+def test_two_states_tell_a_velocity() -> None:
+    """The transition is given the present slot and its last change."""
     model = model_of()
-    losses = model.loss(squares(1, model.window, model.spec))
-    assert losses["loss"].isfinite() and losses["negatives"] > 0
+    seen = []
+
+    class Records(nn.Module):
+        def forward(self, slots: torch.Tensor) -> torch.Tensor:
+            seen.append(slots)
+            return slots[..., 1:]
+
+    model.transition = Records()
+    states = torch.tensor([1.0, 3.0, 4.0])[None, :, None, None]
+    assert model._predicted(states).flatten().tolist() == [5.0, 5.0]
+    assert seen[0].flatten(1).tolist() == [[3.0, 2.0], [4.0, 1.0]]
 
 
 def test_published_negatives_are_a_permutation_of_the_batch() -> None:
@@ -124,13 +146,13 @@ def test_the_true_next_state_is_first_for_the_right_transition_and_never_for_a_c
     model._states = lambda batch: states
     model.transition = _Still(1.0)
     ranks, copied = model.next_state_ranks(None)
-    assert len(ranks) == 80 and ranking(ranks) == ranking(torch.ones(80))
+    assert len(ranks) == 60 and ranking(ranks) == ranking(torch.ones(60))
     assert ranking(copied).hits == 0 and ranking(copied).reciprocal <= 0.5
 
 
 def test_the_transition_follows_the_order_of_the_slots() -> None:
     torch.manual_seed(0)
-    transition = SlotTransition(4, 16)
+    transition = SlotTransition(4, 4, 16)
     slots, order = torch.randn(3, 5, 4), torch.tensor([3, 0, 4, 1, 2])
     changes = transition(slots)
     assert torch.allclose(transition(slots[:, order]), changes[:, order], atol=1e-5)
@@ -139,7 +161,7 @@ def test_the_transition_follows_the_order_of_the_slots() -> None:
 
 def test_every_slot_depends_on_every_other() -> None:
     torch.manual_seed(0)
-    transition = SlotTransition(2, 8)
+    transition = SlotTransition(2, 2, 8)
     slots = torch.randn(1, 4, 2, requires_grad=True)
     for row in range(4):
         (slopes,) = torch.autograd.grad(transition(slots)[0, row].sum(), slots)
@@ -169,11 +191,13 @@ def test_a_state_is_made_of_successive_pictures_the_oldest_first() -> None:
 
 
 def test_features_begin_with_the_first_state_as_published() -> None:
-    model = model_of()
-    batch = squares(2, 4, model.spec)
+    model = Cswm(replace(cswm_config("small"), stacked=3, memory=1), VisionOptions()).eval()
+    batch = squares(2, 5, model.spec)
     with torch.no_grad():
         features, states = model.encode(batch), model._states(batch).flatten(2)
-    assert torch.equal(features[:, 1:], states) and torch.equal(features[:, 0], states[:, 0])
+    assert states.shape[:2] == (2, 3) and torch.equal(features[:, 2:], states)
+    assert torch.equal(features[:, :2], states[:, :1].expand(-1, 2, -1))
+    assert not model.spec.framewise and model_of().spec.framewise
 
 
 def test_a_clip_that_is_too_short_is_refused() -> None:
@@ -199,5 +223,23 @@ def test_maps_are_shown_for_every_state() -> None:
     model = model_of()
     with torch.no_grad():
         maps = model.maps(squares(2, 5, model.spec))
-    assert maps.shape == (2, 4, 6, 16, 16)
+    assert maps.shape == (2, 5, 6, 16, 16)
     assert bool((maps > 0).all()) and bool((maps < 1).all())
+
+
+def test_a_learned_transition_ranks_the_next_state_better_than_a_copy() -> None:
+    """Two pictures determine how squares at constant speed go on."""
+    model = model_of()
+    model.train()
+    optimizer = torch.optim.Adam(model.parameters(), 2e-3)
+    for step in range(100):
+        optimizer.zero_grad()
+        model.loss(squares(16, model.window, model.spec, seed=step))["loss"].backward()
+        optimizer.step()
+    model.eval()
+    held_out = squares(20, model.window, model.spec, seed=10_000)
+    with torch.no_grad():
+        ranks, copied = model.next_state_ranks(held_out)
+        assert model.loss(held_out)["loss"] < model.baseline(held_out)
+    assert len(ranks) == 60 and ranking(copied).hits == 0
+    assert ranking(ranks).hits > 0.4

@@ -13,7 +13,9 @@ from physion.models.vision.model import Size
 class CswmConfig:
     """All settings of C-SWM.
 
-    - ``image_size``: pixels per side. ``history``: successive pictures that make one state.
+    - ``image_size``: pixels per side. ``stacked``: successive pictures that make one state.
+    - ``memory``: states from which the next one is predicted: 1, or 2, the present one and its
+      change.
     - ``slots``: number of slots K, with ``slot_size`` values each. ``hidden``: units of the hidden
       layers.
     - ``channels``: of the first convolution. ``kernels``: sizes of the two convolutions, and
@@ -21,15 +23,16 @@ class CswmConfig:
     - ``sigma``: unit of distances in the energy. ``hinge``: energy from which a negative is far
       enough.
     - ``transitions``: pairs of successive states in a training clip.
-    - ``negatives``: ``clips and steps``, a state of another clip and one of another step of the
-      same clip; or ``permuted``, as published: a random order of the states of the batch, which may
-      leave a state in its place. Without other steps the slots need not follow any motion, since
-      clips differ in their objects.
+    - ``negatives``: ``all`` states of the batch, those of other clips and those of other steps of
+      the same clip with equal weight; or ``permuted``, as published: one state each, in a random
+      order that may leave it in its place. Clips differ in their objects, so that without other
+      steps the slots need not follow any motion.
     - ``training``: optimiser and schedule.
     """
 
     image_size: int = 64
-    history: int = 2
+    stacked: int = 1
+    memory: int = 2
     slots: int = 6
     slot_size: int = 32
     hidden: int = 128
@@ -39,7 +42,7 @@ class CswmConfig:
     sigma: float = 0.5
     hinge: float = 1.0
     transitions: int = 3
-    negatives: Literal["clips and steps", "permuted"] = "clips and steps"
+    negatives: Literal["all", "permuted"] = "all"
     training: TrainingSettings = field(default_factory=TrainingSettings)
 
 
@@ -67,7 +70,8 @@ _PAPER = CswmConfig(
 )
 _RELEASED = replace(
     _PAPER,
-    history=7,
+    stacked=7,
+    memory=1,
     transitions=1,
     negatives="permuted",
     # The published code makes a new Adam at every step, which equals betas of 0.

@@ -8,6 +8,8 @@ and the loss of a transition from z to z', with a negative state n, is
 
     L = H(z + T(z), z') + max(0, hinge - H(z, n)).
 
+In place of one negative for each state, `all_pairs_loss` takes all pairs of states of a batch.
+
 References
 ----------
 Kipf et al. 2020, equations 2 and 3; metrics in section 4.3. As in their code, the negative is
@@ -32,20 +34,22 @@ def hinge_loss(states: Tensor, negatives: Tensor, sigma: float, hinge: float) ->
     return (hinge - energy(states, negatives, sigma)).clamp(min=0).mean()
 
 
-def states_of_other_clips(states: Tensor) -> Tensor:
-    """Return for each state (B, T, K, D) the one of another clip at the same step.
+def all_pairs_loss(states: Tensor, sigma: float, hinge: float) -> Tensor:
+    """Return the hinge loss of all pairs of different states of clips (B, T, K, D).
 
-    With one clip there is none: the result is empty, (0, T, K, D).
+    It is the mean of that of states of different clips and that of states at different steps of the
+    same clip, or the one of them that there is.
     """
-    clips = len(states)
-    if clips < 2:
-        return states[:0]
-    return states.roll(int(torch.randint(1, clips, ())), 0)
-
-
-def states_of_other_steps(states: Tensor) -> Tensor:
-    """Return for each state (B, T, K, D) one of another step of the same clip; T is 2 or more."""
-    return states.roll(int(torch.randint(1, states.shape[1], ())), 1)
+    clips, steps, slots = states.shape[:3]
+    flat = states.flatten(2).flatten(0, 1)
+    squares = flat.pow(2).sum(1)
+    apart = (squares[:, None] + squares - 2 * flat @ flat.T).clamp(min=0)
+    losses = (hinge - apart / (2 * sigma**2 * slots)).clamp(min=0)
+    clip = torch.arange(clips, device=flat.device).repeat_interleave(steps)
+    same = clip[:, None] == clip
+    itself = torch.eye(len(flat), dtype=torch.bool, device=flat.device)
+    kinds = [losses[pairs] for pairs in (~same, same & ~itself)]
+    return torch.stack([kind.mean() for kind in kinds if len(kind)]).mean()
 
 
 @dataclass(frozen=True)

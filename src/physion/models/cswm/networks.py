@@ -3,9 +3,9 @@
 - `SlotExtractor`: pictures (N, C, H, W) to K maps (N, K, h, w) in 0..1.
 - `SlotEncoder`: each map on its own to a slot z_k (N, K, D), with common weights.
 - `SlotTransition`: slots to their changes, a graph network in which every slot receives from every
-  other:
+  other. With what is known of a slot, x_k = z_k, or z_k and its last change,
 
-    m_k = sum_{l != k} f(z_k, z_l),    dz_k = g(z_k, m_k)
+    m_k = sum_{l != k} f(x_k, x_l),    dz_k = g(x_k, m_k)
 
 References
 ----------
@@ -62,15 +62,14 @@ class SlotExtractor(nn.Module):
         return size
 
 
-def two_layers(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
-    """Return an MLP with two hidden layers, the second with layer normalisation."""
+def hidden_layers(inputs: int, hidden: int) -> nn.Sequential:
+    """Return two hidden layers of an MLP, the second with layer normalisation."""
     return nn.Sequential(
         nn.Linear(inputs, hidden),
         nn.ReLU(),
         nn.Linear(hidden, hidden),
         nn.LayerNorm(hidden),
         nn.ReLU(),
-        nn.Linear(hidden, outputs),
     )
 
 
@@ -79,28 +78,39 @@ class SlotEncoder(nn.Module):
 
     def __init__(self, pixels: int, hidden: int, slot_size: int) -> None:
         super().__init__()
-        self.layers = two_layers(pixels, hidden, slot_size)
+        self.hidden = hidden_layers(pixels, hidden)
+        self.slot = nn.Linear(hidden, slot_size)
 
     def forward(self, maps: Tensor) -> Tensor:
         """Return slots (N, K, D) of maps (N, K, h, w)."""
-        out: Tensor = self.layers(maps.flatten(2))
+        out: Tensor = self.slot(self.hidden(maps.flatten(2)))
         return out
 
 
 class SlotTransition(nn.Module):
-    """Graph network on the complete graph of the slots; it does not depend on their order."""
+    """Graph network on the complete graph of the slots; it does not depend on their order.
 
-    def __init__(self, slot_size: int, hidden: int) -> None:
+    Parameters
+    ----------
+    inputs, outputs
+        Number of values that are known of a slot, and of its change.
+    hidden
+        Units of the hidden layers.
+    """
+
+    def __init__(self, inputs: int, outputs: int, hidden: int) -> None:
         super().__init__()
-        self.edge = two_layers(2 * slot_size, hidden, hidden)
-        self.node = two_layers(slot_size + hidden, hidden, slot_size)
+        self.edge = hidden_layers(2 * inputs, hidden)
+        self.message = nn.Linear(hidden, hidden)
+        self.node = hidden_layers(inputs + hidden, hidden)
+        self.change = nn.Linear(hidden, outputs)
 
     def forward(self, slots: Tensor) -> Tensor:
-        """Return the changes (N, K, D) of slots (N, K, D)."""
+        """Return the changes (N, K, outputs) of slots (N, K, inputs)."""
         count = slots.shape[1]
         receivers, senders = (~torch.eye(count, dtype=torch.bool)).nonzero().T.to(slots.device)
         pairs = torch.cat([slots[:, receivers], slots[:, senders]], -1)
         # Receivers are in order, K - 1 pairs each.
-        messages = self.edge(pairs).view(len(slots), count, count - 1, -1).sum(2)
-        out: Tensor = self.node(torch.cat([slots, messages], -1))
+        messages = self.message(self.edge(pairs)).view(len(slots), count, count - 1, -1).sum(2)
+        out: Tensor = self.change(self.node(torch.cat([slots, messages], -1)))
         return out
