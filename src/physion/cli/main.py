@@ -15,7 +15,7 @@ VERBS = {
     "run": "run the whole pipeline: scenes, trials, models, readout, comparison, report",
     "generate": "sample scenes and write trials",
     "replay": "simulate official command logs and compare with the recorded outcomes",
-    "train": "train a model on trials, without labels",
+    "train": "train models on trials, without labels",
     "evaluate": "train models and readouts on trials and write their predictions",
     "compare": "compare predictions with people",
     "experiment": "run the experiment with people: init, serve, export",
@@ -65,6 +65,10 @@ def main(argv: list[str] | None = None) -> int:
         message = " ".join(str(error).split())
         print(f"physion: {message}", file=sys.stderr)
         return error.exit_code
+    except MemoryError:
+        advice = "lower --encoder-batch, --batch, --workers or the size of the pictures"
+        print(f"physion: memory is used up; {advice}, where the verb has them", file=sys.stderr)
+        return 2
     except BrokenPipeError:
         _discard_output()
         return OUTPUT_CLOSED

@@ -8,8 +8,9 @@ from pathlib import Path
 
 from physion.errors import BadInputError, PhysionError
 
-_MEMORY_TEXTS = ("out of memory", "can't allocate memory", "not enough memory")
-"""Parts of the messages by which torch reports that memory is used up."""
+_MEMORY_TEXTS = ("out of memory", "can't allocate memory", "not enough memory", "alloc_failed")
+"""Parts of the messages by which torch reports that memory is used up; cuBLAS and cuDNN write the
+last one."""
 
 
 class OutOfMemoryError(PhysionError):

@@ -82,6 +82,19 @@ def is_first_process() -> bool:
     return int(getattr(rank_zero_only, "rank", 0) or 0) == 0
 
 
+def move_to_device(fabric: Fabric, model: Any) -> None:
+    """Move the weights of a model to the device; `OutOfMemoryError` if they do not fit there."""
+    try:
+        fabric.to_device(model)
+    except (MemoryError, RuntimeError) as error:
+        if not is_out_of_memory(error):
+            raise
+        raise OutOfMemoryError(
+            f"the weights of {model.provenance().model} do not fit the memory of {fabric.device}; "
+            "use a smaller size of the model, or accelerator cpu"
+        ) from error
+
+
 @contextmanager
 def memory_advice(settings: TrainingSettings) -> Iterator[None]:
     """Replace an error for memory that is used up by one that names the setting to lower."""
@@ -95,6 +108,6 @@ def memory_advice(settings: TrainingSettings) -> Iterator[None]:
             f"lower the batch and accumulate more, such as batch {clips // 2} and accumulate "
             f"{2 * parts}"
             if clips > 1
-            else "use a smaller size of the model, or precision bf16-mixed"
+            else "use a smaller image_size or size of the model, or precision bf16-mixed"
         )
         raise OutOfMemoryError(f"training ran out of memory at batch {clips}; {advice}") from error

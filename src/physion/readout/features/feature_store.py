@@ -22,6 +22,7 @@ from physion.compute.progress import Progress, tracked
 from physion.errors import BadInputError
 from physion.models.batch import Batch
 from physion.models.interface import Model, features_digest
+from physion.models.raised import OutOfMemoryError
 from physion.readout.features.feature_file import (
     ArraysInMemory,
     FeatureArrays,
@@ -106,7 +107,7 @@ class FeatureStore:
             raise BadInputError(f"a source of the observed part has no part {part!r} of a clip")
 
         def compute(group: tuple[str, ...]) -> list[Arrays]:
-            batch: Batch = read(group)
+            batch = _read(read, group)
             return encode_clips(model, batch)
 
         work = _Work("features", lambda: features_digest(model), compute, model_name(model), part)
@@ -156,7 +157,7 @@ class FeatureStore:
         place = {trial: row for row, trial in enumerate(context.trials if context else ())}
 
         def compute(group: tuple[str, ...]) -> list[Arrays]:
-            batch = source.context(group)
+            batch = _read(source.context, group)
             if context is not None:
                 features = context.select([place[trial] for trial in group]).array()
                 batch = dataclasses.replace(batch, features=features)
@@ -239,6 +240,16 @@ class FeatureStore:
         if stored is None:
             raise BadInputError(f"features {path} differ from what was written; check the disk")
         return stored
+
+
+def _read(read: Callable[[tuple[str, ...]], Batch], group: tuple[str, ...]) -> Batch:
+    """Return the clips of a group of trials; `OutOfMemoryError` if memory is used up."""
+    try:
+        return read(group)
+    except MemoryError as error:
+        raise OutOfMemoryError(
+            f"reading {len(group)} clips at a time ran out of memory; lower the encoder batch"
+        ) from error
 
 
 def _identity(work: _Work, digest: str, key: str, trial: str) -> dict[str, str]:
