@@ -30,6 +30,13 @@ class Op3Options(VisionOptions):
                 raise BadInputError(f"{name} must be a whole number from {least} on, not {value!r}")
 
 
+_COUNTS = (
+    "image_size", "slots", "deterministic", "stochastic", "width", "layers", "stride", "hidden",
+    "effect", "seed_steps", "past", "imagined", "context",
+)  # fmt: skip
+"""Settings that must be at least 1."""
+
+
 @dataclass(frozen=True, slots=True)
 class Op3Config:
     """All settings of OP3.
@@ -74,9 +81,7 @@ class Op3Config:
     training: TrainingSettings = field(default_factory=TrainingSettings)
 
     def __post_init__(self) -> None:
-        names = ("image_size", "slots", "deterministic", "stochastic", "width", "layers", "hidden")
-        names += ("effect", "seed_steps", "past", "imagined", "context")
-        for name in names:
+        for name in _COUNTS:
             if getattr(self, name) < 1:
                 raise BadInputError(f"OP3: {name} must be at least 1, not {getattr(self, name)}")
         if self.layers < 2 or self.kernel % 2 == 0:

@@ -118,10 +118,11 @@ class SlotInference(nn.Module):
     def start(self, noise: Tensor) -> Slots:
         """Return the beliefs before the first picture; ``noise`` is (B, K, Rs)."""
         clips, slots = noise.shape[:2]
-        own = (self.deterministic, self.mean, self.raw)
-        spread = [value.expand(clips, slots, -1) for value in own]
-        zero = torch.zeros_like(noise)
-        return Slots(*spread, zero, torch.full_like(noise, _UNIT), noise, self._memory(noise))
+        deterministic, mean, raw = (
+            value.expand(clips, slots, -1) for value in (self.deterministic, self.mean, self.raw)
+        )
+        prior = torch.zeros_like(noise), torch.full_like(noise, _UNIT)
+        return Slots(deterministic, mean, raw, *prior, noise, self._memory(noise))
 
     def explain(self, slots: Slots, pictures: Tensor) -> Explained:
         """Compare what slots show with pictures (B, 3, H, W)."""

@@ -104,7 +104,7 @@ class Op3(VisionModel):
                 features.append(state.features())
                 if knobs.get("show", 0) > 0:
                     shown.append(self.slots.decoder(state.states))
-        values = torch.stack(features, 1).float().unflatten(0, (clips, samples))
+        values = torch.stack(features, 1).float().view(clips, samples, config.future, -1)
         return Rollout(features=values, shown=_shown(shown, clips, samples))
 
     def prepare(self, sample: Batch) -> None:
@@ -202,9 +202,14 @@ def _weighted(steps: list[tuple[int, Explained]], valid: Tensor) -> tuple[Tensor
 
 def _repeated(slots: Slots, samples: int, noise: Tensor) -> Slots:
     """Return the beliefs for ``samples`` futures of every clip, which follow one another."""
-    parts = (slots.deterministic, slots.mean, slots.raw, slots.prior_mean, slots.prior_raw)
+    deterministic, mean, raw, prior_mean, prior_raw = (
+        part.repeat_interleave(samples, 0)
+        for part in (
+            slots.deterministic, slots.mean, slots.raw, slots.prior_mean, slots.prior_raw,
+        )
+    )  # fmt: skip
     memory = (noise.new_zeros(0), noise.new_zeros(0))
-    return Slots(*(part.repeat_interleave(samples, 0) for part in parts), noise, memory)
+    return Slots(deterministic, mean, raw, prior_mean, prior_raw, noise, memory)
 
 
 def _shown(steps: list[Decoded], clips: int, samples: int) -> dict[str, Tensor]:
@@ -214,6 +219,6 @@ def _shown(steps: list[Decoded], clips: int, samples: int) -> dict[str, Tensor]:
     rgb = (pictures.movedim(2, -1) * 255).round().to(torch.uint8)
     masks = torch.stack([step.masks[:, :, 0] for step in steps], 1).float()
     return {
-        name: value.unflatten(0, (clips, samples))
+        name: value.view(clips, samples, *value.shape[1:])
         for name, value in {"rgb": rgb, "masks": masks}.items()
     }

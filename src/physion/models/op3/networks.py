@@ -18,7 +18,7 @@ from physion.models.op3.pixels import Decoded
 
 PLAIN, NORMALIZED = 9, 6
 """Channels of the images of `op3.pixels.plain_maps` and `op3.pixels.slope_maps`."""
-_NORMALIZED_PARTS = (1, 1, 1, 3)
+_NORMALIZED_PARTS = [1, 1, 1, 3]
 """Channels that are normalised together: gradient by the mask, likelihood, the one without the
 slot, gradient by the colours."""
 
@@ -51,11 +51,11 @@ class BroadcastConv(nn.Module):
         ones = values.new_ones(1, 1, size, size)
         inside = functional.unfold(ones, self.kernel, padding=pad)[0]
         taps = torch.einsum("nr,crt->nct", values, weight[:, : self.inputs].flatten(2))
-        field = (taps @ inside).unflatten(-1, (size, size))
+        field = (taps @ inside).view(len(values), -1, size, size)
         place = coordinates(size, values)
-        return field + functional.conv2d(
-            place, weight[:, self.inputs :], self.conv.bias, padding=pad
-        )
+        own = functional.conv2d(place, weight[:, self.inputs :], self.conv.bias, padding=pad)
+        out: Tensor = field + own
+        return out
 
 
 class SlotDecoder(nn.Module):
@@ -118,7 +118,7 @@ class Refinement(nn.Module):
         memory
             State of the LSTM.
         """
-        maps = normalized.split(_NORMALIZED_PARTS, 1)
+        maps = torch.split(normalized, _NORMALIZED_PARTS, 1)
         normed = [norm(part) for norm, part in zip(self.map_norms, maps, strict=True)]
         place = coordinates(plain.shape[-1], plain).expand(len(plain), -1, -1, -1)
         seen = self.look(torch.cat([plain, *normed, place], 1)).mean((2, 3))

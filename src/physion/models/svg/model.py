@@ -91,7 +91,7 @@ class Svg(VisionModel):
         """Return the codes (B, T, g) of the pictures of a batch, each of its frame alone."""
         pictures = normalized_pictures(batch, self.spec, self.name)
         codes: Tensor = self.encoder(pictures.flatten(0, 1))[0]
-        return codes.float().unflatten(0, pictures.shape[:2])
+        return codes.float().view(*pictures.shape[:2], -1)
 
     @torch.no_grad()
     def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
@@ -107,7 +107,7 @@ class Svg(VisionModel):
         noise = torch.from_numpy(np.concatenate(draws)).to(pictures)
         imagined = self._roll_out(pictures, noise)
         codes, shown = (
-            value.unflatten(0, (len(context), samples))
+            value.view(len(context), samples, *value.shape[1:])
             for value in (imagined.codes.float(), imagined.pictures)
         )
         if knobs.get("show", 0) <= 0:
