@@ -38,7 +38,7 @@ NAME, VERSION = "cswm", 1
 
 
 class Cswm(VisionModel):
-    """Slots of pictures, trained such that the next ones can be predicted and told from others."""
+    """Slots of pictures, trained to be predictable, and different in different states."""
 
     def __init__(self, config: CswmConfig, options: VisionOptions) -> None:
         spec = Spec(
