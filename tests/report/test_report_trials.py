@@ -23,11 +23,11 @@ from physion.report.page.choose_trials import (
     who_was_right,
     widest_gaps,
 )
-from physion.report.page.model_inputs import inputs_sentence
+from physion.report.page.model_inputs import inputs_sentence, weights_sentence
 from physion.report.page.movies import PageMovies, make_poster
 from physion.report.page.page import DISAGREE, OPENING, render_page
 from physion.report.page.trial_pages import page_name, trial_pages
-from physion.report.settings_text import read_model_inputs
+from physion.report.settings_text import read_by_model
 from physion.trials.video import encode_movie
 
 Maker = Callable[..., Comparison]
@@ -247,7 +247,7 @@ def test_one_sentence_says_what_each_model_was_given(
     (tmp_path / "a.csv").write_text("Model,Inputs\nsimulation,state\nsimulation,state\n")
     (tmp_path / "b.csv").write_text('Model,Inputs\nencoder,"rgb, depth"\n')
     (tmp_path / "c.csv").write_text("Model\nencoder\n")
-    given = read_model_inputs([tmp_path / name for name in ("a.csv", "b.csv", "c.csv")])
+    given = read_by_model([tmp_path / name for name in ("a.csv", "b.csv", "c.csv")], "Inputs")
     assert given == {"simulation": "state", "encoder": "rgb, depth"}
     comparison = make_comparison()
     words = inputs_sentence(ReportInputs(comparison, model_inputs=given))
@@ -257,6 +257,17 @@ def test_one_sentence_says_what_each_model_was_given(
     partly = inputs_sentence(ReportInputs(comparison, model_inputs={"encoder": "rgb"}))
     assert partly.endswith("simulation: not stated.")
     assert inputs_sentence(ReportInputs(comparison)) == ""
+
+
+def test_one_sentence_says_which_weights_each_model_started_from(
+    make_comparison: Maker, tmp_path: Path
+) -> None:
+    (tmp_path / "a.csv").write_text("Model,Init\nsimulation,none\nencoder,imagenet\n")
+    found = read_by_model([tmp_path / "a.csv"], "Init")
+    inputs = ReportInputs(make_comparison(), model_weights=found)
+    sentence = "Weights that each network started from: encoder: imagenet."
+    assert weights_sentence(inputs) == sentence and sentence in render_page(inputs, [])
+    assert weights_sentence(ReportInputs(make_comparison())) == ""
 
 
 # --- a page for each stimulus ---------------------------------------------------------------------

@@ -35,7 +35,7 @@ from physion.report.settings_text import (
     describe_expected,
     describe_people,
     people_from_files,
-    read_model_inputs,
+    read_by_model,
 )
 from physion.report.write import prepare_folder, write_csv, write_plot
 
@@ -194,7 +194,8 @@ def compare_files(
         results,
         methods=choices,
         movies=movies or {},
-        model_inputs=read_model_inputs(predictions),
+        model_inputs=read_by_model(predictions, "Inputs"),
+        model_weights=read_by_model(predictions, "Init"),
         trial_pages=trial_pages,
         rollout_errors=None if errors is None else rollout_error_table(errors, draws),
         **({"question": question} if question else {}),

@@ -25,6 +25,7 @@ class ReportInputs(ComparisonResults):
     - ``movies``: file by stimulus (mp4, webm, gif, png or jpg); other files are ignored.
     - ``question``: what people and models were asked, for the movies.
     - ``model_inputs``: what a model was given, by its name: values of the column *Inputs*.
+    - ``model_weights``: which weights a model started from, by its name: of the column *Init*.
     - ``rollout_errors``: from `rollout_errors.rollout_error_table`, or None.
     - ``movie_count``: largest number of disagreements that are shown as movies.
     - ``page_bytes``: size of the page up to which movies are added; what does not fit is left out.
@@ -37,6 +38,7 @@ class ReportInputs(ComparisonResults):
     movies: Mapping[str, Path] = field(default_factory=dict)
     question: str = "Will the agent touch the patient?"
     model_inputs: Mapping[str, str] = field(default_factory=dict)
+    model_weights: Mapping[str, str] = field(default_factory=dict)
     rollout_errors: pd.DataFrame | None = None
     movie_count: int = 8
     page_bytes: int = 15_000_000

@@ -19,16 +19,16 @@ from physion.analysis.tables.csv_table import read_csv
 from physion.report.words import plural
 
 
-def read_model_inputs(paths: Sequence[Path]) -> dict[str, str]:
-    """Return the column *Inputs* of files of predictions by model, for those files that have it.
+def read_by_model(paths: Sequence[Path], column: str) -> dict[str, str]:
+    """Return a column of files of predictions by model, for those files that have it.
 
     A model whose rows differ has all values, joined by ``or``.
     """
     found: dict[str, dict[str, None]] = {}
     for path in paths:
         table = read_csv(path, ["Model"])
-        if "Inputs" in table.columns:
-            for model, given in zip(table["Model"], table["Inputs"], strict=True):
+        if column in table.columns:
+            for model, given in zip(table["Model"], table[column], strict=True):
                 if given:
                     found.setdefault(model.strip(), {})[given] = None
     return {model: " or ".join(values) for model, values in found.items()}

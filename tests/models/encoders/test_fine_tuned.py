@@ -73,7 +73,7 @@ def test_gradients_reach_encoder_and_dynamics_but_not_the_initial_encoder() -> N
 
 
 def test_no_gradient_passes_through_the_target() -> None:
-    model, batch = make(residual=False, anchor=0.5), clips()
+    model, batch = make(residual=False, distillation=0.5), clips()
     model.prepare(batch)
     with torch.no_grad():
         for parameter in model.encoder.parameters():
@@ -127,7 +127,7 @@ def test_one_batch_is_learned_by_heart() -> None:
     assert float(model.loss(batch)["loss"].detach()) < 0.1 * float(model.baseline(batch))
 
 
-class _WithoutAnchor(FineTunedEncoder):
+class _WithoutDistillation(FineTunedEncoder):
     """Encoder and dynamics that are trained on the error of the next feature alone."""
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
@@ -141,7 +141,7 @@ class _WithoutAnchor(FineTunedEncoder):
 def test_features_of_different_pictures_stay_different(encoder: str) -> None:
     """Where the loss of the next feature alone makes them equal."""
     kept, lost = make(encoder=encoder), make(encoder=encoder)
-    lost.__class__ = _WithoutAnchor
+    lost.__class__ = _WithoutDistillation
     unseen = clips(16, seed=1000)
     variances = []
     for model in (kept, lost):
@@ -155,7 +155,7 @@ def test_features_of_different_pictures_stay_different(encoder: str) -> None:
 def test_the_name_says_fine_tuned(options: dict[str, Any]) -> None:
     provenance = make(**options).provenance()
     assert provenance.model == f"random-test_vit-{options.get('dynamics', 'mlp')}-fine-tuned"
-    assert provenance.encoder_training_task == "L2 on latent, anchored at the initial features"
+    assert provenance.encoder_training_task == "L2 on latent, distillation of the initial encoder"
     assert build_model("frozen-encoder", **TINY).provenance().encoder_training_task == ""
 
 
@@ -204,8 +204,8 @@ def test_statistics_of_batch_normalisation_stay_as_they_are() -> None:
 
 
 def test_fine_tuning_without_what_keeps_features_apart_is_refused() -> None:
-    with pytest.raises(BadInputError, match="anchor must be above 0"):
-        make(anchor=0.0)
+    with pytest.raises(BadInputError, match="distillation must be above 0"):
+        make(distillation=0.0)
     with pytest.raises(BadInputError, match="standardised=true"):
         make(standardised=False)
     with pytest.raises(BadInputError, match="trains no encoder"):

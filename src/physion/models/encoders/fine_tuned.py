@@ -3,21 +3,21 @@
 The paper says that it also trained encoders on the squared error of the next feature, not how. That
 loss alone is 0 for an encoder that gives the same features for every picture. Here
 
-    L = |f(z_1, ..., z_c) - sg(z_c+1)|^2 / D + a |z - z0|^2 / D,
+    L = |f(z_1, ..., z_c) - sg(z_c+1)|^2 / D + w |z - z0|^2 / D,
 
 averaged over windows and frames, with
 
 - z = E(x), the standardised features (D,) of picture x, and z0 = E0(x), those that the encoder gave
   with its initial weights; over the training clips z0 has mean 0 and variance 1;
-- f: the dynamics; a = ``anchor``;
+- f: the dynamics; w = ``distillation``;
 - sg: no gradient passes, so that the encoder cannot lower the first term by moving its target, as
   in BYOL (Grill et al. 2020) and SimSiam (Chen and He 2021).
 
-A stopped gradient alone does not exclude equal features. The second term, as in learning without
-forgetting (Li and Hoiem 2016), does: they would cost a. Even without sg, features s z0 of which a
-fraction e <= 1 of the variance cannot be predicted cost s^2 e + a (1 - s)^2, the least at
-s = a / (a + e): with a = 1 no feature is below half its size there. The term also keeps features
-and their predictions in one space, so that a rollout can start from encoded frames.
+A stopped gradient alone does not exclude equal features. The second term, the distillation of
+learning without forgetting (Li and Hoiem 2016), does: they would cost w. Even without sg, features
+s z0 of which a fraction e <= 1 of the variance cannot be predicted cost s^2 e + w (1 - s)^2, the
+least at s = w / (w + e): with w = 1 no feature is below half its size there. The term also keeps
+features and their predictions in one space, so that a rollout can start from encoded frames.
 
 Batch normalisation keeps its stored statistics and dropout is off, so that a feature depends on its
 picture alone, in training too.
@@ -42,7 +42,7 @@ class FineTunedEncoder(EncoderModel):
 
     diet: Diet = "clips"
     suffix = "fine-tuned"
-    encoder_task = "L2 on latent, anchored at the initial features"
+    encoder_task = "L2 on latent, distillation of the initial encoder"
 
     def __init__(self, config: EncoderConfig, label: Label, training: TrainingSettings) -> None:
         super().__init__(config, label, training)
@@ -76,7 +76,7 @@ class FineTunedEncoder(EncoderModel):
         change = functional.mse_loss(features, self.standardise(self._initial_features(batch)))
         flat = features.detach().flatten(0, 1)
         return {
-            "loss": prediction + self.config.anchor * change,
+            "loss": prediction + self.config.distillation * change,
             "prediction": prediction,
             "change": change,
             "variance": flat.var(0, correction=0).mean(),

@@ -33,8 +33,8 @@ class EncoderConfig:
     - ``residual``: predict the change from the last feature, initially zero, instead of the
       feature itself as the published models do. With few training trials only this works well.
     - ``standardised``: whether the dynamics standardise features; the released code does not.
-    - ``fine_tuned``: train the encoder with the dynamics. ``anchor``: weight of the term that
-      keeps its features near the initial ones (`encoders.fine_tuned`).
+    - ``fine_tuned``: train the encoder with the dynamics. ``distillation``: weight of the term
+      that keeps its features near the initial ones (`encoders.fine_tuned`).
     - ``seed``: of random encoders and of the initial weights of the dynamics.
     - ``stride``, ``context``, ``future``: see `Spec`.
     """
@@ -48,7 +48,7 @@ class EncoderConfig:
     residual: bool = True
     standardised: bool = True
     fine_tuned: bool = False
-    anchor: float = 1.0
+    distillation: float = 1.0
     seed: int = 0
     stride: int = 6
     context: int = 7
@@ -63,10 +63,10 @@ class EncoderConfig:
             raise BadInputError(
                 "a fine-tuned encoder needs standardised=true: its loss counts on it"
             )
-        if not self.anchor > 0:
+        if not self.distillation > 0:
             raise BadInputError(
-                f"anchor must be above 0, not {self.anchor!r}: without it a fine-tuned encoder "
-                "could give the same features for all pictures"
+                f"distillation must be above 0, not {self.distillation!r}: without it a fine-tuned "
+                "encoder could give the same features for all pictures"
             )
 
 

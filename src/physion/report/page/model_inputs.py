@@ -1,10 +1,12 @@
-"""One sentence on what each model was given of a trial."""
+"""Sentences on what each model was given of a trial, and on the weights that it started from."""
 
 from __future__ import annotations
 
 from physion.report.inputs import ReportInputs
 from physion.report.words import listed
 
+WITHOUT = "none"
+"""Value of the column *Init* of models without weights."""
 INPUT_WORDS = {
     "rgb": "the pixels of the movie",
     "ids": "which object every pixel belongs to",
@@ -32,6 +34,18 @@ def inputs_sentence(inputs: ReportInputs) -> str:
         parts.append(f"{listed(unknown)}: not stated")
     people = "People saw the movie. " if inputs.comparison.has_people else ""
     return f"{people}What each model was given: {'; '.join(parts)}."
+
+
+def weights_sentence(inputs: ReportInputs) -> str:
+    """Return the initial weights of each model that has any; "" if there is none."""
+    groups: dict[str, list[str]] = {}
+    for model in dict.fromkeys(inputs.comparison.stimuli["model"].astype(str)):
+        groups.setdefault(inputs.model_weights.get(model, WITHOUT), []).append(model)
+    groups.pop(WITHOUT, None)
+    if not groups:
+        return ""
+    parts = [f"{listed(models)}: {weights}" for weights, models in groups.items()]
+    return f"Weights that each network started from: {'; '.join(parts)}."
 
 
 def _describe(given: str) -> str:

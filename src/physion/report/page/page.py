@@ -12,7 +12,7 @@ from physion.report.figures.registry import BY_SCENARIO, BY_STIMULUS, TRAINING, 
 from physion.report.inputs import EXPECTED_METHODS, ReportInputs
 from physion.report.page import blocks, people_blocks, scores, session_blocks, tests_of_models
 from physion.report.page.document import Picture, Section, figure, render_document
-from physion.report.page.model_inputs import inputs_sentence
+from physion.report.page.model_inputs import inputs_sentence, weights_sentence
 from physion.report.page.movies import PageMovies
 from physion.report.page.trial_pages import FOLDER, page_name
 from physion.report.page.trials import gaps, opening
@@ -113,7 +113,7 @@ def _summary(inputs: ReportInputs) -> str:
             f"In {len(comparison.changed)} of these stimuli the simulated outcome is not the "
             "official one; accuracy is given against both."
         )
-    given = inputs_sentence(inputs)
+    given = f"{inputs_sentence(inputs)} {weights_sentence(inputs)}".strip()
     more = f'<p class="given">{escape(given)}</p>' if given else ""
     return f'<p class="lead">{escape(" ".join(words))}</p>{more}'
 
