@@ -10,12 +10,14 @@ import sys
 import time
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from physion.cli.main import main
 from physion.trials.dataset import Dataset
 from support import trained_models
 from support.moving_dots import make_dots
+from support.plans import plan_models
 
 MODEL = f"{trained_models.__file__}:NextBrightness"
 SLOW = f"{trained_models.__file__}:SlowBrightness"
@@ -159,3 +161,95 @@ def test_evaluate_finds_what_was_trained(
     assert main(["evaluate", str(dots.folder), "frozen-encoder", *chosen]) == 0
     assert "predictions: " in capsys.readouterr().out
     assert {p: p.stat().st_mtime_ns for p in (tmp_path / "training").rglob("*")} == before
+
+
+def test_a_plan_of_models_protocols_and_seeds(
+    dots: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One training of three fails: the others are made, and a second run makes what is missing."""
+    fails = f"{plan_models.__file__}:FailsOnDrop"
+    imagining = f"{plan_models.__file__}:Imagining"
+    plan = ["--protocols", "all-but,only", "--seeds", "2", "--seed", "5"]
+    plan += ["--option", f"{fails}:hidden=3", "--out", str(tmp_path), *CPU]
+    arguments = ["train", f"{imagining},{fails}", str(dots.folder), *plan]
+    assert main([*arguments, "--dry-run"]) == 0
+    shown = capsys.readouterr().out
+    assert "16 of 16 trainings to do" in shown and "measured steps" in shown
+    assert "collide" in shown and not list(tmp_path.iterdir())
+    assert main(arguments) == 1
+    captured = capsys.readouterr()
+    assert captured.out.count("trained for 6 steps") == 12
+    assert captured.out.count("failed: ") == 4 and "no drop, please" in captured.out
+    assert f"{fails}, no_collide, seed 6: failed" in captured.err and " left" in captured.err
+    assert main([*arguments, "--json"]) == 1
+    result = json.loads(capsys.readouterr().out)
+    assert len(result["trained"]) == 12 and all(row["loaded"] for row in result["trained"])
+    assert {row["seed"] for row in result["failed"]} == {5, 6}
+    assert {row["protocol"] for row in result["failed"]} == {"all-but", "only"}
+    assert main([*arguments, "--dry-run", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["plan"]
+    assert sum(row["from"] == "done" for row in rows) == 12
+    assert {row["from"] for row in rows} == {"done", "earlier trainings"}
+
+
+def test_evaluate_takes_the_same_plan(
+    dots: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = f"{plan_models.__file__}:Imagining"
+    plan = ["--protocols", "all,only", "--seeds", "2", "--out", str(tmp_path), *CPU]
+    assert main(["train", model, str(dots.folder), *plan]) == 0
+    before = {p: p.stat().st_mtime_ns for p in (tmp_path / "training").rglob("*")}
+    capsys.readouterr()
+    arguments = ["evaluate", str(dots.folder), model, *plan, "--readout.grid", "0.1", "1"]
+    assert main([*arguments, "--dry-run"]) == 0
+    assert "6 of 6 evaluations to do" in capsys.readouterr().out
+    assert main(arguments) == 0
+    shown = capsys.readouterr().out
+    assert shown.count("predictions: ") == 4 and "observed+simulated" in shown
+    assert {p: p.stat().st_mtime_ns for p in (tmp_path / "training").rglob("*")} == before
+    (table,) = (tmp_path / "results").iterdir()
+    rows = pd.read_csv(table)
+    assert list(rows.columns) == [
+        "model", "protocol", "readout", "scenario", "seeds", "trials", "accuracy", "spread",
+    ]  # fmt: skip
+    assert len(rows) == 2 * 3 * 3 and (rows["seeds"] == 2).all() and rows["spread"].notna().all()
+    assert main(arguments) == 0
+    assert "6 of 6 evaluations were done before" in capsys.readouterr().out
+    assert main([*arguments, "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["results"] == str(table) and len(result["evaluations"]) == 4
+
+
+@pytest.mark.slow
+def test_a_plan_that_is_killed_goes_on_and_a_second_run_takes_a_second(
+    dots: Dataset, tmp_path: Path
+) -> None:
+    model = f"{plan_models.__file__}:Slow"
+    plan = [str(dots.folder), "--protocols", "all,only", "--steps", "40", "--checkpoint-every", "5"]
+    parts = [*plan, "--out", str(tmp_path / "parts")]
+    running = subprocess.Popen(
+        command(model, *parts), env=environment(), stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    end = time.monotonic() + 180
+    while running.poll() is None and time.monotonic() < end:
+        if len(list((tmp_path / "parts").rglob("*checkpoint.safetensors"))) and len(
+            list((tmp_path / "parts").rglob("model.safetensors"))
+        ):
+            break
+        time.sleep(0.01)
+    running.send_signal(signal.SIGINT)
+    assert running.wait() == 130
+    assert len(list((tmp_path / "parts").rglob("model.safetensors"))) < 3
+    for loaded in ("1 of 3 trainings were done before", "3 of 3 trainings were done before"):
+        start = os.times()
+        again = subprocess.run(
+            command(model, *parts), env=environment(), check=False, capture_output=True, text=True
+        )
+        seconds = os.times().children_user - start.children_user
+        assert again.returncode == 0, again.stderr
+        assert loaded in again.stdout
+    assert seconds < 6, "a second run imports no torch"
+    assert main(["train", model, *plan, "--out", str(tmp_path / "whole"), *CPU]) == 0
+    one, other = (files_of(tmp_path / name / "training") for name in ("parts", "whole"))
+    assert one == other

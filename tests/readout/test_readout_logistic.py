@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from sklearn.exceptions import ConvergenceWarning
 from sklearn.linear_model import LogisticRegression
 from sklearn.model_selection import GridSearchCV, StratifiedKFold
 from sklearn.pipeline import make_pipeline
@@ -21,6 +22,7 @@ from physion.readout.logistic import (
     undersample,
 )
 from physion.readout.protocols import Readout, flatten_time
+from physion.readout.readers.logistic_reader import released_reader
 
 
 def problem(n: int, d: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -109,6 +111,45 @@ def test_the_released_setting_is_scikit_learns_early_stop() -> None:
     assert released.probability == pytest.approx(pipe.predict_proba(features[40:])[:, 1])
     exact = fit_readout(features[:40], labels[:40], features[40:], ReadoutConfig(grid=(1.0,)))
     assert not np.allclose(exact.probability, released.probability, atol=1e-9)
+
+
+def test_the_released_setting_stops_after_200_iterations() -> None:
+    """Correlated features and a weak penalty, where lbfgs needs more steps than it was given."""
+    rng = np.random.default_rng(0)
+    factors = rng.normal(size=(150, 6))
+    features = factors @ rng.normal(size=(6, 60)) + 0.01 * rng.normal(size=(150, 60))
+    labels = factors[:, 0] + 0.8 * rng.normal(size=150) > 0
+
+    def scikit_learn(iterations: int) -> Any:
+        model = LogisticRegression(C=1e8, max_iter=iterations)
+        return make_pipeline(StandardScaler(), model).fit(features[:120], labels[:120])
+
+    config = ReadoutConfig(grid=(1e8,), released=True)
+    released = fit_readout(features[:120], labels[:120], features[120:], config)
+    with pytest.warns(ConvergenceWarning):
+        stopped = scikit_learn(200)
+    assert stopped[-1].n_iter_ == [200]
+    assert released.probability == pytest.approx(stopped.predict_proba(features[120:])[:, 1])
+    longer = scikit_learn(100_000).predict_proba(features[120:])[:, 1]
+    assert np.abs(longer - released.probability).max() > 1e-3
+
+
+def test_the_released_reader_is_the_published_grid_search() -> None:
+    """17 values of C, 5 folds, lbfgs with 200 iterations, on equally many trials of each label."""
+    features, labels = problem(90, 30, seed=5)
+    labels[:60] |= np.arange(60) % 3 == 0
+    config = ReadoutConfig(seed=3)
+    reading = released_reader(config).read([features[:60]], labels[:60], [features[60:]])
+    kept = undersample(labels[:60], 3)
+    assert labels[kept].sum() * 2 == len(kept) < 60
+    search = GridSearchCV(
+        make_pipeline(StandardScaler(), LogisticRegression(max_iter=200)),
+        {"logisticregression__C": C_GRID},
+        cv=StratifiedKFold(5, shuffle=True, random_state=3),
+    ).fit(features[kept], labels[kept])
+    assert reading.c == search.best_params_["logisticregression__C"]
+    assert reading.cv_accuracy == pytest.approx(search.best_score_)
+    assert reading.probability == pytest.approx(search.predict_proba(features[60:])[:, 1])
 
 
 def test_it_learns_what_is_there_and_not_what_is_not() -> None:

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from typing import Any
 
 from physion.errors import BadInputError
 
 
-def parse_options(pairs: tuple[str, ...], weights: str = "") -> dict[str, Any]:
+def parse_options(pairs: tuple[str, ...], given: Mapping[str, str] | None = None) -> dict[str, Any]:
     """Parse NAME=VALUE pairs; a value that is not JSON is taken as text.
 
-    ``weights``: value of the option of this name, unless it is empty.
+    ``given``: values of options that have an argument of their own.
     """
-    values: dict[str, Any] = {"weights": weights} if weights else {}
+    values: dict[str, Any] = dict(given or {})
     for pair in pairs:
         name, sign, text = pair.partition("=")
         if not sign or not name:

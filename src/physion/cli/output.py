@@ -55,6 +55,10 @@ class Stages:
         if self._tasks:
             self._progress.stop()
 
+    def note(self, text: str) -> None:
+        """Show a line above the bars, which stays, on standard error."""
+        self._progress.console.print(text, markup=False, highlight=False, soft_wrap=True)
+
     def __call__(self, what: str, done: int, total: int) -> None:
         """Show that ``done`` of ``total`` items of a stage are finished."""
         # Not started earlier: bars without a stage would still print an empty line when they stop.

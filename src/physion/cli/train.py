@@ -1,94 +1,142 @@
-"""Train a model on a dataset without labels; the same command resumes, and evaluate finds the
-result."""
+"""Train models on a dataset without labels; the same command resumes, and evaluate finds the
+results.
+
+Models, training protocols and seeds make a plan of trainings. Those that are done are skipped, and
+one that fails does not stop the others.
+"""
 
 from __future__ import annotations
 
-import dataclasses
 import json as json_module
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
-from physion.cli.model_options import parse_options
 from physion.cli.output import Stages, console
-from physion.readout.trainings import TrainConfig, train
+from physion.cli.plan_models import choose_models
+from physion.cli.plan_tables import estimates_table, print_estimates
+from physion.readout.plans.estimates import estimate_plan, time_left
+from physion.readout.plans.selection import Selection, count_seeds, parse_protocols
+from physion.readout.plans.tasks import TrainingTask
+from physion.readout.plans.training_plan import TrainingPlan, TrainingResults
+from physion.readout.trainings import SharedTrainConfig
 from physion.training.overrides import TrainingOverrides
 from physion.trials.dataset import Dataset
-
-if TYPE_CHECKING:
-    from physion.training.train import TrainedModel
 
 
 @dataclass(frozen=True)
 class Options:
     """Options of ``physion train``."""
 
-    model: Annotated[str, tyro.conf.Positional]
-    """Name of a model (physion ls models lists them), or FILE.py:Class."""
+    models: Annotated[str, tyro.conf.Positional]
+    """Names of models with commas (physion ls models lists them), or FILE.py:Class."""
     dataset: Annotated[Path, tyro.conf.Positional]
     """Folder of a dataset."""
+    protocols: Annotated[str, tyro.conf.arg(aliases=("--protocol",))] = "all"
+    """Scenarios that train a model: all, all-but one, or only one; several with commas."""
+    scenario: str = ""
+    """Scenario that all-but leaves out, or the one of only; default: one training for each."""
+    seeds: int = 1
+    """Number of trainings of each set, with seeds from --seed on."""
+    seed: int = 0
+    """First seed: of initial weights, folds and batches."""
     out: Path = Path("runs/models")
     """Folder for trainings and features, that of physion evaluate."""
     size: Literal["small", "paper", "released"] | None = None
-    """Configuration of a model that has several."""
+    """Configuration of models that have several."""
     option: tuple[str, ...] = ()
-    """Fields of the model's config as NAME=VALUE, such as encoder=resnet50 weights=imagenet."""
-    config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
-    """Scenarios, seed and devices."""
+    """Fields of the models' configs as NAME=VALUE, such as encoder=resnet50 weights=imagenet; of
+    one of several models as MODEL:NAME=VALUE."""
+    config: Annotated[SharedTrainConfig, tyro.conf.arg(name="")] = field(
+        default_factory=SharedTrainConfig
+    )
+    """Folds and devices."""
     settings: Annotated[TrainingOverrides, tyro.conf.arg(name="")] = field(
         default_factory=TrainingOverrides
     )
     """Optimiser and schedule."""
+    dry_run: bool = False
+    """Print the plan with the estimated time of each training, and train nothing. Models of which
+    no training is finished make a few steps to be measured."""
     json: bool = False
     """Print one JSON object."""
 
 
 def main(options: Options) -> int:
-    """Train the model once for every set of trials that the protocol needs."""
-    chosen = parse_options(options.option)
-    if options.size is not None:
-        chosen["size"] = options.size
+    """Train what is missing of a plan; return 1 if a training of several failed."""
+    selection = Selection(
+        tuple(choose_models(options.models, options.option, size=options.size)),
+        parse_protocols(options.protocols),
+        count_seeds(options.seed, options.seeds),
+        options.scenario,
+    )
+    plan = TrainingPlan(
+        Dataset(options.dataset), options.out, selection, options.settings, options.config
+    )
+    if options.dry_run:
+        with Stages() as stages:
+            estimates = estimate_plan(plan, stages)
+        print_estimates(estimates_table(estimates), "trainings", options.json)
+        return 0
     with Stages() as stages:
-        trained = train(
-            Dataset(options.dataset),
-            options.model,
-            options.out,
-            options=chosen,
-            settings=options.settings,
-            config=options.config,
-            progress=stages,
-        )
-    from physion.training.devices import is_first_process
 
-    if is_first_process():
-        _print(trained, options.json)
-    return 0
+        def show(task: TrainingTask, reason: str, left: Sequence[TrainingTask]) -> None:
+            if len(plan.tasks) > 1:
+                outcome = f"failed: {reason}" if reason else "trained"
+                stages.note(f"{task.label}: {outcome}{time_left(plan, left)}")
+
+        results = plan.run(stages, show)
+    if plan.is_first_process:
+        _print(plan, results, options.json)
+    return 1 if results.failed else 0
 
 
-def _print(trained: list[TrainedModel], json: bool) -> None:
+def _print(plan: TrainingPlan, results: TrainingResults, json: bool) -> None:
     if json:
-        print(json_module.dumps({"trained": [_values(result) for result in trained]}))
+        print(json_module.dumps(_values(results)))
         return
-    for result in trained:
-        for note in result.notes:
-            console.print(note, markup=False, soft_wrap=True)
-        losses = [f"loss {result.loss:.4g}"]
-        if not math.isnan(result.validation):
-            losses.append(f"held-out trials {result.validation:.4g}")
-        if not math.isnan(result.baseline):
-            losses.append(f"trivial predictor {result.baseline:.4g}")
-        done = "was trained before" if result.loaded else f"trained for {result.steps} steps"
-        console.print(
-            f"{result.name} {done}, {', '.join(losses)}: {result.folder}",
-            markup=False,
-            soft_wrap=True,
-        )
+    several = len(plan.tasks) > 1
+    for task, trained in results.trained:
+        for note in trained["notes"]:
+            _line(note)
+        if not (several and trained["loaded"]):
+            _line(f"{task.label if several else task.planned.name} {_summary(trained)}")
+    before = sum(trained["loaded"] for _, trained in results.trained)
+    if several and before:
+        _line(f"{before} of {len(plan.tasks)} trainings were done before")
+    for task, reason in results.failed:
+        _line(f"failed: {task.label}: {reason}")
 
 
-def _values(result: TrainedModel) -> dict[str, Any]:
-    values = {**dataclasses.asdict(result), "folder": str(result.folder)}
-    missing = {name for name, value in values.items() if value != value}
-    return {name: None if name in missing else value for name, value in values.items()}
+def _summary(trained: dict[str, Any]) -> str:
+    """Return what happened, the losses, and the folder of a training."""
+    losses = []
+    for name, what in (
+        ("loss", "loss"),
+        ("validation", "held-out trials"),
+        ("baseline", "trivial predictor"),
+    ):
+        value = trained[name]
+        if value is not None and not math.isnan(value):
+            losses.append(f"{what} {value:.4g}")
+    done = "was trained before" if trained["loaded"] else f"trained for {trained['steps']} steps"
+    return f"{done}, {', '.join(losses)}: {trained['folder']}"
+
+
+def _values(results: TrainingResults) -> dict[str, Any]:
+    return {
+        "trained": [{**_identity(task), **trained} for task, trained in results.trained],
+        "failed": [{**_identity(task), "reason": reason} for task, reason in results.failed],
+    }
+
+
+def _identity(task: TrainingTask) -> dict[str, Any]:
+    return {"model": task.choice.name, "protocol": task.protocol.value, "seed": task.seed}
+
+
+def _line(text: str) -> None:
+    console.print(text, markup=False, soft_wrap=True)

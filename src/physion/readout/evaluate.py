@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,13 +19,14 @@ from physion.models.batch import Provenance
 from physion.models.build import build_model
 from physion.models.interface import Learns, Model
 from physion.readout.capabilities import choose_readouts
-from physion.readout.folds import plan_folds
+from physion.readout.folds import Fold, plan_folds, select_scenario
 from physion.readout.model_calls import check_identity
 from physion.readout.predictor import Predictor
 from physion.readout.protocols import Readout
 from physion.readout.rollout_error import check_moves_objects, rollout_error
 from physion.readout.settings import EvaluationConfig
 from physion.readout.table import (
+    ORDER,
     ScenarioPredictions,
     file_name,
     is_complete,
@@ -37,6 +38,8 @@ from physion.training.protocols import Training
 from physion.trials.dataset import Dataset
 from physion.version import __version__
 
+PARTS = "parts"
+"""Folder of the tables of single scenarios."""
 _VERSION = 5
 """To be increased with every change that can alter the table of an evaluation."""
 
@@ -77,7 +80,8 @@ def evaluate(
     folder
         Output folder. The table goes to ``predictions/<model>-<hash>.csv``; caches go to
         ``features/``, ``training/`` and ``rollouts/``. An existing table of the same trials,
-        model and config is returned without a new evaluation.
+        model and config is returned without a new evaluation. Under all-but and only, each tested
+        scenario has a table in ``predictions/parts/`` as soon as it is predicted.
     options
         Fields of the config of a model that is given by its name.
     config
@@ -130,39 +134,87 @@ def evaluate_model(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> Evaluation:
-    """Predict every testing trial with a model that is already built; see `evaluate`."""
+    """Predict every testing trial with a model that is already built; see `evaluate`.
+
+    A model that is trained has its initial weights afterwards.
+    """
     provenance = _provenance(model)
     chosen = choose_readouts(model, config.readouts, config.reader)
     name = f"{file_name(provenance.model)}-{_digest(dataset, model, config, chosen)[:12]}.csv"
-    path = folder / "predictions" / name
-    errors_path = folder / "rollout-errors" / name if rollout_errors else None
+    part = PARTS if config.scenario else ""
+    path = folder / "predictions" / part / name
+    errors_path = folder / "rollout-errors" / part / name if rollout_errors else None
     if errors_path is not None:
         check_moves_objects(model)
     if is_complete(path) and (errors_path is None or is_complete(errors_path)):
         return Evaluation(read_table(path), path, {}, errors_path)
-    folds = plan_folds(dataset.index, Training.named(config.training), config.folds, config.seed)
-    predictor = Predictor(dataset, model, chosen, config, folder, executor, progress)
+    protocol = Training.named(config.training)
+    folds = plan_folds(dataset.index, protocol, config.folds, config.seed)
+    kept = select_scenario([fold.training.name for fold in folds], protocol, config.scenario)
+    if config.scenario or protocol is Training.ALL:
+        predictor = Predictor(dataset, model, chosen, config, folder, executor, progress)
+        try:
+            chosen_folds = [folds[position] for position in kept]
+            tables = _predict(predictor, chosen_folds, provenance, rollout_errors)
+        finally:
+            predictor.restore()
+        problems = predictor.problems
+    else:
+        # One table for each tested scenario, so that what is done is not done again.
+        parts = [
+            evaluate_model(
+                dataset,
+                model,
+                folder,
+                config=dataclasses.replace(config, scenario=scenario),
+                rollout_errors=rollout_errors,
+                executor=executor,
+                progress=progress,
+            )
+            for scenario in sorted({s.scenario for fold in folds for s in fold.scenarios})
+        ]
+        tables = _joined(parts)
+        problems = {trial: why for part in parts for trial, why in part.problems.items()}
+    if not len(tables[0]) and not config.scenario:
+        reason = next(iter(problems.values()), "there is no trial to predict")
+        raise BadInputError(f"{provenance.model} predicts no trial: {reason}")
+    # Another name than a complete table has, so that the next run retries the missing trials.
+    path = path.with_suffix(".partial.csv") if problems else path
+    write_table(tables[0], path)
+    if errors_path is not None:
+        errors_path = errors_path.with_name(path.name)
+        write_table(tables[1], errors_path)
+    return Evaluation(read_table(path), path, problems, errors_path)
+
+
+def _predict(
+    predictor: Predictor, folds: Sequence[Fold], provenance: Provenance, rollout_errors: bool
+) -> list[pd.DataFrame]:
+    """Return the table of predictions of ``folds``, and that of errors of imagined motion."""
+    dataset, model = predictor.dataset, predictor.model
     predictions: list[ScenarioPredictions] = []
     errors: list[pd.DataFrame] = []
-    for fold in tracked(folds, "folds", len(folds), progress):
+    for fold in tracked(folds, "folds", len(folds), predictor.progress):
         predictions += predictor.predict(fold)
-        if errors_path is not None:
+        if rollout_errors:
             # Now, since the model has the weights that were trained for this fold.
             tested = [t for split in fold.scenarios for t in split.test]
             known = [t for t in tested if t not in predictor.problems]
-            errors.append(rollout_error(dataset, model, known, progress=progress))
-    problems = predictor.problems
-    if not any(part.trials for part in predictions):
-        reason = next(iter(problems.values()), "there is no trial to predict")
-        raise BadInputError(f"{provenance.model} predicts no trial: {reason}")
-    table = make_table(predictions, provenance, dataset.index)
-    # Another name than a complete table has, so that the next run retries the missing trials.
-    path = path.with_suffix(".partial.csv") if problems else path
-    write_table(table, path)
-    if errors_path is not None:
-        errors_path = errors_path.with_name(path.name)
-        write_table(pd.concat(errors, ignore_index=True).round(6), errors_path)
-    return Evaluation(read_table(path), path, problems, errors_path)
+            errors.append(rollout_error(dataset, model, known, progress=predictor.progress))
+    tables = [make_table(predictions, provenance, dataset.index)]
+    return [*tables, pd.concat(errors, ignore_index=True).round(6)] if errors else tables
+
+
+def _joined(parts: Sequence[Evaluation]) -> list[pd.DataFrame]:
+    """Return the tables of all parts as one each, with the text of every number."""
+
+    def read(path: Path) -> pd.DataFrame:
+        return pd.read_csv(path, dtype=str, keep_default_na=False)
+
+    table = pd.concat([read(part.path) for part in parts], ignore_index=True)
+    errors = [read(part.rollout_errors) for part in parts if part.rollout_errors is not None]
+    tables = [table.sort_values(list(ORDER), ignore_index=True)]
+    return [*tables, pd.concat(errors, ignore_index=True)] if errors else tables
 
 
 def _provenance(model: Model) -> Provenance:

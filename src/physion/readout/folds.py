@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import pandas as pd
 
-from physion.errors import BadInputError
+from physion.errors import BadInputError, UnknownNameError
 from physion.seeds import stable_hash
-from physion.training.protocols import Training, TrainingSet, training_sets
+from physion.training.protocols import Training, TrainingSet, set_name, training_sets
 
 TRAINING, READOUT, TESTING = "training", "readout", "testing"
 """Names of the splits in the index."""
@@ -88,6 +88,29 @@ def plan_folds(index: pd.DataFrame, protocol: Training, folds: int, seed: int) -
         pool = train if len(train) else rest
         planned += [_make_fold(s, pool, rest, tested[held], number) for s in sets]
     return planned
+
+
+def select_scenario(names: Sequence[str], protocol: Training, scenario: str) -> list[int]:
+    """Return the positions in ``names``, of training sets, of the set of one tested scenario.
+
+    All positions are returned if ``scenario`` is empty.
+
+    Raises
+    ------
+    BadInputError
+        If a scenario is chosen for the protocol all.
+    UnknownNameError
+        If the scenario has no training set.
+    """
+    if not scenario:
+        return list(range(len(names)))
+    if protocol is Training.ALL:
+        raise BadInputError("a scenario needs the protocol all-but or only")
+    wanted = set_name(protocol, scenario)
+    if wanted not in names:
+        known = {name.removeprefix(set_name(protocol, "")) for name in names}
+        raise UnknownNameError("scenario of the dataset", scenario, known)
+    return [position for position, name in enumerate(names) if name == wanted]
 
 
 def assign_folds(table: pd.DataFrame, folds: int, seed: int) -> Mapping[str, int]:

@@ -15,16 +15,13 @@ The released code stopped lbfgs after 200 iterations, before the optimum
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
-from sklearn.linear_model import LogisticRegression
-from sklearn.model_selection import StratifiedKFold
-from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import StandardScaler
 
 from physion.errors import BadInputError
 from physion.readout.gram import Array, Fit, JoinedFeatures, Parts, Rows, grams
@@ -231,13 +228,25 @@ def _solve_exactly(
 def _solve_released(
     train: JoinedFeatures, labels: Booleans, test: JoinedFeatures, config: ReadoutConfig
 ) -> tuple[float, float, str, Array]:
-    """Return what `_solve_exactly` does, from scikit-learn's lbfgs with 200 iterations."""
+    """Return what `_solve_exactly` does, from scikit-learn's lbfgs with 200 iterations.
+
+    Unlike the exact solution it needs all features in memory, some times over.
+    """
+    # Here, since importing scikit-learn takes longer than finding a finished evaluation.
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.linear_model import LogisticRegression
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import StandardScaler
+
     splits, note = _splits(labels, config)
     features = train.array()
 
     def fit(rows: Rows, c: float) -> Any:
         model = make_pipeline(StandardScaler(), LogisticRegression(C=c, max_iter=_RELEASED))
-        return model.fit(features[rows], labels[rows])
+        with warnings.catch_warnings():
+            # To stop before the optimum is what was released.
+            warnings.simplefilter("ignore", ConvergenceWarning)
+            return model.fit(features[rows], labels[rows])
 
     scores = [
         np.column_stack([fit(f, c).decision_function(features[held]) for c in config.grid])
@@ -255,6 +264,8 @@ def _splits(labels: Booleans, config: ReadoutConfig) -> tuple[list[tuple[Rows, R
     folds = min(config.folds, int(labels.sum()), int((~labels).sum()))
     if len(config.grid) == 1 or folds < 2:
         return [], "" if len(config.grid) == 1 else "too few trials to choose C"
+    from sklearn.model_selection import StratifiedKFold
+
     splitter = StratifiedKFold(folds, shuffle=True, random_state=config.seed)
     splits = list(splitter.split(np.zeros(len(labels)), labels))
     return splits, f"only {folds} folds" if folds < config.folds else ""

@@ -85,9 +85,9 @@ class Predictor:
         self.problems: dict[str, str] = self._rollouts.problems
         self._initial: Any = None
         if is_network(self.model):
-            from physion.training.devices import Devices, make_fabric
+            from physion.training.devices import Devices, make_fabric, move_to_device
 
-            make_fabric(Devices(self.config.accelerator), "32-true").to_device(self.model)
+            move_to_device(make_fabric(Devices(self.config.accelerator), "32-true"), self.model)
         if isinstance(self.model, SeesOutcomes):
             self.model = self.model.with_outcomes(self._outcomes)
 
@@ -103,6 +103,12 @@ class Predictor:
             for split in fold.scenarios
             for readout, way in self.ways.items()
         ]
+
+    def restore(self) -> None:
+        """Give the model its initial weights again, if it was trained."""
+        if self._initial is not None:
+            network: Any = self.model
+            network.load_state_dict(self._initial)
 
     def _sub(self, name: str) -> Path | None:
         return self.folder / name if self.folder is not None else None

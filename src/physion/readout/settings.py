@@ -10,13 +10,11 @@ from physion.training.overrides import TrainingOverrides
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluationConfig(TrainingOverrides):
-    """Settings of an evaluation, and of the training that it needs."""
+class EvaluationSettings(TrainingOverrides):
+    """Settings that all evaluations of a plan have in common, and of the trainings they need."""
 
     readouts: tuple[str, ...] = ()
     """Protocols: observed, observed+simulated, full. Default: all that the model supports."""
-    training: str = "all"
-    """Scenarios that train the model: all, all-but or only the tested one."""
     untrained: bool = False
     """Leave the weights of the model as they are; the table says untrained."""
     reader: str = ""
@@ -25,8 +23,6 @@ class EvaluationConfig(TrainingOverrides):
     """Settings of the readout."""
     folds: int = 5
     """Folds of the cross-validation of a dataset without a readout split."""
-    seed: int = 0
-    """Seed of folds and training."""
     encoder_batch: int = 4
     """Clips that a network encodes at a time; lower it when memory runs out."""
     rendered: bool = False
@@ -40,3 +36,15 @@ class EvaluationConfig(TrainingOverrides):
                 f"encoder_batch must be at least 1 and folds at least 2, not "
                 f"{self.encoder_batch} and {self.folds}"
             )
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationConfig(EvaluationSettings):
+    """Settings of one evaluation."""
+
+    training: str = "all"
+    """Scenarios that train the model: all, all-but or only the tested one."""
+    scenario: str = ""
+    """Tested scenario, under all-but and only; default: all of them."""
+    seed: int = 0
+    """Seed of folds and training."""

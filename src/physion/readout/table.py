@@ -42,6 +42,9 @@ OFFICIAL_COLUMNS = (
 )
 """Columns of the official files, in their order (docs/official-system.md, section 5.5)."""
 
+ORDER = ("Protocol", "Readout Test Data", "Stimulus Name")
+"""Columns by which the rows are sorted."""
+
 OWN_COLUMNS = (
     "Protocol",
     "Init",
@@ -169,8 +172,7 @@ def make_table(
     cells = [table["Protocol"], table["Readout Test Data"]]
     table["Test Accuracy"] = hits.groupby(cells).transform("mean")
     table["Train Accuracy"] = table["Train Accuracy"].astype(float).groupby(cells).transform("mean")
-    order = ["Protocol", "Readout Test Data", "Stimulus Name"]
-    return table.sort_values(order, ignore_index=True)
+    return table.sort_values(list(ORDER), ignore_index=True)
 
 
 def write_table(table: pd.DataFrame, path: Path) -> None:

@@ -3,38 +3,36 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from physion.compute.progress import Progress
-from physion.errors import BadInputError, MissingExtraError, UnknownNameError
+from physion.errors import BadInputError, MissingExtraError
 from physion.models.build import build_model
 from physion.models.interface import Model
 from physion.readout.features.feature_store import FeatureStore
-from physion.readout.folds import READOUT, TESTING, TRAINING, plan_folds
+from physion.readout.folds import READOUT, TESTING, TRAINING, plan_folds, select_scenario
 from physion.training.overrides import TrainingOverrides
 from physion.training.protocols import Training, training_sets
 from physion.training.sources.open_source import whole_source
 from physion.trials.dataset import Dataset
 
 if TYPE_CHECKING:
+    from lightning_fabric import Fabric
+
     from physion.training.train import TrainedModel
 
 
-@dataclass(frozen=True)
-class TrainConfig:
-    """Settings of ``physion train``; those that `EvaluationConfig` has too mean the same."""
+@dataclass(frozen=True, kw_only=True)
+class SharedTrainConfig:
+    """Settings that all trainings of a plan have in common; `EvaluationConfig` has some too."""
 
-    protocol: Literal["all", "all-but", "only"] = "all"
-    """Scenarios that train the model: all, all but one, or only one."""
-    scenario: str = ""
-    """Scenario that all-but leaves out, or the one of only; default: one training for each."""
-    seed: int = 0
-    """Seed of folds and training."""
     folds: int = 5
     """Folds of the cross-validation of a dataset that has testing trials alone."""
     encoder_batch: int = 4
@@ -48,13 +46,110 @@ class TrainConfig:
     nodes: int = 1
     """Nodes; the same command is started on each, as Lightning describes."""
 
+    def open_devices(self, precision: str) -> Fabric:
+        """Return the devices, opened for a precision; raise `BadInputError` if there are none."""
+        from physion.training.devices import Devices, make_fabric
+
+        return make_fabric(Devices(self.accelerator, self.devices, self.nodes), precision)
+
+
+@dataclass(frozen=True)
+class TrainConfig(SharedTrainConfig):
+    """Settings of `train`; those that `EvaluationConfig` has too mean the same."""
+
+    protocol: Literal["all", "all-but", "only"] = "all"
+    """Scenarios that train the model: all, all but one, or only one."""
+    scenario: str = ""
+    """Scenario that all-but leaves out, or the one of only; default: one training for each."""
+    seed: int = 0
+    """Seed of folds and training."""
+
 
 @dataclass(frozen=True)
 class PlannedTraining:
-    """Name of a set of trials, such as ``all`` or ``no_drop``, and the trials."""
+    """Name of a set of trials, such as ``all`` or ``no_drop``, and the trials.
+
+    ``fold`` counts the folds of a cross-validation from 0; -1 without one.
+    """
 
     name: str
     trials: tuple[str, ...]
+    fold: int = -1
+
+
+class Trainer:
+    """One model with its initial weights, which is trained on one set of trials after the other.
+
+    Parameters
+    ----------
+    dataset
+        Trials.
+    model
+        `Learns` and a torch ``Module``.
+    folder
+        Output folder of `evaluate`; None keeps nothing.
+    overrides
+        Optimiser and schedule, where they are not to be those of the model.
+    shared
+        Devices and batches.
+    open_devices
+        Returns the devices for a precision; by default those of ``shared`` are opened.
+
+    Raises
+    ------
+    BadInputError
+        If the model cannot be trained, or the devices are not there.
+    """
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        model: Any,
+        folder: Path | None,
+        overrides: TrainingOverrides,
+        shared: SharedTrainConfig,
+        open_devices: Callable[[str], Fabric] | None = None,
+    ) -> None:
+        try:
+            from physion.training.train import check_trainable
+        except ModuleNotFoundError as error:
+            raise MissingExtraError("training", "models") from error
+        check_trainable(model)
+        self.model, self.settings = model, overrides.apply(model.settings)
+        opened = open_devices if open_devices is not None else shared.open_devices
+        self.fabric = opened(self.settings.precision)
+        self.source = whole_source(dataset, model.spec, rendered=shared.rendered)
+        self._folder = folder
+        features = folder / "features" if folder is not None else None
+        self._store = FeatureStore(features, batch=shared.encoder_batch)
+        self._initial = copy.deepcopy(model.state_dict())
+
+    def train(
+        self, plan: PlannedTraining, seed: int, progress: Progress | None = None
+    ) -> TrainedModel:
+        """Train from the initial weights, which the model has again afterwards."""
+        from physion.training.train import train_model
+
+        shown = progress if self.fabric.is_global_zero else None
+
+        def features(trials: Sequence[str]) -> NDArray[np.float32]:
+            return self._store.encoded(self.model, self.source, trials, "whole", shown).array()
+
+        try:
+            return train_model(
+                self.model,
+                self.source,
+                plan.trials,
+                seed=seed,
+                name=plan.name,
+                folder=self._folder / "training" if self._folder is not None else None,
+                settings=self.settings,
+                features=features,
+                fabric=self.fabric,
+                progress=shown,
+            )
+        finally:
+            self.model.load_state_dict(self._initial)
 
 
 def train(
@@ -103,40 +198,9 @@ def train(
     if not isinstance(model, str) and options:
         raise BadInputError("options are for a model that is given by its name; this one is built")
     built: Any = build_model(model, **dict(options or {})) if isinstance(model, str) else model
-    try:
-        from physion.training.devices import Devices, make_fabric
-        from physion.training.train import check_trainable, train_model
-    except ModuleNotFoundError as error:
-        raise MissingExtraError("training", "models") from error
-    check_trainable(built)
-    chosen = (settings if settings is not None else TrainingOverrides()).apply(built.settings)
-    devices = Devices(config.accelerator, config.devices, config.nodes)
-    fabric = make_fabric(devices, chosen.precision)
-    shown = progress if fabric.is_global_zero else None
-    source = whole_source(dataset, built.spec, rendered=config.rendered)
-    store = FeatureStore(Path(folder) / "features", batch=config.encoder_batch)
-    initial = copy.deepcopy(built.state_dict())
-    trained = []
-    for plan in planned:
-        built.load_state_dict(initial)
-        trained.append(
-            train_model(
-                built,
-                source,
-                plan.trials,
-                seed=config.seed,
-                name=plan.name,
-                folder=Path(folder) / "training",
-                settings=chosen,
-                features=lambda trials: store.encoded(
-                    built, source, trials, "whole", shown
-                ).array(),
-                fabric=fabric,
-                progress=shown,
-            )
-        )
-    built.load_state_dict(initial)
-    return trained
+    overrides = settings if settings is not None else TrainingOverrides()
+    trainer = Trainer(dataset, built, Path(folder), overrides, config)
+    return [trainer.train(plan, config.seed, progress) for plan in planned]
 
 
 def plan_trainings(index: pd.DataFrame, config: TrainConfig) -> list[PlannedTraining]:
@@ -153,20 +217,13 @@ def plan_trainings(index: pd.DataFrame, config: TrainConfig) -> list[PlannedTrai
         If a scenario is chosen for the protocol all, or there is nothing to train on.
     """
     protocol = Training.named(config.protocol)
-    if config.scenario and protocol is Training.ALL:
-        raise BadInputError("a scenario needs the protocol all-but or only")
     if (index["split"] == TESTING).any():
         folds = plan_folds(index, protocol, config.folds, config.seed)
-        planned = [PlannedTraining(fold.training.name, fold.train) for fold in folds]
+        planned = [PlannedTraining(f.training.name, f.train, f.number) for f in folds]
     else:
         planned = _without_testing(index, protocol)
-    if config.scenario:
-        prefix = "no_" if protocol is Training.ALL_BUT else ""
-        known = sorted({plan.name.removeprefix(prefix) for plan in planned})
-        planned = [plan for plan in planned if plan.name == prefix + config.scenario]
-        if not planned:
-            raise UnknownNameError("scenario of the dataset", config.scenario, known)
-    return planned
+    kept = select_scenario([plan.name for plan in planned], protocol, config.scenario)
+    return [planned[position] for position in kept]
 
 
 def _without_testing(index: pd.DataFrame, protocol: Training) -> list[PlannedTraining]:

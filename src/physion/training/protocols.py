@@ -38,6 +38,15 @@ class TrainingSet:
     tested: tuple[str, ...]
 
 
+def set_name(protocol: Training, scenario: str) -> str:
+    """Return the name of the `TrainingSet` of a tested scenario."""
+    return {
+        Training.ALL: "all",
+        Training.ALL_BUT: f"no_{scenario}",
+        Training.ONLY: scenario,
+    }[protocol]
+
+
 def training_sets(protocol: Training, scenarios: Sequence[str]) -> list[TrainingSet]:
     """Return the trainings that a protocol needs: one in all, or one per scenario."""
     names = tuple(sorted(set(scenarios)))
@@ -46,9 +55,10 @@ def training_sets(protocol: Training, scenarios: Sequence[str]) -> list[Training
     if protocol is Training.ALL:
         return [TrainingSet("all", names, names)]
     if protocol is Training.ONLY:
-        return [TrainingSet(name, (name,), (name,)) for name in names]
+        return [TrainingSet(set_name(protocol, name), (name,), (name,)) for name in names]
     if len(names) < 2:
         raise BadInputError(f"all-but needs two scenarios or more; there is only {names[0]!r}")
     return [
-        TrainingSet(f"no_{name}", tuple(n for n in names if n != name), (name,)) for name in names
+        TrainingSet(set_name(protocol, name), tuple(n for n in names if n != name), (name,))
+        for name in names
     ]

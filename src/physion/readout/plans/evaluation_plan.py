@@ -1,0 +1,283 @@
+"""Plan of evaluations: every model, training protocol, scenario and seed, and all readouts."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from physion.compute.executor import Executor
+from physion.compute.progress import Progress
+from physion.readout.evaluate import Evaluation, evaluate_model
+from physion.readout.folds import plan_folds, select_scenario
+from physion.readout.plans.failures import describe_failure, stop_if_fatal
+from physion.readout.plans.keys import code_key, dataset_key, key_of
+from physion.readout.plans.model_facts import KnownModels, ModelFacts
+from physion.readout.plans.records import Records
+from physion.readout.plans.selection import ModelChoice, Selection
+from physion.readout.plans.tasks import EvaluationTask
+from physion.readout.protocols import Readout
+from physion.readout.settings import EvaluationConfig, EvaluationSettings
+from physion.readout.table import read_table
+from physion.training.protocols import Training
+from physion.trials.dataset import Dataset
+
+OnTask = Callable[[EvaluationTask, str, Sequence[EvaluationTask]], None]
+_RUN_ON = ("accelerator", "encoder_batch")
+"""Settings that choose where and how an evaluation runs."""
+
+
+@dataclass(frozen=True)
+class EvaluationResults:
+    """What a plan has evaluated.
+
+    - ``evaluated``: tasks and their evaluations, in the order of the plan.
+    - ``tables``: one evaluation for each model, protocol and seed; those of single scenarios where
+      a task failed.
+    - ``failed``: task and reason.
+    """
+
+    evaluated: Sequence[tuple[EvaluationTask, Evaluation]]
+    tables: Sequence[tuple[EvaluationTask, Evaluation]]
+    failed: Sequence[tuple[EvaluationTask, str]]
+
+    @property
+    def problems(self) -> Mapping[str, str]:
+        """Reasons of the trials without a prediction, by task and trial."""
+        return {
+            f"{task.label}: {trial}": reason
+            for task, evaluation in self.evaluated
+            for trial, reason in evaluation.problems.items()
+        }
+
+
+class EvaluationPlan:
+    """All evaluations of a selection, of which those that are done are known from their records.
+
+    A model that is not trained is evaluated once.
+
+    Parameters
+    ----------
+    dataset
+        Trials.
+    folder
+        Output folder.
+    selection
+        Models, protocols and seeds.
+    settings
+        Readouts, training and device.
+    rollout_errors
+        As for `physion.readout.evaluate.evaluate`.
+    """
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        folder: Path,
+        selection: Selection,
+        settings: EvaluationSettings,
+        *,
+        rollout_errors: bool = False,
+    ) -> None:
+        self.dataset, self.settings, self.rollout_errors = dataset, settings, rollout_errors
+        self._folder, self._selection = folder, selection
+        self._records, self.models = Records(folder, "evaluations"), KnownModels(folder)
+        self._data = dataset_key(dataset)
+        self._built: dict[tuple[str, int], Any] = {}
+        self.tasks = self._list_tasks()
+        read = {task.key: self._records.read(task.key) for task in self.tasks}
+        self.done = {key: values for key, values in read.items() if values is not None}
+
+    @property
+    def pending(self) -> list[EvaluationTask]:
+        """Tasks that were not done when the plan was made."""
+        return [task for task in self.tasks if task.key not in self.done]
+
+    def run(
+        self,
+        executor: Executor | None = None,
+        progress: Progress | None = None,
+        on_task: OnTask | None = None,
+    ) -> EvaluationResults:
+        """Do the tasks that are not done; one that fails does not stop the others.
+
+        ``on_task`` is called after each with the task, the reason if it failed, and those left.
+
+        Raises
+        ------
+        PhysionError
+            If the plan has one task and it fails, or if nothing more can be written.
+        """
+        pending = self.pending
+        results = {key: self._stored(values) for key, values in self.done.items()}
+        failed: dict[str, str] = {}
+        if progress is not None and len(pending) > 1:
+            progress("plan", 0, len(pending))
+        for number, task in enumerate(pending, start=1):
+            try:
+                results[task.key] = self._evaluate(task, executor, progress)
+            except Exception as error:
+                stop_if_fatal(error, self._folder, len(results), len(self.tasks))
+                if len(self.tasks) == 1:
+                    raise
+                failed[task.key] = describe_failure(error)
+            if progress is not None and len(pending) > 1:
+                progress("plan", number, len(pending))
+            if on_task is not None:
+                on_task(task, failed.get(task.key, ""), pending[number:])
+        return EvaluationResults(
+            [(task, results[task.key]) for task in self.tasks if task.key in results],
+            self._whole_tables(results),
+            [(task, failed[task.key]) for task in self.tasks if task.key in failed],
+        )
+
+    def expected_seconds(self, task: EvaluationTask) -> float | None:
+        """Return the mean time of finished evaluations of the same model; None without any."""
+        model = self.models.choice_key(task.choice)
+        known = [v["seconds"] for v in self._earlier if v.get("model") == model and v["seconds"]]
+        return sum(known) / len(known) if known else None
+
+    @cached_property
+    def _earlier(self) -> list[dict[str, Any]]:
+        return self._records.all()
+
+    def _list_tasks(self) -> list[EvaluationTask]:
+        """Return the tasks, seed after seed, so that a whole table is there early."""
+        chosen = self._selection
+        sets = {
+            (protocol, seed): self._sets(protocol, seed)
+            for protocol in chosen.protocols
+            for seed in chosen.seeds
+        }
+        tasks = []
+        for seed in chosen.seeds:
+            for choice in chosen.models:
+                facts = self.models.facts(choice)
+                if not self._trains(facts):
+                    if seed == chosen.seeds[0] or self.settings.untrained:
+                        tasks.append(self._task(choice, Training.ALL, "", "", seed))
+                    continue
+                for protocol in chosen.protocols:
+                    tasks += [
+                        self._task(choice, protocol, name, scenario, seed)
+                        for name, scenario in sets[protocol, seed]
+                    ]
+        return tasks
+
+    def _sets(self, protocol: Training, seed: int) -> list[tuple[str, str]]:
+        """Return names of the training sets, each with its tested scenario if there is one."""
+        folds = plan_folds(self.dataset.index, protocol, self.settings.folds, seed)
+        names = [fold.training.name for fold in folds]
+        kept = select_scenario(names, protocol, self._selection.scenario)
+        tested = {names[k]: folds[k].training.tested for k in kept}
+        one = protocol is not Training.ALL
+        return [(name, scenarios[0] if one else "") for name, scenarios in tested.items()]
+
+    def _trains(self, facts: ModelFacts) -> bool:
+        """Return whether an evaluation trains the model, so that protocol and seed matter."""
+        if not facts.learns or facts.trained or self.settings.untrained:
+            return False
+        readouts = self.settings.readouts
+        needs_dynamics = not readouts or Readout.OBSERVED_SIMULATED.value in readouts
+        return facts.diet != "features" or needs_dynamics
+
+    def _task(
+        self, choice: ModelChoice, protocol: Training, name: str, scenario: str, seed: int
+    ) -> EvaluationTask:
+        inputs = {
+            name: value
+            for name, value in dataclasses.asdict(self.settings).items()
+            if name not in _RUN_ON
+        }
+        common = [code_key(), self._data, inputs, self.rollout_errors]
+        what = [self.models.choice_key(choice), protocol.value, name, scenario, seed]
+        key = key_of("evaluation", common, what)
+        return EvaluationTask(choice, protocol, name, scenario, seed, key)
+
+    def _model(self, task: EvaluationTask) -> Any:
+        """Return the model of a task with its seed; the last one is kept."""
+        key = self.models.choice_key(task.choice), task.seed
+        if key not in self._built:
+            self._built.clear()
+            self._built[key] = self.models.build(task.choice, task.seed)
+        return self._built[key]
+
+    def _evaluate(
+        self, task: EvaluationTask, executor: Executor | None, progress: Progress | None
+    ) -> Evaluation:
+        start = time.perf_counter()
+        evaluation = self._ask(task, task.scenario, executor, progress)
+        if not evaluation.problems and self.models.record(task.choice):
+            self._record(task.key, task, evaluation, time.perf_counter() - start)
+        return evaluation
+
+    def _record(
+        self, key: str, task: EvaluationTask, evaluation: Evaluation, seconds: float
+    ) -> None:
+        paths = [evaluation.path]
+        if evaluation.rollout_errors is not None:
+            paths.append(evaluation.rollout_errors)
+        values = {
+            "label": task.label,
+            "model": self.models.choice_key(task.choice),
+            "seconds": seconds,
+            "files": [path.relative_to(self._folder).as_posix() for path in paths],
+        }
+        self._records.write(key, values, paths)
+
+    def _ask(
+        self,
+        task: EvaluationTask,
+        scenario: str,
+        executor: Executor | None = None,
+        progress: Progress | None = None,
+    ) -> Evaluation:
+        config = EvaluationConfig(
+            **{f.name: getattr(self.settings, f.name) for f in dataclasses.fields(self.settings)},
+            training=task.protocol.value,
+            scenario=scenario,
+            seed=task.seed,
+        )
+        return evaluate_model(
+            self.dataset,
+            self._model(task),
+            self._folder,
+            config=config,
+            rollout_errors=self.rollout_errors,
+            executor=executor,
+            progress=progress,
+        )
+
+    def _stored(self, values: Mapping[str, Any]) -> Evaluation:
+        path, *errors = (self._folder / name for name in values["files"])
+        return Evaluation(read_table(path), path, {}, errors[0] if errors else None)
+
+    def _whole_tables(
+        self, results: Mapping[str, Evaluation]
+    ) -> list[tuple[EvaluationTask, Evaluation]]:
+        """Join the tables of single scenarios, where all of a protocol are there and complete."""
+        groups: dict[tuple[str, str, int], list[EvaluationTask]] = defaultdict(list)
+        for task in self.tasks:
+            groups[self.models.choice_key(task.choice), task.protocol.value, task.seed].append(task)
+        tables = []
+        for tasks in groups.values():
+            complete = all(t.key in results and not results[t.key].problems for t in tasks)
+            if complete and tasks[0].scenario and not self._selection.scenario:
+                tables.append((tasks[0], self._joined(tasks)))
+            else:
+                tables += [(task, results[task.key]) for task in tasks if task.key in results]
+        return tables
+
+    def _joined(self, tasks: Sequence[EvaluationTask]) -> Evaluation:
+        key = key_of("joined", [task.key for task in tasks])
+        values = self._records.read(key)
+        if values is not None:
+            return self._stored(values)
+        joined = self._ask(tasks[0], "")
+        self._record(key, tasks[0], joined, 0.0)
+        return joined
