@@ -17,8 +17,8 @@ from typing import Annotated, Any
 import tyro
 
 from physion.cli.output import Stages, console, write_text
-from physion.cli.plan_models import choose_models
-from physion.cli.plan_tables import evaluations_table, print_estimates
+from physion.cli.plans.choose_models import choose_models
+from physion.cli.plans.tables import evaluations_table, print_estimates
 from physion.cli.text_table import text_table
 from physion.compute.local import LocalExecutor
 from physion.readout.evaluate import Evaluation

@@ -17,15 +17,20 @@ from physion.models.interface import Encodes, HasReader, Imagines, Learns, Model
 from physion.readout.model_calls import call_model, check_identity, is_network, model_name, to_array
 from physion.readout.readers.reader import fraction_of_futures
 from physion.readout.rollouts import Outcomes
-from physion.report.viewer.imagined import SHOWABLE, Imagine, ImaginedTrial
-from physion.training.sources.open_source import observed_source
-from physion.training.sources.source import ObservedSource
+from physion.report.viewer.imagined.pack import SHOWABLE
+from physion.report.viewer.imagined.trial import Imagine, ImaginedTrial
+from physion.training.sources.open_source import whole_source
+from physion.training.sources.source import WholeSource
 from physion.trials.dataset import Dataset
 
 Arrays = NDArray[Any]
 
 _FUTURES: dict[str, tuple[tuple[int | None, ...], str]] = {
-    "particles": ((None, None, 3), "float32")
+    "particles": ((None, None, 3), "float32"),
+    "rgb": ((None, None, None, 3), "uint8"),
+    "boxes": ((None, None, 4), "float32"),
+    "masks": ((None, None, None, None), "float32"),
+    "slots": ((None, None, None), "float32"),
 }
 """Shape after the axes of trials and futures, and type, of what the viewer shows (`SHOWABLE`)."""
 _TRIALS = 8
@@ -43,7 +48,8 @@ def imagine_with(
     Parameters
     ----------
     dataset
-        The dataset, of which models get the observed part.
+        The dataset. Models imagine from its observed part; the true pictures that the viewer shows
+        beside are of whole trials.
     names
         Names of models; ``options`` are fields of the config of every one.
     progress
@@ -96,26 +102,25 @@ def _imagine_trials(
 
         network: Any = model
         make_fabric(Devices(), "32-true").to_device(network)
-    source = observed_source(dataset, model.spec)
+    source = whole_source(dataset, model.spec, rendered=_without_movies(dataset, trials))
     groups = [trials[row : row + _TRIALS] for row in range(0, len(trials), _TRIALS)]
     imagined: dict[str, ImaginedTrial] = {}
     for group in tracked(groups, f"predictions of {model_name(model)}", len(groups), progress):
-        imagined |= zip(group, _imagine_batch(model, _context(model, source, group)), strict=True)
+        imagined |= zip(group, _imagine_group(model, source, group), strict=True)
     return imagined
 
 
-def _context(model: Model, source: ObservedSource, trials: Sequence[str]) -> Batch:
-    """Return the context of trials, with its features if the model also encodes."""
-    batch = source.context(trials)
-    if not isinstance(model, Encodes):
-        return batch
-    features = call_model(model, "encode", batch)
-    what, shape = "encode gave features", (len(batch), None, None)
-    return dataclasses.replace(batch, features=to_array(features, model, what, shape, ("float32",)))
+def _without_movies(dataset: Dataset, trials: Sequence[str]) -> bool:
+    """Return whether a trial has no movies, so that pictures must be rendered from the motion."""
+    index = dataset.index
+    if "movie_sha256" not in index:
+        return True
+    return bool(index.loc[index["trial"].isin(trials), "movie_sha256"].isna().any())
 
 
-def _imagine_batch(model: Model, batch: Batch) -> list[ImaginedTrial]:
-    """Return what a model imagines of each trial of a batch; the first future is shown."""
+def _imagine_group(model: Model, source: WholeSource, trials: Sequence[str]) -> list[ImaginedTrial]:
+    """Return what a model imagines of each trial; the first future is shown."""
+    batch = _context(model, source.context(trials))
     samples, seed = (model.samples, model.seed) if isinstance(model, HasReader) else (1, 0)
     rollout = call_model(model, "imagine", batch, samples, seed, show=1.0)
     if not isinstance(rollout, Rollout):
@@ -123,20 +128,44 @@ def _imagine_batch(model: Model, batch: Batch) -> list[ImaginedTrial]:
             f"model {model_name(model)!r}: imagine gave {type(rollout).__name__}, expected Rollout"
         )
     shown, steps = _shown_arrays(model, rollout, len(batch), samples)
+    seen = _seen_arrays(model, rollout, batch, shown)
+    true = _true_arrays(model, source, trials, shown, steps)
     probability, gap = _outcomes(model, rollout, len(batch), samples)
-    frames = model.spec.context_frames()[-1] + model.spec.stride * np.arange(1, steps + 1)
+    context = model.spec.context_frames()
+    frames = context[-1] + model.spec.stride * np.arange(1, steps + 1)
     return [
         ImaginedTrial(
             model=model_name(model),
             weights=describe_weights(model),
             frames=frames,
-            shown={name: value[row] for name, value in shown.items()},
+            shown=_row(shown, row),
+            seen_frames=np.array(context if seen else (), np.int64),
+            seen=_row(seen, row),
+            true=_row(true, row),
             probability=float(probability[row]),
             gap=float(gap[row]),
             futures=samples,
         )
         for row in range(len(batch))
     ]
+
+
+def _row(arrays: Mapping[str, Arrays], row: int) -> dict[str, Arrays]:
+    return {name: values[row] for name, values in arrays.items()}
+
+
+def _context(model: Model, batch: Batch) -> Batch:
+    """Return the context of trials, with its features if the model also encodes."""
+    if not isinstance(model, Encodes):
+        return batch
+    return dataclasses.replace(batch, features=_encoded(model, batch))
+
+
+def _encoded(model: Model, batch: Batch) -> Arrays:
+    """Return the features (B, T', D) of a batch."""
+    features = call_model(model, "encode", batch)
+    what, shape = "encode gave features", (len(batch), None, None)
+    return to_array(features, model, what, shape, ("float32",))
 
 
 def _shown_arrays(
@@ -150,14 +179,64 @@ def _shown_arrays(
             f"model {model_name(model)!r} imagines nothing that can be shown: the viewer shows "
             f"{', '.join(SHOWABLE)}, and it gave {gave}"
         )
-    shown = {}
+    shown: dict[str, Arrays] = {}
+    steps: int | None = None
     for name in known:
-        shape, dtype = _FUTURES[name]
-        shown[name] = _array(model, rollout, name, (clips, samples, *shape), dtype)[:, 0]
+        (_, *shape), dtype = _FUTURES[name]
+        wanted = (clips, samples, steps, *shape)
+        shown[name] = _array(model, rollout, name, wanted, dtype)[:, 0]
+        steps = shown[name].shape[1]
     if "particles" in shown:
         count = shown["particles"].shape[2]
         shown["things"] = _array(model, rollout, "things", (clips, count), "int64")
-    return shown, shown[known[0]].shape[1]
+    return shown, steps or 0
+
+
+def _seen_arrays(
+    model: Model, rollout: Rollout, batch: Batch, shown: Mapping[str, Arrays]
+) -> dict[str, Arrays]:
+    """Return what the model saw (B, T, ...), and the masks and slots that it found there."""
+    if not set(shown) & {"rgb", "boxes", "masks", "slots"}:
+        return {}
+    values = {"rgb": batch.rgb, "boxes": batch.boxes if "boxes" in shown else None}
+    seen: dict[str, Arrays] = {name: value for name, value in values.items() if value is not None}
+    frames = len(model.spec.context_frames())
+    if "context_masks" in rollout.shown:
+        shape = (len(batch), frames, None, None, None)
+        seen["masks"] = _array(model, rollout, "context_masks", shape, "float32")
+    if "slots" in shown and batch.features is not None:
+        seen["slots"] = _as_slots(model, batch.features, shown["slots"])
+    return seen
+
+
+def _true_arrays(
+    model: Model,
+    source: WholeSource,
+    trials: Sequence[str],
+    shown: Mapping[str, Arrays],
+    steps: int,
+) -> dict[str, Arrays]:
+    """Return what was to be imagined (B, F, ...): pictures, and the slots that are found there."""
+    spec = model.spec
+    if not spec.sees_pictures or steps != spec.future:
+        return {}
+    whole = source.whole(trials)
+    true = {} if whole.rgb is None else {"rgb": whole.rgb[:, spec.context :]}
+    if "slots" in shown and isinstance(model, Encodes):
+        features = _encoded(model, whole)[:, spec.context :]
+        true["slots"] = _as_slots(model, features, shown["slots"])
+    return true
+
+
+def _as_slots(model: Model, features: Arrays, slots: Arrays) -> Arrays:
+    """Return features (B, T, K D) as slots (B, T, K, D), of which ``slots`` has K and D."""
+    count, size = slots.shape[2:]
+    if features.shape[2] != count * size:
+        raise BadInputError(
+            f"model {model_name(model)!r}: imagine gave {count} slots of {size} values, and encode "
+            f"features of {features.shape[2]} values, which must be those of all slots"
+        )
+    return features.reshape(*features.shape[:2], count, size)
 
 
 def _array(

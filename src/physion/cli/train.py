@@ -17,8 +17,8 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from physion.cli.output import Stages, console
-from physion.cli.plan_models import choose_models
-from physion.cli.plan_tables import estimates_table, print_estimates
+from physion.cli.plans.choose_models import choose_models
+from physion.cli.plans.tables import estimates_table, print_estimates
 from physion.readout.plans.estimates import estimate_plan, time_left
 from physion.readout.plans.selection import Selection, count_seeds, parse_protocols
 from physion.readout.plans.tasks import TrainingTask

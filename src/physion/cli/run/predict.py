@@ -14,6 +14,9 @@ if TYPE_CHECKING:
 OFFICIAL_MODELS = (
     "pEffNetLite0-mlp",
     "noisy-simulation",
+    "gns",
+    "gns-ransac",
+    "dpi",
     "state-classifier",
     "constant-motion",
     "already-touched",
@@ -21,6 +24,7 @@ OFFICIAL_MODELS = (
 )
 """Models of a run on official scenes, in the order of the report."""
 SIMULATIONS = ("noisy-simulation", "noisy-simulation-outcomes", "noisy-simulation-people")
+PARTICLE_MODELS = ("gns", "gns-ransac", "dpi")
 SAMPLED_MODELS = ("frozen-encoder", "noisy-simulation")
 
 
@@ -37,6 +41,7 @@ def chosen_models(options: Options) -> dict[str, dict[str, Any]]:
         # Frames of the size of the movies: enlarging them would only take time.
         "pEffNetLite0-mlp": {"image_size": options.size},
         "pEffNetLite0-lstm": {"image_size": options.size},
+        **{name: {"weights": "shipped"} for name in PARTICLE_MODELS},
         **{name: {"samples": options.samples, "engine": options.engine} for name in SIMULATIONS},
     }
     return {name: known.get(name, {}) for name in dict.fromkeys(names)}

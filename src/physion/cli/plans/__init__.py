@@ -1,0 +1,1 @@
+"""Plans on the command line: choice of models, and tables of tasks."""
