@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import timm
 import torch
 from safetensors.torch import save_file
 
@@ -100,6 +101,24 @@ def test_dino_weights_of_another_network_are_refused(name: str, tmp_path: Path) 
     save_file(state, path)
     with pytest.raises(BadInputError, match=r"tensors differ, \d+ missing .* another shape"):
         create_encoder(name, 112, EncoderWeights(str(path)))
+
+
+@pytest.mark.slow
+def test_dinov2_weights_as_published_are_read_at_another_image_size(tmp_path: Path) -> None:
+    name, path = "vit_small_patch14_dinov2", tmp_path / "w.safetensors"
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        published: Any = timm.create_model(name, pretrained=False)
+    save_file(published.state_dict(), path)
+    encoder: Any = create_encoder(name, 56, EncoderWeights(str(path)))
+    assert published.pos_embed.shape == (1, 37 * 37 + 1, 384)
+    assert encoder.pos_embed.shape == (1, 4 * 4 + 1, 384)
+    for one, other in zip(encoder.blocks.parameters(), published.blocks.parameters(), strict=True):
+        assert torch.equal(one, other)
+    pictures = torch.rand(2, 3, 56, 56, generator=torch.Generator().manual_seed(0))
+    assert encoder(pictures).shape == (2, 384)
+    grid = create_encoder(name, 56, EncoderWeights(str(path)), "grid")
+    assert grid(pictures).shape == (2, 16 * 384)
 
 
 def test_released_training_is_adam_that_is_created_anew_at_every_step() -> None:
