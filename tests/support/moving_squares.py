@@ -10,6 +10,8 @@ import numpy as np
 from physion.models.batch import Batch, Spec
 
 COLORS = ((220, 40, 30), (230, 220, 40), (40, 60, 200), (40, 180, 60))
+BACKGROUND = 110
+"""Gray of the pictures around the squares."""
 SIDE, MARGIN = 0.2, 0.15
 """Side of the squares, and least distance of their centres from the edge of the picture."""
 
@@ -22,7 +24,7 @@ def squares(clips: int, frames: int, spec: Spec, seed: int = 0, count: int = 2) 
     centers = ends[0] + time * (ends[1] - ends[0])
     edges = np.concatenate([centers - SIDE / 2, centers + SIDE / 2], -1)
     pixels = (np.arange(spec.image_size) + 0.5) / spec.image_size
-    rgb = np.full((clips, frames, spec.image_size, spec.image_size, 3), 110, np.uint8)
+    rgb = np.full((clips, frames, spec.image_size, spec.image_size, 3), BACKGROUND, np.uint8)
     for square in range(count):
         left, top, right, bottom = np.moveaxis(edges[:, :, square, :, None], 2, 0)
         inside = ((top < pixels) & (pixels < bottom))[..., None]

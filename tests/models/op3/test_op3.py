@@ -17,10 +17,16 @@ from physion.models.batch import Batch
 from physion.models.build import build_model
 from physion.models.checkpoints.checkpoint import tensors_of, write_checkpoint
 from physion.models.op3.config import Op3Config, Op3Options, op3_config
-from physion.models.op3.inference import SlotInference, Slots
-from physion.models.op3.model import Op3, _weighted
+from physion.models.op3.inference import Explained, SlotInference, Slots
+from physion.models.op3.model import Op3, weighted_means
 from physion.models.op3.networks import BroadcastConv, SlotDecoder, SlotDynamics, coordinates
-from physion.models.op3.pixels import Decoded, log_likelihood, plain_maps, slope_maps
+from physion.models.op3.pixels import (
+    Decoded,
+    Likelihood,
+    log_likelihood,
+    plain_maps,
+    slope_maps,
+)
 from support.moving_squares import squares, with_arrays
 
 TINY = Op3Config(
@@ -162,19 +168,21 @@ def test_divergence_of_the_start_and_of_a_prediction() -> None:
 
 
 def test_later_steps_weigh_more_and_missing_frames_do_not_count() -> None:
-    class Step:
-        objective = nll = kl = torch.tensor([0.0, 0.0])
-
-    values = torch.tensor([[1.0, 10.0], [2.0, 20.0], [4.0, 40.0]])
-    steps: list[Any] = []
-    for frame, row in zip((0, 0, 1), values, strict=True):
-        step = Step()
-        step.objective = step.nll = step.kl = row
-        steps.append((frame, step))
+    """Pixels have weights too: here those of the second clip's first frame count twice."""
+    slots = SlotInference(TINY).start(torch.zeros(2, 3, 5))
+    likelihoods = torch.tensor([[-1.0, -10.0], [-2.0, -20.0], [-4.0, -40.0]])
+    steps = []
+    for frame, row in zip((0, 0, 1), likelihoods, strict=True):
+        pixels = row[:, None, None].expand(2, 4, 4)
+        known = Likelihood(pixels, pixels)
+        steps.append((frame, Explained(slots, random_decoded(), known, row, -row, row)))
     valid = torch.tensor([[True, True], [True, False]])
-    objective, _, _ = _weighted(steps, valid)
-    expected = (1 * (1 + 10) + 2 * (2 + 20) + 3 * 4) / (2 * 1 + 2 * 2 + 3)
-    assert float(objective) == pytest.approx(expected)
+    weights = torch.ones(2, 2, 4, 4)
+    weights[1, 0] = 2
+    nll, kl = weighted_means(steps, valid, weights)
+    total = 2 * 1 + 2 * 2 + 3
+    assert float(nll) == pytest.approx((1 * (1 + 20) + 2 * (2 + 40) + 3 * 4) / total)
+    assert float(kl) == pytest.approx((1 * (1 + 10) + 2 * (2 + 20) + 3 * 4) / total)
 
 
 def test_sizes_and_their_names() -> None:

@@ -17,7 +17,7 @@ from physion.models.checkpoints.checkpoint import tensors_of, write_checkpoint
 from physion.models.svg.config import SvgConfig, SvgOptions, svg_config
 from physion.models.svg.model import Svg
 from physion.models.svg.networks import CodePredictor, Decoder, Encoder, GaussianPredictor
-from physion.models.vision.moving import copy_error
+from physion.models.vision.moving import copy_error, moving_pixels
 from support.moving_squares import squares, with_arrays
 
 TINY = SvgConfig(
@@ -132,7 +132,7 @@ def test_a_frame_is_decoded_with_the_activations_of_a_seen_one(skip: Any, rows: 
 
 def test_the_loss_is_that_of_the_equations() -> None:
     """With a gray decoder the error is known, and the weight of the divergence is beta."""
-    model = tiny(beta=0.5)
+    model = tiny(beta=0.5, motion=0.0)
     batch = squares(2, model.window, model.spec)
     model.decoder = FirstSkips()  # type: ignore[assignment]
     losses = model.train().loss(batch)
@@ -143,8 +143,21 @@ def test_the_loss_is_that_of_the_equations() -> None:
     assert losses["loss"].item() == pytest.approx(expected.item(), rel=1e-6)
 
 
+def test_moving_pixels_have_a_weight_in_training() -> None:
+    batch = squares(2, 5, tiny().spec)
+    pictures = batch.rgb.permute(0, 1, 4, 2, 3).float() / 255
+    errors = []
+    for motion in (0.0, 3.0):
+        model = tiny(motion=motion).train()
+        model.decoder = FirstSkips()  # type: ignore[assignment]
+        errors.append(float(model.loss(batch)["error"].detach()))
+    squared = (pictures[:, 1:] - 0.5).pow(2).mean(2)
+    moving = (squared * moving_pixels(pictures)).mean()
+    assert errors[1] - errors[0] == pytest.approx(3 * float(moving), rel=1e-4) and moving > 0
+
+
 def test_frames_that_a_movie_lacks_do_not_count() -> None:
-    model = tiny().train()
+    model = tiny(motion=0.0).train()
     batch = squares(2, model.window, model.spec)
     valid = batch.valid.clone()
     valid[:, -1] = False

@@ -52,6 +52,8 @@ class Op3Config:
     - ``density``: of a pixel given a slot: ``gaussian``, or ``released``, that of the published
       code (`op3.pixels`), with the standard deviation ``sigma``.
     - ``beta``: weight of the divergence.
+    - ``motion``: additional weight of moving pixels in the loss; published 0. Few pixels move, and
+      a short training would learn the scenery alone.
     - ``seed_steps``: refinements with the first frame; each later one that is seen has one.
     - ``past``, ``imagined``: frames of a training clip that are seen, and that follow.
     - ``stride_frames``, ``context``, ``future``: see `physion.models.batch.Spec`.
@@ -72,6 +74,7 @@ class Op3Config:
     density: Literal["gaussian", "released"] = "gaussian"
     sigma: float = 0.1
     beta: float = 1e-2
+    motion: float = 20.0
     seed_steps: int = 3
     past: int = 4
     imagined: int = 3
@@ -123,6 +126,7 @@ def op3_config(options: Op3Options) -> Op3Config:
             layers=5,
             stride=1,
             hidden=128,
+            motion=0.0,
             update="replace",
             density="released" if options.size == "released" else "gaussian",
             seed_steps=4,

@@ -7,6 +7,8 @@ the picture of its frame,
 
     loss = sum_i i O_i / sum_i i / pixels
 
+where moving pixels (`physion.models.vision.moving`) have the weight 1 + w, w = 0 as published.
+
 Features are the states of all slots, with the means of their random part: after the refinement for
 frames that are seen, after the prediction for imagined ones. When features are computed, the slots
 of all trials start from the same random numbers, so that a slot tends to hold the same thing.
@@ -22,7 +24,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from physion.models.batch import Batch, Provenance, Rollout, Spec
 from physion.models.op3.config import Op3Config, Op3Options
@@ -30,7 +32,7 @@ from physion.models.op3.inference import Explained, SlotInference, Slots
 from physion.models.op3.pixels import Decoded
 from physion.models.vision.clips import context_pictures, window_pictures
 from physion.models.vision.model import VisionModel
-from physion.models.vision.moving import copy_error, future_error
+from physion.models.vision.moving import copy_error, future_error, moving_pixels
 from physion.models.vision.pictures import normalized_pictures
 from physion.seeds import generator, stable_hash
 
@@ -156,9 +158,10 @@ class Op3(VisionModel):
                 refined = inference.refine(explained, picture, noise())
                 explained = inference.explain(refined, picture)
                 steps.append((frame, explained))
-        objective, nll, kl = _weighted(steps, valid)
-        pixels = height * width
-        return TrainingClips(objective / pixels, nll / pixels, kl, torch.stack(imagined, 1))
+        moves = nn.functional.pad(moving_pixels(pictures), (0, 0, 0, 0, 1, 0))
+        nll, kl = weighted_means(steps, valid, 1 + config.motion * moves)
+        objective = nll + config.beta * kl / (height * width)
+        return TrainingClips(objective, nll, kl, torch.stack(imagined, 1))
 
     def _watch(self, pictures: Tensor) -> tuple[Tensor, Slots]:
         """Return features (B, T, K R) of clips (B, T, 3, H, W), and the beliefs after the last."""
@@ -185,19 +188,32 @@ class Op3(VisionModel):
             return torch.stack(features, 1).float(), slots.detached()
 
 
-def _weighted(steps: list[tuple[int, Explained]], valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return objective, negative log likelihood and divergence: means over clips and steps.
+def weighted_means(
+    steps: list[tuple[int, Explained]], valid: Tensor, weights: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return negative log likelihood by pixel, and divergence, of the steps of training clips.
 
-    Later steps weigh more, in proportion to their number; frames that the movie lacks do not count.
+    Parameters
+    ----------
+    steps
+        Frame of each step, and how well it is explained.
+    valid : Tensor
+        Whether the movies have the frames (B, T); others do not count.
+    weights : Tensor
+        Of the pixels of all frames (B, T, H, W).
+
+    Notes
+    -----
+    They are means over clips and steps; step i has the weight i.
     """
-    totals = []
     counted = torch.stack([valid[:, frame] for frame, _ in steps], 1)
     numbers = torch.arange(1, len(steps) + 1, device=valid.device)
-    weights = (counted * numbers).float()
-    for name in ("objective", "nll", "kl"):
-        values = torch.stack([getattr(explained, name) for _, explained in steps], 1)
-        totals.append((values * weights).sum() / weights.sum().clamp_min(1))
-    return totals[0], totals[1], totals[2]
+    importance = (counted * numbers).float()
+    nll = [-(step.likelihood.pixels * weights[:, f]).mean((1, 2)) for f, step in steps]
+    kl = [step.kl for _, step in steps]
+    total = importance.sum().clamp_min(1)
+    means = [(torch.stack(values, 1) * importance).sum() / total for values in (nll, kl)]
+    return means[0], means[1]
 
 
 def _repeated(slots: Slots, samples: int, noise: Tensor) -> Slots:

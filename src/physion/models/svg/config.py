@@ -46,6 +46,8 @@ class SvgConfig:
       ``layers``: of the LSTM that predicts, the others have one.
     - ``past``, ``imagined``: frames of a training clip that are observed, and that follow.
     - ``beta``: weight of the divergence.
+    - ``motion``: additional weight of moving pixels in the loss; published 0. Few pixels move, and
+      a short training would learn the scenery alone.
     - ``skip``: whose frame's inner activations the decoder sees: ``last`` observed one, or the one
       ``before`` it, as in the published code.
     - ``stride``, ``context``, ``future``: see `physion.models.batch.Spec`.
@@ -63,6 +65,7 @@ class SvgConfig:
     past: int = 7
     imagined: int = 9
     beta: float = 1e-4
+    motion: float = 20.0
     skip: Literal["last", "before"] = "last"
     stride: int = 6
     context: int = 7
@@ -113,6 +116,7 @@ def svg_config(options: SvgOptions) -> SvgConfig:
             hidden=256,
             past=4,
             imagined=6,
+            motion=0.0,
             skip="before" if options.size == "released" else "last",
             training=_PAPER,
         )

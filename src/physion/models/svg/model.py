@@ -6,8 +6,9 @@ With codes h_t and inner activations of an encoder of picture x_t:
     q_t = N(mean, var)(h_1, ..., h_t)              posterior, LSTM
     g_t = LSTM(h_(t-1), z_t; its state)            predicted code, z_t from q_t in training
     y_t = decoder(g_t, inner activations of the last observed frame)
-    loss = mean_t [ mean (y_t - x_t)^2 + beta KL(q_t || p_t) ]
+    loss = mean_t [ mean_p (1 + w m_tp) (y_tp - x_tp)^2 + beta KL(q_t || p_t) ]
 
+with the moving pixels m (`physion.models.vision.moving`), whose weight w is 0 as published.
 In training h_(t-1) is the code of the true picture. To imagine, z_t is drawn from p_t, and h_t is
 the code of y_t after the last observed frame.
 
@@ -36,7 +37,7 @@ from physion.models.svg.networks import (
 from physion.models.vision.clips import context_pictures, window_pictures
 from physion.models.vision.gaussians import gaussian_divergence, gaussian_values
 from physion.models.vision.model import VisionModel
-from physion.models.vision.moving import copy_error, future_error
+from physion.models.vision.moving import copy_error, future_error, moving_pixels
 from physion.models.vision.pictures import normalized_pictures
 from physion.seeds import generator, stable_hash
 
@@ -121,10 +122,10 @@ class Svg(VisionModel):
     def loss(self, batch: Batch) -> dict[str, Tensor]:
         """Return the loss of training clips, and what it consists of.
 
-        Training: ``loss``, ``error`` (of predicted pictures), ``kl``. A validation is of what the
-        model imagines without seeing it: ``loss`` is the squared error of moving pixels of the
-        frames after the observed ones (`physion.models.vision.moving`), ``error`` that of all
-        pixels, and ``objective`` the loss of the training.
+        Training: ``loss``, ``error`` (the first term), ``kl``. A validation is of what the model
+        imagines without seeing it: ``loss`` is the squared error of moving pixels of the frames
+        after the observed ones (`physion.models.vision.moving`), ``error`` that of all pixels, and
+        ``objective`` the loss of the training.
         """
         pictures = window_pictures(batch, self.spec, self.name, self.window)
         objective = self._objective(pictures, batch.valid)
@@ -158,7 +159,8 @@ class Svg(VisionModel):
         rows = [min(frame, limit) - 1 for frame in range(1, frames)]
         chosen = [skip.unflatten(0, (clips, frames))[:, rows].flatten(0, 1) for skip in skips]
         shown = self.decoder(predicted.flatten(0, 1), chosen).unflatten(0, (clips, frames - 1))
-        errors = (shown - pictures[:, 1:]).pow(2).mean((2, 3, 4))
+        squares = (shown - pictures[:, 1:]).pow(2).mean(2)
+        errors = (squares * (1 + config.motion * moving_pixels(pictures))).mean((2, 3))
         divergences = gaussian_divergence(mean, log_variance, of_mean, of_log_variance)
         weights = valid[:, 1:].to(errors.dtype)
         error, divergence = (
