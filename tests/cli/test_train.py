@@ -210,7 +210,8 @@ def test_evaluate_takes_the_same_plan(
     (table,) = (tmp_path / "results").iterdir()
     rows = pd.read_csv(table)
     assert list(rows.columns) == [
-        "model", "protocol", "readout", "scenario", "seeds", "trials", "accuracy", "spread",
+        "model", "init", "protocol", "readout", "scenario", "seeds", "trials", "accuracy",
+        "spread",
     ]  # fmt: skip
     assert len(rows) == 2 * 3 * 3 and (rows["seeds"] == 2).all() and rows["spread"].notna().all()
     assert main(arguments) == 0

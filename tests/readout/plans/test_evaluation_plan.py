@@ -150,11 +150,11 @@ def test_a_scenario_and_readouts_can_be_chosen(dots: Dataset, tmp_path: Path) ->
     assert all(set(e.predictions["Protocol"]) == {"observed"} for _, e in results.tables)
 
 
-def evaluation_of(hits: dict[str, list[bool]]) -> Evaluation:
+def evaluation_of(hits: dict[str, list[bool]], init: str = "random") -> Evaluation:
     """Return an evaluation whose predictions of a scenario are right or not as ``hits`` says."""
     rows = [
         {
-            "Model": "m", "Protocol": "full", "Readout Test Data": scenario,
+            "Model": "m", "Init": init, "Protocol": "full", "Readout Test Data": scenario,
             "Predicted Outcome": hit, "Actual Outcome": True, "Stimulus Name": f"{scenario}{k}",
         }
         for scenario, values in hits.items()
@@ -177,4 +177,8 @@ def test_results_are_means_and_deviations_over_seeds() -> None:
     assert summary["spread"].tolist() == pytest.approx(expected)
     alone = summarise_accuracy([(task(0, ""), first)])
     assert alone["spread"].isna().all() and set(alone["protocol"]) == {""}
+    other = evaluation_of({"collide": [True]}, init="imagenet")
+    both = summarise_accuracy([(task(0), first), (task(0), other)])
+    assert set(both["init"]) == {"random", "imagenet"}, "whose rows are not averaged"
+    assert both["seeds"].tolist() == [1] * len(both)
     assert len(summarise_accuracy([])) == 0

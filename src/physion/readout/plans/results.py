@@ -11,7 +11,8 @@ from physion.readout.plans.tasks import EvaluationTask
 
 MEAN = "mean"
 """Name of the rows with the mean of the scenarios."""
-_GROUP = ["model", "protocol", "readout", "scenario"]
+_MODEL = ["model", "init", "protocol", "readout"]
+_GROUP = [*_MODEL, "scenario"]
 
 
 def summarise_accuracy(evaluated: Iterable[tuple[EvaluationTask, Evaluation]]) -> pd.DataFrame:
@@ -25,10 +26,11 @@ def summarise_accuracy(evaluated: Iterable[tuple[EvaluationTask, Evaluation]]) -
     Returns
     -------
     pandas.DataFrame
-        Columns ``model``, ``protocol`` (of training; empty without one), ``readout``,
-        ``scenario``, ``seeds`` and ``trials`` (numbers of them), ``accuracy`` (0..1, mean of the
-        seeds), ``spread`` (standard deviation of a seed, n - 1; NaN for one seed). Rows with the
-        scenario `MEAN` are of the mean of the scenarios of each seed, where there are several.
+        Columns ``model``, ``init`` (its initial weights), ``protocol`` (of training; empty without
+        one), ``readout``, ``scenario``, ``seeds`` and ``trials`` (numbers of them), ``accuracy``
+        (0..1, mean of the seeds), ``spread`` (standard deviation of a seed, n - 1; NaN for one
+        seed). Rows with the scenario `MEAN` are of the mean of the scenarios of each seed, where
+        there are several.
     """
     rows = []
     for task, evaluation in evaluated:
@@ -37,6 +39,7 @@ def summarise_accuracy(evaluated: Iterable[tuple[EvaluationTask, Evaluation]]) -
         named = pd.DataFrame(
             {
                 "model": table["Model"],
+                "init": table["Init"],
                 "protocol": task.protocol.value if task.set_name else "",
                 "readout": table["Protocol"],
                 "scenario": table["Readout Test Data"],
@@ -50,14 +53,14 @@ def summarise_accuracy(evaluated: Iterable[tuple[EvaluationTask, Evaluation]]) -
     trials = pd.concat(rows, ignore_index=True)
     by_seed = trials.groupby([*_GROUP, "seed"])["hit"].agg(accuracy="mean", trials="size")
     by_seed = by_seed.reset_index()
-    whole = by_seed.groupby(["model", "protocol", "readout", "seed"]).agg(
+    whole = by_seed.groupby([*_MODEL, "seed"]).agg(
         accuracy=("accuracy", "mean"), trials=("trials", "sum"), scenarios=("scenario", "size")
     )
     whole = whole[whole["scenarios"] > 1].reset_index().assign(scenario=MEAN)
     every = pd.concat([by_seed, whole.drop(columns="scenarios")], ignore_index=True)
     # So that the mean stands below the scenarios.
     every["last"] = every["scenario"] == MEAN
-    summary = every.groupby(["model", "protocol", "readout", "last", "scenario"]).agg(
+    summary = every.groupby([*_MODEL, "last", "scenario"]).agg(
         seeds=("seed", "nunique"),
         trials=("trials", "max"),
         accuracy=("accuracy", "mean"),
