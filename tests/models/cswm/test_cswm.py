@@ -78,7 +78,7 @@ def test_loss_of_all_pairs_of_given_states() -> None:
     """Clips (0, 0.5) and (2, 2), energies 2 d^2: 0.5 in the one clip, 0 in the other, 4.5 or more
     between them; so 0.5 and 1 within clips, and 0 between."""
     states = torch.tensor([[0.0, 0.5], [2.0, 2.0]])[..., None, None]
-    assert all_pairs_loss(states, 0.5, 1.0).item() == pytest.approx(0.75 / 2, abs=1e-6)
+    assert all_pairs_loss(states, 0.5, 1.0).item() == pytest.approx(0.75, abs=1e-6)
     assert all_pairs_loss(states[:1], 0.5, 1.0).item() == pytest.approx(0.5, abs=1e-6)
     assert all_pairs_loss(states[:, :1], 0.5, 1.0).item() == pytest.approx(0, abs=1e-6)
     assert all_pairs_loss(states[:, :1], 0.5, 9.0).item() == pytest.approx(1.0, abs=1e-6)
@@ -93,7 +93,7 @@ def test_the_loss_of_all_pairs_is_that_of_the_pairs_one_by_one() -> None:
             pair = states[a // 4, a % 4], states[b // 4, b % 4]
             if a != b:
                 (within if a // 4 == b // 4 else between).append(hinge_loss(*pair, 0.5, 1.0))
-    expected = (torch.stack(within).mean() + torch.stack(between).mean()) / 2
+    expected = torch.stack(within).mean() + torch.stack(between).mean()
     assert all_pairs_loss(states, 0.5, 1.0).item() == pytest.approx(expected.item(), rel=1e-5)
 
 

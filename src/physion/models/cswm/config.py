@@ -23,10 +23,9 @@ class CswmConfig:
     - ``sigma``: unit of distances in the energy. ``hinge``: energy from which a negative is far
       enough.
     - ``transitions``: pairs of successive states in a training clip.
-    - ``negatives``: ``all`` states of the batch, those of other clips and those of other steps of
-      the same clip with equal weight; or ``permuted``, as published: one state each, in a random
-      order that may leave it in its place. Clips differ in their objects, so that without other
-      steps the slots need not follow any motion.
+    - ``negatives``: ``all`` other states of the batch (`contrast.all_pairs_loss`); or ``permuted``,
+      as published: one state each, in a random order that may leave it in its place. Clips differ
+      in their objects, so that without other steps the slots need not follow any motion.
     - ``training``: optimiser and schedule.
     """
 

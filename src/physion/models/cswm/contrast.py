@@ -37,8 +37,9 @@ def hinge_loss(states: Tensor, negatives: Tensor, sigma: float, hinge: float) ->
 def all_pairs_loss(states: Tensor, sigma: float, hinge: float) -> Tensor:
     """Return the hinge loss of all pairs of different states of clips (B, T, K, D).
 
-    It is the mean of that of states of different clips and that of states at different steps of the
-    same clip, or the one of them that there is.
+    It is the sum of two means, one over pairs from different clips and one over pairs of different
+    steps of the same clip. Each has the weight of the first term of a transition's loss: with less,
+    slots that never change can cost least.
     """
     clips, steps, slots = states.shape[:3]
     flat = states.flatten(2).flatten(0, 1)
@@ -49,7 +50,7 @@ def all_pairs_loss(states: Tensor, sigma: float, hinge: float) -> Tensor:
     same = clip[:, None] == clip
     itself = torch.eye(len(flat), dtype=torch.bool, device=flat.device)
     kinds = [losses[pairs] for pairs in (~same, same & ~itself)]
-    return torch.stack([kind.mean() for kind in kinds if len(kind)]).mean()
+    return torch.stack([kind.mean() for kind in kinds if len(kind)]).sum()
 
 
 @dataclass(frozen=True)

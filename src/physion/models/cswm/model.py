@@ -78,7 +78,9 @@ class Cswm(VisionModel):
     def imagine(self, context: Batch, samples: int, seed: int, **knobs: Any) -> Rollout:
         """Roll the transition out from the end of the context.
 
-        It is deterministic: all samples are equal, and ``seed`` has no effect.
+        It is deterministic: all samples are equal, and ``seed`` has no effect. With the knob
+        ``show`` above 0, ``shown`` holds the imagined states under ``slots`` (B, S, future, K, D),
+        and under ``context_masks`` the maps (B, T, K, h, w) of the context.
         """
         features = self.encode(context) if context.features is None else context.features
         states = features[:, -self.config.memory :]
@@ -87,8 +89,14 @@ class Cswm(VisionModel):
         for _ in range(self.spec.future):
             states = torch.cat([states[:, 1:], self._predicted(states)], 1)
             imagined.append(states[:, -1].flatten(1))
-        future = torch.stack(imagined, 1)[:, None]
-        return Rollout(features=future.expand(-1, samples, -1, -1))
+        future = torch.stack(imagined, 1)[:, None].expand(-1, samples, -1, -1)
+        if knobs.get("show", 0) <= 0:
+            return Rollout(features=future)
+        maps = self.maps(context)
+        before = maps[:, :1].expand(-1, self.config.stacked - 1, -1, -1, -1)
+        slots = future.unflatten(3, (self.config.slots, -1))
+        shown = {"slots": slots, "context_masks": torch.cat([before, maps], 1).float()}
+        return Rollout(features=future, shown=shown)
 
     def maps(self, batch: Batch) -> Tensor:
         """Return the maps of the slots (B, S, K, h, w), in 0..1, of the pictures."""
