@@ -94,7 +94,7 @@ class Cswm(VisionModel):
             return Rollout(features=future)
         maps = self.maps(context)
         before = maps[:, :1].expand(-1, self.config.stacked - 1, -1, -1, -1)
-        slots = future.unflatten(3, (self.config.slots, -1))
+        slots = future.reshape(*future.shape[:3], self.config.slots, -1)
         shown = {"slots": slots, "context_masks": torch.cat([before, maps], 1).float()}
         return Rollout(features=future, shown=shown)
 
