@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from physion.report.viewer.imagined import ImaginedTrial
+from physion.report.viewer.imagined.trial import ImaginedTrial
 from physion.report.viewer.write_viewer import ViewerOptions, build_viewer
 from physion.trials.video import read_frames
 from support.browser import Browser
@@ -329,7 +329,7 @@ def test_imagined_particles_are_shown_next_to_the_true_motion(
     assert len(rows) > 100 and len(of_colour(browser.picture("#scene3d"), yellow)) > 100
     seek(browser, 59)  # the true ball has fallen on, the imagined one has not
     assert np.abs(of_colour(browser.picture("#scene3d"), red).mean() - rows.mean()) < 1
-    words = browser.ask("document.querySelector('#view3d .imagined').textContent")
+    words = browser.ask("document.querySelector('#prediction .imagined').textContent")
     assert "from frame 45 on: imagined by standstill (untrained): P(contact) 0.00" in words
     assert "smallest gap 0.700 m" in words
     low = browser.ask("document.getElementById('time').getBoundingClientRect().bottom")
@@ -337,7 +337,7 @@ def test_imagined_particles_are_shown_next_to_the_true_motion(
     browser.key("i", 73, "i")
     browser.ask("new Promise(done => setTimeout(done, 100))")
     assert not len(of_colour(browser.picture("#scene3d"), red))
-    assert browser.ask("document.querySelector('#view3d .imagined').textContent") == ""
+    assert browser.ask("document.querySelector('#prediction .imagined').textContent") == ""
     browser.key("n", 78, "n")  # the choice stays for the next trial
     click(browser, "play")
     assert browser.ask("document.getElementById('imagined-by').value") == "-1"
@@ -346,6 +346,6 @@ def test_imagined_particles_are_shown_next_to_the_true_motion(
     seek(browser, 59)
     assert len(of_colour(browser.picture("#scene3d"), red)) > 100
     click(browser, "labels")
-    text = browser.ask("document.getElementById('view3d').innerText")
+    text = browser.ask("document.getElementById('detail').innerText")
     assert "standstill" not in text and "contact" not in text
     assert browser.complaints() == []

@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 from physion.errors import BadInputError
-from physion.report.viewer import imagined as viewer_imagined
-from physion.report.viewer.imagined import ImaginedTrial, caption, pack_imagined
+from physion.report.viewer.imagined.pack import pack_imagined
+from physion.report.viewer.imagined.particles import REACH
+from physion.report.viewer.imagined.trial import ImaginedTrial, caption
 from physion.report.viewer.motion import STEPS
 from physion.report.viewer.write_viewer import ViewerOptions, build_viewer
 from support.viewer_dataset import PLANS, make_dataset, make_scene
@@ -98,7 +99,7 @@ def test_lost_objects_do_not_coarsen_the_grid() -> None:
     packed = pack_imagined(
         dataclasses.replace(one, shown={**one.shown, "particles": positions}), SCENE, 60
     )
-    assert unpack(packed).max() == pytest.approx(viewer_imagined.REACH)
+    assert unpack(packed).max() == pytest.approx(REACH)
 
 
 def test_many_particles_take_less_than_a_megabyte() -> None:
@@ -128,6 +129,8 @@ def test_the_caption_says_what_is_known() -> None:
     assert caption(falling(probability=1.0, gap=-0.004)) == (
         "sim (weights random): P(contact) 1.00; smallest gap -0.004 m, 0 or less is a contact."
     )
+    text = caption(falling(probability=1.0, gap=-10.0), observed=True)
+    assert text == "sim (weights random): P(contact) 1.00; the contact was already observed."
     text = caption(falling(probability=0.25, gap=0.5, futures=8))
     assert "P(contact) 0.25 from 8 futures; smallest gap of the one shown 0.500 m" in text
 

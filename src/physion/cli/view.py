@@ -13,7 +13,7 @@ import tyro
 from physion.cli.model_options import parse_options
 from physion.cli.output import Stages, console
 from physion.errors import BadInputError
-from physion.report.viewer.imagined import Imagine
+from physion.report.viewer.imagined.trial import Imagine
 from physion.report.viewer.write_viewer import ViewerOptions, build_viewer
 from physion.trials.dataset import Dataset
 
@@ -35,8 +35,8 @@ class Options:
     split: str | None = None
     """Show this split alone."""
     predictions: tuple[str, ...] = ()
-    """Models whose imagined motion is shown in 3D next to the true one: names (physion ls models)
-    or FILE.py:Class."""
+    """Models whose predictions are shown beside what is true, as particles in 3D, pictures, boxes or
+    slots: names (physion ls models) or FILE.py:Class."""
     option: tuple[str, ...] = ()
     """Fields of the config of these models as NAME=VALUE, such as weights=shipped."""
     open: bool = False
@@ -73,6 +73,6 @@ def _imagine(options: Options, stages: Stages) -> Imagine | None:
     from physion.cli.imagined_trials import imagine_with
 
     if options.details < 1:
-        raise BadInputError("--predictions are shown in 3D: --details must be at least 1")
+        raise BadInputError("--predictions are shown in trials with details: --details must be at least 1")
     chosen = parse_options(options.option)
     return imagine_with(Dataset(options.folder), options.predictions, chosen, stages)

@@ -215,9 +215,11 @@ class Rollout:
     - ``gap`` (B, S): smallest distance of agent and patient in metres; 0 or less is a touch.
     - ``contact`` (B, S) bool: whether they touch, of simulators that report contacts.
     - ``shown``: what the model imagined, for ``physion view``: rgb (B, S, future, H, W, 3) uint8,
-      boxes (B, S, future, K, 4), masks (B, S, future, K, H, W), particles (B, S, F, P, 3) float32
-      in metres with ``things`` (B, P) int64, the index of each one's object in `Scene.names`, both
-      NaN and -1 where a trial has fewer. Rows follow the context at the stride of the `Spec`.
+      boxes (B, S, future, K, 4), masks (B, S, future, K, H, W) in 0..1, slots (B, S, future, K, D),
+      whose K D values are those of the features, particles (B, S, F, P, 3) float32 in metres with
+      ``things`` (B, P) int64, the index of each one's object in `Scene.names`, both NaN and -1
+      where a trial has fewer. Rows follow the context at the stride of the `Spec`. Also masks of
+      the frames of the context, context_masks (B, T, K, H, W).
     """
 
     features: Any = None

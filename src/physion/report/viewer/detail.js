@@ -8,11 +8,6 @@ const CAPTIONS = {
   flow: ({ flow }) => ["Flow", `up to ${flow.toFixed(1)} px per frame`],
 };
 
-// Say what a model imagined, and how it is shown.
-const describeImagined = ({ caption, particles }) => particles
-  ? `Points from frame ${particles.from} on: imagined by ${caption} Agent red, patient yellow, others grey; what is true is paler.`
-  : `Imagined by ${caption}`;
-
 class Detail {
   /**
    * @param {any[]} cards Data of the trials.
@@ -48,6 +43,7 @@ class Detail {
     const movie = detail.passes ?? readData(`movie-${number}`);
     this.buildPasses(movie, detail);
     this.buildScene(detail);
+    this.buildPredictions(detail.imagined ?? []);
     this.buildTables(detail.tables);
     this.timeLine = new TimeLine(card, detail.runs, (frame) => this.player.seek(frame));
     this.player = new Player(
@@ -65,7 +61,8 @@ class Detail {
   clear() {
     this.player?.close();
     this.scene?.close();
-    this.player = this.scene = null;
+    this.predictions?.close();
+    this.player = this.scene = this.predictions = null;
   }
 
   buildPasses(movie, detail) {
@@ -112,8 +109,7 @@ class Detail {
       "aria-label": "Scene in 3D. Arrow keys rotate it, with shift they move it, plus and minus zoom, 0 returns to the camera of the trial.",
     });
     this.shapes ??= readData("shapes");
-    const imagined = detail.imagined ?? [];
-    this.scene = new Scene3D(canvas, detail.motion, this.shapes, imagined);
+    this.scene = new Scene3D(canvas, detail.motion, this.shapes, detail.imagined ?? []);
     if (!this.scene.gl) {
       this.scene = null;
       container.replaceChildren(
@@ -134,35 +130,18 @@ class Detail {
     const boxes = [checkbox("paths and touch points", "paths")];
     if (detail.motion.bodies.some((body) => body.scenery)) boxes.push(checkbox("scenery", "scenery"));
     const hint = createElement("span", {}, "drag to rotate, wheel to zoom");
-    const chosen = imagined.length ? this.buildImagined(imagined) : { controls: [], caption: [] };
-    const controls = createElement("div", { class: "controls" }, camera, ...boxes, ...chosen.controls, hint);
-    container.replaceChildren(canvas, controls, ...chosen.caption);
+    const controls = createElement("div", { class: "controls" }, camera, ...boxes, hint);
+    container.replaceChildren(canvas, controls);
   }
 
-  // Return the choice of the model whose prediction is shown, and the caption that describes it.
-  buildImagined(imagined) {
-    const options = ["none", ...imagined.map(({ model }) => model)].map((label, row) =>
-      createElement("option", { value: row - 1 }, label));
-    const select = createElement("select", { id: "imagined-by", title: "Next prediction (I)" }, ...options);
-    const text = createElement("p", { class: "imagined answer", "aria-live": "polite" });
-    const update = () => {
-      this.imaginedBy = this.scene.imaginedBy = Number(select.value);
-      text.textContent = this.imaginedBy < 0 ? "" : describeImagined(imagined[this.imaginedBy]);
+  buildPredictions(imagined) {
+    this.predictions = new Predictions(imagined, this.imaginedBy, byId("passes").firstElementChild, (index) => {
+      // The choice stays for the next trial.
+      if (imagined.length) this.imaginedBy = index;
+      if (!this.scene) return;
+      this.scene.imaginedBy = index;
       this.scene.draw();
-    };
-    select.onchange = update;
-    select.value = Math.min(this.imaginedBy, imagined.length - 1);
-    update();
-    const label = createElement("label", { class: "answer" }, "prediction ", select);
-    return { controls: [label], caption: [text] };
-  }
-
-  // Show the prediction of the next model, after the last one none.
-  nextPrediction() {
-    const select = document.getElementById("imagined-by");
-    if (!(select instanceof HTMLSelectElement)) return;
-    select.selectedIndex = (select.selectedIndex + 1) % select.length;
-    select.dispatchEvent(new Event("change"));
+    });
   }
 
   buildTables(tables) {
@@ -203,6 +182,7 @@ class Detail {
     if (!this.player) return;
     this.timeLine.show(frame, this.card.frameTime);
     this.scene?.show(frame);
+    this.predictions?.show(frame);
     byId("play").textContent = this.player.playing ? "Pause" : "Play";
   }
 
@@ -231,7 +211,7 @@ class Detail {
     else if (event.key === "ArrowRight") this.step(frames);
     else if (event.key === "Home") this.player.seek(0);
     else if (event.key === "End") this.player.seek(this.player.limit - 1);
-    else if (event.key === "i" || event.key === "I") this.nextPrediction();
+    else if (event.key === "i" || event.key === "I") this.predictions?.next();
     else if (event.key === "n" || event.key === "N") byId("next").click();
     else if (event.key === "p" || event.key === "P") byId("previous").click();
     else return;

@@ -57,5 +57,8 @@ addEventListener("hashchange", () => {
   const number = namedTrial();
   if (number >= 0 && number !== openTrial) show(number);
 });
-matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => detail.scene?.draw());
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
+  detail.scene?.draw();
+  detail.predictions?.draw();
+});
 if (namedTrial() >= 0) show(namedTrial());

@@ -16,7 +16,8 @@ from physion.errors import BadInputError, UnknownNameError
 from physion.report.viewer import facts as viewer_facts
 from physion.report.viewer import motion as viewer_motion
 from physion.report.viewer import viewer_movies
-from physion.report.viewer.imagined import Imagine, ImaginedTrial, pack_imagined
+from physion.report.viewer.imagined.pack import pack_imagined
+from physion.report.viewer.imagined.trial import Imagine, ImaginedTrial
 from physion.report.viewer.text import TrialData, render_viewer
 from physion.trials.dataset import Dataset
 
@@ -70,8 +71,8 @@ def build_viewer(
     """Write the page of the dataset in ``folder`` to the file ``out``, whole or not at all.
 
     The page needs no other file and no network. The same trials and options give the same bytes.
-    ``imagine`` is called once with the names of the trials that are shown in 3D; what it returns is
-    shown next to their true motions. Raises `BadInputError` where there is no dataset, a trial is
+    ``imagine`` is called once with the names of the trials that have details; what it returns is
+    shown next to what is true. Raises `BadInputError` where there is no dataset, a trial is
     damaged, an imagined trial cannot be shown, or ``out`` is a folder or cannot be written, and
     `UnknownNameError` for a scenario or split that the dataset does not hold.
     """
@@ -150,8 +151,10 @@ def _trial_data(
         detail["passes"] = strip.as_record()
         detail["ranges"] = {"near": ranges.near, "far": ranges.far, "flow": ranges.flow}
         detail["motion"] = viewer_motion.pack_motion(trial.shown("redyellow"), trial.trajectory)
-        frames = trial.metadata.frames
-        detail["imagined"] = [pack_imagined(one, trial.scene, frames) for one in imagined]
+        detail["imagined"] = [
+            pack_imagined(one, trial.scene, trial.metadata.frames, observed=trial.labels.observed)
+            for one in imagined
+        ]
         shapes = {body.shape for body in trial.scene.bodies}
     movie = viewer_movies.small_movie(paths.movie, trial, options.card_size)
     size = {"width": movie.width, "height": movie.height}

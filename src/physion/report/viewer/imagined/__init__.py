@@ -1,0 +1,1 @@
+"""What models saw and imagined of trials, for the viewer."""
