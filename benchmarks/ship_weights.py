@@ -1,12 +1,13 @@
 """Put trained particle models into the package, each with its card and SHA-256.
 
     python benchmarks/ship_weights.py FOLDER TRAINED        # weights of `physion train`
+    python benchmarks/ship_weights.py FOLDER TRAINED --only gns-small gns-ransac-small
     python benchmarks/ship_weights.py FOLDER TRAINED --scores
 
 FOLDER holds the trials of ``benchmarks/particles.py data``. TRAINED is the output folder of
 
-    physion train dpi FOLDER/all --out TRAINED --steps 12000
-    physion train gns FOLDER/all --out TRAINED --steps 5000
+    physion train dpi FOLDER/all --out TRAINED --steps 16000
+    physion train gns FOLDER/all --out TRAINED --steps 7000
 
 GNS-RANSAC has the weights of GNS and thresholds that are fitted on its own rollouts. With --scores
 only the cards are written again, with the tables of ``results/particles.md``.
@@ -55,7 +56,7 @@ def ship(dataset: Dataset, trained: Path, name: str) -> None:
     if name != SOURCES[name]:
         source = whole_source(dataset, model.spec)
         calibrate(model, source, dataset.trials("training"), metadata_seed(metadata))
-        card = card.replace("gns-small", name) + (
+        card = card.replace("gns-small", name).replace("| rigid | fit |", "| rigid | robust |") + (
             "\nThe weights are those of gns-small; the distances that count as contact are fitted "
             "on the rollouts of this model.\n"
         )
@@ -64,6 +65,7 @@ def ship(dataset: Dataset, trained: Path, name: str) -> None:
     touch = ", ".join(f"{value:.3f}" for value in model.touch.tolist())
     card += f"\n## Contact\nDistance that counts as contact, bodies and cloth, m: {touch}\n"
     card += f"\n## Hardware\n{platform.processor() or platform.machine()}, one thread\n"
+    card += "\n## Trials\nMade by `python benchmarks/particles.py data FOLDER`.\n"
     SHIPPED.mkdir(exist_ok=True)
     metadata = {**metadata, BUILT_AS: model.built_as()}
     write_checkpoint(SHIPPED / f"{name}.safetensors", tensors_of(model), metadata)
@@ -81,7 +83,7 @@ def metadata_seed(metadata: dict[str, object]) -> int:
 def write_scores() -> None:
     """Append the tables of every shipped model to its card, in place of earlier ones."""
     lines = RESULTS.read_text().splitlines()
-    for name in SOURCES:
+    for name in sorted(path.stem for path in SHIPPED.glob("*.safetensors")):
         text = ["## Scores"]
         for line in lines:
             if line.startswith("**") or line.startswith("| model |"):
@@ -93,18 +95,19 @@ def write_scores() -> None:
 
 
 def main() -> None:
-    """Ship all three models."""
+    """Ship the models, or some of them."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("trained", type=Path)
     parser.add_argument("--scores", action="store_true")
+    parser.add_argument("--only", nargs="*", choices=SOURCES, default=list(SOURCES))
     chosen = parser.parse_args()
     if not chosen.scores:
-        for name in SOURCES:
+        for name in chosen.only:
             ship(Dataset(chosen.folder / "all"), chosen.trained, name)
         digests = {
-            name: hashlib.sha256((SHIPPED / f"{name}.safetensors").read_bytes()).hexdigest()
-            for name in SOURCES
+            path.stem: hashlib.sha256(path.read_bytes()).hexdigest()
+            for path in sorted(SHIPPED.glob("*.safetensors"))
         }
         (SHIPPED / DIGESTS).write_text(json.dumps(digests, indent=2) + "\n")
     if RESULTS.is_file():
