@@ -232,25 +232,27 @@ def test_a_plan_that_is_killed_goes_on_and_a_second_run_takes_a_second(
         command(model, *parts), env=environment(), stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )  # fmt: skip
-    end = time.monotonic() + 180
+    end = time.monotonic() + 600
     while running.poll() is None and time.monotonic() < end:
-        if len(list((tmp_path / "parts").rglob("*checkpoint.safetensors"))) and len(
-            list((tmp_path / "parts").rglob("model.safetensors"))
+        if list(tmp_path.rglob("model.safetensors")) and list(
+            tmp_path.rglob("checkpoint.safetensors")
         ):
             break
         time.sleep(0.01)
     running.send_signal(signal.SIGINT)
     assert running.wait() == 130
-    assert len(list((tmp_path / "parts").rglob("model.safetensors"))) < 3
-    for loaded in ("1 of 3 trainings were done before", "3 of 3 trainings were done before"):
+    done = len(list(tmp_path.rglob("model.safetensors")))
+    assert 1 <= done < 3
+    for before in (done, 3):
         start = os.times()
         again = subprocess.run(
             command(model, *parts), env=environment(), check=False, capture_output=True, text=True
         )
         seconds = os.times().children_user - start.children_user
         assert again.returncode == 0, again.stderr
-        assert loaded in again.stdout
+        assert f"{before} of 3 trainings were done before" in again.stdout
     assert seconds < 6, "a second run imports no torch"
+    print(f"second run: {seconds:.1f} s of processor time")
     assert main(["train", model, *plan, "--out", str(tmp_path / "whole"), *CPU]) == 0
     one, other = (files_of(tmp_path / name / "training") for name in ("parts", "whole"))
     assert one == other

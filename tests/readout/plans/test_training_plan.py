@@ -114,9 +114,15 @@ def test_what_is_done_is_skipped_and_seeds_draw_the_initial_weights(
         raise AssertionError("a plan that is done builds no model")
 
     monkeypatch.setattr("physion.readout.plans.model_facts.build_model", build)
-    again = make_plan(dots, tmp_path, protocols=[Training.ALL])
+    moved = tmp_path.with_name(f"{tmp_path.name} moved")
+    tmp_path.rename(moved)
+    again = make_plan(dots, moved, protocols=[Training.ALL])
     assert again.pending == []
-    assert [trained["loaded"] for _, trained in again.run().trained] == [True, True]
+    known = [trained for _, trained in again.run().trained]
+    assert [trained["loaded"] for trained in known] == [True, True]
+    assert [Path(trained["folder"]) for trained in known] == [
+        moved / "training" / f.name for f in folders
+    ]
 
 
 def test_a_training_that_is_missing_or_was_changed_is_done_again(

@@ -117,7 +117,10 @@ class TrainingPlan:
         for task in {self.models.key(task.choice): task for task in reversed(pending)}.values():
             self._trainer(task)
         steps = [self.steps(task) for task in pending]
-        trained = {key: values["trained"] for key, values in self.done.items()}
+        trained = {
+            key: {**values["trained"], "folder": str(self._folder / values["trained"]["folder"])}
+            for key, values in self.done.items()
+        }
         failed: dict[str, str] = {}
         for number, task in enumerate(pending):
             within = _within(progress, sum(steps[:number]), sum(steps))
@@ -220,7 +223,10 @@ class TrainingPlan:
             "speed": dataclasses.asdict(speed) if speed is not None else None,
         }
         if trainer.fabric.is_global_zero:
-            stored = {**values, "trained": {**trained, "loaded": True, "notes": ()}}
+            # The output folder may be moved, or named from another working directory.
+            folder = result.folder.relative_to(self._folder).as_posix()
+            kept = {**trained, "folder": folder, "loaded": True, "notes": ()}
+            stored = {**values, "trained": kept}
             if self.models.record(task.choice):
                 self._records.write(task.key, stored, [result.folder / WEIGHTS])
         self._earlier.append(values)
