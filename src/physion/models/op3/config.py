@@ -31,8 +31,8 @@ class Op3Options(VisionOptions):
 
 
 _COUNTS = (
-    "image_size", "slots", "deterministic", "stochastic", "width", "layers", "stride", "hidden",
-    "effect", "seed_steps", "past", "imagined", "context",
+    "image_size", "slots", "deterministic", "stochastic", "width", "layers", "step", "hidden",
+    "effect", "seed_steps", "past", "imagined", "stride", "context",
 )  # fmt: skip
 """Settings that must be at least 1."""
 
@@ -44,7 +44,7 @@ class Op3Config:
     - ``image_size``: pixels per side. ``slots``: K.
     - ``deterministic``, ``stochastic``: sizes of the two parts of the state of a slot.
     - ``width``: channels of the convolutions, with ``kernel`` x ``kernel`` weights; ``layers`` of
-      the decoder; ``stride`` of those of the refinement.
+      the decoder; ``step``, the stride of those of the refinement.
     - ``hidden``: units of the refinement's LSTM. ``effect``: size of the effect of one slot on
       another.
     - ``update``: whether refinement and dynamics ``add`` to the state or ``replace`` it, as in the
@@ -56,7 +56,7 @@ class Op3Config:
       a short training would learn the scenery alone.
     - ``seed_steps``: refinements with the first frame; each later one that is seen has one.
     - ``past``, ``imagined``: frames of a training clip that are seen, and that follow.
-    - ``stride_frames``, ``context``, ``future``: see `physion.models.batch.Spec`.
+    - ``stride``, ``context``, ``future``: see `physion.models.batch.Spec`.
     - ``training``: optimiser and schedule.
     """
 
@@ -67,7 +67,7 @@ class Op3Config:
     width: int = 16
     kernel: int = 3
     layers: int = 4
-    stride: int = 2
+    step: int = 2
     hidden: int = 64
     effect: int = 32
     update: Literal["add", "replace"] = "add"
@@ -78,7 +78,7 @@ class Op3Config:
     seed_steps: int = 3
     past: int = 4
     imagined: int = 3
-    stride_frames: int = 6
+    stride: int = 6
     context: int = 7
     future: int = 18
     training: TrainingSettings = field(default_factory=TrainingSettings)
@@ -124,7 +124,7 @@ def op3_config(options: Op3Options) -> Op3Config:
             width=32,
             kernel=5,
             layers=5,
-            stride=1,
+            step=1,
             hidden=128,
             motion=0.0,
             update="replace",

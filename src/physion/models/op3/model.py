@@ -62,7 +62,7 @@ class Op3(VisionModel):
             image_size=config.image_size,
             mean=(0.0, 0.0, 0.0),
             std=(1.0, 1.0, 1.0),
-            stride=config.stride_frames,
+            stride=config.stride,
             context=config.context,
             future=config.future,
             framewise=False,

@@ -90,7 +90,7 @@ class Refinement(nn.Module):
         layers: list[nn.Module] = []
         channels = [PLAIN + NORMALIZED + 2, width, width, max(size, width)]
         for before, after in pairwise(channels):
-            layers += [_conv(before, after, config.kernel, config.stride), nn.ELU()]
+            layers += [_conv(before, after, config.kernel, config.step), nn.ELU()]
         self.look = nn.Sequential(*layers)
         self.inner = nn.Linear(channels[-1], config.hidden)
         self.memory = nn.LSTMCell(config.hidden + 5 * size, config.hidden)
