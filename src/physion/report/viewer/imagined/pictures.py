@@ -31,8 +31,10 @@ SLOTS = 12
 """Largest number of slots; later ones are left out."""
 SLOT_SIDE = 64
 """Largest side of the picture of a slot in pixels."""
-QUALITY = 85
-"""Quality setting of WebP, up to 100."""
+QUALITIES = (85, 50, 20, 1)
+"""Quality settings of WebP, up to 100: the first by which a sheet is small enough, or the last."""
+SHEET_BYTES = 225_000
+"""Size of a sheet above which a lower quality is taken, before base64, which adds a third."""
 
 _SHAPES = {
     "rgb": "(frames, height, width, 3) uint8",
@@ -145,10 +147,8 @@ def _sheet(parts: Sequence[NDArray[np.uint8]], first: int, each: int = 1) -> dic
     for place, picture in enumerate(pictures):
         top, left = place // columns * height, place % columns * width
         sheet[top : top + height, left : left + width] = picture
-    stream = io.BytesIO()
-    Image.fromarray(sheet).save(stream, "WEBP", quality=QUALITY, method=4, use_sharp_yuv=True)
     return {
-        "data": base64.b64encode(stream.getvalue()).decode("ascii"),
+        "data": base64.b64encode(_webp(sheet)).decode("ascii"),
         "width": width,
         "height": height,
         "columns": columns,
@@ -156,6 +156,18 @@ def _sheet(parts: Sequence[NDArray[np.uint8]], first: int, each: int = 1) -> dic
         "rows": len(pictures) // each,
         "each": each,
     }
+
+
+def _webp(picture: NDArray[np.uint8]) -> bytes:
+    """Return a picture in the best of the `QUALITIES` that takes at most `SHEET_BYTES`."""
+    image, data = Image.fromarray(picture), b""
+    for quality in QUALITIES:
+        stream = io.BytesIO()
+        image.save(stream, "WEBP", quality=quality, method=4, use_sharp_yuv=True)
+        data = stream.getvalue()
+        if len(data) <= SHEET_BYTES:
+            break
+    return data
 
 
 def _mask_sheet(
