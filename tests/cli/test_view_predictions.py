@@ -13,7 +13,7 @@ from physion.cli.imagined_trials import imagine_with
 from physion.cli.main import main
 from physion.errors import BadInputError, UnknownNameError
 from physion.trials.dataset import Dataset
-from support.viewer_dataset import make_dataset
+from support.viewer_dataset import Plan, make_dataset
 
 STANDSTILL = '''
 """A simulator in which everything stays where it is; half of its futures have a contact."""
@@ -55,6 +55,13 @@ class Silent(Standstill):
         return Rollout(gap=np.zeros((len(context), samples)))
 
 
+class Uneven(Standstill):
+    def imagine(self, context, samples, seed, **knobs):
+        boxes = np.zeros((len(context), samples, 5, 2, 4), np.float32)
+        slots = np.zeros((len(context), samples, 4, 2, 3), np.float32)
+        return Rollout(shown={"boxes": boxes, "slots": slots})
+
+
 class Answers:
     spec = Standstill.spec
     provenance, digest = Standstill.provenance, Standstill.digest
@@ -91,6 +98,28 @@ def test_a_model_gives_plain_arrays_of_its_first_future(folder: Path, file: Path
     assert ball.probability == pytest.approx(2.5 / 5) and ball.gap == 0.5
 
 
+def test_pictures_come_with_what_was_seen_and_what_is_true(folder: Path) -> None:
+    """The grey of a frame of the movies is 40 plus three times its number."""
+    imagined = imagine_with(Dataset(folder), ["copy-last-frame"], {})(["drop_0", "drape_0"])
+    for (one,) in imagined.values():
+        assert one.model == "copy-last-frame" and one.weights == "no weights"
+        assert one.seen_frames.tolist() == list(range(0, 37, 6)) and set(one.seen) == {"rgb"}
+        assert one.frames[:4].tolist() == [42, 48, 54, 60]
+        seen, true, copied = (
+            values["rgb"].mean(axis=(1, 2, 3)) for values in (one.seen, one.true, one.shown)
+        )
+        assert seen == pytest.approx(40 + 3 * one.seen_frames, abs=3)
+        assert true[:3] == pytest.approx(40 + 3 * one.frames[:3], abs=3)
+        assert copied == pytest.approx(np.full(len(one.frames), seen[-1]))
+        assert np.isnan(one.gap) and np.isnan(one.probability)
+
+
+def test_trials_without_movies_are_rendered(tmp_path: Path) -> None:
+    folder = make_dataset(tmp_path / "set", (Plan("state", movies=False),))
+    (one,) = imagine_with(Dataset(folder), ["copy-last-frame"], {})(["state"])["state"]
+    assert one.seen["rgb"].std() > 10 and one.true["rgb"].std() > 10
+
+
 def test_particle_models_are_called_untrained(folder: Path) -> None:
     imagined = imagine_with(Dataset(folder), ["dpi"], {"samples": 1})(["drop_0", "drape_0"])
     for trial, name, agent in (("drop_0", "ball", 0), ("drape_0", "sheet", 2)):
@@ -119,7 +148,7 @@ def test_the_verb_puts_them_into_the_page(folder: Path, file: Path, tmp_path: Pa
             ["--predictions", "{}:Silent"],
             "nothing that can be shown: .* features or outcomes alone",
         ),
-        (["--predictions", "copy-last-frame"], "nothing that can be shown: .* it gave rgb"),
+        (["--predictions", "{}:Uneven"], r"slots as float32 \(1, 4, 4, 2, 3\), expected"),
         (
             ["--predictions", "{}:Rough"],
             r"particles as float64 \(1, 4, 5, 2, 3\), expected float32",
