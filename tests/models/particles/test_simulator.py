@@ -14,7 +14,6 @@ from physion.errors import BadInputError
 from physion.models.batch import LAST_OBSERVED, Batch, Motion
 from physion.models.build import build_model
 from physion.models.checkpoints.checkpoint import DamagedFileError
-from physion.models.checkpoints.trained import shipped_digests
 from physion.models.observed import cut_to_observed
 from physion.models.particles.bodies import KINEMATIC, RIGID, poses_of, scene_particles
 from physion.models.particles.gap import smallest_distance
@@ -338,18 +337,6 @@ def test_weights_of_a_file_are_loaded_and_named(tmp_path: Path) -> None:
         model_of("dpi", weights=str(path))
     with pytest.raises(BadInputError, match="no weights at"):
         model_of("dpi", weights=str(tmp_path / "absent.safetensors"))
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_shipped_weights_load_or_are_said_to_be_missing(name: str) -> None:
-    digests = shipped_digests()
-    if f"{name}-small" not in digests:
-        with pytest.raises(BadInputError, match=f"no weights are shipped for {name}-small"):
-            model_of(name, weights="shipped")
-        return
-    model = model_of(name, weights="shipped")
-    assert model.init == f"shipped:{digests[name + '-small'][:12]}"
-    assert model.trained and model.touch.isfinite().all()
 
 
 @pytest.mark.parametrize(
