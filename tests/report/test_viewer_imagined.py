@@ -141,7 +141,8 @@ def test_detailed_trials_alone_are_imagined_once(tmp_path: Path) -> None:
 
     def imagine(trials: Any) -> dict[str, list[ImaginedTrial]]:
         asked.append(list(trials))
-        return {trials[0]: [falling(), falling(model="other", frames=3)]}
+        falls = falling(probability=1.0, gap=-10.0)
+        return {trials[0]: [falls, falling(model="other", frames=3)], trials[1]: [falls]}
 
     options = ViewerOptions(details=2, card_size=32, pass_size=32, stride=6)
     page = build_viewer(folder, tmp_path / "v.html", options, imagine=imagine).page
@@ -149,4 +150,7 @@ def test_detailed_trials_alone_are_imagined_once(tmp_path: Path) -> None:
     blocks = re.findall(r'id="detail-(\d)">(.*?)</script>', page.read_text())
     details = {int(number): json.loads(text) for number, text in blocks}
     assert [one["model"] for one in details[0]["imagined"]] == ["sim", "other"]
-    assert details[2]["imagined"] == [] and "imagined" not in details[1]
+    assert "imagined" not in details[1]
+    # They touched in frame 20 of drop_2, and in frame 50 of drop_0.
+    assert "smallest gap -10.000 m" in details[0]["imagined"][0]["caption"]
+    assert details[2]["imagined"][0]["caption"].endswith("the contact was already observed.")
