@@ -1,19 +1,21 @@
-"""A dataset of small movies, on which vision models are trained for a minute."""
+"""A dataset of small movies, and windows of its clips in memory, to train vision models quickly."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from physion.compute.local import LocalExecutor
-from physion.models.batch import Batch
-from physion.models.settings import TrainingSettings
-from physion.seeds import generator
-from physion.training.sources.source import WholeSource
-from physion.training.train import train_model
+from physion.models.batch import Batch, Spec
+from physion.training.sources.open_source import whole_source
 from physion.trials.dataset import Dataset
 from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import GenerateSettings, plan_dataset
+from support.moving_squares import with_arrays
+
+LAST_FRAME = 144
 
 
 def make_movies(folder: Path, counts: dict[str, int], scenarios: tuple[str, ...]) -> Dataset:
@@ -24,27 +26,16 @@ def make_movies(folder: Path, counts: dict[str, int], scenarios: tuple[str, ...]
     return Dataset(folder)
 
 
-def held_out(model: Any, source: WholeSource, trials: list[str]) -> Batch:
-    """Return one training clip of every trial, from a random frame, as tensors.
-
-    It starts in the first 40 frames, since later most objects rest.
-    """
-    rng = generator("held out")
-    starts = [int(rng.integers(40)) for _ in trials]
-    return source.window(trials, starts, model.window).to("cpu")
+def read_whole(dataset: Dataset, split: str, spec: Spec) -> Batch:
+    """Return all trials of a split from frame 0 to `LAST_FRAME`, as tensors."""
+    trials = dataset.trials(split)
+    frames = LAST_FRAME // spec.stride + 1
+    return whole_source(dataset, spec).window(trials, [0] * len(trials), frames).to("cpu")
 
 
-def train_quickly(
-    model: Any, source: WholeSource, trials: list[str], settings: TrainingSettings, seed: int
-) -> None:
-    """Train a model in place."""
-    train_model(
-        model,
-        source,
-        trials,
-        settings=settings,
-        seed=seed,
-        name="all",
-        folder=None,
-        accelerator="cpu",
-    )
+def windows(clips: Batch, length: int, latest: int, rows: Any, rng: np.random.Generator) -> Batch:
+    """Return ``length`` frames of clips with these rows, from random ones up to ``latest``."""
+    starts = rng.integers(latest + 1, size=len(rows))
+    chosen = np.asarray(rows)[:, None], starts[:, None] + np.arange(length)
+    arrays = {name: value[chosen] for name, value in clips.arrays().items()}
+    return with_arrays(clips, trials=tuple(clips.trials[row] for row in rows), **arrays)

@@ -13,14 +13,16 @@ from physion.models.batch import Batch
 from physion.models.build import build_model
 from physion.models.rpin.backbone import Backbone
 from physion.models.rpin.boxes import (
+    UNIT,
     constant_velocity,
     is_present,
     known_boxes,
+    last_changes,
     to_center,
     to_edges,
 )
 from physion.models.rpin.config import rpin_config
-from physion.models.rpin.model import UNIT, Imagined, Rpin, Targets
+from physion.models.rpin.model import Imagined, Rpin, Targets
 from physion.models.rpin.networks import Dynamics, Interaction, cut_regions
 from physion.models.vision.model import VisionOptions
 from support.moving_squares import squares, with_arrays
@@ -60,6 +62,12 @@ def test_constant_velocity_continues_a_line() -> None:
     line = (start + torch.arange(6.0)[:, None] * change)[None, :, None]
     assert torch.allclose(constant_velocity(line[:, :3], 3), line[:, 3:], atol=1e-6)
     assert torch.equal(constant_velocity(line[:, :1], 2), line[:, [0, 0]])
+
+
+def test_changes_of_boxes_are_in_units() -> None:
+    boxes = torch.tensor([0.1, 0.1 + UNIT, 0.1 - UNIT]).view(1, 3, 1, 1).expand(1, 3, 1, 4)
+    changes = last_changes(boxes)[0, :, 0, 0]
+    assert torch.allclose(changes, torch.tensor([0.0, 1.0, -2.0]), atol=1e-5)
 
 
 @pytest.mark.parametrize("sampling", [1, 2])

@@ -8,6 +8,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+UNIT = 0.02
+"""Unit of changes of boxes and of errors, as part of the picture's side. A body that moves at
+1 m/s, 3 m from the camera, moves 0.03 in 0.09 s."""
+
 
 def known_boxes(boxes: Tensor) -> Tensor:
     """Return centres and sizes of all objects at all frames.
@@ -48,6 +52,11 @@ def to_edges(boxes: Tensor) -> Tensor:
     """Return left, top, right and bottom (..., 4) of centre and size."""
     center, size = boxes[..., :2], boxes[..., 2:]
     return torch.cat([center - size / 2, center + size / 2], -1)
+
+
+def last_changes(boxes: Tensor) -> Tensor:
+    """Return the change in `UNIT` of boxes (B, T, K, 4) from the frame before, 0 for the first."""
+    return torch.diff(boxes, dim=1, prepend=boxes[:, :1]) / UNIT
 
 
 def constant_velocity(known: Tensor, steps: int) -> Tensor:

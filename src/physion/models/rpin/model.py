@@ -8,8 +8,8 @@ Tensors (B clips, T frames, h = ``config.history``, K objects, states of C x p x
   zeros for an object that no frame of the clip shows.
 
 The boxes are those of the ids, as in the published experiments: the model is supervised by them.
-The published code encodes no boxes apart from the regions; here the box is part of the state
-(`networks.Dynamics.place`).
+The published code encodes no boxes apart from the regions; here the box and its last change are
+part of the state (`networks.Dynamics.place`).
 
 Source: docs/official-system.md, section 5, and Qi et al. 2021 (`networks`).
 """
@@ -26,6 +26,7 @@ from physion.errors import BadInputError
 from physion.models.batch import Batch, Provenance, Rollout, Spec
 from physion.models.rpin.backbone import Backbone
 from physion.models.rpin.boxes import (
+    UNIT,
     constant_velocity,
     is_present,
     known_boxes,
@@ -38,9 +39,6 @@ from physion.models.vision.pictures import normalized_pictures
 from physion.seeds import stable_hash
 
 NAME, VERSION = "rpin", 1
-UNIT = 0.02
-"""Unit of decoded changes and of errors, as part of the picture's side: a body that moves at 1 m/s,
-3 m from the camera, moves 0.03 in 0.09 s."""
 _LEAST_SIZE = 1e-3
 """Least width and height of an imagined box."""
 

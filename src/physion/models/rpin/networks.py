@@ -1,7 +1,8 @@
 """Object states and their interaction.
 
-The state x_k of an object is a small map (C, p, p): the region of its box in the feature maps. With
-the boxes b and h observed frames, x_k^t = s_k^t + E b_k^t, and for every frame t of the history
+The state s_k of an object is a small map (C, p, p): the region of its box in the feature maps. With
+boxes b, their last changes v in `UNIT` and h observed frames, x_k^t = s_k^t + E (b_k^t, v_k^t), and
+for every frame t of the history
 
     e_k = a( f(x_k) + sum_{l != k} r(x_k, x_l) ),    z_k^t = g(e_k, x_k),
 
@@ -24,7 +25,7 @@ import torch
 from torch import Tensor, nn
 from torchvision.ops import roi_align
 
-from physion.models.rpin.boxes import to_edges
+from physion.models.rpin.boxes import last_changes, to_edges
 
 
 def convolution(inputs: int, outputs: int) -> nn.Sequential:
@@ -111,7 +112,7 @@ class Dynamics(nn.Module):
 
     def __init__(self, width: int, pool: int, history: int) -> None:
         super().__init__()
-        self.place = nn.Linear(4, width)
+        self.place = nn.Linear(8, width)
         self.interactions = nn.ModuleList(Interaction(width) for _ in range(history))
         self.join = nn.Sequential(nn.Conv2d(history * width, width, 1), nn.ReLU())
         self.decode = nn.Linear(width * pool * pool, 4)
@@ -135,7 +136,8 @@ class Dynamics(nn.Module):
         decoded : Tensor
             (B, K, 4).
         """
-        placed = states + self.place(boxes)[..., None, None]
+        moving = torch.cat([boxes, last_changes(boxes)], -1)
+        placed = states + self.place(moving)[..., None, None]
         pairs = zip(self.interactions, placed.unbind(1), strict=True)
         effects = [interaction(now, present) for interaction, now in pairs]
         joined = torch.cat(effects, 2).flatten(0, 1)
