@@ -1,4 +1,4 @@
-"""Pictures that a model saw and imagined, for the viewer: in few bytes, beside the true ones.
+"""Pictures that a model saw and imagined, for the viewer, with the true ones, in few bytes.
 
 Pictures of one kind lie in a sheet, one WebP image. Rows are frames: first those that the model
 saw, then those that it imagined.
