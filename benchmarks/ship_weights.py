@@ -91,7 +91,8 @@ def write_scores() -> None:
             elif line.startswith(f"| {name} |"):
                 text.append(line)
         path = SHIPPED / f"{name}.md"
-        path.write_text(path.read_text().split("## Scores")[0] + "\n".join(text) + "\n")
+        card = path.read_text().split("## Scores")[0].rstrip()
+        path.write_text(card + "\n\n" + "\n".join(text) + "\n")
 
 
 def main() -> None:
