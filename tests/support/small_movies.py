@@ -20,7 +20,7 @@ LAST_FRAME = 144
 
 def make_movies(folder: Path, counts: dict[str, int], scenarios: tuple[str, ...]) -> Dataset:
     """Return trials with movies of 64 x 64 pixels, ``counts[split]`` of every scenario."""
-    tasks = plan_dataset("small movies", scenarios, counts)
+    tasks = plan_dataset("small-movies", scenarios, counts)
     settings = GenerateSettings(width=64, height=64, look="redyellow", jitters=0)
     assert not make_trials(folder, tasks, settings, executor=LocalExecutor(workers=2)).failed
     return Dataset(folder)

@@ -35,8 +35,8 @@ class Options:
     split: str | None = None
     """Show this split alone."""
     predictions: tuple[str, ...] = ()
-    """Models whose predictions are shown beside what is true, as particles in 3D, pictures, boxes or
-    slots: names (physion ls models) or FILE.py:Class."""
+    """Models whose predictions are shown next to what is true, as particles in 3D, pictures, boxes
+    or slots: names (physion ls models) or FILE.py:Class."""
     option: tuple[str, ...] = ()
     """Fields of the config of these models as NAME=VALUE, such as weights=shipped."""
     open: bool = False
@@ -73,6 +73,8 @@ def _imagine(options: Options, stages: Stages) -> Imagine | None:
     from physion.cli.imagined_trials import imagine_with
 
     if options.details < 1:
-        raise BadInputError("--predictions are shown in trials with details: --details must be at least 1")
+        raise BadInputError(
+            "--predictions are shown in trials with details: --details must be at least 1"
+        )
     chosen = parse_options(options.option)
     return imagine_with(Dataset(options.folder), options.predictions, chosen, stages)
