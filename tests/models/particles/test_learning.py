@@ -70,7 +70,7 @@ def learn(task: Task) -> Result:
         folder=None,
         accelerator="cpu",
     )
-    motions = [m for m, _ in tested(dataset)]
+    motions = [m for m, _ in motions_and_contacts(dataset)]
     cut = [Motion(m.scene, cut_to_observed(m.scene, m.trajectory)) for m in motions]
     futures = model.futures(cut, 1, 0)
     gaps = model.gaps(cut, futures)[:, 0]
@@ -82,7 +82,7 @@ def learn(task: Task) -> Result:
     return Result(gaps, float(error), float(constant))
 
 
-def tested(dataset: Dataset) -> list[tuple[Motion, bool]]:
+def motions_and_contacts(dataset: Dataset) -> list[tuple[Motion, bool]]:
     """Return the tested motions and whether agent and patient touch; none do while observed."""
     files = [dataset.trial(trial) for trial in dataset.trials("testing")]
     labels = [label_contact(file.scene, file.trajectory) for file in files]
@@ -112,7 +112,7 @@ def results(dataset: Dataset) -> dict[bool, Result]:
 
 @pytest.fixture(scope="module")
 def contacts(dataset: Dataset) -> NDArray[np.bool_]:
-    return np.array([contact for _, contact in tested(dataset)])
+    return np.array([contact for _, contact in motions_and_contacts(dataset)])
 
 
 def auc(result: Result, contacts: NDArray[np.bool_]) -> float:

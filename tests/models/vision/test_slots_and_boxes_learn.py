@@ -55,7 +55,7 @@ def train(model: Any, clips: Batch, steps: int, batch: int, rate: float, seed: i
     model.eval()
 
 
-def tested(model: Any, clips: Batch) -> Batch:
+def early_windows(model: Any, clips: Batch) -> Batch:
     """Return a window of every clip; it starts early, since later most objects rest."""
     latest = 40 // model.spec.stride
     return windows(clips, model.window, latest, range(len(clips)), np.random.default_rng(0))
@@ -72,7 +72,7 @@ def test_slots_tell_the_next_state_from_the_present_and_from_others(
 ) -> None:
     """The candidates are 100 states: five of each of 20 clips."""
     model: Any = build_model("cswm", seed=seed)
-    held_out = tested(model, clips["cswm", "testing"])
+    held_out = early_windows(model, clips["cswm", "testing"])
     model.eval()
     before = loss_of(model, held_out)
     with torch.no_grad():
@@ -91,7 +91,7 @@ def test_boxes_are_nearer_than_at_constant_velocity(
 ) -> None:
     """The untrained network, whose loss is larger, predicts that nothing moves."""
     model: Any = build_model("rpin", seed=seed)
-    held_out = tested(model, clips["rpin", "testing"])
+    held_out = early_windows(model, clips["rpin", "testing"])
     model.eval()
     before = loss_of(model, held_out)
     train(model, clips["rpin", "training"], steps=150, batch=8, rate=1e-3, seed=seed)
