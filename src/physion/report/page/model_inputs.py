@@ -13,7 +13,7 @@ INPUT_WORDS = {
     "depth": "the distance of every pixel",
     "boxes": "a box around every object",
     "camera": "the camera",
-    "state": "the true state of the scene, with every shape, mass and velocity",
+    "state": "the true state of the scene: shapes, motion and, for models that use them, masses",
     "outcomes": "the outcome itself",
     "answers of people": "the answers of people",
     "base rate": "nothing of the trial but how often contact occurs",
