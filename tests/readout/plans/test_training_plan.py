@@ -60,9 +60,7 @@ def make_plan(
     scenario: str = "",
     **changes: Any,
 ) -> TrainingPlan:
-    selection = Selection(
-        tuple(models), tuple(protocols), tuple(seeds), changes.pop("scenario", "")
-    )
+    selection = Selection(tuple(models), tuple(protocols), tuple(seeds), scenario)
     shared = replace(CPU, **changes)
     return TrainingPlan(dots, folder, selection, overrides or TrainingOverrides(), shared)
 
