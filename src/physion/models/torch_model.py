@@ -9,7 +9,8 @@ import hashlib
 import inspect
 import json
 import marshal
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -17,6 +18,7 @@ from torch import Tensor, nn
 
 from physion.models.batch import Provenance, Spec
 from physion.models.from_file import FileLoader
+from physion.seeds import stable_hash
 
 _KNOWN_PACKAGES = {"abc", "builtins", "physion", "torch", "typing"}
 """Packages whose versions, not sources, belong to the digest of a model."""
@@ -51,6 +53,17 @@ class TorchModel(nn.Module):
         """Device of the first weight; the CPU for a model without weights."""
         weight = next(self.parameters(), None)
         return torch.device("cpu") if weight is None else weight.device
+
+
+@contextmanager
+def initial_weights(*key: str | int) -> Iterator[None]:
+    """Let a key, such as a name and a seed, determine the weights that are made in this block.
+
+    Torch's generator is afterwards as it was.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(stable_hash(*key) % 2**63)
+        yield
 
 
 def digest_of(settings: Any, weights: Iterable[tuple[str, Tensor]] = ()) -> str:

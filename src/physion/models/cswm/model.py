@@ -30,9 +30,9 @@ from physion.models.cswm.contrast import (
     rank_next_states,
 )
 from physion.models.cswm.networks import SlotEncoder, SlotExtractor, SlotTransition
+from physion.models.torch_model import initial_weights
 from physion.models.vision.model import VisionModel, VisionOptions
 from physion.models.vision.pictures import normalized_pictures
-from physion.seeds import stable_hash
 
 NAME, VERSION = "cswm", 1
 
@@ -50,8 +50,7 @@ class Cswm(VisionModel):
         super().__init__(NAME, VERSION, config, config.training, options, spec)
         self.config = config
         self.window = config.stacked + config.memory - 1 + config.transitions
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(stable_hash("cswm", options.seed) % 2**63)
+        with initial_weights("cswm", options.seed):
             self.extractor = SlotExtractor(
                 3 * config.stacked, config.channels, config.slots, config.kernels, config.strides
             )
@@ -103,9 +102,6 @@ class Cswm(VisionModel):
         stacked = self._stacked(batch)
         out: Tensor = self.extractor(stacked.flatten(0, 1))
         return out.view(*stacked.shape[:2], *out.shape[1:])
-
-    def prepare(self, sample: Batch) -> None:
-        """Do nothing: there are no statistics."""
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
         """Return the contrastive loss of the transitions of a batch, and its two parts."""

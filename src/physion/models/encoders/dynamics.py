@@ -11,7 +11,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from physion.seeds import stable_hash
+from physion.models.torch_model import initial_weights
 
 Kind = Literal["mlp", "lstm"]
 
@@ -49,8 +49,7 @@ def make_dynamics(
     kind: Kind, size: int, *, context: int, hidden: int, residual: bool, seed: int
 ) -> MlpDynamics | LstmDynamics:
     """Return dynamics with weights drawn from ``seed``; residual ones add nothing at first."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(stable_hash("dynamics", kind, seed) % 2**63)
+    with initial_weights("dynamics", kind, seed):
         network = (MlpDynamics if kind == "mlp" else LstmDynamics)(size, context, hidden)
     if residual:
         nn.init.zeros_(network.outer.weight)

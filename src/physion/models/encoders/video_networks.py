@@ -12,17 +12,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
-import torch
 import transformers
 from huggingface_hub import hf_hub_download
 from torch import Tensor, nn
 
 from physion.errors import BadInputError
+from physion.models.torch_model import initial_weights
 from physion.models.weights import RANDOM, Pooling, read_state_dict
 from physion.models.weights.encoder import offline_without_network
 from physion.models.weights.grid import POOLED, check_pooling
 from physion.models.weights.state_dicts import file_sha256, first_line, load_fitting
-from physion.seeds import stable_hash
 
 HUB = "hub:"
 TUBELET = 2
@@ -170,8 +169,7 @@ def create_video_encoder(family: VideoFamily, config: VideoConfig) -> tuple[nn.M
         If the weights cannot be had or are those of another network; the message names tensors
         that differ.
     """
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(stable_hash("video encoder", family.name, config.seed) % 2**63)
+    with initial_weights("video encoder", family.name, config.seed):
         network = family.build(config)
     origin = config.weights
     if config.weights != RANDOM:

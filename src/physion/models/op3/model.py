@@ -26,15 +26,16 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from physion.models.batch import Batch, Provenance, Rollout, Spec
+from physion.models.batch import Batch, Provenance, Rollout
 from physion.models.op3.config import Op3Config, Op3Options
 from physion.models.op3.inference import Explained, SlotInference, Slots
 from physion.models.op3.pixels import Decoded
+from physion.models.torch_model import initial_weights
 from physion.models.vision.clips import context_pictures, window_pictures
-from physion.models.vision.model import VisionModel
-from physion.models.vision.moving import copy_error, future_error, moving_pixels
+from physion.models.vision.moving import future_error, moving_pixels
+from physion.models.vision.picture_model import PictureModel
 from physion.models.vision.pictures import normalized_pictures
-from physion.seeds import generator, stable_hash
+from physion.seeds import generator
 
 NAME = "op3"
 VERSION = 1
@@ -54,27 +55,15 @@ class TrainingClips:
     imagined: Tensor
 
 
-class Op3(VisionModel):
+class Op3(PictureModel):
     """Model of pictures as slots, and of how they move one another."""
 
     def __init__(self, config: Op3Config, options: Op3Options) -> None:
-        spec = Spec(
-            image_size=config.image_size,
-            mean=(0.0, 0.0, 0.0),
-            std=(1.0, 1.0, 1.0),
-            stride=config.stride,
-            context=config.context,
-            future=config.future,
-            framewise=False,
-        )
-        super().__init__(NAME, VERSION, config, config.training, options, spec)
+        super().__init__(NAME, VERSION, config, options, samples=options.samples, framewise=False)
         self.config = config
         if options.slots:
             self.name += f"-{options.slots}-slots"
-        self.window = config.past + config.imagined
-        self.samples, self.seed = options.samples, options.seed
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(stable_hash("op3", options.seed) % 2**63)
+        with initial_weights("op3", options.seed):
             self.slots = SlotInference(config)
 
     def provenance(self) -> Provenance:
@@ -109,9 +98,6 @@ class Op3(VisionModel):
         values = torch.stack(features, 1).float().view(clips, samples, config.future, -1)
         return Rollout(features=values, shown=_shown(shown, clips, samples))
 
-    def prepare(self, sample: Batch) -> None:
-        """Do nothing: there are no statistics to set."""
-
     def loss(self, batch: Batch) -> dict[str, Tensor]:
         """Return the loss of training clips, and what it consists of.
 
@@ -130,11 +116,6 @@ class Op3(VisionModel):
             return {"loss": clips.objective, **parts}
         parts = {"error": error.pixels, "objective": clips.objective}
         return {name: part.detach() for name, part in {"loss": error.moving, **parts}.items()}
-
-    def baseline(self, batch: Batch) -> Tensor:
-        """Return the squared error of moving pixels if the last observed picture is repeated."""
-        pictures = window_pictures(batch, self.spec, self.name, self.window)
-        return copy_error(pictures, self.config.imagined, batch.valid).moving
 
     def _run(self, pictures: Tensor, valid: Tensor) -> TrainingClips:
         """Return the objective of training clips (B, T, 3, H, W)."""

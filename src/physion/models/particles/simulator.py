@@ -62,10 +62,10 @@ from physion.models.particles.rigid_motion import (
 from physion.models.particles.rollout import Start, disturbed_start, roll_out
 from physion.models.particles.windows import Window, disturbed, read_window, rotated
 from physion.models.threshold import best_threshold
-from physion.models.torch_model import TorchModel, digest_of
+from physion.models.torch_model import TorchModel, digest_of, initial_weights
 from physion.physics.labels import label_contact
 from physion.scenes.scene import FRAME_TIME
-from physion.seeds import generator, stable_hash
+from physion.seeds import generator
 
 VERSION = 3
 """To be raised with every change of what equal weights predict, or of the training."""
@@ -112,8 +112,7 @@ class ParticleSimulator(TorchModel):
             future=0,
             anchor="end",
         )
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(stable_hash("particle model", options.seed) % 2**63)
+        with initial_weights("particle model", options.seed):
             self.network = self._make_network()
         self.register_buffer("touch", torch.zeros(2, dtype=torch.float64))
 

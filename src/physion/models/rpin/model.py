@@ -34,9 +34,9 @@ from physion.models.rpin.boxes import (
 )
 from physion.models.rpin.config import RpinConfig
 from physion.models.rpin.networks import Dynamics, convolution, cut_regions
+from physion.models.torch_model import initial_weights
 from physion.models.vision.model import VisionModel, VisionOptions
 from physion.models.vision.pictures import normalized_pictures
-from physion.seeds import stable_hash
 
 NAME, VERSION = "rpin", 1
 _LEAST_SIZE = 1e-3
@@ -76,8 +76,7 @@ class Rpin(VisionModel):
         super().__init__(NAME, VERSION, config, config.training, options, spec)
         self.config = config
         self.window = config.history + config.rollout
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(stable_hash("rpin", options.seed) % 2**63)
+        with initial_weights("rpin", options.seed):
             self.backbone = Backbone(config.width, config.depth, config.groups)
             self.region = convolution(config.width, config.width)
             self.dynamics = Dynamics(config.width, config.pool, config.history)
@@ -112,9 +111,6 @@ class Rpin(VisionModel):
             features=joined[:, None].expand(-1, samples, -1, -1),
             shown={"boxes": shown[:, None].expand(-1, samples, -1, -1, -1)},
         )
-
-    def prepare(self, sample: Batch) -> None:
-        """Do nothing: there are no statistics."""
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
         """Return the loss of the boxes that follow the first h frames.

@@ -26,7 +26,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from physion.models.batch import Batch, Provenance, Rollout, Spec
+from physion.models.batch import Batch, Provenance, Rollout
 from physion.models.svg.config import SvgConfig, SvgOptions
 from physion.models.svg.networks import (
     CodePredictor,
@@ -34,12 +34,13 @@ from physion.models.svg.networks import (
     Encoder,
     GaussianPredictor,
 )
+from physion.models.torch_model import initial_weights
 from physion.models.vision.clips import context_pictures, window_pictures
 from physion.models.vision.gaussians import gaussian_divergence, gaussian_values
-from physion.models.vision.model import VisionModel
-from physion.models.vision.moving import copy_error, future_error, moving_pixels
+from physion.models.vision.moving import future_error, moving_pixels
+from physion.models.vision.picture_model import PictureModel
 from physion.models.vision.pictures import normalized_pictures
-from physion.seeds import generator, stable_hash
+from physion.seeds import generator
 
 NAME = "svg"
 VERSION = 1
@@ -54,28 +55,17 @@ class ImaginedClips:
     pictures: Tensor
 
 
-class Svg(VisionModel):
+class Svg(PictureModel):
     """Model of the future of pictures, trained to predict the next one."""
 
     def __init__(self, config: SvgConfig, options: SvgOptions) -> None:
-        spec = Spec(
-            image_size=config.image_size,
-            mean=(0.0, 0.0, 0.0),
-            std=(1.0, 1.0, 1.0),
-            stride=config.stride,
-            context=config.context,
-            future=config.future,
-        )
-        super().__init__(NAME, VERSION, config, config.training, options, spec)
+        super().__init__(NAME, VERSION, config, options, samples=options.samples, framewise=True)
         self.config = config
         if options.backbone:
             self.name += f"-{options.backbone}"
         if options.image_size:
             self.name += f"-{options.image_size}"
-        self.window = config.past + config.imagined
-        self.samples, self.seed = options.samples, options.seed
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(stable_hash("svg", options.seed) % 2**63)
+        with initial_weights("svg", options.seed):
             self.encoder = Encoder(config)
             self.decoder = Decoder(config)
             self.predictor = CodePredictor(config.code + config.latent, config)
@@ -116,9 +106,6 @@ class Svg(VisionModel):
         rgb = (shown.movedim(3, -1) * 255).round().to(torch.uint8)
         return Rollout(features=codes, shown={"rgb": rgb})
 
-    def prepare(self, sample: Batch) -> None:
-        """Do nothing: there are no statistics to set."""
-
     def loss(self, batch: Batch) -> dict[str, Tensor]:
         """Return the loss of training clips, and what it consists of.
 
@@ -138,11 +125,6 @@ class Svg(VisionModel):
         error = future_error(imagined.pictures, pictures, batch.valid)
         parts = {"error": error.pixels, "objective": objective["loss"]}
         return {"loss": error.moving, **parts}
-
-    def baseline(self, batch: Batch) -> Tensor:
-        """Return the squared error of moving pixels if the last observed picture is repeated."""
-        pictures = window_pictures(batch, self.spec, self.name, self.window)
-        return copy_error(pictures, self.config.imagined, batch.valid).moving
 
     def _objective(self, pictures: Tensor, valid: Tensor) -> dict[str, Tensor]:
         """Return loss, error and divergence of clips (B, T, 3, H, W), means over the frames."""

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import torch
 
 from physion.errors import BadInputError
-from physion.models.batch import Provenance, Spec
+from physion.models.batch import Batch, Provenance, Spec
 from physion.models.checkpoints.trained import RANDOM
 from physion.models.interface import Diet
 from physion.models.settings import TrainingSettings
@@ -80,6 +80,9 @@ class VisionModel(TorchModel):
         self.trained = False
         self.knobs: Mapping[str, tuple[float, ...]] = {}
         self._config = {k: v for k, v in dataclasses.asdict(config).items() if k != "training"}
+
+    def prepare(self, sample: Batch) -> None:
+        """Do nothing: these models have no statistics to set before a training."""
 
     def built_as(self) -> dict[str, Any]:
         """Return what the weights were made for: name, with the size, and version."""

@@ -17,11 +17,11 @@ from huggingface_hub import constants as hub
 from torch import nn
 
 from physion.errors import BadInputError, UnknownNameError
+from physion.models.torch_model import initial_weights
 from physion.models.weights.grid import GRID, POOLED, GridFeatures, Pooling, check_pooling
 from physion.models.weights.packages import WeightsPackage, timm_efficientnet_names
 from physion.models.weights.source import IMAGENET, TIMM, EncoderWeights
 from physion.models.weights.state_dicts import first_line, load_fitting, read_state_dict
-from physion.seeds import stable_hash
 
 
 def check_encoder_name(name: str) -> None:
@@ -47,8 +47,7 @@ def create_encoder(
         encoder = create_classifier(name, package)
         encoder.reset_classifier(0)  # type: ignore[operator]
     else:
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(stable_hash("encoder", name, weights.seed) % 2**63)
+        with initial_weights("encoder", name, weights.seed):
             encoder = _create(name, image_size, tag=_tag(name, weights))
     if weights.path is not None:
         _load_local(encoder, name, weights.path)
