@@ -187,6 +187,18 @@ class HasReader(Protocol):
     knobs: Mapping[str, tuple[float, ...]]
 
 
+@runtime_checkable
+class ImaginesInProcesses(Protocol):
+    """Network whose outcomes are imagined by all processes, to each of which it is pickled.
+
+    - ``trials_together``: trials that a process imagines at a time; 0 if all are to be imagined by
+      the main process, as on a GPU.
+    """
+
+    @property
+    def trials_together(self) -> int: ...
+
+
 def features_digest(model: Model) -> str:
     """Return the digest under which the features of a model are stored."""
     return model.encoder_digest() if isinstance(model, EncodesApart) else model.digest()

@@ -20,6 +20,7 @@ from physion.models.batch import Batch
 from physion.models.interface import (
     Fits,
     HasReader,
+    ImaginesInProcesses,
     Learns,
     Model,
     SeesOutcomes,
@@ -252,14 +253,17 @@ class Predictor:
     def _imagined_outcomes(self, trials: Sequence[str]) -> dict[Knobs, dict[str, Any]]:
         """Return contacts and gaps of the trials that could be imagined, at all knobs."""
         samples, seed, knobs = self._rollout_settings()
-        if not is_network(self.model):
+        model = self.model
+        shared = model.trials_together if isinstance(model, ImaginesInProcesses) else 0
+        if shared or not is_network(model):
             return self._rollouts.outcomes(
-                self.model,
+                model,
                 self._observed,
                 trials,
                 samples=samples,
                 seed=seed,
                 knobs=knobs,
+                together=max(shared, 1),
                 progress=self.progress,
             )
         found: dict[Knobs, dict[str, Any]] = {}

@@ -1,4 +1,4 @@
-"""Imagined outcomes of trials by models that are no networks: made in processes, and stored.
+"""Imagined outcomes of trials, made in processes, and stored.
 
 Outcomes are small: for every trial, value of the knobs and sample, whether agent and patient touch
 or how close they come. They are kept as one JSON file for a trial and value of the knobs, under a
@@ -7,6 +7,7 @@ digest of everything that decides them.
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import itertools
 import json
@@ -21,10 +22,10 @@ from numpy.typing import NDArray
 from physion.atomic import write_atomic
 from physion.compute.executor import Executor
 from physion.compute.progress import Progress
-from physion.errors import BadInputError
+from physion.errors import BadInputError, PhysionError
 from physion.models.batch import Batch
 from physion.models.from_file import LoadedFiles
-from physion.readout.features.model_outputs import CONTACT, GAP, imagine_clips
+from physion.readout.features.model_outputs import CONTACT, GAP, Arrays, imagine_clips
 from physion.training.sources.source import ObservedSource
 
 Cell = tuple[list[bool] | None, list[float] | None]
@@ -67,7 +68,7 @@ class Outcomes:
 
 @dataclass(frozen=True, eq=False)
 class _Request:
-    """One trial at one value of the knobs: what a worker process needs.
+    """Trials at one value of the knobs: what a worker process needs.
 
     ``files`` comes before ``model``, whose class may stand in one of them.
     """
@@ -88,8 +89,8 @@ class RolloutStore:
     folder
         Where outcomes are kept; None keeps nothing.
     executor
-        Runs the model, a trial and value of the knobs a task. Networks, which imagine many trials
-        at a time, use `FeatureStore.imagined` instead.
+        Runs the model, some trials and one value of the knobs a task. A network that is not
+        `ImaginesInProcesses` uses `FeatureStore.imagined` instead.
     """
 
     def __init__(self, folder: Path | None, executor: Executor) -> None:
@@ -106,15 +107,17 @@ class RolloutStore:
         samples: int,
         seed: int,
         knobs: Mapping[str, Sequence[float]],
+        together: int = 1,
         progress: Progress | None = None,
     ) -> dict[Knobs, dict[str, Cell]]:
         """Return contacts and gaps of every trial at all values of the knobs.
 
-        Trials that fail are left out; `problems` names the reasons.
+        The model is given ``together`` trials at a time. Trials that fail are left out; `problems`
+        names the reasons.
         """
         digest = model.digest()
         found: dict[Knobs, dict[str, Any]] = {value: {} for value in all_knobs(knobs)}
-        missing: dict[str, list[tuple[Knobs, Path | None]]] = {}
+        missing: dict[Knobs, dict[str, Path | None]] = {value: {} for value in found}
         for trial in dict.fromkeys(trials):
             try:
                 key = source.key(trial, "context")
@@ -125,16 +128,16 @@ class RolloutStore:
                 path = self._path([digest, key, trial, samples, seed, value])
                 stored = _read(path, samples)
                 if stored is None:
-                    missing.setdefault(trial, []).append((value, path))
+                    missing[value][trial] = path
                 else:
                     found[value][trial] = stored
         total = sum(len(cells) for cells in missing.values())
-        results = self._imagine(model, source, missing, samples, seed)
-        for done, (trial, value, path, outcome) in enumerate(results, start=1):
+        results = self._imagine(model, source, missing, samples, seed, together)
+        for done, (trial, value, outcome) in enumerate(results, start=1):
             if isinstance(outcome, str):
                 self.problems[trial] = outcome
             else:
-                _write(path, outcome)
+                _write(missing[value][trial], outcome)
                 found[value][trial] = outcome
             if progress is not None:
                 progress("rollouts", done, total)
@@ -144,24 +147,31 @@ class RolloutStore:
         self,
         model: Any,
         source: ObservedSource,
-        missing: Mapping[str, list[tuple[Knobs, Path | None]]],
+        missing: Mapping[Knobs, Mapping[str, Path | None]],
         samples: int,
         seed: int,
-    ) -> Iterator[tuple[str, Knobs, Path | None, Any]]:
+        together: int,
+    ) -> Iterator[tuple[str, Knobs, Cell | str]]:
+        """Yield trial, value of the knobs, and the outcomes or why there are none."""
+        read: dict[tuple[str, ...], list[tuple[tuple[str, ...], Batch | str]]] = {}
         requests: dict[str, _Request] = {}
-        cells: dict[str, tuple[str, Knobs, Path | None]] = {}
-        for trial, wanted in missing.items():
-            try:
-                context = source.context([trial])
-            except BadInputError as error:
-                yield from ((trial, value, path, str(error)) for value, path in wanted)
-                continue
-            for value, path in wanted:
-                name = " ".join([trial, *(f"{knob}={level:g}" for knob, level in value)])
-                requests[name] = _Request(LoadedFiles(), model, context, samples, seed, value)
-                cells[name] = (trial, value, path)
+        for value, paths in missing.items():
+            trials = list(paths)
+            for row in range(0, len(trials), together):
+                group = tuple(trials[row : row + together])
+                if group not in read:
+                    read[group] = list(_contexts(source, group))
+                for part, context in read[group]:
+                    if isinstance(context, str):
+                        yield from ((trial, value, context) for trial in part)
+                        continue
+                    name = " ".join([part[0], *(f"{knob}={level:g}" for knob, level in value)])
+                    requests[name] = _Request(LoadedFiles(), model, context, samples, seed, value)
         for outcome in self._executor.map(_run, requests):
-            yield (*cells[outcome.key], outcome.error if outcome.error else outcome.value)
+            request = requests[outcome.key]
+            for row, trial in enumerate(request.context.trials):
+                made = outcome.error if outcome.error else outcome.value[row]
+                yield trial, request.knobs, made
 
     def _path(self, parts: Sequence[Any]) -> Path | None:
         if self._folder is None:
@@ -196,13 +206,46 @@ def stack_outcomes(
     return stacked
 
 
-def _run(request: _Request) -> Cell:
-    """Return contacts and gaps of one trial."""
-    (arrays,) = imagine_clips(
-        request.model, request.context, request.samples, request.seed, dict(request.knobs)
-    )
+def _contexts(
+    source: ObservedSource, trials: tuple[str, ...]
+) -> Iterator[tuple[tuple[str, ...], Batch | str]]:
+    """Yield the context of trials, or why a trial has none, with their names.
+
+    If one trial has none the others are read one by one.
+    """
+    try:
+        yield trials, source.context(trials)
+    except BadInputError as error:
+        if len(trials) == 1:
+            yield trials, str(error)
+        else:
+            for trial in trials:
+                yield from _contexts(source, (trial,))
+
+
+def _run(request: _Request) -> list[Cell | str]:
+    """Return contacts and gaps of every trial, or why it has none.
+
+    If trials cannot be imagined together they are imagined one by one.
+    """
+    context = request.context
+    try:
+        arrays = imagine_clips(
+            request.model, context, request.samples, request.seed, dict(request.knobs)
+        )
+    except PhysionError as error:
+        if len(context) == 1:
+            return [" ".join(str(error).split())]
+        alone = [
+            dataclasses.replace(request, context=context.select([i])) for i in range(len(context))
+        ]
+        return [cell for one in alone for cell in _run(one)]
+    return [_cell(request.model, row) for row in arrays]
+
+
+def _cell(model: Any, arrays: Arrays) -> Cell:
     if CONTACT not in arrays and GAP not in arrays:
-        name = request.model.provenance().model
+        name = model.provenance().model
         raise BadInputError(f"model {name!r}: imagine gave neither gap nor contact")
     contact, gap = arrays.get(CONTACT), arrays.get(GAP)
     return (

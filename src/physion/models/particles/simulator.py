@@ -74,6 +74,8 @@ UNIT, CHANGE = 0.06, 0.02
 its displacement by 0.009 m, one that moves at 1 m/s moves 0.03 m."""
 _AT_ONCE = 32
 """Scenes of one graph when the distances are fitted."""
+_TOGETHER = 4
+"""Scenes of one graph on a CPU: more are no faster there."""
 _HYPOTHESES = 16
 """Random choices of particles in a robust fit."""
 _INLIER = 0.1
@@ -98,6 +100,7 @@ class ParticleSimulator(TorchModel):
     def __init__(self, name: str, config: ParticleConfig, options: ParticleOptions) -> None:
         super().__init__()
         self.config, self.options = config, options
+        self._made_of: tuple[Any, ...] = (name, config, options)
         self.name = f"{name}-{options.size}"
         self.settings = config.training
         self.window = 3 + config.pushforward
@@ -115,6 +118,20 @@ class ParticleSimulator(TorchModel):
         with initial_weights("particle model", options.seed):
             self.network = self._make_network()
         self.register_buffer("touch", torch.zeros(2, dtype=torch.float64))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return how another process makes the same model, on its CPU.
+
+        Weights go there as arrays: torch would share their memory, which needs an open file for
+        every tensor and task.
+        """
+        weights = {name: value.detach().cpu().numpy() for name, value in self.state_dict().items()}
+        return _made_again, (type(self), self._made_of, weights, self.init, self.trained)
+
+    @property
+    def trials_together(self) -> int:
+        """Scenes that a process moves in one graph; 0 on a GPU, which is not shared."""
+        return _TOGETHER if self.device.type == "cpu" else 0
 
     @property
     def reader(self) -> str:
@@ -388,6 +405,19 @@ class ParticleSimulator(TorchModel):
         errors = _softened(mean_by(squares, layout.owners, layout.objects), self.config.knee)
         free = (layout.kinds != KINEMATIC).double()
         return ((errors * free).sum() / free.sum().clamp_min(1)).float()
+
+
+def _made_again(
+    kind: type[ParticleSimulator],
+    made_of: tuple[Any, ...],
+    weights: Mapping[str, NDArray[np.generic]],
+    init: str,
+    trained: bool,
+) -> ParticleSimulator:
+    model = kind(*made_of)
+    model.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
+    model.init, model.trained = init, trained
+    return model.eval()
 
 
 def _shown(futures: Sequence[Futures], observed: int) -> dict[str, NDArray[np.generic]]:

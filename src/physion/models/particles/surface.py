@@ -17,6 +17,9 @@ F64 = NDArray[np.float64]
 
 _FINE = 3
 """Candidates per distance of neighbouring points."""
+_KEPT = 8192
+"""Shapes whose points are kept, about 5 kB each: several models ask for those of all trials in
+turn."""
 
 
 def surface_points(shape_name: str, scale: Vec3, spacing: float, limit: int) -> tuple[F64, F64]:
@@ -59,7 +62,7 @@ def surface_points(shape_name: str, scale: Vec3, spacing: float, limit: int) -> 
     return points.copy(), normals.copy()
 
 
-@lru_cache(maxsize=1024)
+@lru_cache(maxsize=_KEPT)
 def _spread(shape_name: str, scale: Vec3, spacing: float, limit: int) -> tuple[F64, F64]:
     candidates, normals, corner = _candidates(shape_name, scale, spacing, limit)
     middle = (candidates.min(axis=0) + candidates.max(axis=0)) / 2
