@@ -1,21 +1,23 @@
-"""Speed of C-SWM and RPIN, and what they have learned of movies that they were not trained on.
+"""Speed of the vision models, and what they have learned of movies that they were not trained on.
 
-    OMP_NUM_THREADS=1 python benchmarks/object_models.py speed --write    # seconds a clip
-    python benchmarks/object_models.py learn FOLDER --write               # ranks, errors of boxes
+    OMP_NUM_THREADS=1 python benchmarks/vision_models.py speed --write    # seconds a clip
+    python benchmarks/vision_models.py learn FOLDER --write               # after trainings
 
 ``speed`` times a training step (forward and backward) and the features of a clip, with what is
 imagined, on random pictures with moving boxes; times are processor time on a CPU.
 
 ``learn`` needs the trials of ``physion generate FOLDER --width 64 --height 64`` with the splits
 training and testing. It trains the small models with three seeds and prints, for one clip of every
-testing trial, before and after the training and for the trivial predictor:
+testing trial, after and before the training and for the trivial predictor:
 
-- C-SWM: the mean reciprocal rank of the true next state among 100 states, five of each of 20 clips;
-  the trivial predictor copies the present state.
+- C-SWM: the mean reciprocal rank of the true next state among all states of 20 clips; the trivial
+  predictor copies the present state.
 - RPIN: the mean distance of predicted from true centres of boxes, as part of the picture's side,
   times 1000; the trivial predictor keeps the last velocity.
+- SVG and OP3: the squared error of moving pixels of the imagined frames, times 1000
+  (`physion.models.vision.moving`); the trivial predictor repeats the last observed picture.
 
-With --write a section of ``results/object_models.md`` is replaced.
+With --write a section of ``results/vision_models.md`` is replaced.
 """
 
 from __future__ import annotations
@@ -27,35 +29,46 @@ import os
 import platform
 import re
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from physion import Dataset, build_model
 from physion.models.batch import Batch, Spec
 from physion.models.cswm.contrast import ranking
-from physion.seeds import generator
+from physion.seeds import generator, stable_hash
 from physion.training.sources.open_source import whole_source
 from physion.training.train import train_model
-from pixel_models import best_time, table
 
-RESULTS = Path(__file__).parent / "results" / "object_models.md"
-MODELS = (("cswm", "small", 8), ("cswm", "paper", 1), ("rpin", "small", 4), ("rpin", "paper", 1))
-"""Models whose speed is measured: name, size, clips of a batch."""
-RANKED_CLIPS = 20
-"""Clips whose states are ranked together: with five states each, 100."""
+RESULTS = Path(__file__).parent / "results" / "vision_models.md"
+NAMES = ("cswm", "rpin", "svg", "op3")
+MODELS: tuple[tuple[str, dict[str, Any], int], ...] = (
+    ("cswm", {}, 8),
+    ("cswm", {"size": "paper"}, 1),
+    ("rpin", {}, 4),
+    ("rpin", {"size": "paper"}, 1),
+    ("svg", {}, 8),
+    ("svg", {"backbone": "vgg"}, 2),
+    ("svg", {"size": "paper"}, 1),
+    ("svg", {"size": "paper", "backbone": "dcgan"}, 1),
+    ("op3", {}, 4),
+    ("op3", {"size": "paper"}, 1),
+)
+"""Models whose speed is measured: name, options, clips of a batch."""
+TESTED_CLIPS = 20
+"""Clips of a batch of testing trials, whose states are ranked together."""
 LATEST_START = 40
 """Last frame at which a tested clip starts; later most objects rest."""
 
-Rows = list[list[str]]
+Rows = Iterator[list[str]]
 
 
-def moving_clips(clips: int, frames: int, spec: Spec) -> Batch:
+def random_clips(clips: int, frames: int, spec: Spec) -> Batch:
     """Return clips of random pictures in which the boxes of all objects move, as tensors."""
-    rng = np.random.default_rng(0)
+    rng = generator("clips of random pictures")
     shape = (clips, frames, spec.image_size, spec.image_size, 3)
     ends = rng.uniform(0.2, 0.8, (2, clips, 1, spec.objects, 2))
     part = np.linspace(0, 1, frames)[None, :, None, None]
@@ -70,40 +83,50 @@ def moving_clips(clips: int, frames: int, spec: Spec) -> Batch:
     ).to("cpu")
 
 
-def speed(repeats: int) -> Rows:
-    """Return name, weights, pictures, frames and the least processor times of each model."""
-    rows = []
-    for name, size, clips in MODELS:
-        model: Any = build_model(name, size=size)
+def speed(names: list[str], repeats: int) -> Rows:
+    """Yield name, weights, pictures, frames and the least processor times of each model."""
+    for name, options, clips in MODELS:
+        if name not in names:
+            continue
+        model: Any = build_model(name, **options)
         spec = model.spec
-        window = moving_clips(clips, model.window, spec)
-        context = moving_clips(clips, spec.context, spec)
+        window = random_clips(clips, model.window, spec)
+        context = random_clips(clips, spec.context, spec)
 
         def train(model: Any = model, window: Batch = window) -> None:
             model.train().loss(window)["loss"].backward()
 
         def extract(model: Any = model, context: Batch = context) -> None:
-            with torch.inference_mode():
+            with torch.no_grad():
                 model.eval().encode(context)
                 model.imagine(context, 1, 0)
 
         weights = sum(value.numel() for value in model.parameters())
         times = [best_time(function, repeats) / clips for function in (train, extract)]
         cells = [model.name, f"{weights / 1e6:.2f} M", f"{spec.image_size} px", str(model.window)]
-        rows.append([*cells, *(f"{seconds:.4f}" for seconds in times)])
-        print(*rows[-1], flush=True)
-    return rows
+        yield [*cells, *(f"{seconds:.4f}" for seconds in times)]
+
+
+def best_time(function: Callable[[], None], repeats: int) -> float:
+    """Return the least processor time of several calls, seconds."""
+    function()
+    times = []
+    for _ in range(repeats):
+        start = time.process_time()
+        function()
+        times.append(time.process_time() - start)
+    return min(times)
 
 
 def learn(folder: Path, names: list[str], steps: int, seeds: int) -> Rows:
-    """Return the metrics of testing trials by model and seed."""
-    dataset, rows = Dataset(folder), []
+    """Yield the metrics of testing trials by model and seed."""
+    dataset = Dataset(folder)
     for name in names:
         for seed in range(seeds):
             model: Any = build_model(name, seed=seed)
             source = whole_source(dataset, model.spec)
             clips = tested_clips(model, source, dataset.trials("testing"))
-            before, _ = metrics(name, model, clips)
+            before, _ = metric(name, model, clips)
             start = time.process_time()
             train_model(
                 model,
@@ -116,44 +139,65 @@ def learn(folder: Path, names: list[str], steps: int, seeds: int) -> Rows:
                 accelerator="cpu",
             )
             seconds = time.process_time() - start
-            after, trivial = metrics(name, model, clips)
+            after, trivial = metric(name, model, clips)
             values = [f"{value:.3f}" for value in (after, before, trivial)]
-            rows.append([model.name, str(seed), *values, f"{seconds:.0f}"])
-            print(*rows[-1], flush=True)
-    return rows
+            yield [model.name, str(seed), *values, f"{seconds:.0f}"]
 
 
 def tested_clips(model: Any, source: Any, trials: list[str]) -> list[Batch]:
     """Return one training clip of every trial, from an early frame, in batches."""
     rng = generator("tested clips")
     starts = rng.integers(LATEST_START + 1, size=len(trials)).tolist()
-    groups = range(0, len(trials) - RANKED_CLIPS + 1, RANKED_CLIPS)
+    groups = range(0, len(trials) - TESTED_CLIPS + 1, TESTED_CLIPS)
     if not groups:
-        raise SystemExit(f"learn needs {RANKED_CLIPS} testing trials or more")
-    chosen = [slice(start, start + RANKED_CLIPS) for start in groups]
+        raise SystemExit(f"learn needs {TESTED_CLIPS} testing trials or more")
+    chosen = [slice(start, start + TESTED_CLIPS) for start in groups]
     return [source.window(trials[part], starts[part], model.window).to("cpu") for part in chosen]
 
 
 @torch.no_grad()
-def metrics(name: str, model: Any, clips: list[Batch]) -> tuple[float, float]:
+def metric(name: str, model: Any, clips: list[Batch]) -> tuple[float, float]:
     """Return the metric of a model and of the trivial predictor, means over the batches."""
+    metrics = {"cswm": reciprocal_ranks, "rpin": center_distances}
     model.eval()
-    pairs: list[tuple[float, float]] = []
-    for batch in clips:
-        if name == "cswm":
-            ranks, copied = model.next_state_ranks(batch)
-            pairs.append((ranking(ranks).reciprocal, ranking(copied).reciprocal))
-        else:
-            errors: tuple[Tensor, Tensor] = model.center_errors(batch)
-            own, constant = (1000 * float(value.nanmean()) for value in errors)
-            pairs.append((own, constant))
+    pairs = []
+    with torch.random.fork_rng(devices=[]):
+        for number, batch in enumerate(clips):
+            torch.manual_seed(stable_hash("tested clips", number) % 2**63)
+            pairs.append(metrics.get(name, moving_errors)(model, batch))
     own, trivial = np.mean(pairs, axis=0)
     return float(own), float(trivial)
 
 
+def reciprocal_ranks(model: Any, batch: Batch) -> tuple[float, float]:
+    """Return the mean reciprocal ranks of true next states: of the model, of a copy."""
+    ranks, copied = model.next_state_ranks(batch)
+    return ranking(ranks).reciprocal, ranking(copied).reciprocal
+
+
+def center_distances(model: Any, batch: Batch) -> tuple[float, float]:
+    """Return 1000 times the distances of centres: of the model, at constant velocity."""
+    own, constant = (1000 * float(value.nanmean()) for value in model.center_errors(batch))
+    return own, constant
+
+
+def moving_errors(model: Any, batch: Batch) -> tuple[float, float]:
+    """Return 1000 times the errors of moving pixels: of the model, of a copy."""
+    return 1000 * float(model.loss(batch)["loss"]), 1000 * float(model.baseline(batch))
+
+
+def table(head: list[str], rows: Rows) -> str:
+    """Return a Markdown table; print its rows as they come."""
+    lines = [head, ["---"] * len(head)]
+    for row in rows:
+        print(*row, flush=True)
+        lines.append(row)
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
 def write_section(title: str, text: str) -> None:
     """Replace a section of the results, or append it."""
-    known = RESULTS.read_text() if RESULTS.is_file() else "# C-SWM and RPIN\n"
+    known = RESULTS.read_text() if RESULTS.is_file() else "# Vision models\n"
     known = re.sub(rf"\n## {re.escape(title)}\n.*?(?=\n## |\Z)", "", known, flags=re.DOTALL)
     where = f"{datetime.date.today()}, {platform.machine()}, torch {torch.__version__}"
     threads = f"{torch.get_num_threads()} thread(s), load {os.getloadavg()[0]:.1f}"
@@ -165,7 +209,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("part", choices=("speed", "learn"))
     parser.add_argument("folder", nargs="?", type=Path)
-    parser.add_argument("--models", nargs="+", default=["cswm", "rpin"], choices=("cswm", "rpin"))
+    parser.add_argument("--models", nargs="+", default=list(NAMES), choices=NAMES)
     parser.add_argument("--steps", type=int, default=0, help="0: those of the model")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--repeats", type=int, default=3)
@@ -173,13 +217,14 @@ def main() -> None:
     options = parser.parse_args()
     if options.part == "speed":
         head = ["model", "weights", "pictures", "frames", "training step, s", "features, s"]
-        title, text = "Processor time of a clip", table(head, speed(options.repeats))
+        title, rows = "Processor time of a clip", speed(options.models, options.repeats)
     else:
         if options.folder is None:
             parser.error("learn needs the folder of the trials")
-        rows = learn(options.folder, options.models, options.steps, options.seeds)
         head = ["model", "seed", "trained", "untrained", "trivial", "training, s"]
-        title, text = "Rank of the next state, and distance of boxes", table(head, rows)
+        title = "What was learned of new clips"
+        rows = learn(options.folder, options.models, options.steps, options.seeds)
+    text = table(head, rows)
     print(text)
     if options.write:
         write_section(title, text)
