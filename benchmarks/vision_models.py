@@ -1,7 +1,8 @@
 """Speed of the vision models, and what they have learned of movies that they were not trained on.
 
-    OMP_NUM_THREADS=1 python benchmarks/vision_models.py speed --write    # seconds a clip
-    python benchmarks/vision_models.py learn FOLDER --write               # after trainings
+    OMP_NUM_THREADS=1 python benchmarks/vision_models.py speed --write           # seconds a clip
+    python benchmarks/vision_models.py learn FOLDER --write                      # after trainings
+    OMP_NUM_THREADS=1 python benchmarks/vision_models.py boxes FOLDER --write    # steps a second
 
 ``speed`` times a training step (forward and backward) and the features of a clip, with what is
 imagined, on random pictures with moving boxes; times are processor time on a CPU.
@@ -16,6 +17,10 @@ testing trial, after and before the training and for the trivial predictor:
   times 1000; the trivial predictor keeps the last velocity.
 - SVG and OP3: the squared error of moving pixels of the imagined frames, times 1000
   (`physion.models.vision.moving`); the trivial predictor repeats the last observed picture.
+
+``boxes`` trains RPIN (small) on the same trials and prints the steps a second of processor time,
+reading and rendering included: with boxes that are rendered for every window, with those of earlier
+windows kept, and with all of them kept from the start.
 
 With --write a section of ``results/vision_models.md`` is replaced.
 """
@@ -40,7 +45,12 @@ from physion import Dataset, build_model
 from physion.models.batch import Batch, Spec
 from physion.models.cswm.contrast import ranking
 from physion.seeds import generator, stable_hash
+from physion.training.sources.batches import ObservedBatches, TrialReaders, WholeBatches
+from physion.training.sources.kept_boxes import MOST_BYTES
+from physion.training.sources.movies import MovieReader, movie_files
 from physion.training.sources.open_source import whole_source
+from physion.training.sources.rendered import MotionRenderer
+from physion.training.sources.states import TrialMotions
 from physion.training.train import train_model
 
 RESULTS = Path(__file__).parent / "results" / "vision_models.md"
@@ -62,6 +72,8 @@ TESTED_CLIPS = 20
 """Clips of a batch of testing trials, whose states are ranked together."""
 LATEST_START = 40
 """Last frame at which a tested clip starts; later most objects rest."""
+BOX_STEPS = 100
+"""Steps of the trainings with and without kept boxes."""
 
 Rows = Iterator[list[str]]
 
@@ -186,6 +198,47 @@ def moving_errors(model: Any, batch: Batch) -> tuple[float, float]:
     return 1000 * float(model.loss(batch)["loss"]), 1000 * float(model.baseline(batch))
 
 
+def boxes(folder: Path, steps: int) -> Rows:
+    """Yield which boxes are kept, steps a second, and their ratio to those without kept boxes."""
+    dataset = Dataset(folder)
+    trials = dataset.trials("training")
+    files = {trial: dataset.paths(trial).trial_file for trial in trials}
+    motions = TrialMotions(files, observed=False)
+    lengths = {trial: len(motions[trial].trajectory) for trial in trials}
+    first = 0.0
+    for kept, most_bytes in (("none", 0), ("of earlier windows", MOST_BYTES), ("all", MOST_BYTES)):
+        model: Any = build_model("rpin")
+        renderer = MotionRenderer(
+            motions,
+            ["boxes"],
+            model.spec.image_size,
+            model.spec.objects,
+            dict.fromkeys(trials, "redyellow"),
+            most_bytes,
+        )
+        for trial, length in lengths.items():
+            # One frame compiles and reads what every line needs.
+            renderer.read(trial, np.arange(length if kept == "all" else 1))
+        movies = movie_files(dataset, observed=False)
+        pictures = MovieReader(movies, model.spec.image_size, verify=False)
+        readers = TrialReaders(lengths, [pictures, renderer])
+        source = WholeBatches(ObservedBatches(model.spec, readers), readers)
+        start = time.process_time()
+        train_model(
+            model,
+            source,
+            trials,
+            settings=dataclasses.replace(model.settings, steps=steps, held_out=0.0),
+            seed=0,
+            name="all",
+            folder=None,
+            accelerator="cpu",
+        )
+        rate = steps / (time.process_time() - start)
+        first = first or rate
+        yield [kept, str(steps), f"{rate:.2f}", f"{rate / first:.2f}"]
+
+
 def table(head: list[str], rows: Rows) -> str:
     """Return a Markdown table; print its rows as they come."""
     lines = [head, ["---"] * len(head)]
@@ -207,7 +260,7 @@ def write_section(title: str, text: str) -> None:
 def main() -> None:
     """Run one part."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("part", choices=("speed", "learn"))
+    parser.add_argument("part", choices=("speed", "learn", "boxes"))
     parser.add_argument("folder", nargs="?", type=Path)
     parser.add_argument("--models", nargs="+", default=list(NAMES), choices=NAMES)
     parser.add_argument("--steps", type=int, default=0, help="0: those of the model")
@@ -218,12 +271,16 @@ def main() -> None:
     if options.part == "speed":
         head = ["model", "weights", "pictures", "frames", "training step, s", "features, s"]
         title, rows = "Processor time of a clip", speed(options.models, options.repeats)
-    else:
-        if options.folder is None:
-            parser.error("learn needs the folder of the trials")
+    elif options.folder is None:
+        parser.error(f"{options.part} needs the folder of the trials")
+    elif options.part == "learn":
         head = ["model", "seed", "trained", "untrained", "trivial", "training, s"]
         title = "What was learned of new clips"
         rows = learn(options.folder, options.models, options.steps, options.seeds)
+    else:
+        head = ["boxes kept", "steps", "steps a second", "ratio"]
+        title = "Training steps of RPIN a second"
+        rows = boxes(options.folder, options.steps or BOX_STEPS)
     text = table(head, rows)
     print(text)
     if options.write:

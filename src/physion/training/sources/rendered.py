@@ -1,4 +1,9 @@
-"""Clips rendered on demand from motions: no file is read or written, and no movie encoded."""
+"""Clips rendered on demand from motions: no file is read or written, and no movie encoded.
+
+Boxes are small, but ids of pixels have to be rendered for them. They are kept by trial and frame.
+Most of the time goes into the preparation of a scene, so that a trial that is read a second time is
+rendered as a whole: later windows of it need no rendering for their boxes.
+"""
 
 from __future__ import annotations
 
@@ -22,15 +27,16 @@ from physion.models.batch import (
     Spec,
 )
 from physion.rendering.camera import projection_matrix, view_matrix
-from physion.rendering.renderer import PASSES, VERSION, Frame, Renderer
+from physion.rendering.renderer import PASSES, VERSION, Renderer
 from physion.scenes.looks import in_look
 from physion.scenes.scene import Scene
 from physion.training.sources.batches import ObservedBatches, TrialReaders, WholeBatches
+from physion.training.sources.kept_boxes import MOST_BYTES, KeptBoxes
 from physion.training.sources.motions import CutMotions, cut_motion, motion_digest
 from physion.training.sources.source import FutureFrameError
 
-_PASS = {"rgb": "color", "ids": "ids", "boxes": "ids", "depth": "depth"}
-"""Pass of the renderer by input of a `Spec`."""
+_PASS = {"rgb": "color", "ids": "ids", "depth": "depth"}
+"""Pass of the renderer by input of a `Spec`; boxes are those of the ids."""
 _MOST_OBJECTS = 255
 """Largest id of an object in ``Batch.ids``."""
 
@@ -50,6 +56,8 @@ class MotionRenderer:
         Rows of ``boxes``.
     looks
         Colours by trial, ``redyellow`` or ``free``.
+    kept_bytes
+        Memory for boxes that were read before, at most; 0 keeps none.
     """
 
     def __init__(
@@ -59,17 +67,20 @@ class MotionRenderer:
         size: int,
         objects: int,
         looks: Mapping[str, str],
+        kept_bytes: int = MOST_BYTES,
     ) -> None:
         self._motions, self._inputs = motions, tuple(inputs)
         self._size, self._objects, self._looks = size, objects, looks
-        self._passes = tuple({_PASS[name]: None for name in inputs if name in _PASS})
+        self._passes = tuple(_PASS[name] for name in inputs if name in _PASS)
+        self._kept_boxes = KeptBoxes(objects, kept_bytes)
         self._digests: dict[str, str] = {}
 
     def read(self, trial: str, frames: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
         """Return the inputs of the clip that shows ``frames``."""
         motion = self._motions[trial]
         scene, size = motion.scene, self._size
-        arrays = self._render(trial, motion, frames) if self._passes else {}
+        seen = self._passes or "boxes" in self._inputs
+        arrays = self._render(trial, motion, frames) if seen else {}
         if "camera" in self._inputs:
             projection = projection_matrix(scene.camera, size, size)
             arrays["camera"] = np.stack([view_matrix(scene.camera), projection])
@@ -84,19 +95,37 @@ class MotionRenderer:
                 f"trial {trial!r} was imported without motion ({motion.trajectory.engine}): it "
                 "cannot be rendered, only its movies can be read"
             )
+        drawn = self._draw(trial, motion, chosen, self._passes) if self._passes else {}
+        arrays = {name: drawn[_PASS[name]] for name in self._inputs if name in _PASS}
+        if "boxes" in self._inputs:
+            known = "ids" in arrays
+            arrays["boxes"] = (
+                boxes(arrays["ids"], self._objects) if known else self._boxes(trial, motion, chosen)
+            )
+        return {name: values[rows] for name, values in arrays.items()}
+
+    def _draw(
+        self, trial: str, motion: Motion, frames: NDArray[np.int64], passes: Sequence[str]
+    ) -> dict[str, NDArray[Any]]:
+        """Return passes of frames by name, the ids as in ``Batch.ids``."""
         scene = in_look(motion.scene, self._looks[trial])
         renderer = Renderer(scene, motion.trajectory, self._size, self._size)
-        shown = [renderer.render(int(frame), self._passes) for frame in chosen]
-        passes = {name: _stack(shown, name) for name in self._passes}
-        if "ids" in passes:
-            passes["ids"] = object_ids(scene)[passes["ids"]]
-        return {
-            name: boxes(passes["ids"], self._objects)[rows]
-            if name == "boxes"
-            else passes[_PASS[name]][rows]
-            for name in self._inputs
-            if name in _PASS
-        }
+        shown = [renderer.render(int(frame), passes) for frame in frames]
+        drawn = {name: np.stack([getattr(frame, name) for frame in shown]) for name in passes}
+        if "ids" in drawn:
+            drawn["ids"] = object_ids(scene)[drawn["ids"]]
+        return drawn
+
+    def _boxes(self, trial: str, motion: Motion, frames: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Return boxes (T, K, 4) of frames (T,), which increase; those not kept are rendered."""
+        found, known = self._kept_boxes.get(trial, frames)
+        if known.all():
+            return found
+        wanted = np.union1d(frames[~known], self._kept_boxes.missing(trial))
+        new = boxes(self._draw(trial, motion, wanted, ("ids",))["ids"], self._objects)
+        self._kept_boxes.add(trial, len(motion.trajectory), wanted, new)
+        found[~known] = new[np.searchsorted(wanted, frames[~known])]
+        return found
 
     def identity(self, trial: str) -> str:
         """Return look, version of the renderer, and digest of scene and motion."""
@@ -207,7 +236,3 @@ def boxes(ids: NDArray[np.uint8], objects: int) -> NDArray[np.float32]:
         )
         out[seen, number - 1] = np.stack(edges, axis=1)
     return out
-
-
-def _stack(frames: Sequence[Frame], name: str) -> NDArray[Any]:
-    return np.stack([getattr(frame, name) for frame in frames])
