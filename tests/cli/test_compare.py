@@ -110,7 +110,7 @@ def own_study(folder: Path) -> Own:
     ]  # fmt: skip
     answers = pd.DataFrame(rows)
     answers.to_csv(folder / "trials.csv", index=False)
-    answers[["session", "stimulus"]].to_csv(folder / "expected.csv", index=False)
+    answers[["session", "stimulus"]].to_csv(folder / "lists.csv", index=False)
     p = generator.random(32).round(3)
     pd.DataFrame(
         {
@@ -134,7 +134,7 @@ def own_study(folder: Path) -> Own:
         movie.parent.mkdir(parents=True, exist_ok=True)
         movie.write_bytes(b"not a movie")
     index.to_parquet(dataset / "index.parquet")
-    return Own(folder / "m.csv", folder / "trials.csv", dataset, folder / "expected.csv")
+    return Own(folder / "m.csv", folder / "trials.csv", dataset, folder / "lists.csv")
 
 
 @pytest.mark.slow
@@ -151,7 +151,7 @@ def test_every_option_of_a_comparison_reaches_the_report(
     assert [session for session, flag in flags.items() if flag] == ["drop-p0"]
     assert "60 resamples, seed 0" in plain["methods"]["Intervals"]
     assert (
-        "anyone answered: collide 16, drop 16; 1 session"
+        "sessions answered: collide 16, drop 16; 1 session lacked some"
         in (plain["methods"]["Trials of a whole session"])
     )
     assert all(row["reason"] for row in plain["people_hypotheses"] if row["hypothesis"] == "H1")
@@ -162,8 +162,7 @@ def test_every_option_of_a_comparison_reaches_the_report(
     found = json.loads(capsys.readouterr().out)
     assert not any(row["incomplete"] for row in found["people_flags"])
     assert (
-        "list that was given: collide 16, drop 12 to 16"
-        in (found["methods"]["Trials of a whole session"])
+        "study's list: collide 16, drop 12 to 16" in (found["methods"]["Trials of a whole session"])
     )
     assert "official-code" in found["methods"]["People"]
     assert "seed 5" in found["methods"]["Intervals"]
@@ -189,8 +188,8 @@ def test_the_python_of_the_documentation_runs(
     predictions.mkdir(parents=True)
     data.mkdir()
     own.predictions.rename(predictions / "model-1234.csv")
-    for path in (own.responses, tmp_path / "expected.csv"):
-        path.rename(data / path.name)
+    own.responses.rename(data / own.responses.name)
+    own.expected.rename(data / "expected.csv")
     (tmp_path / "dataset").rename(tmp_path / "trials")
     page = (Path(__file__).parents[2] / "docs" / "analysis.md").read_text(encoding="utf-8")
     code = page.split("```python\n")[1].split("```")[0]
@@ -425,6 +424,8 @@ def test_leaderboard_flags_sessions_and_reads_the_raw_files(
     assert "1 of 16 sessions flagged by the rules “preregistered”" in capsys.readouterr().out
     assert main([*command, "--expected", str(own.expected), "--rules", "official-code"]) == 0
     assert "0 of 16 sessions flagged by the rules “official-code”" in capsys.readouterr().out
+    assert main([*command[:3], "--accept-rules", "slow"]) == 2
+    assert "--responses" in capsys.readouterr().err
     assert main([*command[:3], "--rules", "official-code"]) == 2
     assert "--responses" in capsys.readouterr().err
     answers = pd.read_csv(own.responses)
@@ -447,3 +448,26 @@ def test_leaderboard_flags_sessions_and_reads_the_raw_files(
         assert main([*command[:3], "--responses", *responses, "--json"]) == 0
         kappas.append(json.loads(capsys.readouterr().out)["rows"][0]["kappa"])
     assert kappas[0] == kappas[1] is not None
+
+
+def test_too_many_left_out_is_one_line_and_stray_answers_are_warned_of(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = own_study(tmp_path)
+    answers = pd.read_csv(own.responses)
+    stray = answers[answers["session"] == "drop-p1"].tail(1).assign(stimulus="drop_x", trial=99)
+    pd.concat([answers, stray]).to_csv(own.responses, index=False)
+    command = ["compare", "leaderboard", str(own.predictions), "--responses", str(own.responses)]
+    assert main(command) == 0
+    told = capsys.readouterr()
+    assert "1 of 16 sessions flagged" in told.out
+    assert told.err.count("\n") == 1 and "warning: drop: answers" in told.err
+    listed = pd.read_csv(own.expected)
+    few = tmp_path / "expected.csv"
+    pd.concat([listed, listed[:16].assign(stimulus="drop_y")]).to_csv(few, index=False)
+    assert main(command) == 2
+    told = capsys.readouterr()
+    assert told.err.count("\n") == 1
+    assert "'incomplete' leaves out 8 of 8 sessions of collide" in told.err
+    assert main([*command, "--accept-rules", "incomplete"]) == 0
+    assert "8 of 16 sessions flagged" in capsys.readouterr().out

@@ -35,6 +35,7 @@ class ComparisonResults:
     - ``paired``: from `model_tests.paired_tests`, all scenarios pooled; None for one model.
     - ``calibration``: from `model_tests.calibration_scores`.
     - ``mixed``: from `mixed_fits`.
+    - ``warnings``: what may make the results wrong, one sentence each.
     """
 
     comparison: Comparison
@@ -45,6 +46,7 @@ class ComparisonResults:
     paired: pd.DataFrame | None = None
     calibration: pd.DataFrame | None = None
     mixed: tuple[MixedTable, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 def compare(
@@ -147,4 +149,5 @@ def _with_participants(
         paired=beside.tests if agents > 1 else None,
         calibration=beside.calibration,
         mixed=(*fits_of_people(people), *fits_of_models(main)),
+        warnings=people.warnings,
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,9 @@ from physion.analysis import (
     read_predictions,
 )
 from physion.analysis.models.rollout_errors import read_rollout_errors, rollout_error_table
+from physion.analysis.people.completeness import Expected, find_expected, read_expected
 from physion.analysis.people.exclusions import PREREGISTERED
-from physion.analysis.people.results import read_attributes, read_expected
+from physion.analysis.people.results import read_attributes
 from physion.analysis.results import ComparisonResults, compare
 from physion.analysis.tables.responses import LABELS_FILE, DominoesLook, find_next_to
 from physion.analysis.tables.stimuli import read_stimulus_list
@@ -84,7 +85,8 @@ def report_numbers(inputs: ReportInputs) -> dict[str, Any]:
         for name, table in inputs.tables().items()
         if name != "stimuli"
     }
-    return {"methods": {**inputs.methods, **inputs.comparison.settings}, **values}
+    methods = {**inputs.methods, **inputs.comparison.settings}
+    return {"methods": methods, "warnings": list(inputs.warnings), **values}
 
 
 # --- from files ---------------------------------------------------------------------------------
@@ -99,7 +101,8 @@ def compare_files(
     responses: Sequence[Path] = (),
     sessions: Path | None = None,
     rules: str = PREREGISTERED.name,
-    expected: Path | Mapping[str, int] | None = None,
+    expected: Path | Expected | None = None,
+    accept_rules: Collection[str] = (),
     attributes: Path | pd.DataFrame | None = None,
     zone: Path | None = None,
     exclude: Path | None = None,
@@ -132,8 +135,11 @@ def compare_files(
     rules
         Name of the exclusion rules, see `exclusions.RULE_SETS`.
     expected
-        The stimuli that a session must have: a file for `read_expected`, or counts by scenario or
-        session; None: those that anyone answered.
+        The stimuli that a session must have: a file for `read_expected`, or stimuli by scenario or
+        session. None looks for ``expected.csv`` beside the responses, and else takes those that at
+        least half of the scenario's sessions answered.
+    accept_rules
+        Exclusion rules that may leave out more than a third of a scenario's sessions.
     attributes
         Elements, distractors and occluders of one's own stimuli: a table of
         `attributes.attributes_from_table`, its file, or a dataset.
@@ -167,9 +173,11 @@ def compare_files(
         if humans is not None:
             raise BadInputError("give people's tables (humans) or their responses, not both")
         given = read_labels(labels) if isinstance(labels, Path) else labels
+        expected = find_expected(responses) if expected is None else expected
         people = people_from_files(
             responses, sessions, rules, given, excluded, exclude_ledge, draws,
             expected=read_expected(expected) if isinstance(expected, Path) else expected,
+            accept_rules=accept_rules,
             attributes=read_attributes(attributes) if isinstance(attributes, Path) else attributes,
         )  # fmt: skip
         results = compare(
@@ -183,8 +191,10 @@ def compare_files(
         if attributes is not None:
             choices.setdefault("Attributes of stimuli", describe_attributes(people))
     else:
-        if sessions is not None or expected is not None or attributes is not None:
-            raise BadInputError("sessions, expected and attributes are about responses: give those")
+        if sessions is not None or expected is not None or attributes is not None or accept_rules:
+            raise BadInputError(
+                "sessions, expected, attributes and accepted rules are about responses: give those"
+            )
         settings: dict[str, Any] = {"exclude": excluded, "exclude_ledge": exclude_ledge}
         results, words = _with_averages(
             rows, humans, labels, zone, dominoes, {**settings, "bootstrap": draws}

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import pandas as pd
 
+from physion.analysis.people.completeness import Expected
 from physion.analysis.people.participants import check_labels
 from physion.analysis.people.results import (
     PeopleResults,
@@ -43,7 +44,8 @@ def people_from_files(
     exclude_ledge: bool,
     draws: Bootstrap,
     *,
-    expected: Mapping[str, int] | None = None,
+    expected: Expected | None = None,
+    accept_rules: Collection[str] = (),
     attributes: pd.DataFrame | None = None,
 ) -> PeopleResults:
     """Read responses and run every analysis of people."""
@@ -55,6 +57,7 @@ def people_from_files(
         read,
         rules=chosen,
         expected=expected,
+        accept_rules=accept_rules,
         attributes=attributes,
         exclude=excluded,
         exclude_ledge=exclude_ledge,
@@ -73,7 +76,7 @@ def describe_people(responses: Sequence[Path], people: PeopleResults) -> str:
 
 
 def describe_expected(people: PeopleResults, given: bool) -> str:
-    """Describe how many trials a session must have, and how many sessions had fewer."""
+    """Describe how many stimuli a session must have, and how many sessions lack some."""
     flags = people.tables["flags"]
     counts = flags.groupby("scenario")["expected"].agg(["min", "max"])
     each = ", ".join(
@@ -81,11 +84,11 @@ def describe_expected(people: PeopleResults, given: bool) -> str:
         for name, row in counts.iterrows()
     )
     by = (
-        "by the list that was given"
+        "by the study's list"
         if given
-        else "all stimuli of the scenario that anyone answered"
+        else "stimuli that at least half of the scenario's sessions answered"
     )
-    return f"{by}: {each}; {plural(int(flags['incomplete'].sum()), 'session')} had fewer"
+    return f"{by}: {each}; {plural(int(flags['incomplete'].sum()), 'session')} lacked some"
 
 
 def describe_attributes(people: PeopleResults) -> str:

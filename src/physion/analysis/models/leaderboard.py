@@ -8,7 +8,7 @@ ranks after those that lack none, whatever its scores. Anchors of the files foll
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,9 +27,16 @@ from physion.analysis.models.leaderboard_rows import (
     score_models,
 )
 from physion.analysis.models.observed_contact import observed_contacts
+from physion.analysis.people.completeness import (
+    Expected,
+    check_expected,
+    completeness_warnings,
+    drop_unexpected,
+)
 from physion.analysis.people.exclusions import (
     PREREGISTERED,
     ExclusionRules,
+    check_excluded,
     flag_sessions,
     without_flagged,
 )
@@ -55,6 +62,7 @@ class Leaderboard:
     - ``dropped_answers``: excluded answers of people (`Responses.dropped`); None without single
       answers.
     - ``settings``: the settings as text, by name.
+    - ``warnings``: what may make the scores wrong, one sentence each.
     """
 
     table: pd.DataFrame
@@ -63,6 +71,7 @@ class Leaderboard:
     refused: pd.DataFrame
     dropped_answers: pd.DataFrame | None
     settings: Mapping[str, str]
+    warnings: tuple[str, ...] = ()
 
 
 def leaderboard(
@@ -72,7 +81,8 @@ def leaderboard(
     responses: Responses | None = None,
     *,
     rules: ExclusionRules = PREREGISTERED,
-    expected: Mapping[str, int] | None = None,
+    expected: Expected | None = None,
+    accept_rules: Collection[str] = (),
     scenario: str = MEAN,
     exclude: Iterable[str] = (),
     exclude_ledge: bool = True,
@@ -90,8 +100,8 @@ def leaderboard(
     responses
         Answers of single participants; the sessions that ``rules`` flag are left out. They give
         kappa and, if ``humans`` is None, replace it.
-    rules, expected
-        As in `exclusions.flag_sessions`.
+    rules, expected, accept_rules
+        As in `people.results.analyse_people`.
     scenario
         One of the eight, *mean* (with equal weights) or *pooled*.
     later
@@ -111,7 +121,7 @@ def leaderboard(
     if scenario not in (*SCENARIOS, MEAN, POOLED):
         raise UnknownNameError("scenario", scenario, (*SCENARIOS, MEAN, POOLED))
     draws = bootstrap or Bootstrap()
-    kept, flagging = _unflagged(responses, rules, expected, labels)
+    kept, flagging = _unflagged(responses, rules, expected, accept_rules, labels)
     test = None if kept is None else kept.test
     people, outcomes = _people(humans, labels, test)
     answers = {} if test is None else {each.scenario: each for each in all_answers(test)}
@@ -154,6 +164,7 @@ def leaderboard(
         ),
         None if kept is None else kept.dropped,
         {**settings, **_describe_scores(scenario, test is not None), **flagging},
+        () if responses is None else tuple(completeness_warnings(responses, expected)),
     )
 
 
@@ -186,7 +197,8 @@ def _not_later(read: Mapping[Path, tuple[pd.DataFrame, dict[str, str]]]) -> list
 def _unflagged(
     responses: Responses | None,
     rules: ExclusionRules,
-    expected: Mapping[str, int] | None,
+    expected: Expected | None,
+    accept_rules: Collection[str],
     labels: Mapping[str, bool] | None,
 ) -> tuple[Responses | None, dict[str, str]]:
     """Return the responses without flagged sessions, and the rules as text."""
@@ -194,12 +206,15 @@ def _unflagged(
         return None, {}
     if labels is not None:
         check_labels(responses, labels)
+    check_expected(responses, expected)
     flags = flag_sessions(responses, rules, expected=expected)
+    check_excluded(flags, accept_rules)
     words = (
         f"{int(flags['flagged'].sum())} of {len(flags)} sessions flagged by the rules "
         f"“{rules.name}” and left out"
     )
-    return without_flagged(responses, flags), {"Exclusions": words}
+    kept = without_flagged(drop_unexpected(responses, expected), flags)
+    return kept, {"Exclusions": words}
 
 
 def _people(

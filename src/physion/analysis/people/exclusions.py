@@ -8,18 +8,19 @@ code, which differs from it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 import pandas as pd
 
+from physion.analysis.people.completeness import Expected
 from physion.analysis.people.participants import Responses
 from physion.analysis.people.session_measures import longest_streak, session_measures
 from physion.analysis.statistics.clustered_logit import clustered_logit
 from physion.analysis.tables.stimuli import in_order
-from physion.errors import BadInputError
+from physion.errors import BadInputError, ExclusionError, UnknownNameError
 from physion.seeds import generator
 
 RULES = (
@@ -34,6 +35,9 @@ RULES = (
 """The rules, each a column of the table of flags. ``incomplete`` sessions lack answers;
 ``repeated`` ones are a participant's second and later sessions in a scenario."""
 
+
+MOST_EXCLUDED = 1 / 3
+"""Largest fraction of a scenario's sessions that a rule may leave out unless this is confirmed."""
 
 BY_CONSTRUCTION = "by construction: sessions are flagged for their low accuracy"
 
@@ -110,7 +114,7 @@ def flag_streak(measures: pd.DataFrame, rules: ExclusionRules, seed: int = 0) ->
     limit).
     """
     if rules.streak_percentile is not None:
-        lengths = measures["expected"].astype(int)
+        lengths = measures["trials"].astype(int)
         limits = {n: streak_limit(n, rules.streak_percentile, seed=seed) for n in set(lengths)}
         return measures["longest_streak"] > lengths.map(limits)
     limit = np.inf if rules.streak_over is None else rules.streak_over
@@ -149,8 +153,8 @@ def flag_slow(measures: pd.DataFrame, rules: ExclusionRules) -> pd.Series:
 
 
 def flag_incomplete(measures: pd.DataFrame) -> pd.Series:
-    """Flag fewer answered test trials than expected."""
-    return measures["trials"] < measures["expected"]
+    """Flag an expected stimulus without an answer, or no test answer at all."""
+    return (measures["missing"] > 0) | (measures["trials"] == 0)
 
 
 def flag_repeated(measures: pd.DataFrame) -> pd.Series:
@@ -179,11 +183,13 @@ def flag_sessions(
     responses: Responses,
     rules: ExclusionRules = PREREGISTERED,
     *,
-    expected: Mapping[str, int] | None = None,
+    expected: Expected | None = None,
     seed: int = 0,
 ) -> pd.DataFrame:
     """Return one row a session: the measures, a bool for each of `RULES`, and ``flagged`` (any of
     them).
+
+    ``expected``: the stimuli of a complete session, as in `session_measures`.
 
     Flag before stimuli are dropped: rules about sequences need all answers. Centres and standard
     deviations are those of the scenario's complete sessions, whether another rule flags them or
@@ -201,6 +207,24 @@ def flag_sessions(
     }
     table = measures.assign(**{name: flag.astype(bool) for name, flag in flags.items()})
     return table.assign(flagged=table[list(RULES)].any(axis=1))
+
+
+def check_excluded(flags: pd.DataFrame, accept_rules: Collection[str] = ()) -> None:
+    """Refuse a rule that leaves out more than `MOST_EXCLUDED` of the sessions of a scenario.
+
+    A rule that flags so many is more likely wrong for these data than the sessions are.
+    ``accept_rules``: rules that may. Raises `ExclusionError`, and `UnknownNameError` for a name in
+    ``accept_rules`` that is no rule.
+    """
+    for name in accept_rules:
+        if name not in RULES:
+            raise UnknownNameError("exclusion rule", name, RULES)
+    for scenario in in_order(flags["scenario"]):
+        part = flags[flags["scenario"] == scenario]
+        for rule in RULES:
+            flagged = int(part[rule].sum())
+            if flagged > MOST_EXCLUDED * len(part) and rule not in accept_rules:
+                raise ExclusionError(rule, scenario, flagged, len(part))
 
 
 def without_flagged(responses: Responses, flags: pd.DataFrame) -> Responses:

@@ -77,6 +77,10 @@ class Responses:
         cleaned = _without(self, is_gone, "stimuli", LEDGE)
         return _without(cleaned, cleaned.trials["stimulus"].isin(unwanted), "stimuli", EXCLUDED)
 
+    def drop_rows(self, is_dropped: pd.Series, step: str, reason: str) -> Responses:
+        """Return the responses without the trials where ``is_dropped`` is True, and count these."""
+        return _without(self, is_dropped, step, reason)
+
 
 def read_responses(
     trials: Path,
@@ -260,7 +264,7 @@ def log_ms(rt_ms: npt.ArrayLike) -> npt.NDArray[np.float64]:
 
 
 def _without(cleaned: Responses, is_dropped: pd.Series, step: str, reason: str) -> Responses:
-    """Return the responses without the rows where ``gone`` is True, and count these."""
+    """Return the responses without the rows where ``is_dropped`` is True, and count these."""
     if not is_dropped.any():
         return cleaned
     counts = _counted(cleaned.trials[is_dropped], step, reason)

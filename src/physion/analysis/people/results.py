@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,11 +15,18 @@ from physion.analysis.people.biases import (
     side_bias,
     yes_bias,
 )
+from physion.analysis.people.completeness import (
+    Expected,
+    check_expected,
+    completeness_warnings,
+    drop_unexpected,
+)
 from physion.analysis.people.exclusions import (
     PREREGISTERED,
     RULE_SETS,
     RULES,
     ExclusionRules,
+    check_excluded,
     count_flags,
     flag_effect,
     flag_sessions,
@@ -45,7 +52,7 @@ from physion.analysis.tables.attributes import (
 from physion.analysis.tables.attributes import COLUMNS as ATTRIBUTE_COLUMNS
 from physion.analysis.tables.csv_table import read_csv, read_table
 from physion.errors import BadInputError, UnknownNameError
-from physion.stimulus_names import OFFICIAL_SCENARIOS, canonical_name, scenario_of
+from physion.stimulus_names import scenario_of
 
 
 @dataclass(frozen=True)
@@ -64,12 +71,15 @@ class PeopleResults:
     - ``attributes`` of the stimuli that people answered, and ``hypotheses``
       (`hypotheses.regress_hypotheses`);
     - ``left_out``: dropped answers, with their reasons.
+
+    ``warnings``: what may make the results wrong, one sentence each.
     """
 
     kept: Responses
     whole: Responses
     rules: ExclusionRules
     tables: dict[str, pd.DataFrame]
+    warnings: tuple[str, ...] = ()
 
     def labels(self) -> dict[str, bool]:
         """Return the outcome of every stimulus that people answered."""
@@ -109,24 +119,6 @@ def rules_called(name: str) -> ExclusionRules:
     return RULE_SETS[name]
 
 
-def read_expected(path: Path) -> dict[str, int]:
-    """Read how many stimuli a session must have from the list of them (CSV or parquet).
-
-    Columns: ``stimulus``, and ``session`` (if each has a list of its own) or ``scenario``. The keys
-    are sessions or scenarios, as for `exclusions.flag_sessions`.
-    """
-    table = read_table(path, ("stimulus",))
-    if "session" not in table and "scenario" not in table:
-        raise BadInputError(f"{path} must say whose stimuli these are: column session or scenario")
-    names = table["stimulus"].astype(str).map(canonical_name)
-    if "session" in table:
-        whose = table["session"].astype(str)
-    else:
-        lower = table["scenario"].astype(str).str.strip().str.lower()
-        whose = lower.replace(OFFICIAL_SCENARIOS)
-    return {str(key): int(count) for key, count in names.groupby(whose).nunique().items()}
-
-
 def read_attributes(path: Path) -> pd.DataFrame:
     """Read the attributes of one's own stimuli: a table (CSV or parquet), or a dataset or its
     index.
@@ -144,7 +136,8 @@ def analyse_people(
     responses: Responses,
     *,
     rules: ExclusionRules = PREREGISTERED,
-    expected: Mapping[str, int] | None = None,
+    expected: Expected | None = None,
+    accept_rules: Collection[str] = (),
     attributes: pd.DataFrame | None = None,
     exclude: Iterable[str] = (),
     exclude_ledge: bool = True,
@@ -159,8 +152,10 @@ def analyse_people(
     rules
         Exclusion rules.
     expected
-        Number of test trials that a session must have, by scenario or by session; by default the
-        stimuli of the scenario that anyone answered.
+        Test stimuli that a session must have, by scenario or by session; by default those that at
+        least half of the scenario's sessions answered. Answers to other stimuli are dropped.
+    accept_rules
+        Rules that may leave out more than a third of a scenario's sessions.
     attributes
         Attributes of one's own stimuli, from `attributes.attributes_from_table`; those of other
         stimuli come from official names.
@@ -173,11 +168,14 @@ def analyse_people(
     ------
     BadInputError
         If no session remains, or ``expected`` names none.
+    ExclusionError
+        If a rule leaves out more than a third of a scenario's sessions.
     """
     draws = bootstrap or Bootstrap()
-    _check_expected(responses, expected)
+    check_expected(responses, expected)
     flags = flag_sessions(responses, rules, expected=expected)
-    shown = responses.drop_stimuli(exclude, exclude_ledge)
+    check_excluded(flags, accept_rules)
+    shown = drop_unexpected(responses, expected).drop_stimuli(exclude, exclude_ledge)
     kept, whole = _sets(shown, flags)
     tables = {"flags": flags, "flag_counts": count_flags(flags)}
     tables["flag_effects"] = _flag_effects(shown, flags)
@@ -198,17 +196,8 @@ def analyse_people(
         with_attributes(tables["by_stimulus"], tables["attributes"])
     )
     tables["left_out"] = pd.concat([kept.dropped, missing_times(kept)], ignore_index=True)
-    return PeopleResults(kept, whole, rules, tables)
-
-
-def _check_expected(responses: Responses, expected: Mapping[str, int] | None) -> None:
-    """Refuse a list that names none of these sessions and scenarios."""
-    known = {*responses.sessions["session"], *responses.sessions["scenario"]}
-    if expected is not None and not known & set(expected):
-        raise BadInputError(
-            f"the list of expected stimuli names {next(iter(expected), 'nothing')!r}, which is "
-            "neither a session nor a scenario of the responses"
-        )
+    warnings = tuple(completeness_warnings(responses, expected))
+    return PeopleResults(kept, whole, rules, tables, warnings)
 
 
 def _sets(shown: Responses, flags: pd.DataFrame) -> tuple[Responses, Responses]:

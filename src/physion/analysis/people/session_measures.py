@@ -4,12 +4,11 @@ times.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
+from physion.analysis.people.completeness import Expected, expected_by_session
 from physion.analysis.people.participants import Responses
 from physion.errors import BadInputError
 
@@ -41,14 +40,13 @@ def _longest_run(same: npt.NDArray[np.bool_]) -> int:
     return int(np.max(np.diff(ends))) - 1
 
 
-def session_measures(
-    responses: Responses, expected: Mapping[str, int] | None = None
-) -> pd.DataFrame:
+def session_measures(responses: Responses, expected: Expected | None = None) -> pd.DataFrame:
     """Return the measures for the rules, one row a session, in the order of ``responses.sessions``.
 
-    ``expected``: number of test trials by scenario, or by session if people see subsets; by default
-    the stimuli of the scenario that any session answered. Columns: ``session``, ``participant``,
-    ``scenario``, ``expected``, ``trials``, ``accuracy``, ``yes``, ``mean_log_rt``,
+    ``expected``: the test stimuli by scenario, or by session if people see subsets; by default
+    those that at least half of the scenario's sessions answered (`completeness`). Columns:
+    ``session``, ``participant``, ``scenario``, ``expected`` (number of stimuli), ``missing`` (those
+    of them without an answer), ``trials``, ``accuracy``, ``yes``, ``mean_log_rt``,
     ``median_log_rt``, ``no_log_rt`` (trials without a response time above 0), ``longest_streak``,
     ``longest_alternation``, ``longest_alternation_from_first``, ``familiarization_trials``,
     ``familiarization_correct``. Raises `BadInputError` if no session has a test answer.
@@ -59,8 +57,7 @@ def session_measures(
             f"{len(responses.sessions)} session(s) hold practice alone and no test answer: "
             "give responses with test trials"
         )
-    counts_by_scenario = test.groupby("scenario")["stimulus"].nunique().to_dict()
-    counts_by_scenario |= dict(expected or {})
+    wanted = expected_by_session(responses, expected)
     by_session = {
         str(session): rows.sort_values("trial", kind="stable")
         for session, rows in test.groupby("session", sort=False)
@@ -78,10 +75,10 @@ def session_measures(
     keys = responses.sessions[["session", "participant", "scenario"]]
     measures = pd.DataFrame([records.get(session, nothing) for session in keys["session"]])
     measures = pd.concat([keys.reset_index(drop=True), measures], axis=1)
-    by_session_count = measures["session"].map(dict(expected or {}))
-    measures["expected"] = (
-        by_session_count.fillna(measures["scenario"].map(counts_by_scenario)).fillna(1).astype(int)
-    )
+    answered = {name: frozenset(rows["stimulus"]) for name, rows in by_session.items()}
+    names = measures["session"]
+    measures["expected"] = [len(wanted[name]) for name in names]
+    measures["missing"] = [len(wanted[name] - answered.get(name, frozenset())) for name in names]
     practice = responses.trials[responses.trials["phase"] == "familiarization"]
     counts = practice.groupby("session")["correct"].agg(["size", "sum"])
     counts = counts.reindex(measures["session"])

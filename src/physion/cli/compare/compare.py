@@ -47,7 +47,10 @@ class Options:
     """Exclusion rules: preregistered (if not given) or official-code."""
     expected: Path | None = None
     """Table of the stimuli (stimulus) that each session, or each scenario, must have; if not given,
-    those that anyone answered."""
+    expected.csv beside the responses, else those that half of the scenario's sessions answered."""
+    accept_rules: tuple[str, ...] = ()
+    """Exclusion rules that may leave out more than a third of a scenario's sessions: streak,
+    alternation, familiarization, low_accuracy, slow, incomplete, repeated."""
     attributes: Path | None = None
     """Elements, distractors, occluders of the stimuli: a table (CSV, parquet) or a dataset; if not
     given, by official names."""
@@ -78,7 +81,7 @@ class Options:
 def main(options: Options) -> int:
     """Write the report and print its path."""
     from physion.cli.official.read import humans_folder
-    from physion.cli.output import console
+    from physion.cli.output import console, print_warnings
     from physion.report.build import compare_files
 
     page = compare_files(
@@ -89,8 +92,9 @@ def main(options: Options) -> int:
         exclude_ledge=not options.ledge,
         **_given(options),
     )
+    numbers = json_module.loads((page.parent / "report.json").read_text(encoding="utf-8"))
+    print_warnings(numbers["warnings"])
     if options.json:
-        numbers = json_module.loads((page.parent / "report.json").read_text(encoding="utf-8"))
         print(json_module.dumps({"report": str(page), **numbers}))
     else:
         console.print(f"report: {page}", markup=False, soft_wrap=True)
@@ -103,8 +107,8 @@ def _given(options: Options) -> dict[str, Any]:
     from physion.errors import BadInputError
     from physion.report.page.movies import movies_of
 
-    same = ("responses", "sessions", "rules", "expected", "attributes", "zone", "dominoes",
-            "exclude", "trial_pages")  # fmt: skip
+    same = ("responses", "sessions", "rules", "expected", "accept_rules", "attributes", "zone",
+            "dominoes", "exclude", "trial_pages")  # fmt: skip
     found = {name: getattr(options, name) for name in same if getattr(options, name)}
     if options.rollout_error:
         found["rollout_errors"] = options.rollout_error

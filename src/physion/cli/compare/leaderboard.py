@@ -38,7 +38,10 @@ class Options:
     rules: str | None = None
     """Exclusion rules: preregistered (if not given) or official-code."""
     expected: Path | None = None
-    """Table of the stimuli (stimulus) that each session, or each scenario, must have."""
+    """Table of the stimuli (stimulus) that each session, or each scenario, must have; if not given,
+    expected.csv beside the responses, else those that half of the scenario's sessions answered."""
+    accept_rules: tuple[str, ...] = ()
+    """Exclusion rules that may leave out more than a third of a scenario's sessions."""
     exclude: Path | None = None
     """File of stimuli to exclude, one a line."""
     ledge: bool = False
@@ -59,7 +62,10 @@ class Options:
 
 def main(options: Options) -> int:
     """Print the table; return 1 if a file could not be compared."""
+    from physion.cli.output import print_warnings
+
     board = _board(options)
+    print_warnings(board.warnings)
     record = _record(board)
     if options.out is not None:
         _write(board, record, options.out)
@@ -103,20 +109,25 @@ def _board(options: Options) -> Leaderboard:
 
 def _people(options: Options) -> dict[str, Any]:
     """Return the responses, and the options about them."""
-    from physion.analysis.people.results import read_any_responses, read_expected, rules_called
+    from physion.analysis.people.completeness import find_expected, read_expected
+    from physion.analysis.people.results import read_any_responses, rules_called
     from physion.errors import BadInputError
 
     if not options.responses:
-        if options.sessions or options.rules or options.expected:
-            raise BadInputError("--sessions, --rules and --expected are about --responses")
+        if options.sessions or options.rules or options.expected or options.accept_rules:
+            raise BadInputError(
+                "--sessions, --rules, --expected and --accept-rules are about --responses"
+            )
         return {}
     settings: dict[str, Any] = {
-        "responses": read_any_responses(options.responses, options.sessions)
+        "responses": read_any_responses(options.responses, options.sessions),
+        "accept_rules": options.accept_rules,
     }
     if options.rules is not None:
         settings["rules"] = rules_called(options.rules)
-    if options.expected is not None:
-        settings["expected"] = read_expected(options.expected)
+    expected = options.expected or find_expected(options.responses)
+    if expected is not None:
+        settings["expected"] = read_expected(expected)
     return settings
 
 
@@ -130,7 +141,7 @@ def _record(board: Leaderboard) -> dict[str, Any]:
         name: json_module.loads(table.to_json(orient="records", double_precision=15))
         for name, table in tables.items()
     }
-    return {**record, "settings": dict(board.settings)}
+    return {**record, "settings": dict(board.settings), "warnings": list(board.warnings)}
 
 
 def _rows(board: Leaderboard) -> pd.DataFrame:

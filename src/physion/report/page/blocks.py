@@ -111,6 +111,12 @@ def definition_list(values: Mapping[str, str]) -> str:
     return f"<dl>{rows}</dl>"
 
 
+def warnings(texts: Sequence[str]) -> str:
+    """Return warnings as a framed list, or nothing if there are none."""
+    items = "".join(f"<li>{escape(text)}</li>" for text in texts)
+    return f'<div class="warnings"><strong>Warnings</strong><ul>{items}</ul></div>' if items else ""
+
+
 def paragraph(text: str) -> str:
     """Return text as a paragraph."""
     return f"<p>{escape(text)}</p>"

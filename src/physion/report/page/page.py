@@ -115,7 +115,7 @@ def _summary(inputs: ReportInputs) -> str:
         )
     given = f"{inputs_sentence(inputs)} {weights_sentence(inputs)}".strip()
     more = f'<p class="given">{escape(given)}</p>' if given else ""
-    return f'<p class="lead">{escape(" ".join(words))}</p>{more}'
+    return f'{blocks.warnings(inputs.warnings)}<p class="lead">{escape(" ".join(words))}</p>{more}'
 
 
 def _figures(section: str, shown: Mapping[str, str], below: Mapping[str, str]) -> str:

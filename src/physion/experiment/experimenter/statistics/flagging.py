@@ -16,6 +16,7 @@ from sqlalchemy import Engine
 
 from physion.errors import PhysionError
 from physion.experiment.study.study import Study
+from physion.stimulus_names import canonical_name
 
 LOG = logging.getLogger(__name__)
 MAX_WAIT = 2.0
@@ -115,7 +116,10 @@ def find_flags(study: Study, engine: Engine) -> Mapping[str, Flags]:
     from physion.experiment.export.answer_tables import read_tables
 
     trials, sessions = read_tables(engine, study)
-    expected = {name.lower(): len(study.phase(name, "test")) for name in study.scenarios}
+    expected = {
+        name.lower(): frozenset(canonical_name(each.stimulus) for each in study.phase(name, "test"))
+        for name in study.scenarios
+    }
     result = {"preview": Flags(study.exclusions, problem="previews are never analysed")}
     for kind, simulated in (("person", False), ("simulated", True)):
         rows = trials[trials["simulated"] == simulated]
