@@ -14,7 +14,8 @@ import pytest
 from physion.analysis import Bootstrap
 from physion.analysis.models.model_tests import permutations_of
 from physion.analysis.statistics.kappa import cross_kappa
-from physion.errors import BadInputError, UnknownNameError
+from physion.analysis.tables.attributes import attributes_from_table
+from physion.errors import BadInputError, ExclusionError, UnknownNameError
 from physion.report import compare_files
 
 SCENARIOS = ("collide", "drop")
@@ -24,7 +25,7 @@ PEOPLE, STIMULI = 8, 16
 
 def responses() -> pd.DataFrame:
     """Eight people a scenario; the last of Collide says yes throughout."""
-    generator = np.random.default_rng(1)
+    generator = np.random.default_rng(2)
     rows = []
     for scenario in SCENARIOS:
         easy = generator.normal(1.0, 1.2, STIMULI)
@@ -192,8 +193,30 @@ def test_labels_that_contradict_are_refused(tmp_path: Path) -> None:
 
 def test_no_session_left_is_refused(tmp_path: Path) -> None:
     answers = responses().assign(response="yes")
-    with pytest.raises(BadInputError, match="all 16 sessions are flagged"):
+    with pytest.raises(ExclusionError, match="'streak' leaves out 8 of 8 sessions of collide"):
         build(tmp_path, answers=answers)
+    with pytest.raises(BadInputError, match="all 16 sessions are flagged"):
+        build(tmp_path, answers=answers, accept_rules=["streak"])
+
+
+def test_warnings_stand_above_everything(tmp_path: Path) -> None:
+    answers = responses()
+    stray = answers.tail(1).assign(stimulus="drop_elsewhere", trial=99)
+    page = build(tmp_path, answers=pd.concat([answers, stray]))
+    text = text_of(page)
+    assert text.index("Warnings drop: answers to stimuli") < text.index("2 models")
+    assert "Flagged and left out: 1 of 16 sessions" in text
+    (warning,) = json.loads((page.parent / "report.json").read_text())["warnings"]
+    assert "drop_elsewhere" in warning
+
+
+def test_the_source_of_attributes_is_the_one_used(tmp_path: Path) -> None:
+    answers = responses()
+    own = answers[["stimulus", "scenario"]].drop_duplicates().assign(elements=range(2 * STIMULI))
+    text = text_of(build(tmp_path, attributes=attributes_from_table(own)))
+    assert "Attributes: of 32 stimuli 32 by the table that was given, 0 by their official" in text
+    text = text_of(build(tmp_path, "named"))
+    assert "Attributes: of 32 stimuli 0 by the table that was given, 32 by their official" in text
 
 
 def test_answers_without_times_say_so(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from physion.analysis.models.people_comparison import PeopleComparison, compare_
 from physion.analysis.people.people import accuracy_by_stimulus
 from physion.analysis.people.results import PeopleResults
 from physion.analysis.statistics.bootstrap import Bootstrap
+from physion.analysis.tables.stimuli import check_excluded_names
 from physion.errors import BadInputError
 
 
@@ -84,6 +85,8 @@ def compare(
     ------
     BadInputError
         For ``people`` beside averages, and as `compare_scores`.
+    UnknownNameError
+        For a name in ``exclude`` that no table contains.
     """
     draws = bootstrap or Bootstrap()
     settings: dict[str, Any] = {
@@ -91,10 +94,15 @@ def compare(
         "exclude_ledge": exclude_ledge,
         "bootstrap": draws,
     }
+    column = "stimulus" if "stimulus" in predictions else "Stimulus Name"
+    predicted = set(predictions[column].astype(str))
     if people is not None:
         if humans is not None or labels is not None or zone is not None:
             raise BadInputError("give averages of people or their single responses, not both")
+        check_excluded_names(settings["exclude"], predicted | people.stimuli)
         return _with_participants(predictions, people, draws, settings)
+    seen = set() if humans is None else set(humans["stimulus"])
+    check_excluded_names(settings["exclude"], {*predicted, *seen, *(labels or {})})
     comparison = compare_scores(
         predictions, humans, labels, zone=zone, zone_origin=zone_origin, **settings
     )
@@ -113,6 +121,7 @@ def _with_averages(
         paired=paired_tests(pooled, draws) if several else None,
         calibration=calibration_scores(pooled),
         mixed=tuple(fits_of_models(comparison)),
+        warnings=comparison.warnings,
     )
 
 
@@ -149,5 +158,5 @@ def _with_participants(
         paired=beside.tests if agents > 1 else None,
         calibration=beside.calibration,
         mixed=(*fits_of_people(people), *fits_of_models(main)),
-        warnings=people.warnings,
+        warnings=(*people.warnings, *main.warnings),
     )

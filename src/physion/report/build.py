@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +17,14 @@ from physion.analysis import (
     read_labels,
     read_predictions,
 )
+from physion.analysis.models.contradictions import check_coverage
 from physion.analysis.models.rollout_errors import read_rollout_errors, rollout_error_table
 from physion.analysis.people.completeness import Expected, find_expected, read_expected
 from physion.analysis.people.exclusions import PREREGISTERED
 from physion.analysis.people.results import read_attributes
 from physion.analysis.results import ComparisonResults, compare
 from physion.analysis.tables.responses import LABELS_FILE, DominoesLook, find_next_to
-from physion.analysis.tables.stimuli import read_stimulus_list
+from physion.analysis.tables.stimuli import in_order, read_stimulus_list
 from physion.atomic import write_atomic
 from physion.errors import BadInputError
 from physion.report.figures.registry import make_plots
@@ -188,8 +190,7 @@ def compare_files(
         choices.setdefault(
             "Trials of a whole session", describe_expected(people, expected is not None)
         )
-        if attributes is not None:
-            choices.setdefault("Attributes of stimuli", describe_attributes(people))
+        choices.setdefault("Attributes of stimuli", describe_attributes(people))
     else:
         if sessions is not None or expected is not None or attributes is not None or accept_rules:
             raise BadInputError(
@@ -235,6 +236,11 @@ def _with_averages(
     origin = labels.name if isinstance(labels, Path) else "those recorded with the trials"
     words = {"Official outcomes": origin, "People for Dominoes": _LOOKS[dominoes]}
     zone_source = "" if zone is None else f"official table {zone.name}"
-    return compare(
-        rows, averages, known, zone=zone_table, zone_origin=zone_source, **settings
-    ), words
+    results = compare(rows, averages, known, zone=zone_table, zone_origin=zone_source, **settings)
+    # Outcomes that are no file may be of more stimuli than people saw.
+    cut = check_coverage(averages, known) if known and isinstance(labels, Path) else []
+    if zone_table is not None:
+        absent = [name for name in in_order(averages["scenario"]) if name not in
+                  set(zone_table["scenario"])]  # fmt: skip
+        cut += [f"{name}: {zone_source} has no row: is it cut?" for name in absent]
+    return replace(results, warnings=(*results.warnings, *cut)), words

@@ -72,15 +72,29 @@ def exact_share_up_to(longest: int, tosses: int) -> float:
     return 2 * sequences(tosses) / 2**tosses
 
 
-def test_the_simulated_limit_is_that_of_the_exact_distribution() -> None:
-    assert exact_share_up_to(12, 150) > 0.975 > exact_share_up_to(11, 150)
-    # The limit that was preregistered, whatever the seed.
-    assert [streak_limit(150, 97.5, seed=seed) for seed in range(3)] == [12, 12, 12]
-    short = streak_limit(20, 90, seed=1)
-    assert (
-        exact_share_up_to(int(short), 20) >= 0.89 and exact_share_up_to(int(short) - 1, 20) < 0.91
-    )
-    assert short == streak_limit(20, 90, seed=1)
+def test_the_limit_of_a_streak_depends_on_the_number_of_trials() -> None:
+    # 12 of 150 trials was preregistered.
+    assert [streak_limit(n) for n in (150, 60, 20, 1, 0)] == [12, 10, 9, 1, 0]
+    for trials, percentile in ((150, 97.5), (60, 97.5), (20, 90.0), (7, 50.0)):
+        limit = streak_limit(trials, percentile)
+        below, above = (100 * exact_share_up_to(k, trials) for k in (limit - 1, limit))
+        assert below < percentile <= above
+    every = [[bool(number >> k & 1) for k in range(10)] for number in range(2**10)]
+    longest = np.array([longest_streak(answers) for answers in every])
+    limit = streak_limit(10, 90)
+    assert np.mean(longest <= limit) >= 0.9 > np.mean(longest <= limit - 1)
+
+
+def test_a_session_of_60_trials_is_flagged_from_a_streak_of_11_on() -> None:
+    rest = some_answers(3, 46)
+    sessions = {
+        f"run{n}": [*[not rest[0]] * n, *rest, *[not rest[-1], rest[-1]] * 3][:60] for n in (10, 11)
+    }
+    found = with_answers(sessions, [True] * 60)
+    for rules in RULE_SETS.values():
+        flags = flag_sessions(found, rules)
+        assert flags["longest_streak"].tolist() == [10, 11]
+        assert flagged_by(flags, "streak") == ["run11"]
 
 
 # --- rules --------------------------------------------------------------------------------------
@@ -115,8 +129,10 @@ def test_streaks_from_13_and_alternations_from_24_on_are_flagged() -> None:
         "turns23": [True, *[True, False] * 11, True, True, *pause, *pause, *[False]],
         "turns24": [True, *[True, False] * 12, False, *pause, *pause],
     }
-    n = min(map(len, sessions.values()))
-    found = with_answers({name: given[:n] for name, given in sessions.items()}, [True] * n)
+    n = 150
+    found = with_answers(
+        {name: [*given, *pause * 20][:n] for name, given in sessions.items()}, [True] * n
+    )
     flags = flag_sessions(found).set_index("session", drop=False)
     measures = flags[["longest_streak", "longest_alternation"]]
     assert measures.loc["streak12", "longest_streak"] == 12
@@ -153,7 +169,7 @@ def test_practice_accuracy_and_response_time_rules() -> None:
     trials.loc[poor, "response"] = np.where(trials.loc[poor, "label"], "no", "yes")
     slow = (trials["session"] == "roll-s003") & ~practice
     trials.loc[slow, "rt_ms"] *= 3
-    rules = replace(PREREGISTERED, streak_over=None)
+    rules = replace(PREREGISTERED, streak_percentile=None)
     flags = flag_sessions(as_responses(trials, sessions), rules)
     assert flagged_by(flags, "familiarization") == ["roll-s000"]  # 3 of 10; 4 of 10 is enough
     assert flagged_by(flags, "low_accuracy") == ["roll-s002"]
@@ -182,7 +198,7 @@ def test_the_sets_differ_where_the_released_code_did() -> None:
     by_median = accuracy < np.median(accuracy) - 3 * np.std(accuracy, ddof=1)
     by_mean = accuracy < np.mean(accuracy) - 3 * np.std(accuracy)
     assert by_median.sum() != by_mean.sum()
-    loose = ExclusionRules("x", streak_over=None, alternation=None)
+    loose = ExclusionRules("x", streak_percentile=None, alternation=None)
     assert flag_sessions(found, loose)["low_accuracy"].tolist() == by_median.tolist()
     code = replace(OFFICIAL_CODE, streak_percentile=None, alternation=None)
     assert flag_sessions(found, code)["low_accuracy"].tolist() == by_mean.tolist()
@@ -210,7 +226,7 @@ def test_incomplete_and_repeated_sessions_are_flagged() -> None:
 
 
 def test_rules_can_be_turned_off_and_missing_times_do_not_flag() -> None:
-    nothing = ExclusionRules("nothing", None, None, None, None, None, None, "median", None)
+    nothing = ExclusionRules("nothing", None, None, None, None, None, "median", None)
     found = with_answers({"a": [True] * 40, "b": [True, False] * 20}, [True] * 40)
     assert not flag_sessions(found, nothing)["flagged"].any()
     assert flag_sessions(found)["flagged"].all()

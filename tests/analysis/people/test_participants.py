@@ -43,6 +43,17 @@ def counts(dropped: pd.DataFrame) -> dict[str, tuple[int, int]]:
     return {row.reason: (row.sessions, row.rows) for row in dropped.itertuples()}
 
 
+def test_a_stimulus_in_two_scenarios_is_one_clear_error() -> None:
+    trials, sessions = simulate_study(people=3, stimuli=6, scenarios=("collide", "drop"))
+    trials["stimulus"] = trials["stimulus"].replace("drop_003", "collide_003")
+    with pytest.raises(BadInputError, match="'collide_003' is in two scenarios, collide and drop"):
+        as_responses(trials, sessions)
+    # Practice trials may be the same in all scenarios.
+    trials, sessions = simulate_study(people=3, stimuli=6, scenarios=("collide", "drop"))
+    trials["stimulus"] = trials["stimulus"].str.replace("drop_practice", "collide_practice")
+    assert as_responses(trials, sessions).dropped.empty
+
+
 # --- reading ------------------------------------------------------------------------------------
 
 

@@ -407,6 +407,19 @@ def test_slopes_and_robust_errors_are_those_of_statsmodels() -> None:
     assert found.loc["H1", "reason"].str.contains("not known").all()
 
 
+def test_as_predicted_needs_a_test() -> None:
+    """The sign of b alone is right for one half of all effects that do not exist."""
+    for effect, verdict in ((-0.05, "yes"), (0.05, "opposite")):
+        found = regress_hypotheses(stimuli_table(0, effect)).set_index(["hypothesis", "scenario"])
+        assert found.loc[("H3", "all"), "as_predicted"] == verdict
+    without = pd.concat([regress_hypotheses(stimuli_table(seed, 0.0)) for seed in range(20)])
+    rows = without[without["hypothesis"] == "H3"]
+    assert 20 < (rows["b"] < 0).sum() < 60
+    assert rows["as_predicted"].eq("not shown").equals(rows["p"] >= 0.05)
+    assert rows["as_predicted"].eq("yes").equals((rows["p"] < 0.05) & (rows["b"] < 0))
+    assert rows["as_predicted"].eq("yes").sum() < 8
+
+
 def test_confounded_and_constant_attributes_say_so() -> None:
     stimuli = stimuli_table(1, 0.0)
     together = regress_hypotheses(stimuli.assign(distractors=stimuli["occluders"]))

@@ -273,12 +273,34 @@ def test_a_bad_value_names_file_row_and_column(
 
 
 def test_a_run_without_kappa_is_counted(copy: Path) -> None:
-    path = copy / "results" / "model_human_CohensK.csv"
-    table = pd.read_csv(path, dtype=str, keep_default_na=False)
-    table.iloc[2:].to_csv(path, index=False)
+    for row in (0, 1):
+        spoil(copy / "results" / "model_human_CohensK.csv", "ModelID", row, f"another {row}")
     found = read_published(copy)
     assert len(found.runs) == 1174
-    assert found.dropped[["table", "rows"]].values.tolist() == [["model_human_accuracies.csv", 2]]
+    assert found.dropped[["table", "rows"]].values.tolist() == [
+        ["model_human_accuracies.csv", 2],
+        ["model_human_CohensK.csv", 2],
+    ]
+
+
+@pytest.mark.parametrize(
+    ("file", "words"),
+    [
+        ("results/model_human_accuracies.csv", "rows of roll"),
+        ("results/model_human_CohensK.csv", "rows of roll"),
+        ("humans/human_accuracy-drop_pilot-production_2_testing.csv", "drop has 149 stimuli"),
+        ("humans/human_accuracy-rollingsliding_pilot-production_2_testing.csv", "roll has 93"),
+    ],
+)
+def test_a_cut_table_is_refused(copy: Path, file: str, words: str) -> None:
+    """Both tables of models would otherwise lose the same runs without a word."""
+    lines = (copy / file).read_text().splitlines(keepends=True)
+    if "model" in file:
+        lines = lines[:1] + sorted(lines[1:], key=lambda line: line.startswith("rollingsliding"))
+    (copy / file).write_text("".join(lines[:-1]))
+    with pytest.raises(BadInputError, match=words) as refused:
+        read_published(copy)
+    assert "cut" in str(refused.value)
 
 
 @pytest.mark.parametrize("name", ["results", "humans", "results/human_accuracy_by_scenario.csv"])

@@ -285,7 +285,7 @@ def test_flagged_sessions_do_not_count(files: list[Path]) -> None:
     assert list(board.dropped_answers["reason"]) == ["session is flagged"]
     assert "1 of 10 sessions" in board.settings["Exclusions"]
     assert "preregistered" in board.settings["Exclusions"]
-    lenient = ExclusionRules("none", streak_over=None, alternation=None, accuracy_sd=None,
+    lenient = ExclusionRules("none", streak_percentile=None, alternation=None, accuracy_sd=None,
                              rt_sd=None)  # fmt: skip
     everybody = leaderboard(files, None, None, broken, rules=lenient, bootstrap=QUICK)
     assert not np.allclose(everybody.table["kappa"], board.table["kappa"])

@@ -9,6 +9,12 @@ import numpy as np
 import pandas as pd
 
 from physion.analysis.models.anchors import anchor_scores, kind_of, with_kind
+from physion.analysis.models.contradictions import (
+    check_accuracy,
+    check_labels_of_people,
+    check_outcomes,
+    check_probabilities,
+)
 from physion.analysis.models.observed_contact import SETTING, later_scores, observed_contacts
 from physion.analysis.models.score_tables import people_table, score_table
 from physion.analysis.people.participants import EXCLUDED, LEDGE
@@ -44,6 +50,7 @@ class Comparison:
     - ``dropped``: excluded stimuli: ``agent`` (empty: excluded for all), ``scenario``, ``reason``,
       ``stimuli`` (count).
     - ``settings``: the settings as text for the report, by name.
+    - ``warnings``: what may make the scores wrong, one sentence each (`contradictions`).
     """
 
     scores: pd.DataFrame
@@ -54,6 +61,7 @@ class Comparison:
     changed: pd.DataFrame
     dropped: pd.DataFrame
     settings: Mapping[str, str]
+    warnings: tuple[str, ...] = ()
 
     @property
     def agents(self) -> list[str]:
@@ -136,6 +144,7 @@ def compare_scores(
         people = with_labels(humans, known)
     else:
         raise BadInputError("people's answers need the official outcomes: give the labels")
+    warnings = check_probabilities(rows) + check_labels_of_people(people, set(rows["stimulus"]))
     people, dropped_people = _drop(people, unwanted, exclude_ledge)
     stimuli = _join(rows, people)
     dropped = [dropped_people, *_unmatched(rows, people, unwanted, exclude_ledge)]
@@ -145,6 +154,7 @@ def compare_scores(
             "no stimulus was both seen by people and predicted; people saw for instance "
             f"{seen!r}, the predictions name {rows['stimulus'].iloc[0]!r}"
         )
+    warnings += check_outcomes(stimuli) + check_accuracy(stimuli)
     answered = people[people["stimulus"].isin(stimuli["stimulus"])]
     scores = with_kind(score_table(stimuli, draws))
     later, observed = later_scores(stimuli, draws)
@@ -162,6 +172,7 @@ def compare_scores(
         | {SETTING: observed}
         | (_intervals_with_participants(draws) if participants else {})
         | (_describe_zone(zone, zone_origin) if humans is not None else {}),
+        warnings=tuple(warnings),
     )
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 import pandas as pd
 
 from physion.analysis.models.comparison import compare_scores
+from physion.analysis.models.contradictions import check_coverage
 from physion.analysis.models.leaderboard_order import (
     columns,
     required_stimuli,
@@ -43,7 +44,7 @@ from physion.analysis.people.exclusions import (
 from physion.analysis.people.participants import Responses, check_labels
 from physion.analysis.people.people import all_answers
 from physion.analysis.statistics.bootstrap import Bootstrap
-from physion.analysis.tables.stimuli import MEAN, POOLED
+from physion.analysis.tables.stimuli import MEAN, POOLED, check_excluded_names
 from physion.errors import BadInputError, UnknownNameError
 from physion.stimulus_names import SCENARIOS
 
@@ -115,17 +116,26 @@ def leaderboard(
     BadInputError
         If no file is given or none can be compared, no session is left, the outcomes of the
         responses contradict ``labels``, or ``later`` is asked of files that do not contain it.
+    UnknownNameError
+        For a name in ``exclude`` that no table contains.
     """
     if not files:
         raise BadInputError("no file of predictions was given")
     if scenario not in (*SCENARIOS, MEAN, POOLED):
         raise UnknownNameError("scenario", scenario, (*SCENARIOS, MEAN, POOLED))
-    draws = bootstrap or Bootstrap()
+    draws, exclude = bootstrap or Bootstrap(), tuple(exclude)
     kept, flagging = _unflagged(responses, rules, expected, accept_rules, labels)
     test = None if kept is None else kept.test
     people, outcomes = _people(humans, labels, test)
     answers = {} if test is None else {each.scenario: each for each in all_answers(test)}
     read, refused = _read(files)
+    known = set() if people is None else set(people["stimulus"])
+    known |= {name for rows, _ in read.values() for name in rows["stimulus"]} | set(outcomes or {})
+    if read:
+        check_excluded_names(exclude, known)
+    warnings = [] if responses is None else completeness_warnings(responses, expected)
+    if humans is not None and labels is not None:
+        warnings += check_coverage(humans, labels)
     unwanted = (*exclude, *(_not_later(read) if later else ()))
     tables, dropped, answered = [], [], []
     settings: Mapping[str, str] = {}
@@ -146,6 +156,7 @@ def leaderboard(
         tables.append(scored.assign(file=str(path), versions=scored["agent"].map(versions)))
         dropped.append(comparison.dropped.assign(file=str(path)))
         answered.append(comparison.stimuli.assign(file=str(path)))
+        warnings += [f"{path}: {text}" for text in comparison.warnings]
         settings = comparison.settings
     if not tables:
         raise BadInputError(f"no file can be compared: {next(refused[path] for path in files)}")
@@ -164,7 +175,7 @@ def leaderboard(
         ),
         None if kept is None else kept.dropped,
         {**settings, **_describe_scores(scenario, test is not None), **flagging},
-        () if responses is None else tuple(completeness_warnings(responses, expected)),
+        tuple(warnings),
     )
 
 

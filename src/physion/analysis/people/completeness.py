@@ -46,7 +46,7 @@ def read_expected(path: Path) -> dict[str, frozenset[str]]:
 
 
 def find_expected(responses: Sequence[Path]) -> Path | None:
-    """Return the list `EXPECTED_FILE` beside the responses of an export, or None."""
+    """Return the list `EXPECTED_FILE` next to the responses of an export, or None."""
     paths = [file.parent / EXPECTED_FILE for file in responses]
     return next((path for path in paths if path.is_file()), None)
 

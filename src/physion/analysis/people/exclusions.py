@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
+from fractions import Fraction
+from functools import cache
 from typing import Literal
 
 import numpy as np
@@ -17,11 +19,10 @@ import pandas as pd
 
 from physion.analysis.people.completeness import Expected
 from physion.analysis.people.participants import Responses
-from physion.analysis.people.session_measures import longest_streak, session_measures
+from physion.analysis.people.session_measures import session_measures
 from physion.analysis.statistics.clustered_logit import clustered_logit
 from physion.analysis.tables.stimuli import in_order
 from physion.errors import BadInputError, ExclusionError, UnknownNameError
-from physion.seeds import generator
 
 RULES = (
     "streak",
@@ -46,8 +47,8 @@ BY_CONSTRUCTION = "by construction: sessions are flagged for their low accuracy"
 class ExclusionRules:
     """Thresholds of the rules; None turns a rule off.
 
-    - ``streak_over``: longest run of one answer above which a session is flagged.
-    - ``streak_percentile``: take that limit from simulated coin tosses instead (`streak_limit`).
+    - ``streak_percentile``: percentile of the longest run in as many fair coin tosses as a session
+      has trials; a session with a longer run of one answer is flagged (`streak_limit`).
     - ``alternation``: answers in a row that alternate, from which on a session is flagged.
     - ``alternation_phase``: count only alternations that begin with ``first``, the first answer of
       the scenario's table, as the released code did; None: either.
@@ -59,8 +60,7 @@ class ExclusionRules:
     """
 
     name: str
-    streak_over: float | None = 12
-    streak_percentile: float | None = None
+    streak_percentile: float | None = 97.5
     alternation: int | None = 24
     alternation_phase: Literal["first"] | None = None
     familiarization_share: float | None = 0.3
@@ -76,49 +76,47 @@ PREREGISTERED = ExclusionRules("preregistered")
 
 OFFICIAL_CODE = ExclusionRules(
     "official-code",
-    streak_over=None,
-    streak_percentile=97.5,
     alternation=20,
     alternation_phase="first",
     accuracy_centre="mean",
     rt_summary="median",
     ddof=0,
 )
-"""As in the released code. Its limit of a streak came from an unseeded simulation."""
+"""As in the released code, with the exact limit of a streak. The code's came from an unseeded
+simulation of 150 tosses and changed between runs."""
 
 RULE_SETS: Mapping[str, ExclusionRules] = {
     rules.name: rules for rules in (PREREGISTERED, OFFICIAL_CODE)
 }
 
 
-def streak_limit(
-    trials: int = 150, percentile: float = 97.5, p_yes: float = 0.5,
-    simulations: int = 10_000, seed: int = 0,
-) -> float:  # fmt: skip
-    """Return the percentile of the longest streak of independent answers, by seeded simulation.
+@cache
+def streak_limit(trials: int, percentile: float = 97.5) -> int:
+    """Return a percentile of the longest run of one answer in fair, independent answers.
 
-    The exact 97.5th percentile for 150 fair answers is 12 (98.3 % of sequences do not exceed it,
-    96.6 % do not exceed 11). The thousand simulations of the released code sometimes gave 11 or 13;
-    ten thousand do not.
+    It is the smallest k for which at least ``percentile`` % of the 2^n sequences of n = ``trials``
+    answers have no run longer than k: 12 for 150 answers, 10 for 60, 0 for none. A sequence is its
+    first answer and the lengths of its runs, so that 2 c(n) of them have none longer than k, with
+    c(0) = 1 and c(m) = c(m - 1) + ... + c(m - k).
     """
-    rng = generator("streak", seed, trials, simulations)
-    answers = rng.random((simulations, trials)) < p_yes
-    return float(np.percentile([longest_streak(row) for row in answers], percentile))
+    for longest in range(1, trials + 1):
+        counts = [1]
+        for length in range(1, trials + 1):
+            counts.append(sum(counts[max(0, length - longest) :]))
+        if 100 * Fraction(2 * counts[trials], 2**trials) >= Fraction(percentile):
+            return longest
+    return 0
 
 
 # --- rules: each takes the table of measures and gives a flag a session ------------------------
 
 
-def flag_streak(measures: pd.DataFrame, rules: ExclusionRules, seed: int = 0) -> pd.Series:
-    """Flag a streak of one answer that is longer than ``streak_over`` (or than the simulated
-    limit).
-    """
-    if rules.streak_percentile is not None:
-        lengths = measures["trials"].astype(int)
-        limits = {n: streak_limit(n, rules.streak_percentile, seed=seed) for n in set(lengths)}
-        return measures["longest_streak"] > lengths.map(limits)
-    limit = np.inf if rules.streak_over is None else rules.streak_over
-    return measures["longest_streak"] > limit
+def flag_streak(measures: pd.DataFrame, rules: ExclusionRules) -> pd.Series:
+    """Flag a streak of one answer that is longer than the limit for the session's trials."""
+    if rules.streak_percentile is None:
+        return pd.Series(False, index=measures.index)
+    limits = [streak_limit(int(n), rules.streak_percentile) for n in measures["trials"]]
+    return measures["longest_streak"] > pd.Series(limits, index=measures.index)
 
 
 def flag_alternation(measures: pd.DataFrame, rules: ExclusionRules) -> pd.Series:
@@ -184,7 +182,6 @@ def flag_sessions(
     rules: ExclusionRules = PREREGISTERED,
     *,
     expected: Expected | None = None,
-    seed: int = 0,
 ) -> pd.DataFrame:
     """Return one row a session: the measures, a bool for each of `RULES`, and ``flagged`` (any of
     them).
@@ -197,7 +194,7 @@ def flag_sessions(
     """
     measures = session_measures(responses, expected)
     flags = {
-        "streak": flag_streak(measures, rules, seed),
+        "streak": flag_streak(measures, rules),
         "alternation": flag_alternation(measures, rules),
         "familiarization": flag_familiarization(measures, rules),
         "low_accuracy": flag_low_accuracy(measures, rules),

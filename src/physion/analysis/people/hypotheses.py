@@ -96,9 +96,10 @@ def regress_hypotheses(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFra
     ``stimuli``: from `with_attributes`, with ``mean_log_rt`` for H4. Columns: ``b`` (change of the
     outcome per unit of the predictor), ``se`` (HC3, valid for unequal variances), ``t``, ``df``,
     ``p`` (two-sided), ``low``, ``high``, ``r`` (Pearson's, within scenarios) and ``spearman`` (in
-    ``all`` of values less their scenario's mean), ``as_predicted`` (sign of b), ``left_out``
-    (stimuli without predictor or outcome), ``reason``. The reason also reports if distractors and
-    occluders always occur together: then their effects cannot be separated.
+    ``all`` of values less their scenario's mean), ``as_predicted`` (for p < 1 - ``level`` *yes* if
+    b has the predicted sign, else *opposite*; for a larger p *not shown*), ``left_out`` (stimuli
+    without predictor or outcome), ``reason``. The reason also reports if distractors and occluders
+    always occur together: then their effects cannot be separated.
     """
     records = []
     for hypothesis in HYPOTHESES.values():
@@ -134,9 +135,16 @@ def _record(hypothesis: Hypothesis, name: str, rows: pd.DataFrame, level: float)
     record |= _slope(x, y, of_scenario, level)
     record["r"] = float(np.corrcoef(x, y)[0, 1])
     record["spearman"] = float(stats.spearmanr(x, y).statistic)
-    record["as_predicted"] = "yes" if np.sign(record["b"]) == hypothesis.sign else "no"
+    record["as_predicted"] = _verdict(record, hypothesis.sign, level)
     record["reason"] = _confounded(hypothesis, used)
     return record
+
+
+def _verdict(record: Mapping[str, Any], sign: int, level: float) -> str:
+    """Return whether the test shows an effect in the direction of ``sign``, or in the other."""
+    if not record["p"] < 1 - level:
+        return "not shown"
+    return "yes" if np.sign(record["b"]) == sign else "opposite"
 
 
 def _within(rows: pd.DataFrame, column: str) -> Array:

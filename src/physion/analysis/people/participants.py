@@ -145,8 +145,8 @@ def clean(
     """Return the responses of a table that `check_table` has typed; see `read_responses`.
 
     Raises `BadInputError` for a session with two participants or scenarios, a stimulus with two
-    labels, a ``correct`` that contradicts response and label, or a trial whose session is not in
-    ``sessions``.
+    labels or in two scenarios, a ``correct`` that contradicts response and label, or a trial whose
+    session is not in ``sessions``.
     """
     if trials.empty:
         raise BadInputError(f"{where} has no row")
@@ -248,6 +248,14 @@ def _derived(trials: pd.DataFrame, where: str) -> pd.DataFrame:
     labels = trials.groupby("stimulus")["label"].nunique()
     if (labels > 1).any():
         raise BadInputError(f"{where}: stimulus {labels[labels > 1].index[0]!r} has two labels")
+    in_test = trials[trials["phase"] == "test"]
+    scenarios = in_test.groupby("stimulus")["scenario"].unique()
+    several = scenarios[scenarios.map(len) > 1]
+    if len(several):
+        raise BadInputError(
+            f"{where}: stimulus {several.index[0]!r} is in two scenarios, "
+            f"{' and '.join(several.iloc[0])}; give its versions names of their own"
+        )
     rt = trials["rt_ms"].to_numpy(dtype=np.float64)
     derived = trials.drop(columns="response").assign(
         trial=trials["trial"].astype(np.int64),

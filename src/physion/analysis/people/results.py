@@ -72,7 +72,8 @@ class PeopleResults:
       (`hypotheses.regress_hypotheses`);
     - ``left_out``: dropped answers, with their reasons.
 
-    ``warnings``: what may make the results wrong, one sentence each.
+    ``warnings``: what may make the results wrong, one sentence each; ``stimuli``: names of all
+    stimuli of the responses, also of excluded ones.
     """
 
     kept: Responses
@@ -80,6 +81,7 @@ class PeopleResults:
     rules: ExclusionRules
     tables: dict[str, pd.DataFrame]
     warnings: tuple[str, ...] = ()
+    stimuli: frozenset[str] = frozenset()
 
     def labels(self) -> dict[str, bool]:
         """Return the outcome of every stimulus that people answered."""
@@ -197,7 +199,8 @@ def analyse_people(
     )
     tables["left_out"] = pd.concat([kept.dropped, missing_times(kept)], ignore_index=True)
     warnings = tuple(completeness_warnings(responses, expected))
-    return PeopleResults(kept, whole, rules, tables, warnings)
+    stimuli = frozenset(responses.trials["stimulus"])
+    return PeopleResults(kept, whole, rules, tables, warnings, stimuli)
 
 
 def _sets(shown: Responses, flags: pd.DataFrame) -> tuple[Responses, Responses]:

@@ -23,7 +23,7 @@ from physion.analysis.tables.predictions import READOUTS
 from physion.analysis.tables.responses import read_humans
 from physion.analysis.tables.stimuli import scenario_name
 from physion.errors import BadInputError, UnknownNameError
-from physion.stimulus_names import SCENARIOS
+from physion.stimulus_names import SCENARIOS, is_ledge
 
 MODELS = {
     "SVG": "SVG",
@@ -51,6 +51,9 @@ READOUT_NAMES = {**READOUTS, "D": OBSERVED_AGAIN}
 
 TRAININGS = {"all": "all", "all_but_this": "all-but", "same": "only"}
 """The words of the released tables for the training protocols, and those of the paper."""
+
+STIMULI, LEDGES = 150, 56
+"""Stimuli of a scenario that people saw, and those of Roll with a ledge, which are not released."""
 
 _KEY = ["scenario", "ModelID"]
 _FACTS = (
@@ -103,13 +106,40 @@ class PublishedTables:
 def read_published(folder: Path) -> PublishedTables:
     """Read the released tables in ``folder``, which contains ``results/`` and ``humans/``.
 
-    Raises `BadInputError` for what is missing, out of range or occurs twice.
+    Raises `BadInputError` for what is missing, out of range or occurs twice, and for a table that
+    was cut.
     """
     results = folder / "results"
     if not results.is_dir():
         raise BadInputError(f"{folder} has no folder results; give the folder of the official data")
     runs, dropped = _read_runs(results)
-    return PublishedTables(runs, _read_people(results), read_humans(folder / "humans"), dropped)
+    stimuli = read_humans(folder / "humans")
+    _check_sizes(stimuli, folder / "humans")
+    return PublishedTables(runs, _read_people(results), stimuli, dropped)
+
+
+def _check_whole(models: pd.Series, scenarios: pd.Series, path: Path) -> None:
+    """Refuse a table in which a model has more runs in one scenario than in another."""
+    counts = pd.crosstab(models, scenarios).reindex(columns=list(SCENARIOS), fill_value=0)
+    for model, runs in counts.iterrows():
+        few, most = runs.idxmin(), int(runs.max())
+        if runs[few] < most:
+            raise BadInputError(
+                f"{path}: {model} has {runs[few]} rows of {few} and {most} of {runs.idxmax()}: the "
+                "table is cut, copy it again"
+            )
+
+
+def _check_sizes(stimuli: pd.DataFrame, folder: Path) -> None:
+    """Refuse tables of people that have other numbers of stimuli than the released ones."""
+    counts = stimuli[~stimuli["stimulus"].map(is_ledge)]["scenario"].value_counts()
+    for scenario in SCENARIOS:
+        released = STIMULI - (LEDGES if scenario == "roll" else 0)
+        if counts.get(scenario, 0) != released:
+            raise BadInputError(
+                f"{folder}: the table of {scenario} has {counts.get(scenario, 0)} stimuli, the "
+                f"released one {released}; it may be cut: copy it again"
+            )
 
 
 def in_paper_order(table: pd.DataFrame, columns: Sequence[str]) -> pd.DataFrame:
@@ -130,9 +160,11 @@ def _read_runs(results: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
     kappas = results / "model_human_CohensK.csv"
     measured = ("Cohens_k_lb", "Cohens_k_med", "Cohens_k_ub", "num_datapoints")
     left = read_csv(accuracies, (*_KEY, *_FACTS, "model_correct"))
-    right = read_csv(kappas, (*_KEY, *measured))
+    right = read_csv(kappas, (*_KEY, "Model", *measured))
     for table, path in ((left, accuracies), (right, kappas)):
         refuse_duplicates(table["scenario"] + " / " + table["ModelID"], str(path))
+        models = _named(table["Model"].str.strip(), MODELS, str(path))
+        _check_whole(models, table["scenario"].map(scenario_name), path)
     where = str(accuracies)
     runs = pd.DataFrame(
         {

@@ -105,7 +105,7 @@ def name_models(predictions: pd.DataFrame) -> pd.DataFrame:
 
     It is model and readout and, if several models share these, also what distinguishes them
     (training set, seed, ...). Raises `BadInputError` if one model predicts a stimulus twice, or if
-    two models were shown trials of one name but of different outcome or observed contact.
+    two models were shown trials of one name but of different scenario, outcome or observed contact.
     """
     agent = predictions["model"] + " · " + predictions["readout"]
     for column in DISTINGUISHING:
@@ -121,6 +121,7 @@ def name_models(predictions: pd.DataFrame) -> pd.DataFrame:
     if len(twice):
         row = twice.iloc[0]
         raise BadInputError(f"{row['agent']!r} predicts {row['stimulus']!r} twice; keep one row")
+    _refuse_two_scenarios(named)
     for column, what in (("actual", "outcomes"), ("observed_contact", "observed contacts")):
         if column not in named:
             continue
@@ -131,6 +132,17 @@ def name_models(predictions: pd.DataFrame) -> pd.DataFrame:
                 "compare models on one set of trials"
             )
     return named
+
+
+def _refuse_two_scenarios(named: pd.DataFrame) -> None:
+    scenarios = named.groupby("stimulus")["scenario"].unique()
+    several = scenarios[scenarios.map(len) > 1]
+    if len(several):
+        both = " and ".join(map(str, several.iloc[0]))
+        raise BadInputError(
+            f"{several.index[0]!r} is predicted in two scenarios, {both}; compare models on one "
+            "set of trials"
+        )
 
 
 def _text(values: pd.Series) -> pd.Series:

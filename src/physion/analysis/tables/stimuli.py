@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 
 from physion.errors import BadInputError, UnknownNameError
-from physion.stimulus_names import OFFICIAL_SCENARIOS, SCENARIOS, canonical_name
+from physion.stimulus_names import OFFICIAL_SCENARIOS, SCENARIOS, canonical_name, scenario_of
 
 MEAN = "mean"
 """Name of the row that averages the scores of the scenarios with equal weights."""
@@ -44,3 +44,17 @@ def read_stimulus_list(path: Path) -> list[str]:
     if not names:
         raise BadInputError(f"{path} names no stimulus; it should have one a line")
     return names
+
+
+def check_excluded_names(exclude: Iterable[str], known: Collection[str]) -> None:
+    """Raise `UnknownNameError` for the first excluded stimulus that no table contains.
+
+    A misspelt name would exclude nothing. Official names of scenarios of which ``known``, the
+    stimuli of all tables, holds no other stimulus are accepted: one list may serve many files.
+    """
+    names = {canonical_name(name) for name in known}
+    scenarios = {scenario_of(name) for name in names} - {None}
+    for name in map(canonical_name, exclude):
+        elsewhere = scenario_of(name) is not None and scenario_of(name) not in scenarios
+        if name not in names and not elsewhere:
+            raise UnknownNameError("stimulus to exclude", name, names)

@@ -17,6 +17,7 @@ def write_report(
     """Write the report; return its page and the table of scores."""
     import pandas as pd
 
+    from physion.cli.output import print_warnings
     from physion.report.build import compare_files
     from physion.report.page.movies import movies_of
     from physion.stimulus_names import canonical_name
@@ -33,6 +34,8 @@ def write_report(
         question="Will the red object touch the yellow one?",
         trial_pages=options.trial_pages,
     )
+    warnings = json.loads((page.parent / "report.json").read_text(encoding="utf-8"))["warnings"]
+    print_warnings(warnings)
     scores = pd.read_csv(page.parent / "tables" / "comparison.csv")
     return page, json.loads(scores.to_json(orient="records"))
 

@@ -11,6 +11,7 @@ import pandas as pd
 from physion.analysis.metrics import measure_metrics
 from physion.analysis.people.difficulty import below_chance_level
 from physion.analysis.people.hypotheses import HYPOTHESES
+from physion.analysis.people.results import PeopleResults
 from physion.analysis.tables.stimuli import MEAN, in_order
 from physion.report.inputs import ReportInputs
 from physion.report.page.blocks import (
@@ -22,6 +23,7 @@ from physion.report.page.blocks import (
     table,
 )
 from physion.report.page.blocks import people as averages
+from physion.report.settings_text import describe_attributes
 from physion.report.words import number
 
 MORE = "every scenario, and why an interval is missing, is in tables/measures.csv"
@@ -42,7 +44,7 @@ def people(inputs: ReportInputs, shown: Mapping[str, str]) -> str:
     if inputs.beside is not None:
         parts.append(details("What single people reach", _zones(inputs.beside.zones)))
     parts += ["<h3>Inclinations, practice, background</h3>", _biases(tables)]
-    parts += ["<h3>What makes a stimulus hard</h3>", _hypotheses(tables)]
+    parts += ["<h3>What makes a stimulus hard</h3>", _hypotheses(inputs.people)]
     parts.append(
         details("People on the stimuli that any model predicts", averages(inputs.comparison))
     )
@@ -180,7 +182,8 @@ def _biases(tables: Mapping[str, pd.DataFrame]) -> str:
     )
 
 
-def _hypotheses(tables: Mapping[str, pd.DataFrame]) -> str:
+def _hypotheses(results: PeopleResults) -> str:
+    tables = results.tables
     rows = tables["hypotheses"].assign(
         about=tables["hypotheses"]["hypothesis"].map({k: v.about for k, v in HYPOTHESES.items()})
     )
@@ -199,7 +202,9 @@ def _hypotheses(tables: Mapping[str, pd.DataFrame]) -> str:
     names = "; ".join(f"{name}: {h.about.lower()}" for name, h in HYPOTHESES.items())
     words = (
         f"The preregistered hypotheses by stimulus ({names}). Linear regression with an intercept "
-        "for each scenario, standard errors HC3; the attributes are read off official names."
+        "for each scenario, standard errors HC3. As predicted: yes if b has the predicted sign and "
+        "p < 0.05, opposite if it has the other sign and p < 0.05, else not shown; p are not "
+        f"corrected for the number of tests. Attributes: {describe_attributes(results)}."
     )
     main = rows[rows["scenario"] == "all"] if (rows["scenario"] == "all").any() else rows
     whole = details("By scenario", rows_table(rows, columns)) if len(main) < len(rows) else ""

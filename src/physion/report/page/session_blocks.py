@@ -7,7 +7,7 @@ from html import escape
 import pandas as pd
 
 from physion.analysis.models.anchors import TWO_PEOPLE
-from physion.analysis.people.exclusions import RULES, ExclusionRules
+from physion.analysis.people.exclusions import RULES, ExclusionRules, streak_limit
 from physion.analysis.people.results import PeopleResults
 from physion.analysis.tables.stimuli import MEAN, in_order
 from physion.report.inputs import ReportInputs
@@ -113,11 +113,13 @@ def describe_rules(rules: ExclusionRules) -> str:
     """Describe the rules of a set with their thresholds."""
     words = []
     if rules.streak_percentile is not None:
-        words.append(
-            f"a streak longer than {rules.streak_percentile:g} % of simulated coin tosses have"
+        limits = ", ".join(
+            f"{streak_limit(n, rules.streak_percentile)} for {n} trials" for n in (150, 60)
         )
-    elif rules.streak_over is not None:
-        words.append(f"a streak of one answer over {rules.streak_over:g}")
+        words.append(
+            "a streak of one answer longer than in "
+            f"{rules.streak_percentile:g} % of as many fair coin tosses (over {limits})"
+        )
     if rules.alternation is not None:
         words.append(f"{rules.alternation} or more alternating answers in a row")
     if rules.familiarization_share is not None:
