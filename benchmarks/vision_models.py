@@ -2,6 +2,7 @@
 
     OMP_NUM_THREADS=1 python benchmarks/vision_models.py speed --write           # seconds a clip
     python benchmarks/vision_models.py learn FOLDER --write                      # after trainings
+    python benchmarks/vision_models.py shipped FOLDER --write                    # shipped weights
     OMP_NUM_THREADS=1 python benchmarks/vision_models.py boxes FOLDER --write    # steps a second
 
 ``speed`` times a training step (forward and backward) and the features of a clip, with what is
@@ -17,6 +18,8 @@ testing trial, after and before the training and for the trivial predictor:
   times 1000; the trivial predictor keeps the last velocity.
 - SVG and OP3: the squared error of moving pixels of the imagined frames, times 1000
   (`physion.models.vision.moving`); the trivial predictor repeats the last observed picture.
+
+``shipped`` prints the same for the weights that come with the package, without training.
 
 ``boxes`` trains RPIN (small) on the same trials and prints the steps a second of processor time,
 reading and rendering included: with boxes that are rendered for every window, with those of earlier
@@ -54,7 +57,14 @@ from physion.training.sources.states import TrialMotions
 from physion.training.train import train_model
 
 RESULTS = Path(__file__).parent / "results" / "vision_models.md"
-NAMES = ("cswm", "rpin", "svg", "op3")
+METRICS = {
+    "cswm": "mean reciprocal rank of the next state",
+    "rpin": "distance of centres",
+    "svg": "error of moving pixels",
+    "op3": "error of moving pixels",
+}
+"""What is measured of each model."""
+NAMES = tuple(METRICS)
 MODELS: tuple[tuple[str, dict[str, Any], int], ...] = (
     ("cswm", {}, 8),
     ("cswm", {"size": "paper"}, 1),
@@ -154,6 +164,18 @@ def learn(folder: Path, names: list[str], steps: int, seeds: int) -> Rows:
             after, trivial = metric(name, model, clips)
             values = [f"{value:.3f}" for value in (after, before, trivial)]
             yield [model.name, str(seed), *values, f"{seconds:.0f}"]
+
+
+def shipped(folder: Path, names: list[str]) -> Rows:
+    """Yield the metrics of testing trials with shipped weights."""
+    dataset = Dataset(folder)
+    for name in names:
+        model: Any = build_model(name, weights="shipped")
+        source = whole_source(dataset, model.spec)
+        clips = tested_clips(model, source, dataset.trials("testing"))
+        after, trivial = metric(name, model, clips)
+        before, _ = metric(name, build_model(name), clips)
+        yield [model.name, METRICS[name], *(f"{value:.3f}" for value in (after, before, trivial))]
 
 
 def tested_clips(model: Any, source: Any, trials: list[str]) -> list[Batch]:
@@ -260,7 +282,7 @@ def write_section(title: str, text: str) -> None:
 def main() -> None:
     """Run one part."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("part", choices=("speed", "learn", "boxes"))
+    parser.add_argument("part", choices=("speed", "learn", "shipped", "boxes"))
     parser.add_argument("folder", nargs="?", type=Path)
     parser.add_argument("--models", nargs="+", default=list(NAMES), choices=NAMES)
     parser.add_argument("--steps", type=int, default=0, help="0: those of the model")
@@ -277,6 +299,10 @@ def main() -> None:
         head = ["model", "seed", "trained", "untrained", "trivial", "training, s"]
         title = "What was learned of new clips"
         rows = learn(options.folder, options.models, options.steps, options.seeds)
+    elif options.part == "shipped":
+        head = ["model", "metric", "trained", "untrained", "trivial"]
+        title = "Shipped weights on new clips"
+        rows = shipped(options.folder, options.models)
     else:
         head = ["boxes kept", "steps", "steps a second", "ratio"]
         title = "Training steps of RPIN a second"

@@ -8,6 +8,7 @@ from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import nn
 
 from physion.errors import BadInputError
@@ -102,7 +103,10 @@ def load_file(model: nn.Module, file: str) -> str:
 
 
 def _load(path: Path, model: nn.Module) -> None:
-    tensors, metadata = read_checkpoint(path)
+    stored, metadata = read_checkpoint(path)
+    # Large weights are shipped in half precision.
+    halves = {name for name, value in stored.items() if value.dtype == torch.float16}
+    tensors = {name: v.float() if name in halves else v for name, v in stored.items()}
     built_as = getattr(model, "built_as", None)
     if built_as is not None:
         check_same(path, "model", metadata.get(BUILT_AS, {}), built_as())
