@@ -228,3 +228,36 @@ def test_answers_without_times_say_so(tmp_path: Path) -> None:
 def test_permutations_let_holm_find_something() -> None:
     for pairs in (1, 50, 190, 400):
         assert pairs / (1 + permutations_of(pairs)) < 0.05
+
+
+def test_people_alone(report: Path, tmp_path: Path) -> None:
+    responses().to_csv(tmp_path / "responses.csv", index=False)
+    pages = [
+        compare_files([], None, None, tmp_path / name, bootstrap=Bootstrap(60),
+                      responses=[tmp_path / "responses.csv"])
+        for name in ("one", "two")
+    ]  # fmt: skip
+    assert pages[0].read_bytes() == pages[1].read_bytes()
+    text = text_of(pages[0])
+    assert "15 participants on 32 stimuli of 2 scenarios (collide, drop)" in text
+    assert "Flagged and left out: 1 of 16 sessions" in text
+    assert "60 resamples, seed 0" in text
+    assert "model" not in text.lower()
+    # The same numbers as beside models.
+    for table in (report.parent / "tables").glob("people_*.csv"):
+        assert (tmp_path / "one" / "tables" / table.name).read_bytes() == table.read_bytes()
+    figures = {path.name for path in (tmp_path / "one" / "figures").iterdir()}
+    assert figures == {f"{name}.{kind}" for name in ("difficulty", "response_time")
+                       for kind in ("svg", "png", "csv")}  # fmt: skip
+    numbers = json.loads((tmp_path / "one" / "report.json").read_text())
+    assert numbers["people_by_scenario"] and "comparison" not in numbers
+
+
+def test_people_alone_have_no_results_of_models(tmp_path: Path) -> None:
+    responses().to_csv(tmp_path / "responses.csv", index=False)
+    with pytest.raises(BadInputError, match="about predictions"):
+        compare_files([], None, None, tmp_path / "out", trial_pages=True,
+                      responses=[tmp_path / "responses.csv"])  # fmt: skip
+    with pytest.raises(BadInputError, match="no file of predictions"):
+        compare_files([], None, None, tmp_path / "out")
+    assert not (tmp_path / "out").exists()

@@ -33,9 +33,11 @@ from physion.report.page.movies import check_movies
 from physion.report.page.page import render_page
 from physion.report.page.trial_pages import FOLDER, trial_pages
 from physion.report.page.trials import shown_stimuli
+from physion.report.people_report import PeopleReport, build_people_report
 from physion.report.settings_text import (
     describe_attributes,
     describe_expected,
+    describe_intervals,
     describe_people,
     people_from_files,
     read_by_model,
@@ -122,7 +124,7 @@ def compare_files(
     Parameters
     ----------
     predictions
-        CSV files with the official column names.
+        CSV files with the official column names; none: a page about the people in ``responses``.
     humans
         Folder of ``human_accuracy-*.csv``, or None.
     labels
@@ -167,7 +169,13 @@ def compare_files(
         Before anything is written.
     """
     draws = bootstrap or Bootstrap()
-    rows = read_predictions(predictions)
+    if not predictions and not responses:
+        raise BadInputError(
+            "no file of predictions: give some, or --responses for a page about people alone"
+        )
+    if not predictions and (trial_pages or rollout_errors):
+        raise BadInputError("pages of stimuli and rollout errors are about predictions: give some")
+    rows = read_predictions(predictions) if predictions else None
     errors = read_rollout_errors(rollout_errors) if rollout_errors else None
     excluded = read_stimulus_list(exclude) if exclude is not None else []
     choices = dict(methods or {})
@@ -182,16 +190,20 @@ def compare_files(
             accept_rules=accept_rules,
             attributes=read_attributes(attributes) if isinstance(attributes, Path) else attributes,
         )  # fmt: skip
-        results = compare(
-            rows, people=people, exclude=excluded, exclude_ledge=exclude_ledge, bootstrap=draws
-        )
         choices.setdefault("Official outcomes", "those recorded with the responses")
         choices.setdefault("People", describe_people(responses, people))
         choices.setdefault(
             "Trials of a whole session", describe_expected(people, expected is not None)
         )
         choices.setdefault("Attributes of stimuli", describe_attributes(people))
+        if rows is None:
+            choices.setdefault("Intervals", describe_intervals(draws))
+            return build_people_report(PeopleReport(people, choices, movies or {}), folder)
+        results = compare(
+            rows, people=people, exclude=excluded, exclude_ledge=exclude_ledge, bootstrap=draws
+        )
     else:
+        assert rows is not None
         if sessions is not None or expected is not None or attributes is not None or accept_rules:
             raise BadInputError(
                 "sessions, expected, attributes and accepted rules are about responses: give those"

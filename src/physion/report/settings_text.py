@@ -91,6 +91,14 @@ def describe_expected(people: PeopleResults, given: bool) -> str:
     return f"{by}: {each}; {plural(int(flags['incomplete'].sum()), 'session')} lacked some"
 
 
+def describe_intervals(draws: Bootstrap) -> str:
+    """Describe the intervals of results about people."""
+    return (
+        f"{draws.level:.0%} percentile bootstrap, people drawn within each scenario, "
+        f"{draws.resamples} resamples, seed {draws.seed}"
+    )
+
+
 def describe_attributes(people: PeopleResults) -> str:
     """Describe where the attributes of the stimuli come from."""
     sources = people.tables["attributes"]["source"].value_counts()

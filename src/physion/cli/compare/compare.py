@@ -2,6 +2,8 @@
 
 `physion compare FILES... --humans DIR`: the comparison and its report (the options below).
 
+`physion compare --responses FILE`: a report about people alone.
+
 `physion compare official DIR`: the published numbers beside those that can be recomputed.
 
 `physion compare validate FILE...`: checks files of predictions and names each bad row.
@@ -32,8 +34,8 @@ SUBVERBS = {
 class Options:
     """Predictions and people to compare."""
 
-    predictions: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Prediction files with the official column names."""
+    predictions: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+    """Prediction files with the official column names; none with --responses: people alone."""
     humans: Path | None = None
     """Answers of people by stimulus: official (those of the package), a folder made by
     import-official, or one with human_accuracy-*.csv."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -212,6 +214,15 @@ def stimulus_link(stimulus: str, links: Mapping[str, str]) -> str:
     """Return the name of a stimulus, as a link if ``links`` has its movie."""
     name = f"<code>{escape(stimulus)}</code>"
     return f'<a href="{escape(links[stimulus])}">{name}</a>' if stimulus in links else name
+
+
+def relative_links(movies: Mapping[str, Path], folder: Path) -> dict[str, str]:
+    """Return the addresses of movies by stimulus, relative to ``folder``."""
+    base = folder.resolve()
+    return {
+        stimulus: Path(os.path.relpath(path.resolve(), base)).as_posix()
+        for stimulus, path in movies.items()
+    }
 
 
 def dropped(comparison: Comparison) -> str:

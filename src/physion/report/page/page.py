@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
@@ -75,13 +74,7 @@ def _links(inputs: ReportInputs, folder: Path | None) -> Mapping[str, str]:
     if inputs.trial_pages:
         names = inputs.comparison.stimuli["stimulus"].unique()
         return {name: f"{FOLDER}/{page_name(name)}" for name in names}
-    if folder is None:
-        return {}
-    base = folder.resolve()
-    return {
-        stimulus: Path(os.path.relpath(path.resolve(), base)).as_posix()
-        for stimulus, path in inputs.movies.items()
-    }
+    return {} if folder is None else blocks.relative_links(inputs.movies, folder)
 
 
 def _summary(inputs: ReportInputs) -> str:

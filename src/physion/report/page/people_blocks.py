@@ -36,19 +36,26 @@ def people(inputs: ReportInputs, shown: Mapping[str, str]) -> str:
     parts = [averages(inputs.comparison)]
     if inputs.people is None:
         return "".join(parts)
-    tables = inputs.people.tables
-    parts = [
+    zones = "" if inputs.beside is None else _zones(inputs.beside.zones)
+    on_predicted = averages(inputs.comparison)
+    return "\n".join([
+        people_alone(inputs.people, zones),
+        details("People on the stimuli that any model predicts", on_predicted),
+    ])  # fmt: skip
+
+
+def people_alone(people: PeopleResults, zones: str = "") -> str:
+    """Return the parts that need no predictions; ``zones``: table of what single people reach."""
+    tables = people.tables
+    return "\n".join([
         _accuracy(tables),
         _agreement(tables),
-    ]
-    if inputs.beside is not None:
-        parts.append(details("What single people reach", _zones(inputs.beside.zones)))
-    parts += ["<h3>Inclinations, practice, background</h3>", _biases(tables)]
-    parts += ["<h3>What makes a stimulus hard</h3>", _hypotheses(inputs.people)]
-    parts.append(
-        details("People on the stimuli that any model predicts", averages(inputs.comparison))
-    )
-    return "\n".join(parts)
+        *([details("What single people reach", zones)] if zones else []),
+        "<h3>Inclinations, practice, background</h3>",
+        _biases(tables),
+        "<h3>What makes a stimulus hard</h3>",
+        _hypotheses(people),
+    ])  # fmt: skip
 
 
 def _accuracy(tables: Mapping[str, pd.DataFrame]) -> str:
@@ -269,10 +276,13 @@ def fooled(inputs: ReportInputs, links: Mapping[str, str]) -> str:
     movies.
     """
     if inputs.people is not None:
-        rows = inputs.people.tables["by_stimulus"]
-    else:
-        rows = inputs.comparison.stimuli.drop_duplicates("stimulus")
-        rows = rows.rename(columns={"human_accuracy": "accuracy"})
+        return fooled_by(inputs.people.tables["by_stimulus"], links)
+    rows = inputs.comparison.stimuli.drop_duplicates("stimulus")
+    return fooled_by(rows.rename(columns={"human_accuracy": "accuracy"}), links)
+
+
+def fooled_by(rows: pd.DataFrame, links: Mapping[str, str]) -> str:
+    """Return the stimuli among these that people get wrong more often than by guessing."""
     tail = below_chance_level(rows.reset_index(drop=True))
     counts = [
         [

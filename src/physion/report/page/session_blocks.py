@@ -25,9 +25,14 @@ def sessions(inputs: ReportInputs) -> str:
     """Return which sessions were flagged, by which rule, and the effect of flagged sessions."""
     if inputs.people is None:
         return ""
-    result = inputs.people.tables
-    parts = [paragraph(describe_rules(inputs.people.rules)), _flag_counts(result["flag_counts"])]
-    parts.append(_with_and_without(inputs))
+    return sessions_alone(inputs.people, _models_with_and_without(inputs))
+
+
+def sessions_alone(people: PeopleResults, models: str = "") -> str:
+    """Return the same without models; ``models``: their scores without and with these sessions."""
+    result = people.tables
+    parts = [paragraph(describe_rules(people.rules)), _flag_counts(result["flag_counts"])]
+    parts.append(_with_and_without(people) + models)
     if len(result["flag_effects"]):
         columns = [
             PageColumn("rule", "term", "text"),
@@ -60,10 +65,9 @@ def _flag_counts(counts: pd.DataFrame) -> str:
     return table(["scenario", *heads], rows, words)
 
 
-def _with_and_without(inputs: ReportInputs) -> str:
-    """Return people's accuracy, and the models' scores, without and with the flagged sessions."""
-    assert inputs.people is not None
-    rows = inputs.people.tables["with_and_without"]
+def _with_and_without(people: PeopleResults) -> str:
+    """Return people's accuracy without and with the flagged sessions."""
+    rows = people.tables["with_and_without"]
     columns = [
         PageColumn("people", "people", "count"),
         PageColumn("accuracy", "accuracy", "interval", 3),
@@ -80,9 +84,13 @@ def _with_and_without(inputs: ReportInputs) -> str:
             )
         cells.append(line)
     header = ["scenario", "people, unflagged", "accuracy", "people, all complete", "accuracy"]
-    result = table(header, cells, "Accuracy of people without flagged sessions and with them")
+    return table(header, cells, "Accuracy of people without flagged sessions and with them")
+
+
+def _models_with_and_without(inputs: ReportInputs) -> str:
+    """Return the models' scores without and with the flagged sessions."""
     if inputs.comparison_all is None:
-        return result
+        return ""
     with_all = inputs.comparison_all.all_scores
     grouped: dict[str, list[list[str]]] = {"model": [], "anchor": []}
     for _, row in inputs.comparison.all_scores.iterrows():
@@ -91,8 +99,8 @@ def _with_and_without(inputs: ReportInputs) -> str:
         other = with_all[(with_all["agent"] == row["agent"]) & (with_all["scenario"] == MEAN)]
         line = [escape(str(row["agent"]))]
         for key in ("difference", "r"):
-            for subset in (row, other.iloc[0]):
-                line.append(PageColumn("", key, "interval").cell(subset))
+            column = PageColumn("", key, "interval")
+            line += [column.cell(subset) for subset in (row, other.iloc[0])]
         grouped[row["kind"]].append(line)
     header = [
         "model",
@@ -101,7 +109,7 @@ def _with_and_without(inputs: ReportInputs) -> str:
         "r, unflagged",
         "with all complete",
     ]
-    return result + table(
+    return table(
         header,
         grouped["model"],
         "Models, mean over scenarios: accuracy less people's, and r",
@@ -155,9 +163,12 @@ def dropped(result: PeopleResults) -> str:
 
 def methods(inputs: ReportInputs) -> dict[str, str]:
     """Return the settings about participant-level answers, as text."""
-    if inputs.people is None:
-        return {}
+    return {} if inputs.people is None else rules_text(inputs.people)
+
+
+def rules_text(people: PeopleResults) -> dict[str, str]:
+    """Return the exclusion rules as text."""
     return {
-        "Exclusions": describe_rules(inputs.people.rules),
+        "Exclusions": describe_rules(people.rules),
         "Rules applied": ", ".join(name.replace("_", " ") for name in RULES),
     }

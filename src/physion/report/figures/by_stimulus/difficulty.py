@@ -27,21 +27,22 @@ TAIL = (
 """Parts of these bars, and their positions in the palette."""
 
 
+CAPTION = (
+    "Accuracy of people by stimulus. The tail: stimuli that people get wrong more often than by "
+    "guessing, by the study's rule (accuracy + 1.96 standard errors below 0.5, not corrected for "
+    "the number of stimuli), and those that an exact binomial test also finds after correction "
+    "(false discovery rate 5 % by Benjamini and Hochberg, all stimuli together)."
+)
+
+
 @register_figure("difficulty", section=BY_STIMULUS, heading="Stimuli that mislead people", order=90)
 def difficulty(inputs: ReportInputs) -> Plot | None:
     """Return the distribution of people's accuracy over stimuli."""
     if not inputs.comparison.has_people:
         return None
-    caption = (
-        "Accuracy of people by stimulus. The tail: stimuli that people get wrong more often than "
-        "by guessing, by the study's rule (accuracy + 1.96 standard errors below 0.5, not "
-        "corrected for the number of stimuli), and those that an exact binomial test also finds "
-        "after correction (false discovery rate 5 % by Benjamini and Hochberg, all stimuli "
-        "together)."
-    )
     by_stimulus = None if inputs.people is None else inputs.people.tables["by_stimulus"]
     table = tables.difficulty_table(inputs.comparison, by_stimulus)
-    return Plot("difficulty", caption, table, difficulty_figure)
+    return Plot("difficulty", CAPTION, table, difficulty_figure)
 
 
 def difficulty_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:

@@ -15,6 +15,12 @@ from physion.report.figures.theme import LIGHT, Plot, Theme, panels, style, titl
 from physion.report.inputs import ReportInputs
 from physion.report.words import number
 
+CAPTION = (
+    "Mean over people of the natural logarithm of their response times to a stimulus, against the "
+    "accuracy of people on it, with the least-squares line. Preregistered: the less accurate, the "
+    "slower."
+)
+
 
 @register_figure("response_time", section=BY_STIMULUS, heading="Response times", order=100)
 def response_time(inputs: ReportInputs) -> Plot | None:
@@ -24,12 +30,7 @@ def response_time(inputs: ReportInputs) -> Plot | None:
     table = tables.response_time_table(inputs.people.tables["by_stimulus"])
     if table["mean_log_rt"].isna().all():
         return None
-    caption = (
-        "Mean over people of the natural logarithm of their response times to a stimulus, against "
-        "the accuracy of people on it, with the least-squares line. Preregistered: the less "
-        "accurate, the slower."
-    )
-    return Plot("response_time", caption, table, response_time_figure)
+    return Plot("response_time", CAPTION, table, response_time_figure)
 
 
 def response_time_figure(table: pd.DataFrame, theme: Theme = LIGHT) -> Figure:
