@@ -12,6 +12,8 @@
 
 `physion experiment password DIR`: set a new password for the experimenter's pages.
 
+`physion experiment backup DIR`: copy the database, settings and texts while the study is served.
+
 `physion experiment forget DIR`: delete recruiters' ids, or all data of a session.
 
 For details, use --help after any of these.
@@ -34,6 +36,7 @@ SUBVERBS = {
     "simulate": "physion.cli.experiment.simulate",
     "links": "physion.cli.experiment.links",
     "password": "physion.cli.experiment.password",
+    "backup": "physion.cli.experiment.backup",
     "forget": "physion.cli.experiment.forget",
 }
 """Sub-verbs of ``physion experiment``, and the module of each."""
@@ -46,7 +49,7 @@ class Options:
     """Options of ``physion experiment`` without a sub-verb."""
 
     words: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """One of init, serve, links, simulate, export, password, forget."""
+    """One of init, serve, links, simulate, export, password, backup, forget."""
 
 
 def main(options: Options) -> int:
