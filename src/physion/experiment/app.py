@@ -88,7 +88,7 @@ def _serve_media(app: FastAPI, study: Study, secrets: Secrets) -> None:
 async def _refused(request: Request, error: Exception) -> Response:
     """Handle a refusal by the store."""
     assert isinstance(error, Refused)
-    return refuse(error.code, error.message, error.state)
+    return refuse(error.code, error.message, error.state, completion=error.completion)
 
 
 async def _bad_body(request: Request, error: Exception) -> Response:

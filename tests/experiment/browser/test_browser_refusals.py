@@ -302,6 +302,8 @@ def test_declining_the_consent(chromium: Any, site: tuple[Study, str]) -> None:
         visit.page.select_option("#language", "de")
         visit.heading("Teilnahme an dieser Studie")
         visit.page.get_by_text("Ich möchte nicht teilnehmen").click()
+        visit.heading("Möchten Sie wirklich nicht teilnehmen?")
+        visit.page.get_by_role("button", name="Ich nehme nicht teil").click()
         visit.heading("Sie nehmen nicht teil")
         assert visit.unexpected() == []
     session, answers, _ = rows_of(study, "Decline")

@@ -147,8 +147,9 @@ def test_cells_that_are_not_known_are_empty(study: Study, database_url: str) -> 
     insert_sessions(engine, study, Secrets.load(study.folder), 1, ends=("finished",), now=NOW,
                     **nothing, device={})  # fmt: skip
     absent = ("fixation_ms", "cue_ms", "frames_shown", "frames_dropped", "movie_ms",
-              "visibility_changes", "window_width", "window_height")  # fmt: skip
+              "visibility_changes", "window_width", "window_height", "break_ms")  # fmt: skip
     with engine.connect() as connection, connection.begin():
+        connection.execute(sa.update(ANSWERS).values(break_ms=1500.5))
         connection.execute(
             sa.update(ANSWERS).where(ANSWERS.c.trial == 2).values(**dict.fromkeys(absent))
         )

@@ -33,14 +33,16 @@ def test_an_answer_is_stored_as_it_was_sent(store: Store, small_study: Study) ->
     sent = answer(
         0, response="no", rt_ms=1234.5678901, input="keyboard", fixation_ms=700.25, cue_ms=2000.5,
         frames_shown=44, frames_dropped=1, movie_ms=1466.7, visibility_changes=2,
-        window_width=1024, window_height=600, details={"frames": [1, 2.5, None], HOSTILE: HOSTILE},
+        window_width=1024, window_height=600, break_ms=61_500.5,
+        details={"frames": [1, 2.5, None], HOSTILE: HOSTILE},
     )  # fmt: skip
     stored = run(store.answer(token, sent))
     assert not stored.duplicate and stored.feedback is None and stored.state.trial == 1
     (session,) = rows(store, SESSIONS)
     row = next(row for row in rows(store) if row.phase == "test")
     for name in ("key", "response", "rt_ms", "input", "fixation_ms", "cue_ms", "frames_shown",
-                 "frames_dropped", "movie_ms", "visibility_changes", "window_width"):  # fmt: skip
+                 "frames_dropped", "movie_ms", "visibility_changes", "window_width",
+                 "break_ms"):  # fmt: skip
         assert getattr(row, name) == getattr(sent, name)
     assert json.loads(row.details) == sent.details
     assert row.stimulus == trial_order(small_study, "drop", session.order_seed)["test"][0].stimulus

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from physion.errors import BadInputError
 from physion.experiment.study.study import (
+    EarlyEnd,
     Limits,
     Recruitment,
     Screen,
@@ -40,6 +41,7 @@ SPANS = st.tuples(st.integers(0, 60_000), st.integers(0, 60_000)).map(
 ADDRESSES = st.sampled_from(
     ["", "https://lab.example.org/credit?experiment_id=1&credit_token=a%20b&x=", ]
 )  # fmt: skip
+EARLY_ENDS = st.builds(EarlyEnd, prolific_code=CODES, code=CODES, address=ADDRESSES)
 STUDIES = st.builds(
     Study,
     folder=st.just(Path("somewhere")),
@@ -65,6 +67,7 @@ STUDIES = st.builds(
         fixation_in_familiarization=st.booleans(),
         cue_ms=st.integers(0, 60_000),
         flash_hz=st.floats(0, 3),
+        break_every=st.integers(0, 100_000),
     ),
     screen=st.builds(Screen, st.integers(320, 10_000), st.integers(320, 10_000)),
     recruitment=st.builds(
@@ -76,6 +79,10 @@ STUDIES = st.builds(
         link_code=CODES,
         link_address=ADDRESSES,
     ),
+    declined=EARLY_ENDS,
+    stopped=EARLY_ENDS,
+    device_refused=EARLY_ENDS,
+    full=EARLY_ENDS,
     limits=st.builds(
         Limits, st.floats(0.1, 10_000), st.integers(1, 100_000), st.floats(0.1, 100_000)
     ),

@@ -69,6 +69,37 @@ def test_a_lab_may_change_every_word(tmp_path: Path) -> None:
     assert texts["common.next"] == "Vorwärts <b>&amp;"
 
 
+SCENARIO_TEXTS = """
+[study]
+title = "Was geschieht?"
+[scenario.drape.trial]
+prompt = "Wird das Tuch den gelben Gegenstand berühren?"
+[scenario."a.b".consent]
+text = "Ein Film dauert {minutes} Minuten."
+"""
+
+
+def test_titles_are_translated_and_texts_differ_by_scenario(tmp_path: Path) -> None:
+    path = _copy(tmp_path)
+    path.write_text(path.read_text() + SCENARIO_TEXTS)
+    texts, _ = read_texts(tmp_path, "de", ("collide", "drape", "a.b"))
+    assert texts["study.title"] == "Was geschieht?"
+    assert texts["scenario.drape.trial.prompt"].startswith("Wird das Tuch")
+    assert texts["scenario.a.b.consent.text"] == "Ein Film dauert {minutes} Minuten."
+    with pytest.raises(BadInputError, match=r"unknown text 'scenario\.drape\.trial\.prompt'"):
+        read_texts(tmp_path, "de", ("collide", "a.b"))
+    path.write_text(path.read_text().replace('\nprompt = "Wird das', '\npromt = "Wird das'))
+    with pytest.raises(BadInputError, match=r"unknown text 'trial\.promt'.*closest: trial\.prompt"):
+        read_texts(tmp_path, "de", ("drape", "a.b"))
+
+
+def test_words_in_braces_of_a_scenario_must_be_known(tmp_path: Path) -> None:
+    path = _copy(tmp_path)
+    path.write_text(path.read_text() + '[scenario.drape.study]\ntitle = "{contact}"\n')
+    with pytest.raises(BadInputError, match=r"drape\.study\.title has \{contact\}.*have none"):
+        read_texts(tmp_path, "de", ("drape",))
+
+
 def _words(text: str) -> list[str]:
     return re.findall(r"\{([a-z_]+)\}", text)
 

@@ -92,6 +92,14 @@ TRIAL_COLUMNS: tuple[Column, ...] = (
     Column("visibility_changes", "integer", "How often the page was hidden or shown again", low=0),
     Column("window_width", "integer", "Inner width of the window", unit="px", low=0),
     Column("window_height", "integer", "Inner height of the window", unit="px", low=0),
+    Column(
+        "break_ms",
+        "number",
+        "Duration of the break before the trial; empty: there was none",
+        unit="ms",
+        low=0,
+        high=DAY_MS,
+    ),
     Column("resumed", "flag", "The page was loaded anew while this trial was the next one"),
     Column("answered_at", "time", "When the server stored the answer"),
 )

@@ -47,13 +47,13 @@ from physion.experiment.export.session_rows import (
 from physion.experiment.export.spreadsheet import RULE
 from physion.experiment.export.write_tables import TABLES, WrittenTables, write_tables
 from physion.experiment.store.tables import STUDIES
-from physion.experiment.study.study import Study
+from physion.experiment.study.study import EARLY_ENDS, Study
 from physion.version import __version__
 
 Layout = Literal["both", "psych-ds", "bids"]
 GONE = "its stimulus is no longer in the study folder"
 NO_FILE = "no answer yet, so no file in bids/"
-_SECRET_SETTINGS = ("recruitment", "folder", "stimuli")
+_SECRET_SETTINGS = ("recruitment", *EARLY_ENDS, "folder", "stimuli")
 
 
 @dataclass(frozen=True)

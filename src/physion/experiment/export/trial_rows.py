@@ -81,6 +81,7 @@ _NUMBERS: dict[str, Any] = {
     "visibility_changes": _or_absent(ANSWERS.c.visibility_changes),
     "window_width": _or_absent(ANSWERS.c.window_width),
     "window_height": _or_absent(ANSWERS.c.window_height),
+    "break_ms": _or_absent(ANSWERS.c.break_ms),
     "resumed": cast(ANSWERS.c.resumed, Integer),
     "answered_at": ANSWERS.c.answered_at,
 }

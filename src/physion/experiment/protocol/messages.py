@@ -21,6 +21,8 @@ request                       body, answer               meaning
 ``POST /api/events``          `Events`, `Stored`         store other events in the browser
 ``GET /api/result``           `Result`                   accuracy, percentile and completion of a
                                                          finished session
+``GET /api/ending``           `SessionEnd`               completion of a session that was declined
+                                                         or stopped
 ``GET /api/health``           `Health`                   health check for load balancers, including
                                                          the database
 ============================  =========================  ==========================================
@@ -44,9 +46,13 @@ Stage = Literal[
     "demographics",
     "feedback",
     "done",
+    "declined",
     "withdrawn",
 ]
-"""Stages of a session, in this order; ``withdrawn`` can follow any stage but ``done``."""
+"""Stages of a session, in this order; ``declined`` (no consent) and ``withdrawn`` can follow any
+stage but ``done``."""
+ENDED: tuple[Stage, ...] = ("declined", "withdrawn")
+"""Stages of sessions that ended before they were complete."""
 Kind = Literal["person", "simulated", "preview"]
 Source = Literal["link", "prolific", "sona", "mturk"]
 
@@ -120,6 +126,8 @@ class Enter(Message):
         the raw id.
     scenario, language
         Wanted scenario and language; the server chooses if they are absent.
+    take_back
+        Take part after all in a session that was declined or stopped before the first answer.
     pass_
         Sent as ``pass``: signed key of a preview or pilot link.
     device
@@ -135,6 +143,7 @@ class Enter(Message):
                          Field(max_length=10)] = {}  # fmt: skip
     scenario: Name | None = None
     language: Annotated[str, StringConstraints(max_length=20)] = ""
+    take_back: bool = False
     pass_: Annotated[str, StringConstraints(max_length=200)] | None = Field(
         default=None, alias="pass"
     )
@@ -211,6 +220,8 @@ class Answer(Message):
     visibility_changes: Count | None = None
     window_width: Pixels | None = None
     window_height: Pixels | None = None
+    break_ms: Milliseconds | None = None
+    """Duration of the break before this trial; None: there was none."""
     details: Annotated[dict[Name, Any], Field(max_length=30)] = {}
     """Times of cue changes and frames and further measurements; at most 16 KiB as JSON."""
 
@@ -268,6 +279,17 @@ class Completion(Message):
     post: dict[str, str] | None = None
 
 
+class SessionEnd(Message):
+    """End of a session that was declined or stopped.
+
+    ``can_take_back``: nothing was answered, so that the participant can still take part
+    (`Enter.take_back`).
+    """
+
+    completion: Completion
+    can_take_back: bool
+
+
 class Result(Message):
     """Result that a participant sees at the end.
 
@@ -312,12 +334,16 @@ class PublicStudy(Message):
     min_height: int
     cue_ms: int
     flash_hz: float
+    break_every: int
+    """Number of test trials between two breaks; 0: no breaks."""
     preload: int
     """Number of trials whose media are loaded ahead."""
     example: dict[str, TrialMedia]
     """Media of the animated example in the instructions, by scenario."""
     recruiters: list[Recruiter]
     """In the order in which they are matched against the URL."""
+    device_refused: dict[Source, Completion]
+    """Completion of participants whose device or browser cannot show the movies."""
 
 
 class Health(Message):
@@ -327,8 +353,12 @@ class Health(Message):
 
 
 class Refusal(Message):
-    """Refusal: ``error`` is a code of `REFUSALS`, ``message`` a sentence for people."""
+    """Refusal: ``error`` is a code of `REFUSALS`, ``message`` a sentence for people.
+
+    ``completion``: how a participant who is refused because the study is full reports back.
+    """
 
     error: str
     message: str
     state: SessionState | None = None
+    completion: Completion | None = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from physion.errors import PhysionError
-from physion.experiment.protocol.messages import REFUSALS, SessionState
+from physion.experiment.protocol.messages import REFUSALS, Completion, SessionState
 
 
 class Refused(PhysionError):
@@ -17,9 +17,18 @@ class Refused(PhysionError):
         A sentence for people.
     state
         Current state of the session, for the codes after which a client can continue.
+    completion
+        How the refused participant reports back to the recruiter, if the study says it.
     """
 
-    def __init__(self, code: str, message: str, state: SessionState | None = None) -> None:
+    def __init__(
+        self,
+        code: str,
+        message: str,
+        state: SessionState | None = None,
+        completion: Completion | None = None,
+    ) -> None:
         assert code in REFUSALS
         super().__init__(message)
         self.code, self.message, self.state = code, message, state
+        self.completion = completion

@@ -134,7 +134,7 @@ class Participation:
             self._visit.outcome = "done before"
             return
         dropout = self._person.dropout_trial(state.trials["test"], self._plan.dropouts)
-        while state.stage not in ("done", "withdrawn"):
+        while state.stage not in ("done", *wire.ENDED):
             if state.stage in ("familiarization", "test"):
                 state = await self._run_phase(state, dropout)
                 if state.stage == "test" and state.trial == dropout:

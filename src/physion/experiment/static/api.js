@@ -37,6 +37,8 @@ export class Refused extends Error {
     this.status = status;
     this.code = body.error;
     this.state = body.state ?? null;
+    /** How a participant who is refused reports back to the recruiter. */
+    this.completion = body.completion ?? null;
   }
 }
 

@@ -58,6 +58,29 @@ export async function enter({ api, texts, study, log, frame }, arrival) {
 }
 
 /**
+ * Return the function that takes up a session again that was declined or stopped, or null if the
+ * page was reloaded and no longer knows the participant's id.
+ * @param {import("./session.js").Basis} basis
+ * @param {Arrival} arrival
+ * @returns {((scenario: string) => Promise<SessionState>)|null}
+ */
+export function takingBack(basis, arrival) {
+  if (!arrival.named && !cameWithoutId()) return null;
+  return async (scenario) => {
+    const { api, study, texts } = basis;
+    const who = await whoOf(arrival.enter);
+    const device = await measureDevice();
+    const message = { ...arrival.enter, scenario, device, take_back: true };
+    message.language = texts.language;
+    if (who === null) message.visit = visitKey(study);
+    const entered = await api.post("/api/enter", message);
+    api.token = entered.token;
+    remember({ token: entered.token, who, link: linkOf(arrival) });
+    return entered.state;
+  };
+}
+
+/**
  * Return the state of a remembered session, or null if it is unknown or of another scenario.
  * @param {import("./api.js").Api} api
  * @param {import("./remembered.js").Remembered} session

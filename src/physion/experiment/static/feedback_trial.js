@@ -1,6 +1,6 @@
 /**
- * jsPsych plugin: feedback on a familiarization answer, with the full movie. The participant can
- * continue when the movie has ended.
+ * jsPsych plugin: feedback on a familiarization answer: the flashing map of agent and patient once
+ * more, then the full movie. The participant can continue when the movie has ended.
  * @module feedback_trial
  */
 
@@ -15,10 +15,14 @@ const info = {
   parameters: {
     /** Returns a promise of the server's `Feedback`, which follows the storing of the answer. */
     feedback: { type: ParameterType.FUNCTION, default: undefined },
-    /** Takes the path of a movie and returns a promise of its blob URL. */
+    /** Takes the path of the full movie; returns a promise of the `Addresses` of movie and map. */
     load: { type: ParameterType.FUNCTION, default: undefined },
     /** Size and rate of the movie: a `TrialMedia`. */
     media: { type: ParameterType.OBJECT, default: undefined },
+    /** Duration of the first frame with the flashing map. */
+    cue_ms: { type: ParameterType.INT, default: 2000 },
+    /** On-off cycles of the map per second. */
+    flash_hz: { type: ParameterType.FLOAT, default: 2 },
     /** Texts by name: prompt, waiting, correct, incorrect, contact, no_contact, next, trouble. */
     words: { type: ParameterType.OBJECT, default: undefined },
     /** Called with kind and data of an event. */
@@ -76,18 +80,18 @@ export class FeedbackTrial {
   }
 }
 
-/** Show the verdict and the full movie, and wait until the participant continues. */
+/** Show the verdict, map and full movie, and wait until the participant continues. */
 async function feedbackOn(screen, { verdict, outcome, next }, trial, signal) {
   const { words } = trial;
   const feedback = await trial.feedback();
-  const address = await trial.load(feedback.movie);
+  const addresses = await trial.load(feedback.movie);
   verdict.textContent = feedback.correct ? words.correct : words.incorrect;
   verdict.classList.add(feedback.correct ? "verdict-correct" : "verdict-incorrect");
   outcome.textContent = feedback.contact ? words.contact : words.no_contact;
   try {
-    await playOnce(screen, address, trial, outcome);
+    await playOnce(screen, addresses, trial, outcome);
   } finally {
-    URL.revokeObjectURL(address);
+    URL.revokeObjectURL(addresses.movie);
   }
   const frames_shown = screen.record().shown;
   next.disabled = false;
@@ -99,13 +103,16 @@ async function feedbackOn(screen, { verdict, outcome, next }, trial, signal) {
   return { correct: feedback.correct, contact: feedback.contact, frames_shown };
 }
 
-/** Play the movie; on failure show a message and retry twice, then let the participant continue. */
-async function playOnce(screen, address, trial, outcome) {
+/**
+ * Flash the map and play the movie; on failure show a message and retry twice, then let the
+ * participant continue.
+ */
+async function playOnce(screen, addresses, trial, outcome) {
   const text = outcome.textContent;
   for (let attempt = 1; attempt <= 3; attempt++) {
     try {
-      await screen.load({ movie: address });
-      screen.hide(false);
+      await screen.load(addresses);
+      await screen.flash({ ms: trial.cue_ms, hz: trial.flash_hz });
       await screen.play({ hide: false });
       outcome.textContent = text;
       return;

@@ -4,7 +4,7 @@
  */
 
 import { el, paragraphs } from "./dom.js";
-import { bound } from "./pages.js";
+import { bound } from "./texts.js";
 
 const GENDERS = ["female", "male", "other"];
 const EDUCATIONS = [

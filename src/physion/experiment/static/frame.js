@@ -39,8 +39,7 @@ export class Frame {
   setTexts(texts) {
     this.texts = texts;
     document.documentElement.lang = texts.language;
-    document.title = this.study.title;
-    byId("title").textContent = this.study.title;
+    this.#showTitle();
     byId("skip").textContent = texts.t("common.skip");
     byId("skip").hidden = false;
   }
@@ -61,9 +60,15 @@ export class Frame {
       tools.push(stop);
     }
     byId("tools").replaceChildren(...tools);
-    const title = [this.study.title];
-    if (state.kind === "preview") title.push(this.texts.t("common.preview"));
-    byId("title").textContent = title.join(" · ");
+    this.#showTitle();
+  }
+
+  /** Show the title of the study, in the words of the language and scenario if they have some. */
+  #showTitle() {
+    const title = this.texts.has("study.title") ? this.texts.t("study.title") : this.study.title;
+    document.title = title;
+    const preview = this.state?.kind === "preview" ? [this.texts.t("common.preview")] : [];
+    byId("title").textContent = [title, ...preview].join(" · ");
   }
 
   /**

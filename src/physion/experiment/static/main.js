@@ -6,7 +6,8 @@
 import { AnswerQueue } from "./answer_queue.js";
 import { Api, Refused } from "./api.js";
 import { readArrival } from "./arrival.js";
-import { anotherPerson, cameWithoutId, enter } from "./entering.js";
+import { completionParts } from "./completion.js";
+import { anotherPerson, cameWithoutId, enter, takingBack } from "./entering.js";
 import { EventLog } from "./event_log.js";
 import { Frame } from "./frame.js";
 import { deviceProblem } from "./gate.js";
@@ -15,7 +16,7 @@ import { messagePage, openingPage } from "./pages.js";
 import { Session } from "./session.js";
 import { keep, recall } from "./storage.js";
 import { takeOver } from "./tabs.js";
-import { Texts, chooseLanguage, offeredLanguage } from "./texts.js";
+import { Texts, bound, chooseLanguage, offeredLanguage } from "./texts.js";
 
 /** @typedef {import("./session.js").Basis} Basis */
 
@@ -34,7 +35,10 @@ async function begin() {
   const basis = { api, texts, study, frame, address, log: new EventLog(api) };
   window.addEventListener("pageshow", (event) => event.persisted && window.location.reload());
   const problem = deviceProblem(study);
-  if (problem) return refuse(basis, problem);
+  if (problem) {
+    const completion = study.device_refused[arrival.enter.source] ?? null;
+    return refuse(basis, problem, { completion });
+  }
   if (arrival.preview) return showMessage(basis, "information");
   return takePart(basis, arrival);
 }
@@ -69,6 +73,7 @@ async function takePart(basis, arrival) {
     if (!chosen) await setLanguage(basis, state.language);
     basis.setLanguage = (language) => setLanguage(basis, language);
     basis.another = cameWithoutId() ? anotherPerson(basis.study, arrival) : null;
+    basis.takeBack = takingBack(basis, arrival);
     session = new Session(basis, queue);
     frame.onStop = () => session.askToStop();
     frame.onLanguage = (language) => changeLanguage(basis, session, language);
@@ -77,7 +82,8 @@ async function takePart(basis, arrival) {
     if (!(error instanceof Refused)) throw error;
     const leave = error.code === "already_took_part" || !cameWithoutId();
     const another = leave ? anotherPerson(basis.study, arrival) : null;
-    refuse(basis, error.code, error.message, another);
+    const { message, completion } = error;
+    refuse(basis, error.code, { message, completion, another });
   }
 }
 
@@ -96,8 +102,10 @@ async function changeLanguage(basis, session, language) {
  */
 async function setLanguage(basis, language) {
   if (language === basis.texts.language) return;
+  const { scenario } = basis.texts;
   try {
     basis.texts = await loadTexts(basis.api, language);
+    basis.texts.scenario = scenario;
   } catch (error) {
     if (!(error instanceof Refused)) throw error;
     basis.log.add("no_texts", { language });
@@ -120,8 +128,15 @@ function showMessage({ texts, frame }, name, action = null) {
   showPage(frame.main, messagePage({ title, text, action: labelled }));
 }
 
-/** Show why the study cannot be used: the text of `refusal` with this name, else the message. */
-function refuse({ texts, frame, study, address }, name, message = "", another = null) {
+/**
+ * Show why the study cannot be used: the text of `refusal` with this name, else the message.
+ * @param {Basis} basis
+ * @param {string} name
+ * @param {{message?: string, completion?: import("./messages.js").Completion|null,
+ *   another?: (() => void)|null}} [given] `completion`: how the participant reports back.
+ */
+function refuse(basis, name, { message = "", completion = null, another = null } = {}) {
+  const { texts, frame, study, address } = basis;
   const known = texts.has(`refusal.${name}`);
   const size = { width: study.min_width, height: study.min_height };
   const reason = known ? texts.t(`refusal.${name}`, size) : texts.t("refusal.other", { message });
@@ -135,7 +150,10 @@ function refuse({ texts, frame, study, address }, name, message = "", another = 
   document.getElementById("tools").replaceChildren();
   document.getElementById("progress").hidden = true;
   const quiet = another && { label: texts.t("common.another_person"), run: another };
-  showPage(frame.main, messagePage({ title, text, action, quiet: known ? quiet : null }));
+  const reports = completion?.code || completion?.url;
+  const parts = reports ? completionParts(completion, bound(texts).t, "ended.go_hint") : [];
+  const page = { title, text, parts, action, quiet: known ? quiet : null };
+  showPage(frame.main, messagePage(page));
 }
 
 begin().catch((error) => {

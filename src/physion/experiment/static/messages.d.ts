@@ -10,6 +10,7 @@ export type Stage =
   | "demographics"
   | "feedback"
   | "done"
+  | "declined"
   | "withdrawn";
 
 export interface Device {
@@ -29,6 +30,7 @@ export interface Enter {
   recruiter?: Record<string, string>;
   scenario?: string;
   language?: string;
+  take_back?: boolean;
   pass?: string;
   device?: Device;
 }
@@ -80,6 +82,7 @@ export interface Answer {
   visibility_changes: number | null;
   window_width: number | null;
   window_height: number | null;
+  break_ms: number | null;
   details: Record<string, any>;
 }
 
@@ -113,6 +116,11 @@ export interface Completion {
   post: Record<string, string> | null;
 }
 
+export interface SessionEnd {
+  completion: Completion;
+  can_take_back: boolean;
+}
+
 export interface Result {
   correct: number;
   trials: number;
@@ -139,15 +147,18 @@ export interface PublicStudy {
   min_height: number;
   cue_ms: number;
   flash_hz: number;
+  break_every: number;
   preload: number;
   example: Record<string, TrialMedia>;
   recruiters: Recruiter[];
+  device_refused: Record<string, Completion>;
 }
 
 export interface Refusal {
   error: string;
   message: string;
   state: SessionState | null;
+  completion: Completion | null;
 }
 
 declare global {

@@ -3,9 +3,12 @@
  * @module pages
  */
 
+import { ask } from "./dialog.js";
 import { button, el, paragraphs, sleep } from "./dom.js";
+import { declineQuestion } from "./ending_pages.js";
 import { showExample } from "./example.js";
 import { focusHeading } from "./page_trial.js";
+import { bound } from "./texts.js";
 
 const LATE_MS = 500;
 
@@ -22,16 +25,25 @@ const LATE_MS = 500;
 
 /** Estimate the rounded minutes of so many trials, with the pages before practice. */
 function minutes(study, practice, test) {
-  const seconds = practice * 12 + test * (study.cue_ms / 1000 + 4.5);
+  const seconds = practice * 14 + test * (study.cue_ms / 1000 + 4.5);
   const exact = (practice ? 3 : 0) + seconds / 60;
   return exact > 7.5 ? Math.round(exact / 5) * 5 : Math.max(2, Math.ceil(exact));
 }
 
-/** Render the consent page. @param {Context} context @returns {Render} */
-export function consentPage({ texts, study, state }) {
+/**
+ * Render the consent page. Who does not agree is asked once more.
+ * @param {Context} context
+ * @returns {Render}
+ */
+export function consentPage(context) {
+  const { texts, study, state } = context;
   const { t } = bound(texts);
   const { familiarization, test } = state.trials;
-  return (page, done) =>
+  return (page, done, signal) => {
+    const decline = async () => {
+      const answer = await ask(declineQuestion(context), signal);
+      if (answer?.declined) done({ agreed: false });
+    };
     page.append(
       el("h1", {}, t("consent.title")),
       ...paragraphs(
@@ -45,10 +57,11 @@ export function consentPage({ texts, study, state }) {
       el(
         "div",
         { class: "buttons" },
-        button(t("consent.decline"), () => done({ agreed: false }), { class: "button quiet" }),
+        button(t("consent.decline"), decline, { class: "button quiet" }),
         button(t("consent.agree"), () => done({ agreed: true })),
       ),
     );
+  };
 }
 
 /**
@@ -106,12 +119,31 @@ export function instructionsPages(context) {
 export function readyPage(context) {
   const { t } = bound(context.texts);
   const { test } = context.state.trials;
+  const every = context.study.break_every;
   const values = { trials: test, minutes: minutes(context.study, 0, test) };
+  const breaks = every > 0 && every < test ? paragraphs(t("ready.breaks", { every })) : [];
   return (page, done) =>
     page.append(
       el("h1", {}, t("ready.title")),
       ...paragraphs(t("ready.text", values)),
+      ...breaks,
       el("div", { class: "buttons" }, button(t("ready.start"), () => done())),
+    );
+}
+
+/**
+ * Render the break before a test trial; ends when the participant goes on.
+ * @param {Context} context
+ * @param {number} answered Number of test trials before the break.
+ * @returns {Render}
+ */
+export function breakPage({ texts, state }, answered) {
+  const { t } = bound(texts);
+  return (page, done) =>
+    page.append(
+      el("h1", {}, t("break.title")),
+      ...paragraphs(t("break.text", { answered, trials: state.trials.test })),
+      el("div", { class: "buttons" }, button(t("break.go_on"), () => done())),
     );
 }
 
@@ -215,14 +247,16 @@ export function busyPage({ texts }, ms) {
 }
 
 /**
- * Render a page with heading and text and, if given, a main and a secondary button.
- * @param {{title: string, text: string, action?: {label: string, run: () => void}|null,
+ * Render a page with heading and text and, if given, further elements and a main and a secondary
+ * button.
+ * @param {{title: string, text: string, parts?: HTMLElement[],
+ *   action?: {label: string, run: () => void}|null,
  *   quiet?: {label: string, run: () => void}|null}} content
  * @returns {(page: HTMLElement) => void}
  */
-export function messagePage({ title, text, action = null, quiet = null }) {
+export function messagePage({ title, text, parts = [], action = null, quiet = null }) {
   return (page) => {
-    page.append(el("h1", {}, title), ...paragraphs(text));
+    page.append(el("h1", {}, title), ...paragraphs(text), ...parts);
     const buttons = [
       quiet && button(quiet.label, quiet.run, { class: "button quiet" }),
       action && button(action.label, action.run),
@@ -258,30 +292,4 @@ export function windowPage({ texts, study, address }, fits) {
     window.addEventListener("resize", check, { signal });
     check();
   };
-}
-
-/**
- * Render the question whether to stop; ends with {stop}.
- * @param {Context} context
- * @returns {Render}
- */
-export function stopPage({ texts, study, state }) {
-  const { t } = bound(texts);
-  return (page, done) =>
-    page.append(
-      el("h1", {}, t("stop.title")),
-      ...paragraphs(t("stop.text", { contact: study.contact })),
-      el("p", { class: "small" }, t("common.reference", { reference: state.reference })),
-      el(
-        "div",
-        { class: "buttons" },
-        button(t("stop.confirm"), () => done({ stop: true }), { class: "button quiet" }),
-        button(t("stop.go_on"), () => done({ stop: false })),
-      ),
-    );
-}
-
-/** Return the method `t` of the texts, bound, for destructuring. */
-export function bound(texts) {
-  return { t: texts.t.bind(texts) };
 }

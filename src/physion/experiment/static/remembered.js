@@ -38,7 +38,35 @@ export function forgetSession() {
 
 /** Forget all data of a person. @param {import("./messages.js").PublicStudy} study */
 export function forgetPerson(study) {
-  for (const name of ["session", "language", visitName(study)]) keep(name, null);
+  for (const name of ["session", "language", "feedback", visitName(study)]) keep(name, null);
+}
+
+/**
+ * Remember a practice answer until its feedback was seen.
+ * @param {string} session Reference of the session.
+ * @param {import("./messages.js").Answer} answer
+ */
+export function rememberFeedback(session, answer) {
+  keep("feedback", { session, answer });
+}
+
+/** Forget the practice answer whose feedback was due. */
+export function forgetFeedback() {
+  keep("feedback", null);
+}
+
+/**
+ * Return the last practice answer of the session if its feedback was not seen, as when the page was
+ * reloaded meanwhile; else null.
+ * @param {import("./messages.js").SessionState} state
+ * @returns {import("./messages.js").Answer|null}
+ */
+export function dueFeedback(state) {
+  const due = recall("feedback");
+  if (due?.session !== state.reference || !due.answer) return null;
+  const answered = state.stage === "ready" ? state.trials.familiarization : state.trial;
+  const practises = state.stage === "familiarization" || state.stage === "ready";
+  return practises && answered === due.answer.trial + 1 ? due.answer : null;
 }
 
 /**

@@ -7,15 +7,16 @@
 
 import { Refused } from "./api.js";
 import { ask } from "./dialog.js";
+import { endedPage, stopQuestion } from "./ending_pages.js";
 import { demographicsPage, feedbackPage } from "./forms.js";
 import { Media } from "./media.js";
 import { PageTrial, patiently, showPage } from "./page_trial.js";
 import * as pages from "./pages.js";
 import { PredictionTrial } from "./prediction_trial.js";
 import { newKey } from "./random_key.js";
+import { dueFeedback, forgetFeedback, rememberFeedback } from "./remembered.js";
 import { resultPage } from "./result_page.js";
-import { keep, recall } from "./storage.js";
-import { trialPieces } from "./trial_pieces.js";
+import { feedbackPieces, trialPieces } from "./trial_pieces.js";
 
 const PAGES = {
   consent: pages.consentPage,
@@ -24,6 +25,9 @@ const PAGES = {
   demographics: demographicsPage,
   feedback: feedbackPage,
 };
+
+/** Refusals after which no session of this page can go on. */
+const FINAL = ["unknown_token", "bad_link", "id_needed", "already_took_part", "study_full"];
 
 /** @typedef {import("./messages.js").SessionState} SessionState */
 
@@ -38,6 +42,8 @@ const PAGES = {
  * @property {string} address The URL by which the participant came.
  * @property {(language: string) => Promise<void>} [setLanguage] Changes the language.
  * @property {(() => void)|null} [another] Starts the study for another person; null if it cannot.
+ * @property {((scenario: string) => Promise<SessionState>)|null} [takeBack] Takes up a session again that was
+ *   declined or stopped; null if the participant is not known any more.
  */
 
 /** Raised when the running part of the timeline is left for another state. */
@@ -100,7 +106,7 @@ export class Session {
     const { log } = this.basis;
     log.add("stop_asked", { stage: this.state.stage, phase, trial });
     this.#running.asked += 1;
-    const answer = await ask(pages.stopPage(this.context), this.#question.signal);
+    const answer = await ask(stopQuestion(this.context), this.#question.signal);
     this.#question = null;
     const stop = Boolean(answer?.stop);
     log.add("stop_answered", { stage: this.state.stage, phase, trial, stop });
@@ -115,24 +121,20 @@ export class Session {
     while (!this.#closed) {
       this.#part = new AbortController();
       // The consent can be read in any language, which becomes the language of the session.
-      const reading = this.state.stage === "consent" || this.#declined();
+      const { stage } = this.state;
+      const reading = stage === "consent" || stage === "declined";
+      this.basis.texts.scenario = this.state.scenario;
       if (!reading) await this.basis.setLanguage(this.state.language);
       this.basis.frame.show(this.context);
-      if (this.state.stage === "done" || this.state.stage === "withdrawn") return this.#end();
+      if (stage === "done") return this.#end();
       try {
-        this.state = await this.#stage();
+        const ended = stage === "declined" || stage === "withdrawn";
+        this.state = await (ended ? this.#ended() : this.#stage());
       } catch (error) {
         if (this.#closed) return;
         this.state = await this.#stateAfter(error);
       }
     }
-  }
-
-  /**
-   * Return whether consent was declined in this browser; the server keeps no language in that case.
-   */
-  #declined() {
-    return this.state.stage === "withdrawn" && recall("declined") === this.state.reference;
   }
 
   /** Show the current page again, in another language. */
@@ -152,7 +154,7 @@ export class Session {
   async #stateAfter(error) {
     const { api, log } = this.basis;
     const refused = error instanceof Refused ? error : this.#refused;
-    if (refused?.code === "unknown_token" || this.queue.waits(api.token)) {
+    if (FINAL.includes(refused?.code) || this.queue.waits(api.token)) {
       throw refused ?? error;
     }
     if (!(error instanceof Refused) && !(error instanceof PartLeft)) {
@@ -195,8 +197,10 @@ export class Session {
   }
 
   /** Run the current stage. @returns {Promise<SessionState>} The state after it. */
-  #stage() {
+  async #stage() {
     const { stage } = this.state;
+    const due = dueFeedback(this.state);
+    if (due) await this.#showFeedback(due);
     if (stage === "familiarization" || stage === "test") return this.#phase(stage);
     return this.#page(stage, PAGES[stage](this.context));
   }
@@ -207,7 +211,6 @@ export class Session {
     let outcome = null;
     const store = async (data) => {
       if (page === "consent") data.language = this.basis.texts.language;
-      if (data.agreed === false) keep("declined", this.state.reference);
       const post = this.basis.api.post("/api/page", { page, data }, { signal });
       // Refusals are handled by `run`; the page has ended in any case.
       outcome = await post.catch((error) => ({ error }));
@@ -241,6 +244,27 @@ export class Session {
     return this.#patiently(api.get("/api/session", { signal }));
   }
 
+  /** Show the feedback of a practice trial that the participant has not seen to its end. */
+  async #showFeedback(answer) {
+    const { api, frame } = this.basis;
+    const { signal } = this.#part;
+    frame.show({ state: { ...this.state, stage: "familiarization" } });
+    try {
+      const list = async () => (await api.get("/api/trials/familiarization", { signal })).trials;
+      const trials = await this.#patiently(list());
+      this.media.start(trials, answer.trial, list);
+      // The answer is stored already; sent again, it gives the same feedback.
+      const stored = this.#patiently(api.post("/api/answers", answer, { signal }));
+      stored.catch(() => {}); // the timeline receives the error as well
+      const media = trials.find((each) => each.trial === answer.trial);
+      await this.#timeline(feedbackPieces(this.context, media, { answer, stored }));
+      frame.show(this.context);
+    } catch (error) {
+      if (error instanceof Refused) forgetFeedback();
+      throw error;
+    }
+  }
+
   /** Return the timeline of one trial. */
   #trial(phase, media) {
     const { trial } = media;
@@ -251,6 +275,7 @@ export class Session {
         const details = { ...data.details, stop_asked: this.#running.asked };
         const answer = answerOf(phase, trial, { ...data, details });
         this.state = { ...this.state, trial: trial + 1 };
+        if (phase === "familiarization") rememberFeedback(this.state.reference, answer);
         return { answer, stored: this.queue.add(answer) };
       },
     });
@@ -280,21 +305,27 @@ export class Session {
     return jsPsych.data.get().values();
   }
 
-  /** Show the result, or that the session was declined or withdrawn. */
+  /**
+   * Show that the session was declined or stopped, until the participant takes part after all.
+   * @returns {Promise<SessionState>} The state after that.
+   */
+  async #ended() {
+    this.#question?.abort();
+    const { api, frame, takeBack } = this.basis;
+    const { signal } = this.#part;
+    const ending = await this.#patiently(api.get("/api/ending", { signal }));
+    return new Promise((resolve, reject) => {
+      const { scenario } = this.state;
+      const retake = takeBack && (() => takeBack(scenario).then(resolve, reject));
+      showPage(frame.main, endedPage(this.context, ending, retake));
+      signal.addEventListener("abort", () => reject(signal.reason));
+    });
+  }
+
+  /** Show the result. */
   async #end() {
     this.#question?.abort();
-    const { texts, study, api, frame, another } = this.basis;
-    if (this.state.stage === "withdrawn") {
-      const { reference } = this.state;
-      const declined = this.#declined();
-      const named = `\n\n${texts.t("common.reference", { reference })}`;
-      const title = texts.t(declined ? "declined.title" : "withdrawn.title");
-      const text = declined
-        ? texts.t("declined.text", study)
-        : texts.t("withdrawn.text", study) + named;
-      const quiet = another && { label: texts.t("common.another_person"), run: another };
-      return showPage(frame.main, pages.messagePage({ title, text, quiet }));
-    }
+    const { api, frame } = this.basis;
     const result = await this.#patiently(api.get("/api/result"));
     return showPage(frame.main, resultPage(this.context, result));
   }
@@ -307,5 +338,5 @@ export class Session {
 function answerOf(phase, trial, data) {
   const names = Object.keys(PredictionTrial.info.data);
   const measured = Object.fromEntries(names.map((name) => [name, data[name]]));
-  return { key: newKey(), phase, trial, ...measured };
+  return { key: newKey(), phase, trial, ...measured, break_ms: data.break_ms };
 }

@@ -12,6 +12,8 @@ export class Texts {
   constructor(language, words) {
     this.language = language;
     this.words = words;
+    /** Scenario of the session, which may have texts of its own. */
+    this.scenario = "";
   }
 
   /**
@@ -21,7 +23,7 @@ export class Texts {
    * @returns {string}
    */
   t(key, values = {}) {
-    const text = this.words[key];
+    const text = this.words[`scenario.${this.scenario}.${key}`] ?? this.words[key];
     if (text === undefined) {
       console.error(`the texts of ${this.language} have no ${key}`);
       return key;
@@ -33,8 +35,13 @@ export class Texts {
 
   /** Return whether there is a text for a key. @param {string} key @returns {boolean} */
   has(key) {
-    return key in this.words;
+    return `scenario.${this.scenario}.${key}` in this.words || key in this.words;
   }
+}
+
+/** Return the method `t` of the texts, bound, for destructuring. @param {Texts} texts */
+export function bound(texts) {
+  return { t: texts.t.bind(texts) };
 }
 
 /**

@@ -1,6 +1,6 @@
 /**
- * The jsPsych timeline of one trial: check the window size, wait for the media, show the prediction
- * trial and, in practice, the feedback.
+ * The jsPsych timeline of one trial: offer a break, check the window size, wait for the media, show
+ * the prediction trial and, in practice, the feedback.
  * @module trial_pieces
  */
 
@@ -10,7 +10,10 @@ import { windowFits } from "./gate.js";
 import { PageTrial } from "./page_trial.js";
 import * as pages from "./pages.js";
 import { PredictionTrial } from "./prediction_trial.js";
+import { forgetFeedback } from "./remembered.js";
+import { round } from "./screen.js";
 
+const DAY_MS = 86_400_000;
 const TRIAL_WORDS = ["prompt", "yes", "no", "trouble", "retry"];
 const FEEDBACK_WORDS = ["waiting", "correct", "incorrect", "contact", "no_contact", "next"];
 
@@ -34,14 +37,54 @@ const FEEDBACK_WORDS = ["waiting", "correct", "incorrect", "contact", "no_contac
 export function trialPieces(context, phase, media, session) {
   /** @type {Given|null} */
   let given = null;
+  /** Duration of the break before the trial. @type {number|null} */
+  let break_ms = null;
   const prediction = predictionOf(context, phase, media, session);
   const answered = (data) => {
-    if (data.response) given = session.answered(data); // without a response the trial was left
+    // Without a response the trial was left.
+    if (data.response) given = session.answered({ ...data, break_ms });
   };
   return [
+    ...breakBefore(context, phase, media.trial, (ms) => (break_ms = ms)),
     ...beforeTrial(context, media.trial),
     { ...prediction, on_finish: answered },
     ...(phase === "familiarization" ? [feedbackOf(context, media, () => given)] : []),
+  ];
+}
+
+/**
+ * Return the timeline that shows the feedback of an answered practice trial once more.
+ * @param {import("./pages.js").Context} context
+ * @param {TrialMedia} media
+ * @param {Given} given
+ * @returns {Array<Object>}
+ */
+export function feedbackPieces(context, media, given) {
+  return [...beforeTrial(context, media.trial), feedbackOf(context, media, () => given)];
+}
+
+/**
+ * Return the break before a test trial, if one is due.
+ * @param {import("./pages.js").Context} context
+ * @param {import("./messages.js").Phase} phase
+ * @param {number} number
+ * @param {(ms: number) => void} rested Called with the duration of the break.
+ * @returns {Array<Object>}
+ */
+function breakBefore(context, phase, number, rested) {
+  const every = context.study.break_every;
+  if (phase !== "test" || every === 0 || number === 0 || number % every !== 0) return [];
+  let start = 0;
+  return [
+    {
+      type: PageTrial,
+      render: pages.breakPage(context, number),
+      on_start: () => {
+        start = performance.now();
+        context.log.add("break", { trial: number });
+      },
+      on_finish: () => rested(Math.min(round(performance.now() - start), DAY_MS)),
+    },
   ];
 }
 
@@ -93,17 +136,28 @@ function predictionOf({ study, texts, frame, log, state, ...context }, phase, me
 }
 
 /**
- * Return the feedback trial, which waits until the answer is stored.
+ * Return the feedback trial, which waits until the answer is stored, and forgets at its end that the
+ * feedback is due.
  * @param {import("./pages.js").Context} context
  * @param {TrialMedia} media
  * @param {() => Given} given
  */
-function feedbackOf({ api, texts, log }, media, given) {
+function feedbackOf({ api, texts, log, study, frame, ...context }, media, given) {
+  const load = async (path) => {
+    const { map } = await context.media.get(media.trial);
+    return { movie: URL.createObjectURL(await fullMovie(api, path, given().answer)), map };
+  };
   return {
     type: FeedbackTrial,
     media,
     feedback: async () => (await given().stored).feedback,
-    load: async (path) => URL.createObjectURL(await fullMovie(api, path, given().answer)),
+    load,
+    cue_ms: study.cue_ms,
+    flash_hz: study.flash_hz,
+    on_start: () => frame.progress("familiarization", media.trial),
+    on_finish: (data) => {
+      if ("contact" in data) forgetFeedback(); // else it was left, and is shown again
+    },
     words: {
       ...words(texts, "practice", FEEDBACK_WORDS),
       trouble: texts.t("trial.trouble"),

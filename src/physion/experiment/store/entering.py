@@ -19,6 +19,7 @@ from physion.experiment.store.sessions import (
     SESSION_COLUMNS,
     Session,
     TrialCounts,
+    can_take_back,
     change_session,
     insert_or_skip,
     mark_loaded,
@@ -37,7 +38,7 @@ from physion.experiment.study.identity import (
     participant_hash,
 )
 from physion.experiment.study.orders import draw_buttons, individual_order_seed, prepared_order_seed
-from physion.experiment.study.recruitment import is_unfilled, read_pass
+from physion.experiment.study.recruitment import ending_completion, is_unfilled, read_pass
 from physion.experiment.study.study import Study
 
 
@@ -96,6 +97,9 @@ def enter_session(
 ) -> Entered:
     """Begin a session, or issue another token for the session that the visitor has begun.
 
+    A visitor who declined or stopped gets a token for the ended session, and takes it up again if
+    `Enter.take_back` says so.
+
     Parameters
     ----------
     connection
@@ -119,17 +123,25 @@ def enter_session(
         )
     ]
     session = _find_unfinished(sessions, visitor.enter.scenario)
+    ended = None if session is not None else _find_ended(study, sessions, visitor.enter.scenario)
+    if ended is not None and visitor.enter.take_back and can_take_back(ended):
+        _choose_scenario(connection, study, visitor, set(study.scenarios) - {ended.scenario})
+        _take_back(connection, ended, visitor)
+        session, ended = ended, None
     if session is not None:
         _continue(connection, trials, session, visitor)
-    else:
+    elif ended is None:
         done = {each.scenario for each in sessions}
         scenario = _choose_scenario(connection, study, visitor, done)
         session = _begin_session(connection, study, secrets, scenario, visitor)
+    if ended is None:
+        _keep_raw_id(connection, visitor)  # not of somebody who declined
+    session = session or ended
+    assert session is not None
     connection.execute(
         insert_or_skip(connection, TOKENS),
         {"token_hash": hash_token(visitor.token), "session": session.session, "made": visitor.now},
     )
-    _keep_raw_id(connection, visitor)
     return Entered(token=visitor.token, state=state_of(session, trials.of(session.scenario)))
 
 
@@ -143,6 +155,25 @@ def _find_unfinished(sessions: list[Session], scenario: str | None) -> Session |
         and scenario in (None, session.scenario)
     ]
     return max(unfinished, key=lambda session: session.started_at, default=None)
+
+
+def _find_ended(study: Study, sessions: list[Session], scenario: str | None) -> Session | None:
+    """Return the latest session, of ``scenario`` if it is given, if it was declined or stopped.
+
+    None if another scenario is left in which the visitor may begin, and for closed sessions.
+    """
+    known = {session.scenario for session in sessions}
+    wanted = [session for session in sessions if scenario in (None, session.scenario)]
+    if not wanted or (scenario is None and not set(study.scenarios) <= known):
+        return None
+    last = max(wanted, key=lambda session: session.started_at)
+    return last if last.withdrawn_at is not None and last.closed_at is None else None
+
+
+def _take_back(connection: Connection, session: Session, visitor: Visitor) -> None:
+    """Take up a session again that was declined or stopped; the device was deleted with it."""
+    device = storable_values(visitor.enter.device.model_dump())
+    change_session(connection, session, withdrawn_at=None, device=device)
 
 
 def _choose_scenario(connection: Connection, study: Study, visitor: Visitor, done: set[str]) -> str:
@@ -162,7 +193,11 @@ def _choose_scenario(connection: Connection, study: Study, visitor: Visitor, don
     if visitor.kind == "person":
         available = [each for each in available if counts[each].taken < study.participants]
     if not available:
-        raise Refused("study_full", "The study has all the participants that it needs. Thank you!")
+        raise Refused(
+            "study_full",
+            "The study has all the participants that it needs. Thank you!",
+            completion=ending_completion(study.full, visitor.enter.source),
+        )
     return min(available, key=lambda scenario: counts[scenario].begun)
 
 

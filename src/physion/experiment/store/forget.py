@@ -147,7 +147,8 @@ def _forget_session(connection: Connection, reference: str) -> None:
     session, participant, withdrawn_at = rows[0]
     for table in (ANSWERS, EVENTS, TOKENS):
         connection.execute(delete(table).where(table.c.session == session))
-    values = _EMPTIED | {"withdrawn_at": withdrawn_at or time.time()}
+    now = time.time()
+    values = _EMPTIED | {"withdrawn_at": withdrawn_at or now, "closed_at": now}
     connection.execute(update(SESSIONS).where(columns.session == session).values(**values))
     # Declined and forgotten sessions have no device; if all are such, the id is not needed.
     devices = select(columns.device).where(columns.participant == participant)

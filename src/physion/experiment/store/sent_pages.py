@@ -7,7 +7,7 @@ from typing import Any
 
 from sqlalchemy import Connection, delete, select, update
 
-from physion.experiment.protocol.messages import PageDone, SessionState
+from physion.experiment.protocol.messages import ENDED, PageDone, SessionState
 from physion.experiment.protocol.refused import Refused
 from physion.experiment.store.sessions import (
     ENTERED_AGAIN,
@@ -144,12 +144,12 @@ def submit_page(
     if page == "withdraw" or values.get("agreed") is False:
         if stage == "done":
             raise Refused("wrong_stage", "This session is finished.", state_of(session, trials))
-        if stage != "withdrawn":
+        if stage not in ENDED:
             change_session(connection, session, withdrawn_at=now, last_seen=now)
             if session.consented_at is None:
                 _forget_declined(connection, session)
         return state_of(session, trials)
-    if stage == "withdrawn" or STAGES.index(stage) < STAGES.index(page):  # type: ignore[arg-type]
+    if stage in ENDED or STAGES.index(stage) < STAGES.index(page):  # type: ignore[arg-type]
         raise Refused("wrong_stage", "This page is not next.", state_of(session, trials))
     if stage == page:
         change_session(connection, session, last_seen=now, **_columns(study, page, values, now))

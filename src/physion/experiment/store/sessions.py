@@ -10,7 +10,7 @@ from typing import Any, cast
 from sqlalchemy import Connection, Table, bindparam, select, update
 from sqlalchemy.dialects import postgresql, sqlite
 
-from physion.experiment.protocol.messages import SessionState, Stage
+from physion.experiment.protocol.messages import ENDED, SessionState, Stage
 from physion.experiment.protocol.refused import Refused
 from physion.experiment.store.tables import SESSIONS, TOKENS
 from physion.experiment.study.stimuli import PHASES
@@ -22,7 +22,7 @@ ENTERED_AGAIN = "entered_again"
 """Kind of the event stored when a session is entered again; its data are the device."""
 STAGES: tuple[Stage, ...] = (
     "consent", "instructions", "familiarization", "ready", "test", "demographics", "feedback",
-    "done", "withdrawn",
+    "done", *ENDED,
 )  # fmt: skip
 
 
@@ -45,6 +45,7 @@ class Session:
     demographics_at: float | None
     finished_at: float | None
     withdrawn_at: float | None
+    closed_at: float | None
     answered_familiarization: int
     answered_test: int
     loads: int
@@ -112,7 +113,8 @@ def read_session(connection: Connection, study: Study, token_hash: str) -> Sessi
 def stage_of(session: Session, trials: Mapping[str, int]) -> Stage:
     """Return the current stage of a session: the first one that is not complete."""
     if session.withdrawn_at is not None:
-        return "withdrawn"
+        declined = session.consented_at is None and session.closed_at is None
+        return "declined" if declined else "withdrawn"
     if session.finished_at is not None:
         return "done"
     complete = (
@@ -124,6 +126,15 @@ def stage_of(session: Session, trials: Mapping[str, int]) -> Stage:
         session.demographics_at is not None,
     )
     return STAGES[complete.index(False)] if False in complete else "feedback"
+
+
+def can_take_back(session: Session) -> bool:
+    """Return whether a participant who declined or stopped may still take part.
+
+    Only while nothing was answered, and the session was not closed for good.
+    """
+    unanswered = session.answered_familiarization == session.answered_test == 0
+    return session.withdrawn_at is not None and session.closed_at is None and unanswered
 
 
 def answered(session: Session, phase: str) -> int:

@@ -13,6 +13,7 @@ from sqlalchemy import Connection, Engine, func, insert, select, text
 from sqlalchemy.exc import OperationalError
 
 from physion.experiment.protocol.messages import (
+    ENDED,
     Answer,
     AnswerStored,
     Enter,
@@ -21,6 +22,7 @@ from physion.experiment.protocol.messages import (
     PageDone,
     Phase,
     Result,
+    SessionEnd,
     SessionState,
     Stored,
     TrialList,
@@ -41,6 +43,7 @@ from physion.experiment.store.sent_pages import check_page, submit_page
 from physion.experiment.store.sessions import (
     Session,
     TrialCounts,
+    can_take_back,
     change_session,
     mark_loaded,
     read_session,
@@ -54,7 +57,7 @@ from physion.experiment.store.writer import Writer
 from physion.experiment.study.identity import Secrets, hash_token
 from physion.experiment.study.media_links import sign_media
 from physion.experiment.study.orders import fixations, trial_order
-from physion.experiment.study.recruitment import completion
+from physion.experiment.study.recruitment import completion, ending_completion
 from physion.experiment.study.study import Study
 
 __all__ = ["Refused", "Store"]
@@ -124,7 +127,7 @@ class Store:
         def count(connection: Connection) -> SessionState:
             session = read_session(connection, self.study, hash_token(token))
             trials = self._trials.of(session.scenario)
-            if stage_of(session, trials) != "withdrawn":
+            if stage_of(session, trials) not in ENDED:
                 marks = mark_loaded(session, trials)
                 loads = session.loads + 1
                 change_session(connection, session, loads=loads, last_seen=now, **marks)
@@ -140,7 +143,7 @@ class Store:
         """
         session, trials = self._read(lambda c: self._read_session(c, token))
         stage = stage_of(session, trials)
-        if stage == "withdrawn":
+        if stage in ENDED:
             raise Refused("wrong_stage", "This session has ended.", state_of(session, trials))
         if stage == "consent":
             raise Refused("not_yet", "Trials come after the consent.", state_of(session, trials))
@@ -180,7 +183,7 @@ class Store:
 
         def store(connection: Connection) -> Stored:
             session, trials = self._read_session(connection, token)
-            if stage_of(session, trials) == "withdrawn":
+            if stage_of(session, trials) in ENDED:
                 raise Refused("wrong_stage", "This session has ended.", state_of(session, trials))
             of_session = EVENTS.c.session == session.session
             if events.key is not None:
@@ -201,6 +204,23 @@ class Store:
     def result(self, token: str) -> Result:
         """Return accuracy, percentile and completion of a finished session."""
         return self._read(lambda connection: self._compute_result(connection, token))
+
+    def ending(self, token: str) -> SessionEnd:
+        """Return the end of a session that was declined or stopped."""
+
+        def read(connection: Connection) -> SessionEnd:
+            session, trials = self._read_session(connection, token)
+            stage = stage_of(session, trials)
+            if stage not in ENDED:
+                raise Refused("wrong_stage", "This session goes on.", state_of(session, trials))
+            of_session = select(SESSIONS.c.source).where(SESSIONS.c.session == session.session)
+            source = connection.execute(of_session).scalar_one()
+            part = self.study.declined if stage == "declined" else self.study.stopped
+            return SessionEnd(
+                completion=ending_completion(part, source), can_take_back=can_take_back(session)
+            )
+
+        return self._read(read)
 
     async def write(self, command: Callable[[Connection], T]) -> T:
         """Run any command in the writer; see `Writer` for the rules that it must follow."""
@@ -253,7 +273,7 @@ class Store:
         session, trials = self._read_session(connection, token)
         stage = stage_of(session, trials)
         if stage != "done":
-            code = "wrong_stage" if stage == "withdrawn" else "not_yet"
+            code = "wrong_stage" if stage in ENDED else "not_yet"
             raise Refused(code, "The result comes at the end.", state_of(session, trials))
         scores = dict(self._scores.of(connection, session.scenario, session.kind))
         correct = scores.pop(session.session, None)

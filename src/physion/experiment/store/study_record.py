@@ -47,7 +47,7 @@ def register(connection: Connection, study: Study, now: float) -> None:
         )
     # Previews are not data: those that cannot continue are ended.
     ended = (other | gone) & SESSIONS.c.finished_at.is_(None) & SESSIONS.c.withdrawn_at.is_(None)
-    connection.execute(update(SESSIONS).where(ended).values(withdrawn_at=now))
+    connection.execute(update(SESSIONS).where(ended).values(withdrawn_at=now, closed_at=now))
     connection.execute(
         insert_or_skip(connection, STUDIES),
         {

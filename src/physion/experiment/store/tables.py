@@ -86,6 +86,7 @@ SESSIONS = Table(
     Column("demographics_at", Float),
     Column("finished_at", Float),
     Column("withdrawn_at", Float),
+    Column("closed_at", Float),
     Column("answered_familiarization", Integer, nullable=False, default=0),
     Column("answered_test", Integer, nullable=False, default=0),
     Column("loads", Integer, nullable=False, default=0),
@@ -106,7 +107,9 @@ SESSIONS = Table(
 )
 """Sessions. ``kind`` is written when the session begins and never changed. ``order_number`` is the
 number of the prepared order, 0 if the study has none; ``order_seed`` and the stimuli determine the
-order of the trials. ``loaded_at_*``: the trial that was next when the page was last reloaded."""
+order of the trials. ``loaded_at_*``: the trial that was next when the page was last reloaded.
+``closed_at``: when the lab ended the session for good, so that the participant cannot take it up
+again: its data were deleted, or it was a preview of other stimuli."""
 
 TOKENS = Table(
     "tokens",
@@ -137,6 +140,7 @@ ANSWERS = Table(
     Column("visibility_changes", Integer),
     Column("window_width", Integer),
     Column("window_height", Integer),
+    Column("break_ms", Float),
     Column("resumed", Boolean, nullable=False),
     Column("answered_at", Float, nullable=False),
     Column("details", Text, nullable=False),

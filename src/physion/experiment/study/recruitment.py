@@ -21,7 +21,7 @@ from physion.experiment.study.study_checks import NO_CONTACT
 
 if TYPE_CHECKING:
     from physion.experiment.study.identity import Secrets
-    from physion.experiment.study.study import Study
+    from physion.experiment.study.study import EarlyEnd, Study
 
 NO_ASSIGNMENT = "ASSIGNMENT_ID_NOT_AVAILABLE"
 """Value of ``assignmentId`` that MTurk sends while a worker previews a task."""
@@ -111,6 +111,22 @@ def completion(study: Study, secrets: Secrets, session: Any, raw: Any = None) ->
         code = signed if settings.mturk_code == "session" else settings.mturk_code or signed
         return _mturk_form(code, {} if raw is None else raw.recruiter)
     return Completion(code=settings.link_code or None, url=settings.link_address or None)
+
+
+def ending_completion(end: EarlyEnd, source: str) -> Completion:
+    """Return the code and URL for a participant who did not finish.
+
+    Parameters
+    ----------
+    end
+        Settings of this way to end: ``declined``, ``stopped``, ``device_refused`` or ``full``.
+    source
+        The participant's recruiter.
+    """
+    if source == "prolific":
+        code = end.prolific_code or None
+        return Completion(code=code, url=_with(PROLIFIC_COMPLETION, cc=code) if code else None)
+    return Completion(code=end.code or None, url=end.address or None)
 
 
 def _mturk_form(code: str, recruiter: Mapping[str, str]) -> Completion:

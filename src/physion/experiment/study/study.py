@@ -46,12 +46,15 @@ class Timing:
         Duration of the cue on the first frame.
     flash_hz
         Full cycles (on and off) of the cue per second; 1 in the official study.
+    break_every
+        Number of test trials after which people can rest for as long as they like; 0: no breaks.
     """
 
     fixation_ms: tuple[int, int] = (500, 1500)
     fixation_in_familiarization: bool = True
     cue_ms: int = 2000
     flash_hz: float = 2.0
+    break_every: int = 25
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,23 @@ class Recruitment:
     mturk_code: str = "session"
     link_code: str = ""
     link_address: str = ""
+
+
+@dataclass(frozen=True)
+class EarlyEnd:
+    """How participants who end without finishing report back to the recruiter.
+
+    Attributes
+    ----------
+    prolific_code
+        Prolific's code for this case, also part of the completion URL.
+    code, address
+        Code and URL for participants from elsewhere.
+    """
+
+    prolific_code: str = ""
+    code: str = ""
+    address: str = ""
 
 
 @dataclass(frozen=True)
@@ -142,6 +162,9 @@ class Study:
         Sites that may show the pages in a frame (MTurk); none by default.
     timing, screen, recruitment, limits
         The tables of ``study.toml``.
+    declined, stopped, device_refused, full
+        Codes and URLs of participants who gave no consent, who stopped, whose device cannot show
+        the movies, and who came when the study was full.
     stimuli
         Rows of ``stimuli.csv`` of the study's scenarios.
     texts
@@ -170,6 +193,10 @@ class Study:
     timing: Timing = Timing()
     screen: Screen = Screen()
     recruitment: Recruitment = Recruitment()
+    declined: EarlyEnd = EarlyEnd()
+    stopped: EarlyEnd = EarlyEnd()
+    device_refused: EarlyEnd = EarlyEnd()
+    full: EarlyEnd = EarlyEnd()
     limits: Limits = Limits()
     stimuli: tuple[Stimulus, ...] = ()
     texts: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
@@ -182,7 +209,15 @@ class Study:
         return tuple(sorted(chosen, key=lambda stimulus: stimulus.place))
 
 
-_PARTS = {"timing": Timing, "screen": Screen, "recruitment": Recruitment, "limits": Limits}
+EARLY_ENDS = ("declined", "stopped", "device_refused", "full")
+"""The tables of ``study.toml`` that are an `EarlyEnd`."""
+_PARTS: dict[str, type[Any]] = {
+    "timing": Timing,
+    "screen": Screen,
+    "recruitment": Recruitment,
+    **dict.fromkeys(EARLY_ENDS, EarlyEnd),
+    "limits": Limits,
+}
 
 
 def load_study(folder: Path | str) -> Study:
@@ -208,7 +243,7 @@ def load_study(folder: Path | str) -> Study:
     study = replace(parse_settings(parse_toml(path, content), path), folder=folder)
     texts, written = {}, []
     for language in study.languages:
-        texts[language], text_file = read_texts(folder / TEXTS_FOLDER, language)
+        texts[language], text_file = read_texts(folder / TEXTS_FOLDER, language, study.scenarios)
         written.append(text_file)
     listed = folder / STIMULI_FILE
     rows = read_plain(listed, MAX_STIMULI_BYTES)

@@ -152,10 +152,27 @@ _site = pattern(
 )
 
 
+_EARLY_ENDS = {
+    "declined": "For participants who do not consent.",
+    "stopped": "For participants who stop; they learn the code, so it should not pay in full.",
+    "device_refused": "For participants whose device or browser cannot show the movies.",
+    "full": "For participants who come when the study is full.",
+}
+
+
 def _rules(value: Any) -> str:
     if value not in EXCLUSIONS:
         raise ValueError(" or ".join(EXCLUSIONS))
     return str(value)
+
+
+def _early_end(table: str) -> tuple[Key, ...]:
+    """Return the keys of a way to end without finishing."""
+    return (
+        Key(table, "prolific_code", _code, "Prolific's code for this case."),
+        Key(table, "code", _code, "Code for participants from elsewhere."),
+        Key(table, "address", address(), "URL to which participants from elsewhere are sent."),
+    )
 
 
 KEYS: tuple[Key, ...] = (
@@ -195,6 +212,8 @@ KEYS: tuple[Key, ...] = (
     Key("timing", "flash_hz", number(0, 3),
         "Full cycles of the red and yellow cue per second (official: 1); 0: no flashing.\n"
         "More than 3 could harm people with photosensitive epilepsy."),
+    Key("timing", "break_every", whole(0, 100_000),
+        "Test trials after which people can rest for as long as they like; 0: no breaks."),
     Key("screen", "min_width", whole(320, 10_000), "Smallest browser window, in CSS pixels."),
     Key("screen", "min_height", whole(320, 10_000), ""),
     Key("recruitment", "id_needed", flag,
@@ -210,6 +229,7 @@ KEYS: tuple[Key, ...] = (
         "Completion code for participants who came by a plain link."),
     Key("recruitment", "link_address", address(),
         "URL to which these participants are sent at the end."),
+    *(key for table in _EARLY_ENDS for key in _early_end(table)),
     Key("limits", "requests_per_second", number(0.1, 10_000),
         "Sustained rate of requests of one session."),
     Key("limits", "burst", whole(1, 100_000), "Burst of requests of one session."),
@@ -224,6 +244,7 @@ TABLES = {
     "timing": "Durations within a trial.",
     "screen": "In a smaller window participants are asked to enlarge it; telephones are refused.",
     "recruitment": "Recruitment and completion credit.",
+    **_EARLY_ENDS,
     "limits": "Rate limits; requests beyond them are refused for a while.",
 }
 """Tables of ``study.toml`` and the comment above each."""

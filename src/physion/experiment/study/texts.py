@@ -3,12 +3,15 @@
 ``texts/LANGUAGE.toml`` has one table per page and one line per text: ``title = "..."`` in
 ``[consent]`` has the key ``consent.title``. The pages replace placeholders in braces. Each study
 has its own copies, so that a lab can edit every text.
+
+Two kinds of texts may be absent: ``study.title``, in place of the title of ``study.toml``, and
+``scenario.NAME.KEY``, in place of the text ``KEY`` in the sessions of one scenario.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -21,11 +24,23 @@ from physion.experiment.study.study_file import parse_toml
 TEXTS_FOLDER = "texts"
 MAX_BYTES = 1_000_000
 MAX_TEXT = 20_000
+OPTIONAL = ("study.title",)
 _PLACEHOLDER = re.compile(r"\{([a-z_]+)\}")
 
 
-def read_texts(folder: Path, language: str) -> tuple[dict[str, str], bytes]:
+def read_texts(
+    folder: Path, language: str, scenarios: Sequence[str] = ()
+) -> tuple[dict[str, str], bytes]:
     """Read and check the texts of a language; return them by key, and the bytes of the file.
+
+    Parameters
+    ----------
+    folder
+        The folder of the text files.
+    language
+        Language of the file to read.
+    scenarios
+        Scenarios that may have texts of their own.
 
     Raises
     ------
@@ -37,18 +52,29 @@ def read_texts(folder: Path, language: str) -> tuple[dict[str, str], bytes]:
     texts = _parse(path, content)
     wanted = shipped_texts()
     for key in texts:
-        if key not in wanted:
-            raise BadInputError(f"{path}: {UnknownNameError('text', key, wanted)}")
+        general = _general_key(key, scenarios)
+        if general not in (*wanted, *OPTIONAL):
+            raise BadInputError(f"{path}: {UnknownNameError('text', general, wanted)}")
     for key, original in wanted.items():
         if key not in texts:
             raise BadInputError(
                 f"{path} lacks the text {key}; in English it is: {original[:100]!r}"
             )
-        known = set(_PLACEHOLDER.findall(original))
-        for name in set(_PLACEHOLDER.findall(texts[key])) - known:
+    for key, written in texts.items():
+        general = _general_key(key, scenarios)
+        known = set(_PLACEHOLDER.findall(wanted.get(general, "")))
+        for name in set(_PLACEHOLDER.findall(written)) - known:
             allowed = ", ".join(f"{{{one}}}" for one in sorted(known)) or "none"
             raise BadInputError(f"{path}: {key} has {{{name}}}; it may have {allowed}")
     return texts, content
+
+
+def _general_key(key: str, scenarios: Sequence[str]) -> str:
+    """Return the key of the text that ``key`` replaces in one scenario, or ``key`` itself."""
+    for scenario in scenarios:
+        if key.startswith(f"scenario.{scenario}."):
+            return key.removeprefix(f"scenario.{scenario}.")
+    return key
 
 
 def shipped_languages() -> list[str]:

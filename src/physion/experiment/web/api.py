@@ -20,7 +20,7 @@ from physion.experiment.protocol.messages import (
     TrialMedia,
 )
 from physion.experiment.study.media_links import sign_media
-from physion.experiment.study.recruitment import RECRUITERS, is_mturk_preview
+from physion.experiment.study.recruitment import RECRUITERS, ending_completion, is_mturk_preview
 from physion.experiment.study.stimuli import PHASES
 from physion.experiment.web.bearer import read_token
 from physion.experiment.web.bodies import read_message
@@ -48,9 +48,13 @@ def public_study(study: Study, secrets: Secrets) -> PublicStudy:
         min_height=study.screen.min_height,
         cue_ms=study.timing.cue_ms,
         flash_hz=study.timing.flash_hz,
+        break_every=study.timing.break_every,
         preload=study.preload,
         example={name: _example(study, secrets, name) for name in study.scenarios},
         recruiters=list(RECRUITERS),
+        device_refused={
+            one.source: ending_completion(study.device_refused, one.source) for one in RECRUITERS
+        },
     )
 
 
@@ -150,6 +154,11 @@ def build_api(study: Study, secrets: Secrets, store: Store) -> APIRouter:
     async def get_result(request: Request) -> Response:
         """Return the result of a finished session."""
         return Reply(await run_in_threadpool(store.result, token_of(request)))
+
+    @router.get("/ending")
+    async def get_ending(request: Request) -> Response:
+        """Return the end of a session that was declined or stopped."""
+        return Reply(await run_in_threadpool(store.ending, token_of(request)))
 
     @router.api_route("/health", methods=["GET", "HEAD"])
     async def get_health(request: Request) -> Response:

@@ -8,7 +8,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 from starlette.responses import Response
 
-from physion.experiment.protocol.messages import REFUSALS, Refusal, SessionState
+from physion.experiment.protocol.messages import REFUSALS, Completion, Refusal, SessionState
 
 MESSAGES = {
     "not_found": "There is nothing at this address.",
@@ -32,7 +32,8 @@ class Reply(Response):
 
 
 def refuse(code: str, message: str = "", state: SessionState | None = None, status: int = 0,
-           headers: dict[str, str] | None = None) -> Reply:  # fmt: skip
+           headers: dict[str, str] | None = None,
+           completion: Completion | None = None) -> Reply:  # fmt: skip
     """Return the response for a refusal.
 
     Parameters
@@ -47,8 +48,15 @@ def refuse(code: str, message: str = "", state: SessionState | None = None, stat
         HTTP status in place of that of the code; 0 for none.
     headers
         Additional headers.
+    completion
+        How the refused participant reports back to the recruiter.
     """
-    body = Refusal(error=code, message=message or MESSAGES.get(code, code), state=state)
+    body = Refusal(
+        error=code,
+        message=message or MESSAGES.get(code, code),
+        state=state,
+        completion=completion,
+    )
     return Reply(body, status or REFUSALS[code], headers)
 
 

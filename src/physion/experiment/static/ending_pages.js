@@ -1,0 +1,83 @@
+/**
+ * Pages of participants who do not finish: the questions whether to decline and to stop, and the
+ * page after it.
+ * @module ending_pages
+ */
+
+import { completionParts } from "./completion.js";
+import { button, el, paragraphs } from "./dom.js";
+import { bound } from "./texts.js";
+
+/** @typedef {import("./pages.js").Context} Context */
+/** @typedef {import("./pages.js").Render} Render */
+
+/** Render the question whether to decline; ends with {declined}. @param {Context} context */
+export function declineQuestion({ texts }) {
+  const { t } = bound(texts);
+  return question(t, "decline", t("decline.text"), [], (declined) => ({ declined }));
+}
+
+/** Render the question whether to stop; ends with {stop}. @param {Context} context */
+export function stopQuestion({ texts, study, state }) {
+  const { t } = bound(texts);
+  const begun = !["instructions", "familiarization"].includes(state.stage) || state.trial > 0;
+  const text = t(begun ? "stop.text" : "stop.text_unanswered", { contact: study.contact });
+  const reference = t("common.reference", { reference: state.reference });
+  const parts = [el("p", { class: "small" }, reference)];
+  return question(t, "stop", text, parts, (stop) => ({ stop }));
+}
+
+/**
+ * Render a question whose main button goes on with the study and whose other button ends it.
+ * @param {(key: string) => string} t
+ * @param {string} name Table of the texts `title`, `confirm` and `go_on`.
+ * @param {string} text
+ * @param {HTMLElement[]} parts Elements after the text.
+ * @param {(ends: boolean) => any} answerOf
+ * @returns {Render}
+ */
+function question(t, name, text, parts, answerOf) {
+  return (page, done) =>
+    page.append(
+      el("h1", {}, t(`${name}.title`)),
+      ...paragraphs(text),
+      ...parts,
+      el(
+        "div",
+        { class: "buttons" },
+        button(t(`${name}.confirm`), () => done(answerOf(true)), { class: "button quiet" }),
+        button(t(`${name}.go_on`), () => done(answerOf(false))),
+      ),
+    );
+}
+
+/**
+ * Render the page of a session that was declined or stopped.
+ * @param {Context} context
+ * @param {import("./messages.js").SessionEnd} ending
+ * @param {(() => void)|null} takeBack Takes part after all; null if the page cannot.
+ * @returns {(page: HTMLElement) => void}
+ */
+export function endedPage({ texts, study, state, another }, ending, takeBack) {
+  const { t } = bound(texts);
+  const { completion, can_take_back } = ending;
+  const name = state.stage === "declined" ? "declined" : "withdrawn";
+  const told = completion.code || completion.url;
+  const changed = () => {
+    const control = takeBack && button(t("ended.take_back"), takeBack, { class: "button quiet" });
+    return el("p", { class: "apart" }, t(takeBack ? "ended.mind_changed" : "ended.open_link"), " ", control);
+  };
+  return (page) => {
+    page.append(
+      el("h1", {}, t(`${name}.title`)),
+      ...paragraphs(t(`${name}.text`, study)),
+      ...(told ? [] : [el("p", {}, t("ended.return_submission"))]),
+      ...completionParts(completion, t, "ended.go_hint"),
+      ...(can_take_back ? [changed()] : []),
+      el("p", { class: "small" }, t("common.reference", { reference: state.reference })),
+    );
+    if (!another) return;
+    const next = button(t("common.another_person"), another, { class: "button quiet" });
+    page.append(el("div", { class: "buttons" }, next));
+  };
+}

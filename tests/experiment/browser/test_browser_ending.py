@@ -1,0 +1,98 @@
+"""Declining, coming back and the codes of people who do not finish, in a real browser."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
+
+from physion.experiment.study.study import EarlyEnd, Study
+from support.experiment.browser import Visit, chromium, rows_of, served
+
+__all__ = ["chromium"]
+pytestmark = pytest.mark.slow
+PHONE = {"viewport": {"width": 1100, "height": 700}, "has_touch": True, "is_mobile": True}
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Study, str]]:
+    ends = {
+        "declined": EarlyEnd("NOCONSENT", "no-consent", "https://lab.example/declined"),
+        "device_refused": EarlyEnd("PHONE", "phone"),
+        "full": EarlyEnd("FULL", "full"),
+    }
+    folder = tmp_path_factory.mktemp("study")
+    with served(folder, test=1, familiarization=1, participants=1, **ends) as (study, server):
+        yield study, server.url
+
+
+def decline(visit: Visit) -> None:
+    visit.page.get_by_text("I do not want to take part").click()
+    visit.heading("Do you really not want to take part?")
+    visit.picture("question")
+    visit.page.get_by_role("button", name="I do not take part").click()
+    visit.heading("You do not take part")
+
+
+def test_declining_is_asked_once_more_and_taken_back(
+    chromium: Any, site: tuple[Study, str]
+) -> None:
+    study, url = site
+    with Visit(chromium, url, "decline") as visit:
+        visit.go("?participant=Ada")
+        visit.page.get_by_text("I do not want to take part").click()
+        visit.page.get_by_role("button", name="Back to the consent form").click()
+        visit.page.locator("dialog").wait_for(state="detached")
+        assert visit.heading() == "Taking part in this study"
+        decline(visit)
+        visit.picture("declined")
+        reference = rows_of(study, "Ada")[0].reference
+        assert visit.page.inner_text("#code") == "no-consent"
+        assert visit.page.get_attribute("#go", "href") == "https://lab.example/declined"
+        visit.page.reload()  # the address no longer has the id
+        visit.heading("You do not take part")
+        said = visit.page.inner_text("main")
+        assert reference in said and "open the link of your invitation once more" in said
+        visit.go("?participant=Ada")
+        visit.heading("You do not take part")
+        assert reference in visit.page.inner_text("main")
+        visit.page.get_by_text("Take part after all").click()
+        visit.heading("Taking part in this study")
+        visit.main_button().click()
+        visit.heading("What you will do")
+        visit.page.get_by_text("Stop taking part").click()
+        visit.page.get_by_text("You have not answered yet").wait_for()
+        visit.page.get_by_text("Stop for good").click()
+        visit.heading("You have stopped")
+        visit.page.get_by_text("please return the task there").wait_for()
+        visit.page.get_by_text("Take part after all").click()
+        visit.heading("What you will do")
+        assert visit.unexpected() == []
+    session, _, _ = rows_of(study, "Ada")
+    assert session.withdrawn_at is None and session.reference == reference
+
+
+def test_refused_devices_and_full_studies_have_their_codes(
+    chromium: Any, site: tuple[Study, str]
+) -> None:
+    _, url = site
+    with Visit(chromium, url, "phone", screen=PHONE["viewport"], **PHONE) as visit:
+        visit.go("?PROLIFIC_PID=5f00")
+        visit.page.get_by_text("does not work on phones").wait_for()
+        visit.picture("refused")
+        address = "https://app.prolific.com/submissions/complete?cc=PHONE"
+        assert visit.page.get_attribute("#go", "href") == address
+    with Visit(chromium, url) as visit:
+        visit.begin("?participant=First")
+        visit.practise(1)
+        visit.begin_test()
+        visit.answer("yes")
+        visit.finish()
+    with Visit(chromium, url, "full") as visit:
+        visit.go("?participant=Late")
+        visit.page.get_by_text("Enough people have taken part").wait_for()
+        assert visit.page.inner_text("#code") == "full"
+        visit.picture("refused")
