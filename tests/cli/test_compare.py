@@ -149,7 +149,8 @@ def test_every_option_of_a_comparison_reaches_the_report(
     assert Path(plain["report"]).is_file()
     flags = {row["session"]: row["incomplete"] for row in plain["people_flags"]}
     assert [session for session, flag in flags.items() if flag] == ["drop-p0"]
-    assert "60 resamples, seed 0" in plain["methods"]["Intervals"]
+    intervals = plain["methods"]["Intervals of people's accuracy and agreement"]
+    assert "60 resamples, seed 0" in intervals
     assert (
         "sessions answered: collide 16, drop 16; 1 session lacked some"
         in (plain["methods"]["Trials of a whole session"])

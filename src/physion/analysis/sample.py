@@ -1,4 +1,4 @@
-"""Answers of models and people to the same stimuli, with resamples: what metrics compute from."""
+"""Answers of models and people to the same stimuli, with weights: what metrics compute from."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ Array = npt.NDArray[np.float64]
 
 Resampled = Literal["people", "stimuli", "both"]
 RESAMPLED: tuple[Resampled, ...] = ("people", "stimuli", "both")
-"""What is drawn with replacement for an interval."""
+"""What an interval takes as drawn at random: it is about others of the same number."""
 
 
 class Sums(NamedTuple):
-    """Weighted sums over stimuli, each of shape (b, m): b resamples, m models.
+    """Weighted sums over stimuli, each of shape (b, m): b sets of weights, m models.
 
     - ``n``, ``correct``, ``correct_shown``: stimuli that the model predicts, those of them where
       its answer equals the official outcome, and the outcome of the trial that it was shown;
@@ -61,7 +61,7 @@ class Sums(NamedTuple):
 
 @dataclass(frozen=True)
 class Sample:
-    """Answers of m models and of people to s stimuli, with the weights of b resamples.
+    """Answers of m models and of people to s stimuli, with b sets of weights.
 
     - ``p_contact``, ``predicted`` (m, s): P(contact) in 0..1, and the predicted outcome 1 or 0;
       NaN where a model does not predict the stimulus;
@@ -70,10 +70,10 @@ class Sample:
       right; NaN where nobody answered;
     - ``differ`` (b, s) or (1, s): fraction of pairs of different people who answer differently; NaN
       where fewer than two answered;
-    - ``stimuli`` (b, s): how often each stimulus is drawn;
-    - ``answers``, ``people`` (b, n): answers of single participants, and how often each of them is
-      drawn; None if only averages are known;
-    - ``drawn``: what is drawn with replacement; None for the sample itself (b = 1).
+    - ``stimuli`` (b, s): weight of each stimulus: 0 where it is left out;
+    - ``answers``, ``people`` (b, n): answers of single participants, and the weight of each of
+      them; None if only averages are known;
+    - ``drawn``: whose weights differ from 1; None for the sample itself (b = 1).
     """
 
     p_contact: Array
@@ -138,7 +138,7 @@ class Sample:
         xx, yy, xy = w @ (a * a).T, (weighted * b) @ has.T, weighted @ a.T
         square = xx - 2 * xy + yy
         if len(self.p_yes) == 1:
-            # The same people in every resample: sum the squares themselves, which is more exact.
+            # The same people for all weights: sum the squares themselves, which is more exact.
             gap = np.where(known & answered, self.p_contact - self.p_yes, 0.0) * mask
             square = w @ (gap * gap).T
         return Sums(
@@ -179,9 +179,11 @@ class Sample:
     def _mean_kappa(self, of_people: Array, of_models: Array) -> Array:
         if self.drawn not in ("stimuli", "both"):
             return mean_over_people(cross_kappa(of_people, of_models), self._people)
+        # Rows that draw the same stimuli share the kappas of single people.
+        draws, row = np.unique(self.stimuli, axis=0, return_inverse=True)
         means = []
         for model in of_models:
-            kappa = resampled_kappa(of_people, model, self.stimuli)
+            kappa = resampled_kappa(of_people, model, draws)[row]
             known = np.isfinite(kappa)
             total = np.sum(np.where(known, kappa, 0.0) * self._people, axis=1)
             means.append(total / np.sum(known * self._people, axis=1))
@@ -223,7 +225,7 @@ def sample_of_rows(rows: pd.DataFrame, stimuli: Array) -> Sample:
         One row a stimulus with ``p_contact``, ``predicted``, ``label``, ``simulated``, and, NaN
         without people, ``p_yes``, ``human_accuracy`` and ``count``.
     stimuli
-        (b, s): how often each stimulus is drawn.
+        (b, s): weight of each stimulus.
     """
 
     def column(name: str) -> Array:

@@ -220,7 +220,7 @@ def compare_files(
         model_inputs=read_by_model(predictions, "Inputs"),
         model_weights=read_by_model(predictions, "Init"),
         trial_pages=trial_pages,
-        rollout_errors=None if errors is None else rollout_error_table(errors, draws),
+        rollout_errors=None if errors is None else rollout_error_table(errors, draws.level),
         **({"question": question} if question else {}),
     )
     return build_report(inputs, folder)

@@ -12,6 +12,7 @@ import pytest
 from sklearn.metrics import cohen_kappa_score
 
 from physion.analysis import Bootstrap, Comparison, compare_scores
+from physion.analysis.leaderboard.leaderboard import leaderboard
 from physion.analysis.metrics import metrics
 from physion.analysis.models.anchors import (
     ANCHOR_MODELS,
@@ -21,7 +22,6 @@ from physion.analysis.models.anchors import (
     TWO_PEOPLE,
     kind_of,
 )
-from physion.analysis.models.leaderboard import leaderboard
 from physion.analysis.models.observed_contact import SETTING
 from physion.analysis.models.people_comparison import compare_everywhere
 from physion.analysis.sample import sample_of_rows

@@ -344,8 +344,9 @@ def test_the_settings_say_where_the_zone_comes_from_and_what_is_drawn() -> None:
         *given, zone=zone, zone_origin="from the responses", participants=True, bootstrap=QUICK
     ).settings
     assert "from the responses" in told["Human zone"]
-    for word in ("participants", "stimuli", "both", "200 resamples"):
+    for word in ("participants", "stimuli", "both", "jackknife", "Efron and Stein"):
         assert word in told["Intervals with participants"]
+    assert "200 resamples" in told["Intervals of people's accuracy and agreement"]
     assert "not given" in compare_scores(*given, bootstrap=QUICK).settings["Human zone"]
     assert "Human zone" not in compare_scores(given[0], None, bootstrap=QUICK).settings
 

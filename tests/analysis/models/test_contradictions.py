@@ -10,8 +10,8 @@ import pandas as pd
 import pytest
 
 from physion.analysis import Bootstrap, compare_scores, read_humans, read_labels
+from physion.analysis.leaderboard.leaderboard import leaderboard
 from physion.analysis.models.contradictions import check_coverage
-from physion.analysis.models.leaderboard import leaderboard
 from physion.analysis.results import compare
 from physion.analysis.tables.predictions import check_predictions, name_models
 from physion.cli.main import main

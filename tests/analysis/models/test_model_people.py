@@ -15,14 +15,21 @@ from sklearn.metrics import brier_score_loss, cohen_kappa_score
 from statsmodels.stats.contingency_tables import mcnemar
 from statsmodels.stats.multitest import multipletests
 
-from physion.analysis.metrics import measure_metrics
+from physion.analysis.metrics import measure_metrics, metrics
 from physion.analysis.models.measures import measure_models, measure_table
-from physion.analysis.models.model_people import Models, model_pairs, models_of
+from physion.analysis.models.model_people import (
+    Models,
+    model_pairs,
+    models_of,
+    sample_of_models,
+)
 from physion.analysis.models.people_comparison import PeopleComparison, compare_everywhere
+from physion.analysis.models.sampling_variance import sampling_variances
 from physion.analysis.models.zones import RELEASED_R, human_zones, released_r_zone, released_zone
 from physion.analysis.people.answers import ScenarioAnswers, answers_of
 from physion.analysis.people.difficulty import difficulty_third, r_by_third
-from physion.analysis.people.people import draws_of_people, split_halves
+from physion.analysis.people.people import split_halves
+from physion.analysis.sample import Resampled
 from physion.analysis.statistics import agreement
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.statistics.calibration import (
@@ -31,6 +38,7 @@ from physion.analysis.statistics.calibration import (
     decompose,
     reliability_curve,
 )
+from physion.analysis.statistics.jackknife import Variance
 from physion.analysis.statistics.kappa import correctness
 from physion.analysis.statistics.paired import (
     _coins,
@@ -63,8 +71,8 @@ def models(answers: ScenarioAnswers) -> Models:
     return Models(("people", "chance", "always", "gaps"), p, predicted)
 
 
-def measures(models: Models, answers: ScenarioAnswers, bootstrap: Bootstrap) -> pd.DataFrame:
-    return measure_table(measure_models(models, answers, bootstrap), bootstrap)
+def measures(models: Models, answers: ScenarioAnswers) -> pd.DataFrame:
+    return measure_table(measure_models(models, answers))
 
 
 def plain(
@@ -116,7 +124,7 @@ def plain(
 
 @pytest.mark.filterwarnings("ignore:Mean of empty slice")
 def test_every_measure_is_what_it_says(models: Models, answers: ScenarioAnswers) -> None:
-    table = measures(models, answers, FEW)
+    table = measures(models, answers)
     assert len(table) == 4 * len(MEASURES)
     for k, name in enumerate(models.names):
         expected = plain(k, models, answers, range(12), range(25))
@@ -133,33 +141,67 @@ def test_every_measure_is_what_it_says(models: Models, answers: ScenarioAnswers)
     assert undefined["reason"].str.contains("P\\(contact\\) is constant").all()
 
 
-def test_intervals_are_those_of_drawing_people_stimuli_or_both(
+def test_intervals_are_those_of_leaving_out_people_or_stimuli(
     models: Models, answers: ScenarioAnswers
 ) -> None:
-    draws = Bootstrap(resamples=12, seed=3)
-    table = measures(models, answers, draws).set_index(["model", "measure"])
-    people = draws_of_people(answers, draws).astype(int)
-    stimuli = draws.weights(answers.scenario, 25).astype(int)
-    for what in ("people", "stimuli", "both"):
-        values = []
-        for k in range(12):
-            who = np.arange(12) if what == "stimuli" else np.repeat(np.arange(12), people[k])
-            of = np.arange(25) if what == "people" else np.repeat(np.arange(25), stimuli[k])
-            values.append(plain(1, models, answers, who, of))
+    table = measures(models, answers).set_index(["model", "measure"])
+    people, stimuli = range(12), range(25)
+    whole = plain(1, models, answers, people, stimuli)
+    for what, n in (("people", 12), ("stimuli", 25)):
+        without = [
+            plain(1, models, answers, [i for i in people if what != "people" or i != k],
+                  [s for s in stimuli if what != "stimuli" or s != k])
+            for k in range(n)
+        ]  # fmt: skip
         for measure in MEASURES:
             row = table.loc[("chance", measure)]
             found = (row[f"low_{what}"], row[f"high_{what}"])
             if measure == "accuracy" and what == "people":
                 assert np.isnan(found).all() and "do not enter" in row["reason"]
                 continue
-            drawn = np.array([value[measure] for value in values])
-            assert found == pytest.approx(draws.interval(drawn), abs=1e-9), (what, measure)
+            values = np.array([value[measure] for value in without])
+            variance = Variance(np.asarray((n - 1) * np.var(values)), np.asarray(n - 1.0))
+            expected = variance.interval(whole[measure], 0.95, metrics.get(measure).scale)
+            if what == "stimuli":
+                assert found == pytest.approx(expected, abs=1e-9), (what, measure)
+            else:  # less what is bilinear in two people, which is little for this model
+                width = (found[1] - found[0]) / (expected[1] - expected[0])
+                assert 0.85 < width <= 1 + 1e-9, (what, measure)
+
+
+@pytest.mark.parametrize("drawn", ["people", "both"])
+def test_a_perfect_model_lies_in_its_interval_as_often_as_it_should(drawn: Resampled) -> None:
+    """The noise of people's averages counts once: in the value, not again in the interval."""
+    rng = np.random.default_rng(5)
+    chosen = {name: metrics.get(name) for name in ("rmsd", "r")}
+    rows: dict[str, list[tuple[float, float, float]]] = {name: [] for name in chosen}
+    true = rng.beta(0.8, 0.8, 60)
+    for _ in range(120):
+        if drawn == "both":
+            true = rng.beta(0.8, 0.8, 60)
+        lean = 1 / (1 + np.exp(-0.3 * rng.normal(size=(40, 1)) - np.log(true / (1 - true))))
+        yes = (rng.random((40, 60)) < lean).astype(float)
+        names = tuple(map(str, range(60)))
+        answers = ScenarioAnswers("drop", names[:40], names[:40], names, yes,
+                                  np.arange(60) % 2.0, np.full(yes.shape, np.nan))  # fmt: skip
+        models = Models(("perfect",), true[None], (true[None] > 0.5).astype(float))
+        value = {name: float(metric(sample_of_models(models, answers))[0, 0])
+                 for name, metric in chosen.items()}  # fmt: skip
+        for name, variance in sampling_variances(models, answers, chosen, drawn).items():
+            low, high = variance.of(0).interval(value[name], 0.95, metrics.get(name).scale)
+            rows[name].append((value[name], low, high))
+    for name, found in rows.items():
+        values, low, high = np.array(found).T
+        inside = (low < values.mean()) & (values.mean() < high)
+        assert 0.88 <= inside.mean() <= 0.995, name
+        assert np.mean(high - low) == pytest.approx(3.92 * np.std(values), rel=0.25), name
+        assert ((low < values) & (values < high)).all(), name
 
 
 def test_a_model_that_knows_people_is_best_and_noise_adds_up(answers: ScenarioAnswers) -> None:
     p = np.vstack([answers.p_yes(), np.random.default_rng(1).random(25)])
     models = Models(("people", "chance"), p, (p > 0.5).astype(float))
-    table = measures(models, answers, Bootstrap(resamples=300))
+    table = measures(models, answers)
     table = table.set_index(["model", "measure"])
     assert table.loc[("people", "r"), "value"] == pytest.approx(1)
     assert table.loc[("people", "rmsd"), "value"] == pytest.approx(0, abs=1e-9)
@@ -177,7 +219,7 @@ def test_a_person_as_a_model_stands_in_the_zone_of_people(answers: ScenarioAnswe
                    answers.stimuli, answers.yes[others], answers.label,
                    answers.log_rt[others])  # fmt: skip
     as_model = Models(("person",), answers.yes[4:5], answers.yes[4:5])
-    table = measures(as_model, rest, FEW).set_index("measure")["value"]
+    table = measures(as_model, rest).set_index("measure")["value"]
     every = {}
     for k in range(12):
         chosen = np.arange(12) != k
@@ -237,7 +279,7 @@ def test_tables_become_models_and_what_has_no_counterpart_is_counted(
     with pytest.raises(BadInputError, match="twice"):
         models_of(pd.concat([rows, rows.iloc[[3]]]), answers)
     nothing, dropped = models_of(rows.assign(stimulus=rows.index.astype(str)), answers)
-    table = measures(nothing, answers, FEW)
+    table = measures(nothing, answers)
     assert table["value"].isna().all() and table["reason"].str.contains("predicts none").all()
     assert dropped["stimuli"].sum() == 100
 
@@ -295,7 +337,7 @@ def test_all_scenarios_and_their_mean() -> None:
             assert scores.loc[(model, "mean", measure), "value"] == pytest.approx(values.mean())
     answers = answers_of(test, "roll")
     models, _ = models_of(predictions, answers)
-    alone = measures(models, answers, FEW).set_index(["model", "measure"])
+    alone = measures(models, answers).set_index(["model", "measure"])
     here = scores.xs("roll", level="scenario").loc[alone.index]
     pd.testing.assert_frame_equal(here[alone.columns.drop("scenario")],
                                   alone.drop(columns="scenario"))  # fmt: skip

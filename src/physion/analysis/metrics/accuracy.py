@@ -15,6 +15,7 @@ def _accuracy_of_people(sample: Sample) -> Array:
     label="accuracy",
     definition="fraction of the model's answers that equal the official outcome",
     better="higher",
+    scale="fraction",
     needs="outcome",
     resampled=("stimuli", "both"),
     in_scores=True,
@@ -34,6 +35,7 @@ def accuracy(sample: Sample) -> Array:
     definition="the same answers against the outcome of the trial as it was simulated for the "
     "model",
     better="higher",
+    scale="fraction",
     needs="outcome",
     resampled=("stimuli", "both"),
     in_scores=True,
@@ -51,6 +53,7 @@ def accuracy_simulated(sample: Sample) -> Array:
     heading="people",
     definition="mean over the same stimuli of the fraction of people who are right",
     better="",
+    scale="fraction",
     needs="people",
     in_scores=True,
     two_people=_accuracy_of_people,

@@ -19,6 +19,7 @@ ROUNDING = 1e-12
     definition="correlation over stimuli of P(contact) with the fraction of people who say yes, "
     "that is, with the average person",
     better="higher",
+    scale="correlation",
     needs="people",
     in_scores=True,
     in_measures=True,
@@ -37,6 +38,7 @@ def pearson_r(sample: Sample) -> Array:
     definition="Pearson r without the stimuli whose simulated outcome is not the official one, "
     "since people and model saw different events there",
     better="higher",
+    scale="correlation",
     needs="people",
     in_scores=True,
 )
@@ -59,6 +61,7 @@ def _kappa_of_two_people(sample: Sample) -> Array:
     heading="kappa",
     definition="Cohen's kappa with a person drawn anew for each stimulus, from P(yes) alone",
     better="higher",
+    scale="correlation",
     needs="people",
     in_scores=True,
     in_measures=True,
@@ -97,6 +100,7 @@ def _kappa(agreement: Array, expected: Array) -> Array:
     definition="square root of the mean squared difference between P(contact) and the fraction of "
     "people who say yes",
     better="lower",
+    scale="positive",
     needs="people",
     in_scores=True,
     in_measures=True,
@@ -113,6 +117,7 @@ def rmsd(sample: Sample) -> Array:
     definition="RMSD divided by the square root of the number of stimuli: the “RMSE” of the "
     "released notebooks",
     better="lower",
+    scale="positive",
     needs="people",
     in_measures=True,
 )

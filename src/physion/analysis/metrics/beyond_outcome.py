@@ -24,6 +24,7 @@ BEYOND_OUTCOME = ("r_beyond_outcome", "kappa_beyond_outcome", "kappa_within_outc
     definition="partial correlation of P(contact) with the fraction of people who say yes, given "
     "the official outcome: 0 for a model that knows nothing of people but the outcome",
     better="higher",
+    scale="correlation",
     needs="people",
     in_scores=True,
     in_measures=True,

@@ -24,6 +24,7 @@ def _kappa_of_two_people(sample: Sample) -> Array:
     label="kappa",
     definition="Cohen's kappa with each participant, mean over participants",
     better="higher",
+    scale="correlation",
     needs="participants",
     in_measures=True,
     on_leaderboard=True,
@@ -55,6 +56,7 @@ def kappa_gap(sample: Sample) -> Array:
     definition="kappa of right and wrong answers with each participant, mean over participants "
     "(Geirhos and others, 2020)",
     better="higher",
+    scale="correlation",
     needs="participants",
     in_measures=True,
     by_participant=_errors_by_participant,

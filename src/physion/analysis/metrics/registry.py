@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 
 from physion.analysis.sample import RESAMPLED, Array, Resampled, Sample
+from physion.analysis.statistics.jackknife import Scale
 from physion.registry import Registry
 
 Compute = Callable[[Sample], Array]
@@ -32,7 +33,7 @@ class Metric:
     - ``better``: which values are better; ``zero``: those nearest to 0; empty: none is;
     - ``needs``: ``outcome`` (of the trials), ``people`` (their averages by stimulus) or
       ``participants`` (their single answers);
-    - ``resampled``: what an interval can be drawn over;
+    - ``resampled``: what an interval can be about; ``scale``: the one on which it is symmetric;
     - ``in_scores``, ``in_measures``, ``on_leaderboard``: the tables that contain it: scores of
       models by stimulus, measures with single participants, the leaderboard;
     - ``by_participant``: from a `Sample` to the value with each participant (n, m), if any;
@@ -48,6 +49,7 @@ class Metric:
     better: Literal["higher", "lower", "zero", ""]
     needs: Literal["outcome", "people", "participants"]
     resampled: tuple[Resampled, ...]
+    scale: Scale
     in_scores: bool
     in_measures: bool
     on_leaderboard: bool
@@ -83,6 +85,7 @@ def register_metric(
     needs: Literal["outcome", "people", "participants"],
     heading: str = "",
     resampled: tuple[Resampled, ...] = RESAMPLED,
+    scale: Scale = "identity",
     in_scores: bool = False,
     in_measures: bool = False,
     on_leaderboard: bool = False,
@@ -104,6 +107,7 @@ def register_metric(
             better=better,
             needs=needs,
             resampled=resampled,
+            scale=scale,
             in_scores=in_scores,
             in_measures=in_measures,
             on_leaderboard=on_leaderboard,

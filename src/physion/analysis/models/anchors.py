@@ -22,7 +22,6 @@ import pandas as pd
 from physion.analysis.models.model_people import Models
 from physion.analysis.models.score_tables import score_table, two_people_table
 from physion.analysis.people.answers import ScenarioAnswers
-from physion.analysis.statistics.bootstrap import Bootstrap
 
 OUTCOME = "recorded outcome"
 MAJORITY = "majority of people"
@@ -97,7 +96,7 @@ def _answering(seen: pd.DataFrame, name: str, yes: pd.Series) -> pd.DataFrame:
     return table.assign(gap=table["p_contact"] - table["p_yes"]).reset_index(drop=True)
 
 
-def anchor_scores(stimuli: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
+def anchor_scores(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
     """Return `with_kind` of the scores of the computed anchors; empty without people.
 
     ``stimuli``: as for `anchor_stimuli`.
@@ -105,8 +104,8 @@ def anchor_scores(stimuli: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
     seen, answers = seen_stimuli(stimuli), anchor_stimuli(stimuli)
     if seen.empty:
         return pd.DataFrame()
-    parts = [score_table(answers, bootstrap)] if len(answers) else []
-    parts.append(two_people_table(seen, bootstrap))
+    parts = [score_table(answers, level)] if len(answers) else []
+    parts.append(two_people_table(seen, level))
     return with_kind(pd.concat(parts, ignore_index=True))
 
 

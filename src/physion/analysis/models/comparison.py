@@ -156,15 +156,15 @@ def compare_scores(
         )
     warnings += check_outcomes(stimuli) + check_accuracy(stimuli)
     answered = people[people["stimulus"].isin(stimuli["stimulus"])]
-    scores = with_kind(score_table(stimuli, draws))
-    later, observed = later_scores(stimuli, draws)
+    scores = with_kind(score_table(stimuli, draws.level))
+    later, observed = later_scores(stimuli, draws.level)
     return Comparison(
         scores=scores,
-        anchors=anchor_scores(stimuli, draws).reindex(columns=scores.columns),
+        anchors=anchor_scores(stimuli, draws.level).reindex(columns=scores.columns),
         later=later.reindex(columns=scores.columns),
         people=people.iloc[:0]
         if humans is None
-        else people_table(answered, _whole(zone, people, stimuli), draws),
+        else people_table(answered, _whole(zone, people, stimuli), draws.level),
         stimuli=stimuli,
         changed=_changed(stimuli),
         dropped=pd.concat(dropped, ignore_index=True),
@@ -278,8 +278,8 @@ def _settings(
         else "all that the models predict; no people were given",
         "Roll stimuli with a ledge": "left out, as in the study" if exclude_ledge else "kept",
         "Further stimuli left out": f"{len(unwanted)} on a list" if unwanted else "none",
-        "Intervals": f"{draws.level:.0%} percentile bootstrap over stimuli within each scenario, "
-        f"{draws.resamples} resamples, seed {draws.seed}; people's averages stay as they are",
+        "Intervals": f"{draws.level:.0%} jackknife intervals over stimuli within each scenario: "
+        "where the score is expected with other stimuli of the same number and the same people",
         "Overall": "“mean” averages the scores of the scenarios, each counting the same; “pooled” "
         "takes all stimuli together",
     }
@@ -292,10 +292,15 @@ def _settings(
 
 
 def _intervals_with_participants(draws: Bootstrap) -> dict[str, str]:
+    level = f"{draws.level:.0%}"
     return {
-        "Intervals with participants": f"{draws.level:.0%} percentile bootstrap, three of them: by "
-        "drawing participants, stimuli, or both with replacement within each scenario, "
-        f"{draws.resamples} resamples, seed {draws.seed}"
+        "Intervals with participants": f"{level} jackknife intervals, three of them: where the "
+        "measure is expected with other participants, other stimuli, or both, of the same number "
+        "in each scenario. The jackknife over participants is corrected for the noise of their "
+        "averages (Efron and Stein, 1981); with both, the noise of single answers counts once, "
+        "and not three times as in a bootstrap of both (Owen, 2007)",
+        "Intervals of people's accuracy and agreement": f"{level} percentile bootstrap over "
+        f"participants, as preregistered, {draws.resamples} resamples, seed {draws.seed}",
     }
 
 

@@ -22,9 +22,9 @@ from physion.analysis.people.difficulty import (
     difficulty_third,
     r_by_third,
 )
-from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.statistics.calibration import brier, reliability_curve
 from physion.analysis.statistics.correlation import correlate_resampled, correlate_rows
+from physion.analysis.statistics.jackknife import jackknife, mean_of, variance_of_mean
 from physion.analysis.tables.predictions import DATASETS, PROTOCOLS, READOUTS
 from physion.analysis.tables.stimuli import MEAN, POOLED, in_order
 from physion.stimulus_names import OFFICIAL_SCENARIOS, SCENARIOS
@@ -202,22 +202,21 @@ def calibration_table(comparison: Comparison) -> pd.DataFrame:
 
 
 def thirds_table(
-    comparison: Comparison, answers: pd.DataFrame | None = None, bootstrap: Bootstrap | None = None
+    comparison: Comparison, answers: pd.DataFrame | None = None, level: float = 0.95
 ) -> pd.DataFrame:
     """Return r with the average person within the stimuli that are hard, chance and easy for
     people.
 
     `MEASURE_COLUMNS` and ``stimuli``, their number; a panel a third; all scenarios pooled,
-    intervals by drawing stimuli of the third. With the ``answers`` of participants (``test`` of
+    intervals about other stimuli of the third. With the ``answers`` of participants (``test`` of
     `participants.Responses`) the dashed line is the r of halves of them with each other.
     """
-    draws = bootstrap or Bootstrap()
     people = _halves_by_third(comparison, answers)
     stimuli = pd.concat([comparison.stimuli, anchor_stimuli(comparison.stimuli)])
     parts = []
     for name, words in THIRD_WORDS.items():
         rows = [
-            {"agent": agent, "kind": subset["readout"].iloc[0]} | _third(subset, name, draws)
+            {"agent": agent, "kind": subset["readout"].iloc[0]} | _third(subset, name, level)
             for agent, subset in stimuli.groupby("agent", sort=False)
         ]
         parts.append(pd.DataFrame(rows).assign(panel=words, **people[name]))
@@ -230,7 +229,7 @@ def thirds_table(
 THIRD_WORDS = dict(zip(THIRDS, ("hard (up to 1/3)", "chance", "easy (from 2/3)"), strict=True))
 
 
-def _third(subset: pd.DataFrame, name: str, draws: Bootstrap) -> dict[str, float | str]:
+def _third(subset: pd.DataFrame, name: str, level: float) -> dict[str, float | str]:
     """Return r of one model within one third, with its interval."""
     rows = subset.sort_values("stimulus", kind="stable")
     part = rows[(difficulty_third(rows["human_accuracy"]) == name).to_numpy()]
@@ -239,9 +238,9 @@ def _third(subset: pd.DataFrame, name: str, draws: Bootstrap) -> dict[str, float
     r = float(correlate_rows(x, y)[0]) if len(part) else np.nan
     if not np.isfinite(r):
         return result | {"value": np.nan, "reason": "fewer than 3 stimuli, or constant answers"}
-    weights = draws.weights(f"third {name}", len(part))
-    drawn = correlate_resampled(x, np.broadcast_to(y, weights.shape), weights)
-    result["low"], result["high"] = draws.interval(drawn[:, 0])
+    without = 1 - np.eye(len(part))
+    variance = jackknife(correlate_resampled(x, np.broadcast_to(y, without.shape), without))
+    result["low"], result["high"] = variance.of(0).interval(r, level, "correlation")
     return result | {"value": r, "reason": ""}
 
 
@@ -270,14 +269,14 @@ def _halves_by_third(
 
 
 def effects_table(
-    comparison: Comparison, predictions: pd.DataFrame, bootstrap: Bootstrap | None = None
+    comparison: Comparison, predictions: pd.DataFrame, level: float = 0.95
 ) -> pd.DataFrame:
     """Return accuracy by readout and by training protocol, averaged over seeds, then over
     scenarios.
 
     ``predictions``: from `predictions.read_predictions`. `GROUPED_COLUMNS`; the panel of readouts
     has one training protocol (*all* if it occurs), that of trainings one readout. A panel is absent
-    if no model has two conditions. Intervals draw stimuli.
+    if no model has two conditions. Intervals are about other stimuli.
     """
     rows = _with_training(comparison, predictions)
     if len(rows.drop_duplicates(["readout", "training"])) < 2:
@@ -294,9 +293,9 @@ def effects_table(
     order += sorted(set(trainings) - set(order))
     parts = [
         _effect(rows[rows["training"] == training], "readout", readouts, f"by readout{words}",
-                bootstrap or Bootstrap()),
+                level),
         _effect(rows[rows["readout"] == readout], "training", order,
-                f"by training (readout {readout})", bootstrap or Bootstrap()),
+                f"by training (readout {readout})", level),
     ]  # fmt: skip
     table = pd.concat([part for part in parts if len(part)] or [parts[0]], ignore_index=True)
     people = comparison.people.set_index("scenario")["accuracy"] if comparison.has_people else {}
@@ -329,20 +328,21 @@ def _most_common(values: pd.Series) -> str:
 
 
 def _effect(
-    rows: pd.DataFrame, column: str, groups: Sequence[str], panel: str, draws: Bootstrap
+    rows: pd.DataFrame, column: str, groups: Sequence[str], panel: str, level: float
 ) -> pd.DataFrame:
     if rows.groupby("model")[column].nunique().max() < 2:
         return pd.DataFrame(columns=list(GROUPED_COLUMNS))
     right = rows.assign(right=(rows["predicted"] == rows["label"]).astype(np.float64))
     records = []
     for (model, group), subset in right.groupby(["model", column], sort=False):
-        values, drawn = [], []
-        for scenario, part in subset.groupby("scenario"):
+        values, variances = [], []
+        for _, part in subset.groupby("scenario"):
             mean = part.groupby("stimulus")["right"].mean().sort_index().to_numpy(np.float64)
             values.append(mean.mean())
-            drawn.append(draws.weights(str(scenario), len(mean)) @ mean / len(mean))
-        low, high = draws.interval(np.mean(drawn, axis=0))
-        records.append((panel, model, group, float(np.mean(values)), low, high, np.nan,
+            variances.append(variance_of_mean(mean))
+        value = float(np.mean(values))
+        low, high = mean_of(variances).interval(value, level, "fraction")
+        records.append((panel, model, group, value, low, high, np.nan,
                         subset["stimulus"].nunique(), ""))  # fmt: skip
     table = pd.DataFrame(records, columns=list(GROUPED_COLUMNS))
     rank = {name: at for at, name in enumerate(groups)}

@@ -2,12 +2,13 @@
 
 A *measure* of a model compares it with the people of the scenario; the *zone* of a measure is the
 range of single people (or pairs, or halves of them) from the 2.5th to the 97.5th percentile.
-Intervals draw people, stimuli, or both; they answer different questions, so each is named.
+Intervals are about other people, other stimuli, or both; they answer different questions, so each
+is named. `sampling_variance` contains the method.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,13 +16,13 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from physion.analysis.metrics import measure_metrics
+from physion.analysis.metrics import measure_metrics, metrics
 from physion.analysis.models.model_people import Models, sample_of_models
+from physion.analysis.models.sampling_variance import sampling_variances
 from physion.analysis.people.answers import ScenarioAnswers
-from physion.analysis.people.people import draws_of_people
 from physion.analysis.sample import RESAMPLED, Resampled, Sample
 from physion.analysis.statistics import agreement
-from physion.analysis.statistics.bootstrap import Bootstrap
+from physion.analysis.statistics.jackknife import Variance, mean_of
 from physion.analysis.tables.stimuli import MEAN
 
 Array = npt.NDArray[np.float64]
@@ -35,12 +36,12 @@ TABLE_COLUMNS = (
 
 @dataclass(frozen=True)
 class Measured:
-    """Measures of one model in one scenario, with the resamples for their intervals.
+    """Measures of one model in one scenario, with their sampling variances.
 
     - ``model``, ``scenario``; ``stimuli``: number of stimuli that the model predicts;
     - ``values[measure]``; ``reasons[measure]``: why the value is NaN;
-    - ``draws[what][measure]`` (resamples,) for each of `sample.RESAMPLED`, absent if the measure
-      does not depend on the draw;
+    - ``variances[what][measure]`` for each of `sample.RESAMPLED`, absent if the measure does not
+      depend on what is drawn;
     - ``by_participant[measure]`` (people,), for measures with a value for each participant.
     """
 
@@ -49,26 +50,27 @@ class Measured:
     stimuli: int
     values: dict[str, float]
     reasons: dict[str, str]
-    draws: dict[Resampled, dict[str, Array]]
+    variances: dict[Resampled, dict[str, Variance]]
     by_participant: dict[str, Array]
 
 
 def measure_models(
-    models: Models, answers: ScenarioAnswers, bootstrap: Bootstrap, two_people: str = ""
+    models: Models, answers: ScenarioAnswers, two_people: str = ""
 ) -> list[Measured]:
-    """Compute every measure of every model, and its resamples.
+    """Compute every measure of every model, and its sampling variances.
 
     ``two_people``: name of a further row, at the end, with the measures of one person with another
     that are defined; empty: there is none.
     """
     sample = sample_of_models(models, answers)
-    resamples = _samples(models, answers, bootstrap)
-    metrics = measure_metrics()
-    values = {metric.name: metric(sample)[0] for metric in metrics}
-    each = {m.name: m.by_participant(sample) for m in metrics if m.by_participant is not None}
-    draws = {
-        what: {m.name: m(drawn) for m in metrics if what in m.resampled}
-        for what, drawn in resamples.items()
+    chosen = measure_metrics()
+    values = {metric.name: metric(sample)[0] for metric in chosen}
+    each = {m.name: m.by_participant(sample) for m in chosen if m.by_participant is not None}
+    variances = {
+        what: sampling_variances(
+            models, answers, {m.name: m for m in chosen if what in m.resampled}, what
+        )
+        for what in RESAMPLED
     }
     rows = []
     for k, name in enumerate(models.names):
@@ -81,21 +83,24 @@ def measure_models(
                 stimuli=int(np.sum(~np.isnan(models.p_contact[k]))),
                 values=of_model,
                 reasons={measure: _why(measure, k, models, answers) for measure in undefined},
-                draws={
-                    what: {measure: drawn[:, k] for measure, drawn in by_measure.items()}
-                    for what, by_measure in draws.items()
-                },
+                variances={what: _of_model(found, k) for what, found in variances.items()},
                 by_participant={measure: value[:, k] for measure, value in each.items()},
             )
         )
-    return [*rows, _two_people(two_people, answers, sample, resamples)] if two_people else rows
+    return [*rows, _two_people(two_people, models, answers, sample)] if two_people else rows
 
 
-def _two_people(
-    name: str, answers: ScenarioAnswers, sample: Sample, resamples: Mapping[Resampled, Sample]
-) -> Measured:
-    metrics = [metric for metric in measure_metrics() if metric.two_people is not None]
-    values = {metric.name: float(metric.of_two_people(sample)[0, 0]) for metric in metrics}
+def _of_model(variances: Mapping[str, Variance], k: int) -> dict[str, Variance]:
+    return {name: variance.of(k) for name, variance in variances.items()}
+
+
+def _two_people(name: str, models: Models, answers: ScenarioAnswers, sample: Sample) -> Measured:
+    computes: dict[str, Callable[[Sample], Array]] = {
+        metric.name: metric.of_two_people
+        for metric in measure_metrics()
+        if metric.two_people is not None
+    }
+    values = {measure: float(compute(sample)[0, 0]) for measure, compute in computes.items()}
     undefined = [measure for measure, value in values.items() if not np.isfinite(value)]
     return Measured(
         model=name,
@@ -103,27 +108,27 @@ def _two_people(
         stimuli=len(answers.stimuli),
         values=values,
         reasons=dict.fromkeys(undefined, "needs two answers to every stimulus, not all alike"),
-        draws={
-            what: {metric.name: metric.of_two_people(drawn)[:, 0] for metric in metrics}
-            for what, drawn in resamples.items()
+        variances={
+            what: _of_model(sampling_variances(models, answers, computes, what), 0)
+            for what in RESAMPLED
         },
         by_participant={},
     )
 
 
-def measure_table(measured: Sequence[Measured], bootstrap: Bootstrap) -> pd.DataFrame:
+def measure_table(measured: Sequence[Measured], level: float = 0.95) -> pd.DataFrame:
     """Return one row a model and measure.
 
     Columns: ``model``, ``scenario``, ``measure``, ``stimuli``, ``value``; ``low`` and ``high`` with
-    ``_people``, ``_stimuli``, ``_both`` (interval by what is drawn); for measures by participant
-    also ``pair_low``, ``pair_median``, ``pair_high`` (percentiles over participants) and
-    ``undefined`` (participants for whom it is NaN); ``reason``.
+    ``_people``, ``_stimuli``, ``_both`` (interval by what is drawn, at this ``level``); for
+    measures by participant also ``pair_low``, ``pair_median``, ``pair_high`` (percentiles over
+    participants) and ``undefined`` (participants for whom it is NaN); ``reason``.
     """
     records = []
     for one in measured:
         for measure, value in one.values.items():
-            draws = {what: one.draws[what].get(measure) for what in RESAMPLED}
-            record, reasons = _interval_columns(value, draws, bootstrap)
+            variances = {what: one.variances[what].get(measure) for what in RESAMPLED}
+            record, reasons = _interval_columns(measure, value, variances, level)
             if measure in one.reasons:
                 reasons.insert(0, one.reasons[measure])
             if measure in one.by_participant:
@@ -152,22 +157,21 @@ def mean_measures(measured: Sequence[Sequence[Measured]]) -> list[Measured]:
 
 def _mean(rows: Sequence[Measured]) -> Measured:
     values, reasons = {}, {}
-    draws: dict[Resampled, dict[str, Array]] = {what: {} for what in RESAMPLED}
+    variances: dict[Resampled, dict[str, Variance]] = {what: {} for what in RESAMPLED}
     for measure in rows[0].values:
         values[measure] = float(np.mean([one.values[measure] for one in rows]))
         undefined = [one.scenario for one in rows if not np.isfinite(one.values[measure])]
         if undefined:
             reasons[measure] = f"undefined in {', '.join(undefined)}"
         for what in RESAMPLED:
-            if all(measure in one.draws[what] for one in rows):
-                drawn = [one.draws[what][measure] for one in rows]
-                draws[what][measure] = np.mean(drawn, axis=0)
+            if all(measure in one.variances[what] for one in rows):
+                variances[what][measure] = mean_of([one.variances[what][measure] for one in rows])
     stimuli = sum(one.stimuli for one in rows)
-    return Measured(rows[0].model, MEAN, stimuli, values, reasons, draws, {})
+    return Measured(rows[0].model, MEAN, stimuli, values, reasons, variances, {})
 
 
 def _interval_columns(
-    value: float, draws: Mapping[Resampled, Array | None], bootstrap: Bootstrap
+    measure: str, value: float, variances: Mapping[Resampled, Variance | None], level: float
 ) -> tuple[dict[str, Any], list[str]]:
     """Return ``value`` with ``low_`` and ``high_`` by what is drawn, and reasons for what is
     NaN.
@@ -176,26 +180,16 @@ def _interval_columns(
     reasons = []
     for what in RESAMPLED:
         low, high = np.nan, np.nan
-        drawn = draws[what]
-        if drawn is None:
+        variance = variances[what]
+        if variance is None:
             reasons.append(f"no interval over {what}: they do not enter")
         elif np.isfinite(value):
-            low, high = bootstrap.interval(drawn)
+            scale = metrics.get(measure).scale
+            low, high = variance.interval(value, level, scale)
             if np.isnan(low):
-                reasons.append(f"no interval over {what}: undefined in most resamples")
+                reasons.append(f"no interval over {what}: too few, or undefined without some")
         record |= {f"low_{what}": low, f"high_{what}": high}
     return record, reasons
-
-
-def _samples(models: Models, answers: ScenarioAnswers, draws: Bootstrap) -> dict[Resampled, Sample]:
-    """Return the resamples for the intervals, by what is drawn."""
-    people = draws_of_people(answers, draws)
-    stimuli = draws.weights(answers.scenario, len(answers.stimuli))
-    return {
-        "people": sample_of_models(models, answers, None, people, "people"),
-        "stimuli": sample_of_models(models, answers, stimuli, None, "stimuli"),
-        "both": sample_of_models(models, answers, stimuli, people, "both"),
-    }
 
 
 def _over_people(values: Array) -> dict[str, float]:

@@ -9,7 +9,6 @@ import pandas as pd
 
 from physion.analysis.models.anchors import anchor_scores, with_kind
 from physion.analysis.models.score_tables import score_table
-from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.tables.stimuli import in_order
 
 SETTING = "Contact in the observed part"
@@ -25,7 +24,7 @@ def observed_contacts(predictions: pd.DataFrame) -> pd.Series:
     return known.set_index("stimulus")["observed_contact"].astype(bool)
 
 
-def later_scores(stimuli: pd.DataFrame, bootstrap: Bootstrap) -> tuple[pd.DataFrame, str]:
+def later_scores(stimuli: pd.DataFrame, level: float = 0.95) -> tuple[pd.DataFrame, str]:
     """Return the scores of models and anchors on trials without observed contact, and a sentence.
 
     Parameters
@@ -33,8 +32,8 @@ def later_scores(stimuli: pd.DataFrame, bootstrap: Bootstrap) -> tuple[pd.DataFr
     stimuli
         As `comparison.Comparison.stimuli`. Trials of which it is not known whether the contact was
         observed (``observed_contact`` is None) are left out too.
-    bootstrap
-        Draws for the intervals.
+    level
+        Level of the intervals.
 
     Returns
     -------
@@ -59,5 +58,5 @@ def later_scores(stimuli: pd.DataFrame, bootstrap: Bootstrap) -> tuple[pd.DataFr
     kept = stimuli[stimuli["stimulus"].isin(each.loc[later, "stimulus"])]
     if kept.empty:
         return pd.DataFrame(), f"{words}; none is left, so there are no scores without them"
-    parts = [with_kind(score_table(kept, bootstrap)), anchor_scores(kept, bootstrap)]
+    parts = [with_kind(score_table(kept, level)), anchor_scores(kept, level)]
     return pd.concat([part for part in parts if len(part)], ignore_index=True), words

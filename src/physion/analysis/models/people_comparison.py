@@ -58,7 +58,7 @@ def compare_everywhere(
     test
         Test rows of `participants.Responses`.
     bootstrap
-        Draws for the intervals.
+        Level of the intervals, and draws of the tests.
     halves
         Number of random splits of the people into halves.
     permutations
@@ -78,16 +78,16 @@ def compare_everywhere(
         dropped.append(unmatched.assign(scenario=answers.scenario))
         scored.append((models, answers))
         measured.append(
-            measure_models(add_anchors(models, answers), answers, draws, two_people=TWO_PEOPLE)
+            measure_models(add_anchors(models, answers), answers, two_people=TWO_PEOPLE)
         )
         zones.append(human_zones(answers, split_halves(answers.yes, halves, draws.seed)))
         pairs.append(model_pairs(models, answers).assign(scenario=answers.scenario))
     zone = pd.concat(zones, ignore_index=True)
     if len(measured) > 1:
         zone = pd.concat([zone, released_r_zone(zone)], ignore_index=True)
-    tables = [measure_table(one, draws) for one in measured]
+    tables = [measure_table(one, draws.level) for one in measured]
     if len(measured) > 1:
-        tables.append(measure_table(mean_measures(measured), draws))
+        tables.append(measure_table(mean_measures(measured), draws.level))
     pooled = pool_scenarios(scored)
     return PeopleComparison(
         scores=with_kind(_with_zone(pd.concat(tables, ignore_index=True), zone), "model"),

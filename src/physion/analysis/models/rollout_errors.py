@@ -1,7 +1,6 @@
 """Errors of imagined motion over time, by scenario and model, next to constant velocity.
 
-The mean over trials at each time after the last observed frame; intervals draw trials, the same
-ones for all models that have the same number of trials of a scenario.
+The mean over trials at each time after the last observed frame; intervals are about other trials.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from physion.analysis.statistics.bootstrap import Bootstrap
+from physion.analysis.statistics.jackknife import Variance, mean_of, variance_of_mean
 from physion.analysis.tables.csv_table import as_numbers, read_csv
 from physion.analysis.tables.stimuli import MEAN, in_order
 from physion.errors import BadInputError
@@ -66,7 +65,7 @@ def read_rollout_errors(paths: Sequence[Path]) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True)
 
 
-def rollout_error_table(errors: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
+def rollout_error_table(errors: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
     """Return mean errors with intervals; `COLUMNS`.
 
     The baseline is that of the first model, since the step of a model decides its last velocity. A
@@ -76,8 +75,8 @@ def rollout_error_table(errors: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFr
     ----------
     errors
         From `read_rollout_errors`.
-    bootstrap
-        Draws of the intervals.
+    level
+        Level of the intervals, which are symmetric in the logarithm of the mean error.
     """
     agents = list(dict.fromkeys(errors["agent"]))
     scenarios = in_order(set(errors["scenario"]))
@@ -86,16 +85,16 @@ def rollout_error_table(errors: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFr
     rows: list[pd.DataFrame] = []
     for name, kind, column, agent in curves:
         own = errors[errors["agent"] == agent]
-        draws = {
-            scenario: _draws(own[own["scenario"] == scenario], column, scenario, bootstrap)
+        means = {
+            scenario: _means(own[own["scenario"] == scenario], column)
             for scenario in scenarios
             if (own["scenario"] == scenario).any()
         }
-        if len(draws) > 1:
-            draws[MEAN] = _mean_over_scenarios(list(draws.values()))
+        if len(means) > 1:
+            means[MEAN] = _mean_over_scenarios(list(means.values()))
         rows += [
-            _rows(values, bootstrap).assign(panel=panel, agent=name, kind=kind)
-            for panel, values in draws.items()
+            _rows(values, level).assign(panel=panel, agent=name, kind=kind)
+            for panel, values in means.items()
         ]
     table = pd.concat(rows, ignore_index=True)[list(COLUMNS)]
     order = {panel: place for place, panel in enumerate([*scenarios, MEAN])}
@@ -104,39 +103,54 @@ def rollout_error_table(errors: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFr
     )
 
 
-def _draws(rows: pd.DataFrame, column: str, scenario: str, bootstrap: Bootstrap) -> pd.DataFrame:
-    """Return by time the number of trials, the mean, and its draws as further columns 0, 1, ..."""
+def _means(rows: pd.DataFrame, column: str) -> pd.DataFrame:
+    """Return ``trials``, ``value`` (mean), ``variance`` of the mean and its ``df``, by time."""
     wide = rows.pivot(index="stimulus", columns="seconds", values=column).sort_index()
     values: Array = wide.to_numpy(dtype=np.float64)
-    known = np.isfinite(values).astype(np.float64)
-    weights = np.concatenate([np.ones((1, len(values))), bootstrap.weights(scenario, len(values))])
-    counts = weights @ known
-    with np.errstate(invalid="ignore"):
-        means = (weights @ np.nan_to_num(values)) / np.where(counts > 0, counts, np.nan)
-    table = pd.DataFrame(means[1:].T, index=wide.columns)
-    table.insert(0, "trials", known.sum(axis=0).astype(int))
-    table.insert(1, "value", means[0])
-    return table
+    variance = variance_of_mean(values)
+    return pd.DataFrame(
+        {
+            "trials": np.isfinite(values).sum(axis=0),
+            "value": np.nanmean(values, axis=0),
+            "variance": variance.value,
+            "df": variance.df,
+        },
+        index=wide.columns,
+    )
 
 
 def _mean_over_scenarios(parts: Sequence[pd.DataFrame]) -> pd.DataFrame:
-    """Return the mean of scenarios, and of their draws, at the times that all have."""
+    """Return the mean of scenarios at the times that all have."""
     times = sorted(set.intersection(*(set(part.index) for part in parts)))
     aligned = [part.loc[times] for part in parts]
-    mean = sum(aligned[1:], aligned[0]) / len(aligned)
-    mean["trials"] = sum(part["trials"] for part in aligned)
-    return mean
-
-
-def _rows(draws: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
-    samples = draws.drop(columns=["trials", "value"]).to_numpy(dtype=np.float64)
-    intervals = np.array([bootstrap.interval(row) for row in samples]).reshape(-1, 2)
+    variance = mean_of(
+        [Variance(part["variance"].to_numpy(), part["df"].to_numpy()) for part in aligned]
+    )
     return pd.DataFrame(
         {
-            "seconds": draws.index.to_numpy(dtype=np.float64),
-            "trials": draws["trials"].to_numpy(dtype=int),
-            "value": draws["value"].to_numpy(dtype=np.float64),
-            "low": intervals[:, 0],
-            "high": intervals[:, 1],
+            "trials": np.sum([part["trials"] for part in aligned], axis=0),
+            "value": np.mean([part["value"] for part in aligned], axis=0),
+            "variance": variance.value,
+            "df": variance.df,
+        },
+        index=pd.Index(times),
+    )
+
+
+def _rows(means: pd.DataFrame, level: float) -> pd.DataFrame:
+    variance = Variance(means["variance"].to_numpy(), means["df"].to_numpy())
+    bounds = np.array(
+        [
+            variance.of(k).interval(float(value), level, "positive")
+            for k, value in enumerate(means["value"])
+        ]
+    ).reshape(-1, 2)
+    return pd.DataFrame(
+        {
+            "seconds": means.index.to_numpy(dtype=np.float64),
+            "trials": means["trials"].to_numpy(dtype=int),
+            "value": means["value"].to_numpy(dtype=np.float64),
+            "low": bounds[:, 0],
+            "high": bounds[:, 1],
         }
     )

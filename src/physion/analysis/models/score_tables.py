@@ -9,29 +9,38 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from physion.analysis.metrics import score_metrics
+from physion.analysis.metrics import metrics, score_metrics
 from physion.analysis.sample import Sample, pool, sample_of_rows
 from physion.analysis.statistics import agreement
-from physion.analysis.statistics.bootstrap import Bootstrap
+from physion.analysis.statistics.jackknife import (
+    Integers,
+    Variance,
+    delete_one,
+    jackknife,
+    mean_of,
+    variance_of_mean,
+)
 from physion.analysis.tables.stimuli import MEAN, POOLED, in_order
 
 Array = npt.NDArray[np.float64]
 Compute = Callable[[Sample], dict[str, Array]]
-"""Function from a `Sample` to the values of every metric, each of shape (1 + resamples,)."""
+"""Function from a `Sample` to the values of every metric, each of shape (1 + n,): of all stimuli,
+then without each of the n stimuli of all scenarios."""
 
 Explain = Callable[[pd.DataFrame], dict[str, str]]
 """Function from rows of stimuli to reasons for what is undefined, by the label of the metric."""
 
 
-def score_table(stimuli: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
+def score_table(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
     """Return the scores of every model.
 
     Parameters
     ----------
     stimuli
         One row a model and stimulus, as `comparison.Comparison.stimuli`.
-    bootstrap
-        Draws for the intervals: stimuli within each scenario.
+    level
+        Level of the intervals, which are about other stimuli of the same number in each scenario,
+        with the same people (`jackknife`).
 
     Returns
     -------
@@ -41,10 +50,10 @@ def score_table(stimuli: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
     ``_high``; ``ceiling`` of r and ``floor`` of the RMSD; ``reason``: why a score or an interval is
     NaN, or means less than it seems to (for example if all labels are of one class); else empty.
     """
-    # Sorted, so that the draws do not depend on the order of the files.
+    # Sorted, so that rounding does not depend on the order of the files.
     ordered = stimuli.sort_values("stimulus", kind="stable")
     parts = [
-        _agent_rows(rows, bootstrap, _of_models, _why_undefined)
+        _agent_rows(rows, level, _of_models, _why_undefined)
         for _, rows in ordered.groupby("agent", sort=False)
     ]
     table = pd.concat(parts, ignore_index=True)
@@ -54,29 +63,29 @@ def score_table(stimuli: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
     )
 
 
-def two_people_table(stimuli: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
+def two_people_table(stimuli: pd.DataFrame, level: float = 0.95) -> pd.DataFrame:
     """Return the scores of one person with another, with the columns of `score_table`.
 
     ``stimuli`` has a row for each stimulus, whose predictions do not matter. Metrics that are not
     defined for two people are NaN.
     """
     ordered = stimuli.sort_values("stimulus", kind="stable")
-    return _agent_rows(ordered, bootstrap, _of_two_people, _why_no_pair)
+    return _agent_rows(ordered, level, _of_two_people, _why_no_pair)
 
 
-def _agent_rows(
-    rows: pd.DataFrame, bootstrap: Bootstrap, scores: Compute, why: Explain
-) -> pd.DataFrame:
+def _agent_rows(rows: pd.DataFrame, level: float, scores: Compute, why: Explain) -> pd.DataFrame:
     names = in_order(rows["scenario"])
     parts = [rows[rows["scenario"] == name] for name in names]
-    samples = [_sample(part, name, bootstrap) for part, name in zip(parts, names, strict=True)]
+    weights, strata = delete_one([len(part) for part in parts])
+    samples = [sample_of_rows(part, each) for part, each in zip(parts, weights, strict=True)]
     by_scenario = [scores(sample) for sample in samples]
     mean = {key: np.mean([values[key] for values in by_scenario], axis=0) for key in by_scenario[0]}
     reasons = [why(part) for part in parts]
-    records = [
-        _record(name, part, values_of, bootstrap, [*because.values()])
-        for name, part, values_of, because in zip(names, parts, by_scenario, reasons, strict=True)
-    ]
+    records = []
+    for at, (name, part, because) in enumerate(zip(names, parts, reasons, strict=True)):
+        own = np.concatenate([[True], strata == at])
+        values_of = {key: values[own] for key, values in by_scenario[at].items()}
+        records.append(_record(name, part, values_of, None, level, [*because.values()]))
     one_class = [name for name, part in zip(names, parts, strict=True) if _one_class(part)]
     undefined: dict[str, list[str]] = {}
     for name, because in zip(names, reasons, strict=True):
@@ -84,24 +93,19 @@ def _agent_rows(
             undefined.setdefault(label, []).append(name)
     whys = [f"{label}: undefined in {', '.join(where)}" for label, where in undefined.items()]
     whys += [f"labels: of one class in {', '.join(one_class)}"] if one_class else []
-    records.append(_record(MEAN, rows, mean, bootstrap, whys))
+    records.append(_record(MEAN, rows, mean, strata, level, whys))
     for key in ("ceiling", "floor"):
         records[-1][key] = float(np.mean([record[key] for record in records[:-1]]))
-    records.append(_record(POOLED, rows, scores(pool(samples)), bootstrap, [*why(rows).values()]))
+    pooled = scores(pool(samples))
+    records.append(_record(POOLED, rows, pooled, strata, level, [*why(rows).values()]))
     table = pd.DataFrame(records)
     for position, column in enumerate(("agent", "model", "readout")):
         table.insert(position, column, rows[column].iloc[0])
     return table
 
 
-def _sample(part: pd.DataFrame, stratum: str, bootstrap: Bootstrap) -> Sample:
-    """Return the stimuli of one scenario: in row 0 each once, below them the resamples."""
-    weights = bootstrap.weights(stratum, len(part))
-    return sample_of_rows(part, np.vstack([np.ones(len(part)), weights]))
-
-
 def _of_models(sample: Sample) -> dict[str, Array]:
-    """Return the values of every metric by stimulus, each of shape (1 + resamples,)."""
+    """Return the values of every metric by stimulus."""
     return {metric.name: metric(sample)[:, 0] for metric in score_metrics()}
 
 
@@ -134,7 +138,8 @@ def _record(
     name: str,
     rows: pd.DataFrame,
     values_of: dict[str, Array],
-    bootstrap: Bootstrap,
+    strata: Integers | None,
+    level: float,
     whys: list[str],
 ) -> dict[str, Any]:
     reasons = [*whys]
@@ -147,15 +152,13 @@ def _record(
         "changed": int((rows["label"] != rows["simulated"]).sum()),
     }
     for key, values in values_of.items():
-        value = float(values[0])
-        # With one stimulus all draws are equal: the interval would have no width.
-        known = np.isfinite(value) and len(rows) > 1
-        low, high = bootstrap.interval(values[1:]) if known else (np.nan, np.nan)
-        if known and np.isnan(low):
-            reasons.append(f"{key}: undefined in most resamples, no interval")
-        record |= {key: value, f"{key}_low": low, f"{key}_high": high}
+        variance = jackknife(values[1:], strata)
+        low, high = variance.interval(float(values[0]), level, metrics.get(key).scale)
+        if np.isfinite(values[0]) and np.isnan(low) and len(rows) > 1:
+            reasons.append(f"{key}: no interval, too few stimuli or undefined without one of them")
+        record |= {key: float(values[0]), f"{key}_low": low, f"{key}_high": high}
     if len(rows) > 1 and record["accuracy_low"] == record["accuracy_high"]:
-        reasons.append("accuracy: all answers alike, so the bootstrap interval has no width")
+        reasons.append("accuracy: all answers alike, so the interval has no width")
     if len(rows) == 1:
         reasons.append("intervals: one stimulus")
     if np.isfinite(values_of["r"][0]) and np.isnan(values_of["r_same"][0]):
@@ -169,7 +172,7 @@ def _record(
 
 
 def people_table(
-    people: pd.DataFrame, zone: pd.DataFrame | None, bootstrap: Bootstrap
+    people: pd.DataFrame, zone: pd.DataFrame | None, level: float = 0.95
 ) -> pd.DataFrame:
     """Return the people by scenario and, in row `MEAN`, averaged over scenarios.
 
@@ -177,19 +180,18 @@ def people_table(
 
     Columns: ``scenario``, ``stimuli``, ``people`` (median number a stimulus), ``base_rate``
     (fraction of stimuli with contact), ``yes`` (mean fraction who say yes), ``accuracy`` with
-    ``_low`` and ``_high`` (bootstrap over stimuli), ``reliability`` and ``ceiling`` (see
+    ``_low`` and ``_high`` (jackknife over stimuli), ``reliability`` and ``ceiling`` (see
     `agreement`), and ``zone_low``, ``zone_high``: the middle 95 % of participants if ``zone``
     contains it, else NaN; always NaN in the mean, since nobody took part in more than one scenario.
     """
     zones = {} if zone is None else zone.set_index("scenario")[["low", "high"]].T.to_dict()
-    records, draws = [], []
+    records, variances = [], []
     for name in in_order(people["scenario"]):
         rows = people[people["scenario"] == name].sort_values("stimulus", kind="stable")
-        right = rows["accuracy"].to_numpy(dtype=np.float64)
-        draws.append(bootstrap.weights(name, len(rows)) @ right / len(rows))
-        records.append(_people_record(name, rows, draws[-1], zones.get(name, {}), bootstrap))
+        variances.append(variance_of_mean(rows["accuracy"].to_numpy(dtype=np.float64)))
+        records.append(_people_record(name, rows, variances[-1], zones.get(name, {}), level))
     table = pd.DataFrame(records)
-    low, high = bootstrap.interval(np.mean(draws, axis=0))
+    low, high = mean_of(variances).interval(float(table["accuracy"].mean()), level, "fraction")
     averaged = ["people", "base_rate", "yes", "accuracy", "reliability", "ceiling"]
     mean = {"scenario": MEAN, "stimuli": len(people), "accuracy_low": low, "accuracy_high": high}
     mean |= {column: float(table[column].mean(skipna=False)) for column in averaged}
@@ -197,9 +199,9 @@ def people_table(
 
 
 def _people_record(
-    name: str, rows: pd.DataFrame, drawn: Array, zone: dict[str, float], bootstrap: Bootstrap
+    name: str, rows: pd.DataFrame, variance: Variance, zone: dict[str, float], level: float
 ) -> dict[str, Any]:
-    low, high = bootstrap.interval(drawn) if len(rows) > 1 else (np.nan, np.nan)
+    low, high = variance.interval(float(rows["accuracy"].mean()), level, "fraction")
     return {
         "scenario": name,
         "stimuli": len(rows),

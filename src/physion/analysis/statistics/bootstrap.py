@@ -1,10 +1,8 @@
-"""Bootstrap intervals by resampling stimuli or people.
+"""Bootstrap intervals by drawing people, or whatever else is independent, with replacement.
 
-Stimuli are drawn with replacement, since results are to generalise over them; each scenario keeps
-its number of stimuli. If the answers of single participants are known, people are drawn likewise
-(`people`), or both (`model_people`); tables by stimulus permit stimuli only. All models of a
-comparison that answered the same stimuli get the same draws, so that differences between them are
-paired.
+For means and agreement of people, as preregistered. What depends on the noise of people's averages,
+such as a model's r or RMSD, has the intervals of `jackknife`, since drawing people again adds their
+noise a second time.
 """
 
 from __future__ import annotations

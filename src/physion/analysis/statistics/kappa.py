@@ -138,15 +138,14 @@ def resampled_mean_kappa(
         if raters is None:
             raise BadInputError("give the draws of stimuli, of raters, or of both")
         return resampled_mean_of_pairs(pairwise_kappa(values), raters)
-    drawn = np.asarray(stimuli, dtype=np.float64)
-    people = np.ones((len(drawn), len(values))) if raters is None else np.asarray(raters)
-    parts = _split(values)
-    return np.concatenate(
-        [
-            resampled_mean_of_pairs(_kappa(parts, parts, draw), row[None])
-            for draw, row in zip(drawn, people, strict=True)
-        ]
-    )
+    # Rows that draw the same stimuli share the kappas of pairs.
+    draws, row = np.unique(np.asarray(stimuli, dtype=np.float64), axis=0, return_inverse=True)
+    people = np.ones((len(row), len(values))) if raters is None else np.asarray(raters, np.float64)
+    parts, means = _split(values), np.empty(len(row))
+    for at, draw in enumerate(draws):
+        rows = np.flatnonzero(row == at)
+        means[rows] = resampled_mean_of_pairs(_kappa(parts, parts, draw), people[rows])
+    return means
 
 
 def _split(values: Array) -> tuple[Array, Array | None]:

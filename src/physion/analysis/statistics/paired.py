@@ -15,6 +15,7 @@ from scipy import stats
 from physion.analysis.statistics.agreement import pearson
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.statistics.correlation import correlate_resampled, correlation_from_sums
+from physion.analysis.statistics.jackknife import jackknife
 from physion.errors import BadInputError
 from physion.seeds import generator
 
@@ -48,10 +49,10 @@ def mcnemar_exact(first: npt.ArrayLike, second: npt.ArrayLike) -> McNemar:
     return McNemar(only_a, only_b, p)
 
 
-def r_difference_draws(
+def r_differences(
     first: npt.ArrayLike, second: npt.ArrayLike, people: npt.ArrayLike, weights: npt.ArrayLike
 ) -> Array:
-    """Return r(first, people) - r(second, people) in each resample of the stimuli, (resamples,)."""
+    """Return r(first, people) - r(second, people) for each row of weights of stimuli, (rows,)."""
     pair = np.stack([np.asarray(first, np.float64), np.asarray(second, np.float64)])
     drawn = np.asarray(weights, dtype=np.float64)
     p_yes = np.broadcast_to(np.asarray(people, dtype=np.float64), drawn.shape)
@@ -168,10 +169,9 @@ def compare_models(
     people
         (s,): fraction of people who say yes.
     bootstrap
-        Draws for the intervals.
+        Level of the intervals, and the seed of the permutations.
     strata
-        (s,): scenario of each stimulus; every scenario keeps its number of stimuli when they are
-        drawn.
+        (s,): scenario of each stimulus; every scenario keeps its number of stimuli.
     permutations
         Permutations of the test of differences in r.
 
@@ -179,12 +179,13 @@ def compare_models(
     -------
     ``first``, ``second``, ``stimuli``, ``accuracy_difference`` (first - second), ``only_first``,
     ``only_second``, ``p_accuracy`` (McNemar, exact), ``r_difference`` with ``_low``, ``_high``
-    (bootstrap over stimuli), ``p_r`` (permutations), and of both p the corrected ``_holm`` and
+    (jackknife over stimuli), ``p_r`` (permutations), and of both p the corrected ``_holm`` and
     ``_bh`` over all pairs of this table, ``reason``.
     """
     draws = bootstrap or Bootstrap()
-    weights = _stratified(draws, ["pooled"] * len(people) if strata is None else list(strata))
-    together = correlate_resampled(p_contact, np.broadcast_to(people, weights.shape), weights)
+    groups = pd.factorize(np.asarray(["pooled"] * len(people) if strata is None else strata))[0]
+    without = 1 - np.eye(len(people))
+    together = correlate_resampled(p_contact, np.broadcast_to(people, without.shape), without)
     records = []
     for i, j in combinations(range(len(names)), 2):
         shared = np.isfinite(correct[i]) & np.isfinite(correct[j])
@@ -195,8 +196,8 @@ def compare_models(
         if (np.isfinite(p_contact[i]) == np.isfinite(p_contact[j])).all():
             drawn = together[:, i] - together[:, j]
         else:
-            drawn = r_difference_draws(x, z, people, weights)
-        low, high = draws.interval(drawn)
+            drawn = r_differences(x, z, people, without)
+        low, high = jackknife(drawn, groups, both).interval(difference, draws.level)
         records.append(
             {
                 "first": names[i],
@@ -209,8 +210,8 @@ def compare_models(
                 "only_second": counts.only_second,
                 "p_accuracy": counts.p if shared.any() else np.nan,
                 "r_difference": difference,
-                "r_difference_low": low if np.isfinite(difference) else np.nan,
-                "r_difference_high": high if np.isfinite(difference) else np.nan,
+                "r_difference_low": low,
+                "r_difference_high": high,
                 "p_r": r_permutation_p(x, z, people, permutations, draws.seed),
                 "reason": _why(shared, difference),
             }
@@ -222,16 +223,6 @@ def compare_models(
         table[f"{p}_holm"] = holm(table[p])
         table[f"{p}_bh"] = benjamini_hochberg(table[p])
     return table
-
-
-def _stratified(bootstrap: Bootstrap, strata: list[str]) -> Array:
-    """Return how often each stimulus is drawn, (resamples, s), separately by stratum."""
-    names = np.array(strata, dtype=object)
-    weights = np.zeros((bootstrap.resamples, len(names)))
-    for name in dict.fromkeys(strata):
-        members = np.flatnonzero(names == name)
-        weights[:, members] = bootstrap.weights(name, len(members))
-    return weights
 
 
 def _why(shared: npt.NDArray[np.bool_], difference: float) -> str:

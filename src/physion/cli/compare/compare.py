@@ -71,9 +71,9 @@ class Options:
     ledge: bool = False
     """Keep the Roll stimuli with a ledge, which the study excluded."""
     resamples: int | None = None
-    """Draws of the bootstrap; 1000 if not given."""
+    """Draws of people for their accuracy, agreement and biases; 1000 if not given."""
     seed: int | None = None
-    """Seed of the bootstrap; 0 if not given."""
+    """Seed of these draws, of halves of people and of permutations; 0 if not given."""
     out: Path = Path("runs/report")
     """Folder for the report."""
     json: bool = False

@@ -15,7 +15,7 @@ import tyro
 if TYPE_CHECKING:
     import pandas as pd
 
-    from physion.analysis.models.leaderboard import Leaderboard
+    from physion.analysis.leaderboard.leaderboard import Leaderboard
 
 SHOWN = ("rank", "model", "readout", "training", "scenarios", "stimuli")
 """Columns on the console before the metrics, the versions and the file."""
@@ -80,8 +80,8 @@ def main(options: Options) -> int:
 def _board(options: Options) -> Leaderboard:
     from dataclasses import replace
 
-    from physion.analysis.models.leaderboard import leaderboard
-    from physion.analysis.models.leaderboard_order import sort_leaderboard
+    from physion.analysis.leaderboard.leaderboard import leaderboard
+    from physion.analysis.leaderboard.order import sort_leaderboard
     from physion.analysis.tables.responses import (
         LABELS_FILE,
         find_next_to,

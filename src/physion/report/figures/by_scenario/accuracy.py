@@ -16,7 +16,7 @@ from physion.report.inputs import ReportInputs
 def accuracy(inputs: ReportInputs) -> Plot:
     """Return accuracy by scenario and model."""
     comparison = inputs.comparison
-    caption = "Fraction of answers that equal the official outcome, with bootstrap intervals."
+    caption = "Fraction of answers that equal the official outcome, with 95 % intervals."
     if comparison.has_people:
         caption += " Dashed: people on the stimuli that any model predicts."
         if comparison.people["zone_low"].notna().any():

@@ -27,7 +27,7 @@ def rollout_error(inputs: ReportInputs) -> Plot | None:
         return None
     caption = (
         "Distance of the centres of objects between imagined and true motion, mean over objects "
-        "and trials, over the time after the last observed frame. Bands: bootstrap intervals, "
+        "and trials, over the time after the last observed frame. Bands: 95 % intervals, "
         f"which draw trials. Dotted: {CONSTANT_VELOCITY} from the last two observed steps, cut off "
         "where it leaves the panel. The panels have different scales."
     )

@@ -18,9 +18,9 @@ from physion.analysis.models.anchors import (
 )
 from physion.analysis.models.comparison import Comparison
 from physion.analysis.models.model_people import models_of, sample_of_models
+from physion.analysis.models.sampling_variance import sampling_variances
 from physion.analysis.people.answers import ScenarioAnswers
-from physion.analysis.people.people import draws_of_people
-from physion.analysis.statistics.bootstrap import Bootstrap
+from physion.analysis.statistics.jackknife import mean_of
 from physion.analysis.tables.csv_table import read_csv
 from physion.analysis.tables.predictions import REQUIRED, check_predictions, name_models
 from physion.analysis.tables.stimuli import MEAN, POOLED
@@ -68,10 +68,10 @@ def score_models(
     rows: pd.DataFrame,
     answers: Mapping[str, ScenarioAnswers],
     scenario: str,
-    draws: Bootstrap,
+    level: float,
 ) -> pd.DataFrame:
     """Return one row for each model of one file, whose checked rows are ``rows``."""
-    table = _scored(comparison.scores, comparison.stimuli, answers, scenario, draws)
+    table = _scored(comparison.scores, comparison.stimuli, answers, scenario, level)
     training = rows.drop_duplicates("agent").set_index("agent")["Dynamics Training Dataset"]
     return table.assign(training=table["agent"].map(training))
 
@@ -80,17 +80,17 @@ def score_anchors(
     stimuli: pd.DataFrame,
     answers: Mapping[str, ScenarioAnswers],
     scenario: str,
-    draws: Bootstrap,
+    level: float,
 ) -> pd.DataFrame:
     """Return one row for each anchor of `anchors.COMPUTED`; empty without people.
 
     ``stimuli``: `Comparison.stimuli` of all files; the anchors answer each stimulus once.
     """
-    scores, given = anchor_scores(stimuli, draws), anchor_stimuli(stimuli)
+    scores, given = anchor_scores(stimuli, level), anchor_stimuli(stimuli)
     if scores.empty:
         return scores
     rows = pd.concat([given, seen_stimuli(stimuli)], ignore_index=True)
-    return _scored(scores, rows, answers, scenario, draws).assign(
+    return _scored(scores, rows, answers, scenario, level).assign(
         rank=pd.Series(dtype="Int64"), training="", file="", versions=""
     )
 
@@ -100,7 +100,7 @@ def _scored(
     stimuli: pd.DataFrame,
     answers: Mapping[str, ScenarioAnswers],
     scenario: str,
-    draws: Bootstrap,
+    level: float,
 ) -> pd.DataFrame:
     """Return the scores of one scenario, or of a mean, with the metrics of participants added."""
     chosen = scores[scores["scenario"] == scenario]
@@ -123,7 +123,7 @@ def _scored(
             continue
         table[[metric.name, f"{metric.name}_low", f"{metric.name}_high"]] = np.nan
         if answers:
-            _add_metric(table, metric, stimuli, answers, scenario, draws)
+            _add_metric(table, metric, stimuli, answers, scenario, level)
         else:
             why = f"{metric.name}: needs the answers of single participants"
             table["reason"] = _also(table["reason"], why)
@@ -136,9 +136,9 @@ def _add_metric(
     stimuli: pd.DataFrame,
     answers: Mapping[str, ScenarioAnswers],
     scenario: str,
-    draws: Bootstrap,
+    level: float,
 ) -> None:
-    """Add a metric with participants: mean over scenarios, interval by drawing participants."""
+    """Add a metric with participants: mean over scenarios, interval about other participants."""
     key = metric.name
     for index, agent in table["agent"].items():
         subset = stimuli[stimuli["agent"] == agent]
@@ -150,16 +150,16 @@ def _add_metric(
                 why = f"{key}: no answers of single participants for every scenario"
             table.loc[index, "reason"] = "; ".join(filter(None, [table["reason"][index], why]))
             continue
-        values, resampled = [], []
+        values, variances = [], []
         for name in names:
             models, _ = models_of(subset[subset["scenario"] == name], answers[name])
             values.append(float(compute(sample_of_models(models, answers[name]))[0, 0]))
-            people = draws_of_people(answers[name], draws)
-            sample = sample_of_models(models, answers[name], None, people, "people")
-            resampled.append(compute(sample)[:, 0])
-        low, high = draws.interval(np.mean(resampled, axis=0))
-        table.loc[index, [key, f"{key}_low", f"{key}_high"]] = [np.mean(values), low, high]
-        if not np.isfinite(np.mean(values)):
+            found = sampling_variances(models, answers[name], {key: compute}, "people")[key]
+            variances.append(found.of(0))
+        value = float(np.mean(values))
+        low, high = mean_of(variances).interval(value, level, metric.scale)
+        table.loc[index, [key, f"{key}_low", f"{key}_high"]] = [value, low, high]
+        if not np.isfinite(value):
             why = f"{key}: undefined, model and people always give the same one answer"
             table.loc[index, "reason"] = "; ".join(filter(None, [table["reason"][index], why]))
 

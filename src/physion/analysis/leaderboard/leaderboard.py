@@ -14,19 +14,19 @@ from pathlib import Path
 
 import pandas as pd
 
-from physion.analysis.models.comparison import compare_scores
-from physion.analysis.models.contradictions import check_coverage
-from physion.analysis.models.leaderboard_order import (
+from physion.analysis.leaderboard.order import (
     columns,
     required_stimuli,
     sort_leaderboard,
     with_required,
 )
-from physion.analysis.models.leaderboard_rows import (
+from physion.analysis.leaderboard.rows import (
     read_submission,
     score_anchors,
     score_models,
 )
+from physion.analysis.models.comparison import compare_scores
+from physion.analysis.models.contradictions import check_coverage
 from physion.analysis.models.observed_contact import observed_contacts
 from physion.analysis.people.completeness import (
     Expected,
@@ -54,7 +54,7 @@ class Leaderboard:
     """Ranked table of models.
 
     - ``table``: the models of the files, and the anchors among them; see
-      `leaderboard_order.columns`.
+      `order.columns`.
     - ``anchors``: those that are computed on the stimuli of all files (`anchors.COMPUTED`), with
       the same columns; no file contains them. Empty without people.
     - ``dropped``: what was left out of each file: ``file``, ``agent``, ``scenario``, ``reason``,
@@ -149,7 +149,7 @@ def leaderboard(
                 exclude_ledge=exclude_ledge,
                 bootstrap=draws,
             )
-            scored = score_models(comparison, rows, answers, scenario, draws)
+            scored = score_models(comparison, rows, answers, scenario, draws.level)
         except BadInputError as error:
             refused[path] = str(error)
             continue
@@ -161,7 +161,7 @@ def leaderboard(
     if not tables:
         raise BadInputError(f"no file can be compared: {next(refused[path] for path in files)}")
     left_out, stimuli = pd.concat(dropped, ignore_index=True), pd.concat(answered)
-    anchors = score_anchors(stimuli, answers, scenario, draws)
+    anchors = score_anchors(stimuli, answers, scenario, draws.level)
     required = required_stimuli(stimuli, left_out)
     table = with_required(pd.concat(tables, ignore_index=True), required, scenario)
     order = ["file", "agent", "scenario", "reason", "stimuli"]
@@ -250,6 +250,6 @@ def _describe_scores(scenario: str, single: bool) -> dict[str, str]:
     if single:
         descriptions["Kappa"] = (
             "mean over participants of Cohen's kappa with the model, averaged over scenarios; its "
-            "interval draws participants, those of the other scores draw stimuli"
+            "interval is about other participants, those of the other scores about other stimuli"
         )
     return descriptions

@@ -1,0 +1,1 @@
+"""The leaderboard: one table of many prediction files."""
