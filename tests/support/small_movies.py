@@ -18,9 +18,11 @@ from support.moving_squares import with_arrays
 LAST_FRAME = 144
 
 
-def make_movies(folder: Path, counts: dict[str, int], scenarios: tuple[str, ...]) -> Dataset:
+def make_movies(
+    folder: Path, counts: dict[str, int], scenarios: tuple[str, ...], name: str = "small-movies"
+) -> Dataset:
     """Return trials with movies of 64 x 64 pixels, ``counts[split]`` of every scenario."""
-    tasks = plan_dataset("small-movies", scenarios, counts)
+    tasks = plan_dataset(name, scenarios, counts)
     settings = GenerateSettings(width=64, height=64, look="redyellow", jitters=0)
     assert not make_trials(folder, tasks, settings, executor=LocalExecutor(workers=2)).failed
     return Dataset(folder)
@@ -39,3 +41,9 @@ def windows(clips: Batch, length: int, latest: int, rows: Any, rng: np.random.Ge
     chosen = np.asarray(rows)[:, None], starts[:, None] + np.arange(length)
     arrays = {name: value[chosen] for name, value in clips.arrays().items()}
     return with_arrays(clips, trials=tuple(clips.trials[row] for row in rows), **arrays)
+
+
+def early_windows(model: Any, clips: Batch) -> Batch:
+    """Return a window of every clip; it starts early, since later most objects rest."""
+    latest = 40 // model.spec.stride
+    return windows(clips, model.window, latest, range(len(clips)), np.random.default_rng(0))

@@ -13,7 +13,7 @@ from physion.models.batch import Batch
 from physion.models.build import build_model
 from physion.models.cswm.contrast import ranking
 from physion.trials.dataset import Dataset
-from support.small_movies import make_movies, read_whole, windows
+from support.small_movies import early_windows, make_movies, read_whole, windows
 
 pytestmark = pytest.mark.slow
 
@@ -53,12 +53,6 @@ def train(model: Any, clips: Batch, steps: int, batch: int, rate: float, seed: i
         optimizer.step()
         schedule.step()
     model.eval()
-
-
-def early_windows(model: Any, clips: Batch) -> Batch:
-    """Return a window of every clip; it starts early, since later most objects rest."""
-    latest = 40 // model.spec.stride
-    return windows(clips, model.window, latest, range(len(clips)), np.random.default_rng(0))
 
 
 @torch.no_grad()

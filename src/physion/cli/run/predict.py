@@ -24,7 +24,8 @@ OFFICIAL_MODELS = (
 )
 """Models of a run on official scenes, in the order of the report."""
 SIMULATIONS = ("noisy-simulation", "noisy-simulation-outcomes", "noisy-simulation-people")
-PARTICLE_MODELS = ("gns", "gns-ransac", "dpi")
+TRAINED_MODELS = ("gns", "gns-ransac", "dpi", "svg", "op3", "cswm", "rpin")
+"""Models whose weights come with the package."""
 SAMPLED_MODELS = ("frozen-encoder", "noisy-simulation")
 
 
@@ -41,7 +42,7 @@ def chosen_models(options: Options) -> dict[str, dict[str, Any]]:
         # Frames of the size of the movies: enlarging them would only take time.
         "pEffNetLite0-mlp": {"image_size": options.size},
         "pEffNetLite0-lstm": {"image_size": options.size},
-        **{name: {"weights": "shipped"} for name in PARTICLE_MODELS},
+        **{name: {"weights": "shipped"} for name in TRAINED_MODELS},
         **{name: {"samples": options.samples, "engine": options.engine} for name in SIMULATIONS},
     }
     return {name: known.get(name, {}) for name in dict.fromkeys(names)}
