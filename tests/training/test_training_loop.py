@@ -16,11 +16,11 @@ from torch import Tensor, nn
 from physion.atomic import folder_lock
 from physion.errors import BadInputError, PhysionError
 from physion.models.batch import Batch
-from physion.models.checkpoints.checkpoint import read_checkpoint
+from physion.models.checkpoints.checkpoint import WEIGHTS, read_checkpoint
 from physion.models.raised import OutOfMemoryError
 from physion.models.settings import TrainingSettings
 from physion.training.devices import Devices, make_fabric
-from physion.training.folder import CARD, CHECKPOINT, PREVIOUS, WEIGHTS
+from physion.training.folder import CARD, CHECKPOINT, PREVIOUS
 from physion.training.loop import TrainingStoppedError
 from physion.training.metrics_log import METRICS, read_metrics
 from physion.training.train import TrainedModel, train_model

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from physion.atomic import remove_leftovers, write_atomic
 from physion.models.checkpoints.checkpoint import (
+    WEIGHTS,
     DamagedFileError,
     check_same,
     read_checkpoint,
@@ -19,7 +20,7 @@ from physion.models.checkpoints.checkpoint import (
 )
 
 CHECKPOINT, PREVIOUS = "checkpoint.safetensors", "previous.safetensors"
-WEIGHTS, CARD = "model.safetensors", "model_card.md"
+CARD = "model_card.md"
 _DAMAGED = ".damaged"
 """Suffix of damaged files that were set aside."""
 

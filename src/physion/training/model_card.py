@@ -8,8 +8,8 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from physion.models.checkpoints.checkpoint import WEIGHTS
 from physion.models.settings import TrainingSettings
-from physion.training.folder import WEIGHTS
 from physion.training.state import TrainingState
 
 

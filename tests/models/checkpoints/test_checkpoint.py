@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from physion.errors import BadInputError
 from physion.models.checkpoints.checkpoint import (
+    WEIGHTS,
     DamagedFileError,
     check_same,
     load_weights,
@@ -26,7 +27,7 @@ from physion.models.checkpoints.checkpoint import (
 from physion.models.settings import TrainingSettings
 from physion.training import folder as folder_module
 from physion.training.devices import Devices, make_fabric
-from physion.training.folder import CHECKPOINT, PREVIOUS, WEIGHTS
+from physion.training.folder import CHECKPOINT, PREVIOUS
 from physion.training.train import TrainedModel, train_model
 from support.trained_models import QUICK, MovingValues, NextBrightness, equal_weights
 

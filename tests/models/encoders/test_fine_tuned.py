@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from physion.errors import BadInputError
 from physion.models import Batch, build_model
-from physion.models.checkpoints.checkpoint import load_weights
+from physion.models.checkpoints.checkpoint import WEIGHTS, load_weights
 from physion.models.encoders.fine_tuned import FineTunedEncoder
 from physion.models.encoders.settings import FINE_TUNING
 from physion.models.interface import features_digest
@@ -21,7 +21,6 @@ from physion.models.settings import TrainingSettings
 from physion.readout import EvaluationConfig, evaluate
 from physion.readout.logistic import ReadoutConfig
 from physion.training.devices import Devices, make_fabric
-from physion.training.folder import WEIGHTS
 from physion.training.train import train_model
 from support.moving_dots import make_dots
 from support.tiny_models import TINY

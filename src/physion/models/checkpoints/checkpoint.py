@@ -27,6 +27,8 @@ _METADATA = "physion"
 _VERSION = 1
 """To be increased with every change of the files."""
 _MODEL, _OPTIMIZER = "model/", "optimizer/"
+WEIGHTS = "model.safetensors"
+"""Name of the file with the weights of a finished training."""
 _NAMED = 3
 """Largest number of differences that a message names."""
 
@@ -97,6 +99,15 @@ def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             f"physion {metadata.get('versions', {}).get('physion', '')}, or move it elsewhere"
         )
     return tensors, metadata
+
+
+def is_checkpoint(path: Path) -> bool:
+    """Return whether a file is one that `write_checkpoint` wrote, whole or not."""
+    try:
+        with safe_open(path, framework="pt") as file:
+            return _METADATA in (file.metadata() or {})
+    except (SafetensorError, OSError, ValueError):
+        return False
 
 
 def tensors_of(model: nn.Module, optimizer: Optimizer | None = None) -> dict[str, Tensor]:

@@ -13,8 +13,10 @@ from torch import nn
 
 from physion.errors import BadInputError
 from physion.models.checkpoints.checkpoint import (
+    WEIGHTS,
     DamagedFileError,
     check_same,
+    is_checkpoint,
     load_tensors,
     read_checkpoint,
 )
@@ -43,7 +45,8 @@ def load_named(model: Any, weights: str) -> None:
     model
         Torch ``Module`` with a ``name`` and its initial weights.
     weights
-        `RANDOM`, which leaves the model as it is; `SHIPPED`; or the path of a file.
+        `RANDOM`, which leaves the model as it is; `SHIPPED`; or the path of a file, or of the
+        folder of a training.
 
     Raises
     ------
@@ -86,13 +89,25 @@ def load_shipped(model: nn.Module, name: str) -> str:
     return f"shipped:{digests[name][:12]}"
 
 
+def trained_file(path: Path) -> Path | None:
+    """Return the file with the weights of a training, given by its own path or its folder's.
+
+    None if ``path`` is neither.
+    """
+    file = path / WEIGHTS if path.is_dir() else path
+    return file if is_checkpoint(file) else None
+
+
 def load_file(model: nn.Module, file: str) -> str:
     """Load a ``model.safetensors`` of ``physion train``, and return its origin for the tables.
+
+    ``file`` may be the folder of the training, too.
 
     Raises `BadInputError` for a file that is missing, holds other weights, or weights of a model
     that was built otherwise (`BUILT_AS`).
     """
     path = Path(file)
+    path = path / WEIGHTS if path.is_dir() else path
     if not path.is_file():
         raise BadInputError(
             f"there are no weights at {path}; give random, shipped, or the model.safetensors of "

@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from physion.errors import BadInputError
 from physion.models.build import make_config
+from physion.models.checkpoints.trained import load_named
 from physion.models.encoders.dynamics import Kind
 from physion.models.encoders.encoder_model import EncoderModel, Label
 from physion.models.encoders.fine_tuned import FineTunedEncoder
 from physion.models.encoders.frozen import FrozenEncoder
 from physion.models.encoders.settings import FAMILIES, FINE_TUNING, SMALL, EncoderConfig
+from physion.models.encoders.trained import before_training
 from physion.models.settings import TrainingSettings
 from physion.models.weights import RANDOM, EncoderWeights
 
 
 def frozen_encoder(**options: Any) -> EncoderModel:
     """Build any timm encoder with MLP or LSTM dynamics (options: `EncoderConfig`)."""
-    return _build(make_config(EncoderConfig, "frozen-encoder", options), Label())
+    config, trained = before_training(make_config(EncoderConfig, "frozen-encoder", options))
+    return _build(config, Label(), trained)
 
 
 def pvgg_mlp(**options: Any) -> EncoderModel:
@@ -87,17 +91,26 @@ def _family(family: str, dynamics: Kind, options: Mapping[str, Any]) -> EncoderM
         raise BadInputError(f"the released code of {name} trains no encoder; choose another size")
     own = sizes[size].config
     settings = {**dataclasses.asdict(own), "dynamics": dynamics, **chosen}
-    config = make_config(EncoderConfig, name, settings)
+    config, trained = before_training(make_config(EncoderConfig, name, settings))
     same = config.encoder == own.encoder and (
         config.weights in (own.weights, RANDOM) or EncoderWeights(config.weights).path is not None
     )
     label = Label(family, size) if same else Label()
-    return _build(config, label, sizes[size].training)
+    return _build(config, label, trained, sizes[size].training)
 
 
 def _build(
-    config: EncoderConfig, label: Label, training: TrainingSettings | None = None
+    config: EncoderConfig,
+    label: Label,
+    trained: Path | None,
+    training: TrainingSettings | None = None,
 ) -> EncoderModel:
-    if config.fine_tuned:
-        return FineTunedEncoder(config, label, FINE_TUNING)
-    return FrozenEncoder(config, label, training if training is not None else TrainingSettings())
+    """Build a model, with the weights of the file ``trained`` if there is one."""
+    model = (
+        FineTunedEncoder(config, label, FINE_TUNING)
+        if config.fine_tuned
+        else FrozenEncoder(config, label, training or TrainingSettings())
+    )
+    if trained is not None:
+        load_named(model, str(trained))
+    return model

@@ -70,6 +70,8 @@ class EncoderModel(nn.Module):
     def __init__(self, config: EncoderConfig, label: Label, training: TrainingSettings) -> None:
         super().__init__()
         self.config, self.label, self.settings = config, label, training
+        self.trained = False
+        self.init = ""  # of a training; by default the origin of the encoder's weights
         self._weights = EncoderWeights(config.weights, config.seed)
         mean, std = input_statistics(config.encoder, self._weights)
         self.spec = Spec(
@@ -156,6 +158,15 @@ class EncoderModel(nn.Module):
         settings = [_VERSION, self.encoder_digest(), dataclasses.asdict(self.config)]
         return digest_of(settings, self.state_dict().items())
 
+    def built_as(self) -> dict[str, Any]:
+        """Return what the weights were made for: name, version, settings, initial encoder."""
+        return {
+            "model": self.name(),
+            "version": _VERSION,
+            "settings": dataclasses.asdict(self.config),
+            "encoder": self._weights.identity(),
+        }
+
     def encoder_digest(self) -> str:
         """Return the key of stored features, which does not depend on the dynamics."""
         parts: list[Any] = [self.config.encoder, self.config.image_size, self._weights.identity()]
@@ -182,7 +193,7 @@ class EncoderModel(nn.Module):
         task, dataset = self._weights.pretraining()
         return Provenance(
             model=self.name(),
-            init=self._weights.init(),
+            init=self.init or self._weights.init(),
             encoder_type=config.encoder,
             dynamics_type=config.dynamics.upper() + " residual" * config.residual,
             encoder_pretraining_task=task,

@@ -26,7 +26,8 @@ class EncoderConfig:
 
     - ``encoder``: any timm name. ``image_size``: pixels per side; most weights expect 224.
     - ``weights``: ``imagenet``, ``timm:<tag>`` of other weights of timm, ``random``,
-      ``package:<name>`` of an installed Python package, or the path of a state dict.
+      ``package:<name>`` of an installed Python package, the path of a state dict, or of the
+      ``model.safetensors`` of a training of this model, or of its folder.
     - ``pooling``: ``pooled`` features, or ``grid``, which keeps positions (`models.weights.grid`).
     - ``dynamics``: ``mlp`` (all context features at once) or ``lstm`` (one after the other).
     - ``hidden``: units of the hidden layer.

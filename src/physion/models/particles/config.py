@@ -20,7 +20,8 @@ class ParticleOptions:
     - ``size``: ``small`` or ``paper`` of this package's own form, or ``released``, the networks,
       inputs and decision of the published code (`released.simulator`).
     - ``weights``: ``random``, to be trained; ``shipped``, those that come with the package,
-      trained on all scenarios; or the path of a ``model.safetensors`` that ``physion train`` wrote.
+      trained on all scenarios; or the path of a ``model.safetensors`` that ``physion train`` wrote,
+      or of its folder.
     - ``swept``: whether particles that come close during a step are neighbours; those of the size
       released never are.
     - ``samples``: futures of a trial, and ``spread``: standard deviation of the noise on their

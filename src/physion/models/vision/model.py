@@ -26,7 +26,7 @@ class VisionOptions:
     - ``size``: ``small`` (for a CPU) or ``paper``, or ``released``, with the settings of the
       published code where they differ from the paper.
     - ``weights``: ``random``, to be trained; ``shipped``, those that come with the package; or the
-      path of a ``model.safetensors`` that ``physion train`` wrote.
+      path of a ``model.safetensors`` that ``physion train`` wrote, or of its folder.
     - ``seed``: of the initial weights.
     """
 

@@ -23,6 +23,8 @@ from physion.trials.dataset import Dataset
 
 _LIBRARIES = ("torch", "timm", "torchvision", "transformers", "lightning-fabric", "scikit-learn")
 """Libraries whose version can change a result."""
+_WEIGHTS = "model.safetensors"
+"""Name of a file with trained weights, `checkpoints.checkpoint.WEIGHTS`, here without torch."""
 _COLUMNS = (
     "trial", "scenario", "split", "contact", "digest", "movie_sha256", "observed_movie_sha256",
     "recorded_contact", "observed_contact",
@@ -51,9 +53,10 @@ def choice_key(choice: ModelChoice) -> str:
     """Return the key of a model: its name, its options, and the files that belong to it.
 
     These are the Python files beside a ``FILE.py:Class``, the package of a model that is not of
-    this package, and files that options name.
+    this package, files that options name, and weights in folders that they name.
     """
     named = [Path(value) for value in choice.options.values() if isinstance(value, str)]
+    named += [path / _WEIGHTS for path in named]
     sources: Iterable[Path] = ()
     if is_file_name(choice.name):
         sources = Path(choice.name.partition(":")[0]).resolve().parent.glob("*.py")

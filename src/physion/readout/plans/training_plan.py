@@ -209,7 +209,7 @@ class TrainingPlan:
         return self.shared.devices * self.shared.nodes > 1
 
     def _train(self, task: TrainingTask, meter: Meter) -> dict[str, Any]:
-        from physion.training.folder import WEIGHTS
+        from physion.models.checkpoints.checkpoint import WEIGHTS
 
         trainer = self._trainer(task)
         result = trainer.train(task.planned, task.seed, meter)
