@@ -1,16 +1,24 @@
-"""A small comparison with invented answers, for the tests of figures and page."""
+"""A small comparison with invented answers, and a browser, for the tests of figures and pages."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from physion.analysis import Bootstrap, Comparison, compare_scores
+from support.browser import Browser
 
 Maker = Callable[..., Comparison]
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    found = Browser(tmp_path_factory.mktemp("profile"))
+    yield found
+    found.close()
 
 
 @pytest.fixture

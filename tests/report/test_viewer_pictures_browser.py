@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -27,13 +27,6 @@ TILES = {
     "cswm": ["true", "masks", "changes"],
 }
 RED = np.array([230, 40, 40])
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    found = Browser(tmp_path_factory.mktemp("profile"))
-    yield found
-    found.close()
 
 
 @pytest.fixture(scope="module")
@@ -124,6 +117,10 @@ def check_kind(browser: Browser, name: str, one: ImaginedTrial, first: int, seco
         seek(browser, first)
         painted(browser, "masks")
         assert f"imagined at frame {first}" in text(browser, "masks")
+        drawn = canvas(browser, "masks")
+        seek(browser, int(one.seen_frames[1]))
+        assert f"seen at frame {one.seen_frames[1]}" in text(browser, "masks")
+        assert not np.array_equal(drawn, canvas(browser, "masks"))
     if name == "rpin":
         left, top, right, bottom = 256 * one.shown["boxes"][1, 0]
         near = np.abs(canvas(browser, "true")[..., :3] - RED).max(axis=2) < 40

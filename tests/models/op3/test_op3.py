@@ -27,6 +27,7 @@ from physion.models.op3.pixels import (
     plain_maps,
     slope_maps,
 )
+from physion.models.vision.pictures import normalized_pictures
 from support.moving_squares import squares, with_arrays
 
 TINY = Op3Config(
@@ -244,6 +245,25 @@ def test_futures_follow_from_seed_and_name_of_the_trial() -> None:
     assert torch.allclose(masks.sum(3), torch.ones(3, 3, 3, 16, 16), atol=1e-5)
 
 
+def test_masks_of_seen_frames_are_those_of_their_refined_slots() -> None:
+    model = tiny()
+    context = context_of(model, 2)
+    shown = model.imagine(context, 3, 7, show=1.0).shown
+    masks = shown["context_masks"]
+    assert masks.shape == (2, context.rgb.shape[1], 3, 16, 16) and masks.dtype == torch.float32
+    assert torch.allclose(masks.sum(2), torch.ones(masks.shape[0], masks.shape[1], 16, 16))
+    # Those of a frame do not depend on the frames after it, nor on the futures.
+    later = context.rgb.clone()
+    later[:, -1] = 255 - later[:, -1]
+    other = model.imagine(with_arrays(context, rgb=later), 1, 0, show=1.0).shown["context_masks"]
+    assert torch.equal(other[:, :-1], masks[:, :-1]) and not torch.equal(other[:, -1], masks[:, -1])
+    pictures = normalized_pictures(context, model.spec, model.name)
+    last = model._watch(pictures)[1][-1]
+    with torch.no_grad():
+        expected = model.slots.decoder(last.states).masks[:, :, 0]
+    assert torch.equal(masks[:, -1], expected)
+
+
 def test_a_validation_is_of_frames_that_are_not_seen() -> None:
     model = tiny()
     batch = squares(2, model.window, model.spec)
@@ -270,21 +290,6 @@ def test_every_weight_is_trained() -> None:
     model = tiny().train()
     model.loss(squares(2, model.window, model.spec))["loss"].backward()
     assert all(weight.grad is not None for weight in model.parameters())
-
-
-def test_bad_clips_are_refused() -> None:
-    model = tiny()
-    context = context_of(model)
-    with pytest.raises(BadInputError, match=r"op3-small: pictures must be .*16, 16.*48, 48"):
-        model.encode(squares(2, 3, replace(model.spec, image_size=48)))
-    with pytest.raises(BadInputError, match="from a context of 3 frames, not 2"):
-        model.imagine(context.steps(slice(0, 2)), 1, 0)
-    with pytest.raises(BadInputError, match="clips of 4 frames, not 3"):
-        model.loss(context)
-    valid = context.valid.clone()
-    valid[0, 2] = False
-    with pytest.raises(BadInputError, match=r"squares_0000.*up to frame 12"):
-        model.imagine(with_arrays(context, valid=valid), 1, 0)
 
 
 @pytest.mark.parametrize(

@@ -80,23 +80,28 @@ class Op3(PictureModel):
 
         They follow from ``seed`` and the name of the trial alone. With the knob ``show`` above 0,
         ``shown`` holds pictures, ``rgb`` (B, S, future, H, W, 3) uint8, and ``masks``
-        (B, S, future, K, H, W) float32.
+        (B, S, future, K, H, W) float32, and under ``context_masks`` those of the frames that were
+        seen (B, T, K, H, W).
         """
-        _, slots = self._watch(context_pictures(context, self.spec, self.name))
+        _, seen = self._watch(context_pictures(context, self.spec, self.name))
+        slots = seen[-1]
         config, clips = self.config, len(context)
         shape = (samples, config.future + 1, config.slots, config.stochastic)
         draws = [generator(NAME, seed, trial).standard_normal(shape) for trial in context.trials]
         noise = torch.from_numpy(np.concatenate(draws)).to(slots.mean)
-        features, shown = [], []
+        shows = knobs.get("show", 0) > 0
+        features, shown, found = [], [], []
         with torch.no_grad():
+            if shows:
+                found = [self.slots.decoder(beliefs.states) for beliefs in seen]
             state = _repeated(slots, samples, noise[:, 0])
             for step in range(config.future):
                 state = self.slots.predict(state, noise[:, step + 1])
                 features.append(state.features())
-                if knobs.get("show", 0) > 0:
+                if shows:
                     shown.append(self.slots.decoder(state.states))
         values = torch.stack(features, 1).float().view(clips, samples, config.future, -1)
-        return Rollout(features=values, shown=_shown(shown, clips, samples))
+        return Rollout(features=values, shown=_shown(shown, found, clips, samples))
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
         """Return the loss of training clips, and what it consists of.
@@ -144,11 +149,11 @@ class Op3(PictureModel):
         objective = nll + config.beta * kl / (height * width)
         return TrainingClips(objective, nll, kl, torch.stack(imagined, 1))
 
-    def _watch(self, pictures: Tensor) -> tuple[Tensor, Slots]:
-        """Return features (B, T, K R) of clips (B, T, 3, H, W), and the beliefs after the last."""
+    def _watch(self, pictures: Tensor) -> tuple[Tensor, list[Slots]]:
+        """Return features (B, T, K R) of clips (B, T, 3, H, W), and beliefs after each frame."""
         config, inference = self.config, self.slots
         rng = generator(NAME, "slots")
-        features = []
+        features, beliefs = [], []
         # The refinement needs gradients, which tensors of the inference mode cannot have.
         with torch.inference_mode(False), torch.enable_grad():
             seen = pictures.clone()
@@ -166,7 +171,8 @@ class Op3(PictureModel):
                     explained = inference.explain(slots.detached(), seen[:, frame])
                     slots = inference.refine(explained, seen[:, frame], noise())
                 features.append(slots.features().detach())
-            return torch.stack(features, 1).float(), slots.detached()
+                beliefs.append(slots.detached())
+            return torch.stack(features, 1).float(), beliefs
 
 
 def weighted_means(
@@ -209,13 +215,21 @@ def _repeated(slots: Slots, samples: int, noise: Tensor) -> Slots:
     return Slots(deterministic, mean, raw, prior_mean, prior_raw, noise, memory)
 
 
-def _shown(steps: list[Decoded], clips: int, samples: int) -> dict[str, Tensor]:
+def _shown(
+    steps: list[Decoded], seen: list[Decoded], clips: int, samples: int
+) -> dict[str, Tensor]:
+    """Return what slots show at imagined steps, and the masks of frames that were seen."""
     if not steps:
         return {}
     pictures = torch.stack([step.picture() for step in steps], 1).clamp(0, 1)
     rgb = (pictures.movedim(2, -1) * 255).round().to(torch.uint8)
-    masks = torch.stack([step.masks[:, :, 0] for step in steps], 1).float()
-    return {
+    futures = {
         name: value.view(clips, samples, *value.shape[1:])
-        for name, value in {"rgb": rgb, "masks": masks}.items()
+        for name, value in {"rgb": rgb, "masks": _masks(steps)}.items()
     }
+    return {**futures, "context_masks": _masks(seen)}
+
+
+def _masks(steps: list[Decoded]) -> Tensor:
+    """Return the masks (B, T, K, H, W) of T steps, float32."""
+    return torch.stack([step.masks[:, :, 0] for step in steps], 1).float()
