@@ -31,25 +31,22 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from physion.errors import BadInputError
-from physion.models.anchors.smallest_gap import FAR
 from physion.models.batch import LAST_OBSERVED, Batch, Motion, Provenance, Rollout, Spec
 from physion.models.interface import Diet
-from physion.models.observed import cut_to_observed
 from physion.models.particles.bodies import (
-    CLOTH,
     KINEMATIC,
     RIGID,
     Poses,
-    SceneParticles,
-    join_poses_in_time,
-    later_poses,
-    particle_positions,
-    poses_of,
-    put_by_events,
-    scene_particles,
 )
 from physion.models.particles.config import ParticleConfig, ParticleOptions
-from physion.models.particles.gap import smallest_distance
+from physion.models.particles.futures import (
+    Futures,
+    join_futures,
+    observed_start,
+    shown_particles,
+    smallest_gaps,
+    unseen_outcomes,
+)
 from physion.models.particles.graph import Drift, Graph, drift_of, make_graph, move, move_loose
 from physion.models.particles.layout import ObjectState, SceneLayout
 from physion.models.particles.networks import MessageNetwork, ObjectNetwork
@@ -63,7 +60,6 @@ from physion.models.particles.rollout import Start, disturbed_start, roll_out
 from physion.models.particles.windows import Window, disturbed, read_window, rotated
 from physion.models.threshold import best_threshold
 from physion.models.torch_model import TorchModel, digest_of, initial_weights
-from physion.physics.labels import label_contact
 from physion.scenes.scene import FRAME_TIME
 from physion.seeds import generator
 
@@ -82,8 +78,6 @@ _INLIER = 0.1
 """Distance in spacings within which a particle agrees with a rigid motion."""
 
 F64 = NDArray[np.float64]
-Futures = list[tuple[SceneParticles, Poses]]
-"""Particles and motion of every sample of a trial."""
 
 
 class ParticleSimulator(TorchModel):
@@ -199,25 +193,13 @@ class ParticleSimulator(TorchModel):
         Trials with a contact in the observed part do not count.
         """
         self.touch.zero_()
-        motions, labels, cloth = [], [], []
-        for motion in whole.state or ():
-            if len(motion.trajectory) <= LAST_OBSERVED:
-                continue
-            label = label_contact(motion.scene, motion.trajectory)
-            if not label.observed:
-                cut = cut_to_observed(motion.scene, motion.trajectory)
-                motions.append(Motion(motion.scene, cut))
-                labels.append(label.contact)
-                roles = motion.scene.roles
-                things = [motion.scene.index(name) for name in (roles.agent, roles.patient)]
-                cloth.append(max(things) >= len(motion.scene.bodies))
+        motions, labels, cloth = unseen_outcomes(whole.state or ())
         if not motions:
             return
         parts = [motions[row : row + _AT_ONCE] for row in range(0, len(motions), _AT_ONCE)]
         gaps = np.concatenate([self.gaps(part, self.futures(part, 1, 0))[:, 0] for part in parts])
-        touching, soft = np.array(labels), np.array(cloth)
-        for row, which in enumerate((~soft, soft)):
-            self.touch[row] = best_threshold(gaps[which], touching[which])
+        for row, which in enumerate((~cloth, cloth)):
+            self.touch[row] = best_threshold(gaps[which], labels[which])
 
     @torch.no_grad()
     def imagine(self, context: Batch, samples: int, seed: int, **knobs: float) -> Rollout:
@@ -232,7 +214,7 @@ class ParticleSimulator(TorchModel):
         if context.state is None:
             raise BadInputError("a particle model imagines from motions, which the batch lacks")
         futures = self.futures(context.state, samples, seed)
-        shown = _shown(futures, self.spec.context) if knobs.get("show", 0) > 0 else {}
+        shown = shown_particles(futures, self.spec.context) if knobs.get("show", 0) > 0 else {}
         return Rollout(gap=self.gaps(context.state, futures), shown=shown)
 
     @torch.no_grad()
@@ -256,11 +238,7 @@ class ParticleSimulator(TorchModel):
         self.eval()
         known, imagined = self._prepared(observed), self._roll_out(self._prepared(starts))
         self.train(was_training)
-        joined = [
-            (start.particles, join_poses_in_time(start.poses, later))
-            for start, later in zip(known, imagined, strict=True)
-        ]
-        return [joined[row : row + samples] for row in range(0, len(joined), samples)]
+        return join_futures(known, imagined, samples)
 
     def step(self, layout: SceneLayout, before: ObjectState, now: ObjectState) -> ObjectState:
         """Return the state after the next step."""
@@ -320,17 +298,7 @@ class ParticleSimulator(TorchModel):
 
     def _start(self, motion: Motion, frames: range) -> Start:
         """Return the observed motion of a scene in these frames, and the steps to its end."""
-        scene = motion.scene
-        own = scene_particles(scene, self.config.particles, scene.present(LAST_OBSERVED))
-        poses = poses_of(own, motion, frames)
-        # What was put somewhere between the last two steps did not move there.
-        put = np.isin(own.things, put_by_events(scene, frames[-2], frames[-1]))
-        poses.centers[-2, put], poses.rotations[-2, put] = (
-            poses.centers[-1, put],
-            poses.rotations[-1, put],
-        )
-        limit = scene.ending.frame_limits()[1] - 1 - LAST_OBSERVED
-        return Start(own, poses, limit // self.options.stride)
+        return observed_start(motion, frames, self.config.particles)
 
     def _prepared(self, starts: Sequence[Start]) -> Sequence[Start]:
         """Return scenes in the form in which the network moves them."""
@@ -346,21 +314,9 @@ class ParticleSimulator(TorchModel):
         They count from frame 44 on. After a contact that was observed, by the rule of the label,
         they are -`FAR`, below every threshold that a reader can fit.
         """
-        config = self.config
         touch = self.touch.cpu().numpy()
-        gaps = np.zeros((len(motions), len(futures[0])))
-        for row, (motion, own) in enumerate(zip(motions, futures, strict=True)):
-            for column, (particles, poses) in enumerate(own):
-                later = later_poses(poses, self.spec.context - 1)
-                distance = smallest_distance(
-                    motion.scene, particles, later, config.gap_spacing, config.gap_limit
-                )
-                pair = [particles.agent, particles.patient]
-                soft = min(pair) >= 0 and CLOTH in particles.kinds[pair]
-                gaps[row, column] = distance - touch[int(soft)]
-            if label_contact(motion.scene, motion.trajectory).observed:
-                gaps[row] = -FAR
-        return gaps
+        first = self.spec.context - 1
+        return smallest_gaps(motions, futures, self.config, first=first, touch=touch)
 
     def _read(self, batch: Batch) -> Window:
         config = self.config
@@ -418,25 +374,6 @@ def _made_again(
     model.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
     model.init, model.trained = init, trained
     return model.eval()
-
-
-def _shown(futures: Sequence[Futures], observed: int) -> dict[str, NDArray[np.generic]]:
-    """Return the particles of the frames after the first ``observed`` ones; see `imagine`."""
-    clouds = [
-        [particle_positions(particles, poses)[observed:] for particles, poses in own]
-        for own in futures
-    ]
-    samples, parts = len(futures[0]), [cloud for own in clouds for cloud in own]
-    frames, count = (max(cloud.shape[axis] for cloud in parts) for axis in (0, 1))
-    shape = (len(futures), samples, frames, count, 3)
-    positions = np.full(shape, np.nan, np.float32)
-    things = np.full((len(futures), count), -1, np.int64)
-    for row, own in enumerate(clouds):
-        particles = futures[row][0][0]
-        things[row, : len(particles.owners)] = particles.things[particles.owners]
-        for sample, cloud in enumerate(own):
-            positions[row, sample, : cloud.shape[0], : cloud.shape[1]] = cloud
-    return {"particles": positions, "things": things}
 
 
 def _softened(squares: Tensor, knee: float) -> Tensor:

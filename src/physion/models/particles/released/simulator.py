@@ -23,6 +23,7 @@ from physion.models.particles.bodies import (
 )
 from physion.models.particles.cell_list import radius_edges_on_device
 from physion.models.particles.config import ParticleOptions
+from physion.models.particles.futures import Futures
 from physion.models.particles.layout import ObjectState, SceneLayout, with_loose
 from physion.models.particles.neighbours import radius_edges
 from physion.models.particles.released.config import ReleasedConfig
@@ -38,7 +39,7 @@ from physion.models.particles.released.graph import released_graph
 from physion.models.particles.released.layers import Widths
 from physion.models.particles.rigid_motion import fit_rigid
 from physion.models.particles.rollout import Start
-from physion.models.particles.simulator import Futures, ParticleSimulator
+from physion.models.particles.simulator import ParticleSimulator
 from physion.models.torch_model import digest_of
 from physion.scenes.scene import FRAME_TIME
 
