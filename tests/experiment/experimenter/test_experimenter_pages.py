@@ -91,8 +91,8 @@ def test_progress_counts_people_alone(busy: tuple[Lab, Visitor]) -> None:
             for p in own
         )  # fmt: skip
         assert row[0] == scenario and row[2] == f"{ended['finished']} of 80"
-        expected = [ended[state] for state in ("going", "left", "withdrawn", "declined")]
-        assert row[3:7] == [str(count) for count in expected]
+        expected = [ended[state] for state in ("going", "left", "withdrawn", "declined", "void")]
+        assert row[3:8] == [str(count) for count in expected]
         assert min(ended.values()) > 0 and sum(ended.values()) == len(own)
     assert rows[-1][0] == "All" and len(rows) == 3
 

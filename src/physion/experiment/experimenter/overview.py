@@ -233,7 +233,7 @@ def funnel(part: Sequence[SessionSummary]) -> tuple[FunnelStage, ...]:
         reached = sum(at[later].total() for later in order[index:])
         percent = 100.0 * reached / len(part) if part else 0.0
         states = at[stage]
-        ended = states["withdrawn"] + states["declined"]
+        ended = states["withdrawn"] + states["declined"] + states["void"]
         steps.append(
             FunnelStage(STAGES[stage], reached, percent, states["going"], states["left"], ended)
         )
@@ -243,7 +243,8 @@ def funnel(part: Sequence[SessionSummary]) -> tuple[FunnelStage, ...]:
 def _performance(study: Study, name: str, part: Sequence[SessionSummary]) -> ScenarioPerformance:
     """Return accuracy and response times of the people who completed one scenario."""
     trials = len(study.phase(name, "test"))
-    complete = [s.answered for s in part if trials and s.answered.test >= trials]
+    counted = [s for s in part if s.state != "void"]
+    complete = [s.answered for s in counted if trials and s.answered.test >= trials]
     accuracies = [answered.correct / answered.test for answered in complete]
     times = list(chain.from_iterable(answered.rt_ms for answered in complete))
     margin = 1.96 * stdev(accuracies) / math.sqrt(len(accuracies)) if len(accuracies) > 1 else None

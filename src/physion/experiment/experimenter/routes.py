@@ -15,6 +15,7 @@ from starlette.responses import Response
 
 from physion.experiment.experimenter.access.access_control import drop_cookie, set_cookie
 from physion.experiment.experimenter.export_pages import ExportPages
+from physion.experiment.experimenter.manage_pages import ManagePages
 from physion.experiment.experimenter.page_context import WRONG_FORM, PageContext, redirect
 from physion.experiment.experimenter.payment_pages import PaymentPages
 from physion.experiment.experimenter.session_list import KINDS, SessionFilter
@@ -31,8 +32,9 @@ LOG = logging.getLogger(__name__)
 def build_router(study: Study, secrets: Secrets, store: Store) -> APIRouter:
     """Return the router of the pages of a study, to be included under ``/experimenter``."""
     context = PageContext(study, secrets, store.engine.url.render_as_string(hide_password=False))
-    pages, exports = _Pages(context), ExportPages(context)
-    payments = PaymentPages(context, store, exports)
+    exports = ExportPages(context)
+    manage = ManagePages(context, store, exports)
+    pages, payments = _Pages(context, manage), PaymentPages(context, store, exports)
 
     @contextlib.asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -48,6 +50,9 @@ def build_router(study: Study, secrets: Secrets, store: Store) -> APIRouter:
         ("POST", "/logout", pages.logout),
         ("GET", "/sessions", pages.sessions),
         ("GET", "/sessions/{session}", pages.session),
+        ("POST", "/sessions/{session}/void", manage.set_voided),
+        ("POST", "/sessions/{session}/forget", manage.forget),
+        ("POST", "/recruitment", manage.set_recruitment),
         ("GET", "/payments", payments.show),
         ("POST", "/payments", payments.confirm),
         ("POST", "/payments/forget", payments.forget),
@@ -62,8 +67,8 @@ def build_router(study: Study, secrets: Secrets, store: Store) -> APIRouter:
 class _Pages:
     """Request handlers of login, overview, sessions and static files."""
 
-    def __init__(self, context: PageContext) -> None:
-        self._context = context
+    def __init__(self, context: PageContext, manage: ManagePages) -> None:
+        self._context, self._manage = context, manage
         self._files = read_page_files(Path(__file__).parent / "static")
 
     async def login_page(self, request: Request) -> Response:
@@ -121,8 +126,9 @@ class _Pages:
             return result
         overview, flags = result
         return await self._context.render_in_thread(
-            request, "overview.html", here="overview", overview=overview, flags=flags
-        )
+            request, "overview.html", here="overview", overview=overview, flags=flags,
+            paused=await self._manage.is_paused(),
+        )  # fmt: skip
 
     async def sessions(self, request: Request) -> Response:
         """Show the table of sessions."""

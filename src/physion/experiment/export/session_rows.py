@@ -22,6 +22,7 @@ EXPORTED_KINDS = ("person", "simulated")
 """Kinds of sessions that can be exported; previews cannot."""
 PREVIEW = "preview by the experimenter"
 NO_CONSENT = "no consent was given"
+VOID = "the experimenter made the session void"
 WITHDRAWN = "the participant withdrew"
 UNFINISHED = "not finished, and only finished ones were requested"
 OTHER_KIND = "{kind}, which was not requested"
@@ -98,6 +99,8 @@ def _why_not(row: _Row, wanted: SessionSelection, study: Study) -> str | None:
         return OTHER_KIND.format(kind=row.kind)
     if wanted.scenario not in (None, row.scenario):
         return OTHER_SCENARIO
+    if row.voided_at is not None:
+        return VOID
     if row.consented_at is None:
         return NO_CONSENT
     if row.withdrawn_at is not None:

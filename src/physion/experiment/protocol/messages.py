@@ -64,6 +64,7 @@ REFUSALS = {
     "id_needed": 403,
     "already_took_part": 409,
     "study_full": 409,
+    "paused": 409,
     "wrong_stage": 409,
     "out_of_order": 409,
     "already_answered": 409,

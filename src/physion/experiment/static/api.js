@@ -19,6 +19,7 @@ const CODES = new Set([
   "id_needed",
   "already_took_part",
   "study_full",
+  "paused",
   "wrong_stage",
   "out_of_order",
   "already_answered",

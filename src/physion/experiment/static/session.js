@@ -27,7 +27,7 @@ const PAGES = {
 };
 
 /** Refusals after which no session of this page can go on. */
-const FINAL = ["unknown_token", "bad_link", "id_needed", "already_took_part", "study_full"];
+const FINAL = ["unknown_token", "bad_link", "id_needed", "already_took_part", "study_full", "paused"];
 
 /** @typedef {import("./messages.js").SessionState} SessionState */
 

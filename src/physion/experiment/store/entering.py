@@ -13,6 +13,7 @@ from sqlalchemy import Connection, case, func, insert, or_, select
 
 from physion.experiment.protocol.messages import Enter, Entered, Kind
 from physion.experiment.protocol.refused import Refused
+from physion.experiment.store.managing import is_paused
 from physion.experiment.store.sessions import (
     ACTIVE_WITHIN,
     ENTERED_AGAIN,
@@ -114,7 +115,7 @@ def enter_session(
     Raises
     ------
     Refused
-        The visitor has taken part already, or the study is full.
+        The visitor has taken part already, or the study is full or paused.
     """
     sessions = [
         session_from_row(study, row)
@@ -152,6 +153,7 @@ def _find_unfinished(sessions: list[Session], scenario: str | None) -> Session |
         for session in sessions
         if session.finished_at is None
         and session.withdrawn_at is None
+        and session.voided_at is None
         and scenario in (None, session.scenario)
     ]
     return max(unfinished, key=lambda session: session.started_at, default=None)
@@ -160,14 +162,16 @@ def _find_unfinished(sessions: list[Session], scenario: str | None) -> Session |
 def _find_ended(study: Study, sessions: list[Session], scenario: str | None) -> Session | None:
     """Return the latest session, of ``scenario`` if it is given, if it was declined or stopped.
 
-    None if another scenario is left in which the visitor may begin, and for closed sessions.
+    None if another scenario is left in which the visitor may begin, and for sessions that the lab
+    ended.
     """
     known = {session.scenario for session in sessions}
     wanted = [session for session in sessions if scenario in (None, session.scenario)]
     if not wanted or (scenario is None and not set(study.scenarios) <= known):
         return None
     last = max(wanted, key=lambda session: session.started_at)
-    return last if last.withdrawn_at is not None and last.closed_at is None else None
+    by_lab = last.closed_at is not None or last.voided_at is not None
+    return last if last.withdrawn_at is not None and not by_lab else None
 
 
 def _take_back(connection: Connection, session: Session, visitor: Visitor) -> None:
@@ -189,6 +193,8 @@ def _choose_scenario(connection: Connection, study: Study, visitor: Visitor, don
     ]
     if not available:
         raise Refused("already_took_part", "You have taken part already. Thank you!")
+    if visitor.kind == "person" and is_paused(connection):
+        raise Refused("paused", "The study takes in nobody at the moment; try again later.")
     counts = _count_sessions(connection, visitor)
     if visitor.kind == "person":
         available = [each for each in available if counts[each].taken < study.participants]
@@ -226,6 +232,7 @@ def _count_sessions(connection: Connection, visitor: Visitor) -> Mapping[str, _S
         .where(
             columns.kind == visitor.kind,
             columns.withdrawn_at.is_(None),
+            columns.voided_at.is_(None),
             or_(finished, columns.last_seen >= visitor.now - ACTIVE_WITHIN),
         )
         .group_by(columns.scenario)
@@ -274,7 +281,12 @@ def _least_used_order(connection: Connection, study: Study, scenario: str, kind:
     columns = SESSIONS.c
     statement = (
         select(columns.order_number, func.count())
-        .where(columns.scenario == scenario, columns.kind == kind, columns.withdrawn_at.is_(None))
+        .where(
+            columns.scenario == scenario,
+            columns.kind == kind,
+            columns.withdrawn_at.is_(None),
+            columns.voided_at.is_(None),
+        )
         .group_by(columns.order_number)
     )
     used: dict[int, int] = dict(connection.execute(statement).all())

@@ -70,9 +70,11 @@ def forget_sessions(url: str, references: Sequence[str]) -> int:
     """
     wanted = list(dict.fromkeys(reference.strip().upper() for reference in references))
 
+    now = time.time()
+
     def work(connection: Connection) -> int:
         for reference in wanted:
-            _forget_session(connection, reference)
+            _forget_session(connection, reference, now)
         return len(wanted)
 
     return _run_exclusively(url, work, (RAW_IDS, ANSWERS, EVENTS, TOKENS, SESSIONS))
@@ -111,6 +113,17 @@ async def forget_raw_ids(store: Store, participants: Sequence[str] | None = None
     return count
 
 
+async def forget_session(store: Store, reference: str) -> None:
+    """Delete all data of one session as `forget_sessions` does, while the study is served.
+
+    In PostgreSQL only the raw ids are rewritten, which is quick; the other deleted rows are
+    overwritten when the database vacuums by itself.
+    """
+    now = time.time()
+    await store.write(lambda connection: _forget_session(connection, reference, now))
+    await asyncio.to_thread(_erase_deleted_bytes, store.engine, (RAW_IDS,), compact=False)
+
+
 def _check_participants(participants: Sequence[str] | None) -> None:
     """Raise `BadInputError` unless all names are participant hashes."""
     for name in participants or ():
@@ -134,7 +147,7 @@ def _delete_raw_ids(connection: Connection, participants: Sequence[str] | None) 
     return len(names)
 
 
-def _forget_session(connection: Connection, reference: str) -> None:
+def _forget_session(connection: Connection, reference: str, now: float) -> None:
     """Delete the data of the session with this reference."""
     columns = SESSIONS.c
     query = select(columns.session, columns.participant, columns.withdrawn_at)
@@ -147,7 +160,6 @@ def _forget_session(connection: Connection, reference: str) -> None:
     session, participant, withdrawn_at = rows[0]
     for table in (ANSWERS, EVENTS, TOKENS):
         connection.execute(delete(table).where(table.c.session == session))
-    now = time.time()
     values = _EMPTIED | {"withdrawn_at": withdrawn_at or now, "closed_at": now}
     connection.execute(update(SESSIONS).where(columns.session == session).values(**values))
     # Declined and forgotten sessions have no device; if all are such, the id is not needed.

@@ -21,6 +21,7 @@ _FINISHED = (
         SESSIONS.c.kind == bindparam("of_kind"),
         SESSIONS.c.finished_at.is_not(None),
         SESSIONS.c.withdrawn_at.is_(None),
+        SESSIONS.c.voided_at.is_(None),
         # Previews may have used other stimuli, whose labels are no longer known.
         STUDIES.c.stimuli_digest == bindparam("of_stimuli"),
     )

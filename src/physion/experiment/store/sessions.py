@@ -46,6 +46,7 @@ class Session:
     finished_at: float | None
     withdrawn_at: float | None
     closed_at: float | None
+    voided_at: float | None
     answered_familiarization: int
     answered_test: int
     loads: int
@@ -117,6 +118,8 @@ def stage_of(session: Session, trials: Mapping[str, int]) -> Stage:
         return "declined" if declined else "withdrawn"
     if session.finished_at is not None:
         return "done"
+    if session.voided_at is not None:
+        return "withdrawn"
     complete = (
         session.consented_at is not None,
         session.instructed_at is not None,
@@ -131,10 +134,11 @@ def stage_of(session: Session, trials: Mapping[str, int]) -> Stage:
 def can_take_back(session: Session) -> bool:
     """Return whether a participant who declined or stopped may still take part.
 
-    Only while nothing was answered, and the session was not closed for good.
+    Only while nothing was answered, and the lab has not closed or voided the session.
     """
     unanswered = session.answered_familiarization == session.answered_test == 0
-    return session.withdrawn_at is not None and session.closed_at is None and unanswered
+    ended_by_lab = session.closed_at is not None or session.voided_at is not None
+    return session.withdrawn_at is not None and unanswered and not ended_by_lab
 
 
 def answered(session: Session, phase: str) -> int:

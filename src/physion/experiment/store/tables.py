@@ -87,6 +87,7 @@ SESSIONS = Table(
     Column("finished_at", Float),
     Column("withdrawn_at", Float),
     Column("closed_at", Float),
+    Column("voided_at", Float),
     Column("answered_familiarization", Integer, nullable=False, default=0),
     Column("answered_test", Integer, nullable=False, default=0),
     Column("loads", Integer, nullable=False, default=0),
@@ -109,7 +110,16 @@ SESSIONS = Table(
 number of the prepared order, 0 if the study has none; ``order_seed`` and the stimuli determine the
 order of the trials. ``loaded_at_*``: the trial that was next when the page was last reloaded.
 ``closed_at``: when the lab ended the session for good, so that the participant cannot take it up
-again: its data were deleted, or it was a preview of other stimuli."""
+again: its data were deleted, or it was a preview of other stimuli. ``voided_at``: when the lab
+decided that the session does not count."""
+
+PAUSES = Table(
+    "pauses",
+    METADATA,
+    Column("paused_at", Float, primary_key=True, autoincrement=False),
+    Column("resumed_at", Float),
+)
+"""Pauses of recruitment; the last one goes on while ``resumed_at`` is empty."""
 
 TOKENS = Table(
     "tokens",

@@ -26,6 +26,7 @@ STATES = {
     "left": "Dropped out",
     "withdrawn": "Withdrawn",
     "declined": "Declined",
+    "void": "Void",
 }
 """States of a session and their labels. Participants who dropped out may still continue."""
 
@@ -210,6 +211,8 @@ def session_state(facts: Mapping[str, Any], now: float) -> str:
 
     A participant who withdraws before giving consent has declined.
     """
+    if facts["voided_at"] is not None:
+        return "void"
     if facts["finished_at"] is not None:
         return "finished"
     if facts["withdrawn_at"] is not None:

@@ -76,11 +76,12 @@ class StatisticsWorker:
 
     def _flags(self, kind: str) -> Flags:
         # These counts are a version token of the data that the rules use: sessions do not change
-        # after their end, but withdrawn ones are excluded.
+        # after their end, but withdrawn and void ones are excluded.
         ended = sum(s.facts["finished_at"] is not None for s in self._read)
         withdrawn = sum(s.facts["withdrawn_at"] is not None for s in self._read)
+        void = sum(s.facts["voided_at"] is not None for s in self._read)
         trials = sum(s.answered.trials for s in self._read)
-        return self._flagger.flags(kind, (len(self._read), trials, ended, withdrawn))
+        return self._flagger.flags(kind, (len(self._read), trials, ended, withdrawn, void))
 
 
 def serve_questions(study: Study, url: str, connection: Connection) -> None:
