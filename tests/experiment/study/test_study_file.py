@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from physion.errors import BadInputError
 from physion.experiment.study.study import (
+    Bonus,
     EarlyEnd,
     Limits,
     Recruitment,
@@ -83,6 +84,7 @@ STUDIES = st.builds(
     stopped=EARLY_ENDS,
     device_refused=EARLY_ENDS,
     full=EARLY_ENDS,
+    bonus=st.builds(Bonus, st.floats(0, 10_000), st.floats(0, 1), st.floats(0, 1_000_000)),
     limits=st.builds(
         Limits, st.floats(0.1, 10_000), st.integers(1, 100_000), st.floats(0.1, 100_000)
     ),

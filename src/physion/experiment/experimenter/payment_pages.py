@@ -11,9 +11,12 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from physion.errors import PhysionError
+from physion.experiment.experimenter.access.access_control import HEADERS
+from physion.experiment.experimenter.archive import file_name
 from physion.experiment.experimenter.export_pages import ExportPages
 from physion.experiment.experimenter.page_context import FORGET_WORD, PageContext, redirect
-from physion.experiment.experimenter.payments import read_payments
+from physion.experiment.experimenter.payment_table import bonus_of, payment_csv
+from physion.experiment.experimenter.payments import Payments, read_payments
 from physion.experiment.experimenter.session_list import page_number
 
 if TYPE_CHECKING:
@@ -73,18 +76,45 @@ class PaymentPages:
         LOG.warning("%d raw ids were deleted by an experimenter", deleted)
         return await self._list(request, f"{deleted} ids were deleted.")
 
+    async def download(self, request: Request) -> Response:
+        """Send the selected payments as CSV."""
+        login = self._context.access.login(request)
+        if login is None:
+            return redirect("/login")
+        if not login.may_see_payments(self._context.access.clock()):
+            return self._confirm_form(request)
+        known = await self._context.query_statistics(request, "payments")
+        if isinstance(known, Response):
+            return known
+        payments = await self._read(request, None)
+        content = payment_csv(payments.rows, known, self._context.study.bonus)
+        name = f"{file_name(self._context.study)}-payments.csv"
+        headers = {**HEADERS, "content-disposition": f'attachment; filename="{name}"'}
+        return Response(content, 200, headers, "text/csv; charset=utf-8")
+
+    async def _read(self, request: Request, page: int | None) -> Payments:
+        """Read the payments that the query of the request selects."""
+        query = request.query_params
+        return await run_in_threadpool(
+            read_payments, self._context.study, self._context.secrets, self._store.engine,
+            source=query.get("source", "")[:20], finished=query.get("who", "finished") != "all",
+            page=page,
+        )  # fmt: skip
+
     async def _list(self, request: Request, message: str = "", status: int = 200) -> Response:
         """Show the payments with a message."""
         query = request.query_params
-        source = query.get("source", "")[:20]
-        finished = query.get("who", "finished") != "all"
-        payments = await run_in_threadpool(
-            read_payments, self._context.study, self._context.secrets, self._store.engine,
-            source=source, finished=finished, page=page_number(query.get("page", "")),
-        )  # fmt: skip
+        payments = await self._read(request, page_number(query.get("page", "")))
+        try:
+            known = await self._context.statistics.query("payments")
+        except PhysionError:
+            known = {}  # ids and codes are needed without it too
+        rule = self._context.study.bonus
+        bonus = {name: bonus_of(rule, done) for name, done in known.items()}
         return await self._context.render_in_thread(
-            request, "payments.html", status, here="payments", payments=payments, source=source,
-            finished=finished, message=message,
+            request, "payments.html", status, here="payments", payments=payments,
+            source=query.get("source", "")[:20], finished=query.get("who", "finished") != "all",
+            message=message, known=known, bonus=bonus if rule.per_correct else {},
         )  # fmt: skip
 
     def _confirm_form(

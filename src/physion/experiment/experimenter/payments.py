@@ -64,7 +64,7 @@ class Payments:
 
 
 def read_payments(
-    study: Study, secrets: Secrets, engine: Engine, *, source: str, finished: bool, page: int
+    study: Study, secrets: Secrets, engine: Engine, *, source: str, finished: bool, page: int | None
 ) -> Payments:
     """Read a page of the sessions of people whose raw id is stored, last finished first.
 
@@ -79,7 +79,8 @@ def read_payments(
     finished
         Only finished sessions.
     page
-        Number of the page from 1; numbers out of range give the closest page.
+        Number of the page from 1; numbers out of range give the closest page. None: all rows on
+        one page.
     """
     session, ids = SESSIONS.c, RAW_IDS.c
     chosen = [session.kind == "person"]
@@ -94,9 +95,10 @@ def read_payments(
     lines = select(*columns, ids.raw_id, ids.recruiter).select_from(joined).where(*chosen)
     with engine.connect() as connection:
         all_names = connection.execute(names).scalars().all()
-        pages = max(1, -(-len(all_names) // PAGE))
-        page = min(max(1, page), pages)
-        part = lines.order_by(*order).limit(PAGE).offset((page - 1) * PAGE)
+        size = PAGE if page is not None else max(1, len(all_names))
+        pages = max(1, -(-len(all_names) // size))
+        page = min(max(1, page or 1), pages)
+        part = lines.order_by(*order).limit(size).offset((page - 1) * size)
         rows = connection.execute(part).all()
         stored = connection.execute(select(func.count()).select_from(RAW_IDS)).scalar_one()
         sources = connection.execute(select(ids.source).distinct()).scalars().all()

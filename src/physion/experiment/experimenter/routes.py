@@ -55,6 +55,7 @@ def build_router(study: Study, secrets: Secrets, store: Store) -> APIRouter:
         ("POST", "/recruitment", manage.set_recruitment),
         ("GET", "/payments", payments.show),
         ("POST", "/payments", payments.confirm),
+        ("GET", "/payments.csv", payments.download),
         ("POST", "/payments/forget", payments.forget),
         ("GET", "/export", exports.show),
         ("POST", "/export", exports.make),

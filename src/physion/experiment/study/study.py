@@ -110,6 +110,25 @@ class EarlyEnd:
 
 
 @dataclass(frozen=True)
+class Bonus:
+    """Bonus of finished sessions: ``per_correct`` for each right test answer beyond a fraction.
+
+    Attributes
+    ----------
+    per_correct
+        Amount in the lab's currency for each counted answer; 0: no bonus.
+    above
+        Fraction of the test trials whose right answers do not count, such as 0.5 for guessing.
+    most
+        Largest bonus; 0: no limit.
+    """
+
+    per_correct: float = 0.0
+    above: float = 0.5
+    most: float = 0.0
+
+
+@dataclass(frozen=True)
 class Limits:
     """Rate limits (token buckets).
 
@@ -165,6 +184,8 @@ class Study:
     declined, stopped, device_refused, full
         Codes and URLs of participants who gave no consent, who stopped, whose device cannot show
         the movies, and who came when the study was full.
+    bonus
+        The rule of the bonus in the table of payments.
     stimuli
         Rows of ``stimuli.csv`` of the study's scenarios.
     texts
@@ -197,6 +218,7 @@ class Study:
     stopped: EarlyEnd = EarlyEnd()
     device_refused: EarlyEnd = EarlyEnd()
     full: EarlyEnd = EarlyEnd()
+    bonus: Bonus = Bonus()
     limits: Limits = Limits()
     stimuli: tuple[Stimulus, ...] = ()
     texts: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
@@ -216,6 +238,7 @@ _PARTS: dict[str, type[Any]] = {
     "screen": Screen,
     "recruitment": Recruitment,
     **dict.fromkeys(EARLY_ENDS, EarlyEnd),
+    "bonus": Bonus,
     "limits": Limits,
 }
 

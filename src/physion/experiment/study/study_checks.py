@@ -230,6 +230,11 @@ KEYS: tuple[Key, ...] = (
     Key("recruitment", "link_address", address(),
         "URL to which these participants are sent at the end."),
     *(key for table in _EARLY_ENDS for key in _early_end(table)),
+    Key("bonus", "per_correct", number(0, 10_000),
+        "Amount in your currency for each counted right answer; 0: no bonus."),
+    Key("bonus", "above", number(0, 1),
+        "Fraction of the test trials whose right answers do not count; 0.5 is guessing."),
+    Key("bonus", "most", number(0, 1_000_000), "Largest bonus; 0: no limit."),
     Key("limits", "requests_per_second", number(0.1, 10_000),
         "Sustained rate of requests of one session."),
     Key("limits", "burst", whole(1, 100_000), "Burst of requests of one session."),
@@ -245,6 +250,7 @@ TABLES = {
     "screen": "In a smaller window participants are asked to enlarge it; telephones are refused.",
     "recruitment": "Recruitment and completion credit.",
     **_EARLY_ENDS,
+    "bonus": "Bonus in the table of payments, for finished sessions.",
     "limits": "Rate limits; requests beyond them are refused for a while.",
 }
 """Tables of ``study.toml`` and the comment above each."""

@@ -16,6 +16,7 @@ from sqlalchemy import Engine
 from physion.errors import PhysionError
 from physion.experiment.experimenter.archive import export_archive
 from physion.experiment.experimenter.overview import Overview, compute_overview
+from physion.experiment.experimenter.payment_table import Performance, performances
 from physion.experiment.experimenter.session_list import SessionFilter, SessionList, list_sessions
 from physion.experiment.experimenter.session_page import SessionPage, read_session_page
 from physion.experiment.experimenter.statistics.flagging import FlagCache, Flags, find_flags
@@ -63,6 +64,10 @@ class StatisticsWorker:
         flags = self._flags(kinds.get(session, ""))
         return read_session_page(self._study, self._engine, summaries, flags, session)
 
+    def payments(self) -> dict[str, Performance]:
+        """Return the performance in each session of a person."""
+        return performances(self._refresh(), self._flags("person"))
+
     def export(self, folder: Path, simulated: bool) -> Path:
         """Write the export into ``folder``; return the path of its zip file."""
         return export_archive(self._study, self._engine, folder, simulated)
@@ -107,6 +112,7 @@ def _reply(worker: StatisticsWorker, question: str, arguments: Mapping[str, Any]
         "overview": worker.overview,
         "sessions": worker.sessions,
         "session": worker.session,
+        "payments": worker.payments,
         "export": worker.export,
     }
     try:
