@@ -23,6 +23,7 @@ request                       body, answer               meaning
                                                          finished session
 ``GET /api/ending``           `SessionEnd`               completion of a session that was declined
                                                          or stopped
+``POST /api/jump``            `Jump`, `SessionState`     go to any page or trial of a preview
 ``GET /api/health``           `Health`                   health check for load balancers, including
                                                          the database
 ============================  =========================  ==========================================
@@ -202,6 +203,16 @@ class PageDone(Message):
 
     page: Literal["consent", "instructions", "ready", "demographics", "feedback", "withdraw"]
     data: Annotated[dict[Name, bool | int | float | Text | None], Field(max_length=20)] = {}
+
+
+class Jump(Message):
+    """Page or trial to which a preview goes. ``trial`` counts from 0; ignored for pages."""
+
+    stage: Literal[
+        "consent", "instructions", "familiarization", "ready", "test", "demographics", "feedback",
+        "done",
+    ]  # fmt: skip
+    trial: Annotated[int, Field(ge=0, le=100_000)] = 0
 
 
 class Answer(Message):

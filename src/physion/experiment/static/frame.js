@@ -4,6 +4,7 @@
  */
 
 import { button, el } from "./dom.js";
+import { jumpControl } from "./jump.js";
 
 const STAGES_WITH_STOP_BUTTON = [
   "instructions",
@@ -28,6 +29,8 @@ export class Frame {
     this.main = byId("main");
     /** @type {() => void} */
     this.onStop = () => {};
+    /** @type {(to: {stage: string, trial: number}) => void} */
+    this.onJump = () => {};
     /** @type {(language: string) => void} */
     this.onLanguage = () => {};
     /** @type {import("./messages.js").SessionState|null} */
@@ -54,6 +57,9 @@ export class Frame {
     document.body.classList.toggle("in-trials", inTrials);
     byId("progress").hidden = !inTrials;
     const tools = [];
+    if (state.kind === "preview") {
+      tools.push(jumpControl(this.texts, state, (to) => this.onJump(to)));
+    }
     if (state.stage === "consent") tools.push(this.languageChooser());
     if (STAGES_WITH_STOP_BUTTON.includes(state.stage)) {
       const stop = button(this.texts.t("stop.open"), () => this.onStop(), { class: "link" });

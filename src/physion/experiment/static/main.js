@@ -76,6 +76,7 @@ async function takePart(basis, arrival) {
     basis.takeBack = takingBack(basis, arrival);
     session = new Session(basis, queue);
     frame.onStop = () => session.askToStop();
+    frame.onJump = (to) => session.jump(to);
     frame.onLanguage = (language) => changeLanguage(basis, session, language);
     await session.run(state);
   } catch (error) {

@@ -67,6 +67,11 @@ export interface TrialList {
   trials: TrialMedia[];
 }
 
+export interface Jump {
+  stage: string;
+  trial?: number;
+}
+
 export interface Answer {
   key: string;
   phase: Phase;

@@ -59,6 +59,8 @@ export class Session {
   /** Closes the question whether to stop, while it is open. @type {AbortController|null} */
   #question = null;
   #withdraws = false;
+  /** Where a preview goes next. @type {{stage: string, trial: number}|null} */
+  #target = null;
   /**
    * The running trial, and how often the question was opened during it.
    * @type {{phase: string|null, trial: number|null, asked: number}}
@@ -98,6 +100,12 @@ export class Session {
     this.#leave();
   }
 
+  /** Go to any page or trial of a preview. @param {{stage: string, trial: number}} to */
+  jump(to) {
+    this.#target = to;
+    this.#leave();
+  }
+
   /** Ask whether to stop; the trial and its response time continue behind the question. */
   async askToStop() {
     if (this.#question) return;
@@ -126,15 +134,20 @@ export class Session {
       this.basis.texts.scenario = this.state.scenario;
       if (!reading) await this.basis.setLanguage(this.state.language);
       this.basis.frame.show(this.context);
-      if (stage === "done") return this.#end();
       try {
-        const ended = stage === "declined" || stage === "withdrawn";
-        this.state = await (ended ? this.#ended() : this.#stage());
+        this.state = await this.#next();
       } catch (error) {
         if (this.#closed) return;
         this.state = await this.#stateAfter(error);
       }
     }
+  }
+
+  /** Run the current stage, or show the end. @returns {Promise<SessionState>} */
+  #next() {
+    const { stage } = this.state;
+    if (stage === "done") return this.#end();
+    return stage === "declined" || stage === "withdrawn" ? this.#ended() : this.#stage();
   }
 
   /** Show the current page again, in another language. */
@@ -165,6 +178,7 @@ export class Session {
     if (this.queue.length > 0) showPage(this.basis.frame.main, this.#waiting());
     await this.queue.empty();
     if (this.#withdraws) return this.#withdraw();
+    if (this.#target) return this.#jump();
     const known = this.#refused?.state ?? refused?.state;
     this.#refused = null;
     const request = (path) => this.#patiently(api.get(path));
@@ -172,6 +186,15 @@ export class Session {
     // A trial that was seen already is marked in its answer, as after a reload.
     const seen = this.#shown.has(`${state.stage} ${state.trial}`);
     return seen ? request("/api/session?load=true") : state;
+  }
+
+  /** Go to the target. @returns {Promise<SessionState>} */
+  #jump() {
+    const target = this.#target;
+    this.#target = null;
+    this.#shown.clear();
+    forgetFeedback();
+    return this.#patiently(this.basis.api.post("/api/jump", target));
   }
 
   /** Withdraw from the study. @returns {Promise<SessionState>} */
@@ -322,12 +345,16 @@ export class Session {
     });
   }
 
-  /** Show the result. */
+  /** Show the result, until a preview goes elsewhere. @returns {Promise<never>} */
   async #end() {
     this.#question?.abort();
     const { api, frame } = this.basis;
-    const result = await this.#patiently(api.get("/api/result"));
-    return showPage(frame.main, resultPage(this.context, result));
+    const { signal } = this.#part;
+    const result = await this.#patiently(api.get("/api/result", { signal }));
+    showPage(frame.main, resultPage(this.context, result));
+    return new Promise((_, reject) => {
+      signal.addEventListener("abort", () => reject(signal.reason));
+    });
   }
 }
 

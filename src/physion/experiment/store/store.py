@@ -19,6 +19,7 @@ from physion.experiment.protocol.messages import (
     Enter,
     Entered,
     Events,
+    Jump,
     PageDone,
     Phase,
     Result,
@@ -38,6 +39,7 @@ from physion.experiment.store.database import (
     upgrade,
 )
 from physion.experiment.store.entering import enter_session, identify_visitor
+from physion.experiment.store.jumping import jump
 from physion.experiment.store.scores import Scores, percentile
 from physion.experiment.store.sent_pages import check_page, submit_page
 from physion.experiment.store.sessions import (
@@ -158,6 +160,16 @@ class Store:
             return submit_page(connection, self.study, trials, session, done.page, values, now)
 
         return await self._writer.run(submit)
+
+    async def jump(self, token: str, to: Jump) -> SessionState:
+        """Move a preview to a page or trial."""
+        now = time.time()
+
+        def move(connection: Connection) -> SessionState:
+            session, trials = self._read_session(connection, token)
+            return jump(connection, trials, session, to, now)
+
+        return await self._writer.run(move)
 
     async def answer(self, token: str, answer: Answer) -> AnswerStored:
         """Store one answer; repeating the request does not store it twice."""

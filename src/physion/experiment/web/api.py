@@ -15,6 +15,7 @@ from physion.experiment.protocol.messages import (
     Enter,
     Events,
     Health,
+    Jump,
     PageDone,
     PublicStudy,
     TrialMedia,
@@ -143,6 +144,12 @@ def build_api(study: Study, secrets: Secrets, store: Store) -> APIRouter:
         """Store a submitted page."""
         page = await read_message(request, PageDone)
         return Reply(await store.page(token_of(request), page))
+
+    @router.post("/jump")
+    async def post_jump(request: Request) -> Response:
+        """Move a preview to a page or trial."""
+        to = await read_message(request, Jump)
+        return Reply(await store.jump(token_of(request), to))
 
     @router.post("/events")
     async def post_events(request: Request) -> Response:

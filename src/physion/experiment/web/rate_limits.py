@@ -17,7 +17,7 @@ WRONG = (401, 422)
 WITH_TOKEN = frozenset(
     f"/api/{name}"
     for name in ("session", "trials/familiarization", "trials/test", "page", "answers", "events",
-                 "result", "ending")
+                 "result", "ending", "jump")
 )  # fmt: skip
 
 

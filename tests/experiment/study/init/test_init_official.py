@@ -277,3 +277,49 @@ def test_the_published_lists_are_read(official: Path) -> None:
     shared = outcomes.keys() & listed.keys()
     assert len(shared) > 1000
     assert all(outcomes[name] == listed[name] for name in shared)
+
+
+def _write_own(path: Path, names: list[str], **columns: Any) -> Path:
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, ["stim_ID", "target_hit_zone_label", *columns])
+        writer.writeheader()
+        for number, name in enumerate(names):
+            row = {key: values[number] for key, values in columns.items()}
+            writer.writerow({"stim_ID": name, "target_hit_zone_label": number % 2 == 0, **row})
+    return path
+
+
+def test_own_movies_have_any_scenario_and_length(tmp_path: Path) -> None:
+    names, practice = [f"ball-{i}" for i in range(3)], ["try-0", "try-1"]
+    own = {"scenario": ["billiards"] * 3, "observed_frames": [20, "", 50]}
+    listed = _write_own(tmp_path / "mine.csv", names, **own)
+    fam = _write_own(tmp_path / "first.csv", practice, scenario=["billiards"] * 2)
+    _write_media(tmp_path / "movies", names + practice)
+    words = ["--stimuli", str(listed), "--familiarization", str(fam)]
+    words += ["--movies", str(tmp_path / "movies")]
+    assert main(["experiment", "init", str(tmp_path / "study"), *words]) == 0
+    study = load_study(tmp_path / "study")
+    assert study.scenarios == ("billiards",)
+    test = study.phase("billiards", "test")
+    assert [stimulus.frames for stimulus in test] == [20, OBSERVED, 50]
+    for stimulus in test:
+        shown = [read_number(frame) for frame in read_frames(study.folder / stimulus.movie)]
+        assert shown == list(range(stimulus.frames))
+
+
+@pytest.mark.parametrize(
+    ("columns", "told"),
+    [
+        ({"scenario": ["a b"] * 2}, r"row 2: scenario must be letters"),
+        ({"scenario": ["pool", "snooker"]}, r"of one scenario, not of pool and snooker"),
+        ({"scenario": ["pool", ""]}, r"of one scenario"),
+        ({"scenario": ["pool"] * 2, "observed_frames": [0, 9]}, r"row 2: observed_frames must be"),
+        ({"scenario": ["pool"] * 2, "observed_frames": [9, 2.5]}, r"row 3: observed_frames must"),
+    ],
+)
+def test_bad_columns_of_own_movies_are_named(
+    tmp_path: Path, columns: dict[str, Any], told: str
+) -> None:
+    path = _write_own(tmp_path / "list.csv", ["a", "b"], **columns)
+    with pytest.raises(BadInputError, match=told):
+        list_scenario(path, read_list(path))

@@ -2,14 +2,17 @@
 
 A list is a JSON file as published by the official study (one object per column, keyed by row) or a
 CSV file. Its columns are ``stim_ID``, ``target_hit_zone_label`` (whether the agent touches the
-patient) and optionally ``map_url`` (name of the map, if it does not follow from the stimulus).
-Movies are called ``STIM_ID.mp4`` and contain all frames; they are cut to the observed frames later.
+patient) and optionally ``map_url`` (name of the map, if it does not follow from the stimulus),
+``scenario`` (any name, the same in all rows) and ``observed_frames`` (number of frames before the
+answer, 45 in the official study). Movies are called ``STIM_ID.mp4`` and contain all frames; they
+are cut to the observed frames later.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +24,8 @@ from physion.experiment.study.csv_rows import csv_rows
 from physion.experiment.study.init.generated_trials import StimulusSelection, check_even
 from physion.experiment.study.init.media import StimulusSource
 from physion.experiment.study.plain_files import read_plain
-from physion.experiment.study.stimuli import is_name
+from physion.experiment.study.stimuli import MAX_FRAMES, is_name
+from physion.scenes.scene import OBSERVED_FRAMES
 from physion.seeds import generator
 from physion.stimulus_names import (
     FOLDERS,
@@ -34,17 +38,23 @@ from physion.stimulus_names import (
 
 MAX_LIST_BYTES = 50_000_000
 ID, LABEL, MAP = "stim_ID", "target_hit_zone_label", "map_url"
+SCENARIO, FRAMES = "scenario", "observed_frames"
+OPTIONAL = (MAP, SCENARIO, FRAMES)
 _REDYELLOW = "-redyellow"
 _LABELS = {"true": True, "false": False, "1": True, "0": False}
 
 
 @dataclass(frozen=True)
 class ListedStimulus:
-    """One row of a stimulus list: name, contact label and file name of the map (may be empty)."""
+    """One row of a stimulus list: name, contact label, file name of the map and scenario (either
+    may be empty), and number of observed frames.
+    """
 
     stim_id: str
     contact: bool
     map_name: str
+    scenario: str = ""
+    frames: int = OBSERVED_FRAMES
 
     @property
     def stimulus(self) -> str:
@@ -130,7 +140,13 @@ def read_list(path: Path) -> list[ListedStimulus]:
             )
         # URLs are never opened; only their last part is used, as a name in a local folder.
         map_name = str(row.get(MAP) or "").strip().rpartition("/")[2]
-        listed = ListedStimulus(name, label, map_name if is_name(map_name) else "")
+        listed = ListedStimulus(
+            name,
+            label,
+            map_name if is_name(map_name) else "",
+            _scenario(path, number, row),
+            _frames(path, number, row),
+        )
         if listed.stimulus in by_name:
             raise BadInputError(f"{path}, row {number}: {name} is there already")
         by_name[listed.stimulus] = listed
@@ -139,8 +155,39 @@ def read_list(path: Path) -> list[ListedStimulus]:
     return list(by_name.values())
 
 
+def _scenario(path: Path, number: int, row: Mapping[str, Any]) -> str:
+    """Return the scenario of a row, or an empty text if the list does not name it."""
+    given = str(row.get(SCENARIO) or "").strip()
+    if given and not is_name(given):
+        raise BadInputError(
+            f"{path}, row {number}: {SCENARIO} must be letters, digits and ._+- alone, not "
+            f"{given[:100]!r}"
+        )
+    return given
+
+
+def _frames(path: Path, number: int, row: Mapping[str, Any]) -> int:
+    """Return the number of observed frames of a row; that of the official study if not given."""
+    given = str(row.get(FRAMES) or "").strip()
+    if not given:
+        return OBSERVED_FRAMES
+    if not re.fullmatch(r"[0-9]{1,6}(\.0)?", given) or not 1 <= float(given) <= MAX_FRAMES:
+        raise BadInputError(
+            f"{path}, row {number}: {FRAMES} must be from 1 to {MAX_FRAMES}, not {given[:100]!r}"
+        )
+    return int(float(given))
+
+
 def list_scenario(path: Path, rows: Iterable[ListedStimulus]) -> str:
-    """Return the scenario of a list, from its stimulus names or else from its file name."""
+    """Return the scenario of a list: that of its rows, else of its stimulus names or file name."""
+    rows = list(rows)
+    named = {row.scenario for row in rows}
+    if len(named) > 1:
+        raise BadInputError(
+            f"{path}: a list is of one scenario, not of {' and '.join(sorted(named)[:5])}"
+        )
+    if named != {""}:
+        return named.pop()
     from_stimuli = {scenario_of(canonical_name(row.stim_id)) for row in rows}
     if len(from_stimuli) == 1 and None not in from_stimuli:
         return str(from_stimuli.pop())
@@ -149,7 +196,8 @@ def list_scenario(path: Path, rows: Iterable[ListedStimulus]) -> str:
     from_name &= set(SCENARIOS)
     if len(from_name) != 1:
         raise BadInputError(
-            f"{path}: which scenario is it? Put one of {', '.join(SCENARIOS)} into the file's name"
+            f"{path}: which scenario is it? Give a column {SCENARIO}, or put one of "
+            f"{', '.join(SCENARIOS)} into the file's name"
         )
     return from_name.pop()
 
@@ -168,11 +216,11 @@ def _json_rows(path: Path, content: bytes) -> list[dict[str, Any]]:
                 f"{path} lacks the column {name}; it has {', '.join(columns)[:200]}"
             )
     keys = list(columns[ID])
-    for name in (LABEL, *({MAP} & set(columns))):
+    optional = [name for name in OPTIONAL if name in columns]
+    for name in (LABEL, *optional):
         if list(columns[name]) != keys:
             raise BadInputError(f"{path}: the columns {ID} and {name} have different rows")
-    wanted = [name for name in (ID, LABEL, MAP) if name in columns]
-    return [{name: columns[name][key] for name in wanted} for key in keys]
+    return [{name: columns[name][key] for name in (ID, LABEL, *optional)} for key in keys]
 
 
 def _select(
@@ -206,7 +254,7 @@ class _MediaFinder:
         for folder in filter(None, (movies, maps)):
             if not folder.is_dir():
                 raise BadInputError(f"there is no folder {folder}")
-        title = FOLDERS[scenario]
+        title = FOLDERS.get(scenario, scenario)
         roots = [movies, movies / title, movies / title.lower()]
         self.movies = [root / sub for root in roots for sub in ("", "mp4s", "mp4s-redyellow")]
         map_folders = [root / "maps" for root in (*roots, movies.parent)]
@@ -242,4 +290,5 @@ def _source(
         look=row.look,
         movie=files.movie(row),
         map=files.map(row),
+        frames=row.frames,
     )

@@ -1,0 +1,54 @@
+/**
+ * The control by which a preview goes to any page or trial.
+ * @module jump
+ */
+
+import { el } from "./dom.js";
+import { bound } from "./texts.js";
+
+const PLACES = [
+  "consent",
+  "instructions",
+  "familiarization",
+  "ready",
+  "test",
+  "demographics",
+  "feedback",
+  "done",
+];
+
+/**
+ * Create the control.
+ * @param {import("./texts.js").Texts} texts
+ * @param {import("./messages.js").SessionState} state
+ * @param {(to: {stage: string, trial: number}) => void} onJump
+ * @returns {HTMLElement}
+ */
+export function jumpControl(texts, state, onJump) {
+  const { t } = bound(texts);
+  const options = PLACES.map((stage) =>
+    el("option", { value: stage, selected: stage === state.stage }, t(`preview.${stage}`)),
+  );
+  const stages = el("select", { id: "jump-stage", "aria-label": t("preview.page") }, ...options);
+  const number = el("input", {
+    id: "jump-trial",
+    type: "number",
+    min: 1,
+    value: 1,
+    "aria-label": t("preview.trial"),
+  });
+  const choose = () => {
+    const trials = state.trials[stages.value];
+    number.hidden = trials === undefined;
+    number.max = String(trials ?? 1);
+  };
+  stages.addEventListener("change", choose);
+  choose();
+  const go = el("button", { class: "link" }, t("preview.go"));
+  const form = el("form", { class: "jump" }, stages, number, go);
+  form.addEventListener("submit", (event) => {
+    event.preventDefault();
+    onJump({ stage: stages.value, trial: number.hidden ? 0 : Number(number.value) - 1 });
+  });
+  return form;
+}
