@@ -13,8 +13,10 @@ import pytest
 
 from physion.analysis import Bootstrap
 from physion.analysis.models.model_tests import permutations_of
+from physion.analysis.people.participants import PERSON, REHEARSAL
 from physion.analysis.statistics.kappa import cross_kappa
 from physion.analysis.tables.attributes import attributes_from_table
+from physion.cli.main import main
 from physion.errors import BadInputError, ExclusionError, UnknownNameError
 from physion.report import compare_files
 
@@ -197,6 +199,31 @@ def test_no_session_left_is_refused(tmp_path: Path) -> None:
         build(tmp_path, answers=answers)
     with pytest.raises(BadInputError, match="all 16 sessions are flagged"):
         build(tmp_path, answers=answers, accept_rules=["streak"])
+
+
+def test_a_rehearsal_with_simulated_participants_is_marked_on_every_page(
+    report: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    answers = responses().assign(simulated=True)
+    with pytest.raises(BadInputError, match=r"only simulated participants .* --simulated"):
+        build(tmp_path, answers=answers)
+    person = answers.tail(STIMULI * 2).assign(simulated=False, participant="p", session="p")
+    person = person.drop_duplicates("stimulus")
+    both = pd.concat([answers, person.assign(scenario="drop")])
+    page = build(tmp_path, answers=both, simulated=True, trial_pages=True)
+    pages = [page, *(page.parent / "trials").glob("*.html")]
+    assert len(pages) == 2 + 2 * STIMULI
+    for path in pages:
+        text = path.read_text(encoding="utf-8")
+        assert f"<title>{REHEARSAL}: " in text and f'<p class="mark">{REHEARSAL}</p>' in text, path
+    assert "16 sessions" in text_of(page) and f"{PERSON} 1 16" in text_of(page)
+    assert json.loads((page.parent / "report.json").read_text())["warnings"] == [REHEARSAL]
+    assert "Rehearsal" not in report.read_text(encoding="utf-8")
+    command = ["compare", "leaderboard", str(tmp_path / "predictions.csv"), "--responses",
+               str(tmp_path / "both.csv")]  # fmt: skip
+    both.to_csv(tmp_path / "both.csv", index=False)
+    assert main([*command, "--simulated"]) == 0
+    assert f"physion: warning: {REHEARSAL}" in capsys.readouterr().err
 
 
 def test_warnings_stand_above_everything(tmp_path: Path) -> None:

@@ -24,7 +24,11 @@ from physion.analysis.people.exclusions import PREREGISTERED
 from physion.analysis.people.results import read_attributes
 from physion.analysis.results import ComparisonResults, compare
 from physion.analysis.tables.responses import LABELS_FILE, DominoesLook, find_next_to
-from physion.analysis.tables.stimuli import in_order, read_stimulus_list
+from physion.analysis.tables.stimuli import (
+    check_excluded_names,
+    in_order,
+    read_stimulus_list,
+)
 from physion.atomic import write_atomic
 from physion.errors import BadInputError
 from physion.report.figures.registry import make_plots
@@ -107,6 +111,7 @@ def compare_files(
     rules: str = PREREGISTERED.name,
     expected: Path | Expected | None = None,
     accept_rules: Collection[str] = (),
+    simulated: bool = False,
     attributes: Path | pd.DataFrame | None = None,
     zone: Path | None = None,
     exclude: Path | None = None,
@@ -144,6 +149,9 @@ def compare_files(
         least half of the scenario's sessions answered.
     accept_rules
         Exclusion rules that may leave out more than a third of a scenario's sessions.
+    simulated
+        Whether to rehearse the analysis with the simulated participants of ``responses``, who are
+        left out otherwise. Every page is marked.
     attributes
         Elements, distractors and occluders of one's own stimuli: a table of
         `attributes.attributes_from_table`, its file, or a dataset.
@@ -188,6 +196,7 @@ def compare_files(
             responses, sessions, rules, given, excluded, exclude_ledge, draws,
             expected=read_expected(expected) if isinstance(expected, Path) else expected,
             accept_rules=accept_rules,
+            participants="simulated" if simulated else "people",
             attributes=read_attributes(attributes) if isinstance(attributes, Path) else attributes,
         )  # fmt: skip
         choices.setdefault("Official outcomes", "those recorded with the responses")
@@ -197,6 +206,7 @@ def compare_files(
         )
         choices.setdefault("Attributes of stimuli", describe_attributes(people))
         if rows is None:
+            check_excluded_names(excluded, people.stimuli)
             choices.setdefault("Intervals", describe_intervals(draws))
             return build_people_report(PeopleReport(people, choices, movies or {}), folder)
         results = compare(
@@ -204,9 +214,11 @@ def compare_files(
         )
     else:
         assert rows is not None
-        if sessions is not None or expected is not None or attributes is not None or accept_rules:
+        about = (sessions, expected, attributes)
+        if any(one is not None for one in about) or accept_rules or simulated:
             raise BadInputError(
-                "sessions, expected, attributes and accepted rules are about responses: give those"
+                "sessions, expected, attributes, accepted rules and simulated participants are "
+                "about responses: give those"
             )
         settings: dict[str, Any] = {"exclude": excluded, "exclude_ledge": exclude_ledge}
         results, words = _with_averages(

@@ -50,6 +50,11 @@ class ReportInputs(ComparisonResults):
         """Return the inputs for these results; ``settings`` are further fields."""
         return cls(**{one.name: getattr(results, one.name) for one in fields(results)}, **settings)
 
+    @property
+    def mark(self) -> str:
+        """What stands at the top of every page, see `PeopleResults.mark`."""
+        return "" if self.people is None else self.people.mark
+
     def scatter_agents(self) -> list[str]:
         """The models of the scatter figure: the first ones, in the order of the predictions."""
         return self.comparison.models[: self.scatter_limit]

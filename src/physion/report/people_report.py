@@ -58,7 +58,8 @@ def build_people_report(report: PeopleReport, folder: Path) -> Path:
         for name, table in tables.items()
     }
     shown = [write_plot(plot, pictures) for plot in make_plots(report.people)]
-    content = {"methods": _methods(report), **numbers}
+    warnings = list(report.people.warnings)
+    content = {"methods": _methods(report), "warnings": warnings, **numbers}
     text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
     write_atomic(folder / "report.json", f"{text}\n".encode())
     page = folder / "report.html"
@@ -93,7 +94,7 @@ def render_people_page(report: PeopleReport, pictures: Sequence[Picture], folder
         Section("How this was made", blocks.definition_list(_methods(report))),
         Section("What was left out", session_blocks.dropped(people)),
     ]
-    return render_document(report.title, _summary(people), sections)
+    return render_document(report.title, _summary(people), sections, people.mark)
 
 
 def _summary(people: PeopleResults) -> str:
@@ -107,7 +108,8 @@ def _summary(people: PeopleResults) -> str:
         f"given. Flagged and left out: {int(flags['flagged'].sum())} of "
         f"{plural(len(flags), 'session')}; the main results are given with them too."
     )
-    return f'<p class="lead">{escape(words)}</p>'
+    warned = blocks.warnings(people.warnings, people.mark)
+    return f'{warned}<p class="lead">{escape(words)}</p>'
 
 
 def _methods(report: PeopleReport) -> dict[str, str]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pandas as pd
 
 from physion.analysis.people.completeness import Expected
-from physion.analysis.people.participants import check_labels
+from physion.analysis.people.participants import Kind, check_labels
 from physion.analysis.people.results import (
     PeopleResults,
     analyse_people,
@@ -46,11 +46,12 @@ def people_from_files(
     *,
     expected: Expected | None = None,
     accept_rules: Collection[str] = (),
+    participants: Kind = "people",
     attributes: pd.DataFrame | None = None,
 ) -> PeopleResults:
     """Read responses and run every analysis of people."""
     chosen = rules_called(rules)
-    read = read_any_responses(responses, sessions)
+    read = read_any_responses(responses, sessions, participants)
     if labels is not None:
         check_labels(read, labels)
     return analyse_people(
@@ -68,8 +69,9 @@ def people_from_files(
 def describe_people(responses: Sequence[Path], people: PeopleResults) -> str:
     """Describe the responses and the flagged sessions."""
     flags = people.tables["flags"]
+    kind = "simulated" if people.mark else "single"
     return (
-        f"answers of single participants from {', '.join(path.name for path in responses)}: "
+        f"answers of {kind} participants from {', '.join(path.name for path in responses)}: "
         f"{len(flags)} sessions, {int(flags['flagged'].sum())} of them flagged by the rules "
         f"“{people.rules.name}” and left out of the main analysis"
     )

@@ -17,6 +17,7 @@ from physion.analysis.people.participants import (
     EXCLUDED,
     LEDGE,
     NO_ANSWER,
+    PERSON,
     SIMULATED,
     UNKNOWN,
     check_labels,
@@ -187,8 +188,15 @@ def test_simulated_participants_are_left_out_and_counted(
     trials.assign(simulated=trials["session"] == "collide-s002").to_csv(tmp_path / "t.csv")
     marked = read_responses(tmp_path / "t.csv")  # the mark travels with every row
     assert counts(marked.dropped) == {SIMULATED: (1, 16)}
-    kept = read_responses(tmp_path / "t.csv", tmp_path / "s.csv", simulated=True)
+    kept = read_responses(tmp_path / "t.csv", tmp_path / "s.csv", participants="all")
     assert kept.dropped.empty and len(kept.sessions) == 3
+    assert kept.simulated_sessions == {"collide-s001", "collide-s002"}
+    rehearsal = read_responses(tmp_path / "t.csv", tmp_path / "s.csv", participants="simulated")
+    assert set(rehearsal.trials["session"]) == kept.simulated_sessions
+    assert counts(rehearsal.dropped) == {PERSON: (1, 16)}
+    tables[0].to_csv(tmp_path / "people.csv", index=False)
+    with pytest.raises(BadInputError, match="no simulated participant was found"):
+        read_responses(tmp_path / "people.csv", participants="simulated")
 
 
 def test_contradictions_are_refused(tables: tuple[pd.DataFrame, pd.DataFrame]) -> None:

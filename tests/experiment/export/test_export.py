@@ -105,7 +105,7 @@ def test_the_analysis_reads_what_is_exported(
     trials, sessions = read_tables(engine, study)
     assert report.rows["trials"] == len(trials) and report.rows["sessions"] == len(sessions)
     out = tmp_path / "out"
-    found = read_responses(out / "trials.csv", out / "sessions.csv", simulated=True)
+    found = read_responses(out / "trials.csv", out / "sessions.csv", participants="all")
     assert len(found.trials) == len(trials) and found.dropped.empty
     assert found.sessions["session"].tolist() == sessions["session"].tolist()
     joined = found.trials.merge(trials, on=["session", "phase", "trial"], suffixes=("", "_stored"))

@@ -41,7 +41,7 @@ from physion.analysis.people.exclusions import (
     flag_sessions,
     without_flagged,
 )
-from physion.analysis.people.participants import Responses, check_labels
+from physion.analysis.people.participants import REHEARSAL, Responses, check_labels
 from physion.analysis.people.people import all_answers
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.tables.stimuli import MEAN, POOLED, check_excluded_names
@@ -133,7 +133,8 @@ def leaderboard(
     known |= {name for rows, _ in read.values() for name in rows["stimulus"]} | set(outcomes or {})
     if read:
         check_excluded_names(exclude, known)
-    warnings = [] if responses is None else completeness_warnings(responses, expected)
+    warnings = [REHEARSAL] if responses is not None and responses.simulated_sessions else []
+    warnings += [] if responses is None else completeness_warnings(responses, expected)
     if humans is not None and labels is not None:
         warnings += check_coverage(humans, labels)
     unwanted = (*exclude, *(_not_later(read) if later else ()))

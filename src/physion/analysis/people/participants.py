@@ -22,12 +22,17 @@ from physion.errors import BadInputError
 from physion.stimulus_names import OFFICIAL_SCENARIOS, canonical_name, is_ledge
 
 Refuse = Literal["refuse", "drop"]
+Kind = Literal["people", "simulated", "all"]
+"""Whose sessions are kept: those of people, of simulated participants, or of both."""
 
 NO_ANSWER = "no answer was given"
 COPY = "exact copy of another row"
 CONFLICT = "another row of the same session is about the same stimulus"
 UNKNOWN = "stimulus is not known"
 SIMULATED = "session of a simulated participant"
+PERSON = "session of a person, in a rehearsal"
+REHEARSAL = "Rehearsal: participants are simulated, so no number here is about people"
+"""Mark of every result that simulated participants are in."""
 EXCLUDED = "on the list of stimuli to leave out"
 LEDGE = "Roll stimulus with a ledge"
 NO_TIME = "no response time above 0: the answer counts, its time does not"
@@ -59,6 +64,12 @@ class Responses:
         """Rows of the test phase."""
         return self.trials[self.trials["phase"] == "test"]
 
+    @property
+    def simulated_sessions(self) -> frozenset[str]:
+        """Sessions of simulated participants; the mark of a trial or of the session counts."""
+        tables = [table for table in (self.trials, self.sessions) if "simulated" in table]
+        return frozenset().union(*(table.loc[table["simulated"], "session"] for table in tables))
+
     def keep_sessions(self, sessions: Collection[str], reason: str) -> Responses:
         """Return these sessions only; the others are counted as dropped for ``reason``."""
         is_dropped = ~self.trials["session"].isin(sessions)
@@ -89,7 +100,7 @@ def read_responses(
     known: Collection[str] | None = None,
     unknown: Refuse = "refuse",
     conflicts: Refuse = "refuse",
-    simulated: bool = False,
+    participants: Kind = "people",
 ) -> Responses:
     """Read the responses of our experiment's export.
 
@@ -103,14 +114,13 @@ def read_responses(
         What to do with other stimuli.
     conflicts
         What to do with a second answer of one session to one stimulus (``drop`` keeps the first).
-    simulated
-        Whether to keep the sessions of simulated participants.
+    participants
+        Whose sessions to keep; the others are dropped and counted.
 
     Raises
     ------
     BadInputError
-        For files that break the schema or contradict themselves, and where simulated participants
-        alone have answered, unless their sessions are kept.
+        For files that break the schema or contradict themselves, and if no session is left.
     """
     table = check_table(read_table(trials, ()), TRIAL_COLUMNS, str(trials))
     people = None
@@ -119,18 +129,31 @@ def read_responses(
     cleaned = clean(
         table, people, where=str(trials), known=known, unknown=unknown, conflicts=conflicts
     )
-    simulated_sessions = set(cleaned.trials.loc[cleaned.trials["simulated"], "session"])
-    if "simulated" in cleaned.sessions:
-        simulated_sessions |= set(cleaned.sessions.loc[cleaned.sessions["simulated"], "session"])
-    if simulated or not simulated_sessions:
+    return _of_kind(cleaned, participants, str(trials))
+
+
+def _of_kind(cleaned: Responses, kind: Kind, where: str) -> Responses:
+    """Return the sessions of one kind of participants; `BadInputError` if there is none."""
+    if kind == "all":
         return cleaned
-    if set(cleaned.trials["session"]) <= simulated_sessions:
-        count = cleaned.trials["session"].nunique()
+    simulated = cleaned.simulated_sessions
+    answered = set(cleaned.trials["session"])
+    if kind == "people" and answered <= simulated:
         raise BadInputError(
-            f"{trials}: only simulated participants were found ({count} sessions), and these are "
-            "left out; export the study again when people have taken part"
+            f"{where}: only simulated participants were found ({len(answered)} sessions), and "
+            "these are left out; export the study again when people have taken part, or rehearse "
+            "the analysis with --simulated"
         )
-    return cleaned.keep_sessions(set(cleaned.sessions["session"]) - simulated_sessions, SIMULATED)
+    if kind == "simulated" and not answered & simulated:
+        raise BadInputError(
+            f"{where}: no simulated participant was found; leave out --simulated, or make some "
+            "with physion experiment simulate"
+        )
+    if kind == "simulated":
+        return cleaned.keep_sessions(simulated, PERSON)
+    if not simulated:
+        return cleaned
+    return cleaned.keep_sessions(set(cleaned.sessions["session"]) - simulated, SIMULATED)
 
 
 def clean(

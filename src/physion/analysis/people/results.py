@@ -35,7 +35,13 @@ from physion.analysis.people.exclusions import (
 )
 from physion.analysis.people.hypotheses import regress_hypotheses, with_attributes
 from physion.analysis.people.official_responses import read_official_responses
-from physion.analysis.people.participants import Responses, missing_times, read_responses
+from physion.analysis.people.participants import (
+    REHEARSAL,
+    Kind,
+    Responses,
+    missing_times,
+    read_responses,
+)
 from physion.analysis.people.people import (
     accuracy_by_participant,
     accuracy_by_scenario,
@@ -83,6 +89,11 @@ class PeopleResults:
     warnings: tuple[str, ...] = ()
     stimuli: frozenset[str] = frozenset()
 
+    @property
+    def mark(self) -> str:
+        """What must stand at the top of every page: `REHEARSAL` for simulated participants."""
+        return REHEARSAL if self.whole.simulated_sessions else ""
+
     def labels(self) -> dict[str, bool]:
         """Return the outcome of every stimulus that people answered."""
         rows = self.whole.test.drop_duplicates("stimulus")
@@ -97,21 +108,26 @@ class PeopleResults:
         )
 
 
-def read_any_responses(files: Sequence[Path], sessions: Path | None = None) -> Responses:
+def read_any_responses(
+    files: Sequence[Path], sessions: Path | None = None, participants: Kind = "people"
+) -> Responses:
     """Read the export of our experiment (one file), or raw files of the original study.
 
-    The study's files are recognised by their column ``gameID``. Raises `BadInputError`.
+    The study's files are recognised by their column ``gameID``; all of their participants are
+    people. ``participants``: whose sessions to keep. Raises `BadInputError`.
     """
     official = [p for p in files if p.suffix.lower() != ".parquet" and "gameID" in read_csv(p, ())]
     if official and len(official) < len(files):
         raise BadInputError(f"{official[0]} has the study's raw columns and the other files do not")
     if official:
+        if participants == "simulated":
+            raise BadInputError("the study's raw files hold people alone: leave out --simulated")
         if sessions is not None:
             raise BadInputError("the study's raw files hold their sessions; give no table of them")
         return read_official_responses(files)
     if len(files) != 1:
         raise BadInputError("give one file of responses, or raw files of the original study")
-    return read_responses(files[0], sessions)
+    return read_responses(files[0], sessions, participants=participants)
 
 
 def rules_called(name: str) -> ExclusionRules:
@@ -198,7 +214,8 @@ def analyse_people(
         with_attributes(tables["by_stimulus"], tables["attributes"])
     )
     tables["left_out"] = pd.concat([kept.dropped, missing_times(kept)], ignore_index=True)
-    warnings = tuple(completeness_warnings(responses, expected))
+    mark = (REHEARSAL,) if responses.simulated_sessions else ()
+    warnings = (*mark, *completeness_warnings(responses, expected))
     stimuli = frozenset(responses.trials["stimulus"])
     return PeopleResults(kept, whole, rules, tables, warnings, stimuli)
 

@@ -53,6 +53,8 @@ class Options:
     accept_rules: tuple[str, ...] = ()
     """Exclusion rules that may leave out more than a third of a scenario's sessions: streak,
     alternation, familiarization, low_accuracy, slow, incomplete, repeated."""
+    simulated: bool = False
+    """Rehearse with the simulated participants of --responses alone; every page is marked."""
     attributes: Path | None = None
     """Elements, distractors, occluders of the stimuli: a table (CSV, parquet) or a dataset; if not
     given, by official names."""
@@ -110,7 +112,7 @@ def _given(options: Options) -> dict[str, Any]:
     from physion.report.page.movies import movies_of
 
     same = ("responses", "sessions", "rules", "expected", "accept_rules", "attributes", "zone",
-            "dominoes", "exclude", "trial_pages")  # fmt: skip
+            "dominoes", "exclude", "trial_pages", "simulated")  # fmt: skip
     found = {name: getattr(options, name) for name in same if getattr(options, name)}
     if options.rollout_error:
         found["rollout_errors"] = options.rollout_error

@@ -42,6 +42,8 @@ class Options:
     expected.csv beside the responses, else those that half of the scenario's sessions answered."""
     accept_rules: tuple[str, ...] = ()
     """Exclusion rules that may leave out more than a third of a scenario's sessions."""
+    simulated: bool = False
+    """Rehearse with the simulated participants of --responses alone; the table is marked."""
     exclude: Path | None = None
     """File of stimuli to exclude, one a line."""
     ledge: bool = False
@@ -114,13 +116,17 @@ def _people(options: Options) -> dict[str, Any]:
     from physion.errors import BadInputError
 
     if not options.responses:
-        if options.sessions or options.rules or options.expected or options.accept_rules:
+        about = (options.sessions, options.rules, options.expected, options.accept_rules)
+        if any(about) or options.simulated:
             raise BadInputError(
-                "--sessions, --rules, --expected and --accept-rules are about --responses"
+                "--sessions, --rules, --expected, --accept-rules and --simulated are about "
+                "--responses"
             )
         return {}
     settings: dict[str, Any] = {
-        "responses": read_any_responses(options.responses, options.sessions),
+        "responses": read_any_responses(
+            options.responses, options.sessions, "simulated" if options.simulated else "people"
+        ),
         "accept_rules": options.accept_rules,
     }
     if options.rules is not None:

@@ -113,9 +113,11 @@ def definition_list(values: Mapping[str, str]) -> str:
     return f"<dl>{rows}</dl>"
 
 
-def warnings(texts: Sequence[str]) -> str:
-    """Return warnings as a framed list, or nothing if there are none."""
-    items = "".join(f"<li>{escape(text)}</li>" for text in texts)
+def warnings(texts: Sequence[str], mark: str = "") -> str:
+    """Return warnings as a framed list, or nothing if there are none but the ``mark`` of the
+    page.
+    """
+    items = "".join(f"<li>{escape(text)}</li>" for text in texts if text != mark)
     return f'<div class="warnings"><strong>Warnings</strong><ul>{items}</ul></div>' if items else ""
 
 

@@ -43,8 +43,11 @@ def page_kind(figure: Mapping[str, bytes]) -> str:
     return "svg" if len(figure["svg"]) <= SVG_LIMIT else "png"
 
 
-def render_document(title: str, lead: str, sections: Sequence[Section]) -> str:
-    """Return the page as text: heading, ``lead`` (HTML), contents if there are sections, these."""
+def render_document(title: str, lead: str, sections: Sequence[Section], mark: str = "") -> str:
+    """Return the page as text: heading, ``lead`` (HTML), contents if there are sections, these.
+
+    ``mark``: text that stays in view at the top of the page and begins the title of its window.
+    """
     links = "".join(f'<li><a href="#{s.anchor}">{escape(s.title)}</a></li>' for s in sections)
     parts = [
         f'<section id="{s.anchor}"><h2>{escape(s.title)}</h2>\n{s.content}</section>'
@@ -52,7 +55,11 @@ def render_document(title: str, lead: str, sections: Sequence[Section]) -> str:
     ]
     nav = f'<nav aria-label="Contents"><ul>{links}</ul></nav>' if links else ""
     return _TEMPLATE.format(
-        title=escape(title), style=_style(), body="\n".join([lead, nav, *parts])
+        window=escape(f"{mark}: {title}" if mark else title),
+        mark=f'<p class="mark">{escape(mark)}</p>\n' if mark else "",
+        title=escape(title),
+        style=_style(),
+        body="\n".join([lead, nav, *parts]),
     )
 
 
@@ -64,12 +71,12 @@ _TEMPLATE = """<!DOCTYPE html>
 <meta name="color-scheme" content="light dark">
 <meta http-equiv="Content-Security-Policy" content="default-src 'none'; img-src data:; \
 media-src data:; style-src 'unsafe-inline'">
-<title>{title}</title>
+<title>{window}</title>
 <style>
 {style}</style>
 </head>
 <body>
-<main>
+{mark}<main>
 <h1>{title}</h1>
 {body}
 </main>

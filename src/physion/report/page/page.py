@@ -50,7 +50,8 @@ def render_page(
     ]
     left = inputs.page_bytes - _FRAME_BYTES - sum(len(text.encode()) for text in texts)
     sections = _with_trials(inputs, sections, PageMovies(inputs.movies, left), links)
-    page = render_document(inputs.title, lead, [one for one in sections if one.content])
+    filled = [one for one in sections if one.content]
+    page = render_document(inputs.title, lead, filled, inputs.mark)
     return protocol_names(page)  # here, so that all tables and captions use the same names
 
 
@@ -108,7 +109,8 @@ def _summary(inputs: ReportInputs) -> str:
         )
     given = f"{inputs_sentence(inputs)} {weights_sentence(inputs)}".strip()
     more = f'<p class="given">{escape(given)}</p>' if given else ""
-    return f'{blocks.warnings(inputs.warnings)}<p class="lead">{escape(" ".join(words))}</p>{more}'
+    warned = blocks.warnings(inputs.warnings, inputs.mark)
+    return f'{warned}<p class="lead">{escape(" ".join(words))}</p>{more}'
 
 
 def _figures(section: str, shown: Mapping[str, str], below: Mapping[str, str]) -> str:

@@ -72,7 +72,8 @@ def _page(inputs: ReportInputs, rows: pd.DataFrame, before: str | None, after: s
         f"{answers(rows)}</div></div>"
         f'<p class="note">{escape(KEY)}</p>{_answers(rows)}'
     )
-    return render_document(first["stimulus"], f'<p class="ways">{ways}</p>{body}', [])
+    lead = f'<p class="ways">{ways}</p>{body}'
+    return render_document(first["stimulus"], lead, [], inputs.mark)
 
 
 def _facts(first: pd.Series) -> str:
@@ -115,4 +116,4 @@ def _index(inputs: ReportInputs, groups: list[pd.DataFrame]) -> str:
     header = ["stimulus", "scenario", "outcome", *(["people right"] if people else [])]
     body = table([*header, "models right"], cells)
     lead = '<p class="ways"><a href="../report.html">the report</a></p>'
-    return render_document("Every stimulus", lead + body, [])
+    return render_document("Every stimulus", lead + body, [], inputs.mark)
