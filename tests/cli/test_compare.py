@@ -247,8 +247,8 @@ def test_official_prints_and_writes_the_published_numbers(
     assert {path.stem for path in (out / "tables").glob("*.csv")} == set(written["tables"])
     assert "report.html" in text and "<figure" in (out / "report.html").read_text(encoding="utf-8")
     assert {path.name for path in (out / "figures").glob("*.svg")} == {
-        f"panel_{panel}.svg" for panel in "acde"
-    }
+        *(f"panel_{panel}.svg" for panel in "acde"), "figure_s1.svg", "figure_s3.svg"
+    }  # fmt: skip
 
 
 def test_official_as_json(official: Path, capsys: pytest.CaptureFixture[str]) -> None:

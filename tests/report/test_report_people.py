@@ -280,6 +280,22 @@ def test_people_alone(report: Path, tmp_path: Path) -> None:
     assert numbers["people_by_scenario"] and "comparison" not in numbers
 
 
+def test_a_rehearsal_with_people_alone_is_marked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "responses.csv"
+    responses().assign(simulated=True).to_csv(path, index=False)
+    command = ["compare", "--responses", str(path), "--simulated", "--resamples", "20"]
+    assert main([*command, "--out", str(tmp_path / "out")]) == 0
+    assert f"physion: warning: {REHEARSAL}" in capsys.readouterr().err
+    text = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert f'<p class="mark">{REHEARSAL}</p>' in text and "Warnings" not in text
+    (tmp_path / "exclude.txt").write_text(f"{STEMS['drop']}_00001\n")
+    assert main([*command, "--exclude", str(tmp_path / "exclude.txt")]) == 2
+    error = capsys.readouterr().err
+    assert f"closest: {STEMS['drop']}_00" in error and error.count("\n") == 1
+
+
 def test_people_alone_have_no_results_of_models(tmp_path: Path) -> None:
     responses().to_csv(tmp_path / "responses.csv", index=False)
     with pytest.raises(BadInputError, match="about predictions"):

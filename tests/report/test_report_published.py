@@ -14,6 +14,8 @@ from physion.analysis.models.figure_tables import SCENARIO_ZONE
 from physion.analysis.published.summary import PublishedResults, published_results
 from physion.report.published_report import build_published_report, published_plots
 
+FIGURES = [*(f"panel_{name}" for name in "acde"), "figure_s1", "figure_s3"]
+
 
 @pytest.fixture(scope="module")
 def results(official: Path) -> PublishedResults:
@@ -35,11 +37,15 @@ def test_page_shows_published_and_expected_means(built: Path) -> None:
         assert f"DPI {words}" in text
     assert "mix detection into prediction" in text
     assert "released table calls pVGG a Transformer" in text
+    assert "only when readout full, which sees the outcome, is pooled in" in text
+    for name in ("S2", "S4", "S5"):
+        assert re.search(rf"Figures that the released tables do not determine .* {name} ", text)
+    assert "interval by the paper's way" in text
 
 
 def test_four_panels_with_their_tables(built: Path) -> None:
     names = {path.name for path in (built.parent / "figures").iterdir()}
-    assert names == {f"panel_{p}.{k}" for p in "acde" for k in ("svg", "png", "csv")}
+    assert names == {f"{name}.{kind}" for name in FIGURES for kind in ("svg", "png", "csv")}
     values = json.loads((built.parent / "published.json").read_text())
     assert len(values["tables"]["accuracies"]) == 88
     panel = pd.read_csv(built.parent / "figures" / "panel_a.csv")
@@ -48,6 +54,6 @@ def test_four_panels_with_their_tables(built: Path) -> None:
 
 
 def test_bytes_repeat(results: PublishedResults, built: Path, tmp_path: Path) -> None:
-    assert [plot.name for plot in published_plots(results)] == [f"panel_{p}" for p in "acde"]
+    assert [plot.name for plot in published_plots(results)] == FIGURES
     again = build_published_report(results, tmp_path / "again")
     assert again.read_bytes() == built.read_bytes()

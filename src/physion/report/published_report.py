@@ -20,6 +20,8 @@ from physion.analysis.published.cells import grid
 from physion.analysis.published.summary import TITLES, PublishedResults
 from physion.analysis.tables.stimuli import MEAN
 from physion.atomic import write_atomic
+from physion.report.figures.by_scenario.model_and_people import model_and_people_figure
+from physion.report.figures.by_stimulus.difficulty import difficulty_figure
 from physion.report.figures.conditions import grouped_figure
 from physion.report.figures.measures import measure_figure
 from physion.report.figures.theme import Plot, Theme
@@ -61,7 +63,7 @@ def published_numbers(results: PublishedResults) -> dict[str, Any]:
 
 
 def published_plots(results: PublishedResults) -> list[Plot]:
-    """Return panels A, C, D and E of the paper's main figure."""
+    """Return panels A, C, D and E of the paper's main figure, and figures S1 (top) and S3."""
     tables, words = results.tables, results.descriptions["panels"]
     rows = tables["panel_a"]
     people = float(rows.loc[rows["scenario"] == MEAN, "people"].iloc[0])
@@ -92,9 +94,31 @@ def published_plots(results: PublishedResults) -> list[Plot]:
             ),
             _draw_grouped,
         ),
+        Plot(
+            "figure_s1",
+            f"{TITLES['figure_s1']}. {_BELOW_CHANCE}",
+            tables["figure_s1"],
+            difficulty_figure,
+        ),
+        Plot(
+            "figure_s3",
+            f"{TITLES['figure_s3']}. {_DPI}",
+            tables["figure_s3"],
+            model_and_people_figure,
+        ),
     ]
 
 
+_BELOW_CHANCE = (
+    "Hatched: stimuli that people get wrong more often than by guessing, by the study's rule "
+    "(accuracy + 1.96 standard errors below 0.5) and by an exact test corrected for the number of "
+    "stimuli. Roll's ledges are left out."
+)
+_DPI = (
+    "Trained on all scenarios, readout observed+simulated. Below the diagonal the model is more "
+    "accurate than people; it is given the true states and was tested on all test stimuli, also on "
+    "those that people did not see."
+)
 _SHOWN = (
     "Trained on all scenarios, readout observed+simulated. Dashed: people. Grey: the middle 95 % "
     "of {of}. Hatched, in the mean: the band of the paper, a bootstrap over the scenario means. "
@@ -151,6 +175,8 @@ def _page(results: PublishedResults, shown: dict[str, str]) -> str:
         Section("Accuracies by scenario", _accuracies(results)),
         Section("Panels A and C", "\n".join(panels)),
         Section("Panels D and E", shown["panel_d"] + shown["panel_e"]),
+        Section("Accuracy and kappa", _accuracy_kappa(results)),
+        Section("Supplementary figures", _supplement(results, shown)),
         Section("Regressions of the Results section", _regressions(results)),
         Section("People", _people(tables["people"], tables["people_claims"], words["people"])),
         Section("Rows left out", _left_out(tables["left_out"])),
@@ -177,6 +203,9 @@ def _accuracies(results: PublishedResults) -> str:
         PageColumn("model", "model", "text"),
         PageColumn("scenario", "scenario", "text"),
         PageColumn("published", "published", "interval", 3),
+        PageColumn(
+            "interval by the paper's way", "published", "interval", 3, "paper_low", "paper_high"
+        ),
         PageColumn("rows", "rows", "count"),
         PageColumn("observed once", "without_copies", digits=3),
         PageColumn("expected", "expected", "interval", 3),
@@ -198,6 +227,23 @@ def _panel(rows: pd.DataFrame, measure: str) -> str:
     ]
     words = rows.assign(in_zone=rows["in_zone"].map({True: "yes", False: "no"}))
     return details(f"{measure} as a table", rows_table(words, columns))
+
+
+def _accuracy_kappa(results: PublishedResults) -> str:
+    columns = [
+        PageColumn("over", "over", "text"),
+        PageColumn("models", "models", "count"),
+        PageColumn("points", "points", "count"),
+        PageColumn("r", "r", "interval", 3),
+    ]
+    rows = rows_table(results.tables["accuracy_kappa"], columns)
+    return paragraph(results.descriptions["accuracy_kappa"]) + rows
+
+
+def _supplement(results: PublishedResults, shown: dict[str, str]) -> str:
+    cells = [[escape(text) for text in row] for row in results.tables["not_made"].to_numpy()]
+    missing = table(["figure", "why it is missing"], cells, TITLES["not_made"])
+    return shown["figure_s1"] + shown["figure_s3"] + missing
 
 
 def _regressions(results: PublishedResults) -> str:

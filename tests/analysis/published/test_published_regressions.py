@@ -98,6 +98,13 @@ def test_every_printed_figure_is_met_but_three(table: pd.DataFrame) -> None:
     assert round(table.loc["only and all", "run_b"], 3) == 0.021
 
 
+def test_op3_is_less_accurate_than_svg_only_with_readout_full(table: pd.DataFrame) -> None:
+    pooled, predicting = table.loc["OP3 and CSWM"], table.loc["OP3 and SVG, predicting"]
+    assert pooled["asked_b"] < -0.04 and pooled["asked_p"] < 1e-6
+    assert predicting["asked_p"] > 0.05 and predicting["asked_rows"] == 120
+    assert "only when readout full" in pooled["differs"]
+
+
 def test_what_the_sentences_ask_for(table: pd.DataFrame) -> None:
     assert table.loc["people above chance", "asked_b"] == pytest.approx(0.747, abs=5e-4)
     assert table.loc["people above chance", "run_b"] == pytest.approx(0.707, abs=5e-4)

@@ -36,7 +36,8 @@ def accuracy_table(tables: PublishedTables, bootstrap: Bootstrap | None = None) 
 
     Columns: ``model``, ``scenario``; ``published`` with ``published_low``, ``published_high``
     (bootstrap over the rows that it averages: variation with other protocols and seeds, not with
-    other stimuli), ``rows`` (number of rows), ``without_copies`` (the mean with *observed* once);
+    other stimuli) and ``paper_low``, ``paper_high`` (`paper_intervals`), ``rows`` (number of rows),
+    ``without_copies`` (the mean with *observed* once);
     ``expected`` with ``expected_low``, ``expected_high`` (Wilson's 95 % interval: other stimuli of
     the kind), ``runs`` (seeds averaged in it), ``stimuli`` (tested; see `count_tested`),
     ``difference`` (expected - published).
@@ -45,6 +46,7 @@ def accuracy_table(tables: PublishedTables, bootstrap: Bootstrap | None = None) 
     level = draws.level
     counts = count_tested(tables.runs)
     once = tables.distinct
+    by_paper = paper_intervals(tables, draws)
     records = []
     for (model, scenario), rows in tables.runs.groupby(["model", "scenario"], sort=False):
         values = rows["accuracy"].to_numpy(dtype=np.float64)
@@ -62,6 +64,8 @@ def accuracy_table(tables: PublishedTables, bootstrap: Bootstrap | None = None) 
                 "published": float(values.mean()),
                 "published_low": low,
                 "published_high": high,
+                "paper_low": by_paper[(model, scenario)][0],
+                "paper_high": by_paper[(model, scenario)][1],
                 "rows": len(rows),
                 "without_copies": float(own["accuracy"].mean()),
                 "expected": expected,
@@ -73,6 +77,29 @@ def accuracy_table(tables: PublishedTables, bootstrap: Bootstrap | None = None) 
             }
         )
     return in_paper_order(pd.DataFrame(records), ["model", "scenario"])
+
+
+def paper_intervals(
+    tables: PublishedTables, bootstrap: Bootstrap | None = None
+) -> dict[tuple[str, str], tuple[float, float]]:
+    """Return the interval of each published value by the paper's way, by (model, scenario).
+
+    The released notebook calls ``tidyboot_mean`` on the table grouped by model and scenario, which
+    resamples the rows of the whole table, ungrouped, with one row of people a scenario, and then
+    averages each group. So the number of rows of a value differs between draws, and the intervals
+    are wider than those of drawing its own rows. A draw without a row of the value is left out.
+    """
+    draws = bootstrap or Bootstrap()
+    runs = tables.runs
+    weights = draws.weights("published table", len(runs) + len(tables.people))[:, : len(runs)]
+    accuracy = runs["accuracy"].to_numpy(dtype=np.float64)
+    found = {}
+    for (model, scenario), positions in runs.groupby(["model", "scenario"]).indices.items():
+        drawn = weights[:, positions]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            means = drawn @ accuracy[positions] / drawn.sum(axis=1)
+        found[(str(model), str(scenario))] = draws.interval(means)
+    return found
 
 
 def grid(table: pd.DataFrame, column: str) -> pd.DataFrame:

@@ -1,9 +1,9 @@
 """Panels of the paper's main comparison as tables: accuracy, kappa, readouts, trainings.
 
-Panels A to C show training *all* and readout *observed+simulated*, of SVG and RPIN the first seed
-only (as the released code selects); panels D and E vary the readout and the training. The intervals
-of the panels are bootstraps over the eight scenario values. Panel B (r with the average person)
-needs the predictions for single stimuli, which the released tables do not contain.
+Panels A to C show training *all* and readout *observed+simulated*; panels D and E vary the readout
+and the training. All show the first seed of SVG and RPIN, as the released code selects. The
+intervals of the panels are bootstraps over the eight scenario values. Panel B (r with the average
+person) needs the predictions for single stimuli, which the released tables do not contain.
 """
 
 from __future__ import annotations
@@ -24,15 +24,12 @@ from physion.analysis.published.tables import (
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.tables.stimuli import MEAN
 
-FIRST_SEED = ("SVG", "RPIN")
-"""Models of which panels A to C show seed 0 alone."""
-
 READOUT_ORDER = ("observed", "observed+simulated", "full")
 
 SELECTION = (
-    "Panels A and C: training all, readout observed+simulated, of SVG and RPIN seed 0 alone, as "
-    "the released code selects. Panel D: training all, mean of the runs; particle models have one "
-    "readout. Panel E: readout observed+simulated, mean of the runs. Intervals of a mean are a "
+    "All panels show seed 0 alone of SVG and RPIN, as the released code selects. Panels A and C: "
+    "training all, readout observed+simulated. Panel D: training all; particle models have one "
+    "readout. Panel E: readout observed+simulated. Intervals of a mean are a "
     "bootstrap over the scenario values, seeded (the released code drew without a seed). “Zone” "
     "in a scenario's row is the middle 95 % of participants (accuracy) or of pairs of them "
     "(kappa); in the row of the mean it is the paper's grey band, a bootstrap over the scenario "
@@ -53,14 +50,13 @@ def panel_c(tables: PublishedTables, bootstrap: Bootstrap | None = None) -> pd.D
 
 
 def panel_d(tables: PublishedTables, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
-    """Return accuracy by readout, trained on all scenarios, averaged over runs, then over
-    scenarios.
+    """Return accuracy by readout, trained on all scenarios, averaged over scenarios.
 
-    Columns: ``model``, ``readout``, ``scenarios`` (averaged), ``runs`` (of one scenario),
-    ``accuracy`` with ``low`` and ``high``.
+    Columns: ``model``, ``readout``, ``scenarios`` (averaged), ``accuracy`` with ``low`` and
+    ``high``.
     """
-    cell = tables.mean_runs()
-    rows = cell[(cell["training"] == EXPECTED["training"]) & ~cell["model"].isin(PARTICLES)]
+    runs = tables.first_seeds
+    rows = runs[(runs["training"] == EXPECTED["training"]) & ~runs["model"].isin(PARTICLES)]
     return _by(rows, "readout", READOUT_ORDER, bootstrap or Bootstrap())
 
 
@@ -68,8 +64,8 @@ def panel_e(tables: PublishedTables, bootstrap: Bootstrap | None = None) -> pd.D
     """Return accuracy by training protocol, readout observed+simulated; columns as `panel_d`, with
     ``training`` instead of ``readout``.
     """
-    cell = tables.mean_runs()
-    rows = cell[cell["readout"] == EXPECTED["readout"]]
+    runs = tables.first_seeds
+    rows = runs[runs["readout"] == EXPECTED["readout"]]
     return _by(rows, "training", tuple(TRAININGS.values()), bootstrap or Bootstrap())
 
 
@@ -81,9 +77,8 @@ def _measure(tables: PublishedTables, measure: str, draws: Bootstrap) -> pd.Data
     with ``zone_low``, ``zone_high``, and ``in_zone`` (whether the model is within; None without a
     zone).
     """
-    runs = tables.distinct
+    runs = tables.first_seeds
     chosen = runs[(runs[list(EXPECTED)] == pd.Series(EXPECTED)).all(axis=1)]
-    chosen = chosen[~chosen["model"].isin(FIRST_SEED) | (chosen["seed"] == 0)]
     own = chosen[["model", "scenario", measure]].copy()
     if measure == "kappa":
         own[["low", "high"]] = chosen[["kappa_low", "kappa_high"]]
@@ -109,8 +104,8 @@ def _measure(tables: PublishedTables, measure: str, draws: Bootstrap) -> pd.Data
 def _by(rows: pd.DataFrame, what: str, order: Sequence[str], draws: Bootstrap) -> pd.DataFrame:
     records = []
     for (model, value), cells in rows.groupby(["model", what], sort=False):
-        record = {"model": model, what: value, "scenarios": len(cells)}
-        record |= {"runs": int(cells["runs"].max()), **_mean(cells["accuracy"], "accuracy", draws)}
+        record: dict[str, object] = {"model": model, what: value, "scenarios": len(cells)}
+        record |= _mean(cells["accuracy"], "accuracy", draws)
         records.append(record)
     table = pd.DataFrame(records)
     table = table.assign(place=table[what].map({name: at for at, name in enumerate(order)}))

@@ -12,6 +12,12 @@ from physion.analysis.published.cells import accuracy_table, describe_averages
 from physion.analysis.published.panels import SELECTION, panel_a, panel_c, panel_d, panel_e
 from physion.analysis.published.people import people_by_scenario, people_claims
 from physion.analysis.published.regressions import published_regressions
+from physion.analysis.published.supplement import (
+    NOT_MADE,
+    accuracy_and_kappa,
+    figure_s1,
+    figure_s3,
+)
 from physion.analysis.published.tables import PublishedTables, read_published
 from physion.analysis.statistics.bootstrap import Bootstrap
 
@@ -22,6 +28,10 @@ TITLES = {
     "panel_c": "Panel C: Cohen's kappa with participants",
     "panel_d": "Panel D: accuracy by readout",
     "panel_e": "Panel E: accuracy by training",
+    "accuracy_kappa": "How kappa with participants follows accuracy",
+    "figure_s1": "Figure S1, top: accuracy of people by stimulus",
+    "figure_s3": "Figure S3: accuracy of DPI and of people by scenario",
+    "not_made": "Figures that the released tables do not determine",
     "regressions": "Regressions of the Results section",
     "people": "People by scenario",
     "people_claims": "What the paper says of people",
@@ -35,6 +45,13 @@ REGRESSIONS = (
     "each released row once; “asked” what the sentence says, each row once. Rows of one model and "
     "scenario that differ in readout or seed share their test stimuli and are not independent, "
     "which none of these models knows: their p are too small."
+)
+
+ACCURACY_KAPPA = (
+    "The paper says that kappa is strongly correlated with accuracy, without a number. Pearson's "
+    "r over the cells of panels A and C; intervals draw models with all of their scenarios. Kappa "
+    "with people is bound to rise with accuracy where people are mostly right, so this r is no "
+    "sign of likeness beyond the outcome."
 )
 
 
@@ -63,6 +80,10 @@ def results_of(released: PublishedTables, bootstrap: Bootstrap | None = None) ->
         "panel_c": panel_c(released, draws),
         "panel_d": panel_d(released, draws),
         "panel_e": panel_e(released, draws),
+        "accuracy_kappa": accuracy_and_kappa(released, draws),
+        "figure_s1": figure_s1(released),
+        "figure_s3": figure_s3(released, draws),
+        "not_made": pd.DataFrame(list(NOT_MADE.items()), columns=["figure", "reason"]),
         "regressions": published_regressions(released),
         "people": people_by_scenario(released, draws),
         "people_claims": people_claims(released),
@@ -71,8 +92,10 @@ def results_of(released: PublishedTables, bootstrap: Bootstrap | None = None) ->
     descriptions = {
         "accuracies": describe_averages(released)
         + f" Intervals: {draws.level:.0%}, of a published value a bootstrap over the rows that it "
-        "averages, of the expected cell Wilson's for the stimuli tested.",
+        "averages, and next to it by the paper's way, which draws the rows of the whole table, "
+        "ungrouped; of the expected cell Wilson's for the stimuli tested.",
         "panels": SELECTION,
+        "accuracy_kappa": ACCURACY_KAPPA,
         "regressions": REGRESSIONS,
         "people": "Accuracy, kappa and split-half r from the released tables by scenario; kappa is "
         "the median over pairs; split-half r is of halves (half_r_full: stepped up to all people). "

@@ -2,7 +2,8 @@
 
 Prints the accuracies by model and scenario as published (means over readouts, trainings and seeds)
 and as a reader expects them (trained on all scenarios, readout observed+simulated), the panels of
-the main figure, the regressions of the Results section with what differs, and people.
+the main figure, supplementary figures, the regressions of the Results section with what differs,
+and people.
 """
 
 from __future__ import annotations
@@ -64,6 +65,10 @@ def _print(results: PublishedResults) -> None:
     _show(_title("panel_d"), _wide(tables["panel_d"], "readout"))
     _show(_title("panel_e"), _wide(tables["panel_e"], "training"))
     _say(words["panels"])
+    _show(_title("accuracy_kappa"), tables["accuracy_kappa"])
+    _say(words["accuracy_kappa"])
+    _show(_title("figure_s3"), tables["figure_s3"])
+    _show(_title("not_made"), tables["not_made"])
     _regressions(tables["regressions"])
     _say(words["regressions"])
     people = ["scenario", "accuracy", "zone_low", "zone_high", "kappa", "half_r", "half_r_full"]
