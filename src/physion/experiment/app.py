@@ -16,6 +16,7 @@ from physion.errors import BadInputError
 from physion.experiment.experimenter.routes import build_router
 from physion.experiment.protocol.refused import Refused
 from physion.experiment.study.media_links import read_media_path
+from physion.experiment.study.texts import TEXTS_FOLDER, read_consent_file
 from physion.experiment.web.api import build_api
 from physion.experiment.web.bodies import BadBodyError
 from physion.experiment.web.guards import Guards
@@ -47,14 +48,18 @@ def build_app(study: Study, secrets: Secrets, store: Store) -> FastAPI:
         },
     )
     app.include_router(build_api(study, secrets, store))
-    _serve_pages(app)
+    _serve_pages(app, study)
     _serve_media(app, study, secrets)
     app.include_router(build_router(study, secrets, store), prefix="/experimenter")
     return app
 
 
-def _serve_pages(app: FastAPI) -> None:
-    """Add the routes of the page and its static files."""
+def _serve_pages(app: FastAPI, study: Study) -> None:
+    """Add the routes of the page, its static files and the consent forms."""
+    forms = {
+        f"{language}.pdf": read_consent_file(study.folder / TEXTS_FOLDER, language)
+        for language in study.consent_files
+    }
     index = read_page_file(PACKAGE / "pages" / "index.html")
     files = read_page_files(PACKAGE / "static")
 
@@ -66,6 +71,13 @@ def _serve_pages(app: FastAPI) -> None:
     async def get_static(request: Request) -> Response:
         file = files.get(request.path_params["name"])
         return refuse("not_found") if file is None else file.response(request)
+
+    @app.get("/consent/{name}")
+    async def get_consent(request: Request) -> Response:
+        content = forms.get(request.path_params["name"])
+        if content is None:
+            return refuse("not_found")
+        return Response(content, media_type="application/pdf")
 
 
 def _serve_media(app: FastAPI, study: Study, secrets: Secrets) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from physion.cli.main import main
 from physion.errors import BadInputError, PhysionError
-from physion.experiment.store.backup import back_up
+from physion.experiment.store.lab.backup import back_up
 from physion.experiment.store.store import Store
 from physion.experiment.store.tables import ANSWERS
 from physion.experiment.study.identity import Secrets

@@ -70,7 +70,7 @@ STUDIES = st.builds(
         flash_hz=st.floats(0, 3),
         break_every=st.integers(0, 100_000),
     ),
-    screen=st.builds(Screen, st.integers(320, 10_000), st.integers(320, 10_000)),
+    screen=st.builds(Screen, st.integers(320, 10_000), st.integers(320, 10_000), st.booleans()),
     recruitment=st.builds(
         Recruitment,
         id_needed=st.booleans(),
@@ -106,7 +106,7 @@ def test_every_setting_is_written_with_its_comment(tmp_path: Path) -> None:
         assert key.name in (tables[key.table] if key.table else tables)
         assert all(f"# {line}" in text for line in key.about.splitlines())
     # Each field of the types is a key, so that none can be forgotten.
-    others = {"folder", "stimuli", "texts", "digest", "stimuli_digest", *TABLES}
+    others = {"folder", "stimuli", "texts", "consent_files", "digest", "stimuli_digest", *TABLES}
     assert {key.name for key in KEYS if not key.table} == {
         field.name for field in dataclasses.fields(Study)
     } - others

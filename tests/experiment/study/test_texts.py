@@ -10,6 +10,7 @@ import pytest
 
 from physion.errors import BadInputError, UnknownNameError
 from physion.experiment.study.texts import (
+    read_consent_file,
     read_texts,
     shipped_file,
     shipped_languages,
@@ -98,6 +99,31 @@ def test_words_in_braces_of_a_scenario_must_be_known(tmp_path: Path) -> None:
     path.write_text(path.read_text() + '[scenario.drape.study]\ntitle = "{contact}"\n')
     with pytest.raises(BadInputError, match=r"drape\.study\.title has \{contact\}.*have none"):
         read_texts(tmp_path, "de", ("drape",))
+
+
+def test_boxes_to_tick_are_optional_and_at_most_nine(tmp_path: Path) -> None:
+    path = _copy(tmp_path)
+    boxes = '[consent]\ncheck_1 = "Ich bin volljährig."\ncheck_9 = "Ich habe alles gelesen."\n'
+    path.write_text(path.read_text().replace("[consent]\n", boxes))
+    texts, _ = read_texts(tmp_path, "de")
+    assert texts["consent.check_1"] == "Ich bin volljährig."
+    path.write_text(path.read_text().replace("check_9", "check_10"))
+    with pytest.raises(BadInputError, match=r"unknown text 'consent\.check_10'"):
+        read_texts(tmp_path, "de")
+
+
+def test_a_consent_form_is_a_pdf_file(tmp_path: Path) -> None:
+    assert read_consent_file(tmp_path, "en") is None
+    path = tmp_path / "consent-en.pdf"
+    path.write_bytes(b"%PDF-1.7 ...")
+    assert read_consent_file(tmp_path, "en") == b"%PDF-1.7 ..."
+    path.write_bytes(b"<html>")
+    with pytest.raises(BadInputError, match="no PDF file"):
+        read_consent_file(tmp_path, "en")
+    path.unlink()
+    path.symlink_to(tmp_path / "elsewhere.pdf")
+    with pytest.raises(BadInputError, match="link"):
+        read_consent_file(tmp_path, "en")
 
 
 def _words(text: str) -> list[str]:

@@ -14,7 +14,7 @@ from starlette.responses import Response
 from physion.errors import PhysionError
 from physion.experiment.experimenter.export_pages import ExportPages
 from physion.experiment.experimenter.page_context import FORGET_WORD, PageContext, redirect
-from physion.experiment.store.managing import is_paused, set_paused, set_voided
+from physion.experiment.store.lab.managing import is_paused, set_paused, set_voided
 from physion.experiment.store.tables import SESSIONS
 
 if TYPE_CHECKING:

@@ -340,10 +340,13 @@ class PublicStudy(Message):
     contact: str
     languages: list[str]
     consent_version: str
+    consent_files: list[str]
+    """Languages in which the consent form can be read as a file, ``/consent/LANGUAGE.pdf``."""
     scenarios: list[str]
     id_needed: bool
     min_width: int
     min_height: int
+    fullscreen: bool
     cue_ms: int
     flash_hz: float
     break_every: int

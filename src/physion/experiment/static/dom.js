@@ -22,9 +22,23 @@ export function el(tag, attributes = {}, ...children) {
   return element;
 }
 
+const ADDRESS = /(https:\/\/[^\s<>"']*[^\s<>"'.,;:!?)])/;
+
+/**
+ * Split a text at its https addresses, which become links that open in another tab.
+ * @param {string} text
+ * @returns {Array<Node|string>}
+ */
+function linked(text) {
+  return text.split(ADDRESS).map((part, index) => {
+    if (index % 2 === 0) return part;
+    return el("a", { href: part, target: "_blank", rel: "noopener noreferrer" }, part);
+  });
+}
+
 /**
  * Convert plain text to paragraphs, separated by empty lines; lines that begin with "- " form a
- * list.
+ * list, and https addresses become links.
  * @param {string} text
  * @returns {HTMLElement[]}
  */
@@ -34,8 +48,10 @@ export function paragraphs(text) {
     .split(/\n\s*\n/)
     .map((block) => {
       const lines = block.trim().split("\n");
-      if (!lines.every((line) => line.startsWith("- "))) return el("p", {}, lines.join(" "));
-      return el("ul", {}, ...lines.map((line) => el("li", {}, line.slice(2))));
+      if (!lines.every((line) => line.startsWith("- "))) {
+        return el("p", {}, ...linked(lines.join(" ")));
+      }
+      return el("ul", {}, ...lines.map((line) => el("li", {}, ...linked(line.slice(2)))));
     });
 }
 

@@ -32,6 +32,9 @@ export class EventLog {
       this.add("online");
       this.send();
     });
+    document.addEventListener("fullscreenchange", () =>
+      this.add("fullscreen", { on: document.fullscreenElement !== null }),
+    );
     window.addEventListener("offline", () => this.add("offline"));
     window.addEventListener("error", (event) => this.add("error", { message: event.message }));
     window.addEventListener("unhandledrejection", (event) =>

@@ -146,10 +146,12 @@ export interface PublicStudy {
   contact: string;
   languages: string[];
   consent_version: string;
+  consent_files: string[];
   scenarios: string[];
   id_needed: boolean;
   min_width: number;
   min_height: number;
+  fullscreen: boolean;
   cue_ms: number;
   flash_hz: number;
   break_every: number;

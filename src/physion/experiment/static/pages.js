@@ -3,9 +3,7 @@
  * @module pages
  */
 
-import { ask } from "./dialog.js";
 import { button, el, paragraphs, sleep } from "./dom.js";
-import { declineQuestion } from "./ending_pages.js";
 import { showExample } from "./example.js";
 import { focusHeading } from "./page_trial.js";
 import { bound } from "./texts.js";
@@ -24,44 +22,10 @@ const LATE_MS = 500;
  */
 
 /** Estimate the rounded minutes of so many trials, with the pages before practice. */
-function minutes(study, practice, test) {
+export function minutes(study, practice, test) {
   const seconds = practice * 14 + test * (study.cue_ms / 1000 + 4.5);
   const exact = (practice ? 3 : 0) + seconds / 60;
   return exact > 7.5 ? Math.round(exact / 5) * 5 : Math.max(2, Math.ceil(exact));
-}
-
-/**
- * Render the consent page. Who does not agree is asked once more.
- * @param {Context} context
- * @returns {Render}
- */
-export function consentPage(context) {
-  const { texts, study, state } = context;
-  const { t } = bound(texts);
-  const { familiarization, test } = state.trials;
-  return (page, done, signal) => {
-    const decline = async () => {
-      const answer = await ask(declineQuestion(context), signal);
-      if (answer?.declined) done({ agreed: false });
-    };
-    page.append(
-      el("h1", {}, t("consent.title")),
-      ...paragraphs(
-        t("consent.text", {
-          trials: familiarization + test,
-          minutes: minutes(study, familiarization, test),
-          contact: study.contact,
-        }),
-      ),
-      el("p", { class: "small" }, t("consent.version", { version: study.consent_version })),
-      el(
-        "div",
-        { class: "buttons" },
-        button(t("consent.decline"), decline, { class: "button quiet" }),
-        button(t("consent.agree"), () => done({ agreed: true })),
-      ),
-    );
-  };
 }
 
 /**

@@ -6,9 +6,11 @@
  */
 
 import { Refused } from "./api.js";
+import { consentPage } from "./consent_page.js";
 import { ask } from "./dialog.js";
 import { endedPage, stopQuestion } from "./ending_pages.js";
 import { demographicsPage, feedbackPage } from "./forms.js";
+import { leaveFullscreen } from "./fullscreen.js";
 import { Media } from "./media.js";
 import { PageTrial, patiently, showPage } from "./page_trial.js";
 import * as pages from "./pages.js";
@@ -19,7 +21,7 @@ import { resultPage } from "./result_page.js";
 import { feedbackPieces, trialPieces } from "./trial_pieces.js";
 
 const PAGES = {
-  consent: pages.consentPage,
+  consent: consentPage,
   instructions: pages.instructionsPages,
   ready: pages.readyPage,
   demographics: demographicsPage,
@@ -225,6 +227,7 @@ export class Session {
     const due = dueFeedback(this.state);
     if (due) await this.#showFeedback(due);
     if (stage === "familiarization" || stage === "test") return this.#phase(stage);
+    if (stage !== "ready") leaveFullscreen();
     return this.#page(stage, PAGES[stage](this.context));
   }
 

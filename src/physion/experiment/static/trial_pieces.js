@@ -1,11 +1,12 @@
 /**
- * The jsPsych timeline of one trial: offer a break, check the window size, wait for the media, show
+ * The jsPsych timeline of one trial: offer a break and full screen, check the window size, wait for the media, show
  * the prediction trial and, in practice, the feedback.
  * @module trial_pieces
  */
 
 import { Refused } from "./api.js";
 import { FeedbackTrial } from "./feedback_trial.js";
+import { fullscreenPage, offersFullscreen } from "./fullscreen.js";
 import { windowFits } from "./gate.js";
 import { PageTrial } from "./page_trial.js";
 import * as pages from "./pages.js";
@@ -105,6 +106,7 @@ function beforeTrial(context, number) {
     conditional_function: condition,
   });
   return [
+    page(fullscreenPage(context), () => offersFullscreen(study)),
     page(pages.windowPage(context, fits), small),
     page(pages.loadingPage(context), loading),
   ];

@@ -13,7 +13,7 @@ from sqlalchemy import Connection, case, func, insert, or_, select
 
 from physion.experiment.protocol.messages import Enter, Entered, Kind
 from physion.experiment.protocol.refused import Refused
-from physion.experiment.store.managing import is_paused
+from physion.experiment.store.lab.managing import is_paused
 from physion.experiment.store.sessions import (
     ACTIVE_WITHIN,
     ENTERED_AGAIN,

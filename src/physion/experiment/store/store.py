@@ -39,7 +39,7 @@ from physion.experiment.store.database import (
     upgrade,
 )
 from physion.experiment.store.entering import enter_session, identify_visitor
-from physion.experiment.store.jumping import jump
+from physion.experiment.store.lab.jumping import jump
 from physion.experiment.store.scores import Scores, percentile
 from physion.experiment.store.sent_pages import check_page, submit_page
 from physion.experiment.store.sessions import (

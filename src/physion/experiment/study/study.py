@@ -26,7 +26,7 @@ from physion.experiment.study.plain_files import check_plain, read_plain
 from physion.experiment.study.stimuli import MAX_BYTES as MAX_STIMULI_BYTES
 from physion.experiment.study.stimuli import PHASES, STIMULI_FILE, Stimulus, parse_stimuli
 from physion.experiment.study.study_file import check_tables, format_tables, parse_toml
-from physion.experiment.study.texts import TEXTS_FOLDER, read_texts
+from physion.experiment.study.texts import TEXTS_FOLDER, read_consent_file, read_texts
 
 STUDY_FILE = "study.toml"
 MAX_BYTES = 1_000_000
@@ -59,10 +59,14 @@ class Timing:
 
 @dataclass(frozen=True)
 class Screen:
-    """Smallest browser window in which participants may take part, in CSS pixels."""
+    """Smallest browser window in which participants may take part, in CSS pixels.
+
+    ``fullscreen``: whether full screen is offered before the trials, and again after it was left.
+    """
 
     min_width: int = 1024
     min_height: int = 600
+    fullscreen: bool = False
 
 
 @dataclass(frozen=True)
@@ -190,8 +194,10 @@ class Study:
         Rows of ``stimuli.csv`` of the study's scenarios.
     texts
         Texts by language and key.
+    consent_files
+        SHA-256 of the consent forms that are files, by language.
     digest
-        SHA-256 of study.toml, texts and stimuli.csv.
+        SHA-256 of study.toml, texts, consent forms and stimuli.csv.
     stimuli_digest
         SHA-256 of stimuli.csv.
     """
@@ -222,6 +228,7 @@ class Study:
     limits: Limits = Limits()
     stimuli: tuple[Stimulus, ...] = ()
     texts: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    consent_files: Mapping[str, str] = field(default_factory=dict)
     digest: str = ""
     stimuli_digest: str = ""
 
@@ -264,10 +271,14 @@ def load_study(folder: Path | str) -> Study:
         )
     content = read_plain(path, MAX_BYTES)
     study = replace(parse_settings(parse_toml(path, content), path), folder=folder)
-    texts, written = {}, []
+    texts, files, written = {}, {}, []
     for language in study.languages:
         texts[language], text_file = read_texts(folder / TEXTS_FOLDER, language, study.scenarios)
         written.append(text_file)
+        consent = read_consent_file(folder / TEXTS_FOLDER, language)
+        if consent is not None:
+            files[language] = hashlib.sha256(consent).hexdigest()
+            written.append(consent)
     listed = folder / STIMULI_FILE
     rows = read_plain(listed, MAX_STIMULI_BYTES)
     stimuli = tuple(s for s in parse_stimuli(listed, rows) if s.scenario in study.scenarios)
@@ -276,6 +287,7 @@ def load_study(folder: Path | str) -> Study:
         study,
         stimuli=stimuli,
         texts=texts,
+        consent_files=files,
         digest=_digest(content, *written, rows),
         stimuli_digest=_digest(rows),
     )

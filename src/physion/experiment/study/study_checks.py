@@ -216,6 +216,8 @@ KEYS: tuple[Key, ...] = (
         "Test trials after which people can rest for as long as they like; 0: no breaks."),
     Key("screen", "min_width", whole(320, 10_000), "Smallest browser window, in CSS pixels."),
     Key("screen", "min_height", whole(320, 10_000), ""),
+    Key("screen", "fullscreen", flag,
+        "Offer full screen before the trials, and again after it was left."),
     Key("recruitment", "id_needed", flag,
         "Refuse participants without an id (of Prolific, SONA or MTurk, or participant=ID in a\n"
         "plain link)."),

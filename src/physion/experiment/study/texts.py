@@ -4,12 +4,15 @@
 ``[consent]`` has the key ``consent.title``. The pages replace placeholders in braces. Each study
 has its own copies, so that a lab can edit every text.
 
-Two kinds of texts may be absent: ``study.title``, in place of the title of ``study.toml``, and
-``scenario.NAME.KEY``, in place of the text ``KEY`` in the sessions of one scenario.
+Some texts may be absent: ``study.title``, in place of the title of ``study.toml``;
+``consent.check_1`` to ``consent.check_9``, boxes that must be ticked to agree; and
+``scenario.NAME.KEY``, in place of the text ``KEY`` in the sessions of one scenario. A file
+``consent-LANGUAGE.pdf`` beside the texts is the consent form as a file.
 """
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -24,7 +27,8 @@ from physion.experiment.study.study_file import parse_toml
 TEXTS_FOLDER = "texts"
 MAX_BYTES = 1_000_000
 MAX_TEXT = 20_000
-OPTIONAL = ("study.title",)
+OPTIONAL = ("study.title", *(f"consent.check_{number}" for number in range(1, 10)))
+MAX_FILE = 20_000_000
 _PLACEHOLDER = re.compile(r"\{([a-z_]+)\}")
 
 
@@ -67,6 +71,23 @@ def read_texts(
             allowed = ", ".join(f"{{{one}}}" for one in sorted(known)) or "none"
             raise BadInputError(f"{path}: {key} has {{{name}}}; it may have {allowed}")
     return texts, content
+
+
+def read_consent_file(folder: Path, language: str) -> bytes | None:
+    """Return the consent form of a language as a file (PDF), or None if there is none.
+
+    Raises
+    ------
+    BadInputError
+        The file is a link, is larger than `MAX_FILE`, or is no PDF.
+    """
+    path = folder / f"consent-{language}.pdf"
+    if not os.path.lexists(path):
+        return None
+    content = read_plain(path, MAX_FILE)
+    if not content.startswith(b"%PDF-"):
+        raise BadInputError(f"{path} is no PDF file; replace or remove it")
+    return content
 
 
 def _general_key(key: str, scenarios: Sequence[str]) -> str:
