@@ -63,7 +63,7 @@ def _serve_pages(app: FastAPI, study: Study) -> None:
     index = read_page_file(PACKAGE / "pages" / "index.html")
     files = read_page_files(PACKAGE / "static")
 
-    @app.get("/")
+    @app.api_route("/", methods=["GET", "HEAD"])
     async def get_index(request: Request) -> Response:
         return index.response(request)
 

@@ -24,7 +24,7 @@ def test_a_preview_jumps_and_a_person_cannot(chromium: Any, tmp_path: Path) -> N
     ):
         visit.go("?participant=Ada")
         visit.heading("Taking part in this study")
-        assert visit.page.locator(".jump").count() == 0
+        assert visit.page.locator(".jump, .is-preview").count() == 0
         word = make_pass(Secrets.load(study.folder), "preview")
 
         def jump(stage: str, trial: int = 0) -> None:
@@ -36,6 +36,7 @@ def test_a_preview_jumps_and_a_person_cannot(chromium: Any, tmp_path: Path) -> N
 
         visit.go(f"?pass={word}")
         visit.heading("Taking part in this study")
+        assert visit.page.locator("body.is-preview").count() == 1
         jump("done")
         visit.heading("Thank you!")
         jump("test", 3)

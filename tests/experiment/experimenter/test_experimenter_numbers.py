@@ -81,7 +81,7 @@ def test_histograms_hold_everybody() -> None:
         *zip(BROWSERS, ("Chrome 150", "Firefox 140", "Safari 18"), strict=True),
         (BROWSERS[0] + " Edg/150.0", "Edge 150"),
         (BROWSERS[0] + " OPR/120.0", "Opera 120"),
-        ("", "not known"),
+        ("", "browser not known"),
         ("curl/8", "other"),
         ("Version/" * 100_000, "other"),
     ],
@@ -94,8 +94,8 @@ def test_refresh_rates_are_the_usual_ones() -> None:
     given = (59.94, 60.3, 144.1, 119.9, 83.0, None, 0, "60", True, float("nan"))
     names = ["60 Hz", "60 Hz", "144 Hz", "120 Hz", "about 85 Hz"]
     assert [refresh_rate_label(hz) for hz in given[:5]] == names
-    assert [refresh_rate_label(hz) for hz in given[5:8]] == ["not known"] * 3
-    assert refresh_rate_label(given[9]) == "not known"
+    assert [refresh_rate_label(hz) for hz in given[5:8]] == ["screen not known"] * 3
+    assert refresh_rate_label(given[9]) == "screen not known"
 
 
 def test_spans_of_time_in_words() -> None:

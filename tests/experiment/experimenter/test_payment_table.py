@@ -17,6 +17,7 @@ from physion.experiment.experimenter.payment_table import (
     payment_csv,
 )
 from physion.experiment.experimenter.payments import read_payments
+from physion.experiment.experimenter.templating import make_environment
 from physion.experiment.study.study import Bonus
 from support.experiment.experimenter_client import lab
 from support.experiment.store_walk import enter, walk
@@ -73,3 +74,9 @@ def test_the_page_shows_and_sends_the_table(tmp_path: Path) -> None:
         assert sent.headers["content-disposition"].endswith('-payments.csv"')
         (cells,) = csv.DictReader(io.StringIO(sent.text))
         assert (cells["id"], cells["accuracy"], cells["bonus"]) == ("Ada", "0.5000", "3.00")
+
+
+def test_an_id_cannot_turn_the_page_round() -> None:
+    page = make_environment().from_string("{{ text|visible }}")
+    assert page.render(text="ab\u202ecd\x00") == "ab\\u202ecd\\u0000"
+    assert page.render(text="5f1eada0<é>") == "5f1eada0&lt;é&gt;"

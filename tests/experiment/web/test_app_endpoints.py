@@ -52,6 +52,7 @@ class TestWithoutASession:
         answer = site.client.get("/")
         assert answer.headers["content-type"] == "text/html; charset=utf-8"
         assert answer.text.startswith("<!doctype html>")
+        assert site.client.head("/").status_code == 200  # as monitors ask
 
     def test_an_unchanged_file_is_not_sent_again(self, site: Served) -> None:
         first = site.client.get("/static/main.js")

@@ -309,13 +309,13 @@ def browser_label(user_agent: str) -> str:
         match = re.search(pattern, user_agent[:1000])
         if match:
             return f"{name} {match[1]}"
-    return "other" if user_agent else "not known"
+    return "other" if user_agent else "browser not known"
 
 
 def refresh_rate_label(refresh_hz: object) -> str:
     """Return the common refresh rate within 3 % of the measured one, else round to 5 Hz."""
     if not isinstance(refresh_hz, int | float) or not refresh_hz > 0:
-        return "not known"
+        return "screen not known"
     for usual in (30, 50, 60, 75, 90, 100, 120, 144, 165, 240):
         if abs(refresh_hz - usual) <= 0.03 * usual:
             return f"{usual} Hz"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import unicodedata
 from datetime import UTC, datetime
 from typing import Any
 
@@ -45,6 +46,14 @@ def minutes(value: float | None) -> str:
     return f"{hours} h {rest:02d}" if hours < 24 else f"{hours // 24} d {hours % 24} h"
 
 
+def visible(text: str) -> str:
+    """Return a text in which invisible characters, such as marks that turn it round, are codes."""
+    return "".join(
+        f"\\u{ord(character):04x}" if unicodedata.category(character) in ("Cf", "Cc") else character
+        for character in text
+    )
+
+
 def or_dash(value: object) -> object:
     """Return the value, or a dash if it is missing."""
     return NONE if value is None or value == "" else value
@@ -67,7 +76,9 @@ def make_environment(**shared: Any) -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    filters = (date_time, time_of_day, percent, in_seconds, minutes, or_dash, yes_no)
+    filters = (
+        date_time, time_of_day, percent, in_seconds, minutes, visible, or_dash, yes_no,
+    )  # fmt: skip
     environment.filters.update({function.__name__: function for function in filters})
     environment.globals.update(shared, path=PATH)
     return environment

@@ -73,6 +73,7 @@ export class Frame {
   #showTitle() {
     const title = this.texts.has("study.title") ? this.texts.t("study.title") : this.study.title;
     document.title = title;
+    document.body.classList.toggle("is-preview", this.state?.kind === "preview");
     const preview = this.state?.kind === "preview" ? [this.texts.t("common.preview")] : [];
     byId("title").textContent = [title, ...preview].join(" · ");
   }
