@@ -10,13 +10,14 @@ import numpy as np
 
 from physion.models.batch import Batch, Spec, clip_frames
 from physion.training.sources.source import Part
+from support.clip_source import ClipSource
 from support.moving_squares import squares
 
 FRAMES = 60
 """Length of a trial, in which a square crosses up to 0.7 of the picture."""
 
 
-class SquaresSource:
+class SquaresSource(ClipSource):
     """Source of ``count`` trials with two squares each; the seed determines the trials."""
 
     def __init__(self, spec: Spec, count: int, seed: int = 0) -> None:
@@ -28,23 +29,10 @@ class SquaresSource:
     def length(self, trial: str) -> int:
         return FRAMES
 
-    def window(self, trials: Sequence[str], starts: Sequence[int], length: int) -> Batch:
-        steps = self.spec.stride * np.arange(length)
-        return self._clips(trials, [[int(start + step) for step in steps] for start in starts])
-
-    def context(self, trials: Sequence[str]) -> Batch:
-        return self._clips(trials, [self.spec.context_frames()] * len(trials))
-
-    def later(self, trials: Sequence[str]) -> Batch:
-        return self._clips(trials, [self.spec.future_frames()] * len(trials))
-
-    def whole(self, trials: Sequence[str]) -> Batch:
-        return self._clips(trials, [self.spec.all_frames()] * len(trials))
-
     def key(self, trial: str, part: Part) -> str:
         return hashlib.sha256(f"{trial} {self._seed} {part} {self.spec}".encode()).hexdigest()
 
-    def _clips(self, trials: Sequence[str], frames: Sequence[Sequence[int]]) -> Batch:
+    def clips(self, trials: Sequence[str], frames: Sequence[Sequence[int]]) -> Batch:
         clipped = [clip_frames(wanted, FRAMES) for wanted in frames]
         rows = [self.trials.index(trial) for trial in trials]
         shown = np.stack([frame for frame, _ in clipped])

@@ -19,6 +19,7 @@ from physion.models.interface import Diet
 from physion.models.settings import TrainingSettings
 from physion.models.torch_model import TorchModel
 from physion.training.sources.source import Part
+from support.clip_source import ClipSource
 from support.hand_made import make_scene, make_trajectory
 
 SPEC = Spec(image_size=4, stride=6, context=3, future=5)
@@ -27,7 +28,7 @@ QUICK = TrainingSettings(
 )
 
 
-class MovingValues:
+class MovingValues(ClipSource):
     """Source of trials whose pictures become brighter at a constant speed.
 
     ``frames`` is the length of every motion, or of each.
@@ -45,19 +46,9 @@ class MovingValues:
     def length(self, trial: str) -> int:
         return self.frames[trial]
 
-    def context(self, trials: Sequence[str]) -> Batch:
-        return self._clips(trials, [self.spec.context_frames()] * len(trials))
-
-    def later(self, trials: Sequence[str]) -> Batch:
-        return self._clips(trials, [self.spec.future_frames()] * len(trials))
-
-    def whole(self, trials: Sequence[str]) -> Batch:
-        return self._clips(trials, [self.spec.all_frames()] * len(trials))
-
     def window(self, trials: Sequence[str], starts: Sequence[int], length: int) -> Batch:
         self.read.append((tuple(trials), tuple(starts)))
-        steps = self.spec.stride * np.arange(length)
-        return self._clips(trials, [tuple(start + steps) for start in starts])
+        return super().window(trials, starts, length)
 
     def key(self, trial: str, part: Part) -> str:
         if trial not in self.frames:
@@ -74,7 +65,7 @@ class MovingValues:
         rows = [self.values(t, np.minimum(frames, self.frames[t] - 1)) / 100 for t in trials]
         return np.stack([np.stack([row, row**2], axis=1) for row in rows]).astype(np.float32)
 
-    def _clips(self, trials: Sequence[str], frames: Sequence[Sequence[int]]) -> Batch:
+    def clips(self, trials: Sequence[str], frames: Sequence[Sequence[int]]) -> Batch:
         clipped = [clip_frames(f, self.frames[t]) for t, f in zip(trials, frames, strict=True)]
         shown = np.stack([frame for frame, _ in clipped])
         bright = np.stack([self.values(t, f) for t, f in zip(trials, shown, strict=True)])

@@ -244,21 +244,6 @@ def test_a_future_is_that_of_the_equations(skip: Any) -> None:
     assert torch.allclose(imagined[-1], predicted, atol=1e-5)
 
 
-def test_bad_clips_are_refused() -> None:
-    model = tiny()
-    context = context_of(model)
-    with pytest.raises(BadInputError, match=r"svg-small: pictures must be .*16, 16.*48, 48"):
-        model.encode(squares(2, 4, replace(model.spec, image_size=48)))
-    with pytest.raises(BadInputError, match="from a context of 4 frames, not 3"):
-        model.imagine(context.steps(slice(0, 3)), 1, 0)
-    with pytest.raises(BadInputError, match="clips of 5 frames, not 4"):
-        model.loss(context)
-    valid = context.valid.clone()
-    valid[1, 3] = False
-    with pytest.raises(BadInputError, match=r"squares_0001.*up to frame 18"):
-        model.imagine(with_arrays(context, valid=valid), 1, 0)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,8 @@ from physion.models.checkpoints.trained import shipped_digests
 from support.moving_squares import squares, with_arrays
 
 NAMES = ("cswm", "rpin", "svg", "op3")
+OF_PICTURES = ("svg", "op3")
+"""Those that predict pictures."""
 
 
 def model_of(name: str, **options: Any) -> Any:
@@ -207,6 +210,24 @@ def test_bad_input_is_named(name: str) -> None:
         model_of(name, size="huge")
     with pytest.raises(BadInputError, match="no weights at"):
         model_of(name, weights="absent.safetensors")
+
+
+@pytest.mark.parametrize("name", OF_PICTURES)
+def test_clips_of_another_size_or_length_or_with_missing_frames_are_refused(name: str) -> None:
+    model = model_of(name)
+    spec, context = model.spec, context_of(model)
+    size, frames = spec.image_size, spec.context
+    with pytest.raises(BadInputError, match=rf"pictures must be .*{size}, {size}.*48, 48"):
+        model.imagine(squares(2, frames, replace(spec, image_size=48)), 1, 0)
+    shorter = context.steps(slice(0, frames - 1))
+    with pytest.raises(BadInputError, match=f"from a context of {frames} frames, not {frames - 1}"):
+        model.imagine(shorter, 1, 0)
+    with pytest.raises(BadInputError, match=f"clips of {model.window} frames, not {frames - 1}"):
+        model.loss(shorter)
+    valid = context.valid.clone()
+    valid[1, frames - 1] = False
+    with pytest.raises(BadInputError, match=rf"squares_0001.*up to frame {spec.stride * 6}"):
+        model.imagine(with_arrays(context, valid=valid), 1, 0)
 
 
 def test_checkpoints_hold_no_code(tmp_path: Path) -> None:

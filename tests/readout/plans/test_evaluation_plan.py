@@ -12,55 +12,34 @@ import pytest
 
 from physion.analysis.tables.predictions import read_predictions
 from physion.readout.evaluate import Evaluation, evaluate
-from physion.readout.logistic import ReadoutConfig
-from physion.readout.plans.evaluation_plan import EvaluationPlan
 from physion.readout.plans.results import MEAN, summarise_accuracy
-from physion.readout.plans.selection import ModelChoice, Selection
+from physion.readout.plans.selection import Selection
 from physion.readout.plans.tasks import EvaluationTask
 from physion.readout.plans.training_plan import TrainingPlan
-from physion.readout.settings import EvaluationConfig, EvaluationSettings
+from physion.readout.settings import EvaluationConfig
 from physion.readout.trainings import SharedTrainConfig
 from physion.training.overrides import TrainingOverrides
 from physion.training.protocols import Training
 from physion.trials.dataset import Dataset
-from support.moving_dots import make_dots
-from support.plans import plan_models
+from support.plans.make_plans import (
+    EVERY,
+    FAILS,
+    IMAGINING,
+    QUICK,
+    SETS,
+    UNTRAINED,
+    make_evaluation_plan,
+)
 
-FILE = plan_models.__file__
-IMAGINING = ModelChoice(f"{FILE}:Imagining")
-FAILS = ModelChoice(f"{FILE}:FailsOnDrop")
-UNTRAINED = ModelChoice(f"{FILE}:NothingToTrain")
-EVERY = (Training.ALL, Training.ALL_BUT, Training.ONLY)
 READOUTS = {"observed", "observed+simulated", "full"}
-QUICK: dict[str, Any] = {"accelerator": "cpu", "readout": ReadoutConfig(grid=(1e-2, 1.0))}
-
-
-@pytest.fixture(scope="module")
-def dots(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    counts = {"training": 4, "readout": 6, "testing": 4}
-    return make_dots(tmp_path_factory.mktemp("dots"), counts, ("collide", "drop"))
-
-
-def make_plan(
-    dots: Dataset,
-    folder: Path,
-    models: Sequence[ModelChoice] = (IMAGINING,),
-    protocols: Sequence[Training] = EVERY,
-    seeds: Sequence[int] = (0, 1),
-    scenario: str = "",
-    **changes: Any,
-) -> EvaluationPlan:
-    selection = Selection(tuple(models), tuple(protocols), tuple(seeds), scenario)
-    return EvaluationPlan(dots, folder, selection, EvaluationSettings(**{**QUICK, **changes}))
 
 
 def test_a_plan_predicts_all_readouts_and_a_second_run_only_reads(
     dots: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    plan = make_plan(dots, tmp_path, [UNTRAINED, IMAGINING])
-    names = ["all", "no_collide", "no_drop", "collide", "drop"]
+    plan = make_evaluation_plan(dots, tmp_path, [UNTRAINED, IMAGINING])
     assert [(t.set_name, t.seed) for t in plan.tasks if t.choice == IMAGINING] == [
-        (name, seed) for seed in (0, 1) for name in names
+        (name, seed) for seed in (0, 1) for name in SETS
     ]
     # Nothing of it is trained, so that protocols and seeds would give the same rows again.
     assert [t.set_name for t in plan.tasks if t.choice == UNTRAINED] == [""]
@@ -82,7 +61,7 @@ def test_a_plan_predicts_all_readouts_and_a_second_run_only_reads(
         raise AssertionError("a plan that is done builds no model")
 
     monkeypatch.setattr("physion.readout.plans.model_facts.build_model", build)
-    again = make_plan(dots, tmp_path, [UNTRAINED, IMAGINING])
+    again = make_evaluation_plan(dots, tmp_path, [UNTRAINED, IMAGINING])
     assert not again.pending
     pd.testing.assert_frame_equal(
         summarise_accuracy(again.run().evaluated), summarise_accuracy(results.evaluated)
@@ -96,7 +75,7 @@ def test_the_tables_are_those_of_single_evaluations_and_trainings_are_found(
     shared = SharedTrainConfig(accelerator="cpu")
     TrainingPlan(dots, tmp_path, selection, TrainingOverrides(), shared).run()
     trained = {p: p.stat().st_mtime_ns for p in (tmp_path / "training").rglob("*")}
-    results = make_plan(dots, tmp_path, protocols=[Training.ALL_BUT], seeds=(0,)).run()
+    results = make_evaluation_plan(dots, tmp_path, protocols=[Training.ALL_BUT], seeds=(0,)).run()
     assert {p: p.stat().st_mtime_ns for p in (tmp_path / "training").rglob("*")} == trained
     ((_, evaluation),) = results.tables
     parts = [part.predictions for _, part in results.evaluated]
@@ -125,7 +104,7 @@ def test_an_evaluation_that_fails_is_reported_and_the_rest_goes_on(
     def show(task: EvaluationTask, reason: str, left: Sequence[EvaluationTask]) -> None:
         seen.append((task.set_name, bool(reason), len(left)))
 
-    results = make_plan(dots, tmp_path, [FAILS], seeds=(0,)).run(on_task=show)
+    results = make_evaluation_plan(dots, tmp_path, [FAILS], seeds=(0,)).run(on_task=show)
     assert [task.set_name for task, _ in results.failed] == ["all", "no_collide", "drop"]
     assert all("no drop, please" in reason for _, reason in results.failed)
     assert [task.set_name for task, _ in results.tables] == ["no_drop", "collide"]
@@ -137,12 +116,12 @@ def test_an_evaluation_that_fails_is_reported_and_the_rest_goes_on(
     assert set(zip(summary["protocol"], summary["scenario"], strict=True)) == {
         ("all-but", "drop"), ("only", "collide"),
     }  # fmt: skip
-    again = make_plan(dots, tmp_path, [FAILS], seeds=(0,))
+    again = make_evaluation_plan(dots, tmp_path, [FAILS], seeds=(0,))
     assert [task.set_name for task in again.pending] == ["all", "no_collide", "drop"]
 
 
 def test_a_scenario_and_readouts_can_be_chosen(dots: Dataset, tmp_path: Path) -> None:
-    plan = make_plan(dots, tmp_path, protocols=EVERY[1:], seeds=(0,), scenario="drop",
+    plan = make_evaluation_plan(dots, tmp_path, protocols=EVERY[1:], seeds=(0,), scenario="drop",
                      readouts=("observed",))  # fmt: skip
     assert [task.set_name for task in plan.tasks] == ["no_drop", "drop"]
     results = plan.run()

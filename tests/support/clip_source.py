@@ -1,0 +1,32 @@
+"""Base class of sources whose clips are computed, for tests that need no file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from physion.models.batch import Batch, Spec
+
+
+class ClipSource:
+    """Source of whole trials; subclasses set ``spec`` and compute clips, lengths and keys."""
+
+    spec: Spec
+
+    def clips(self, trials: Sequence[str], frames: Sequence[Sequence[int]]) -> Batch:
+        """Return the clips of ``trials`` that show these frames (B, T)."""
+        raise NotImplementedError
+
+    def context(self, trials: Sequence[str]) -> Batch:
+        return self.clips(trials, [self.spec.context_frames()] * len(trials))
+
+    def later(self, trials: Sequence[str]) -> Batch:
+        return self.clips(trials, [self.spec.future_frames()] * len(trials))
+
+    def whole(self, trials: Sequence[str]) -> Batch:
+        return self.clips(trials, [self.spec.all_frames()] * len(trials))
+
+    def window(self, trials: Sequence[str], starts: Sequence[int], length: int) -> Batch:
+        steps = self.spec.stride * np.arange(length)
+        return self.clips(trials, [(start + steps).tolist() for start in starts])
