@@ -46,7 +46,23 @@ def heed_interrupts() -> None:
 
 
 def environment() -> dict[str, str]:
-    return {**os.environ, "PYTHONPATH": str(TESTS), "OMP_NUM_THREADS": "1"}
+    paths = [str(TESTS), *filter(None, [os.environ.get("PYTHONPATH")])]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
+
+
+def run_apart(*commands: list[str]) -> tuple[str, set[str]]:
+    """Run commands in one new process; return what they print, and slow libraries they import."""
+    code = (
+        "import sys\n"
+        "from physion.cli.main import main\n"
+        f"assert not any([main(arguments) for arguments in {list(commands)!r}])\n"
+        "print(*{'torch', 'numba', 'scipy', 'av', 'h5py'} & set(sys.modules), sep=', ')"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment(), capture_output=True, text=True, check=True
+    )
+    *shown, last = done.stdout.splitlines()
+    return "\n".join(shown), set(filter(None, last.split(", ")))
 
 
 def test_a_second_run_does_nothing_and_says_so(
@@ -203,7 +219,8 @@ def test_evaluate_takes_the_same_plan(
 ) -> None:
     model = f"{plan_models.__file__}:Imagining"
     plan = ["--protocols", "all,only", "--seeds", "2", "--out", str(tmp_path), *CPU]
-    assert main(["train", model, str(dots.folder), *plan]) == 0
+    trainings = ["train", model, str(dots.folder), *plan]
+    assert main(trainings) == 0
     before = {p: p.stat().st_mtime_ns for p in (tmp_path / "training").rglob("*")}
     capsys.readouterr()
     arguments = ["evaluate", str(dots.folder), model, *plan, "--readout.grid", "0.1", "1"]
@@ -220,8 +237,10 @@ def test_evaluate_takes_the_same_plan(
         "spread",
     ]  # fmt: skip
     assert len(rows) == 2 * 3 * 3 and (rows["seeds"] == 2).all() and rows["spread"].notna().all()
-    assert main(arguments) == 0
-    assert "6 of 6 evaluations were done before" in capsys.readouterr().out
+    again, loaded = run_apart(trainings, arguments)
+    assert "6 of 6 trainings were done before" in again
+    assert "6 of 6 evaluations were done before" in again
+    assert not loaded, "what is done needs no library of models, movies or numerics"
     assert main([*arguments, "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["results"] == str(table) and len(result["evaluations"]) == 4

@@ -15,8 +15,8 @@ from physion.cli.main import main
 from physion.compute.local import LocalExecutor, SerialExecutor
 from physion.errors import BadInputError, PhysionError
 from physion.models import Batch
-from physion.readout import EvaluationConfig
 from physion.readout.logistic import ReadoutConfig
+from physion.readout.settings import EvaluationConfig
 from physion.readout.trainings import TrainConfig
 from physion.training.overrides import TrainingOverrides
 from physion.trials.dataset import Dataset

@@ -12,13 +12,14 @@ import pytest
 from physion.compute.local import SerialExecutor
 from physion.errors import BadInputError
 from physion.models import build_model, models
-from physion.readout import EvaluationConfig, evaluate, evaluate_model
+from physion.readout.evaluate import evaluate, evaluate_model
 from physion.readout.leak_checks import (
     with_exchanged_futures,
     with_permuted_labels,
     with_poisoned_futures,
 )
 from physion.readout.logistic import ReadoutConfig
+from physion.readout.settings import EvaluationConfig
 from physion.trials.dataset import Dataset
 from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import GenerateSettings, plan_dataset

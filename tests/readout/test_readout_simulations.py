@@ -16,10 +16,11 @@ from physion.errors import BadInputError
 from physion.models import Batch, Provenance, Spec
 from physion.models.noisy_simulation import NoisySimulation, NoisySimulationConfig
 from physion.physics.trajectory import Contacts, State, Trajectory
-from physion.readout import EvaluationConfig, evaluate, evaluate_model
 from physion.readout.capabilities import choose_readouts
+from physion.readout.evaluate import evaluate, evaluate_model
 from physion.readout.folds import plan_folds
 from physion.readout.predictor import Predictor
+from physion.readout.settings import EvaluationConfig
 from physion.scenes.scene import Body, Camera, Roles, Scene
 from physion.training.protocols import Training
 from physion.trials.trial_file import Trial

@@ -21,8 +21,9 @@ from physion.models.particles.bodies import (
     poses_of,
     scene_particles,
 )
-from physion.readout import EvaluationConfig, evaluate
+from physion.readout.evaluate import evaluate
 from physion.readout.rollout_error import COLUMNS, motion_error, rollout_error
+from physion.readout.settings import EvaluationConfig
 from physion.scenes.scene import BodyEvent
 from physion.trials.dataset import Dataset
 from support.viewer_dataset import FRAMES, PLANS, make_dataset, make_scene, make_trajectory

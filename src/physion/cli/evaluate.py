@@ -21,13 +21,13 @@ from physion.cli.plans.choose_models import choose_models
 from physion.cli.plans.tables import evaluations_table, print_estimates
 from physion.cli.text_table import text_table
 from physion.compute.local import LocalExecutor
-from physion.readout.evaluate import Evaluation
 from physion.readout.plans.evaluation_plan import EvaluationPlan, EvaluationResults
 from physion.readout.plans.keys import key_of
 from physion.readout.plans.results import summarise_accuracy
 from physion.readout.plans.selection import Selection, count_seeds, parse_protocols
 from physion.readout.plans.tasks import EvaluationTask
 from physion.readout.settings import EvaluationSettings
+from physion.readout.table import Evaluation
 from physion.trials.dataset import Dataset
 
 

@@ -6,7 +6,6 @@ import dataclasses
 import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +26,7 @@ from physion.readout.rollout_error import check_moves_objects, rollout_error
 from physion.readout.settings import EvaluationConfig
 from physion.readout.table import (
     ORDER,
+    Evaluation,
     ScenarioPredictions,
     file_name,
     is_complete,
@@ -42,19 +42,6 @@ PARTS = "parts"
 """Folder of the tables of single scenarios."""
 _VERSION = 5
 """To be increased with every change that can alter the table of an evaluation."""
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """Table of predictions, its file, and the reasons of trials that have none.
-
-    ``rollout_errors``: file of the errors of imagined motion, if they were asked for.
-    """
-
-    predictions: pd.DataFrame
-    path: Path
-    problems: Mapping[str, str]
-    rollout_errors: Path | None = None
 
 
 def evaluate(

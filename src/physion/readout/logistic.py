@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
 from physion.errors import BadInputError
 from physion.readout.gram import Array, Fit, JoinedFeatures, Parts, Rows, grams
@@ -147,7 +146,9 @@ def solve_path(kernel: Array, labels: Booleans, grid: tuple[float, ...]) -> tupl
     ``kernel`` (k, k) is the Gram matrix of the fit trials. The decision value of a trial with
     inner products ``g`` (k,) is ``g @ weights + intercept``.
     """
-    values, vectors = linalg.eigh(kernel)
+    from scipy.linalg import eigh  # imported late: settings are read without it
+
+    values, vectors = eigh(kernel)
     kept = values > max(values[-1], 0.0) * 1e-12
     roots = np.sqrt(values[kept])
     rotated = vectors[:, kept] * roots
@@ -167,6 +168,8 @@ def solve_path(kernel: Array, labels: Booleans, grid: tuple[float, ...]) -> tupl
 
 def _newton(design: Array, signs: Array, c: float, start: Array) -> Array:
     """Return the optimum for one C, starting from the solution for the next smaller one."""
+    from scipy.linalg import solve
+
     penalty = np.full(design.shape[1], 1.0 / (c * len(signs)))
     penalty[-1] = 0.0
     x = start
@@ -180,7 +183,7 @@ def _newton(design: Array, signs: Array, c: float, start: Array) -> Array:
         hessian = (design * curvature[:, None]).T @ design
         # 1e-15 keeps the Hessian regular when every trial is far from the decision boundary.
         hessian[np.diag_indices_from(hessian)] += penalty + 1e-15
-        step = -linalg.solve(hessian, gradient, assume_a="pos")
+        step = -solve(hessian, gradient, assume_a="pos")
         slope, length = float(gradient @ step), 1.0
         while length > 1e-10:
             trial, trial_margins = _objective(design, signs, penalty, x + length * step)

@@ -81,6 +81,19 @@ OWN_COLUMNS = (
 
 
 @dataclass(frozen=True)
+class Evaluation:
+    """Table of predictions, its file, and the reasons of trials that have none.
+
+    ``rollout_errors``: file of the errors of imagined motion, if they were asked for.
+    """
+
+    predictions: pd.DataFrame
+    path: Path
+    problems: Mapping[str, str]
+    rollout_errors: Path | None = None
+
+
+@dataclass(frozen=True)
 class ScenarioPredictions:
     """Predictions of one scenario under one protocol in one fold; arrays are over ``trials``."""
 

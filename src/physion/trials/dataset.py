@@ -1,4 +1,7 @@
-"""Reading of a dataset: a folder of trials with its index."""
+"""Reading of a dataset: a folder of trials with its index.
+
+What reads trial files and movies is imported when it is used: an index is known without it.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ from collections.abc import Sequence
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -15,8 +18,9 @@ from numpy.typing import NDArray
 from physion.errors import BadInputError, UnknownNameError
 from physion.trials.index import read_index
 from physion.trials.layout import TrialPaths
-from physion.trials.trial_file import Trial
-from physion.trials.video import read_frames
+
+if TYPE_CHECKING:
+    from physion.trials.trial_file import Trial
 
 
 class ObservedDataset:
@@ -51,6 +55,8 @@ class ObservedDataset:
         """Return observed frames 0, ``stride``, ... (T, H, W, 3), sRGB; see `video.read_frames`."""
         if trial not in self._movies:
             raise UnknownNameError("trial", trial, self._movies)
+        from physion.trials.video import read_frames
+
         path = self._movies[trial]
         frames = read_frames(path, count=count, stride=stride, size=size)
         if (len(frames) - 1) * stride >= self._lengths[trial]:
@@ -112,6 +118,8 @@ class Dataset:
 
     def trial(self, trial: str) -> Trial:
         """Open and check a trial file."""
+        from physion.trials.trial_file import Trial
+
         return Trial.open(self.paths(trial).trial_file)
 
     def frames(
@@ -124,6 +132,8 @@ class Dataset:
         size: tuple[int, int] | None = None,
     ) -> NDArray[np.uint8]:
         """Return frames of the full movie (T, H, W, 3) in sRGB; see `video.read_frames`."""
+        from physion.trials.video import read_frames
+
         path = self.paths(trial).movie
         return read_frames(path, start=start, count=count, stride=stride, size=size)
 

@@ -5,17 +5,18 @@ from __future__ import annotations
 import hashlib
 import io
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 import pyarrow as pa
 
 from physion.atomic import write_atomic
 from physion.errors import BadInputError
-from physion.scenes.scene import Scene
 from physion.trials.columns import FILES, INDEX_COLUMNS
 from physion.trials.layout import INDEX, SAFE_NAME, TrialPaths, find_trials
-from physion.trials.trial_file import Trial
+
+if TYPE_CHECKING:
+    from physion.scenes.scene import Scene
 
 COLUMNS = {name: column.dtype for name, column in INDEX_COLUMNS.items()}
 """Pandas types by column, in the stored order."""
@@ -23,6 +24,9 @@ COLUMNS = {name: column.dtype for name, column in INDEX_COLUMNS.items()}
 
 def index_row(paths: TrialPaths) -> dict[str, Any]:
     """Return the index row of one trial; `BadInputError` if a file is missing or damaged."""
+    # Imported late: an index is read without what reads trial files.
+    from physion.trials.trial_file import Trial
+
     row: dict[str, Any] = dict.fromkeys(COLUMNS)
     trial = Trial.open(paths.trial_file)
     meta, labels, scene = trial.metadata, trial.labels, trial.scene

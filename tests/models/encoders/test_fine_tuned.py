@@ -18,8 +18,9 @@ from physion.models.encoders.fine_tuned import FineTunedEncoder
 from physion.models.encoders.settings import FINE_TUNING
 from physion.models.interface import features_digest
 from physion.models.settings import TrainingSettings
-from physion.readout import EvaluationConfig, evaluate
+from physion.readout.evaluate import evaluate
 from physion.readout.logistic import ReadoutConfig
+from physion.readout.settings import EvaluationConfig
 from physion.training.devices import Devices, make_fabric
 from physion.training.train import train_model
 from support.moving_dots import make_dots

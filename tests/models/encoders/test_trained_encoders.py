@@ -17,8 +17,9 @@ from physion.models.encoders.encoder_model import EncoderModel
 from physion.models.interface import features_digest
 from physion.models.settings import TrainingSettings
 from physion.models.weights import EncoderWeights, create_encoder
-from physion.readout import EvaluationConfig, evaluate
+from physion.readout.evaluate import evaluate
 from physion.readout.logistic import ReadoutConfig
+from physion.readout.settings import EvaluationConfig
 from physion.training.train import train_model
 from support.moving_dots import make_dots
 from support.tiny_models import TINY

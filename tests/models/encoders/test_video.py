@@ -16,8 +16,9 @@ from torch import Tensor
 
 from physion.errors import BadInputError
 from physion.models import Batch, build_model
-from physion.readout import EvaluationConfig, evaluate
+from physion.readout.evaluate import evaluate
 from physion.readout.logistic import ReadoutConfig
+from physion.readout.settings import EvaluationConfig
 from support.moving_dots import make_dots
 from support.programs import absent
 from support.tiny_models import VIDEO

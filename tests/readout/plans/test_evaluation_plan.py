@@ -11,12 +11,13 @@ import pandas as pd
 import pytest
 
 from physion.analysis.tables.predictions import read_predictions
-from physion.readout.evaluate import Evaluation, evaluate
+from physion.readout.evaluate import evaluate
 from physion.readout.plans.results import MEAN, summarise_accuracy
 from physion.readout.plans.selection import Selection
 from physion.readout.plans.tasks import EvaluationTask
 from physion.readout.plans.training_plan import TrainingPlan
 from physion.readout.settings import EvaluationConfig
+from physion.readout.table import Evaluation
 from physion.readout.trainings import SharedTrainConfig
 from physion.training.overrides import TrainingOverrides
 from physion.training.protocols import Training

@@ -13,7 +13,6 @@ from typing import Any
 
 from physion.compute.executor import Executor
 from physion.compute.progress import Progress
-from physion.readout.evaluate import Evaluation, evaluate_model
 from physion.readout.folds import plan_folds, select_scenario
 from physion.readout.plans.failures import describe_failure, stop_if_fatal
 from physion.readout.plans.keys import code_key, dataset_key, key_of
@@ -23,7 +22,7 @@ from physion.readout.plans.selection import ModelChoice, Selection
 from physion.readout.plans.tasks import EvaluationTask
 from physion.readout.protocols import Readout
 from physion.readout.settings import EvaluationConfig, EvaluationSettings
-from physion.readout.table import read_table
+from physion.readout.table import Evaluation, read_table
 from physion.training.protocols import Training
 from physion.trials.dataset import Dataset
 
@@ -243,6 +242,9 @@ class EvaluationPlan:
             scenario=scenario,
             seed=task.seed,
         )
+        # Imported late: a plan that is done needs none of the libraries of models and movies.
+        from physion.readout.evaluate import evaluate_model
+
         return evaluate_model(
             self.dataset,
             self._model(task),

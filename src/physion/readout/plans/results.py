@@ -6,8 +6,8 @@ from collections.abc import Iterable
 
 import pandas as pd
 
-from physion.readout.evaluate import Evaluation
 from physion.readout.plans.tasks import EvaluationTask
+from physion.readout.table import Evaluation
 
 MEAN = "mean"
 """Name of the rows with the mean of the scenarios."""
