@@ -47,7 +47,7 @@ def minutes(value: float | None) -> str:
 
 
 def visible(text: str) -> str:
-    """Return a text in which invisible characters, such as marks that turn it round, are codes."""
+    """Return a text with codes for invisible characters, such as those that reverse its order."""
     return "".join(
         f"\\u{ord(character):04x}" if unicodedata.category(character) in ("Cf", "Cc") else character
         for character in text
