@@ -160,6 +160,8 @@ class Participant:
             "window_height": 720,
             "details": {"frames_ms": moments, "cue_ms": [0.0, 250.1, 500.2, 750.1, 1000.0]},
         }
+        showing = {"key": body["key"], "phase": phase, "trial": media["trial"]}
+        await self.ask("POST", "/api/showings", showing)
         begin = time.perf_counter()
         await self.ask("POST", "/api/answers", body)
         if phase == "test":
@@ -283,7 +285,7 @@ def check(study: Study, database: str | None, tally: Tally) -> int:
 
 def measure(name: str, options: argparse.Namespace, folder: Path) -> Row:
     """Make a study, serve it, load it, stop, and look everything up."""
-    from physion.experiment.study.study import Limits
+    from physion.experiment.study.study import Limits, Plausibility
     from support.experiment.tiny_study import make_tiny_study
 
     fast = Limits(
@@ -292,7 +294,9 @@ def measure(name: str, options: argparse.Namespace, folder: Path) -> Row:
         sessions_per_minute=100_000,
         sessions_at_once=100_000,
     )
-    study = make_tiny_study(folder / name, test=TEST_TRIALS, limits=fast)
+    # Every answer is checked, at a speed that the participants of a load can keep.
+    checked = Plausibility(simulated_speed=1_000_000)
+    study = make_tiny_study(folder / name, test=TEST_TRIALS, limits=fast, plausibility=checked)
     words = [sys.executable]
     if options.profile:
         words += ["-m", "cProfile", "-o", str(options.profile)]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import math
+import time
 from typing import TYPE_CHECKING
 
 from fastapi import FastAPI
@@ -15,7 +17,7 @@ from starlette.responses import Response
 from physion.errors import BadInputError
 from physion.experiment.experimenter.routes import build_router
 from physion.experiment.protocol.refused import Refused
-from physion.experiment.study.media_links import read_media_path
+from physion.experiment.study.media_links import read_media
 from physion.experiment.study.texts import TEXTS_FOLDER, read_consent_file
 from physion.experiment.web.api import build_api
 from physion.experiment.web.bodies import BadBodyError
@@ -49,7 +51,7 @@ def build_app(study: Study, secrets: Secrets, store: Store) -> FastAPI:
     )
     app.include_router(build_api(study, secrets, store))
     _serve_pages(app, study)
-    _serve_media(app, study, secrets)
+    _serve_media(app, study, secrets, store)
     app.include_router(build_router(study, secrets, store), prefix="/experimenter")
     return app
 
@@ -80,27 +82,30 @@ def _serve_pages(app: FastAPI, study: Study) -> None:
         return Response(content, media_type="application/pdf")
 
 
-def _serve_media(app: FastAPI, study: Study, secrets: Secrets) -> None:
+def _serve_media(app: FastAPI, study: Study, secrets: Secrets, store: Store) -> None:
     """Add the route of movies and maps."""
     files = MediaFiles()
 
     @app.get("/media/{name}")
     async def get_media(request: Request) -> Response:
         try:
-            path = read_media_path(study, secrets, request.scope["path"])
+            media = read_media(study, secrets, request.scope["path"])
         except BadInputError:
             return refuse("not_found")
         try:
-            return await files.response(path)
+            response = await files.response(media.file)
         except BadInputError as error:
             log.error("a movie or map could not be sent to a participant: %s", error)
             return refuse("not_found", "This file is missing on the server.")
+        store.fetched.note(media.tag, media.phase, media.trial, media.kind, time.time())
+        return response
 
 
 async def _refused(request: Request, error: Exception) -> Response:
     """Handle a refusal by the store."""
     assert isinstance(error, Refused)
-    return refuse(error.code, error.message, error.state, completion=error.completion)
+    wait = {"retry-after": str(math.ceil(error.wait_s))} if error.wait_s else None
+    return refuse(error.code, error.message, error.state, headers=wait, completion=error.completion)
 
 
 async def _bad_body(request: Request, error: Exception) -> Response:

@@ -19,7 +19,7 @@ from physion.experiment.simulated.person import SimulatedPerson
 from physion.experiment.simulated.server_process import ServerProcess
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.stimuli import Stimulus
-from physion.experiment.study.study import Study
+from physion.experiment.study.study import Plausibility, Study
 from support.experiment.serving import stored_answers, stored_sessions
 from support.experiment.tiny_study import make_tiny_study
 
@@ -74,7 +74,10 @@ def test_a_fraction_of_the_people_leaves() -> None:
 @pytest.fixture(scope="module")
 def study(tmp_path_factory: pytest.TempPathFactory) -> Study:
     folder = tmp_path_factory.mktemp("simulated") / "study"
-    return make_tiny_study(folder, test=4, familiarization=2, scenarios=("collide", "drop"))
+    return make_tiny_study(
+        folder, test=4, familiarization=2, scenarios=("collide", "drop"),
+        plausibility=Plausibility(simulated_speed=200.0),
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -110,13 +113,15 @@ def test_simulated_is_written_in_the_data_for_good(
     sessions = stored_sessions(study)
     assert len(sessions) == 8 and {session.kind for session in sessions.values()} == {"simulated"}
     assert all(session.finished_at for session in sessions.values())
+    # They behave as browsers do: nothing about their sessions is impossible.
+    assert {session.implausible for session in sessions.values()} == {None}
     known = [(visit.reference, a) for visit in (*first, *second) for a in visit.answers]
     stored = stored_answers(study)
     assert len(stored) == 48
     for reference, answer in known:
         row = stored[reference, answer.phase, answer.trial]
-        assert (row.key, row.stimulus, row.response, row.rt_ms) == (
-            answer.key, answer.stimulus, answer.response, answer.rt_ms
+        assert (row.key, row.stimulus, row.response, row.rt_ms, row.showings) == (
+            answer.key, answer.stimulus, answer.response, answer.rt_ms, 1
         )  # fmt: skip
     labels = {s.stimulus: s.label for s in study.stimuli}
     for visit in first:
@@ -164,6 +169,19 @@ def test_the_verb_serves_by_itself_and_prints(
     assert 0 <= found["mean_accuracy"] <= 1
     assert main(words) == 0
     assert "3 done before" in capsys.readouterr().out
+
+
+def test_without_leave_of_the_study_they_take_their_time(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from physion.experiment.simulated.participants import minutes_each
+
+    real = make_tiny_study(tmp_path / "real", plausibility=Plausibility())
+    # 16 trials of 1 s cross, 2 s cue, 1.5 s movie and some 0.8 s to answer, 10 s of reading,
+    # and ten full movies of 2 s.
+    assert minutes_each(real, "collide") == pytest.approx((16 * 5.3 + 10 + 20) / 60, rel=0.05)
+    fast = replace(real, plausibility=Plausibility(simulated_speed=100.0))
+    assert minutes_each(fast, "collide") == pytest.approx(minutes_each(real, "collide") / 100)
 
 
 def test_another_study_s_server_refuses_the_pilot_link(

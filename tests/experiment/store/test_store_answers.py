@@ -16,14 +16,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sqlalchemy import delete
 
-from physion.experiment.protocol.messages import Answer, Enter, PageDone
+from physion.experiment.protocol.messages import Answer, PageDone
 from physion.experiment.store.store import Refused, Store
 from physion.experiment.store.tables import ANSWERS, METADATA, SESSIONS, STUDIES
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.media_links import read_media_path
 from physion.experiment.study.orders import trial_order
 from physion.experiment.study.study import Study
-from support.experiment.store_walk import answer, enter, give, page, refusal, rows, run, walk
+from support.experiment.store_walk import (
+    answer,
+    enter,
+    give,
+    page,
+    refusal,
+    request,
+    rows,
+    run,
+    walk,
+)
 
 HOSTILE = "'; DROP TABLE answers; -- \"<script>alert(1)</script>\\ %s {0} \0 é ☃ 🎲"
 
@@ -152,7 +162,7 @@ def test_racing_tabs_make_one_row(store: Store) -> None:
 
 def test_many_people_at_once_lose_nothing(store: Store) -> None:
     async def one(number: int) -> None:
-        asked = Enter(id=f"p{number}", scenario=("collide", "drop")[number % 2])
+        asked = request(f"p{number}", scenario=("collide", "drop")[number % 2])
         token = (await store.enter(asked)).token
         luck = random.Random(number)
         for name, phase, count in (("instructions", "familiarization", 3), ("ready", "test", 4)):

@@ -14,7 +14,7 @@ from physion.experiment.store.store import Refused, Store
 from physion.experiment.store.tables import EVENTS, RAW_IDS, SESSIONS
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.study import EarlyEnd, Study
-from support.experiment.store_walk import enter, give, page, refusal, rows, run, walk
+from support.experiment.store_walk import enter, give, page, refusal, request, rows, run, walk
 
 DEVICE = Device(user_agent="Mozilla", screen_width=1920)
 ENDS = {
@@ -25,7 +25,7 @@ ENDS = {
 
 
 def come(store: Store, person: str, *, take_back: bool = False) -> Enter:
-    return Enter(id=person, source="prolific", scenario="drop", device=DEVICE, take_back=take_back)
+    return request(person, source="prolific", scenario="drop", device=DEVICE, take_back=take_back)
 
 
 def test_a_declined_session_is_found_again_and_can_be_taken_back(store: Store) -> None:
@@ -75,7 +75,7 @@ def test_going_on_has_no_ending(store: Store) -> None:
 
 def test_another_scenario_comes_before_a_declined_one(store: Store) -> None:
     page(store, enter(store, "Ada", scenario="drop"), "consent", agreed=False)
-    assert run(store.enter(Enter(id="Ada"))).state.scenario == "collide"
+    assert run(store.enter(request("Ada"))).state.scenario == "collide"
 
 
 def test_deleted_data_cannot_be_taken_back(

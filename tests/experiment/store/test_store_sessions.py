@@ -29,6 +29,7 @@ from support.experiment.store_walk import (
     give,
     page,
     refusal,
+    request,
     rows,
     run,
     walk,
@@ -97,23 +98,23 @@ def test_unknown_tokens_open_nothing(sqlite_store: Store, token: str) -> None:
 
 def test_finished_and_withdrawn_people_may_not_begin_again(store: Store) -> None:
     walk(store, enter(store, "Ada", scenario="drop"), "done")
-    assert refusal(store.enter(Enter(id="Ada", scenario="drop"))).code == "already_took_part"
+    assert refusal(store.enter(request("Ada", scenario="drop"))).code == "already_took_part"
     token = walk(store, enter(store, "Bob", scenario="drop"), "test")
     page(store, token, "withdraw")
-    assert run(store.enter(Enter(id="Bob", scenario="drop"))).state.stage == "withdrawn"
+    assert run(store.enter(request("Bob", scenario="drop"))).state.stage == "withdrawn"
     for person in ("Ada", "Bob"):
         # They may still take part in the other scenario, requested or not.
-        assert run(store.enter(Enter(id=person))).state.scenario == "collide"
+        assert run(store.enter(request(person))).state.scenario == "collide"
     walk(store, enter(store, "Ada"), "done")
-    assert refusal(store.enter(Enter(id="Ada"))).code == "already_took_part"
+    assert refusal(store.enter(request("Ada"))).code == "already_took_part"
     assert len(rows(store, SESSIONS)) == 4
 
 
 def test_an_unfinished_session_continues_before_another_begins(store: Store) -> None:
     walk(store, enter(store, "Ada", scenario="drop"), "test")
-    state = run(store.enter(Enter(id="Ada"))).state
+    state = run(store.enter(request("Ada"))).state
     assert (state.scenario, state.stage) == ("drop", "test")
-    assert run(store.enter(Enter(id="Ada", scenario="collide"))).state.stage == "consent"
+    assert run(store.enter(request("Ada", scenario="collide"))).state.stage == "consent"
 
 
 def test_sources_keep_ids_apart(store: Store) -> None:
@@ -137,11 +138,11 @@ def test_the_scenario_with_fewest_sessions_comes_first_until_the_study_is_full(
     early = enter(store, "early", scenario="drop")
     for token in tokens:
         page(store, token, "consent")
-    assert refusal(store.enter(Enter(id="late"))).code == "study_full"
-    assert refusal(store.enter(Enter(id="late", scenario="drop"))).code == "study_full"
+    assert refusal(store.enter(request("late"))).code == "study_full"
+    assert refusal(store.enter(request("late", scenario="drop"))).code == "study_full"
     # A person who has begun may finish, even if the scenario is full by then.
-    assert run(store.enter(Enter(id="asleep"))).state.scenario == "collide"
-    assert run(store.enter(Enter(id="early"))).state.stage == "consent"
+    assert run(store.enter(request("asleep"))).state.scenario == "collide"
+    assert run(store.enter(request("early"))).state.stage == "consent"
     for token in (early, *tokens, enter(store, "asleep")):
         walk(store, token, "done")
     finished = Counter(row.scenario for row in rows(store, SESSIONS) if row.finished_at)
@@ -152,22 +153,23 @@ def test_an_abandoned_session_is_not_counted_and_may_be_continued(store: Store) 
     tokens = [enter(store, f"p{i}", scenario="drop") for i in range(3)]
     for token in tokens:
         walk(store, token, "test")
-    assert refusal(store.enter(Enter(id="late", scenario="drop"))).code == "study_full"
+    assert refusal(store.enter(request("late", scenario="drop"))).code == "study_full"
     _let_time_pass(store, "p0", ACTIVE_WITHIN - 30)
-    assert refusal(store.enter(Enter(id="late", scenario="drop"))).code == "study_full"
+    assert refusal(store.enter(request("late", scenario="drop"))).code == "study_full"
     _let_time_pass(store, "p0", 60)
     walk(store, enter(store, "late", scenario="drop"), "test")
-    assert refusal(store.enter(Enter(id="later", scenario="drop"))).code == "study_full"
+    assert refusal(store.enter(request("later", scenario="drop"))).code == "study_full"
     for token in (*tokens, enter(store, "p0")):
         walk(store, token, "done")
 
 
 def _let_time_pass(store: Store, person: str, seconds: float = ACTIVE_WITHIN + 1) -> None:
-    """Make a session inactive, as if its last request were long ago."""
+    """Make a session inactive, as if its last request and answer were long ago."""
     own = SESSIONS.c.participant == participant_hash(store.secrets, "link", person)
     with store.engine.begin() as connection:
-        earlier = SESSIONS.c.last_seen - seconds
-        connection.execute(update(SESSIONS).where(own).values(last_seen=earlier))
+        names = ("last_seen", "progressed_at")
+        earlier = {name: SESSIONS.c[name] - seconds for name in names}
+        connection.execute(update(SESSIONS).where(own).values(earlier))
 
 
 def test_previews_and_simulations_do_not_count_as_participants(
@@ -178,7 +180,7 @@ def test_previews_and_simulations_do_not_count_as_participants(
         for number in range(4):
             token = enter(store, f"p{number}", scenario="drop", **{"pass": word})
             assert run(store.state(token)).kind == kind
-    assert [run(store.enter(Enter(id=f"p{i}", scenario="drop"))).state.kind for i in range(3)] == [
+    assert [run(store.enter(request(f"p{i}", scenario="drop"))).state.kind for i in range(3)] == [
         "person"
     ] * 3
     kinds = Counter(row.kind for row in rows(store, SESSIONS))
@@ -265,7 +267,7 @@ def test_a_visit_key_gives_the_same_session_again(
     enter(store, WORD)
     found = rows(store, SESSIONS)
     assert len(found) == 6 == len({row.participant for row in found})
-    assert enter(store, "Ada") and len(rows(store, SESSIONS)) == 6
+    assert enter(store, "Ada", visit=WORD) and len(rows(store, SESSIONS)) == 6
     # The key is not stored and is not an id.
     assert {row.raw_id for row in rows(store, RAW_IDS)} == {"Ada", WORD}
     for table in (SESSIONS, TOKENS, EVENTS, PARTICIPANTS):
@@ -303,7 +305,7 @@ def test_a_removed_language_locks_nobody_out(
         run(store.state(token, True)),
         give(store, token, 0).state,
         page(store, token, "ready"),
-        run(store.enter(Enter(id="Ada"))).state,
+        run(store.enter(request("Ada"))).state,
         refusal(store.answer(token, answer(3))).state,
     ]
     assert [state.language for state in states if state is not None] == ["en"] * 6
@@ -352,7 +354,7 @@ def test_prepared_orders_are_used_evenly(
 def test_buttons_stay_with_the_participant(store: Store) -> None:
     for person in ("a", "b", "c"):
         buttons = {
-            run(store.enter(Enter(id=person, scenario=scenario))).state.buttons
+            run(store.enter(request(person, scenario=scenario))).state.buttons
             for scenario in ("collide", "drop")
         }
         assert len(buttons) == 1
@@ -360,7 +362,7 @@ def test_buttons_stay_with_the_participant(store: Store) -> None:
 
 def test_concurrent_visitors_get_one_session_each(store: Store) -> None:
     async def all_at_once() -> list[Any]:
-        visits = [Enter(id=f"p{number % 3}", scenario="drop") for number in range(30)]
+        visits = [request(f"p{number % 3}", scenario="drop") for number in range(30)]
         return await asyncio.gather(*(store.enter(visit) for visit in visits))
 
     entered = run(all_at_once())
@@ -500,7 +502,7 @@ def test_hostile_texts_are_stored_as_texts(store: Store) -> None:
     assert session.device["user_agent"] == clean
     assert raw.raw_id == clean and raw.recruiter == {clean: clean}
     assert stored.data == {clean: clean}
-    assert run(store.enter(Enter(id="other"))).state.stage == "consent"
+    assert run(store.enter(request("other"))).state.stage == "consent"
 
 
 def test_trials_come_after_the_consent_in_the_sessions_order(store: Store) -> None:

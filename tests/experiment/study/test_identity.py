@@ -180,12 +180,12 @@ def test_no_full_movie_of_a_test_trial(small_study: Study) -> None:
 def test_other_addresses_lead_nowhere(small_study: Study) -> None:
     good = sign_media(small_study, KEYS, "drop", 77, "test", 0, "movie")
     practice = sign_media(small_study, KEYS, "drop", 77, "familiarization", 0, "movie")
-    *_, hidden, signature = good.split("-")
+    *_, hidden, tag, signature = good.split("-")
     bad = [
         good.replace("t-0-", "t-1-"), good.replace("t-0-", "t-00-"), good.replace("t-0-", "f-0-"),
         good.replace("movie", "map"), good.replace("movie", "full"),
         good.replace(hidden, f"{int(hidden, 16) ^ 1:016x}"), good.replace(hidden, "0" * 16),
-        good.replace(signature, f"{int(signature, 16) ^ 1:032x}"),
+        good.replace(tag, "f" * 16), good.replace(signature, f"{int(signature, 16) ^ 1:032x}"),
         practice.replace("movie", "full"), good + "0", good[:-1], good.upper(), good + "\n",
         good.replace("/media/", "/media/../"), "/media/../secret.json", "", "/media/", "\ud800",
         good.replace("t-0-", "t-٠-"), "/media/media/00000.mp4",
@@ -222,7 +222,7 @@ def test_addresses_tell_nothing_of_the_seed(small_study: Study) -> None:
         for trial in range(4):
             for kind in ("movie", "map"):
                 path = sign_media(small_study, KEYS, "drop", seed, "test", trial, kind)
-                place, trial_shown, kind_shown, word, _ = path[7:].split("-")
+                place, trial_shown, kind_shown, word, *_ = path[7:].split("-")
                 assert (place, trial_shown, kind_shown) == ("t", str(trial), kind)
                 hidden[seed, trial, kind] = int(word, 16)
     words = list(hidden.values())

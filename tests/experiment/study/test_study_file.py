@@ -17,6 +17,7 @@ from physion.experiment.study.study import (
     Bonus,
     EarlyEnd,
     Limits,
+    Plausibility,
     Recruitment,
     Screen,
     Study,
@@ -70,10 +71,24 @@ STUDIES = st.builds(
         flash_hz=st.floats(0, 3),
         break_every=st.integers(0, 100_000),
     ),
+    plausibility=st.builds(
+        Plausibility,
+        server_checks=st.booleans(),
+        fast_ms=st.integers(0, 10_000),
+        fast_answers=st.integers(1, 100_000),
+        reading_s=st.floats(0, 3600),
+        max_showings=st.integers(1, 50),
+        interrupted=st.sampled_from(["repeat", "void"]),
+        simulated_speed=st.floats(1, 1e6),
+    ),
     screen=st.builds(Screen, st.integers(320, 10_000), st.integers(320, 10_000), st.booleans()),
     recruitment=st.builds(
         Recruitment,
         id_needed=st.booleans(),
+        prolific_id=st.sampled_from(["", r"[0-9a-f]{24}", r'a\d"b']),
+        allow_list=st.sampled_from(["", "ids.txt"]),
+        signed_links=st.sampled_from(["no", "study", "person"]),
+        hold_minutes=st.integers(1, 100_000),
         prolific_code=CODES,
         sona_address=ADDRESSES,
         mturk_code=CODES.filter(bool),
@@ -106,7 +121,8 @@ def test_every_setting_is_written_with_its_comment(tmp_path: Path) -> None:
         assert key.name in (tables[key.table] if key.table else tables)
         assert all(f"# {line}" in text for line in key.about.splitlines())
     # Each field of the types is a key, so that none can be forgotten.
-    others = {"folder", "stimuli", "texts", "consent_files", "digest", "stimuli_digest", *TABLES}
+    others = {"folder", "stimuli", "allowed_ids", "texts", "consent_files", "digest",
+              "stimuli_digest", *TABLES}  # fmt: skip
     assert {key.name for key in KEYS if not key.table} == {
         field.name for field in dataclasses.fields(Study)
     } - others
@@ -144,6 +160,11 @@ REFUSED: dict[str, tuple[str, Any, str]] = {
         "recruitment.sona_address", "https://s.org/?experiment_id=1", "credit_token"),
     "an address that is a script": ("recruitment.link_address", "javascript:alert(1)", "https://"),
     "an address that is no address": ("recruitment.link_address", "https://[", "https://"),
+    "a pattern that is none": ("recruitment.prolific_id", "[0-9", "a regular expression"),
+    "a list outside the folder": ("recruitment.allow_list", "../ids", "in the study folder"),
+    "another way to sign": ("recruitment.signed_links", "yes", "no or study or person"),
+    "an unknown treatment": ("plausibility.interrupted", "skip", "repeat or void"),
+    "slow motion": ("plausibility.simulated_speed", 0.5, "from 1"),
     "no code for MTurk": ("recruitment.mturk_code", "", "session"),
     "a tiny window": ("screen.min_width", 10, "from 320"),
     "no requests": ("limits.requests_per_second", 0, "from 0.1"),

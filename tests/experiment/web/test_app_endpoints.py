@@ -14,6 +14,7 @@ from sqlalchemy.exc import OperationalError
 
 from physion.experiment.protocol import messages as wire
 from physion.experiment.store.tables import ANSWERS, RAW_IDS, SESSIONS
+from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.study import Recruitment
 from support.experiment.app_walk import Person, Served, answer_body, served
 
@@ -23,6 +24,7 @@ WITH_TOKEN = [
     ("GET", "/api/session", None),
     ("GET", "/api/trials/test", None),
     ("POST", "/api/page", {"page": "consent", "data": {"agreed": True}}),
+    ("POST", "/api/showings", {"key": "a-showing-1", "phase": "test", "trial": 0}),
     ("POST", "/api/answers", answer_body(0)),
     ("POST", "/api/events", {"events": []}),
     ("GET", "/api/result", None),
@@ -182,13 +184,21 @@ class TestSession:
         assert refusal["error"] == "out_of_order"
         assert refusal["state"]["trial"] == 1
 
-    def test_a_second_browser_continues(self, site: Served) -> None:
-        first = site.person(source="sona", id="1234", scenario="drop").walk("test")
+    def test_a_second_browser_continues_by_a_signed_link_only(self, site: Served) -> None:
+        who = {"source": "sona", "id": "1234", "scenario": "drop"}
+        first = site.person(**who).walk("test")
         first.answer(0)
-        second = site.person(source="sona", id="1234", scenario="drop")
+        refused = Person(site.client).ask("POST", "/api/enter", who, 403)
+        assert refused["error"] == "other_browser" and refused["state"] is None
+        other = make_pass(site.secrets, "person", "sona", "1235")
+        Person(site.client).ask("POST", "/api/enter", {**who, "pass": other}, 403)
+        own = make_pass(site.secrets, "person", "sona", "1234")
+        second = site.person(**who, visit="another-browser-0001", **{"pass": own})
         assert second.last["state"]["trial"] == 1
         assert second.token != first.token
         assert second.answer(1)["state"]["trial"] == first.state()["trial"] == 2
+        # The first browser, which has a token, need not have kept its key.
+        assert first.ask("POST", "/api/enter", who)["state"]["trial"] == 2
 
     def test_a_token_opens_only_its_session(self, site: Served) -> None:
         one, two = site.person().walk("test"), site.person().walk("test")

@@ -18,7 +18,7 @@ from sqlalchemy import select
 
 from physion.experiment.store.tables import SESSIONS
 from physion.experiment.study.identity import sign
-from physion.experiment.study.media_links import sign_media
+from physion.experiment.study.media_links import NO_TAG, sign_media
 from physion.experiment.study.orders import trial_order
 from physion.experiment.study.stimuli import Stimulus
 from physion.experiment.web.page_files import MEDIA_TYPES, PACKAGE
@@ -27,7 +27,9 @@ from support.experiment.tiny_study import FULL, OBSERVED, read_number
 
 TRIALS = {"familiarization": 3, "test": 6}
 PHASES = ("familiarization", "test")
-ADDRESS = re.compile(r"/media/([tf]-\d+-(?:movie|map))-([0-9a-f]{16})-([0-9a-f]{32})")
+ADDRESS = re.compile(
+    r"/media/([tf]-\d+-(?:movie|map))-([0-9a-f]{16})-([0-9a-f]{16})-([0-9a-f]{32})"
+)
 TELLING = {"contact", "correct", "accuracy", "percentile", "label", "outcome", "score", "stimulus",
            "full", "place", "answer", "feedback"}  # fmt: skip
 """Names in messages under which an end could be told."""
@@ -164,7 +166,7 @@ def test_trial_lists_do_not_depend_on_outcomes(site: Served) -> None:
     assert without == [without[0]] * len(without)
     found = [ADDRESS.fullmatch(one[kind]) for one in listed for kind in ("movie", "map")]
     assert all(found)
-    assert len({match[3] for match in found if match}) == len(found)
+    assert len({match[4] for match in found if match}) == len(found)
 
 
 def test_nothing_reveals_the_seed_of_the_order(site: Served) -> None:
@@ -186,8 +188,8 @@ def test_nothing_reveals_the_seed_of_the_order(site: Served) -> None:
         assert written not in said
     numbers_said = {int(word) for word in re.findall(r"\d+", said)}
     numbers_said |= {int(word, 16) for word in re.findall(r"[0-9a-f]+", said)}
-    numbers_said |= {int(word[2], 16) ^ int(word[3][at : at + 16], 16)
-                     for word in ADDRESS.finditer(said) for at in (0, 16)}  # fmt: skip
+    numbers_said |= {int(word[2], 16) ^ int((word[3] + word[4])[at : at + 16], 16)
+                     for word in ADDRESS.finditer(said) for at in (0, 16, 32)}  # fmt: skip
     assert seed not in numbers_said and len(numbers_said) > 50
     assert all(name not in said for name in order)
 
@@ -224,13 +226,15 @@ class TestWholeMovies:
 
     def test_nor_by_any_other_change(self, site: Served, listed: dict[str, list[Any]]) -> None:
         path: str = listed["test"][0]["movie"]
-        letter, trial, kind, hidden, mac = path.removeprefix("/media/").split("-")
+        letter, trial, kind, seed, tag, mac = path.removeprefix("/media/").split("-")
+        hidden, others = f"{seed}-{tag}", f"{int(seed, 16) ^ 1:016x}-{tag}"
         other = "0" if mac[0] != "0" else "1"
         start, own = f"{letter}-{trial}-{kind}", f"-{hidden}-{mac}"
         changed = [
             f"f-{trial}-full{own}", f"f-{trial}-{kind}{own}", f"{letter}-1-{kind}{own}",
             f"{letter}-0{trial}-{kind}{own}", f"{letter}-٠-{kind}{own}", f"{start}-",
-            f"{start}-{int(hidden, 16) ^ 1:016x}-{mac}", f"{start}-{hidden}-{other}{mac[1:]}",
+            f"{start}-{others}-{mac}", f"{start}-{seed}-{'f' * 16}-{mac}",
+            f"{start}-{hidden}-{other}{mac[1:]}",
             f"{start}-{mac[:16]}-{mac}", f"{start}-{mac}", f"{start}-{hidden}-{mac.upper()}",
             f"{start}{own}%0a", f"{start}{own}/", f"{start}{own}.mp4",
         ]  # fmt: skip
@@ -239,10 +243,10 @@ class TestWholeMovies:
             assert answer.status_code == 404, name
 
     def test_a_test_trial_has_none_even_with_the_key(self, site: Served) -> None:
-        words = ("media", site.study.stimuli_digest, "collide", "1", "t-0-full")
+        words = ("media", site.study.stimuli_digest, "collide", "1", "t-0-full", NO_TAG)
         signature = sign(site.secrets, *words)
         pad = int(sign(site.secrets, "hidden seed", signature)[:16], 16)
-        path = f"/media/t-0-full-{1 ^ pad:016x}-{signature}"
+        path = f"/media/t-0-full-{1 ^ pad:016x}-{NO_TAG}-{signature}"
         assert site.client.get(path).status_code == 404
         with pytest.raises(ValueError, match="test trial"):
             sign_media(site.study, site.secrets, "collide", 1, "test", 0, "full")

@@ -15,6 +15,7 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 from physion.cli.main import main
 from physion.errors import BadInputError
+from physion.experiment.protocol.messages import Enter
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.recruitment import (
     MTURK_HOSTS,
@@ -109,14 +110,29 @@ class TestLinks:
 
 class TestPasses:
     def test_a_key_is_valid_only_for_its_kind(self, secrets: Secrets) -> None:
+        def key_of(word: str) -> str | None:
+            return read_pass(secrets, Enter.model_validate({"pass": word}))
+
         for kind in ("preview", "simulated"):
-            word = make_pass(secrets, kind)  # type: ignore[arg-type]
-            assert read_pass(secrets, word) == kind
+            assert key_of(make_pass(secrets, kind)) == kind
         signature = make_pass(secrets, "preview").partition("-")[2]
         others = (f"simulated-{signature}", f"person-{signature}", signature, "é-é")
         longer = (f"preview-{signature}0", f"preview-{signature[:-1]}")
         for word in ("", "preview", "preview-", *others, *longer):
-            assert read_pass(secrets, word) is None, word
+            assert key_of(word) is None, word
+
+    def test_a_key_for_people_is_valid_for_its_recruiter_and_id(self, secrets: Secrets) -> None:
+        def key_of(word: str, source: Any = "sona", raw_id: str | None = "17") -> str | None:
+            asked = {"pass": word, "source": source, "id": raw_id}
+            return read_pass(secrets, Enter.model_validate(asked))
+
+        study = make_pass(secrets, "study", "sona")
+        person = make_pass(secrets, "person", "sona", "17")
+        assert (key_of(study), key_of(person)) == ("study", "person")
+        assert key_of(study, raw_id="18") == "study"
+        assert key_of(study, "prolific") is None is key_of(person, "prolific")
+        assert key_of(person, raw_id="18") is None is key_of(person, raw_id=None)
+        assert key_of(person.replace("person", "study")) is None
 
     def test_links_open_sessions_of_their_kinds(self, tmp_path: Path) -> None:
         with served(tmp_path / "s", familiarization=1, test=1) as site:

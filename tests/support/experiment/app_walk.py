@@ -14,7 +14,7 @@ from physion.experiment.app import build_app
 from physion.experiment.store.store import Store
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.study import Limits, Study
-from support.experiment.store_walk import PAGES, STAGES
+from support.experiment.store_walk import PAGES, STAGES, visit_of
 from support.experiment.tiny_study import make_tiny_study
 
 FAST = Limits(
@@ -32,9 +32,10 @@ class Served:
     client: TestClient
 
     def person(self, **enter: Any) -> Person:
-        """Return a person who has entered."""
+        """Return a person who has entered; one with an id always has the same browser."""
         person = Person(self.client)
-        person.ask("POST", "/api/enter", enter)
+        visit = {"visit": visit_of(enter["id"])} if "id" in enter else {}
+        person.ask("POST", "/api/enter", visit | enter)
         person.token = person.last["token"]
         return person
 

@@ -22,7 +22,7 @@ from physion.experiment.simulated.server_process import ServerProcess
 from physion.experiment.store.database import open_database, sqlite_url
 from physion.experiment.store.tables import ANSWERS, EVENTS, SESSIONS
 from physion.experiment.study.identity import Secrets, participant_hash
-from physion.experiment.study.study import Recruitment, Study, Timing
+from physion.experiment.study.study import Plausibility, Recruitment, Study, Timing
 from support.experiment.tiny_study import make_tiny_study
 from support.programs import absent, find_chromium
 
@@ -53,6 +53,7 @@ def served(folder: Path, **settings: Any) -> Iterator[tuple[Study, ServerProcess
         "test": 3,
         "familiarization": 2,
         "timing": SHORT,
+        "plausibility": Plausibility(reading_s=0.0),
         "recruitment": Recruitment(link_code="TINY-CODE", link_address="https://lab.example/done"),
     }
     study = make_tiny_study(folder, **{**given, **settings})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 from collections.abc import Coroutine, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
@@ -38,8 +39,19 @@ def answer(trial: int, phase: Any = "test", key: str | None = None, **more: Any)
     return Answer(key=key or f"{phase}-{trial:04d}", phase=phase, trial=trial, **values)
 
 
+def visit_of(person: str) -> str:
+    """Return the key of the one browser of a person."""
+    return hashlib.sha256(person.encode("utf-8", "replace")).hexdigest()
+
+
+def request(person: str | None = None, **more: Any) -> Enter:
+    """Return the request of a person, always from the same browser, to enter."""
+    visit = {} if person is None else {"visit": visit_of(person)}
+    return Enter(id=person, **{**visit, **more})
+
+
 def enter(store: Store, person: str | None = None, **more: Any) -> str:
-    return run(store.enter(Enter(id=person, **more))).token
+    return run(store.enter(request(person, **more))).token
 
 
 def give(store: Store, token: str, trial: int, phase: Any = "test", **more: Any) -> AnswerStored:

@@ -23,10 +23,12 @@ from PIL import Image
 
 from physion.experiment.study.identity import SECRET_FILE, Secrets
 from physion.experiment.study.stimuli import STIMULI_FILE, Stimulus, write_stimuli
-from physion.experiment.study.study import Study, load_study, write_settings
+from physion.experiment.study.study import Plausibility, Study, load_study, write_settings
 from physion.experiment.study.texts import TEXTS_FOLDER, shipped_file
 from physion.trials.video import encode_movie
 
+UNCHECKED = Plausibility(server_checks=False, simulated_speed=1_000_000)
+"""Lets tests answer without showing a movie, and simulated participants without waiting."""
 OBSERVED, FULL, RATE, BLOCKS = 45, 60, 30, 6
 PASSWORD = "tiny password"
 
@@ -39,6 +41,8 @@ def make_tiny_study(
     scenarios: tuple[str, ...] = ("collide",),
     size: int = 128,
     password: str = PASSWORD,
+    plausibility: Plausibility = UNCHECKED,
+    prolific_id: str = "",
     **settings: Any,
 ) -> Study:
     """Write and load a study with alternating labels (the first trial has contact).
@@ -55,6 +59,10 @@ def make_tiny_study(
         Width and height of the movies in pixels.
     password
         The experimenter's password.
+    plausibility
+        Rules of plausible sessions; by default answers may come at any time and without media.
+    prolific_id
+        Pattern of Prolific's ids; by default any id is allowed.
     settings
         Fields of `Study` (``participants=3``, ``timing=Timing(cue_ms=100)``, ...).
     """
@@ -74,7 +82,8 @@ def make_tiny_study(
         contact="Ada Lab, ada@example.org",
         scenarios=scenarios,
     )
-    study = replace(study, **settings)
+    study = replace(study, plausibility=plausibility, **settings)
+    study = replace(study, recruitment=replace(study.recruitment, prolific_id=prolific_id))
     (folder / TEXTS_FOLDER).mkdir(exist_ok=True)
     for language in study.languages:
         (folder / TEXTS_FOLDER / f"{language}.toml").write_bytes(shipped_file(language))

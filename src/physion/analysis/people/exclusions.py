@@ -32,9 +32,13 @@ RULES = (
     "slow",
     "incomplete",
     "repeated",
+    "implausible",
+    "replayed",
 )
 """The rules, each a column of the table of flags. ``incomplete`` sessions lack answers;
-``repeated`` ones are a participant's second and later sessions in a scenario."""
+``repeated`` ones are a participant's second and later sessions in a scenario. The last two are not
+of the preregistration; the experiment's server finds them: sessions that no person can have made,
+and sessions with trials that were shown more often than the study allows."""
 
 
 MOST_EXCLUDED = 1 / 3
@@ -165,6 +169,19 @@ def flag_repeated(measures: pd.DataFrame) -> pd.Series:
     return ordered.duplicated(["participant", "scenario"]).reindex(measures.index)
 
 
+def flag_from_server(responses: Responses, measures: pd.DataFrame, column: str) -> pd.Series:
+    """Flag what the experiment's server found: a reason or a number above 0 in a column.
+
+    Sessions without the column, such as those of the original study, are not flagged.
+    """
+    if column not in responses.sessions:
+        return pd.Series(False, index=measures.index)
+    values = responses.sessions.set_index("session")[column]
+    numeric = pd.api.types.is_numeric_dtype(values)
+    found = values.fillna(0) > 0 if numeric else values.fillna("") != ""
+    return measures["session"].map(found.astype(bool)).fillna(False).astype(bool)
+
+
 def _reference(measures: pd.DataFrame, column: str, centre: str, ddof: int) -> pd.DataFrame:
     """Return centre and standard deviation of the complete sessions of each session's scenario."""
     complete = measures[~flag_incomplete(measures)]
@@ -201,6 +218,8 @@ def flag_sessions(
         "slow": flag_slow(measures, rules),
         "incomplete": flag_incomplete(measures),
         "repeated": flag_repeated(measures),
+        "implausible": flag_from_server(responses, measures, "implausible"),
+        "replayed": flag_from_server(responses, measures, "replayed"),
     }
     table = measures.assign(**{name: flag.astype(bool) for name, flag in flags.items()})
     return table.assign(flagged=table[list(RULES)].any(axis=1))

@@ -35,6 +35,7 @@ REHEARSAL = "Rehearsal: participants are simulated, so no number here is about p
 """Mark of every result that simulated participants are in."""
 EXCLUDED = "on the list of stimuli to leave out"
 LEDGE = "Roll stimulus with a ledge"
+VOID = "the movie was interrupted"
 NO_TIME = "no response time above 0: the answer counts, its time does not"
 
 DROPPED_COLUMNS = ("step", "scenario", "reason", "sessions", "rows")
@@ -75,6 +76,15 @@ class Responses:
         is_dropped = ~self.trials["session"].isin(sessions)
         kept = self.sessions[self.sessions["session"].isin(sessions)].reset_index(drop=True)
         return replace(_without(self, is_dropped, "sessions", reason), sessions=kept)
+
+    def drop_void(self) -> Responses:
+        """Return the responses without answers to trials whose movie was interrupted.
+
+        Flag sessions first: they have answered these trials.
+        """
+        if "void" not in self.trials:
+            return self
+        return _without(self, self.trials["void"].fillna("") != "", "trials", VOID)
 
     def drop_stimuli(self, exclude: Iterable[str] = (), ledge: bool = True) -> Responses:
         """Return the responses without the stimuli of a list and, as in the study, without Roll's

@@ -101,6 +101,16 @@ TRIAL_COLUMNS: tuple[Column, ...] = (
         high=DAY_MS,
     ),
     Column("resumed", "flag", "The page was loaded anew while this trial was the next one"),
+    Column(
+        "showings", "integer", "How often the movie was shown, over all loads of the page", low=0
+    ),
+    Column(
+        "void",
+        "choice",
+        "What interrupted the movie, so that the answer does not count: the "
+        "page was hidden, a dialog open, or the window too small; empty: nothing",
+        choices=("hidden", "dialog", "window"),
+    ),
     Column("answered_at", "time", "When the server stored the answer"),
 )
 """One row a participant and trial."""
@@ -123,6 +133,9 @@ SESSION_COLUMNS: tuple[Column, ...] = (
     Column("order_number", "integer", "Prepared order of trials, from 1; 0: an order of its own",
            low=0),
     Column("loads", "integer", "How often the page was loaded; more than 1: it was resumed", low=0),
+    Column("replayed", "integer", "Trials shown more often than the study allows", low=0),
+    Column("implausible", "text", "Why no person can have made the session, as the server judged: "
+           "fast answers, no media, short; empty: nothing is wrong"),
     Column("age", "integer", "Age", unit="years", low=0, high=130),
     Column("gender", "text", "Gender, in the words of the questionnaire"),
     Column("education", "text", "Highest education, in the words of the questionnaire"),

@@ -193,7 +193,8 @@ def analyse_people(
     check_expected(responses, expected)
     flags = flag_sessions(responses, rules, expected=expected)
     check_excluded(flags, accept_rules)
-    shown = drop_unexpected(responses, expected).drop_stimuli(exclude, exclude_ledge)
+    shown = drop_unexpected(responses, expected).drop_void()
+    shown = shown.drop_stimuli(exclude, exclude_ledge)
     kept, whole = _sets(shown, flags)
     tables = {"flags": flags, "flag_counts": count_flags(flags)}
     tables["flag_effects"] = _flag_effects(shown, flags)

@@ -2,9 +2,10 @@
 
 Their sessions are permanently marked as simulated and never counted with people. They answer
 correctly with a probability that depends on person and stimulus; for this they read the outcomes in
-the study folder, which the server never sends. The same --seed gives the same participants: those
-who have finished are left as they are, those who dropped out continue (to the end with --dropouts
-0). The exit status is 1 if any participant was refused or failed.
+the study folder, which the server never sends. They take as long as people, unless simulated_speed
+in study.toml lets them be faster. The same --seed gives the same participants: those who have
+finished are left as they are, those who dropped out continue (to the end with --dropouts 0). The
+exit status is 1 if any participant was refused or failed.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ class Options:
     database: str | None = None
     """URL of a PostgreSQL database for the server that is started."""
     pace: float = 0.0
-    """Seconds before each answer; people take about 6."""
+    """Further seconds before each answer."""
     seed: int = 0
     """Seed of the participants."""
     dropouts: float = 0.1
@@ -63,6 +64,7 @@ def main(options: Options) -> int:
     _check(options)
     study = load_study(options.study)
     secrets = Secrets.load(options.study)
+    _tell_duration(study, options)
     with _server(options) as url, _progress(options) as visited:
         plan = SimulationPlan(
             url=url,
@@ -76,6 +78,21 @@ def main(options: Options) -> int:
         visits = asyncio.run(simulate(study, secrets, plan, visited))
     _print(summary(study, plan, visits), options.json)
     return 1 if any(visit.outcome in ("refused", "failed") for visit in visits) else 0
+
+
+def _tell_duration(study: Study, options: Options) -> None:
+    """Print how long a participant takes, if that is more than a minute."""
+    from physion.cli.output import console
+    from physion.experiment.simulated.participants import minutes_each
+
+    minutes = max(minutes_each(study, scenario) for scenario in study.scenarios)
+    if minutes > 1 and not options.json:
+        console.print(
+            f"each participant takes about {minutes:.0f} minutes, as people do; simulated_speed in "
+            f"{options.study / 'study.toml'} makes them faster",
+            markup=False,
+            soft_wrap=True,
+        )
 
 
 def summary(study: Study, plan: SimulationPlan, visits: list[Visit]) -> dict[str, Any]:

@@ -35,6 +35,8 @@ class ScenarioProgress:
         Number of complete sessions wanted.
     states
         Number of sessions in each of `STATES`.
+    counted
+        Number of finished sessions that count towards ``wanted``: the plausible ones.
     flagged
         Number of flagged finished sessions; None while unknown.
     done_at
@@ -44,13 +46,14 @@ class ScenarioProgress:
     scenario: str
     wanted: int
     states: Mapping[str, int]
+    counted: int
     flagged: int | None
     done_at: float | None
 
     @property
     def percent(self) -> float:
-        """Finished sessions in percent of the wanted ones, at most 100."""
-        return min(100.0, 100.0 * self.states["finished"] / self.wanted) if self.wanted else 0.0
+        """Counted sessions in percent of the wanted ones, at most 100."""
+        return min(100.0, 100.0 * self.counted / self.wanted) if self.wanted else 0.0
 
 
 @dataclass(frozen=True)
@@ -169,10 +172,10 @@ def _progress(
     """Return the row of the progress table for one scenario."""
     states = Counter(summary.state for summary in part)
     counts = {state: states[state] for state in STATES}
-    finished = [float(s.facts["finished_at"]) for s in part if s.state == "finished"]
-    return ScenarioProgress(
-        name, wanted, counts, _flagged(part, flags), expected_end(finished, wanted, now)
-    )
+    counted = [s for s in part if s.state == "finished" and s.facts["implausible"] is None]
+    finished = [float(s.facts["finished_at"]) for s in counted]
+    end = expected_end(finished, wanted, now)
+    return ScenarioProgress(name, wanted, counts, len(counted), _flagged(part, flags), end)
 
 
 def _total(
@@ -180,12 +183,17 @@ def _total(
 ) -> ScenarioProgress:
     """Return the total row; its completion time is the latest one, if all can be estimated."""
     counts = {state: sum(row.states[state] for row in rows) for state in STATES}
-    open_rows = [row for row in rows if row.states["finished"] < row.wanted]
+    open_rows = [row for row in rows if row.counted < row.wanted]
     ends = [row.done_at for row in open_rows]
     known = [end for end in ends if end is not None]
     done_at = max(known) if known and len(known) == len(ends) else None
     return ScenarioProgress(
-        "All", sum(r.wanted for r in rows), counts, _flagged(part, flags), done_at
+        "All",
+        sum(row.wanted for row in rows),
+        counts,
+        sum(row.counted for row in rows),
+        _flagged(part, flags),
+        done_at,
     )
 
 

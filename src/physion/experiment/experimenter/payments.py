@@ -15,12 +15,15 @@ from physion.experiment.study.study import Study
 PAGE = 100
 """Rows per page."""
 _SESSION = ("source", "session", "reference", "scenario", "finished_at", "withdrawn_at",
-            "answered_test")  # fmt: skip
+            "answered_test", "implausible")  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Payment:
-    """Session of a person with the raw id; ``recruiter``: further parameters of the entry URL."""
+    """Session of a person with the raw id; ``recruiter``: further parameters of the entry URL.
+
+    ``implausible``: why no person can have made it; its ``code`` was not shown to the participant.
+    """
 
     source: str
     raw_id: str
@@ -30,6 +33,7 @@ class Payment:
     finished_at: float | None
     withdrawn_at: float | None
     trials: int
+    implausible: str | None
     code: str | None
     recruiter: Mapping[str, str]
 
@@ -47,7 +51,7 @@ class Payments:
     page, pages
         This page, and number of pages.
     ids
-        Unique raw ids of all selected sessions, in order.
+        Unique raw ids of all selected sessions that are plausible, in order.
     sources
         Recruiters of the stored ids.
     stored
@@ -90,11 +94,13 @@ def read_payments(
         chosen.append(session.finished_at.is_not(None))
     order = (session.finished_at.is_(None), session.finished_at.desc(), session.started_at.desc())
     joined = RAW_IDS.join(SESSIONS, session.participant == ids.participant)
-    names = select(ids.raw_id).select_from(joined).where(*chosen).order_by(*order)
+    names = (
+        select(ids.raw_id, session.implausible).select_from(joined).where(*chosen).order_by(*order)
+    )
     columns = [session[name] for name in _SESSION]
     lines = select(*columns, ids.raw_id, ids.recruiter).select_from(joined).where(*chosen)
     with engine.connect() as connection:
-        all_names = connection.execute(names).scalars().all()
+        all_names = connection.execute(names).all()
         size = PAGE if page is not None else max(1, len(all_names))
         pages = max(1, -(-len(all_names) // size))
         page = min(max(1, page or 1), pages)
@@ -105,11 +111,13 @@ def read_payments(
     shown = tuple(
         Payment(
             row.source, row.raw_id, row.session, row.reference, row.scenario, row.finished_at,
-            row.withdrawn_at, row.answered_test, _code(study, secrets, row), row.recruiter,
+            row.withdrawn_at, row.answered_test, row.implausible,
+            _code(study, secrets, row), row.recruiter,
         )
         for row in rows
     )  # fmt: skip
-    ids_once = tuple(dict.fromkeys(all_names))
+    plausible = [name for name, implausible in all_names if implausible is None]
+    ids_once = tuple(dict.fromkeys(plausible))
     return Payments(shown, len(all_names), page, pages, ids_once, tuple(sorted(sources)), stored)
 
 

@@ -35,6 +35,8 @@ class AnswerLine:
     frames_dropped: int | None
     hidden: int | None
     resumed: bool
+    showings: int | None
+    void: str | None
     answered_at: float
 
     @property
@@ -129,7 +131,7 @@ def _answers(
         AnswerLine(
             row.phase, row.trial, row.stimulus, row.response, labels.get((scenario, row.stimulus)),
             row.rt_ms, row.input, row.frames_shown, row.frames_expected, row.frames_dropped,
-            row.visibility_changes, row.resumed, row.answered_at,
+            row.visibility_changes, row.resumed, row.showings, row.void, row.answered_at,
         )
         for row in rows
     )  # fmt: skip

@@ -51,6 +51,7 @@ class TrialBatch:
 
 _INPUTS = ("mouse", "touch", "keyboard")
 _RESPONSES = ("no", "yes")
+_VOID = ("hidden", "dialog", "window")
 _ABSENT = -1.0
 """Value of empty cells while numbers are fetched; real values are never negative."""
 
@@ -83,10 +84,12 @@ _NUMBERS: dict[str, Any] = {
     "window_height": _or_absent(ANSWERS.c.window_height),
     "break_ms": _or_absent(ANSWERS.c.break_ms),
     "resumed": cast(ANSWERS.c.resumed, Integer),
+    "showings": _or_absent(ANSWERS.c.showings),
+    "void": _index(ANSWERS.c.void, _VOID),
     "answered_at": ANSWERS.c.answered_at,
 }
 """Columns of an answer that are fetched as numbers, several times faster than as text."""
-_CHOICES = {"phase": PHASES, "response": _RESPONSES, "input": _INPUTS}
+_CHOICES = {"phase": PHASES, "response": _RESPONSES, "input": _INPUTS, "void": _VOID}
 
 
 def read_trials(

@@ -17,6 +17,7 @@ request                       body, answer               meaning
                                                          and outcomes
 ``GET /media/...``            bytes                      signed paths of `TrialMedia`, no token
 ``POST /api/page``            `PageDone`, `SessionState` submit a page between the trials
+``POST /api/showings``        `Showing`, `Shown`         announce that the next trial begins
 ``POST /api/answers``         `Answer`, `AnswerStored`   store an answer; acknowledged after commit
 ``POST /api/events``          `Events`, `Stored`         store other events in the browser
 ``GET /api/result``           `Result`                   accuracy, percentile and completion of a
@@ -63,12 +64,16 @@ REFUSALS = {
     "unknown_token": 401,
     "bad_link": 403,
     "id_needed": 403,
+    "id_refused": 403,
+    "other_browser": 403,
     "already_took_part": 409,
     "study_full": 409,
     "paused": 409,
     "wrong_stage": 409,
     "out_of_order": 409,
     "already_answered": 409,
+    "not_shown": 409,
+    "too_early": 425,
     "not_yet": 403,
     "too_many": 429,
     "not_found": 404,
@@ -76,8 +81,8 @@ REFUSALS = {
     "unavailable": 503,
     "server_error": 500,
 }
-"""Refusal codes and their HTTP status. ``out_of_order``, ``already_answered`` and ``wrong_stage``
-carry the state of the session, with which the client continues."""
+"""Refusal codes and their HTTP status. ``out_of_order``, ``already_answered``, ``not_shown`` and
+``wrong_stage`` carry the state from which to continue, ``too_early`` a header Retry-After."""
 
 MAX_BODY = 64 * 1024
 """Bytes of a request body."""
@@ -120,9 +125,9 @@ class Enter(Message):
         The participant's id at the recruiter.
     visit
         Random key that the page makes once, before its first request, and keeps in the browser's
-        storage. Without an ``id`` it identifies the participant, so that a repeated request gives
-        the same session. It does not replace a required ``id``. Without both, every request is a
-        new participant.
+        storage. An unfinished session is continued only with its key, with one of its tokens, or by
+        a link signed for the ``id``. Without an ``id`` (which it does not replace where one is
+        required) it identifies the participant; without both, every request is a new participant.
     recruiter
         Further URL parameters of the recruiter (study id, visit id, ...), stored only together with
         the raw id.
@@ -131,7 +136,7 @@ class Enter(Message):
     take_back
         Take part after all in a session that was declined or stopped before the first answer.
     pass_
-        Sent as ``pass``: signed key of a preview or pilot link.
+        Sent as ``pass``: signed key of the link (`recruitment.LINK_KEYS`).
     device
         Browser and screen.
     """
@@ -208,11 +213,24 @@ class PageDone(Message):
 class Jump(Message):
     """Page or trial to which a preview goes. ``trial`` counts from 0; ignored for pages."""
 
-    stage: Literal[
-        "consent", "instructions", "familiarization", "ready", "test", "demographics", "feedback",
-        "done",
-    ]  # fmt: skip
+    stage: Literal["consent", "instructions", "familiarization", "ready", "test", "demographics",
+                   "feedback", "done"]  # fmt: skip
     trial: Annotated[int, Field(ge=0, le=100_000)] = 0
+
+
+class Showing(Message):
+    """The next trial begins, ``ago_ms`` before the request is sent; one ``key`` per showing."""
+
+    key: Key
+    phase: Phase
+    trial: Annotated[int, Field(ge=0, le=100_000)]
+    ago_ms: Milliseconds = 0.0
+
+
+class Shown(Message):
+    """How often the trial has been shown over all loads of the page, this time included."""
+
+    showings: int
 
 
 class Answer(Message):
@@ -234,6 +252,7 @@ class Answer(Message):
     window_height: Pixels | None = None
     break_ms: Milliseconds | None = None
     """Duration of the break before this trial; None: there was none."""
+    void: Literal["hidden", "dialog", "window"] | None = None  # what interrupted the movie
     details: Annotated[dict[Name, Any], Field(max_length=30)] = {}
     """Times of cue changes and frames and further measurements; at most 16 KiB as JSON."""
 
@@ -283,12 +302,13 @@ class Stored(Message):
 class Completion(Message):
     """How the participant gets the credit: a completion code, a URL to go to, or both.
 
-    ``post``: form fields to send to the URL by POST (MTurk); None for a plain link.
-    """
+    ``post``: form fields to send to the URL by POST (MTurk); None for a plain link. ``withheld``:
+    neither is shown until the experimenter has looked at the session."""
 
     code: str | None
     url: str | None
     post: dict[str, str] | None = None
+    withheld: bool = False
 
 
 class SessionEnd(Message):
@@ -353,6 +373,7 @@ class PublicStudy(Message):
     """Number of test trials between two breaks; 0: no breaks."""
     preload: int
     """Number of trials whose media are loaded ahead."""
+    interrupted: Literal["repeat", "void"]  # see `Plausibility`
     example: dict[str, TrialMedia]
     """Media of the animated example in the instructions, by scenario."""
     recruiters: list[Recruiter]

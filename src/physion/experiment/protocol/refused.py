@@ -19,6 +19,8 @@ class Refused(PhysionError):
         Current state of the session, for the codes after which a client can continue.
     completion
         How the refused participant reports back to the recruiter, if the study says it.
+    wait_s
+        Seconds after which the same request will be accepted, for ``too_early``.
     """
 
     def __init__(
@@ -27,8 +29,11 @@ class Refused(PhysionError):
         message: str,
         state: SessionState | None = None,
         completion: Completion | None = None,
+        *,
+        wait_s: float = 0.0,
     ) -> None:
         assert code in REFUSALS
         super().__init__(message)
+        self.wait_s = wait_s
         self.code, self.message, self.state = code, message, state
         self.completion = completion

@@ -10,7 +10,7 @@ import httpx2
 from physion.errors import PhysionError
 from physion.experiment.protocol import messages as wire
 
-GO_ON = ("out_of_order", "already_answered", "wrong_stage")
+GO_ON = ("out_of_order", "already_answered", "wrong_stage", "not_shown")
 """Refusals that carry the session's state, with which the participant continues."""
 
 
@@ -66,7 +66,7 @@ class SimulatedBrowser:
             else:
                 if answer.is_success:
                     return answer.content
-                if answer.status_code != 429 and answer.status_code < 500:
+                if answer.status_code not in (425, 429) and answer.status_code < 500:
                     raise RefusedError(_refusal(answer))
                 trouble = f"the server answers {answer.status_code}"
             if time.monotonic() > until:

@@ -3,8 +3,9 @@
 They enter with the signed key of the pilot link, which marks their sessions as simulated for good.
 Each uses a `SimulatedBrowser` to load the pages' data and media, answer every trial (with a key
 that stays the same over retries) and submit the pages. The answers come from `SimulatedPerson`,
-which reads the outcomes from the study folder, never from the server. The only waiting time is
-``pace``; the reported times of cue, movie and frames are the nominal ones.
+which reads the outcomes from the study folder, never from the server. They announce each trial and
+wait for cross, cue, movie, response time and feedback as a browser does; a study may let their time
+pass faster (``plausibility.simulated_speed``). The reported times are the nominal ones.
 """
 
 from __future__ import annotations
@@ -20,11 +21,11 @@ import httpx2
 from physion.errors import PhysionError, UnknownNameError
 from physion.experiment.protocol import messages as wire
 from physion.experiment.simulated.browser import RefusedError, SimulatedBrowser, state_after
-from physion.experiment.simulated.person import SimulatedPerson
+from physion.experiment.simulated.person import TYPICAL_RT_MS, SimulatedPerson
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.media_links import read_media_path
 from physion.experiment.study.recruitment import make_pass
-from physion.experiment.study.stimuli import Stimulus
+from physion.experiment.study.stimuli import PHASES, Stimulus
 from physion.experiment.study.study import Study
 
 DEVICE = wire.Device(
@@ -81,7 +82,7 @@ class SimulationPlan:
     at_once
         Number of participants at the same time.
     pace
-        Seconds before each answer.
+        Further seconds before each answer.
     dropouts
         Fraction of people who close the page before a random test trial.
     media
@@ -174,6 +175,8 @@ class Participation:
         }
         page = {"page": state.stage, "data": filled.get(state.stage, {})}
         done = wire.PageDone.model_validate(page)
+        if state.stage == "consent":
+            await self._live(1000 * self._study.plausibility.reading_s)
         try:
             answer = await self._browser.ask("POST", "/api/page", done)
         except RefusedError as refused:
@@ -197,8 +200,12 @@ class Participation:
         await self._fetch(media.movie, media.map)
         stimulus = self._find_stimulus(phase, media.movie)
         body = build_answer(self._study, media, phase, self._person, stimulus)
-        await asyncio.sleep(self._plan.pace)
+        showing = wire.Showing(key=uuid.uuid4().hex, phase=phase, trial=media.trial)
         try:
+            await self._browser.ask("POST", "/api/showings", showing)
+            await self._live(media.fixation_ms + self._study.timing.cue_ms)
+            await self._live(1000 * media.frames / media.rate + body.rt_ms)
+            await asyncio.sleep(self._plan.pace)
             answer = await self._browser.ask("POST", "/api/answers", body)
         except RefusedError as refused:
             return state_after(refused)
@@ -208,7 +215,12 @@ class Participation:
         )
         if stored.feedback is not None:
             await self._fetch(stored.feedback.movie)
+            await self._live(1000 * stored.feedback.frames / media.rate)
         return stored.state
+
+    async def _live(self, ms: float) -> None:
+        """Let ``ms`` milliseconds of a person's time pass, at the speed that the study allows."""
+        await asyncio.sleep(ms / 1000 / self._study.plausibility.simulated_speed)
 
     def _find_stimulus(self, phase: wire.Phase, movie: str) -> Stimulus:
         """Return the stimulus of a movie path, which only the server's keys can decode."""
@@ -273,6 +285,17 @@ def build_answer(
         window_height=WINDOW[1],
         details={"simulated": True, "frames_ms": frame_times},
     )
+
+
+def minutes_each(study: Study, scenario: str) -> float:
+    """Return about how many minutes a simulated participant takes, without breaks."""
+    cross_ms = sum(study.timing.fixation_ms) / 2
+    seconds = study.plausibility.reading_s
+    for phase in PHASES:
+        for stimulus in study.phase(scenario, phase):
+            trial_ms = cross_ms + study.timing.cue_ms + TYPICAL_RT_MS
+            seconds += trial_ms / 1000 + (stimulus.frames + stimulus.full_frames) / stimulus.rate
+    return seconds / 60 / study.plausibility.simulated_speed
 
 
 async def simulate(

@@ -27,6 +27,8 @@ LOG_RT = 6.6
 """Mean logarithm of the response time in milliseconds when a correct answer is certain."""
 LOG_RT_HARD = 0.4
 """Added to the mean logarithm, times the probability of a wrong answer."""
+TYPICAL_RT_MS = 800.0
+"""Typical response time in milliseconds, for estimates of durations."""
 LOG_RT_SD = (0.2, 0.35)
 """Standard deviations over people, and over the trials of one person."""
 GENDERS = ("female", "male", "")

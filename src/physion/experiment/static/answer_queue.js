@@ -7,20 +7,29 @@
  */
 
 import { Refused } from "./api.js";
+import { announce } from "./showings.js";
 import { keep, recall } from "./storage.js";
 
 const NAME = "answers";
 const DAY_MS = 86_400_000;
 /** Refusals that neither a retry nor another token can change. */
-const FINAL = ["already_answered", "out_of_order", "wrong_stage", "bad_request", "too_large"];
+const FINAL = [
+  "already_answered",
+  "out_of_order",
+  "wrong_stage",
+  "not_shown",
+  "bad_request",
+  "too_large",
+];
 
 /** @typedef {import("./messages.js").Answer} Answer */
+/** @typedef {import("./showings.js").Announced} Announced */
 /** @typedef {import("./messages.js").AnswerStored} AnswerStored */
 
 /**
- * An answer with the token and the reference of its session; `resolve` and `reject` settle the
- * promise of `add` and are missing after a reload of the page.
- * @typedef {{token: string, session: string|null, answer: Answer,
+ * An answer with the last showing of its trial, the token and the reference of its session;
+ * `resolve` and `reject` settle the promise of `add` and are missing after a reload of the page.
+ * @typedef {{token: string, session: string|null, answer: Answer, showing: Announced|null,
  *   resolve?: (stored: AnswerStored) => void, reject?: (error: Error) => void}} Item
  */
 
@@ -95,11 +104,12 @@ export class AnswerQueue {
    * Save an answer in the storage and send it. The promise resolves when the server has stored the
    * answer, and rejects when it refuses it.
    * @param {Answer} answer
+   * @param {Announced|null} showing The last showing of the trial.
    * @returns {Promise<AnswerStored>}
    */
-  add(answer) {
+  add(answer, showing = null) {
     const stored = new Promise((resolve, reject) => {
-      const item = { token: this.api.token, session: this.#session, answer };
+      const item = { token: this.api.token, session: this.#session, answer, showing };
       keep(NAME, [...(recall(NAME) ?? []), item]);
       this.#items.push({ ...item, resolve, reject });
     });
@@ -135,6 +145,7 @@ export class AnswerQueue {
       const item = this.#items.find((each) => this.#isSendable(each));
       if (!item) return;
       try {
+        if (item.showing) await announce(this.api, item.showing, { token: item.token, signal });
         const options = { token: item.token, signal, expects: "duplicate" };
         const stored = await this.api.post("/api/answers", item.answer, options);
         this.#forget(item);

@@ -17,18 +17,23 @@ const CODES = new Set([
   "unknown_token",
   "bad_link",
   "id_needed",
+  "id_refused",
+  "other_browser",
   "already_took_part",
   "study_full",
   "paused",
   "wrong_stage",
   "out_of_order",
   "already_answered",
+  "not_shown",
   "not_yet",
   "not_found",
   "not_allowed",
 ]);
+/** An answer for whose acceptance the server still waits; nothing is wrong with the connection. */
+const TOO_EARLY = 425;
 /** Statuses that are worth a retry although they are 4xx. */
-const TEMPORARY = [408, 429];
+const TEMPORARY = [408, TOO_EARLY, 429];
 
 /** Refusal by the server; `state` is the state of the session if the server sent it. */
 export class Refused extends Error {
@@ -56,6 +61,7 @@ class Trouble extends Error {
     /** Too many requests; the page for entering then shows the time of the next attempt. */
     this.crowd = status === 429;
     this.busy = this.crowd || status >= 500;
+    this.silent = status === TOO_EARLY;
   }
 }
 
@@ -113,11 +119,13 @@ export class Api {
 
   /**
    * Send a POST request and return the JSON body.
-   * @param {string} path @param {any} body @param {Options} [options] @returns {Promise<any>}
+   * @param {string} path @param {any} body A function is called for each attempt.
+   * @param {Options} [options] @returns {Promise<any>}
    */
   post(path, body, options = {}) {
     const { signal, onBusy } = options;
-    return this.#repeat(() => this.#json("POST", path, body, options), signal, onBusy);
+    const current = () => (typeof body === "function" ? body() : body);
+    return this.#repeat(() => this.#json("POST", path, current(), options), signal, onBusy);
   }
 
   /**
@@ -222,7 +230,7 @@ export class Api {
         } catch (error) {
           if (!(error instanceof Trouble)) throw error;
           const crowd = error.crowd && onBusy;
-          if (!crowd) this.#troubled(request, error.busy ? "busy" : "lost");
+          if (!crowd && !error.silent) this.#troubled(request, error.busy ? "busy" : "lost");
           // Random pauses, so that many participants do not retry at the same moment.
           const ms = Math.max(error.pauseMs, wait / 2) + (Math.random() * wait) / 2;
           if (crowd) onBusy(ms);

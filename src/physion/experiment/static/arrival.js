@@ -3,13 +3,15 @@
  * @module arrival
  */
 
+import { isOfStudy } from "./remembered.js";
+
 const LONGEST_ID = 200;
 const LONGEST_OTHER = 500;
 
 /**
  * The URL parameters of a visit. `enter`: the identifying fields of the message; `preview`: only
- * information may be shown; `named`: the URL identifies the participant or has a signed key, so it
- * takes precedence over a session that the browser remembers.
+ * information may be shown; `named`: the URL identifies the participant or has a signed key of its
+ * own, so it takes precedence over a session that the browser remembers.
  * @typedef {{enter: import("./messages.js").Enter, preview: boolean, named: boolean,
  *   language: string|null}} Arrival
  */
@@ -41,5 +43,6 @@ export function readArrival(search, recruiters) {
   const preview = Object.entries(recruiter?.preview ?? {}).some(
     ([name, value]) => given.get(name) === value,
   );
-  return { enter, preview, named: Boolean(enter.id || enter.pass), language };
+  const personal = enter.pass && !isOfStudy(enter.pass);
+  return { enter, preview, named: Boolean(enter.id || personal), language };
 }

@@ -6,6 +6,9 @@
 import { el } from "./dom.js";
 import { focusHeading } from "./page_trial.js";
 
+/** Event of the document when a question was opened or closed. */
+export const ASKED = "physion:asked";
+
 /**
  * Show a question and wait for the answer.
  * @param {import("./pages.js").Render} render Fills the dialog; its `done` gives the answer.
@@ -23,6 +26,7 @@ export function ask(render, signal) {
     };
     dialog.addEventListener("close", () => {
       dialog.remove();
+      document.dispatchEvent(new Event(ASKED));
       resolve(answer);
     });
     signal.addEventListener("abort", () => dialog.close());
@@ -32,6 +36,7 @@ export function ask(render, signal) {
     dialog.setAttribute("aria-labelledby", heading.id);
     document.body.append(dialog);
     dialog.showModal();
+    document.dispatchEvent(new Event(ASKED));
     focusHeading(page);
   });
 }

@@ -10,6 +10,7 @@ import {
   forgetPerson,
   forgetSession,
   isFoundAgain,
+  isOfStudy,
   remember,
   remembered,
   visitKey,
@@ -42,8 +43,9 @@ export async function enter({ api, texts, study, log, frame }, arrival) {
   try {
     const onBusy = (ms) => showPage(frame.main, busyPage({ texts }, ms));
     const message = { ...arrival.enter, language: texts.language, device };
-    if (who === null) message.visit = visitKey(study);
-    const entered = await api.post("/api/enter", message, { onBusy });
+    // Without an id, each opening of a preview link is a new session.
+    if (who === null || message.id) message.visit = visitKey(study, who);
+    const entered = await api.post("/api/enter", message, { onBusy, token: own?.token });
     api.token = entered.token;
     remember({ token: entered.token, who, link: linkOf(arrival) });
     hideAddress(api.token);
@@ -122,7 +124,8 @@ export const cameWithoutId = () => remembered()?.who === null;
 
 /** Return the query with the parameters that do not identify a person. @param {Arrival} arrival */
 function linkOf({ enter, language }) {
-  const named = Object.entries({ scenario: enter.scenario, language });
+  const pass = enter.pass && isOfStudy(enter.pass) ? enter.pass : null;
+  const named = Object.entries({ scenario: enter.scenario, language, pass });
   const query = new URLSearchParams(named.filter(([, value]) => value)).toString();
   return query && `?${query}`;
 }

@@ -72,6 +72,17 @@ export interface Jump {
   trial?: number;
 }
 
+export interface Showing {
+  key: string;
+  phase: Phase;
+  trial: number;
+  ago_ms: number;
+}
+
+export interface Shown {
+  showings: number;
+}
+
 export interface Answer {
   key: string;
   phase: Phase;
@@ -88,6 +99,7 @@ export interface Answer {
   window_width: number | null;
   window_height: number | null;
   break_ms: number | null;
+  void: "hidden" | "dialog" | "window" | null;
   details: Record<string, any>;
 }
 
@@ -119,6 +131,7 @@ export interface Completion {
   code: string | null;
   url: string | null;
   post: Record<string, string> | null;
+  withheld: boolean;
 }
 
 export interface SessionEnd {
@@ -156,6 +169,7 @@ export interface PublicStudy {
   flash_hz: number;
   break_every: number;
   preload: number;
+  interrupted: "repeat" | "void";
   example: Record<string, TrialMedia>;
   recruiters: Recruiter[];
   device_refused: Record<string, Completion>;

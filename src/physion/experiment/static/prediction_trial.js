@@ -1,17 +1,19 @@
 /**
  * jsPsych plugin: one trial of object contact prediction. Sequence: fixation cross; first frame
  * with the flashing map of agent and patient; the observed movie; then, with the movie hidden, YES
- * or NO. If the page is hidden before the movie has ended, the trial is shown again from the start.
+ * or NO. If the showing is interrupted before the movie has ended, the trial is shown again from the
+ * start, or its answer is void.
  * @module prediction_trial
  */
 
 import { isAsked } from "./dialog.js";
-import { button, el, nextFrame, pageVisible } from "./dom.js";
+import { button, el, nextFrame } from "./dom.js";
+import { Interrupted, undisturbed, watchInterruptions } from "./interruptions.js";
 import { MovieFailed, Screen, round } from "./screen.js";
 
 const { ParameterType } = window.jsPsychModule;
 const ATTEMPTS = 3;
-/** Most repetitions of a trial because the page was hidden; afterwards it continues regardless. */
+/** Most repetitions of a trial because it was interrupted; afterwards its answer is void. */
 const REPEATS = 5;
 const DAY_MS = 86_400_000;
 /** Largest number of recorded times of each kind, to limit the size of an answer. */
@@ -38,6 +40,14 @@ const info = {
     words: { type: ParameterType.OBJECT, default: undefined },
     /** How often the trial was shown before and left without an answer. */
     before: { type: ParameterType.INT, default: 0 },
+    /** Whether an interrupted trial is shown again. */
+    repeat: { type: ParameterType.BOOL, default: true },
+    /** Returns whether the window is large enough. */
+    fits: { type: ParameterType.FUNCTION, default: () => true },
+    /** Shows a page while the window is too small; returns a promise of its end. */
+    enlarge: { type: ParameterType.FUNCTION, default: async () => {} },
+    /** Called when a showing begins. */
+    began: { type: ParameterType.FUNCTION, default: () => {} },
     /** Called when the scene becomes visible. */
     shown: { type: ParameterType.FUNCTION, default: () => {} },
     /** Called with kind and data of an event. */
@@ -59,13 +69,12 @@ const info = {
     visibility_changes: { type: ParameterType.INT },
     window_width: { type: ParameterType.INT },
     window_height: { type: ParameterType.INT },
+    /** What interrupted the showing, so that the answer does not count: hidden, dialog, window. */
+    void: { type: ParameterType.STRING, default: null },
     /** Times of flashes and frames in ms since the last showing began; numbers of showings. */
     details: { type: ParameterType.OBJECT },
   },
 };
-
-/** Raised when the page is hidden before the movie has ended. */
-class PageHidden extends Error {}
 
 /** The plugin class. */
 export class PredictionTrial {
@@ -86,18 +95,23 @@ export class PredictionTrial {
     const signal = trial.signal();
     const over = new AbortController();
     const visibility = watchVisibility(over.signal);
-    let [failed, hidden] = [0, 0];
+    let [failed, hidden, repeated] = [0, 0, 0];
     try {
       for (let attempt = 1; ; attempt++) {
-        await pageVisible();
-        const seen = whileSeen(signal, hidden < REPEATS);
+        await undisturbed(trial.fits, () => trial.enlarge(display, signal), signal);
+        const repeat = trial.repeat && repeated < REPEATS;
+        const seen = watchInterruptions(signal, trial.fits, repeat);
         const showing = { ...trial, attempt, failed, hidden, seen };
         try {
           return await show(display, showing, signal, visibility, on_load);
         } catch (error) {
           if (signal.aborted) throw error;
-          if (error instanceof PageHidden) hidden += 1;
-          else if (error instanceof MovieFailed) {
+          if (error instanceof Interrupted) {
+            repeated += 1;
+            hidden += error.reason === "hidden" ? 1 : 0;
+            const { trial: number } = trial.media;
+            trial.log("trial_interrupted", { trial: number, attempt, reason: error.reason });
+          } else if (error instanceof MovieFailed) {
             failed += 1;
             const { trial: number } = trial.media;
             trial.log("movie_failed", { trial: number, attempt, reason: error.message });
@@ -139,6 +153,7 @@ async function show(display, trial, signal, visibility, on_load) {
 /** Run cross, cue, movie and answer in sequence, and return the data of the trial. */
 async function run(screen, cross, buttons, trial, signal, visibility) {
   const start = await nextFrame();
+  trial.began();
   const loaded = trial.load(trial.failed).then((addresses) => screen.load(addresses));
   await Promise.all([loaded, reach(start + trial.fixation_ms, trial.seen.signal)]);
   const fixation_ms = round((await nextFrame()) - start);
@@ -162,9 +177,10 @@ async function run(screen, cross, buttons, trial, signal, visibility) {
     visibility_changes: visibility.changes.length,
     window_width: window.innerWidth,
     window_height: window.innerHeight,
+    void: trial.seen.reasons[0] ?? null,
     details: {
       attempts: trial.before + trial.attempt,
-      hidden: trial.hidden + (trial.seen.wasHidden() ? 1 : 0),
+      hidden: trial.hidden + (trial.seen.reasons.includes("hidden") ? 1 : 0),
       flashes: cue.changes,
       frames: frames.seen.slice(-MOST_NOTED).map(([at, frame, count]) => [since(at), frame, count]),
       play_ms: movie.startMs,
@@ -246,29 +262,6 @@ function sideOf(event, keys) {
 /** Return the input device of a pointer event as recorded in the answer. */
 function inputOf({ pointerType }) {
   return pointerType === "touch" || pointerType === "pen" ? "touch" : "mouse";
-}
-
-/**
- * Create a signal that follows another one and, until `end` is called, notices when the page is
- * hidden.
- * @param {AbortSignal} signal
- * @param {boolean} repeat Whether it also aborts when the page is hidden.
- */
-function whileSeen(signal, repeat) {
-  const seen = new AbortController();
-  const over = new AbortController();
-  const options = { signal: over.signal };
-  let was = false;
-  const stop = () => seen.abort(signal.reason);
-  const changed = () => {
-    if (!document.hidden) return;
-    was = true;
-    if (repeat) seen.abort(new PageHidden("the page was hidden"));
-  };
-  signal.addEventListener("abort", stop, options);
-  document.addEventListener("visibilitychange", changed, options);
-  if (signal.aborted) stop();
-  return { signal: seen.signal, end: () => over.abort(), wasHidden: () => was };
 }
 
 /** Record the changes of the page's visibility until the signal aborts. */

@@ -70,12 +70,14 @@ export function dueFeedback(state) {
 }
 
 /**
- * Return the random key of a participant without an id; draw and store it on the first call.
+ * Return the random key that binds a person's session to this browser; draw and store it on the
+ * first call.
  * @param {import("./messages.js").PublicStudy} study
+ * @param {string|null} who The person: see `whoOf`.
  * @returns {string}
  */
-export function visitKey(study) {
-  const name = visitName(study);
+export function visitKey(study, who) {
+  const name = visitName(study) + (who === null ? "" : `:${who}`);
   const known = recall(name);
   if (typeof known === "string") return known;
   const key = newKey();
@@ -91,13 +93,16 @@ const visitName = (study) => `visit:${study.title}`;
  * @returns {Promise<string|null>}
  */
 export async function whoOf({ source, id, pass }) {
-  if (!id && !pass) return null;
+  if (!id && (!pass || isOfStudy(pass))) return null;
   const bytes = new TextEncoder().encode(JSON.stringify([source, id ?? null, pass ?? null]));
   // Browsers lack it without HTTPS.
   if (!crypto.subtle) return plainHash(bytes);
   const digest = new Uint8Array(await crypto.subtle.digest("SHA-256", bytes));
   return Array.from(digest, hex).join("");
 }
+
+/** Return whether a link's key is signed for all people. @param {string} pass @returns {boolean} */
+export const isOfStudy = (pass) => pass.startsWith("study-");
 
 const hex = (byte) => byte.toString(16).padStart(2, "0");
 

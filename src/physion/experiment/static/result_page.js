@@ -27,6 +27,10 @@ export function resultPage({ texts, study, state, another }, result) {
       page.append(el("p", {}, t("result.percentile", { percentile: rounded })));
     }
     page.append(el("p", {}, t("result.saved")));
+    if (completion.withheld) {
+      const { contact } = study;
+      page.append(el("p", { id: "withheld" }, t("result.withheld", { contact })));
+    }
     page.append(...completionParts(completion, t, "result.go_hint"));
     const contact = t("result.contact", { contact: study.contact });
     const reference = t("common.reference", { reference: state.reference });

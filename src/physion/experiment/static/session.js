@@ -18,6 +18,7 @@ import { PredictionTrial } from "./prediction_trial.js";
 import { newKey } from "./random_key.js";
 import { dueFeedback, forgetFeedback, rememberFeedback } from "./remembered.js";
 import { resultPage } from "./result_page.js";
+import { announce, newShowing } from "./showings.js";
 import { feedbackPieces, trialPieces } from "./trial_pieces.js";
 
 const PAGES = {
@@ -64,10 +65,11 @@ export class Session {
   /** Where a preview goes next. @type {{stage: string, trial: number}|null} */
   #target = null;
   /**
-   * The running trial, and how often the question was opened during it.
-   * @type {{phase: string|null, trial: number|null, asked: number}}
+   * The running trial with its last showing, and how often the question was opened during it.
+   * @type {{phase: string|null, trial: number|null, asked: number,
+   *   showing: import("./showings.js").Announced|null}}
    */
-  #running = { phase: null, trial: null, asked: 0 };
+  #running = { phase: null, trial: null, asked: 0, showing: null };
   /** How often the scene of a trial was shown, by phase and trial. @type {Map<string, number>} */
   #shown = new Map();
 
@@ -296,15 +298,23 @@ export class Session {
     const { trial } = media;
     return trialPieces(this.context, phase, media, {
       shown: this.#shown,
-      started: () => (this.#running = { phase, trial, asked: 0 }),
+      started: () => (this.#running = { phase, trial, asked: 0, showing: null }),
+      began: () => this.#announce(phase, trial),
       answered: (data) => {
         const details = { ...data.details, stop_asked: this.#running.asked };
         const answer = answerOf(phase, trial, { ...data, details });
         this.state = { ...this.state, trial: trial + 1 };
         if (phase === "familiarization") rememberFeedback(this.state.reference, answer);
-        return { answer, stored: this.queue.add(answer) };
+        return { answer, stored: this.queue.add(answer, this.#running.showing) };
       },
     });
+  }
+
+  /** Tell the server that a showing begins; the queue does it again if this fails. */
+  #announce(phase, trial) {
+    const showing = newShowing(phase, trial);
+    this.#running.showing = showing;
+    announce(this.basis.api, showing, { signal: this.#part.signal }).catch(() => {});
   }
 
   /** Run a jsPsych timeline and return the data of its trials. */
@@ -326,7 +336,7 @@ export class Session {
     } finally {
       signal.removeEventListener("abort", abort);
     }
-    this.#running = { phase: null, trial: null, asked: 0 };
+    this.#running = { phase: null, trial: null, asked: 0, showing: null };
     signal.throwIfAborted();
     return jsPsych.data.get().values();
   }

@@ -8,7 +8,7 @@ import { Refused } from "./api.js";
 import { FeedbackTrial } from "./feedback_trial.js";
 import { fullscreenPage, offersFullscreen } from "./fullscreen.js";
 import { windowFits } from "./gate.js";
-import { PageTrial } from "./page_trial.js";
+import { PageTrial, showPage } from "./page_trial.js";
 import * as pages from "./pages.js";
 import { PredictionTrial } from "./prediction_trial.js";
 import { forgetFeedback } from "./remembered.js";
@@ -32,6 +32,7 @@ const FEEDBACK_WORDS = ["waiting", "correct", "incorrect", "contact", "no_contac
  * @param {Object} session
  * @param {Map<string, number>} session.shown How often each scene was shown.
  * @param {() => void} session.started Called when the trial starts.
+ * @param {() => void} session.began Called when a showing of the trial begins.
  * @param {(data: any) => Given} session.answered Called with the data of the trial.
  * @returns {Array<Object>}
  */
@@ -112,8 +113,25 @@ function beforeTrial(context, number) {
   ];
 }
 
+/** Show the page about the window until it is large enough. */
+function enlarged(context, display, signal) {
+  const fits = () => windowFits(context.study);
+  context.log.add("too_small", { width: innerWidth, height: innerHeight });
+  return new Promise((resolve, reject) => {
+    const over = new AbortController();
+    signal.addEventListener("abort", () => reject(signal.reason), { signal: over.signal });
+    const done = () => {
+      over.abort();
+      resolve(null);
+    };
+    const render = pages.windowPage(context, fits);
+    showPage(display, (page) => render(page, done, over.signal));
+  });
+}
+
 /** Return the prediction trial. */
-function predictionOf({ study, texts, frame, log, state, ...context }, phase, media, session) {
+function predictionOf(context, phase, media, session) {
+  const { study, texts, frame, log, state } = context;
   const number = media.trial;
   const key = `${phase} ${number}`;
   const seen = () => session.shown.get(key) ?? 0;
@@ -126,7 +144,11 @@ function predictionOf({ study, texts, frame, log, state, ...context }, phase, me
     flash_hz: study.flash_hz,
     choices: state.buttons.split("-"),
     words: words(texts, "trial", TRIAL_WORDS),
+    repeat: study.interrupted === "repeat",
+    fits: () => windowFits(study),
+    enlarge: (display, signal) => enlarged(context, display, signal),
     before: seen,
+    began: () => session.began(),
     shown: () => session.shown.set(key, seen() + 1),
     log: (kind, data) => log.add(kind, data),
     on_start: () => {

@@ -10,10 +10,19 @@ from sqlalchemy import Connection, bindparam, select, update
 
 from physion.experiment.protocol.messages import Answer, AnswerStored, Feedback
 from physion.experiment.protocol.refused import Refused
+from physion.experiment.store.plausibility import (
+    TOLERANCE_S,
+    Presentation,
+    earliest_answer,
+    judged,
+    reasons,
+    speed,
+)
 from physion.experiment.store.sessions import Session, answered, insert_or_skip, stage_of, state_of
+from physion.experiment.store.showings import read_presentation
 from physion.experiment.store.tables import ANSWERS, SESSIONS
 from physion.experiment.study.identity import Secrets
-from physion.experiment.study.media_links import sign_media
+from physion.experiment.study.media_links import session_tag, sign_media
 from physion.experiment.study.orders import trial_order
 from physion.experiment.study.stimuli import PHASES, Stimulus
 from physion.experiment.study.study import Study
@@ -24,10 +33,16 @@ _STORED = select(ANSWERS.c.key, ANSWERS.c.response).where(
     ANSWERS.c.phase == bindparam("of_phase"),
     ANSWERS.c.trial == bindparam("of_trial"),
 )
+_JUDGED = ("fast_answers", "unfetched", "replayed", "implausible", "next_from")
+"""Columns of a session that change with each answer, besides its number of answers."""
 _COUNT = {
     phase: update(SESSIONS)
     .where(SESSIONS.c.session == bindparam("of_session"))
-    .values({f"answered_{phase}": bindparam("count"), "last_seen": bindparam("now")})
+    .values(
+        {f"answered_{phase}": bindparam("count")}
+        | dict.fromkeys(("last_seen", "progressed_at"), bindparam("now"))
+        | {name: bindparam(f"new_{name}") for name in _JUDGED}
+    )
     for phase in PHASES
 }
 
@@ -58,6 +73,7 @@ def store_answer(
     answer: Answer,
     details: str,
     now: float,
+    fetched_at: float | None = None,
 ) -> AnswerStored:
     """Store the answer to the next trial, unless the same answer is stored already.
 
@@ -77,11 +93,14 @@ def store_answer(
         `encode_details` of the answer.
     now
         Time of the server in seconds since 1970.
+    fetched_at
+        `FetchedMedia.sent_at` of the trial.
 
     Raises
     ------
     Refused
-        Another trial is next, or the trial or the key has another answer.
+        Another trial is next, the trial or the key has another answer, or the trial was not shown
+        or cannot have been shown until now.
     """
     known = answered(session, answer.phase)
     if answer.trial < known:
@@ -94,7 +113,15 @@ def store_answer(
     # Stimuli cannot change while there are sessions, so an answered trial has this stimulus too.
     stimulus = trial_order(study, session.scenario, session.order_seed)[answer.phase][answer.trial]
     if not duplicate:
-        _insert_answer(connection, trials, session, stimulus, answer, details, now)
+        shown = read_presentation(connection, study, trials, session, answer, fetched_at)
+        changes = _judge(study, session, answer, shown, now)
+        values = {
+            "stimulus": stimulus.stimulus,
+            "frames_expected": stimulus.frames,
+            "showings": shown.showings or None,
+            "details": details,
+        }
+        _insert_answer(connection, trials, session, answer, values, changes, now)
     feedback = None
     if answer.phase == PHASES[0]:
         feedback = _build_feedback(study, secrets, session, stimulus, answer.trial, response)
@@ -125,34 +152,51 @@ def _check_next(trials: Mapping[str, int], session: Session, answer: Answer, kno
         raise Refused("out_of_order", "Another trial is next.", state_of(session, trials))
 
 
+def _judge(
+    study: Study, session: Session, answer: Answer, shown: Presentation, now: float
+) -> dict[str, Any]:
+    """Return the columns of `_JUDGED` after an answer; raise `Refused` if it comes too early."""
+    earliest = earliest_answer(study, session, answer.phase, answer.trial, shown)
+    if study.plausibility.server_checks and now < earliest:
+        raise Refused(
+            "too_early",
+            "The movie of this trial cannot have been shown yet.",
+            wait_s=earliest - now,
+        )
+    changes: dict[str, Any] = judged(study, session, answer, shown)
+    for name, value in changes.items():
+        setattr(session, name, value)
+    ended_at = earliest + (TOLERANCE_S + answer.rt_ms / 1000) / speed(study, session)
+    return changes | {"implausible": reasons(study, session), "next_from": min(now, ended_at)}
+
+
 def _insert_answer(
     connection: Connection,
     trials: Mapping[str, int],
     session: Session,
-    stimulus: Stimulus,
     answer: Answer,
-    details: str,
+    values: Mapping[str, Any],
+    changes: Mapping[str, Any],
     now: float,
 ) -> None:
-    """Insert the answer and increase the session's count of answers."""
+    """Insert the answer with the further columns ``values``; count it and change the session."""
     loaded = (session.loaded_at_phase, session.loaded_at_trial)
-    values: dict[str, Any] = {
+    row: dict[str, Any] = {
         **answer.model_dump(exclude={"details"}),
+        **values,
         "session": session.session,
-        "stimulus": stimulus.stimulus,
-        "frames_expected": stimulus.frames,
         "resumed": loaded == (answer.phase, answer.trial),
         "answered_at": now,
-        "details": details,
     }
     # Only a key that another trial has can conflict; then nothing is written.
-    if connection.execute(insert_or_skip(connection, ANSWERS), values).rowcount != 1:
+    if connection.execute(insert_or_skip(connection, ANSWERS), row).rowcount != 1:
         raise Refused(
             "already_answered", "This key belongs to another trial.", state_of(session, trials)
         )
     count = answer.trial + 1
+    new = {f"new_{name}": value for name, value in changes.items()}
     connection.execute(
-        _COUNT[answer.phase], {"of_session": session.session, "count": count, "now": now}
+        _COUNT[answer.phase], {"of_session": session.session, "count": count, "now": now, **new}
     )
     setattr(session, f"answered_{answer.phase}", count)
 
@@ -170,7 +214,14 @@ def _build_feedback(
         contact=stimulus.label,
         correct=(response == "yes") == stimulus.label,
         movie=sign_media(
-            study, secrets, session.scenario, session.order_seed, PHASES[0], trial, "full"
+            study,
+            secrets,
+            session.scenario,
+            session.order_seed,
+            PHASES[0],
+            trial,
+            "full",
+            session_tag(secrets, session.session),
         ),
         frames=stimulus.full_frames,
     )

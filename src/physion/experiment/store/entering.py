@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from secrets import token_hex
 from typing import NamedTuple
 
-from sqlalchemy import Connection, case, func, insert, or_, select
+from sqlalchemy import Connection, and_, case, func, insert, or_, select
 
 from physion.experiment.protocol.messages import Enter, Entered, Kind
 from physion.experiment.protocol.refused import Refused
@@ -39,7 +39,12 @@ from physion.experiment.study.identity import (
     participant_hash,
 )
 from physion.experiment.study.orders import draw_buttons, individual_order_seed, prepared_order_seed
-from physion.experiment.study.recruitment import ending_completion, is_unfilled, read_pass
+from physion.experiment.study.recruitment import (
+    ending_completion,
+    is_id_allowed,
+    is_unfilled,
+    read_pass,
+)
 from physion.experiment.study.study import Study
 
 
@@ -51,25 +56,34 @@ class Visitor:
     kind: Kind
     participant: str
     raw_id: str | None
+    now: float
+    known_token: str = ""
+    """Token of an earlier visit, with which the session can be continued."""
+    signed: bool = False
+    """Whether the link is signed for this person or for sessions of this kind."""
+    browser: str = ""
+    """Keyed hash of the key of the browser; empty if it sent none."""
     token: str = field(default_factory=new_token)
     session: str = field(default_factory=new_session)
     reference: str = field(default_factory=new_reference)
-    now: float = field(default_factory=time.time)
 
 
-def identify_visitor(study: Study, secrets: Secrets, enter: Enter) -> Visitor:
+def identify_visitor(study: Study, secrets: Secrets, enter: Enter, token: str = "") -> Visitor:
     """Identify the visitor by link and id, else by the visit key, else as a new participant.
+
+    ``token`` is one that the browser has from an earlier visit, or empty.
 
     Raises
     ------
     Refused
         The link has an invalid key, an unknown scenario or an unfilled placeholder for the id, or
-        lacks a required id.
+        lacks a required signature or id; or the study does not allow the id.
     """
-    kind: Kind | None = "person"
-    if enter.pass_ is not None:
-        kind = read_pass(secrets, enter.pass_)
-    if kind is None:
+    key = read_pass(secrets, enter)
+    kind: Kind = "preview" if key == "preview" else "simulated" if key == "simulated" else "person"
+    required = {"no": (None, "study", "person"), "study": ("study", "person")}
+    people = required.get(study.recruitment.signed_links, ("person",))
+    if (key is None and enter.pass_ is not None) or (kind == "person" and key not in people):
         raise Refused("bad_link", "This link is not complete; copy all of it and try again.")
     if is_unfilled(enter):
         raise Refused(
@@ -81,6 +95,8 @@ def identify_visitor(study: Study, secrets: Secrets, enter: Enter) -> Visitor:
     needed = study.recruitment.id_needed or enter.source != "link"
     if raw_id is None and kind == "person" and needed:
         raise Refused("id_needed", "This link lacks your id; open the link that you were given.")
+    if raw_id is not None and kind == "person" and not is_id_allowed(study, enter.source, raw_id):
+        raise Refused("id_refused", "This study does not know the id of this link.")
     if enter.scenario is not None and enter.scenario not in study.scenarios:
         raise Refused("bad_link", "This link names a scenario that the study does not have.")
     # A simulated or preview session must not block a person with the same id.
@@ -90,7 +106,18 @@ def identify_visitor(study: Study, secrets: Secrets, enter: Enter) -> Visitor:
     else:
         # A visit key is as secret as a token: only its browser knows it.
         participant = participant_hash(secrets, f"{source} visit", enter.visit or token_hex(16))
-    return Visitor(enter, kind, participant, raw_id if kind == "person" else None)
+    return Visitor(
+        enter,
+        kind,
+        participant,
+        raw_id if kind == "person" else None,
+        time.time(),
+        known_token=token,
+        signed=key in ("preview", "simulated", "person"),
+        browser=participant_hash(secrets, f"browser of {participant}", enter.visit)
+        if enter.visit
+        else "",
+    )
 
 
 def enter_session(
@@ -115,7 +142,8 @@ def enter_session(
     Raises
     ------
     Refused
-        The visitor has taken part already, or the study is full or paused.
+        The visitor has taken part already, the session belongs to another browser, or the study is
+        full or paused.
     """
     sessions = [
         session_from_row(study, row)
@@ -125,6 +153,9 @@ def enter_session(
     ]
     session = _find_unfinished(sessions, visitor.enter.scenario)
     ended = None if session is not None else _find_ended(study, sessions, visitor.enter.scenario)
+    begun = session or ended
+    if begun is not None:
+        _check_browser(connection, begun, visitor)
     if ended is not None and visitor.enter.take_back and can_take_back(ended):
         _choose_scenario(connection, study, visitor, set(study.scenarios) - {ended.scenario})
         _take_back(connection, ended, visitor)
@@ -144,6 +175,27 @@ def enter_session(
         {"token_hash": hash_token(visitor.token), "session": session.session, "made": visitor.now},
     )
     return Entered(token=visitor.token, state=state_of(session, trials.of(session.scenario)))
+
+
+def _check_browser(connection: Connection, session: Session, visitor: Visitor) -> None:
+    """Raise `Refused` unless the visitor's browser may continue the session.
+
+    It may with its own key, with a token of the session, or by a signed link. Sessions of older
+    versions have no key; the next browser gives them one.
+    """
+    if visitor.signed or session.browser is None:
+        return
+    if session.browser and session.browser == visitor.browser:
+        return
+    known = select(TOKENS.c.token_hash).where(
+        TOKENS.c.session == session.session,
+        TOKENS.c.token_hash == hash_token(visitor.known_token),
+    )
+    if connection.execute(known).first() is None:
+        raise Refused(
+            "other_browser",
+            "This session began in another browser; continue there, or ask for a link of your own.",
+        )
 
 
 def _find_unfinished(sessions: list[Session], scenario: str | None) -> Session | None:
@@ -195,7 +247,7 @@ def _choose_scenario(connection: Connection, study: Study, visitor: Visitor, don
         raise Refused("already_took_part", "You have taken part already. Thank you!")
     if visitor.kind == "person" and is_paused(connection):
         raise Refused("paused", "The study takes in nobody at the moment; try again later.")
-    counts = _count_sessions(connection, visitor)
+    counts = _count_sessions(connection, study, visitor)
     if visitor.kind == "person":
         available = [each for each in available if counts[each].taken < study.participants]
     if not available:
@@ -210,30 +262,40 @@ def _choose_scenario(connection: Connection, study: Study, visitor: Visitor, don
 class _SessionCounts(NamedTuple):
     """Numbers of sessions of a scenario.
 
-    ``taken``: finished, or active with consent given. ``begun``: these and the active ones that are
-    still at the consent page.
+    ``taken``: places of plausible sessions, finished or held for people who go on.
+    ``begun``: finished and active sessions.
     """
 
     taken: int = 0
     begun: int = 0
 
 
-def _count_sessions(connection: Connection, visitor: Visitor) -> Mapping[str, _SessionCounts]:
-    """Count the sessions of the visitor's kind in each scenario."""
+def _count_sessions(
+    connection: Connection, study: Study, visitor: Visitor
+) -> Mapping[str, _SessionCounts]:
+    """Count the sessions of the visitor's kind in each scenario.
+
+    A place is held from the consent on, until no page or answer has come for ``hold_minutes``.
+    """
     counts_by_scenario: dict[str, _SessionCounts] = defaultdict(_SessionCounts)
     if visitor.kind != "person" and visitor.enter.scenario is not None:
         return counts_by_scenario  # the counts would not be used
     columns = SESSIONS.c
     finished = columns.finished_at.is_not(None)
+    active = columns.last_seen >= visitor.now - ACTIVE_WITHIN
+    held_since = visitor.now - 60 * study.recruitment.hold_minutes
+    progressed_at = func.coalesce(columns.progressed_at, columns.last_seen)
     # Somebody who only opened the page may never consent, and must not take a place.
-    taken = case((or_(finished, columns.consented_at.is_not(None)), 1), else_=0)
+    held = and_(columns.consented_at.is_not(None), progressed_at >= held_since)
+    taken = case((and_(columns.implausible.is_(None), or_(finished, held)), 1), else_=0)
+    begun = case((or_(finished, active), 1), else_=0)
     statement = (
-        select(columns.scenario, func.sum(taken), func.count())
+        select(columns.scenario, func.sum(taken), func.sum(begun))
         .where(
             columns.kind == visitor.kind,
             columns.withdrawn_at.is_(None),
             columns.voided_at.is_(None),
-            or_(finished, columns.last_seen >= visitor.now - ACTIVE_WITHIN),
+            or_(finished, active, held),
         )
         .group_by(columns.scenario)
     )
@@ -265,6 +327,7 @@ def _begin_session(
         "order_number": number,
         "buttons": draw_buttons(study, visitor.participant),
         "language": _match_language(study, visitor.enter.language),
+        "browser": visitor.browser,
         "started_at": visitor.now,
         "last_seen": visitor.now,
         "device": storable_values(visitor.enter.device.model_dump()),
@@ -305,7 +368,8 @@ def _continue(
 ) -> None:
     """Record that the visitor entered an unfinished session again."""
     marks = mark_loaded(session, trials.of(session.scenario))
-    change_session(connection, session, last_seen=visitor.now, **marks)
+    browser = {} if session.browser is not None else {"browser": visitor.browser}
+    change_session(connection, session, last_seen=visitor.now, **browser, **marks)
     event = {
         "session": session.session,
         "kind": ENTERED_AGAIN,

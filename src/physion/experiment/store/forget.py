@@ -22,15 +22,17 @@ from physion.experiment.store.database import (
     open_database,
     server_lock,
 )
-from physion.experiment.store.tables import ANSWERS, EVENTS, RAW_IDS, SESSIONS, TOKENS
+from physion.experiment.store.tables import ANSWERS, EVENTS, RAW_IDS, SESSIONS, SHOWINGS, TOKENS
 
 if TYPE_CHECKING:
     from physion.experiment.store.store import Store
 
 _EMPTIED = dict.fromkeys((
     "instructed_at", "ready_at", "demographics_at", "finished_at", "loaded_at_phase",
-    "loaded_at_trial", "age", "gender", "education", "difficulty", "technical_problems", "feedback",
-)) | {"answered_familiarization": 0, "answered_test": 0, "loads": 0, "device": {}}  # fmt: skip
+    "loaded_at_trial", "browser", "progressed_at", "next_from", "implausible", "age", "gender",
+    "education", "difficulty", "technical_problems", "feedback",
+)) | {"answered_familiarization": 0, "answered_test": 0, "fast_answers": 0, "unfetched": 0,
+      "replayed": 0, "loads": 0, "device": {}}  # fmt: skip
 """Column values that replace the data of a forgotten session."""
 
 
@@ -77,7 +79,7 @@ def forget_sessions(url: str, references: Sequence[str]) -> int:
             _forget_session(connection, reference, now)
         return len(wanted)
 
-    return _run_exclusively(url, work, (RAW_IDS, ANSWERS, EVENTS, TOKENS, SESSIONS))
+    return _run_exclusively(url, work, (RAW_IDS, ANSWERS, SHOWINGS, EVENTS, TOKENS, SESSIONS))
 
 
 def _run_exclusively(url: str, work: Callable[[Connection], int], tables: Sequence[Table]) -> int:
@@ -158,7 +160,7 @@ def _forget_session(connection: Connection, reference: str, now: float) -> None:
             "deleted"
         )
     session, participant, withdrawn_at = rows[0]
-    for table in (ANSWERS, EVENTS, TOKENS):
+    for table in (ANSWERS, SHOWINGS, EVENTS, TOKENS):
         connection.execute(delete(table).where(table.c.session == session))
     values = _EMPTIED | {"withdrawn_at": withdrawn_at or now, "closed_at": now}
     connection.execute(update(SESSIONS).where(columns.session == session).values(**values))

@@ -7,7 +7,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from itertools import islice
 
-from sqlalchemy import Connection, bindparam, select
+from sqlalchemy import Connection, bindparam, or_, select
 
 from physion.experiment.store.tables import ANSWERS, SESSIONS, STUDIES
 from physion.experiment.study.study import Study
@@ -22,6 +22,7 @@ _FINISHED = (
         SESSIONS.c.finished_at.is_not(None),
         SESSIONS.c.withdrawn_at.is_(None),
         SESSIONS.c.voided_at.is_(None),
+        or_(SESSIONS.c.implausible.is_(None), SESSIONS.c.session == bindparam("of_session")),
         # Previews may have used other stimuli, whose labels are no longer known.
         STUDIES.c.stimuli_digest == bindparam("of_stimuli"),
     )
@@ -44,12 +45,14 @@ class Scores:
         self._correct: dict[str, int] = {}
         self._lock = threading.Lock()
 
-    def of(self, connection: Connection, scenario: str, kind: str) -> dict[str, int]:
+    def of(self, connection: Connection, scenario: str, kind: str, session: str) -> dict[str, int]:
         """Return the number of correct answers of each finished session of a scenario and kind.
 
-        Sessions with other than the current stimuli are left out.
+        Sessions with other than the current stimuli are left out, and implausible ones except
+        ``session`` itself.
         """
-        values = {"of_scenario": scenario, "of_kind": kind, "of_stimuli": self._stimuli}
+        values = {"of_scenario": scenario, "of_kind": kind, "of_stimuli": self._stimuli,
+                  "of_session": session}  # fmt: skip
         rows = connection.execute(_FINISHED, values)
         finished = [session for (session,) in rows]
         with self._lock:

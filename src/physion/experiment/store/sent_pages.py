@@ -9,6 +9,7 @@ from sqlalchemy import Connection, delete, select, update
 
 from physion.experiment.protocol.messages import ENDED, PageDone, SessionState
 from physion.experiment.protocol.refused import Refused
+from physion.experiment.store.plausibility import reasons
 from physion.experiment.store.sessions import (
     ENTERED_AGAIN,
     STAGES,
@@ -152,7 +153,9 @@ def submit_page(
     if stage in ENDED or STAGES.index(stage) < STAGES.index(page):  # type: ignore[arg-type]
         raise Refused("wrong_stage", "This page is not next.", state_of(session, trials))
     if stage == page:
-        change_session(connection, session, last_seen=now, **_columns(study, page, values, now))
+        columns = _columns(study, session, page, values, now)
+        times = {"last_seen": now, "progressed_at": now, "next_from": now}
+        change_session(connection, session, **times, **columns)
     return state_of(session, trials)
 
 
@@ -170,7 +173,9 @@ def _forget_declined(connection: Connection, session: Session) -> None:
     connection.execute(delete(RAW_IDS).where(own, ~other.exists()))
 
 
-def _columns(study: Study, page: str, values: Mapping[str, Any], now: float) -> dict[str, Any]:
+def _columns(
+    study: Study, session: Session, page: str, values: Mapping[str, Any], now: float
+) -> dict[str, Any]:
     """Return the columns of SESSIONS that a page sets."""
     match page:
         case "consent":
@@ -187,6 +192,7 @@ def _columns(study: Study, page: str, values: Mapping[str, Any], now: float) -> 
         case _:
             return {
                 "finished_at": now,
+                "implausible": reasons(study, session, now),
                 "difficulty": values["difficulty"],
                 "technical_problems": values["technical_problems"],
                 "feedback": values["text"],

@@ -47,6 +47,12 @@ class Session:
     withdrawn_at: float | None
     closed_at: float | None
     voided_at: float | None
+    browser: str | None
+    next_from: float | None
+    fast_answers: int
+    unfetched: int
+    replayed: int
+    implausible: str | None
     answered_familiarization: int
     answered_test: int
     loads: int

@@ -16,6 +16,7 @@ from physion.experiment.protocol.messages import (
     ENDED,
     Answer,
     AnswerStored,
+    Completion,
     Enter,
     Entered,
     Events,
@@ -25,6 +26,8 @@ from physion.experiment.protocol.messages import (
     Result,
     SessionEnd,
     SessionState,
+    Showing,
+    Shown,
     Stored,
     TrialList,
     TrialMedia,
@@ -39,6 +42,7 @@ from physion.experiment.store.database import (
     upgrade,
 )
 from physion.experiment.store.entering import enter_session, identify_visitor
+from physion.experiment.store.fetched_media import FetchedMedia
 from physion.experiment.store.lab.jumping import jump
 from physion.experiment.store.scores import Scores, percentile
 from physion.experiment.store.sent_pages import check_page, submit_page
@@ -53,11 +57,12 @@ from physion.experiment.store.sessions import (
     state_of,
     storable_values,
 )
+from physion.experiment.store.showings import store_showing
 from physion.experiment.store.study_record import register
 from physion.experiment.store.tables import EVENTS, RAW_IDS, SESSIONS
 from physion.experiment.store.writer import Writer
 from physion.experiment.study.identity import Secrets, hash_token
-from physion.experiment.study.media_links import sign_media
+from physion.experiment.study.media_links import MediaKind, session_tag, sign_media
 from physion.experiment.study.orders import fixations, trial_order
 from physion.experiment.study.recruitment import completion, ending_completion
 from physion.experiment.study.study import Study
@@ -82,6 +87,7 @@ class Store:
         self._writer = writer
         self._trials = TrialCounts(study)
         self._scores = Scores(study)
+        self.fetched = FetchedMedia()
         self._held = contextlib.ExitStack()
 
     @classmethod
@@ -111,9 +117,9 @@ class Store:
         """Write all waiting commands, then close the database."""
         self._held.close()
 
-    async def enter(self, enter: Enter) -> Entered:
-        """Begin or continue a session."""
-        visitor = identify_visitor(self.study, self.secrets, enter)
+    async def enter(self, enter: Enter, token: str = "") -> Entered:
+        """Begin or continue a session; ``token``: one of an earlier visit of the browser."""
+        visitor = identify_visitor(self.study, self.secrets, enter, token)
         return await self._writer.run(
             lambda connection: enter_session(
                 connection, self.study, self.secrets, self._trials, visitor
@@ -175,12 +181,28 @@ class Store:
         """Store one answer; repeating the request does not store it twice."""
         details, token_hash, now = encode_details(answer), hash_token(token), time.time()
 
-        def store(connection: Connection) -> AnswerStored:
+        def store(connection: Connection) -> tuple[AnswerStored, str]:
             session = read_session(connection, self.study, token_hash)
             trials = self._trials.of(session.scenario)
-            return store_answer(
-                connection, self.study, self.secrets, trials, session, answer, details, now
+            tag = session_tag(self.secrets, session.session)
+            sent_at = self.fetched.sent_at(tag, session.started_at, answer.phase, answer.trial)
+            stored = store_answer(
+                connection, self.study, self.secrets, trials, session, answer, details, now, sent_at
             )
+            return stored, tag
+
+        stored, tag = await self._writer.run(store)
+        self.fetched.forget(tag, answer.phase, answer.trial)
+        return stored
+
+    async def showing(self, token: str, showing: Showing) -> Shown:
+        """Store that the next trial begins; repeating the request does not count it twice."""
+        token_hash, now = hash_token(token), time.time()
+
+        def store(connection: Connection) -> Shown:
+            session = read_session(connection, self.study, token_hash)
+            trials = self._trials.of(session.scenario)
+            return store_showing(connection, trials, session, showing, now)
 
         return await self._writer.run(store)
 
@@ -266,11 +288,16 @@ class Store:
         """Return the signed media and timing of the trials of a phase."""
         study, scenario, seed = self.study, session.scenario, session.order_seed
         crosses = fixations(study, scenario, seed, phase)
+        tag = session_tag(self.secrets, session.session)
+
+        def signed(trial: int, kind: MediaKind) -> str:
+            return sign_media(study, self.secrets, scenario, seed, phase, trial, kind, tag)
+
         return [
             TrialMedia(
                 trial=trial,
-                movie=sign_media(study, self.secrets, scenario, seed, phase, trial, "movie"),
-                map=sign_media(study, self.secrets, scenario, seed, phase, trial, "map"),
+                movie=signed(trial, "movie"),
+                map=signed(trial, "map"),
                 frames=stimulus.frames,
                 rate=stimulus.rate,
                 width=stimulus.width,
@@ -287,7 +314,7 @@ class Store:
         if stage != "done":
             code = "wrong_stage" if stage in ENDED else "not_yet"
             raise Refused(code, "The result comes at the end.", state_of(session, trials))
-        scores = dict(self._scores.of(connection, session.scenario, session.kind))
+        scores = dict(self._scores.of(connection, session.scenario, session.kind, session.session))
         correct = scores.pop(session.session, None)
         if correct is None:  # a preview of other stimuli, whose labels are no longer known
             raise Refused("unknown_token", "The stimuli have changed since; open your link again.")
@@ -304,7 +331,9 @@ class Store:
             trials=trials["test"],
             accuracy=correct / trials["test"],
             percentile=percentile(correct, others) if enough else None,
-            completion=completion(self.study, self.secrets, row, raw),
+            completion=Completion(code=None, url=None, withheld=True)
+            if session.implausible
+            else completion(self.study, self.secrets, row, raw),
         )
 
 

@@ -71,7 +71,7 @@ def _by_scenario(connection: Connection, which: ColumnElement[bool]) -> dict[str
 
 def _settings(study: Study) -> dict[str, Any]:
     """Return settings and texts as JSON values, without stimuli, whose labels stay private."""
-    left_out = {"folder", "stimuli"}
+    left_out = {"folder", "stimuli", "allowed_ids"}
     shallow = {name: value for name, value in vars(study).items() if name not in left_out}
     return json.loads(json.dumps(shallow, default=_plain))  # type: ignore[no-any-return]
 

@@ -88,8 +88,15 @@ SESSIONS = Table(
     Column("withdrawn_at", Float),
     Column("closed_at", Float),
     Column("voided_at", Float),
+    Column("browser", String(32)),
+    Column("progressed_at", Float),
+    Column("next_from", Float),
     Column("answered_familiarization", Integer, nullable=False, default=0),
     Column("answered_test", Integer, nullable=False, default=0),
+    Column("fast_answers", Integer, nullable=False, server_default="0"),
+    Column("unfetched", Integer, nullable=False, server_default="0"),
+    Column("replayed", Integer, nullable=False, server_default="0"),
+    Column("implausible", String(100)),
     Column("loads", Integer, nullable=False, default=0),
     Column("loaded_at_phase", String(15)),
     Column("loaded_at_trial", Integer),
@@ -111,7 +118,13 @@ number of the prepared order, 0 if the study has none; ``order_seed`` and the st
 order of the trials. ``loaded_at_*``: the trial that was next when the page was last reloaded.
 ``closed_at``: when the lab ended the session for good, so that the participant cannot take it up
 again: its data were deleted, or it was a preview of other stimuli. ``voided_at``: when the lab
-decided that the session does not count."""
+decided that the session does not count.
+``browser``: keyed hash of the key of the browser that began the session, empty if it sent none,
+NULL in sessions of older versions. ``progressed_at``: time of the last page or answer.
+``next_from``: earliest time at which the next trial can have begun. ``fast_answers``,
+``unfetched``, ``replayed``: number of answers that were too fast, whose media were not fetched, and
+whose movie was shown too often. ``implausible``: reasons, separated by commas, for which the
+session is no person's (`plausibility.REASONS`); NULL without any."""
 
 PAUSES = Table(
     "pauses",
@@ -152,13 +165,30 @@ ANSWERS = Table(
     Column("window_height", Integer),
     Column("break_ms", Float),
     Column("resumed", Boolean, nullable=False),
+    Column("showings", Integer),
+    Column("void", String(10)),
     Column("answered_at", Float, nullable=False),
     Column("details", Text, nullable=False),
     UniqueConstraint("session", "key"),
     UniqueConstraint("session", "phase", "stimulus"),
     CheckConstraint("response IN ('yes', 'no')", name="response"),
 )
-"""Answers, one row per session and trial; ``details`` is JSON text."""
+"""Answers, one row per session and trial; ``details`` is JSON text. ``showings``: how often the
+movie was shown, counted over all loads of the page; ``void``: what interrupted the movie."""
+
+SHOWINGS = Table(
+    "showings",
+    METADATA,
+    Column("session", ForeignKey("sessions.session"), primary_key=True),
+    Column("key", String(64), primary_key=True),
+    Column("phase", String(15), nullable=False),
+    Column("trial", Integer, nullable=False),
+    Column("began_at", Float, nullable=False),
+    Column("stored_at", Float, nullable=False),
+    Index("ix_showings_session_phase_trial", "session", "phase", "trial"),
+)
+"""Showings of trials, one row each; ``began_at`` is the start of the fixation cross, from the
+server's time of the request and the browser's report of how long ago it was."""
 
 EVENTS = Table(
     "events",

@@ -1,10 +1,11 @@
 """Signed media URLs that reveal neither the stimulus nor its outcome.
 
-A URL path is ``/media/<phase>-<trial>-<kind>-<encrypted seed>-<signature>``: the first letter of
-the phase, the index of the trial in its phase, and ``movie``, ``map`` or ``full``. The seed of the
+A URL path is ``/media/<phase>-<trial>-<kind>-<encrypted seed>-<tag>-<signature>``: the first letter
+of the phase, the index of the trial in its phase, ``movie``, ``map`` or ``full``, and the
+`session_tag` by which the server knows who fetched the file. The seed of the
 session's trial order is encrypted, since with a public list of stimuli it would reveal every
 stimulus. The encryption pad is derived from the signature (synthetic IV: P. Rogaway and
-T. Shrimpton, EUROCRYPT 2006). The signature also covers the scenario and the digest of the stimuli,
+T. Shrimpton, EUROCRYPT 2006). The signature also covers tag, scenario and digest of the stimuli,
 so a URL can never refer to another movie. Without the key nobody can make or decode a URL; the full
 movie is available only by the URL that is sent with the feedback. Decoding needs no database.
 """
@@ -12,8 +13,9 @@ movie is available only by the URL that is sent with the feedback. Decoding need
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, cast
 
 from physion.errors import BadInputError
 from physion.experiment.study.identity import Secrets, check_signature, sign
@@ -24,9 +26,27 @@ from physion.experiment.study.study import Study
 MediaKind = Literal["movie", "map", "full"]
 PREFIX = "/media/"
 _PATH = re.compile(
-    r"/media/(([ft])-(0|[1-9][0-9]{0,5})-(movie|map|full))-([0-9a-f]{16})-([0-9a-f]{32})"
+    r"/media/(([ft])-(0|[1-9][0-9]{0,5})-(movie|map|full))-([0-9a-f]{16})-([0-9a-f]{16})-([0-9a-f]{32})"
 )
+NO_TAG = "0" * 16
+"""Tag of media that belong to no session, such as the example."""
 _PHASES = {phase[0]: phase for phase in PHASES}
+
+
+@dataclass(frozen=True)
+class SignedMedia:
+    """What a valid path stands for: the file, and the trial of the session with this tag."""
+
+    file: Path
+    tag: str
+    phase: str
+    trial: int
+    kind: MediaKind
+
+
+def session_tag(secrets: Secrets, session: str) -> str:
+    """Return the tag (16 hexadecimal digits) of a session in its media URLs."""
+    return sign(secrets, "media of", session)[:16]
 
 
 def sign_media(
@@ -37,6 +57,7 @@ def sign_media(
     phase: str,
     trial: int,
     kind: MediaKind,
+    tag: str = NO_TAG,
 ) -> str:
     """Return the signed path of one file of one trial.
 
@@ -50,23 +71,31 @@ def sign_media(
         Phase, and index of the trial in it.
     kind
         The observed movie, the map, or the full movie (familiarization only).
+    tag
+        The `session_tag` of the session.
     """
     if kind == "full" and phase != PHASES[0]:
         raise ValueError("there is no URL for the full movie of a test trial")
     item = f"{phase[0]}-{trial}-{kind}"
-    signature = sign(secrets, *_signed_parts(study, scenario, order_seed, item))
-    return f"{PREFIX}{item}-{order_seed ^ _pad(secrets, signature):016x}-{signature}"
+    signature = sign(secrets, *_signed_parts(study, scenario, order_seed, item, tag))
+    return f"{PREFIX}{item}-{order_seed ^ _pad(secrets, signature):016x}-{tag}-{signature}"
 
 
 def read_media_path(study: Study, secrets: Secrets, path: str) -> Path:
     """Return the file of a signed path; raise `BadInputError` if the path is not validly signed."""
+    return read_media(study, secrets, path).file
+
+
+def read_media(study: Study, secrets: Secrets, path: str) -> SignedMedia:
+    """Return what a signed path stands for; raise `BadInputError` if it is not validly signed."""
     match = _PATH.fullmatch(path)
     if match is None:
         raise BadInputError("no such movie or picture")
-    item, letter, trial, kind, encrypted, signature = match.groups()
+    item, letter, trial, kind, encrypted, tag, signature = match.groups()
     order_seed = int(encrypted, 16) ^ _pad(secrets, signature)
     for scenario in study.scenarios:
-        if check_signature(secrets, signature, *_signed_parts(study, scenario, order_seed, item)):
+        parts = _signed_parts(study, scenario, order_seed, item, tag)
+        if check_signature(secrets, signature, *parts):
             break
     else:
         raise BadInputError("no such movie or picture")
@@ -74,12 +103,15 @@ def read_media_path(study: Study, secrets: Secrets, path: str) -> Path:
     name: str = getattr(stimuli[int(trial)], kind) if int(trial) < len(stimuli) else ""
     if not name:
         raise BadInputError("no such movie or picture")
-    return study.folder / name
+    file = study.folder / name
+    return SignedMedia(file, tag, _PHASES[letter], int(trial), cast(MediaKind, kind))
 
 
-def _signed_parts(study: Study, scenario: str, order_seed: int, item: str) -> tuple[str, ...]:
+def _signed_parts(
+    study: Study, scenario: str, order_seed: int, item: str, tag: str
+) -> tuple[str, ...]:
     """Return the texts that the signature of a URL covers."""
-    return "media", study.stimuli_digest, scenario, str(order_seed), item
+    return "media", study.stimuli_digest, scenario, str(order_seed), item, tag
 
 
 def _pad(secrets: Secrets, signature: str) -> int:

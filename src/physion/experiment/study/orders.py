@@ -68,11 +68,15 @@ def _order(key: _StudyKey, scenario: str, order_seed: int) -> Order:
 def fixations(study: Study, scenario: str, order_seed: int, phase: str) -> tuple[int, ...]:
     """Return the duration in ms (integer, uniform) of the fixation cross before each trial."""
     count = len(study.phase(scenario, phase))
+    return tuple(fixation(study, order_seed, phase, trial) for trial in range(count))
+
+
+def fixation(study: Study, order_seed: int, phase: str, trial: int) -> int:
+    """Return the duration in ms of the fixation cross before one trial."""
     if phase == PHASES[0] and not study.timing.fixation_in_familiarization:
-        return (0,) * count
+        return 0
     low, high = study.timing.fixation_ms
-    draws = (stable_hash("fixation", order_seed, phase, trial) for trial in range(count))
-    return tuple(low + draw % (high - low + 1) for draw in draws)
+    return low + stable_hash("fixation", order_seed, phase, trial) % (high - low + 1)
 
 
 def draw_buttons(study: Study, participant: str) -> Literal["yes-no", "no-yes"]:

@@ -8,6 +8,8 @@ from pathlib import Path
 
 from physion.errors import BadInputError
 
+MAX_IDS_BYTES = 10_000_000
+
 
 def read_plain(path: Path, limit: int) -> bytes:
     """Read a regular file of at most ``limit`` bytes.
@@ -55,3 +57,15 @@ def _describe_error(path: Path, error: OSError) -> str:
     if isinstance(error, FileNotFoundError):
         return f"{path} is missing"
     return f"{path} cannot be read: {error.strerror}"
+
+
+def read_ids(path: Path) -> frozenset[str]:
+    """Read a text file with one id a line; `BadInputError` if it has none or cannot be read."""
+    try:
+        lines = read_plain(path, MAX_IDS_BYTES).decode().splitlines()
+    except UnicodeDecodeError as error:
+        raise BadInputError(f"{path}: not a text file in UTF-8") from error
+    ids = frozenset(filter(None, (line.strip() for line in lines)))
+    if not ids:
+        raise BadInputError(f"{path} has no id; write one a line")
+    return ids

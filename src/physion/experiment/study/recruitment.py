@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl, quote, unquote, urlencode, urlsplit, urlunsplit
 
 from physion.errors import BadInputError
-from physion.experiment.protocol.messages import Completion, Enter, Kind, Recruiter
+from physion.experiment.protocol.messages import Completion, Enter, Recruiter, Source
 from physion.experiment.study.identity import REFERENCE_LETTERS, check_signature, sign
 from physion.experiment.study.study_checks import NO_CONTACT
 
@@ -65,18 +65,40 @@ def is_unfilled(enter: Enter) -> bool:
     return False
 
 
-def make_pass(secrets: Secrets, kind: Kind) -> str:
-    """Return the signed ``pass`` of links whose sessions are ``preview`` or ``simulated``."""
-    return f"{kind}-{sign(secrets, 'pass', kind)}"
+LINK_KEYS = ("preview", "simulated", "study", "person")
+"""What a link's ``pass`` is signed for: sessions of a kind, the people of a recruiter, or one
+person."""
 
 
-def read_pass(secrets: Secrets, word: str) -> Kind | None:
-    """Return the session kind that a link's ``pass`` gives; None if its signature is invalid."""
-    for kind in ("preview", "simulated"):
-        name, _, signature = word.partition("-")
-        if name == kind and check_signature(secrets, signature, "pass", kind):
-            return kind  # type: ignore[return-value]
-    return None
+def make_pass(secrets: Secrets, key: str, *signed: str) -> str:
+    """Return the ``pass`` of a link.
+
+    Parameters
+    ----------
+    secrets
+        Keys of the study.
+    key
+        One of `LINK_KEYS`.
+    signed
+        Nothing for ``preview`` and ``simulated``, the recruiter for ``study``, recruiter and id for
+        ``person``.
+    """
+    return f"{key}-{sign(secrets, 'pass', key, *signed)}"
+
+
+def read_pass(secrets: Secrets, enter: Enter) -> str | None:
+    """Return which of `LINK_KEYS` signed the link of a visitor; None if there is no valid one."""
+    key, _, signature = (enter.pass_ or "").partition("-")
+    signed = {"study": (enter.source,), "person": (enter.source, enter.id or "")}.get(key, ())
+    if key not in LINK_KEYS or (key == "person" and not enter.id):
+        return None
+    return key if check_signature(secrets, signature, "pass", key, *signed) else None
+
+
+def is_id_allowed(study: Study, source: str, raw_id: str) -> bool:
+    """Return whether an id fits the recruiter's pattern and the allow list."""
+    fits = re.fullmatch(getattr(study.recruitment, f"{source}_id") or ".*", raw_id, re.DOTALL)
+    return fits is not None and (study.allowed_ids is None or raw_id in study.allowed_ids)
 
 
 def session_code(secrets: Secrets, session: str) -> str:
@@ -203,12 +225,46 @@ def links(study: Study, secrets: Secrets, base_url: str) -> tuple[Link, ...]:
         for name, goes_to in GOES_TO.items():
             query = [f"scenario={quote(scenario, safe='')}"]
             if name in ("preview", "simulated"):
-                query.append(f"pass={make_pass(secrets, name)}")  # type: ignore[arg-type]
+                query.append(f"pass={make_pass(secrets, name)}")
+            elif study.recruitment.signed_links == "study":
+                query.append(f"pass={make_pass(secrets, 'study', name)}")
             if name in PLACEHOLDERS:
                 query.append(PLACEHOLDERS[name])
             address = f"{root}/?{'&'.join(query)}"
             result.append(Link(name, scenario, address, goes_to, _lacks(study, name)))
     return tuple(result)
+
+
+def signed_links(
+    study: Study, secrets: Secrets, base_url: str, source: Source, ids: Sequence[str]
+) -> tuple[tuple[str, str, str], ...]:
+    """Return a link for each scenario and id, signed for the person: (scenario, id, URL).
+
+    It can be opened in any browser, also to continue a session that began in another one.
+
+    Raises
+    ------
+    BadInputError
+        ``base_url`` is not the root URL of a web site, or the study does not allow an id.
+    """
+    root, name = _root(base_url), next(one.id for one in RECRUITERS if one.source == source)
+    for raw_id in ids:
+        if not is_id_allowed(study, source, raw_id):
+            raise BadInputError(
+                f"{raw_id[:40]!r} does not fit {source}_id or is not in the allow list of the study"
+            )
+    return tuple(
+        (scenario, raw_id, f"{root}/?{urlencode(query)}")
+        for scenario in study.scenarios
+        for raw_id in ids
+        for query in (
+            {
+                "scenario": scenario,
+                "pass": make_pass(secrets, "person", source, raw_id),
+                name: raw_id,
+            },
+        )
+    )
 
 
 def missing_settings(study: Study) -> tuple[str, ...]:
@@ -227,6 +283,8 @@ def missing_settings(study: Study) -> tuple[str, ...]:
 def _lacks(study: Study, name: str) -> str:
     """Return the setting that is still missing for a recruiter, or an empty text."""
     settings = study.recruitment
+    if settings.signed_links == "person" and name not in ("preview", "simulated"):
+        return "links without a person's signature: print them with --ids FILE"
     if name == "prolific" and not settings.prolific_code:
         return "prolific_code: the completion code that Prolific gives"
     if name == "sona" and not settings.sona_address:

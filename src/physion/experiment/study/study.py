@@ -22,7 +22,7 @@ from typing import Any
 
 from physion.atomic import write_atomic
 from physion.errors import BadInputError
-from physion.experiment.study.plain_files import check_plain, read_plain
+from physion.experiment.study.plain_files import check_plain, read_ids, read_plain
 from physion.experiment.study.stimuli import MAX_BYTES as MAX_STIMULI_BYTES
 from physion.experiment.study.stimuli import PHASES, STIMULI_FILE, Stimulus, parse_stimuli
 from physion.experiment.study.study_file import check_tables, format_tables, parse_toml
@@ -70,6 +70,39 @@ class Screen:
 
 
 @dataclass(frozen=True)
+class Plausibility:
+    """What a session must keep to, to be one of a person, and what interrupts a trial.
+
+    Attributes
+    ----------
+    server_checks
+        Whether answers are checked against the server's clock and the media that it sent: they are
+        refused before fixation cross, cue and movie can have been shown.
+    fast_ms, fast_answers
+        Response time under which an answer is too fast, and the number of such answers from which a
+        session is implausible (a person may press by anticipation now and then).
+    reading_s
+        Shortest time in seconds for all pages together; less, with all movies, is implausible.
+    max_showings
+        How often a trial may be shown, over all loads of the page; sessions with more are flagged.
+    interrupted
+        What happens when, during cue or movie, the page is hidden, the window too small, or the
+        question whether to stop open: ``repeat`` shows the trial again (five times at most),
+        ``void`` goes on and marks the answer, which the analysis leaves out.
+    simulated_speed
+        How many times faster than people simulated participants may be.
+    """
+
+    server_checks: bool = True
+    fast_ms: int = 100
+    fast_answers: int = 3
+    reading_s: float = 10.0
+    max_showings: int = 2
+    interrupted: str = "repeat"
+    simulated_speed: float = 1.0
+
+
+@dataclass(frozen=True)
 class Recruitment:
     """Settings of recruitment and completion credit.
 
@@ -77,6 +110,16 @@ class Recruitment:
     ----------
     id_needed
         Whether participants without an id are refused.
+    prolific_id, sona_id, mturk_id, link_id
+        Regular expression that ids from this recruiter must match completely; empty: any id.
+    allow_list
+        Name of a text file in the study folder with all ids that may take part; empty: any.
+    signed_links
+        ``no``: anyone who has the address may enter; ``study``: only by a link that
+        `recruitment.links` signed for a recruiter; ``person``: only by a link signed for the id.
+    hold_minutes
+        Time without an answer or page after which the place of an unfinished session is given to
+        somebody else.
     prolific_code
         Prolific's completion code, also part of the completion URL.
     sona_address
@@ -89,6 +132,13 @@ class Recruitment:
     """
 
     id_needed: bool = False
+    prolific_id: str = "[0-9a-fA-F]{24}"
+    sona_id: str = ""
+    mturk_id: str = ""
+    link_id: str = ""
+    allow_list: str = ""
+    signed_links: str = "no"
+    hold_minutes: int = 15
     prolific_code: str = ""
     sona_address: str = ""
     mturk_code: str = "session"
@@ -183,13 +233,15 @@ class Study:
         Number of trials loaded ahead of the current one.
     embed_from
         Sites that may show the pages in a frame (MTurk); none by default.
-    timing, screen, recruitment, limits
+    timing, screen, plausibility, recruitment, limits
         The tables of ``study.toml``.
     declined, stopped, device_refused, full
         Codes and URLs of participants who gave no consent, who stopped, whose device cannot show
         the movies, and who came when the study was full.
     bonus
         The rule of the bonus in the table of payments.
+    allowed_ids
+        Ids of the allow list; None if the study has none.
     stimuli
         Rows of ``stimuli.csv`` of the study's scenarios.
     texts
@@ -219,6 +271,7 @@ class Study:
     embed_from: tuple[str, ...] = ()
     timing: Timing = Timing()
     screen: Screen = Screen()
+    plausibility: Plausibility = Plausibility()
     recruitment: Recruitment = Recruitment()
     declined: EarlyEnd = EarlyEnd()
     stopped: EarlyEnd = EarlyEnd()
@@ -227,6 +280,7 @@ class Study:
     bonus: Bonus = Bonus()
     limits: Limits = Limits()
     stimuli: tuple[Stimulus, ...] = ()
+    allowed_ids: frozenset[str] | None = field(default=None, repr=False)
     texts: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     consent_files: Mapping[str, str] = field(default_factory=dict)
     digest: str = ""
@@ -243,6 +297,7 @@ EARLY_ENDS = ("declined", "stopped", "device_refused", "full")
 _PARTS: dict[str, type[Any]] = {
     "timing": Timing,
     "screen": Screen,
+    "plausibility": Plausibility,
     "recruitment": Recruitment,
     **dict.fromkeys(EARLY_ENDS, EarlyEnd),
     "bonus": Bonus,
@@ -279,6 +334,7 @@ def load_study(folder: Path | str) -> Study:
         if consent is not None:
             files[language] = hashlib.sha256(consent).hexdigest()
             written.append(consent)
+    allow_list = study.recruitment.allow_list
     listed = folder / STIMULI_FILE
     rows = read_plain(listed, MAX_STIMULI_BYTES)
     stimuli = tuple(s for s in parse_stimuli(listed, rows) if s.scenario in study.scenarios)
@@ -286,6 +342,7 @@ def load_study(folder: Path | str) -> Study:
     return replace(
         study,
         stimuli=stimuli,
+        allowed_ids=read_ids(folder / allow_list) if allow_list else None,
         texts=texts,
         consent_files=files,
         digest=_digest(content, *written, rows),

@@ -112,6 +112,27 @@ def listed(each: Check, least: int, most: int = 100) -> Check:
     return check
 
 
+def regex(value: Any) -> str:
+    """Check an empty text or a regular expression."""
+    line = str(text(500)(value))
+    try:
+        re.compile(line)
+    except re.error as error:
+        raise ValueError(f"empty or a regular expression ({error})") from None
+    return line
+
+
+def one_of(*allowed: str) -> Check:
+    """Return a check for one of several texts."""
+
+    def check(value: Any) -> str:
+        if value not in allowed:
+            raise ValueError(" or ".join(allowed))
+        return str(value)
+
+    return check
+
+
 def span(value: Any) -> tuple[int, int]:
     """Check a range in milliseconds: two integers, the smaller first."""
     allowed = "two whole numbers of milliseconds from 0 to 60000, the smaller first"
@@ -218,9 +239,43 @@ KEYS: tuple[Key, ...] = (
     Key("screen", "min_height", whole(320, 10_000), ""),
     Key("screen", "fullscreen", flag,
         "Offer full screen before the trials, and again after it was left."),
+    Key("plausibility", "server_checks", flag,
+        "Check answers by the server's clock and the media that it sent: an answer before cross,\n"
+        "cue and movie can have been shown is refused; sessions without media or too short are\n"
+        "implausible."),
+    Key("plausibility", "fast_ms", whole(0, 10_000),
+        "Response time in ms under which an answer is too fast for a person."),
+    Key("plausibility", "fast_answers", whole(1, 100_000),
+        "Number of such answers from which a session is implausible."),
+    Key("plausibility", "reading_s", number(0, 3600),
+        "A session that took less than all its movies and this many seconds is implausible."),
+    Key("plausibility", "max_showings", whole(1, 50),
+        "How often a trial may be shown, also after reloading the page; sessions with more are\n"
+        "flagged as replayed."),
+    Key("plausibility", "interrupted", one_of("repeat", "void"),
+        "If the page was hidden, the window too small or the question whether to stop open\n"
+        "during a movie: \"repeat\" shows the trial again (five times at most), \"void\" goes on\n"
+        "and marks the answer, which the analysis leaves out."),
+    Key("plausibility", "simulated_speed", number(1, 1_000_000),
+        "How many times faster than people simulated participants may be (1000 for a quick test)."),
     Key("recruitment", "id_needed", flag,
         "Refuse participants without an id (of Prolific, SONA or MTurk, or participant=ID in a\n"
         "plain link)."),
+    Key("recruitment", "prolific_id", regex,
+        "Regular expression that ids from Prolific must match completely; empty: any id."),
+    Key("recruitment", "sona_id", regex, "The same for SONA's survey codes, e.g. [0-9]{1,7}."),
+    Key("recruitment", "mturk_id", regex, "The same for MTurk's worker ids, e.g. A[0-9A-Z]{5,20}."),
+    Key("recruitment", "link_id", regex, "The same for participant=ID in a plain link."),
+    Key("recruitment", "allow_list", pattern(
+        rf"|{NAME}", "empty or the name of a file in the study folder"),
+        "Text file in this folder with the ids that may take part, one a line; empty: all ids."),
+    Key("recruitment", "signed_links", one_of("no", "study", "person"),
+        "\"study\": people enter only by the links that physion experiment links prints;\n"
+        "\"person\": only by a link that it signs for their id (links --ids FILE); \"no\": by any\n"
+        "address."),
+    Key("recruitment", "hold_minutes", whole(1, 100_000),
+        "The place of an unfinished session is free again after this many minutes without an\n"
+        "answer; its participant can still finish."),
     Key("recruitment", "prolific_code", _code, "Prolific's completion code."),
     Key("recruitment", "sona_address", address("experiment_id", "credit_token"),
         "SONA's completion URL, with experiment_id and credit_token."),
@@ -250,6 +305,7 @@ KEYS: tuple[Key, ...] = (
 TABLES = {
     "timing": "Durations within a trial.",
     "screen": "In a smaller window participants are asked to enlarge it; telephones are refused.",
+    "plausibility": "Sessions that no person can have made, repeated and interrupted movies.",
     "recruitment": "Recruitment and completion credit.",
     **_EARLY_ENDS,
     "bonus": "Bonus in the table of payments, for finished sessions.",

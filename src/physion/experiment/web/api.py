@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, cast
 
 from fastapi import APIRouter
 from starlette.concurrency import run_in_threadpool
@@ -18,6 +18,7 @@ from physion.experiment.protocol.messages import (
     Jump,
     PageDone,
     PublicStudy,
+    Showing,
     TrialMedia,
 )
 from physion.experiment.study.media_links import sign_media
@@ -53,6 +54,7 @@ def public_study(study: Study, secrets: Secrets) -> PublicStudy:
         flash_hz=study.timing.flash_hz,
         break_every=study.timing.break_every,
         preload=study.preload,
+        interrupted=cast(Literal["repeat", "void"], study.plausibility.interrupted),
         example={name: _example(study, secrets, name) for name in study.scenarios},
         recruiters=list(RECRUITERS),
         device_refused={
@@ -123,7 +125,7 @@ def build_api(study: Study, secrets: Secrets, store: Store) -> APIRouter:
         enter = await read_message(request, Enter)
         if is_mturk_preview(enter):
             return refuse("not_yet", "Accept the task first.")
-        entered = await store.enter(enter)
+        entered = await store.enter(enter, token_of(request))
         request.scope["state"][ISSUED_TOKEN] = entered.token
         return Reply(entered)
 
@@ -152,6 +154,12 @@ def build_api(study: Study, secrets: Secrets, store: Store) -> APIRouter:
         """Move a preview to a page or trial."""
         to = await read_message(request, Jump)
         return Reply(await store.jump(token_of(request), to))
+
+    @router.post("/showings")
+    async def post_showing(request: Request) -> Response:
+        """Store that the next trial begins."""
+        showing = await read_message(request, Showing)
+        return Reply(await store.showing(token_of(request), showing))
 
     @router.post("/events")
     async def post_events(request: Request) -> Response:

@@ -16,8 +16,8 @@ WRONG = (401, 422)
 """Statuses of responses to unknown tokens; 422 since an invalid body is refused first."""
 WITH_TOKEN = frozenset(
     f"/api/{name}"
-    for name in ("session", "trials/familiarization", "trials/test", "page", "answers", "events",
-                 "result", "ending", "jump")
+    for name in ("session", "trials/familiarization", "trials/test", "page", "showings", "answers",
+                 "events", "result", "ending", "jump")
 )  # fmt: skip
 
 
