@@ -166,7 +166,7 @@ def test_every_option_of_a_comparison_reaches_the_report(
         "study's list: collide 16, drop 12 to 16" in (found["methods"]["Trials of a whole session"])
     )
     assert "official-code" in found["methods"]["People"]
-    assert "seed 5" in found["methods"]["Intervals"]
+    assert "seed 5" in found["methods"]["Intervals of people's accuracy and agreement"]
     slopes = {row["hypothesis"]: row for row in found["people_hypotheses"]
               if row["scenario"] == "all"}  # fmt: skip
     assert slopes["H1"]["b"] is not None and slopes["H2"]["b"] is not None
