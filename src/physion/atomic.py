@@ -52,8 +52,11 @@ def write_atomic(path: Path, data: bytes, mode: int = 0o644) -> None:
         finally:
             os.close(descriptor)
         os.replace(part, path)  # noqa: PTH105 - the plain call is what a test can make fail
-    except BaseException:
+    except BaseException as error:
         part.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            # That of a failed write names no file, that of others the temporary one.
+            error.filename, error.filename2 = str(path), None
         raise
     sync_folder(path.parent)
 

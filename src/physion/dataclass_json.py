@@ -87,7 +87,7 @@ def read_dataclass(
     hints = field_types(kind)
     check_keys(data, hints, where, error)
     values = {
-        key: _read_value(hints[key], value, f"{where}.{key}", error) for key, value in data.items()
+        key: read_value(hints[key], value, f"{where}.{key}", error) for key, value in data.items()
     }
     missing = _missing(kind, data)
     if missing:
@@ -143,12 +143,15 @@ def _children(item: Any) -> Iterable[Any]:
     return item if isinstance(item, list) else ()
 
 
-def _read_value(kind: Any, data: Any, where: str, error: type[BadInputError]) -> Any:
-    """Return ``data`` as a value of the type ``kind``, or raise ``error``."""
+def read_value(kind: Any, data: Any, where: str, error: type[BadInputError] = BadInputError) -> Any:
+    """Return parsed JSON as a value of the type ``kind``, or raise ``error`` that says ``where``.
+
+    Types are those that `read_dataclass` takes for fields.
+    """
     origin = typing.get_origin(kind)
     if origin is types.UnionType:
         (chosen,) = (one for one in typing.get_args(kind) if one is not types.NoneType)
-        return None if data is None else _read_value(chosen, data, where, error)
+        return None if data is None else read_value(chosen, data, where, error)
     if dataclasses.is_dataclass(kind):
         return read_dataclass(kind, data, where, error)  # type: ignore[arg-type]
     if origin is tuple:
@@ -165,7 +168,7 @@ def _read_value(kind: Any, data: Any, where: str, error: type[BadInputError]) ->
         raise error(f"{where} must be an object, not {shown(data)}")
     item_kind = typing.get_args(kind)[1]
     return {
-        key: _read_value(item_kind, value, f"{where}[{shown(key)}]", error)
+        key: read_value(item_kind, value, f"{where}[{shown(key)}]", error)
         for key, value in data.items()
     }
 
@@ -193,7 +196,7 @@ def _read_tuple(
     if len(data) != len(kinds):
         raise error(f"{where} must hold {len(kinds)} values, not {len(data)}")
     return tuple(
-        _read_value(kind, item, f"{where}[{i}]", error)
+        read_value(kind, item, f"{where}[{i}]", error)
         for i, (kind, item) in enumerate(zip(kinds, data, strict=True))
     )
 

@@ -129,6 +129,9 @@ def own_study(folder: Path) -> Own:
         split="testing", elements=np.arange(32) % 3 + 1,
         distractors=pd.array(np.arange(32) % 4, dtype="Int64"), occluders=0,
     )  # fmt: skip
+    for name, dtype in COLUMNS.items():
+        if dtype in ("bool", "int64", "float64") and index[name].isna().any():
+            index[name] = pd.Series(0, index.index).astype(dtype)
     for scenario, name in stimuli:
         movie = TrialPaths(dataset, "testing", scenario, name).movie
         movie.parent.mkdir(parents=True, exist_ok=True)

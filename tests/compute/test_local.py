@@ -153,6 +153,40 @@ def test_workers_end_when_the_parent_is_killed(tmp_path: Path) -> None:
     assert children and not any(_runs(child) for child in children)
 
 
+@pytest.mark.skipif(not hasattr(os, "killpg"), reason="there are no process groups here")
+def test_ctrl_c_while_a_worker_imports_prints_no_traceback(tmp_path: Path) -> None:
+    (tmp_path / "slow_tasks.py").write_text(
+        "import os, time\n"
+        "if 'STARTED' in os.environ:\n"
+        "    print('importing', flush=True)\n"
+        "    time.sleep(60)\n"
+        "def same(value): return value\n"
+    )
+    script = tmp_path / "program.py"
+    script.write_text(
+        "import os, sys\n"
+        "from physion.compute.local import LocalExecutor\n"
+        "if __name__ == '__main__':\n"
+        "    from slow_tasks import same\n"
+        "    os.environ['STARTED'] = '1'\n"
+        "    try:\n"
+        "        list(LocalExecutor(1).map(same, {'a': 1}))\n"
+        "    except KeyboardInterrupt:\n"
+        "        sys.exit(130)\n"
+    )
+    program = subprocess.Popen(
+        [sys.executable, str(script)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert program.stdout is not None and program.stdout.readline() == "importing\n"
+    os.killpg(program.pid, signal.SIGINT)
+    _, errors = program.communicate(timeout=60)
+    assert (program.returncode, errors) == (130, "")
+
+
 def test_a_script_without_a_main_guard_is_told_so(tmp_path: Path) -> None:
     script = tmp_path / "careless.py"
     script.write_text(

@@ -15,8 +15,9 @@ import pytest
 from physion.physics.labels import Labels
 from physion.trials import state
 from physion.trials.columns import INDEX_COLUMNS
+from physion.trials.metadata import Metadata
 from physion.trials.schema import FIELDS, GEOMETRY, PASSES, SCHEMA, Field
-from physion.trials.trial_file import Metadata, Trial
+from physion.trials.trial_file import Trial
 from support.paths import ROOT
 
 PAGE = (ROOT / "docs" / "trial-files.md").read_text(encoding="utf-8")

@@ -103,6 +103,36 @@ def test_malicious_pickle_is_refused_and_never_run(how: str, tmp_path: Path) -> 
     assert not target.exists()
 
 
+def test_a_refused_pickle_is_not_advised_to_be_run(tmp_path: Path) -> None:
+    path = tmp_path / "weights.pth"
+    torch.save({"x": _Evil(tmp_path / "pwned")}, path)
+    with pytest.raises(BadInputError, match="save the state dict alone") as error:
+        read_state_dict(path)
+    assert "weights_only" not in str(error.value)
+
+
+@pytest.mark.parametrize("broken", [IndexError("pop"), TypeError("x"), AttributeError("y")])
+def test_whatever_a_broken_pickle_raises_is_one_line(
+    broken: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "weights.pth"
+    torch.save({"a": torch.zeros(1)}, path)
+
+    def load(*_: Any, **__: Any) -> None:
+        raise broken
+
+    monkeypatch.setattr(torch, "load", load)
+    with pytest.raises(BadInputError, match=r"weights\.pth cannot be read as weights"):
+        read_state_dict(path)
+
+
+def test_an_old_torch_file_with_a_pickle_without_end_is_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "weights.pt"
+    path.write_bytes(b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19..")
+    with pytest.raises(BadInputError, match=r"weights\.pt (is refused|cannot be read)"):
+        read_state_dict(path)
+
+
 @pytest.mark.parametrize("name", ["w.pth", "w.safetensors"])
 def test_damaged_missing_and_foreign_files_are_one_clear_error(
     name: str, tmp_path: Path, trained: nn.Module

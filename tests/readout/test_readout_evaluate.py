@@ -98,6 +98,24 @@ def test_a_second_run_does_nothing_and_says_the_same(
     assert done.path.read_bytes() == content
 
 
+@pytest.mark.parametrize("damage", ["cut", "empty", "no text", "another number"])
+def test_a_damaged_table_is_made_again(
+    done: Evaluation, dots: Dataset, work: Path, damage: str
+) -> None:
+    content = done.path.read_bytes()
+    changed = {
+        "cut": b"\n".join(content.split(b"\n")[:3]) + b"\n",
+        "empty": b"",
+        "no text": b"\xff\xfe" + content,
+        "another number": content.replace(b"True", b"Trve", 1),
+    }[damage]
+    assert changed != content
+    done.path.write_bytes(changed)
+    again = evaluate(dots, "frozen-encoder", work, options=TINY, config=QUICK)
+    assert again.path.read_bytes() == content
+    pd.testing.assert_frame_equal(again.predictions, done.predictions)
+
+
 def test_other_dynamics_share_the_features(done: Evaluation, dots: Dataset, work: Path) -> None:
     steps: list[str] = []
     config = EvaluationConfig(

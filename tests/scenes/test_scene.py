@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import time
 from dataclasses import replace
 
 import pytest
@@ -173,3 +174,25 @@ def test_given_frames_are_the_fewest_and_the_most() -> None:
     assert ending.frame_limits(70) == (70, 70)
     with pytest.raises(BadInputError, match="at least 1, not 0"):
         ending.frame_limits(0)
+
+
+@pytest.mark.parametrize("count", [10_001, 100_000])
+def test_too_many_bodies_are_refused_at_once(count: int) -> None:
+    text = json.loads(small_scene().to_json())
+    text["bodies"] += [{**text["bodies"][0], "name": f"body {i}"} for i in range(count - 2)]
+    written, start = json.dumps(text), time.process_time()
+    with pytest.raises(BadSceneError, match=rf"scene has {count} bodies, more than 10000"):
+        Scene.from_json(written)
+    assert time.process_time() - start < 10
+    bodies = tuple(Body(f"b{i}", "cube", (0.0, 0.0, 0.0)) for i in range(10_001))
+    with pytest.raises(BadSceneError, match="'many' has 10001 bodies and cloths, more than 10000"):
+        Scene("many", "drop", bodies, Roles("b0", "b1"), Camera((1.0, 0.0, 0.0)))
+
+
+def test_events_of_many_bodies_take_a_moment() -> None:
+    bodies = tuple(Body(f"b{i}", "cube", (0.0, 0.0, 0.0)) for i in range(3000))
+    events = tuple(BodyEvent(1, body.name, "appear") for body in bodies[2:])
+    start = time.process_time()
+    scene = Scene("many", "drop", bodies, Roles("b0", "b1"), Camera((1.0, 0.0, 0.0)), events=events)
+    assert scene.present(0) == (True, True, *[False] * 2998) and all(scene.present(1))
+    assert time.process_time() - start < 5

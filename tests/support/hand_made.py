@@ -18,7 +18,8 @@ from physion.physics.trajectory import Contacts, Trajectory
 from physion.scenes.scene import Body, Camera, Cloth, Roles, Scene
 from physion.trials.files import encode_png, write_files
 from physion.trials.making.plan import GenerateJob
-from physion.trials.trial_file import Metadata, TrialWriter
+from physion.trials.metadata import Metadata
+from physion.trials.trial_file import TrialWriter
 from physion.trials.video import encode_movie
 
 FRAMES, SIZE = 60, 32

@@ -15,7 +15,8 @@ from physion.scenes.scene import Body, Camera, Cloth, Look, Push, Roles, Scene, 
 from physion.trials.files import write_files
 from physion.trials.index import build_index, write_index
 from physion.trials.layout import TrialPaths
-from physion.trials.trial_file import Metadata, TrialWriter
+from physion.trials.metadata import Metadata
+from physion.trials.trial_file import TrialWriter
 from physion.trials.video import encode_movie
 from support.hand_made import encode_png
 

@@ -13,7 +13,8 @@ from physion.scenes.scene import Body, Camera, Cloth, Look, Push, Roles, Scene
 from physion.trials.files import encode_png, write_files
 from physion.trials.index import build_index, write_index
 from physion.trials.layout import TrialPaths
-from physion.trials.trial_file import Metadata, TrialWriter
+from physion.trials.metadata import Metadata
+from physion.trials.trial_file import TrialWriter
 from physion.trials.video import encode_movie
 
 FRAMES, SIZE = 60, 64

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import json
 import subprocess
 import sys
 from collections.abc import Callable
@@ -127,13 +128,13 @@ def test_every_single_flipped_bit_is_noticed(parts: Parts) -> None:
 
 
 def test_missing_and_foreign_files_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match=r"none\.h5 cannot be read: No such file"):
+    with pytest.raises(BadInputError, match=r"none\.h5 is missing"):
         Trial.open(tmp_path / "none.h5")
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file["x"] = 1
     with pytest.raises(BadInputError, match=r"other\.h5 is not a trial file"):
         Trial.open(tmp_path / "other.h5")
-    with pytest.raises(BadInputError, match="cannot be read"):
+    with pytest.raises(BadInputError, match="is not a regular file"):
         Trial.open(tmp_path)
 
 
@@ -202,6 +203,34 @@ def array_for_group(file: h5py.File) -> None:
 
 
 CHUNKED = {"chunks": True}
+
+
+def json_with(path: str, **values: Any) -> Callable[[h5py.File], None]:
+    """Change values of a field that holds JSON."""
+
+    def change(file: h5py.File) -> None:
+        content = json.loads(bytes(file[path][0])) | values
+        replace_with(path, np.array([json.dumps(content).encode()]), **CHUNKED)(file)
+
+    return change
+
+
+def array_with(path: str, value: float) -> Callable[[h5py.File], None]:
+    """Change one value of an array."""
+
+    def change(file: h5py.File) -> None:
+        values = file[path][()]
+        values.reshape(-1)[7] = value
+        replace_with(path, values, **CHUNKED)(file)
+
+    return change
+
+
+def nested(path: str) -> Callable[[h5py.File], None]:
+    """JSON that is nested without end."""
+    return replace_with(path, np.array([b'{"a": ' + b"[" * 100_000]), **CHUNKED)
+
+
 LISTS = np.empty(1, object)
 LISTS[0] = np.zeros(3, np.float32)
 EVIL: dict[str, tuple[str, Callable[[h5py.File], None]]] = {
@@ -269,6 +298,31 @@ EVIL: dict[str, tuple[str, Callable[[h5py.File], None]]] = {
         "contacts/bodies.*leaves -1..2",
         replace_with("contacts/bodies", np.full((10, 2), 3, np.int32), **CHUNKED),
     ),
+    "deep scene": ("scene.*nested deeper than 100 levels", nested("scene")),
+    "deep metadata": ("metadata.*nested deeper than 100 levels", nested("metadata")),
+    "wide": (
+        "metadata: width must be 1 to 4096, not 1000000",
+        json_with("metadata", width=10**6),
+    ),
+    "no rate": (
+        "metadata: playback_rate must be 1 to 1000, not 0",
+        json_with("metadata", playback_rate=0),
+    ),
+    "long": ("metadata: frames must be 1 to 10000", json_with("metadata", frames=10**9)),
+    "nothing after": (
+        "metadata: observed_frames must be 1 to 60, not 61",
+        json_with("metadata", observed_frames=61),
+    ),
+    "no time": ("metadata: index .* frame_time", json_with("metadata", frame_time=0)),
+    "unknown position": (
+        "trajectory/positions' has values that are not finite",
+        array_with("trajectory/positions", np.nan),
+    ),
+    "infinite rotation": (
+        "trajectory/rotations' has values that are not finite",
+        array_with("trajectory/rotations", np.inf),
+    ),
+    "ids of nothing": ("first_frame/ids' leaves 0..3", array_with("first_frame/ids", 4)),
     "contact after the end": (
         "contacts/frame.*leaves 0..59",
         replace_with("contacts/frame", np.full(10, 60, np.int32), **CHUNKED),

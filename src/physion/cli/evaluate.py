@@ -63,6 +63,8 @@ class Options:
     """Also write how far imagined motion is from the true one over time, for particle models."""
     workers: int = os.cpu_count() or 1
     """Number of processes for simulations."""
+    verify: bool = True
+    """Compare files with their SHA-256 in the index before they are used."""
     dry_run: bool = False
     """Print the plan, with the mean time of earlier evaluations of each model, and do nothing."""
     json: bool = False
@@ -78,7 +80,7 @@ def main(options: Options) -> int:
         options.scenario,
     )
     plan = EvaluationPlan(
-        Dataset(options.dataset),
+        Dataset(options.dataset, verify=options.verify),
         options.out,
         selection,
         options.config,

@@ -44,6 +44,8 @@ class Options:
     """Export this scenario alone."""
     images: bool = True
     """Write pictures into HDF5 files; without, the export is 20 times as fast."""
+    verify: bool = True
+    """Compare files with their SHA-256 in the index before they are used."""
     parts: Literal["all", "seen"] = "all"
     """For webdataset: all parts of a sample, or only those that do not reveal the outcome."""
     license: str | None = None
@@ -79,6 +81,8 @@ def main(options: Options) -> int:
         raise BadInputError(
             f"--no-images applies to HDF5 files: use it with --layout {', '.join(HDF5_LAYOUTS)}"
         )
+    if not options.verify and options.layout in ("webdataset", "result-tables"):
+        raise BadInputError(f"--no-verify does not apply to {options.layout}: leave it out")
     if options.layout == "card":
         return _card(options)
     if options.out is None:
@@ -97,7 +101,7 @@ def _card(options: Options) -> int:
         raise BadInputError("a card describes a whole dataset: leave out --split and --scenario")
     given = {name: getattr(options, name) for name in CARD_TERMS}
     terms = {name: value for name, value in given.items() if value is not None}
-    card = write_card(options.folder, options.out, **terms)
+    card = write_card(options.folder, options.out, verify=options.verify, **terms)
     return _print_paths([card.readme, card.metadata, *card.tables], options.json)
 
 
@@ -151,6 +155,7 @@ def _official(options: Options, out: Path) -> int:
             options.folder,
             out,
             layout=options.layout,
+            verify=options.verify,
             split=options.split,
             scenario=options.scenario,
             images=options.images,

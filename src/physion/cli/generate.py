@@ -76,9 +76,13 @@ def main(options: Options) -> int:
 def _print(report: RunReport, json: bool) -> None:
     if json:
         values = {"made": report.made, "kept": report.kept, "failed": dict(report.failed)}
-        print(json_module.dumps(values | {"index": str(report.index)}, default=list))
+        values |= {"notes": dict(report.notes), "index": str(report.index)}
+        print(json_module.dumps(values, default=list))
         return
     for name, reason in report.failed.items():
         console.print(f"failed: {name}: {reason}", markup=False, soft_wrap=True)
+    for name, notes in report.notes.items():
+        for note in notes:
+            console.print(f"note: {name}: {note}", markup=False, soft_wrap=True)
     done = f"{len(report.made)} made, {len(report.kept)} kept, {len(report.failed)} failed"
     console.print(f"{done}: {report.index}", markup=False, soft_wrap=True)

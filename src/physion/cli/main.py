@@ -73,7 +73,9 @@ def main(argv: list[str] | None = None) -> int:
         _discard_output()
         return OUTPUT_CLOSED
     except OSError as error:
-        print(f"physion: {error.filename or 'a file'}: {error.strerror or error}", file=sys.stderr)
+        where = f"{error.filename}: " if error.filename else ""
+        reason = " ".join((error.strerror or str(error)).split())
+        print(f"physion: {where}{reason}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("physion: interrupted; run the same command again to resume", file=sys.stderr)

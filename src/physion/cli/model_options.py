@@ -23,6 +23,6 @@ def parse_options(pairs: tuple[str, ...], given: Mapping[str, str] | None = None
             raise BadInputError(f"{name} is given twice")
         try:
             values[name] = json.loads(text)
-        except json.JSONDecodeError:
+        except (json.JSONDecodeError, RecursionError):
             values[name] = text
     return values

@@ -59,6 +59,8 @@ class Options:
         default_factory=TrainingOverrides
     )
     """Optimiser and schedule."""
+    verify: bool = True
+    """Compare files with their SHA-256 in the index before they are used."""
     dry_run: bool = False
     """Print the plan with the estimated time of each training, and train nothing. Models of which
     no training is finished make a few steps to be measured."""
@@ -74,9 +76,8 @@ def main(options: Options) -> int:
         count_seeds(options.seed, options.seeds),
         options.scenario,
     )
-    plan = TrainingPlan(
-        Dataset(options.dataset), options.out, selection, options.settings, options.config
-    )
+    dataset = Dataset(options.dataset, verify=options.verify)
+    plan = TrainingPlan(dataset, options.out, selection, options.settings, options.config)
     if options.dry_run:
         with Stages() as stages:
             estimates = estimate_plan(plan, stages)

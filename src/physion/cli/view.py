@@ -39,6 +39,8 @@ class Options:
     or slots: names (physion ls models) or FILE.py:Class."""
     option: tuple[str, ...] = ()
     """Fields of the config of these models as NAME=VALUE, such as weights=shipped."""
+    verify: bool = True
+    """Compare files with their SHA-256 in the index before they are used."""
     open: bool = False
     """Open the page in the browser."""
     json: bool = False
@@ -51,7 +53,9 @@ def main(options: Options) -> int:
     out = options.out if options.out is not None else options.folder / "view.html"
     with Stages() as stages:
         imagine = _imagine(options, stages)
-        report = build_viewer(options.folder, out, wanted, imagine=imagine, progress=stages)
+        report = build_viewer(
+            options.folder, out, wanted, imagine=imagine, verify=options.verify, progress=stages
+        )
     if options.json:
         values = {"page": str(report.page), "bytes": report.size}
         print(json_module.dumps(values | {"shown": report.shown, "left_out": report.left_out}))
@@ -77,4 +81,6 @@ def _imagine(options: Options, stages: Stages) -> Imagine | None:
             "--predictions are shown in trials with details: --details must be at least 1"
         )
     chosen = parse_options(options.option)
-    return imagine_with(Dataset(options.folder), options.predictions, chosen, stages)
+    return imagine_with(
+        Dataset(options.folder, verify=options.verify), options.predictions, chosen, stages
+    )

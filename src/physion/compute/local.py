@@ -12,6 +12,7 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, TypeVar
@@ -139,7 +140,7 @@ class _Worker:
         self.process: BaseProcess = context.Process(
             target=_serve, args=(far, function), daemon=True
         )
-        with _one_thread():
+        with _one_thread(), _interrupts_blocked():
             self.process.start()
         # Only the child holds the far end now, so its death closes the pipe.
         far.close()
@@ -225,6 +226,8 @@ def _serve(pipe: Connection, function: Callable[..., Any]) -> None:
     """Run the tasks that come through the pipe, in the worker process, until it is closed."""
     # Ctrl-C is sent to all processes of the group; only the parent reacts to it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     try:
         pipe.send(_READY)
         while True:
@@ -249,6 +252,25 @@ def _run_task(key: str, function: Callable[[T], R], task: T) -> TaskOutcome[R]:
         text = " ".join(str(error).split()) or "no message"
         line = text if isinstance(error, PhysionError) else f"{type(error).__name__}: {text}"
         return TaskOutcome(key, error=line, traceback=traceback.format_exc(), errno=number)
+
+
+@contextlib.contextmanager
+def _interrupts_blocked() -> Iterator[None]:
+    """Start child processes with Ctrl-C blocked, until they ignore it (`_serve`).
+
+    Otherwise Ctrl-C while a child imports would print the child's traceback. This process handles
+    one that comes in the meantime at the end of the block.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # pragma: no cover - Windows
+        yield
+        return
+    # Started first, since the start of this helper process of Python unblocks Ctrl-C.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextlib.contextmanager

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import types
+import typing
 from collections.abc import Callable, Mapping
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
+import numpy as np
+
+from physion.dataclass_json import field_types, read_value, shown
 from physion.errors import BadInputError, MissingExtraError, PhysionError, UnknownNameError
 from physion.models.batch import Spec
 from physion.models.from_file import is_file_name, load_from_file
@@ -151,9 +156,47 @@ def _missing(name: str, error: ModuleNotFoundError) -> Exception:
 
 
 def make_config(kind: type[C], model: str, options: Mapping[str, Any]) -> C:
-    """Build a config of the dataclass ``kind``; raise `UnknownNameError` for an unknown option."""
-    known = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
-    for option in options:
+    """Build a config of the dataclass ``kind`` from options, each checked against its type.
+
+    Raises
+    ------
+    UnknownNameError
+        For an unknown option.
+    BadInputError
+        For a value of another type than the field declares, or one that the config refuses.
+    """
+    known = field_types(kind)
+    values = {}
+    for option, value in options.items():
         if option not in known:
             raise UnknownNameError(f"option of model {model}", option, known)
-    return kind(**options)
+        values[option] = _as_declared(known[option], value, f"option {option} of model {model}")
+    config = kind(**values)
+    # After the config's own checks, which say more about a wrong name.
+    for option in values:
+        chosen, names = getattr(config, option), typing.get_args(known[option])
+        if typing.get_origin(known[option]) is Literal and chosen not in names:
+            listed = ", ".join(map(str, names))
+            raise BadInputError(
+                f"option {option} of model {model} must be one of {listed}, not {shown(chosen)}"
+            )
+    return config
+
+
+def _as_declared(kind: Any, value: Any, where: str) -> Any:
+    """Return the value of an option as its field's type; raise `BadInputError` for another type.
+
+    Values of fields that JSON cannot express, such as functions, stay as they are.
+    """
+    origin = typing.get_origin(kind)
+    plain = kind in (bool, int, float, str) or origin in (tuple, types.UnionType)
+    if not plain or dataclasses.is_dataclass(value):
+        return value
+    # In Python, options may be tuples and numbers of numpy.
+    if isinstance(value, tuple | list):
+        return read_value(kind, [_without_numpy(item) for item in value], where)
+    return read_value(kind, _without_numpy(value), where)
+
+
+def _without_numpy(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else value

@@ -13,6 +13,7 @@ import pandas as pd
 
 from physion.compute.executor import Executor
 from physion.compute.progress import Progress, tracked
+from physion.digests import is_whole
 from physion.errors import BadInputError
 from physion.models.batch import Provenance
 from physion.models.build import build_model
@@ -29,7 +30,6 @@ from physion.readout.table import (
     Evaluation,
     ScenarioPredictions,
     file_name,
-    is_complete,
     make_table,
     read_table,
     write_table,
@@ -133,7 +133,7 @@ def evaluate_model(
     errors_path = folder / "rollout-errors" / part / name if rollout_errors else None
     if errors_path is not None:
         check_moves_objects(model)
-    if is_complete(path) and (errors_path is None or is_complete(errors_path)):
+    if is_whole(path) and (errors_path is None or is_whole(errors_path)):
         return Evaluation(read_table(path), path, {}, errors_path)
     protocol = Training.named(config.training)
     folds = plan_folds(dataset.index, protocol, config.folds, config.seed)

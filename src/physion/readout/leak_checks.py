@@ -65,9 +65,8 @@ def with_poisoned_futures(
     copy = _copy(dataset, folder)
     for trial in _trials(copy, splits):
         _change_movie(copy, trial, poison)
-        path = copy.paths(trial).trial_file
-        if path.is_file():
-            _poison_motion(path, generator("poison motion", seed, trial))
+        if copy.paths(trial).trial_file.is_file():
+            _poison_motion(copy, trial, generator("poison motion", seed, trial))
     return _written(copy)
 
 
@@ -84,7 +83,7 @@ def with_exchanged_futures(
         trials = [t for split in splits for t in copy.trials(split, scenario)]
         order = [trials[i] for i in generator("exchange", seed, scenario).permutation(len(trials))]
         for trial, other in zip(order, order[1:] + order[:1], strict=True):
-            ending = read_frames(dataset.paths(other).movie)[OBSERVED_FRAMES:]
+            ending = dataset.frames(other)[OBSERVED_FRAMES:]
             _change_movie(
                 copy,
                 trial,
@@ -124,10 +123,15 @@ def _change_movie(
     frames = change(trial, read_frames(path))
     content = encode_movie(frames)
     path.write_bytes(content)
+    _index_again(dataset, trial, "movie", content)
+    dataset.index.loc[dataset.index["trial"] == trial, "frames"] = len(frames)
+
+
+def _index_again(dataset: Dataset, trial: str, column: str, content: bytes) -> None:
+    """Put size and SHA-256 of a file that was written anew into the index."""
     row = dataset.index["trial"] == trial
-    dataset.index.loc[row, "movie_bytes"] = len(content)
-    dataset.index.loc[row, "movie_sha256"] = hashlib.sha256(content).hexdigest()
-    dataset.index.loc[row, "frames"] = len(frames)
+    dataset.index.loc[row, f"{column}_bytes"] = len(content)
+    dataset.index.loc[row, f"{column}_sha256"] = hashlib.sha256(content).hexdigest()
 
 
 def _written(dataset: Dataset) -> Dataset:
@@ -135,8 +139,9 @@ def _written(dataset: Dataset) -> Dataset:
     return Dataset(dataset.folder)
 
 
-def _poison_motion(path: Path, rng: np.random.Generator) -> None:
+def _poison_motion(dataset: Dataset, name: str, rng: np.random.Generator) -> None:
     """Replace the motion after the observed part by noise, and remove its contacts."""
+    path = dataset.paths(name).trial_file
     trial = Trial.open(path)
     trajectory = trial.trajectory
     changed: dict[str, Any] = {}
@@ -153,3 +158,4 @@ def _poison_motion(path: Path, rng: np.random.Generator) -> None:
         trajectory, **changed, contacts=Contacts(**contacts), completed=not trajectory.completed
     )
     write_trial(path, trial.metadata, trial.scene, poisoned, trial.labels, trial.ids)
+    _index_again(dataset, name, "trial_file", path.read_bytes())

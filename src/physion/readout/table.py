@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
 import re
 from collections.abc import Mapping, Sequence
@@ -12,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from physion.atomic import write_atomic
+from physion.digests import write_with_digest
 from physion.models.batch import Provenance
 from physion.readout.protocols import Readout
 
@@ -189,32 +188,16 @@ def make_table(
 
 
 def write_table(table: pd.DataFrame, path: Path) -> None:
-    """Write a CSV file atomically, then its checksum; equal tables give equal bytes."""
+    """Write a CSV file and its SHA-256; equal tables give equal bytes."""
     buffer = io.StringIO()
     table.to_csv(buffer, index=False, lineterminator="\n")
-    content = buffer.getvalue().encode()
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomic(path, content)
-    line = f"{hashlib.sha256(content).hexdigest()}  {path.name}\n"
-    write_atomic(_checksum_path(path), line.encode())
-
-
-def is_complete(path: Path) -> bool:
-    """Return whether a table exists with exactly the bytes that `write_table` wrote."""
-    try:
-        wanted = _checksum_path(path).read_text().partition(" ")[0]
-        return hashlib.sha256(path.read_bytes()).hexdigest() == wanted
-    except (OSError, UnicodeDecodeError):
-        return False
+    write_with_digest(path, buffer.getvalue().encode())
 
 
 def file_name(model: str) -> str:
     """Return the name of a model as part of a file's name: other characters become ``-``."""
     return re.sub(r"[^A-Za-z0-9._+]+", "-", model).strip("-.") or "model"
-
-
-def _checksum_path(path: Path) -> Path:
-    return path.with_name(path.name + ".sha256")
 
 
 def read_table(path: Path) -> pd.DataFrame:

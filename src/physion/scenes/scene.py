@@ -31,6 +31,8 @@ OBSERVED_FRAMES = 45
 """Number of frames that people and models see: 1.5 s of movie, 0.45 s of physics."""
 EVENT_KINDS = ("appear", "vanish", "move")
 """Kinds of `BodyEvent`."""
+MAX_THINGS = 10_000
+"""Largest number of bodies and cloths of a scene; sampled and official ones have less than 50."""
 GRAVITY = 9.81
 """Metres per second squared, downwards."""
 
@@ -223,6 +225,8 @@ class Scene:
 
     def __post_init__(self) -> None:
         names = self.names()
+        if len(names) > MAX_THINGS:
+            raise BadSceneError(_too_many(f"scene {self.name!r}", len(names)))
         repeated = sorted(name for name, count in Counter(names).items() if count > 1)
         if repeated:
             raise BadSceneError(
@@ -250,7 +254,7 @@ class Scene:
     def _check_events(self) -> None:
         """Raise `BadSceneError` for events out of order, or of a kind that makes no sense."""
         bodies = {body.name for body in self.bodies}
-        absent = {name for name in bodies if not self._starts_present(name)}
+        absent = bodies & self._appearing()
         before = 0
         for event in self.events:
             where = f"scene {self.name!r}: event {event.kind!r} of {event.body!r}"
@@ -270,10 +274,13 @@ class Scene:
             if event.kind != "move":
                 absent ^= {event.body}
 
-    def _starts_present(self, name: str) -> bool:
-        """Return whether a body is there in frame 0, because it does not appear later."""
-        kinds = (e.kind for e in self.events if e.body == name and e.kind != "move")
-        return next(kinds, "vanish") != "appear"
+    def _appearing(self) -> set[str]:
+        """Return the bodies that are absent in frame 0, because they appear later."""
+        first: dict[str, str] = {}
+        for event in self.events:
+            if event.kind != "move":
+                first.setdefault(event.body, event.kind)
+        return {name for name, kind in first.items() if kind == "appear"}
 
     def present(self, frame: int) -> tuple[bool, ...]:
         """Return which bodies and cloths are there in ``frame``, in the order of `names`.
@@ -281,9 +288,9 @@ class Scene:
         The same ones take part in the step that leads to it.
         """
         last = {e.body: e.kind for e in self.events if e.kind != "move" and e.frame <= frame}
+        absent = self._appearing()
         return tuple(
-            last[name] == "appear" if name in last else self._starts_present(name)
-            for name in self.names()
+            last[name] == "appear" if name in last else name not in absent for name in self.names()
         )
 
     def names(self) -> list[str]:
@@ -326,4 +333,14 @@ class Scene:
     @classmethod
     def from_json(cls, text: str) -> Scene:
         """Read what `to_json` wrote; `BadSceneError` names the field that is wrong."""
-        return read_dataclass(cls, parse_json(text, "scene", BadSceneError), "scene", BadSceneError)
+        data = parse_json(text, "scene", BadSceneError)
+        # Before every one of them is read.
+        for name in ("bodies", "cloths", "events", "pushes", "joints"):
+            values = data.get(name) if isinstance(data, dict) else None
+            if isinstance(values, list) and len(values) > MAX_THINGS:
+                raise BadSceneError(_too_many("scene", len(values), name))
+        return read_dataclass(cls, data, "scene", BadSceneError)
+
+
+def _too_many(scene: str, count: int, what: str = "bodies and cloths") -> str:
+    return f"{scene} has {count} {what}, more than {MAX_THINGS}"

@@ -5,7 +5,7 @@ What reads trial files and movies is imported when it is used: an index is known
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from physion.errors import BadInputError, UnknownNameError
 from physion.trials.index import read_index
+from physion.trials.indexed_file import IndexedFile
 from physion.trials.layout import TrialPaths
 
 if TYPE_CHECKING:
@@ -27,16 +28,12 @@ class ObservedDataset:
     """Access to the observed movies of a dataset and to nothing else.
 
     For code that must not see the outcome of a trial: only files that end with the observed part
-    are opened, so the future cannot be read by mistake.
+    are opened, so the future cannot be read by mistake. With ``verify``, movies are compared with
+    their SHA-256 in the index.
     """
 
-    def __init__(self, folder: Path, index: pd.DataFrame) -> None:
-        self._movies = {
-            trial: TrialPaths(folder, split, scenario, trial).observed_movie
-            for trial, split, scenario in zip(
-                index["trial"], index["split"], index["scenario"], strict=True
-            )
-        }
+    def __init__(self, folder: Path, index: pd.DataFrame, *, verify: bool = True) -> None:
+        self._movies = _files(folder, index, "observed_movie", verify)
         self._lengths = dict(zip(index["trial"], index["observed_frames"], strict=True))
 
     @property
@@ -57,7 +54,7 @@ class ObservedDataset:
             raise UnknownNameError("trial", trial, self._movies)
         from physion.trials.video import read_frames
 
-        path = self._movies[trial]
+        path = _checked(self._movies[trial], trial)
         frames = read_frames(path, count=count, stride=stride, size=size)
         if (len(frames) - 1) * stride >= self._lengths[trial]:
             raise BadInputError(
@@ -75,16 +72,20 @@ class Dataset:
     ----------
     folder
         Folder that `physion.generate` or ``physion import`` made.
+    verify
+        Compare every file with its SHA-256 in the index before it is used: movies once in a
+        process, trial files whenever they are read.
 
     Raises
     ------
     BadInputError
-        If there is no index. Methods that take the name of a trial raise `UnknownNameError` for an
-        unknown one.
+        If there is no index, or it is damaged. Methods that read a file raise it if the file is
+        missing, damaged or changed. Methods that take the name of a trial raise `UnknownNameError`
+        for an unknown one.
     """
 
-    def __init__(self, folder: Path | str) -> None:
-        self.folder = Path(folder)
+    def __init__(self, folder: Path | str, *, verify: bool = True) -> None:
+        self.folder, self.verify = Path(folder), verify
         self.index: pd.DataFrame = read_index(self.folder)
         """Index: one row per trial; columns as in `physion.trials.columns.INDEX_COLUMNS`."""
 
@@ -107,7 +108,7 @@ class Dataset:
     @cached_property
     def observed(self) -> ObservedDataset:
         """Access to the observed movies alone, for code that must not see the outcome."""
-        return ObservedDataset(self.folder, self.index)
+        return ObservedDataset(self.folder, self.index, verify=self.verify)
 
     def paths(self, trial: str) -> TrialPaths:
         """Return the paths of the files of a trial."""
@@ -116,11 +117,27 @@ class Dataset:
         row = self.index.iloc[self._rows[trial]]
         return TrialPaths(self.folder, row["split"], row["scenario"], trial)
 
+    def file(self, trial: str, column: str) -> IndexedFile | None:
+        """Return a file of a trial, by its column of the index; None if the trial has no such."""
+        if trial not in self._rows:
+            raise UnknownNameError("trial", trial, self._rows)
+        return indexed_file(
+            self.folder, self.index.iloc[self._rows[trial]], column, verify=self.verify
+        )
+
+    def files(self, column: str) -> dict[str, IndexedFile]:
+        """Return the files of one column of the index by trial, without trials that have none."""
+        found = _files(self.folder, self.index, column, self.verify)
+        return {trial: file for trial, file in found.items() if file is not None}
+
     def trial(self, trial: str) -> Trial:
         """Open and check a trial file."""
         from physion.trials.trial_file import Trial
 
-        return Trial.open(self.paths(trial).trial_file)
+        file = self.file(trial, "trial_file")
+        if file is None:
+            raise BadInputError(f"trial {trial!r} has no trial file in the index of {self.folder}")
+        return Trial(file.read(), f"trial file {file.path}")
 
     def frames(
         self,
@@ -134,7 +151,7 @@ class Dataset:
         """Return frames of the full movie (T, H, W, 3) in sRGB; see `video.read_frames`."""
         from physion.trials.video import read_frames
 
-        path = self.paths(trial).movie
+        path = _checked(self.file(trial, "movie"), trial)
         return read_frames(path, start=start, count=count, stride=stride, size=size)
 
     def observed_frames(
@@ -240,3 +257,34 @@ class Dataset:
     @cached_property
     def _rows(self) -> dict[str, int]:
         return {str(name): row for row, name in enumerate(self.index["trial"])}
+
+
+def indexed_file(
+    folder: Path, row: Mapping[Any, Any] | pd.Series[Any], column: str, *, verify: bool = True
+) -> IndexedFile | None:
+    """Return the file of a trial by its column of the index; None if the trial has no such file.
+
+    ``row`` is the trial's row of the index. The path is that of the layout, since one in the index
+    could lead out of the folder.
+    """
+    sha256 = row.get(f"{column}_sha256")
+    if sha256 is None or pd.isna(sha256):
+        return None
+    paths = TrialPaths(folder, str(row["split"]), str(row["scenario"]), str(row["trial"]))
+    return IndexedFile(paths.trial, getattr(paths, column), str(sha256), verify)
+
+
+def _files(
+    folder: Path, index: pd.DataFrame, column: str, verify: bool
+) -> dict[str, IndexedFile | None]:
+    """Return the files of one column of an index by trial."""
+    rows = index[["trial", "split", "scenario", f"{column}_sha256"]].to_dict("records")
+    return {str(row["trial"]): indexed_file(folder, row, column, verify=verify) for row in rows}
+
+
+def _checked(file: IndexedFile | None, trial: str) -> Path:
+    """Return the path of a movie that was compared with its SHA-256."""
+    if file is None:
+        raise BadInputError(f"trial {trial!r} has no such movie; Trial.render makes its pictures")
+    file.check()
+    return file.path

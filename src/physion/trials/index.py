@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import hashlib
 import io
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 import pyarrow as pa
+import pyarrow.parquet as pq
 
-from physion.atomic import write_atomic
+from physion.digests import check_digest, write_with_digest
 from physion.errors import BadInputError
+from physion.plain_files import read_plain
 from physion.trials.columns import FILES, INDEX_COLUMNS
+from physion.trials.indexed_file import MAX_FILE_BYTES
 from physion.trials.layout import INDEX, SAFE_NAME, TrialPaths, find_trials
 
 if TYPE_CHECKING:
@@ -20,6 +24,17 @@ if TYPE_CHECKING:
 
 COLUMNS = {name: column.dtype for name, column in INDEX_COLUMNS.items()}
 """Pandas types by column, in the stored order."""
+MAX_BYTES = 1 << 30
+"""Largest index that is read; that of a million trials has about 300 MB."""
+_AGAIN = "run the command that made the dataset again, which makes its index again"
+_KINDS: dict[str, tuple[str, tuple[Callable[[Any], bool], ...]]] = {
+    "string": ("text", (pa.types.is_string, pa.types.is_large_string)),
+    "int64": ("whole numbers", (pa.types.is_integer,)),
+    "float64": ("numbers", (pa.types.is_floating, pa.types.is_integer)),
+    "bool": ("true or false", (pa.types.is_boolean,)),
+}
+"""What columns of a pandas type hold, and the tests of their Arrow type."""
+_KINDS |= {"Int64": _KINDS["int64"], "Float64": _KINDS["float64"], "boolean": _KINDS["bool"]}
 
 
 def index_row(paths: TrialPaths) -> dict[str, Any]:
@@ -36,10 +51,7 @@ def index_row(paths: TrialPaths) -> dict[str, Any]:
             "it was moved or renamed"
         )
     for name, path in paths.all(meta.movies, meta.free_movies).items():
-        try:
-            content = path.read_bytes()
-        except OSError as error:
-            raise BadInputError(f"{path} cannot be read: {error.strerror}") from error
+        content = read_plain(path, MAX_FILE_BYTES, follow_links=True)
         row[name] = path.relative_to(paths.folder).as_posix()
         row[f"{name}_bytes"] = len(content)
         row[f"{name}_sha256"] = hashlib.sha256(content).hexdigest()
@@ -96,7 +108,7 @@ def build_index(
             if (
                 paths.trial in old
                 and paths.trial not in rows
-                and _is_unchanged(old[paths.trial], paths)
+                and has_sizes(old[paths.trial], paths)
             ):
                 rows[paths.trial] = old[paths.trial]
                 continue
@@ -108,8 +120,8 @@ def build_index(
     return as_table(list(rows.values())), problems
 
 
-def _is_unchanged(row: dict[str, Any], paths: TrialPaths) -> bool:
-    """Return whether a row describes the files of ``paths`` and they have the stored sizes."""
+def has_sizes(row: Mapping[Any, Any], paths: TrialPaths) -> bool:
+    """Return whether a row of an index describes these files, and they have its sizes."""
     if (row["split"], row["scenario"]) != (paths.split, paths.scenario):
         return False
     sizes = {name: row[f"{name}_bytes"] for name in FILES if not pd.isna(row[name])}
@@ -120,6 +132,18 @@ def _is_unchanged(row: dict[str, Any], paths: TrialPaths) -> bool:
         return False
 
 
+def describe_mixed_versions(table: pd.DataFrame) -> str:
+    """Return a note on trials that several versions of the package made; "" if one made all.
+
+    Versions that simulate or render differently are never mixed: `generate` refuses them.
+    """
+    counts = table["package"].dropna().value_counts().sort_index()
+    if len(counts) < 2:
+        return ""
+    listed = ", ".join(f"{count} by {package}" for package, count in counts.items())
+    return f"the trials were made by several versions: {listed}; a new folder has those of one"
+
+
 def as_table(rows: list[dict[str, Any]]) -> pd.DataFrame:
     """Return rows as a table with the columns and types of `COLUMNS`, sorted by split and trial."""
     table = pd.DataFrame(rows, columns=list(COLUMNS)).astype(COLUMNS)
@@ -127,33 +151,42 @@ def as_table(rows: list[dict[str, Any]]) -> pd.DataFrame:
 
 
 def write_index(folder: Path, table: pd.DataFrame) -> Path:
-    """Write the index of ``folder`` atomically; equal tables give equal bytes."""
+    """Write the index of ``folder`` and its SHA-256; equal tables give equal bytes."""
     path = folder / INDEX
-    write_atomic(path, index_bytes(table))
+    write_with_digest(path, index_bytes(table))
     return path
 
 
-def index_bytes(table: pd.DataFrame) -> bytes:
-    """Return the bytes of the parquet file of an index."""
+def index_bytes(table: pd.DataFrame, *, checksums: bool = True) -> bytes:
+    """Return the bytes of the parquet file of an index, with a checksum for every page.
+
+    ``checksums=False`` gives the bytes that earlier versions wrote.
+    """
     buffer = io.BytesIO()
-    table.to_parquet(buffer, engine="pyarrow", compression="zstd", index=False)
+    table.to_parquet(
+        buffer,
+        engine="pyarrow",
+        compression="zstd",
+        index=False,
+        write_page_checksum=checksums,
+    )
     return buffer.getvalue()
 
 
 def read_index(folder: Path) -> pd.DataFrame:
-    """Read and check the index of the dataset in ``folder``; `BadInputError` if it is not valid."""
+    """Read and check the index of the dataset in ``folder``.
+
+    Raises `BadInputError` if there is none, it was changed since it was written, or it has wrong
+    columns, types or names.
+    """
     path = folder / INDEX
     if not folder.is_dir():
         raise BadInputError(f"dataset folder {folder} does not exist")
     if not path.is_file():
         raise BadInputError(f"{folder} has no {INDEX}: it is not a dataset, or is not finished")
-    try:
-        table = pd.read_parquet(path, engine="pyarrow")
-    except (pa.ArrowException, OSError, ValueError, KeyError, TypeError) as error:
-        raise BadInputError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
-    missing = [name for name in COLUMNS if name not in table.columns]
-    if missing:
-        raise BadInputError(f"{path} lacks the columns {missing}")
+    content = read_plain(path, MAX_BYTES, follow_links=True)
+    check_digest(path, content, _AGAIN)
+    table = _read_columns(path, content)
     for name in ("trial", "split", "scenario"):
         safe = table[name].astype("string").str.fullmatch(SAFE_NAME).fillna(False)
         if not safe.all():
@@ -161,3 +194,33 @@ def read_index(folder: Path) -> pd.DataFrame:
     if table["trial"].duplicated().any():
         raise BadInputError(f"{path}: column 'trial' has duplicate names")
     return table
+
+
+def _read_columns(path: Path, content: bytes) -> pd.DataFrame:
+    """Return the table of a parquet file with the columns and types of `COLUMNS`."""
+    try:
+        stored = pq.read_table(io.BytesIO(content), page_checksum_verification=True)
+        # Otherwise text of invalid bytes would be an error where it is first used.
+        stored.validate(full=True)
+        missing = [name for name in COLUMNS if name not in stored.column_names]
+        if missing:
+            raise BadInputError(f"{path} lacks the columns {missing}; {_AGAIN}")
+        for name, dtype in COLUMNS.items():
+            _check_type(path, stored.column(name), name, dtype)
+        table: pd.DataFrame = stored.to_pandas()
+        return table.astype(COLUMNS)
+    except (pa.ArrowException, OSError, ValueError, KeyError, TypeError, OverflowError) as error:
+        reason = " ".join(str(error).split())
+        raise BadInputError(f"{path} cannot be read: {reason}; {_AGAIN}") from error
+
+
+def _check_type(path: Path, column: Any, name: str, dtype: str) -> None:
+    """Raise `BadInputError` unless a column of an Arrow table holds values of a pandas type."""
+    meaning, tests = _KINDS[dtype]
+    optional = dtype not in ("int64", "bool")
+    kind = column.type.value_type if pa.types.is_dictionary(column.type) else column.type
+    fits = any(test(kind) for test in tests) or (optional and pa.types.is_null(kind))
+    if not fits:
+        raise BadInputError(f"{path}: column {name!r} must hold {meaning}, not {kind}; {_AGAIN}")
+    if not optional and column.null_count:
+        raise BadInputError(f"{path}: column {name!r} lacks {column.null_count} values; {_AGAIN}")

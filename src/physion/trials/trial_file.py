@@ -11,7 +11,6 @@ import dataclasses
 import io
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -25,10 +24,13 @@ from physion.dataclass_json import parse_json, read_dataclass
 from physion.errors import BadInputError
 from physion.physics.labels import Labels
 from physion.physics.trajectory import Contacts, Trajectory
+from physion.plain_files import read_plain
 from physion.scenes.looks import in_look
 from physion.scenes.scene import Scene
 from physion.trials.geometry import geometry_arrays
 from physion.trials.guarded_hdf5 import open_hdf5
+from physion.trials.indexed_file import MAX_FILE_BYTES
+from physion.trials.metadata import Metadata
 from physion.trials.schema import (
     FIELDS,
     GEOMETRY,
@@ -48,82 +50,6 @@ T = TypeVar("T")
 
 _STATE = ("positions", "rotations", "velocities", "angular_velocities")
 _CONTACTS = ("frame", "bodies", "point", "normal", "impulse")
-
-
-@dataclass(frozen=True)
-class Metadata:
-    """Origin and settings of a trial; nothing in it depends on the time of its making.
-
-    Parameters
-    ----------
-    trial, dataset, scenario, split
-        Names; that of the trial is unique in the dataset.
-    index
-        Position in the split of the scenario, from 0.
-    preset
-        Name of the scenario's parameter set; None for an imported scene.
-    seed
-        Entropy of the trial's `SeedSequence` in hexadecimal; None for an imported scene.
-    look
-        Colours of the trial's movies, one of `physion.scenes.looks.LOOKS`.
-    width, height
-        Size of the pictures in pixels.
-    frames, observed_frames
-        Number of frames of the whole trial, and of the part shown before the prediction.
-    frame_time
-        Seconds of physics per frame.
-    playback_rate
-        Frames per second of the movies.
-    completed
-        True if everything came to rest before the time limit.
-    engine, renderer, package
-        Names with versions.
-    digest
-        SHA-256 of the trajectory.
-    scene_digest
-        SHA-256 of everything that determines the motion (`Scene.physics_digest`).
-    attempt
-        Number of scenes sampled for this trial and rejected before; None for an imported scene.
-    movies, free_movies
-        Whether there are movies and a map, and further movies in free colours.
-    recorded_contact
-        Outcome that an imported scene was recorded with, else None.
-    """
-
-    trial: str
-    dataset: str
-    scenario: str
-    split: str
-    index: int
-    preset: str | None
-    seed: str | None
-    look: str
-    width: int
-    height: int
-    frames: int
-    observed_frames: int
-    frame_time: float
-    playback_rate: int
-    completed: bool
-    engine: str
-    renderer: str
-    package: str
-    digest: str
-    scene_digest: str
-    attempt: int | None = None
-    movies: bool = True
-    free_movies: bool = False
-    recorded_contact: bool | None = None
-
-    @property
-    def physics_seconds(self) -> float:
-        """Duration in the simulated world, in seconds."""
-        return (self.frames - 1) * self.frame_time
-
-    @property
-    def playback_seconds(self) -> float:
-        """Duration of the movie, in seconds."""
-        return self.frames / self.playback_rate
 
 
 class TrialWriter:
@@ -270,15 +196,17 @@ class Trial:
     def open(cls, path: Path) -> Trial:
         """Open the trial file at ``path``; `BadInputError` names file and field if it is bad."""
         try:
-            data = path.read_bytes()
-        except OSError as error:
-            raise BadInputError(f"trial file {path} cannot be read: {error.strerror}") from error
+            data = read_plain(path, MAX_FILE_BYTES, follow_links=True)
+        except BadInputError as error:
+            raise BadInputError(f"trial file {error}") from error
         return cls(data, f"trial file {path}")
 
     @cached_property
     def metadata(self) -> Metadata:
         """Origin and settings of the trial."""
-        return self._read_json(Metadata, "metadata")
+        metadata = self._read_json(Metadata, "metadata")
+        metadata.check(self._where)
+        return metadata
 
     @cached_property
     def labels(self) -> Labels:
@@ -321,19 +249,36 @@ class Trial:
                 raise BadInputError(
                     f"{self._where}: field 'contacts/{name}' leaves {low}..{high - 1}"
                 )
+        arrays["cloth_vertices"] = self._reader.array("trajectory/cloth_vertices")
+        self._check_finite(arrays)
         return Trajectory(
             **arrays,
-            cloth_vertices=self._reader.array("trajectory/cloth_vertices"),
             cloth_distance=self._reader.array("trajectory/cloth_distance"),
             contacts=contacts,
             completed=self.metadata.completed,
             engine=self.metadata.engine,
         )
 
+    def _check_finite(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Raise `BadInputError` for infinite values, and for NaN in motions that were simulated.
+
+        A motion that was imported may be unknown, which is NaN.
+        """
+        bad = np.isinf if self.metadata.imported else lambda values: ~np.isfinite(values)
+        for name, values in arrays.items():
+            if bad(values).any():
+                raise BadInputError(
+                    f"{self._where}: field 'trajectory/{name}' has values that are not finite"
+                )
+
     @cached_property
     def ids(self) -> NDArray[np.int16]:
         """Ids (H, W) of frame 0: 0 is the room, i + 1 the i-th object of `Scene.names`."""
-        return self._reader.array("first_frame/ids")
+        ids: NDArray[np.int16] = self._reader.array("first_frame/ids")
+        things = len(self.scene.names())
+        if ids.size and (ids.min() < 0 or ids.max() > things):
+            raise BadInputError(f"{self._where}: field 'first_frame/ids' leaves 0..{things}")
+        return ids
 
     @cached_property
     def pixel_fractions(self) -> NDArray[np.float32]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -67,6 +68,20 @@ def test_a_plan_predicts_all_readouts_and_a_second_run_only_reads(
     pd.testing.assert_frame_equal(
         summarise_accuracy(again.run().evaluated), summarise_accuracy(results.evaluated)
     )
+
+
+def test_a_table_that_was_changed_in_place_is_made_again(dots: Dataset, tmp_path: Path) -> None:
+    def plan() -> EvaluationPlan:
+        return make_plan(dots, tmp_path, [UNTRAINED], [Training.ALL], (0,))
+
+    ((_, done),) = plan().run().tables
+    content, stamp = done.path.read_bytes(), done.path.stat()
+    done.path.write_bytes(content.replace(b"True", b"Trve", 1))
+    os.utime(done.path, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
+    again = plan()
+    assert len(again.pending) == 1
+    again.run()
+    assert done.path.read_bytes() == content and not plan().pending
 
 
 def test_the_tables_are_those_of_single_evaluations_and_trainings_are_found(

@@ -6,6 +6,7 @@ import csv
 import gzip
 import json
 import math
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from physion.physics.engine import make_engine
 from physion.physics.labels import label_contact
 from physion.scenes.scene import BodyEvent, Scene
 from physion.scenes.tdw.commands import quaternion_from_euler, vector
+from physion.scenes.tdw.log_lines import MAX_LINE_BYTES
 from physion.scenes.tdw.read_logs import read_scenes
 
 Command = dict[str, Any]
@@ -382,3 +384,36 @@ def test_official_logs_are_imported_completely(official: Path) -> None:
     assert all(published[t.scene.name] == t.outcome.contact for t in shared)
     for trial in found.trials[::50]:
         assert Scene.from_json(trial.scene.to_json()) == trial.scene
+
+
+def test_a_packed_log_is_not_unpacked_beyond_its_limit(tmp_path: Path) -> None:
+    """A line of 300 MB in 300 KB: what is unpacked stays below three times the longest line."""
+    folder = tmp_path / "bomb"
+    path = write_log(folder, [[two_cubes()]], packed=True)
+    path.write_bytes(gzip.compress(b" " * 2**20) * 300)
+    tracemalloc.start()
+    found = read_scenes(tmp_path)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    (failure,) = found.failures
+    assert f"has a line of more than {MAX_LINE_BYTES} bytes" in failure.message
+    assert peak < 3 * MAX_LINE_BYTES
+
+
+def test_a_packed_log_of_many_lines_is_bounded_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_log(tmp_path / "bomb", [[two_cubes()]], packed=True)
+    monkeypatch.setattr("physion.scenes.tdw.log_lines.MAX_LOG_BYTES", 2**20)
+    (tmp_path / "bomb" / "metadata.json").write_text("[]")
+    path.write_bytes(gzip.compress(b"[] trial 0\n" * 2**10) * 100)
+    (failure,) = read_scenes(tmp_path).failures
+    assert "has more than 1048576 bytes uncompressed" in failure.message
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '[{"a": ' * 100_000])
+def test_deep_metadata_is_one_line(tmp_path: Path, text: str) -> None:
+    write_log(tmp_path / "deep", [[two_cubes()]])
+    (tmp_path / "deep" / "metadata.json").write_text(text)
+    (failure,) = read_scenes(tmp_path).failures
+    assert "metadata.json cannot be read" in failure.message and "\n" not in failure.message

@@ -14,6 +14,7 @@ import pytest
 from physion.errors import BadInputError, UnknownNameError
 from physion.models.batch import Spec
 from physion.training.sources.open_source import observed_source, whole_source
+from physion.trials import indexed_file
 from physion.trials.dataset import Dataset
 from physion.trials.video import encode_movie, read_frames
 from support.official_hand_made import CLOTH, FRAMES, RIGID, SIZE
@@ -130,7 +131,7 @@ def test_a_changed_movie_is_refused_with_its_trial_and_file(copy: Dataset) -> No
     # Again, and not only the first time.
     with pytest.raises(BadInputError, match="was changed since it was made"):
         observed_source(copy, SPEC).context([RIGID])
-    unchecked = observed_source(copy, SPEC, verify=False).context([RIGID])
+    unchecked = observed_source(Dataset(copy.folder, verify=False), SPEC).context([RIGID])
     whole = read_frames(paths.observed_movie, stride=6, count=7, size=(16, 16))
     np.testing.assert_array_equal(unchecked.rgb[0], whole)
     # The full movie is another file.
@@ -141,13 +142,13 @@ def test_a_movie_is_checked_once_and_again_after_it_was_written(
     copy: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read: list[Path] = []
-    read_bytes = Path.read_bytes
-    monkeypatch.setattr(Path, "read_bytes", lambda path: read.append(path) or read_bytes(path))
+    hashed = indexed_file.file_sha256
+    monkeypatch.setattr(indexed_file, "file_sha256", lambda p: read.append(p) or hashed(p))
     movie = copy.paths(RIGID).observed_movie
     for _ in range(3):
         observed_source(copy, SPEC).context([RIGID, RIGID])
     assert read.count(movie) == 1
-    content = bytearray(read_bytes(movie))
+    content = bytearray(movie.read_bytes())
     content[-1] ^= 1
     movie.write_bytes(bytes(content))
     os.utime(movie, ns=(0, 0))
@@ -159,7 +160,7 @@ def test_a_missing_movie_is_named(copy: Dataset) -> None:
     copy.paths(RIGID).observed_movie.unlink()
     for verify in (True, False):
         with pytest.raises(BadInputError, match=rf"{RIGID}_observed\.mp4 is missing"):
-            observed_source(copy, SPEC, verify=verify).context([RIGID])
+            observed_source(Dataset(copy.folder, verify=verify), SPEC).context([RIGID])
 
 
 @pytest.mark.parametrize(
@@ -188,7 +189,7 @@ def test_a_cut_movie_is_refused(copy: Dataset) -> None:
     movie = copy.paths(RIGID).movie
     movie.write_bytes(movie.read_bytes()[:-2000])
     with pytest.raises(BadInputError, match=r"_img\.mp4 is (cut short|damaged)"):
-        whole_source(copy, SPEC, verify=False).whole([RIGID])
+        whole_source(Dataset(copy.folder, verify=False), SPEC).whole([RIGID])
 
 
 def test_keys_follow_the_movie_and_what_the_spec_reads(made: Dataset, copy: Dataset) -> None:

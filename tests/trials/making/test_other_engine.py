@@ -9,11 +9,11 @@ import pytest
 from physion.compute.local import SerialExecutor
 from physion.errors import BadInputError, UnknownNameError
 from physion.physics.engine import make_engine
+from physion.sealed import read_sealed
 from physion.trials.dataset import Dataset
 from physion.trials.making.generate import make_trials
 from physion.trials.making.plan import GenerateSettings, plan_dataset
 from physion.trials.making.verify import verify_dataset
-from physion.trials.sealed import read_sealed
 
 MUJOCO = GenerateSettings(
     width=32, height=32, jitters=1, min_visible=0.0, movies=False, engine="mujoco"

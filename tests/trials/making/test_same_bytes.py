@@ -1,4 +1,4 @@
-"""Equal seeds give equal bytes on other processors, code paths of libraries and threads."""
+"""Equal seeds give equal bytes on other processors, code paths, threads, in other environments."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from physion.scenes.sampling.registry import scenarios
 from physion.trials.making.reproduce import trial_digests
 
 PROBE = """
-import hashlib, json, math
+import hashlib, json, locale, math, time
 import numba, numpy, scipy.linalg, threadpoolctl
 from numba.core.registry import cpu_target
 from numpy._core._multiarray_umath import __cpu_dispatch__, __cpu_features__
@@ -31,6 +31,8 @@ print(json.dumps({
     "threads": [numba.get_num_threads(), *(pool["num_threads"] for pool in pools)],
     "numba": list(cpu_target.target_context.codegen().magic_tuple()[1:]),
     "numpy": [name for name in __cpu_dispatch__ if __cpu_features__[name]],
+    "hash": hash("physion"),
+    "zone": [time.localtime(0).tm_gmtoff, locale.setlocale(locale.LC_ALL, "")],
     "libm": hashlib.sha256(repr(values).encode()).hexdigest(),
 }))
 """
@@ -107,6 +109,10 @@ ENVIRONMENTS = {
         needs=("FMA3",),
     ),
     "one thread": _threads(1),
+    "hash seed, time zone and locale": Environment(
+        {"PYTHONHASHSEED": "7", "TZ": "<+1245>-12:45", "LC_ALL": "C"},
+        lambda seen, default: seen["zone"] == [45_900, "C"] and seen["hash"] != default["hash"],
+    ),
     "two threads": _threads(2),
 }
 

@@ -65,7 +65,7 @@ def test_missing_unlisted_and_relabelled_trials_are_found(folder: Path) -> None:
     write_index(folder, table)
     faults = "\n".join(verify_dataset(folder, again=0).faults)
     assert "c.h5 is not in the index" in faults
-    assert "a_map.png cannot be read" in faults
+    assert "a_map.png is missing" in faults
     assert "b: contact is True, the index says False" in faults
 
 

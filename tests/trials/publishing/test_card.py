@@ -19,6 +19,7 @@ import pytest
 
 from physion.cli.main import main as cli
 from physion.errors import BadInputError
+from physion.sealed import write_sealed
 from physion.trials.columns import INDEX_COLUMNS
 from physion.trials.files import encode_png, write_files
 from physion.trials.index import COLUMNS, build_index, read_index, write_index
@@ -76,7 +77,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert not problems
     write_index(folder, table)
     chosen = {"min_visible": 0.0005, "robust": 0.5, "observed_contact": False}
-    (folder / "dataset.json").write_text(json.dumps({"dataset": "mine", "settings": chosen}))
+    write_sealed(folder / "dataset.json", {"dataset": "mine", "settings": chosen})
     return folder
 
 

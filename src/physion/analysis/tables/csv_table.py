@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
+from physion.digests import check_digest, digest_path
 from physion.errors import BadInputError
 
 Array = npt.NDArray[np.float64]
@@ -17,13 +19,13 @@ Array = npt.NDArray[np.float64]
 def read_csv(path: Path, columns: Iterable[str]) -> pd.DataFrame:
     """Read the CSV file at ``path`` as text; it must have ``columns`` and at least one row.
 
-    Raises `BadInputError` for a file that is absent, of another kind, empty, or lacks a column.
+    Raises `BadInputError` for a file that is absent, of another kind, empty, lacks a column, or
+    was changed since this package wrote it with its SHA-256.
     """
-    if not path.is_file():
-        raise BadInputError(f"{path} is not a file")
+    content = _read_checked(path)
     try:
-        table = pd.read_csv(path, dtype=str, keep_default_na=False, encoding="utf-8")
-    except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError, OSError) as error:
+        table = pd.read_csv(io.BytesIO(content), dtype=str, keep_default_na=False, encoding="utf-8")
+    except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
         raise BadInputError(f"{path} is not a CSV table: {error}") from error
     require_columns(table, columns, str(path))
     if table.empty:
@@ -38,12 +40,26 @@ def read_table(path: Path, columns: Iterable[str]) -> pd.DataFrame:
     """
     if path.suffix.lower() != ".parquet":
         return read_csv(path, columns)
+    content = _read_checked(path)
     try:
-        table = pd.read_parquet(path, engine="pyarrow")
+        table = pd.read_parquet(io.BytesIO(content), engine="pyarrow")
     except (OSError, ValueError) as error:
         raise BadInputError(f"{path} is not a parquet table: {error}") from error
     require_columns(table, columns, str(path))
     return table
+
+
+def _read_checked(path: Path) -> bytes:
+    """Return the bytes of a file, compared with the SHA-256 in its digest file, if there is one."""
+    if not path.is_file():
+        raise BadInputError(f"{path} is not a file")
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise BadInputError(f"{path} cannot be read: {error.strerror}") from error
+    digest = digest_path(path).name
+    check_digest(path, content, f"make it again, or delete {digest} to use the table as it is")
+    return content
 
 
 def require_columns(table: pd.DataFrame, columns: Iterable[str], where: str) -> None:

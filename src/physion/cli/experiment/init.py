@@ -212,7 +212,7 @@ def _study(options: Options, scenarios: tuple[str, ...]) -> Study:
 def _password(path: Path | None) -> str:
     """Return the first line of the password file, or a random password (96 bits)."""
     from physion.experiment.study.identity import MAX_PASSWORD, MIN_PASSWORD
-    from physion.experiment.study.plain_files import read_plain
+    from physion.plain_files import read_plain
 
     if path is None:
         return secrets.token_urlsafe(12)

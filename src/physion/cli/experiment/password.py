@@ -64,7 +64,7 @@ def read_password(path: Path | None) -> str:
 def password_in(path: Path) -> str:
     """Return the first line of a file without surrounding spaces."""
     from physion.errors import BadInputError
-    from physion.experiment.study.plain_files import read_plain
+    from physion.plain_files import read_plain
 
     try:
         return read_plain(path, MAX_BYTES).decode().splitlines()[0].strip()

@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import physion
-from physion.atomic import write_atomic
+from physion.digests import file_sha256
+from physion.errors import BadInputError
+from physion.sealed import read_sealed, write_sealed
 
 if TYPE_CHECKING:
     from physion.cli.run.options import Options
@@ -26,13 +28,13 @@ def finished(options: Options, folder: Path) -> dict[str, Any] | None:
     were changed, are made again. Movies are not read: `physion verify` checks them.
     """
     try:
-        record = json.loads((folder / RECORD).read_bytes())
+        record = read_sealed(folder / RECORD)
         if record["inputs"] != _inputs(options):
             return None
-        if any(_sha256(folder / name) != digest for name, digest in record["files"].items()):
+        if any(file_sha256(folder / name) != digest for name, digest in record["files"].items()):
             return None
         answer: dict[str, Any] = record["answer"]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+    except (BadInputError, OSError, KeyError, TypeError, AttributeError):
         return None
     return answer
 
@@ -41,9 +43,9 @@ def record_finished(
     options: Options, folder: Path, files: list[Path], answer: dict[str, Any]
 ) -> None:
     """Write down options, code and results of a run without failures."""
-    digests = {path.relative_to(folder).as_posix(): _sha256(path) for path in files}
+    digests = {path.relative_to(folder).as_posix(): file_sha256(path) for path in files}
     record = {"inputs": _inputs(options), "files": digests, "answer": answer}
-    write_atomic(folder / RECORD, (json.dumps(record, indent=1) + "\n").encode())
+    write_sealed(folder / RECORD, record)
 
 
 def _inputs(options: Options) -> str:
@@ -55,10 +57,5 @@ def _inputs(options: Options) -> str:
     for folder in folders:
         for path in sorted(path for path in folder.rglob("*") if path.is_file()):
             if "__pycache__" not in path.parts:
-                sha.update(f"{path.relative_to(folder)} {_sha256(path)}".encode())
+                sha.update(f"{path.relative_to(folder)} {file_sha256(path)}".encode())
     return sha.hexdigest()
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

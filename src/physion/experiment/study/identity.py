@@ -18,7 +18,7 @@ from typing import Any
 
 from physion.atomic import write_atomic
 from physion.errors import BadInputError
-from physion.experiment.study.plain_files import read_plain
+from physion.plain_files import read_plain
 
 SECRET_FILE = "secret.json"
 VERSION = 1

@@ -12,9 +12,9 @@ import av
 from PIL import Image
 
 from physion.errors import BadInputError
-from physion.experiment.study.plain_files import check_plain
 from physion.experiment.study.stimuli import Stimulus
 from physion.experiment.study.study import Study
+from physion.plain_files import check_plain
 
 
 def check_media(study: Study) -> None:

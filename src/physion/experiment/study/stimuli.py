@@ -17,7 +17,7 @@ from pathlib import Path
 from physion.atomic import write_atomic
 from physion.errors import BadInputError, UnknownNameError
 from physion.experiment.study.csv_rows import csv_rows
-from physion.experiment.study.plain_files import read_plain
+from physion.plain_files import read_plain
 from physion.stimulus_names import canonical_name
 
 STIMULI_FILE = "stimuli.csv"

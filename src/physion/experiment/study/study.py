@@ -22,11 +22,11 @@ from typing import Any
 
 from physion.atomic import write_atomic
 from physion.errors import BadInputError
-from physion.experiment.study.plain_files import check_plain, read_ids, read_plain
 from physion.experiment.study.stimuli import MAX_BYTES as MAX_STIMULI_BYTES
 from physion.experiment.study.stimuli import PHASES, STIMULI_FILE, Stimulus, parse_stimuli
 from physion.experiment.study.study_file import check_tables, format_tables, parse_toml
 from physion.experiment.study.texts import TEXTS_FOLDER, read_consent_file, read_texts
+from physion.plain_files import check_plain, read_ids, read_plain
 
 STUDY_FILE = "study.toml"
 MAX_BYTES = 1_000_000

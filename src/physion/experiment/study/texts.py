@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any
 
 from physion.errors import BadInputError, UnknownNameError
-from physion.experiment.study.plain_files import read_plain
 from physion.experiment.study.study_file import parse_toml
+from physion.plain_files import read_plain
 
 TEXTS_FOLDER = "texts"
 MAX_BYTES = 1_000_000

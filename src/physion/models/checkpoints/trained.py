@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import torch
 from torch import nn
 
+from physion.digests import file_sha256
 from physion.errors import BadInputError
 from physion.models.checkpoints.checkpoint import (
     WEIGHTS,
@@ -79,7 +79,7 @@ def load_shipped(model: nn.Module, name: str) -> str:
             f"no weights are shipped for {name}, {known}; train it with physion train"
         )
     with as_file(files(__package__) / FOLDER / f"{name}.safetensors") as path:
-        found = _sha256(path) if path.is_file() else "no file"
+        found = file_sha256(path) if path.is_file() else "no file"
         if found != digests[name]:
             raise DamagedFileError(
                 f"the weights {path} that come with the package are damaged or changed; install "
@@ -114,7 +114,7 @@ def load_file(model: nn.Module, file: str) -> str:
             "a training"
         )
     _load(path, model)
-    return f"local:{_sha256(path)[:12]}"
+    return f"local:{file_sha256(path)[:12]}"
 
 
 def _load(path: Path, model: nn.Module) -> None:
@@ -126,8 +126,3 @@ def _load(path: Path, model: nn.Module) -> None:
     if built_as is not None:
         check_same(path, "model", metadata.get(BUILT_AS, {}), built_as())
     load_tensors(path, tensors, model)
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

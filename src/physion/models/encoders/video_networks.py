@@ -21,7 +21,7 @@ from physion.models.torch_model import initial_weights
 from physion.models.weights import RANDOM, Pooling, read_state_dict
 from physion.models.weights.encoder import offline_without_network
 from physion.models.weights.grid import POOLED, check_pooling
-from physion.models.weights.state_dicts import file_sha256, first_line, load_fitting
+from physion.models.weights.state_dicts import first_line, load_fitting, weights_sha256
 
 HUB = "hub:"
 TUBELET = 2
@@ -175,7 +175,7 @@ def create_video_encoder(family: VideoFamily, config: VideoConfig) -> tuple[nn.M
     if config.weights != RANDOM:
         path = _weights_file(config.weights)
         if not config.weights.startswith(HUB):
-            origin = f"local:{file_sha256(path)[:12]}"
+            origin = f"local:{weights_sha256(path)[:12]}"
         state = _renamed(read_state_dict(path), family)
         unused = [name for name in state if name.startswith(family.unused)]
         load_fitting(network, state, unused=unused, where=str(path), name=family.name)

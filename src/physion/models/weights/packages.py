@@ -15,7 +15,7 @@ from types import MappingProxyType
 from torch import Tensor
 
 from physion.errors import BadInputError, MissingExtraError, UnknownNameError
-from physion.models.weights.state_dicts import file_sha256, read_state_dict
+from physion.models.weights.state_dicts import read_state_dict, weights_sha256
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ class WeightsPackage:
     def read(self) -> dict[str, Tensor]:
         """Return the tensors under the names of the file; raise `BadInputError` if it differs."""
         path = self.locate()
-        found = file_sha256(path)
+        found = weights_sha256(path)
         if found != self.sha256:
             raise BadInputError(
                 f"{path} was changed: its SHA-256 is {found[:12]}..., that of package {self.name} "

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from physion.models.weights.packages import WeightsPackage, weights_package
-from physion.models.weights.state_dicts import file_sha256
+from physion.models.weights.state_dicts import weights_sha256
 
 IMAGENET, RANDOM, PACKAGE, TIMM = "imagenet", "random", "package:", "timm:"
 TIMM_PRETRAINING = {
@@ -69,7 +69,7 @@ class EncoderWeights:
         It is imagenet, timm:<tag>, random, package:<name>, or local:<start of the file's SHA-256>.
         """
         path = self.path
-        return self.source if path is None else f"local:{file_sha256(path)[:12]}"
+        return self.source if path is None else f"local:{weights_sha256(path)[:12]}"
 
     def identity(self) -> str:
         """Return one string that identifies the weights."""
@@ -78,7 +78,7 @@ class EncoderWeights:
         if package := self.package:
             return f"{self.source}:{package.sha256}"
         path = self.path
-        return self.source if path is None else f"local:{file_sha256(path)}"
+        return self.source if path is None else f"local:{weights_sha256(path)}"
 
     def pretraining(self) -> tuple[str, str]:
         """Return task and data set that trained the weights; both are empty if unknown."""

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import pickle
-import zipfile
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +12,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
+from physion.digests import file_sha256
 from physion.errors import BadInputError
 
 _WRAPPERS = ("state_dict", "model", "model_state_dict")
@@ -31,12 +30,18 @@ def read_state_dict(path: Path) -> dict[str, Tensor]:
         if path.suffix == ".safetensors":
             return load_file(path)
         content: Any = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, SafetensorError) as error:
+    except pickle.UnpicklingError as error:
+        # The error of torch advises to switch off `weights_only`, which would execute the file.
         raise BadInputError(
-            f"{path} is refused: it is not a file of plain tensors ({first_line(error)}); "
-            "save the state dict alone, best as .safetensors"
+            f"{path} is refused: it holds more than plain tensors, or is no file of torch; save "
+            "the state dict alone, best as .safetensors"
         ) from error
-    except (RuntimeError, EOFError, OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+    except SafetensorError as error:
+        raise BadInputError(
+            f"{path} is refused: it is not a file of plain tensors ({first_line(error)})"
+        ) from error
+    except Exception as error:
+        # A damaged pickle raises whatever its instructions lead to: IndexError, TypeError, ...
         raise BadInputError(f"{path} cannot be read as weights: {first_line(error)}") from error
     while isinstance(content, dict) and (inner := _wrapped(content)) is not None:
         content = inner
@@ -97,11 +102,10 @@ def load_fitting(
         raise BadInputError(f"{where} does not fit encoder {name!r}: {error}") from error
 
 
-def file_sha256(path: Path) -> str:
-    """Return the hexadecimal SHA-256 of a file of weights."""
+def weights_sha256(path: Path) -> str:
+    """Return the hexadecimal SHA-256 of a file of weights; `BadInputError` if there is none."""
     _check_exists(path)
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    return file_sha256(path)
 
 
 def first_line(error: BaseException) -> str:

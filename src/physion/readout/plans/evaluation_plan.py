@@ -9,10 +9,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 from physion.compute.executor import Executor
 from physion.compute.progress import Progress
+from physion.digests import is_whole
 from physion.readout.folds import plan_folds, select_scenario
 from physion.readout.plans.failures import describe_failure, stop_if_fatal
 from physion.readout.plans.keys import code_key, dataset_key, key_of
@@ -90,7 +91,7 @@ class EvaluationPlan:
         self._built: dict[tuple[str, int], Any] = {}
         self.tasks = self._list_tasks()
         read = {task.key: self._records.read(task.key) for task in self.tasks}
-        self.done = {key: values for key, values in read.items() if values is not None}
+        self.done = {key: values for key, values in read.items() if self._is_valid(values)}
 
     @property
     def pending(self) -> list[EvaluationTask]:
@@ -255,6 +256,10 @@ class EvaluationPlan:
             progress=progress,
         )
 
+    def _is_valid(self, values: Mapping[str, Any] | None) -> TypeGuard[Mapping[str, Any]]:
+        """Return whether there is a record, and its tables have their SHA-256."""
+        return values is not None and all(is_whole(self._folder / n) for n in values["files"])
+
     def _stored(self, values: Mapping[str, Any]) -> Evaluation:
         path, *errors = (self._folder / name for name in values["files"])
         return Evaluation(read_table(path), path, {}, errors[0] if errors else None)
@@ -278,7 +283,7 @@ class EvaluationPlan:
     def _joined(self, tasks: Sequence[EvaluationTask]) -> Evaluation:
         key = key_of("joined", [task.key for task in tasks])
         values = self._records.read(key)
-        if values is not None:
+        if self._is_valid(values):
             return self._stored(values)
         joined = self._ask(tasks[0], "")
         self._record(key, tasks[0], joined, 0.0)

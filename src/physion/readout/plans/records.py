@@ -1,14 +1,14 @@
-"""Records of finished tasks, one JSON file each, valid while the files that they name stay."""
+"""Records of finished tasks: a sealed JSON file each, valid while the files they name stay."""
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from physion.atomic import write_atomic
+from physion.errors import BadInputError
+from physion.sealed import read_sealed, write_sealed
 
 FOLDER = "plan"
 """Folder of the records in an output folder."""
@@ -40,7 +40,7 @@ class Records:
         stamps = {self._name(path): _stamp(path) for path in files}
         content = {"values": {name: _finite(v) for name, v in values.items()}, "files": stamps}
         self._folder.mkdir(parents=True, exist_ok=True)
-        write_atomic(self._path(key), (json.dumps(content, indent=1) + "\n").encode())
+        write_sealed(self._path(key), content)
 
     def all(self) -> list[dict[str, Any]]:
         """Return the values of all valid records, in the order of their keys."""
@@ -55,11 +55,11 @@ class Records:
 
     def _read(self, path: Path) -> dict[str, Any] | None:
         try:
-            content = json.loads(path.read_bytes())
+            content = read_sealed(path)
             if any(_stamp(self._root / name) != stamp for name, stamp in content["files"].items()):
                 return None
             values = content["values"]
-        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        except (BadInputError, OSError, KeyError, TypeError, AttributeError):
             return None
         return values if isinstance(values, dict) else None
 

@@ -29,14 +29,18 @@ _POSTER_SIDE = 256
 def movies_of(folder: Path) -> dict[str, Path]:
     """Return the movies of a dataset's testing trials, by canonical stimulus, for `ReportInputs`.
 
-    Raises `BadInputError` if ``folder`` is no dataset or has no testing trial.
+    Raises `BadInputError` if ``folder`` is no dataset or has no testing trial, or if a movie does
+    not have its SHA-256 in the index.
     """
     from physion.trials.dataset import Dataset
 
     dataset = Dataset(folder)
-    trials = dataset.trials("testing")
+    trials = dict.fromkeys(dataset.trials("testing"))
     if not trials:
         raise BadInputError(f"{folder} has no testing trial, so no movie that people saw")
+    for trial, file in dataset.files("movie").items():
+        if trial in trials and file.path.is_file():
+            file.check()
     return {canonical_name(trial): dataset.paths(trial).movie for trial in trials}
 
 

@@ -66,18 +66,20 @@ def build_viewer(
     options: ViewerOptions | None = None,
     *,
     imagine: Imagine | None = None,
+    verify: bool = True,
     progress: Progress | None = None,
 ) -> ViewerReport:
     """Write the page of the dataset in ``folder`` to the file ``out``, whole or not at all.
 
     The page needs no other file and no network. The same trials and options give the same bytes.
     ``imagine`` is called once with the names of the trials that have details; what it returns is
-    shown next to what is true. Raises `BadInputError` where there is no dataset, a trial is
-    damaged, an imagined trial cannot be shown, or ``out`` is a folder or cannot be written, and
-    `UnknownNameError` for a scenario or split that the dataset does not hold.
+    shown next to what is true. With ``verify``, files are compared with their SHA-256 in the index.
+    Raises `BadInputError` where there is no dataset, a trial is damaged, an imagined trial cannot
+    be shown, or ``out`` is a folder or cannot be written, and `UnknownNameError` for a scenario or
+    split that the dataset does not hold.
     """
     options = options or ViewerOptions()
-    dataset = Dataset(folder)
+    dataset = Dataset(folder, verify=verify)
     if out.is_dir():
         raise BadInputError(f"{out} is a folder; give a file for the page")
     if not out.parent.is_dir():
@@ -156,6 +158,9 @@ def _trial_data(
             for one in imagined
         ]
         shapes = {body.shape for body in trial.scene.bodies}
+    stored = dataset.file(row["trial"], "movie")
+    if stored is not None:
+        stored.check()
     movie = viewer_movies.small_movie(paths.movie, trial, options.card_size)
     size = {"width": movie.width, "height": movie.height}
     return TrialData(viewer_facts.card(trial) | size, movie.as_record(), detail), shapes

@@ -6,17 +6,20 @@ import gzip
 import json
 import re
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from physion.errors import BadInputError
+from physion.plain_files import read_plain
 
 Command: TypeAlias = dict[str, Any]
 
-MAX_LOG_BYTES = 1 << 30
-"""Largest size of an uncompressed log; the largest official one has a few MB."""
+MAX_LOG_BYTES = 1 << 27
+"""Largest size of an uncompressed log, and of metadata; the largest official one has a few MB."""
+MAX_LINE_BYTES = 1 << 24
+"""Longest line of a log that is decompressed; its parsed commands take some hundred MB."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +55,8 @@ def find_logs(root: Path) -> list[Path]:
         raise BadInputError(f"{root} does not exist; give a folder with official command logs")
     if not root.is_dir():
         raise BadInputError(f"{root} is a file; give the folder that holds the command logs")
-    logs = sorted([*root.rglob("tdw_commands.json"), *root.rglob("tdw_commands.json.gz")])
+    found = [*root.rglob("tdw_commands.json"), *root.rglob("tdw_commands.json.gz")]
+    logs = sorted(path for path in found if path.is_file())
     if not logs:
         raise BadInputError(f"{root} holds no tdw_commands.json or tdw_commands.json.gz")
     return logs
@@ -65,10 +69,12 @@ def read_metadata(path: Path) -> dict[str, dict[str, Any]]:
     record in the file if the name has none.
     """
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise BadInputError(f"{path} is missing; it holds the outcomes of the trials") from None
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        data = json.loads(read_plain(path, MAX_LOG_BYTES, follow_links=True).decode())
+    except BadInputError:
+        if not path.exists():
+            raise BadInputError(f"{path} is missing; it holds the outcomes of the trials") from None
+        raise
+    except (ValueError, RecursionError) as error:
         raise BadInputError(f"{path} cannot be read: {error}") from error
     if not isinstance(data, list) or not all(isinstance(record, dict) for record in data):
         raise BadInputError(f"{path} must be a list with one object per trial")
@@ -81,30 +87,25 @@ def read_metadata(path: Path) -> dict[str, dict[str, Any]]:
 
 def read_command_log(path: Path) -> CommandLog:
     """Read a log, compressed or not; `BadInputError` if it cannot be read to its end."""
-    log, broken, size, last = CommandLog(), set(), 0, ""
-    opener: Callable[..., Any] = gzip.open if path.suffix == ".gz" else open
+    log, broken, last = CommandLog(), set(), ""
     try:
-        with opener(path, "rt", encoding="utf-8") as lines:
-            for number, line in enumerate(lines, 1):
-                size += len(line)
-                if size > MAX_LOG_BYTES:
-                    raise BadInputError(f"{path} has more than {MAX_LOG_BYTES} bytes uncompressed")
-                if not line.strip():
-                    continue
-                # A line whose end is missing belongs to the same trial as the line before.
-                tag = _tag(line) or last
-                last = tag
-                try:
-                    commands = _parse_line(line)
-                except BadInputError as error:
-                    broken.add(tag)
-                    message = f"line {number}: {error}"
-                    log.failures.append(ImportFailure(str(path), tag or None, message))
-                    continue
-                if tag == "None":
-                    log.setup += commands
-                else:
-                    log.trials.setdefault(tag, []).append((number, commands))
+        for number, line in enumerate(_lines(path), 1):
+            if not line.strip():
+                continue
+            # A line whose end is missing belongs to the same trial as the line before.
+            tag = _tag(line) or last
+            last = tag
+            try:
+                commands = _parse_line(line)
+            except BadInputError as error:
+                broken.add(tag)
+                message = f"line {number}: {error}"
+                log.failures.append(ImportFailure(str(path), tag or None, message))
+                continue
+            if tag == "None":
+                log.setup += commands
+            else:
+                log.trials.setdefault(tag, []).append((number, commands))
     except (OSError, EOFError, UnicodeDecodeError, zlib.error) as error:
         raise BadInputError(f"{path} cannot be read to its end: {error}") from error
     if not (log.trials or log.failures):
@@ -112,6 +113,20 @@ def read_command_log(path: Path) -> CommandLog:
     for tag in broken:
         log.trials.pop(tag, None)
     return log
+
+
+def _lines(path: Path) -> Iterator[str]:
+    """Yield the lines of a log; `BadInputError` before more than the limits is decompressed."""
+    opener: Callable[..., Any] = gzip.open if path.suffix == ".gz" else open
+    size = 0
+    with opener(path, "rb") as file:
+        while line := file.readline(MAX_LINE_BYTES + 1):
+            size += len(line)
+            if len(line) > MAX_LINE_BYTES:
+                raise BadInputError(f"{path} has a line of more than {MAX_LINE_BYTES} bytes")
+            if size > MAX_LOG_BYTES:
+                raise BadInputError(f"{path} has more than {MAX_LOG_BYTES} bytes uncompressed")
+            yield line.decode("utf-8")
 
 
 def _tag(line: str) -> str:

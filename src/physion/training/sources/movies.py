@@ -2,86 +2,55 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from physion.errors import BadInputError, UnknownNameError
-from physion.trials.dataset import Dataset
+from physion.trials.dataset import Dataset, indexed_file
 from physion.trials.decoder import MovieProperties
-from physion.trials.layout import TrialPaths
+from physion.trials.indexed_file import IndexedFile
 from physion.trials.video import read_chosen
 
 
 @dataclass(frozen=True, slots=True)
 class MovieFile:
-    """Movie of a trial, with its SHA-256 and properties according to the index."""
+    """Movie of a trial, with its properties according to the index."""
 
-    trial: str
-    path: Path
-    sha256: str
+    file: IndexedFile
     properties: MovieProperties
-
-    def check(self) -> None:
-        """Raise `BadInputError` unless the file has its SHA-256; read it once in a process."""
-        try:
-            known = self.path.stat()
-            _check_once(self, known.st_size, known.st_mtime_ns)
-        except OSError as error:
-            raise BadInputError(
-                f"trial {self.trial!r}: movie {self.path} is missing or cannot be read: "
-                f"{error.strerror}"
-            ) from error
-
-
-@cache
-def _check_once(file: MovieFile, size: int, modified: int) -> None:
-    """Check a file of this size and time of modification; errors are not remembered."""
-    if hashlib.sha256(file.path.read_bytes()).hexdigest() != file.sha256:
-        raise BadInputError(
-            f"trial {file.trial!r}: movie {file.path} was changed since it was made: it does not "
-            "have the SHA-256 of the index; make the trial again"
-        )
 
 
 class MovieReader:
-    """Reader of ``rgb`` from movies, at ``size`` pixels per side.
+    """Reader of ``rgb`` from movies, at ``size`` pixels per side."""
 
-    With ``verify``, the SHA-256 of each file is checked once in a process, before its first use.
-    """
-
-    def __init__(self, files: Mapping[str, MovieFile | None], size: int, *, verify: bool) -> None:
-        self._files, self._size, self._verify = files, size, verify
+    def __init__(self, files: Mapping[str, MovieFile | None], size: int) -> None:
+        self._files, self._size = files, size
 
     def read(self, trial: str, frames: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
         """Return ``rgb`` (T, H, W, 3) of ``frames``."""
-        file = self._file(trial)
-        if self._verify:
-            file.check()
-        size = (self._size, self._size)
-        return {"rgb": read_chosen(file.path, frames.tolist(), size=size, expected=file.properties)}
+        movie = self._movie(trial)
+        movie.file.check()
+        path, size = movie.file.path, (self._size, self._size)
+        return {"rgb": read_chosen(path, frames.tolist(), size=size, expected=movie.properties)}
 
     def identity(self, trial: str) -> str:
         """Return the SHA-256 of the trial's movie."""
-        return f"movie {self._file(trial).sha256}"
+        return f"movie {self._movie(trial).file.sha256}"
 
-    def _file(self, trial: str) -> MovieFile:
+    def _movie(self, trial: str) -> MovieFile:
         if trial not in self._files:
             raise UnknownNameError("trial", trial, self._files)
-        file = self._files[trial]
-        if file is None:
+        movie = self._files[trial]
+        if movie is None:
             raise BadInputError(
                 f"trial {trial!r} has no movie in the colours that were asked for; render it from "
                 "its motion (rendered=True)"
             )
-        return file
+        return movie
 
 
 def movie_files(
@@ -103,13 +72,9 @@ def movie_files(
     for row in dataset.index.to_dict("records"):
         own = look is None or look == row["look"]
         column = kind if own else f"{look}_{kind}"
-        sha256 = row.get(f"{column}_sha256")
-        if pd.isna(sha256):
-            files[row["trial"]] = None
-            continue
-        paths = TrialPaths(dataset.folder, row["split"], row["scenario"], row["trial"])
-        path = getattr(paths, column)
-        files[row["trial"]] = MovieFile(row["trial"], path, sha256, _properties(row, observed))
+        file = indexed_file(dataset.folder, row, column, verify=dataset.verify)
+        known = None if file is None else MovieFile(file, _properties(row, observed))
+        files[row["trial"]] = known
     return files
 
 

@@ -29,7 +29,6 @@ def observed_source(
     *,
     look: str | None = None,
     rendered: bool = False,
-    verify: bool = True,
 ) -> ObservedSource:
     """Return the source of the observed part of the trials of a dataset.
 
@@ -46,8 +45,6 @@ def observed_source(
         Colours: ``redyellow`` or ``free``, by default each trial's own.
     rendered
         Render ``rgb`` from the motion instead of reading movies.
-    verify
-        Check the SHA-256 of each movie before its first use.
 
     Raises
     ------
@@ -55,7 +52,7 @@ def observed_source(
         If the look is unknown. Batches raise it for a file that is missing, damaged, or changed
         since it was made.
     """
-    return _observed(dataset, spec, look, rendered, verify)
+    return _observed(dataset, spec, look, rendered)
 
 
 def whole_source(
@@ -64,17 +61,14 @@ def whole_source(
     *,
     look: str | None = None,
     rendered: bool = False,
-    verify: bool = True,
 ) -> WholeSource:
     """Return the source of whole trials of a dataset; parameters as of `observed_source`."""
-    context = _observed(dataset, spec, look, rendered, verify)
-    return WholeBatches(context, _readers(dataset, spec, look, rendered, verify, observed=False))
+    context = _observed(dataset, spec, look, rendered)
+    return WholeBatches(context, _readers(dataset, spec, look, rendered, observed=False))
 
 
-def _observed(
-    dataset: Dataset, spec: Spec, look: str | None, rendered: bool, verify: bool
-) -> ObservedBatches:
-    readers = _readers(dataset, spec, look, rendered, verify, observed=True)
+def _observed(dataset: Dataset, spec: Spec, look: str | None, rendered: bool) -> ObservedBatches:
+    readers = _readers(dataset, spec, look, rendered, observed=True)
     return ObservedBatches(spec, readers)
 
 
@@ -83,7 +77,6 @@ def _readers(
     spec: Spec,
     look: str | None,
     rendered: bool,
-    verify: bool,
     *,
     observed: bool,
 ) -> TrialReaders:
@@ -102,13 +95,12 @@ def _readers(
         from physion.training.sources.movies import MovieReader, movie_files
 
         files = movie_files(dataset, observed=observed, look=look)
-        readers.append(MovieReader(files, spec.image_size, verify=verify))
+        readers.append(MovieReader(files, spec.image_size))
     if not from_motion and "state" not in spec.inputs:
         return TrialReaders(lengths, readers)
     from physion.training.sources.states import TrialMotions
 
-    trial_files = {trial: dataset.paths(trial).trial_file for trial in lengths}
-    motions = TrialMotions(trial_files, observed=observed)
+    motions = TrialMotions(dataset.files("trial_file"), observed=observed)
     if from_motion:
         from physion.training.sources.rendered import MotionRenderer
 

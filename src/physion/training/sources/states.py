@@ -8,12 +8,12 @@ import threading
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from functools import cache, partial
-from pathlib import Path
 from typing import Any
 
 from physion.errors import UnknownNameError
 from physion.models.batch import Motion
 from physion.training.sources.motions import cut_motion
+from physion.trials.indexed_file import IndexedFile
 from physion.trials.trial_file import Trial
 
 _LEAST_BYTES, _FRACTION = 2**28, 8
@@ -26,7 +26,7 @@ class TrialMotions(Mapping[str, Motion]):
     With ``observed``, a motion is cut at the last observed frame when it is read.
     """
 
-    def __init__(self, files: Mapping[str, Path], *, observed: bool) -> None:
+    def __init__(self, files: Mapping[str, IndexedFile], *, observed: bool) -> None:
         self._files, self._observed = files, observed
         self._kept: OrderedDict[str, Motion] = OrderedDict()
         self._bytes, self._lock = 0, threading.Lock()
@@ -38,8 +38,9 @@ class TrialMotions(Mapping[str, Motion]):
                 return self._kept[trial]
         if trial not in self._files:
             raise UnknownNameError("trial", trial, self._files)
-        file = Trial.open(self._files[trial])
-        motion = Motion(file.scene, file.trajectory)
+        stored = self._files[trial]
+        opened = Trial(stored.read(), f"trial file {stored.path}")
+        motion = Motion(opened.scene, opened.trajectory)
         if self._observed:
             motion = cut_motion(motion)
         with self._lock:

@@ -29,9 +29,9 @@ from physion.physics.trajectory import Trajectory
 from physion.scenes.sampling.preset import get_preset
 from physion.scenes.sampling.sample import sample_scene
 from physion.scenes.scene import Scene
+from physion.sealed import read_sealed, write_sealed
 from physion.seeds import child_generator, stable_hash, trial_seed
 from physion.trials.making.plan import GenerateSettings, TrialTask
-from physion.trials.sealed import read_sealed, write_sealed
 
 BALANCED = ("readout", "testing", "familiarization")
 """Splits in which half of the trials have contact, and none of them in the observed part."""

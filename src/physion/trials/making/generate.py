@@ -17,15 +17,24 @@ from physion.atomic import folder_for_writing, remove_leftovers, write_atomic
 from physion.compute.executor import Executor, TaskOutcome
 from physion.compute.progress import Progress
 from physion.compute.run_tasks import FATAL_ERRNOS, RunReport, run_tasks
+from physion.digests import has_digest
 from physion.errors import BadInputError, PhysionError
 from physion.physics.engine import make_engine
 from physion.scenes.sampling.preset import get_preset
 from physion.scenes.sampling.registry import as_record
+from physion.sealed import read_sealed, write_sealed
 from physion.seeds import stable_hash
-from physion.trials.index import build_index, read_index, write_index
+from physion.trials.columns import FILES
+from physion.trials.index import (
+    build_index,
+    describe_mixed_versions,
+    has_sizes,
+    read_index,
+    write_index,
+)
 from physion.trials.layout import CHOICES, FAILURES, INDEX, SETTINGS, find_trials
 from physion.trials.making.plan import GenerateJob, GenerateSettings, TrialTask, check_names
-from physion.trials.sealed import read_sealed, write_sealed
+from physion.trials.trial_file import Trial
 
 
 def make_trials(
@@ -83,7 +92,8 @@ def make_trials(
     with folder_for_writing(folder):
         _fix_settings(folder, datasets.pop(), settings, tasks)
         remove_leftovers(folder)
-        missing = {name: job for name, job in jobs.items() if not job.complete()}
+        listed = _listed_files(folder)
+        missing = {n: job for n, job in jobs.items() if not _is_made(job, listed.get(n))}
         chosen, unchosen = _choose(folder, jobs, missing, settings, executor, progress)
         made, failed = run_tasks(
             make,
@@ -95,8 +105,41 @@ def make_trials(
             on_outcome=lambda outcome: _note_outcome(folder, outcome, chosen[outcome.key]),
         )
         problems = _update_index(folder, set(made))
-    kept = [name for name in jobs if name not in missing]
-    return RunReport(list(made), kept, {**unchosen, **failed, **problems}, folder / INDEX)
+        notes = _mixed_versions(folder)
+    kept = [name for name in jobs if name not in missing and name not in problems]
+    return RunReport(list(made), kept, {**unchosen, **failed, **problems}, folder / INDEX, notes)
+
+
+def _listed_files(folder: Path) -> dict[str, dict[Any, Any]]:
+    """Return paths and sizes of all files by trial according to the index; none without one."""
+    try:
+        index = read_index(folder)
+    except BadInputError:
+        return {}
+    columns = ["trial", "split", "scenario", *FILES, *(f"{name}_bytes" for name in FILES)]
+    return {str(row["trial"]): row for row in index[columns].to_dict("records")}
+
+
+def _is_made(job: GenerateJob, row: Mapping[Any, Any] | None) -> bool:
+    """Return whether all files of a trial exist and have the sizes in the index.
+
+    The file of a trial that is not in the index is read.
+    """
+    if not job.complete():
+        return False
+    if row is not None:
+        return has_sizes(row, job.paths)
+    try:
+        Trial.open(job.paths.trial_file)
+    except BadInputError:
+        return False
+    return True
+
+
+def _mixed_versions(folder: Path) -> dict[str, tuple[str, ...]]:
+    """Return a note if trials of several versions of the package are in the folder."""
+    note = describe_mixed_versions(read_index(folder))
+    return {str(folder): (note,)} if note else {}
 
 
 def _choose(
@@ -155,7 +198,8 @@ def _note_outcome(folder: Path, outcome: TaskOutcome[Any], job: GenerateJob) -> 
 def _update_index(folder: Path, made: set[str]) -> dict[str, str]:
     """Write the index unless it is up to date; return problems by name of the trial.
 
-    It is up to date if it lists exactly the trials of the folder and none of them is in ``made``.
+    It is up to date if it has a SHA-256, lists exactly the trials of the folder, and none of them
+    is in ``made``.
     """
     there = {(paths.split, paths.trial) for paths in find_trials(folder)}
     try:
@@ -165,6 +209,7 @@ def _update_index(folder: Path, made: set[str]) -> dict[str, str]:
     if (
         index is not None
         and not made
+        and has_digest(folder / INDEX)
         and set(zip(index["split"], index["trial"], strict=True)) == there
     ):
         return {}

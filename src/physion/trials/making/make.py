@@ -22,7 +22,8 @@ from physion.scenes.sampling.sample import sample_scene
 from physion.scenes.scene import FRAME_TIME, OBSERVED_FRAMES, Scene
 from physion.trials.files import encode_png, write_files
 from physion.trials.making.plan import GenerateJob, TrialTask
-from physion.trials.trial_file import Metadata, TrialWriter
+from physion.trials.metadata import Metadata
+from physion.trials.trial_file import TrialWriter
 from physion.trials.video import MovieEncoder
 from physion.version import __version__
 

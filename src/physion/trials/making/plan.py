@@ -18,6 +18,7 @@ from physion.scenes.sampling.registry import scenarios as known_scenarios
 from physion.scenes.scene import FRAME_TIME, PLAYBACK_RATE, Scene
 from physion.seeds import trial_seed
 from physion.trials.layout import SAFE_NAME, TrialPaths
+from physion.trials.metadata import MAX_SIDE
 from physion.trials.schema import PASSES
 
 SPLITS = ("training", "readout", "testing", "familiarization")
@@ -131,9 +132,11 @@ class GenerateSettings:
     observed part, as the official sets do."""
 
     def __post_init__(self) -> None:
-        if min(self.width, self.height) < 2 or self.width % 2 or self.height % 2:
+        sides = self.width, self.height
+        if min(sides) < 2 or max(sides) > MAX_SIDE or self.width % 2 or self.height % 2:
             raise BadInputError(
-                f"movies need an even width and height, not {self.width} x {self.height}"
+                f"movies need an even width and height from 2 to {MAX_SIDE}, not {self.width} x "
+                f"{self.height}"
             )
         unknown = sorted(set(self.passes) - set(PASSES))
         if unknown:

@@ -17,14 +17,21 @@ from physion.compute.progress import Progress, tracked
 from physion.errors import BadInputError
 from physion.physics.labels import label_contact
 from physion.scenes.sampling.preset import load_presets
+from physion.sealed import read_sealed
 from physion.seeds import stable_hash
 from physion.trials.columns import FILES
 from physion.trials.geometry import geometry_arrays
-from physion.trials.index import COLUMNS, as_table, index_bytes, index_row, read_index
+from physion.trials.index import (
+    COLUMNS,
+    as_table,
+    describe_mixed_versions,
+    index_bytes,
+    index_row,
+    read_index,
+)
 from physion.trials.layout import CHOICES, INDEX, SETTINGS, TrialPaths, find_trials
 from physion.trials.making.choose import BALANCED, robustness, split_of, wanted_contact
 from physion.trials.making.plan import TrialTask
-from physion.trials.sealed import read_sealed
 from physion.trials.trial_file import Trial
 from physion.trials.video import count_frames
 
@@ -38,8 +45,9 @@ class Verification:
 
     ``faults`` is empty if the dataset is intact. ``other_versions`` lists what cannot be reproduced
     because another version of engine, renderer or encoder made it, which is not a fault.
-    ``notes`` lists what is no fault either: pictures that are only compressed differently, and
-    trials whose scene was not drawn again because their preset is unknown.
+    ``notes`` lists what is no fault either: trials of several versions of the package, pictures
+    that are only compressed differently, and trials whose scene was not drawn again because their
+    preset is unknown.
     """
 
     faults: list[str] = field(default_factory=list)
@@ -92,6 +100,8 @@ def verify_dataset(
     )
     result.faults += _check_folder(folder, table)
     result.faults += _duplicates(table)
+    mixed = describe_mixed_versions(table)
+    result.notes += [f"{folder}: {mixed}"] if mixed else []
     settings = _settings(folder)
     remade = _choose_trials(table, again)
     rows = [row for _, row in table.iterrows()]
@@ -127,9 +137,10 @@ def _check_folder(folder: Path, table: pd.DataFrame) -> list[str]:
         except BadInputError as error:
             faults.append(str(error))
     path = folder / INDEX
-    # Bytes are comparable only if the same version of the parquet library wrote them.
-    rewritten = index_bytes(table)
-    if path.read_bytes() != rewritten and _writer(path.read_bytes()) == _writer(rewritten):
+    # Bytes are comparable only if the same version of the parquet library wrote them. An index of
+    # an earlier version of this package has no checksums.
+    content, forms = path.read_bytes(), [index_bytes(table, checksums=c) for c in (True, False)]
+    if content not in forms and _writer(content) == _writer(forms[0]):
         faults.append(f"{path}: its bytes are not those of the table that it contains")
     listed = {folder / str(name) for file in FILES for name in table[file].dropna()}
     unknown = {path for path in folder.glob("*/*/*") if path.is_file()} - listed
@@ -219,7 +230,7 @@ def _check_trial(paths: TrialPaths) -> list[str]:
             for path, array in trial.geometry.items()
             if not np.array_equal(array, wanted[path])
         ]
-    if meta.engine.startswith("imported"):
+    if meta.imported:
         return faults  # labels and movies are those of another simulator
     labels = label_contact(trial.scene, trial.trajectory)
     for name in ("contact", "first_frame", "observed", "min_distance"):
@@ -248,7 +259,7 @@ def _make_again(paths: TrialPaths, settings: Mapping[str, Any], result: Verifica
 
     trial = Trial.open(paths.trial_file)
     meta = trial.metadata
-    if meta.engine.startswith("imported"):
+    if meta.imported:
         return
     motion = engine_of(meta.engine).simulate(trial.scene)
     found: list[str] = []

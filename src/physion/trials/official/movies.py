@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from physion.errors import BadInputError
 from physion.scenes.scene import OBSERVED_FRAMES
-from physion.trials.official.names import MAX_SIDE
-from physion.trials.official.read_hdf5 import MAX_FRAMES, OfficialFile
+from physion.trials.metadata import MAX_FRAMES, MAX_SIDE
+from physion.trials.official.read_hdf5 import OfficialFile
 from physion.trials.video import MovieEncoder
 
 _BT709 = 1

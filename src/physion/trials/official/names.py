@@ -16,6 +16,7 @@ from PIL import Image
 
 from physion.errors import BadInputError
 from physion.physics.cloth.contact_gap import CLOTH_CONTACT_GAP
+from physion.trials.metadata import MAX_SIDE
 
 Bytes = NDArray[np.uint8]
 
@@ -31,8 +32,6 @@ CLOTH_DISTANCE = CLOTH_THRESHOLD - CLOTH_CONTACT_GAP
 between surfaces of this package; it makes each threshold valid for the other's data."""
 TRIAL_FILE = "physion/trial_file"
 """Path of the embedded trial file in official files that this package exports."""
-MAX_SIDE = 4096
-"""Largest width or height in pixels of a picture that is read."""
 FLOW_FULL = 0.02
 """Motion per frame with full brightness in ``_flow``, as a fraction of the picture's width."""
 

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from physion.errors import BadInputError
 from physion.trials.guarded_hdf5 import GuardedHdf5, open_hdf5
+from physion.trials.metadata import MAX_FRAMES
 from physion.trials.official.names import decode_picture
 
-MAX_FRAMES = 10_000
 MAX_BYTES = 2**27
 """Largest array that is read, in bytes of memory."""
 MAX_TEXT = 2**20

@@ -61,6 +61,7 @@ def write_card(
     creator: str | None = None,
     url: str | None = None,
     published: str | None = None,
+    verify: bool = True,
 ) -> Card:
     """Write `README.md`, `croissant.json` and ``data/`` for the dataset in ``folder``.
 
@@ -74,12 +75,14 @@ def write_card(
         Folder to write into; by default ``folder``. An older card is replaced.
     license, version, creator, url, published
         See `PublicationTerms`; the day of publication is by default today.
+    verify
+        Compare the movies that are copied with their SHA-256 in the index.
 
     Raises
     ------
     BadInputError
-        If there is no index or no trial, a file that is not a card has one of the two names, or an
-        argument is not valid.
+        If there is no index or no trial, a file is damaged, a file that is not a card has one of
+        the two names, or an argument is not valid.
     """
     day = published or datetime.date.today().isoformat()
     terms = _checked(PublicationTerms(day, license, version, creator, url))
@@ -90,7 +93,7 @@ def write_card(
     text = json.dumps(metadata, indent=1, ensure_ascii=False) + "\n"
     try:
         target.mkdir(parents=True, exist_ok=True)
-        tables = write_split_tables(folder, facts.index, target)
+        tables = write_split_tables(folder, facts.index, target, verify=verify)
         write_atomic(target / METADATA, text.encode())
         write_atomic(target / CARD, card_text(facts, terms).encode())
     except OSError as error:

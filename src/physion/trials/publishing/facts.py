@@ -7,7 +7,6 @@ datasets that this package makes.
 from __future__ import annotations
 
 import hashlib
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 import pandas as pd
 
 from physion.errors import BadInputError
+from physion.sealed import read_sealed
 from physion.trials.columns import FILES, INDEX_COLUMNS
 from physion.trials.index import read_index
 from physion.trials.layout import INDEX, SETTINGS
@@ -155,9 +155,9 @@ def read_facts(folder: Path) -> DatasetFacts:
     path, settings = folder / SETTINGS, {}
     if path.is_file():
         try:
-            settings = dict(json.loads(path.read_text(encoding="utf-8"))["settings"])
-        except (ValueError, KeyError, TypeError) as error:
-            raise BadInputError(f"{path} is damaged: {error}") from error
+            settings = dict(read_sealed(path)["settings"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise BadInputError(f"{path} is damaged: field 'settings' is missing") from error
     return DatasetFacts(index, len(data), hashlib.sha256(data).hexdigest(), settings)
 
 

@@ -7,11 +7,13 @@ while the notebooks select ``collision``, ``containment``, ``clothiness``, ``lin
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import pandas as pd
 
 from physion.atomic import folder_for_writing, write_atomic
+from physion.digests import check_digest
 from physion.errors import BadInputError
 from physion.stimulus_names import NAMES
 
@@ -66,10 +68,12 @@ def export_result_tables(folder: Path, out: Path) -> list[Path]:
 def _with_old_names(path: Path) -> str | None:
     """Return the text of a table with the old names; None if it is no table of predictions."""
     try:
-        if MARK not in pd.read_csv(path, nrows=0).columns:
+        content = path.read_bytes()
+        if MARK not in pd.read_csv(io.BytesIO(content), nrows=0).columns:
             return None
+        check_digest(path, content, "run physion evaluate again")
         # As text, so that every other cell stays as it is.
-        table = pd.read_csv(path, dtype=str, keep_default_na=False)
+        table = pd.read_csv(io.BytesIO(content), dtype=str, keep_default_na=False)
     except (ValueError, OSError) as error:
         raise BadInputError(f"{path} is not a table: {error}") from error
     for column in COLUMNS:

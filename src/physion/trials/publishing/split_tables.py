@@ -17,8 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from physion.atomic import write_atomic
-from physion.errors import BadInputError
-from physion.trials.layout import TrialPaths
+from physion.trials.dataset import indexed_file
 
 FOLDER = "data"
 """Folder of the tables, next to the card."""
@@ -50,10 +49,13 @@ def _path(name: str, split: str) -> str:
     return f"{FOLDER}/{name}-{HUB_SPLITS.get(split, split)}.parquet"
 
 
-def write_split_tables(folder: Path, index: pd.DataFrame, out: Path) -> list[Path]:
+def write_split_tables(
+    folder: Path, index: pd.DataFrame, out: Path, *, verify: bool = True
+) -> list[Path]:
     """Write the tables of the dataset in ``folder`` below ``out``; return their paths.
 
-    `BadInputError` if an observed movie cannot be read.
+    `BadInputError` if an observed movie cannot be read or, with ``verify``, does not have its
+    SHA-256 in the index.
     """
     made = []
     (out / FOLDER).mkdir(parents=True, exist_ok=True)
@@ -64,15 +66,15 @@ def write_split_tables(folder: Path, index: pd.DataFrame, out: Path) -> list[Pat
         seen = rows[rows["observed_movie"].notna()]
         if len(seen):
             path = out / _path("videos", str(split))
-            write_atomic(path, _parquet(_videos(folder, seen)))
+            write_atomic(path, _parquet(_videos(folder, seen, verify)))
             made.append(path)
     return made
 
 
-def _videos(folder: Path, rows: pd.DataFrame) -> pa.Table:
+def _videos(folder: Path, rows: pd.DataFrame, verify: bool) -> pa.Table:
     """Return the table ``videos``, with the types of the library in its schema."""
     table = pa.Table.from_pandas(rows[list(SEEN)], preserve_index=False)
-    movies = [_movie(folder, row) for row in rows.to_dict("records")]
+    movies = [_movie(folder, row, verify) for row in rows.to_dict("records")]
     table = table.append_column("video", pa.array(movies, _VIDEO))
     features: dict[str, Any] = {
         name: {"dtype": "string" if kind in (pa.string(), pa.large_string()) else str(kind)}
@@ -88,13 +90,10 @@ def _videos(folder: Path, rows: pd.DataFrame) -> pa.Table:
     return table.cast(pa.schema(strings)).replace_schema_metadata({"huggingface": text})
 
 
-def _movie(folder: Path, row: Mapping[Any, Any]) -> dict[str, Any]:
-    # Paths in the index could point outside the folder; those of the layout cannot.
-    path = TrialPaths(folder, row["split"], row["scenario"], row["trial"]).observed_movie
-    try:
-        return {"bytes": path.read_bytes(), "path": path.name}
-    except OSError as error:
-        raise BadInputError(f"{path} cannot be read: {error.strerror}") from error
+def _movie(folder: Path, row: Mapping[Any, Any], verify: bool) -> dict[str, Any]:
+    file = indexed_file(folder, row, "observed_movie", verify=verify)
+    assert file is not None, "trials without a movie were left out"
+    return {"bytes": file.read(), "path": file.path.name}
 
 
 def _parquet(table: pa.Table) -> bytes:

@@ -20,8 +20,8 @@ from PIL import Image
 
 from physion.atomic import write_atomic
 from physion.errors import BadInputError
-from physion.experiment.study.plain_files import read_plain
 from physion.experiment.study.stimuli import MAX_SIDE, MEDIA_FOLDER, Stimulus
+from physion.plain_files import read_plain
 from physion.scenes.scene import OBSERVED_FRAMES
 from physion.trials.files import encode_png
 from physion.trials.official.movies import SourceMovie

@@ -23,8 +23,8 @@ from physion.errors import BadInputError
 from physion.experiment.study.csv_rows import csv_rows
 from physion.experiment.study.init.generated_trials import StimulusSelection, check_even
 from physion.experiment.study.init.media import StimulusSource
-from physion.experiment.study.plain_files import read_plain
 from physion.experiment.study.stimuli import MAX_FRAMES, is_name
+from physion.plain_files import read_plain
 from physion.scenes.scene import OBSERVED_FRAMES
 from physion.seeds import generator
 from physion.stimulus_names import (

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from physion.physics.trajectory import Trajectory
 from physion.scenes.scene import FRAME_TIME, OBSERVED_FRAMES, Scene
 from physion.trials.layout import TrialPaths
-from physion.trials.trial_file import Metadata
+from physion.trials.metadata import Metadata
 from physion.version import __version__
 
 IMPORTED = "imported"

@@ -23,6 +23,7 @@ from physion.rendering.renderer import role_map
 from physion.scenes.scene import FRAME_TIME, OBSERVED_FRAMES, Cloth
 from physion.stimulus_names import plain_name
 from physion.trials.files import encode_png
+from physion.trials.metadata import Metadata
 from physion.trials.official.axes import to_official_camera
 from physion.trials.official.movies import (
     PICTURES,
@@ -36,7 +37,7 @@ from physion.trials.official.read_hdf5 import OfficialFile
 from physion.trials.official.reading.job import ImportJob
 from physion.trials.official.reading.read_motion import MotionReader
 from physion.trials.official.writing.objects import OfficialObjects
-from physion.trials.trial_file import Metadata, Trial, TrialWriter
+from physion.trials.trial_file import Trial, TrialWriter
 from physion.trials.video import MovieEncoder, count_frames
 
 _CLOSE = 1e-5

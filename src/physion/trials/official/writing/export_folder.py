@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 from collections import Counter
 from collections.abc import Mapping
@@ -12,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from physion.atomic import folder_for_writing, remove_leftovers, write_atomic
 from physion.compute.executor import Executor
@@ -21,11 +19,13 @@ from physion.compute.run_tasks import RunReport, run_tasks
 from physion.errors import BadInputError, UnknownNameError
 from physion.trials.dataset import Dataset
 from physion.trials.files import encode_png
+from physion.trials.indexed_file import IndexedFile
 from physion.trials.layout import TrialPaths
+from physion.trials.metadata import Metadata
 from physion.trials.official.names import TRIAL_FILE
 from physion.trials.official.read_hdf5 import OfficialFile
 from physion.trials.official.writing.layouts import LAYOUTS, Content, Files
-from physion.trials.trial_file import Metadata, Trial
+from physion.trials.trial_file import Trial
 from physion.trials.video import MovieEncoder
 
 _SAME = ("digest", "look", "width", "height", "playback_rate", "package")
@@ -43,8 +43,8 @@ class ExportJob:
         Files of the trial.
     out, files
         Folder to write into, and contents by path below it; the last is written last.
-    sha256
-        SHA-256 in the index of the trial's own movie and of that in free colours, by column.
+    stored
+        Files of the index by column: trial file, own movie, and that in free colours.
     images
         Whether HDF5 files get pictures.
     """
@@ -52,7 +52,7 @@ class ExportJob:
     paths: TrialPaths
     out: Path
     files: Files
-    sha256: Mapping[str, str | None]
+    stored: Mapping[str, IndexedFile]
     images: bool = True
 
     @property
@@ -67,6 +67,7 @@ def export_official(
     out: Path,
     *,
     layout: str = "official",
+    verify: bool = True,
     split: str | None = None,
     scenario: str | None = None,
     images: bool = True,
@@ -84,6 +85,8 @@ def export_official(
         Folder of the dataset, and folder to write into, outside the dataset.
     layout
         One of `LAYOUTS`. Trials that have no place in it are named in the notes.
+    verify
+        Compare trial files and movies with their SHA-256 in the index.
     split, scenario
         Trials to export; by default all.
     images
@@ -103,16 +106,18 @@ def export_official(
     """
     if layout not in LAYOUTS:
         raise UnknownNameError("layout", layout, LAYOUTS)
-    source = Dataset(dataset)
+    source = Dataset(dataset, verify=verify)
     names = source.trials(split, scenario)
     if not names:
         raise BadInputError(
             f"{dataset} has no trial of split {split or 'any'!r} and scenario {scenario or 'any'!r}"
         )
-    rows = source.index.set_index("trial")
-    planned = {
-        name: _job(source.paths(name), rows.loc[name], out, layout, images) for name in names
-    }
+    files = {column: source.files(column) for column in ("trial_file", "movie", "free_movie")}
+    planned = {}
+    for name in names:
+        stored = {column: found[name] for column, found in files.items() if name in found}
+        paths = source.paths(name)
+        planned[name] = ExportJob(paths, out, LAYOUTS[layout].files(paths), stored, images)
     jobs = {name: job for name, job in planned.items() if job.files}
     notes = _without_place(planned, layout)
     if not jobs:
@@ -135,12 +140,6 @@ def export_official(
     return RunReport(tuple(made), in_order, {**failed, **broken}, index, notes)
 
 
-def _job(paths: TrialPaths, row: pd.Series[Any], out: Path, layout: str, images: bool) -> ExportJob:
-    columns = {name: row[f"{name}_sha256"] for name in ("movie", "free_movie")}
-    sha256 = {name: None if pd.isna(value) else str(value) for name, value in columns.items()}
-    return ExportJob(paths, out, LAYOUTS[layout].files(paths), sha256, images)
-
-
 def _without_place(planned: Mapping[str, ExportJob], layout: str) -> dict[str, tuple[str, ...]]:
     """Return a note on the trials that the layout has no files for, by name of the layout."""
     left = Counter(
@@ -154,7 +153,8 @@ def _without_place(planned: Mapping[str, ExportJob], layout: str) -> dict[str, t
 
 def export_trial(job: ExportJob) -> str:
     """Write all files of one trial; return its name."""
-    trial = Trial.open(job.paths.trial_file)
+    file = job.stored["trial_file"]
+    trial = Trial(file.read(), f"trial file {file.path}")
     if not np.isfinite(trial.trajectory.positions).all() and "state" in _kinds(job):
         raise BadInputError(
             f"the motion of trial {job.paths.trial!r} is unknown (it was imported from a movie "
@@ -203,12 +203,8 @@ def _movie(job: ExportJob, trial: Trial, look: str) -> bytes:
     """Return the movie of the trial in a look: that of the index if there is one, else rendered."""
     meta = trial.metadata
     column = "movie" if look == meta.look else "free_movie" if look == "free" else None
-    if column is not None and (sha256 := job.sha256[column]) is not None:
-        path: Path = getattr(job.paths, column)
-        data = path.read_bytes() if path.is_file() else b""
-        if hashlib.sha256(data).hexdigest() != sha256:
-            raise BadInputError(f"{path} is not the file of the index; run `physion verify` on it")
-        return data
+    if column is not None and column in job.stored:
+        return job.stored[column].read()
     if not np.isfinite(trial.trajectory.positions).all():
         raise BadInputError(
             f"trial {job.paths.trial!r} has no movie in the look {look!r}, and its motion is "

@@ -1,4 +1,4 @@
-"""Safe reading of files in a study folder: regular files of limited size; links are refused."""
+"""Safe reading of files that somebody else may have put there: regular files of limited size."""
 
 from __future__ import annotations
 
@@ -11,20 +11,22 @@ from physion.errors import BadInputError
 MAX_IDS_BYTES = 10_000_000
 
 
-def read_plain(path: Path, limit: int) -> bytes:
+def read_plain(path: Path, limit: int, *, follow_links: bool = False) -> bytes:
     """Read a regular file of at most ``limit`` bytes.
 
-    Raises `BadInputError` if the file is missing, is larger, or is a link, a folder or a pipe.
+    Raises `BadInputError` if the file is missing, is larger, or is a folder or a pipe, or a link
+    unless ``follow_links`` is set.
     """
+    no_links = 0 if follow_links else getattr(os, "O_NOFOLLOW", 0)
     try:
         # Non-blocking, so that a pipe does not hang; the type is checked on the open descriptor,
         # so that the file cannot be replaced between check and read.
-        flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+        flags = os.O_RDONLY | no_links | getattr(os, "O_NONBLOCK", 0)
         descriptor = os.open(path, flags | getattr(os, "O_BINARY", 0))
     except FileNotFoundError:
         raise BadInputError(f"{path} is missing") from None
     except OSError as error:
-        raise BadInputError(_describe_error(path, error)) from error
+        raise BadInputError(_describe_error(path, error, follow_links)) from error
     try:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):
@@ -32,11 +34,14 @@ def read_plain(path: Path, limit: int) -> bytes:
         if status.st_size > limit:
             raise BadInputError(f"{path} has {status.st_size} bytes, more than {limit}")
         with os.fdopen(descriptor, "rb", closefd=False) as file:
-            content = file.read(limit + 1)
+            # Memory for as many bytes as are asked for is allocated before they are read.
+            content = file.read(status.st_size + 1)
+    except OSError as error:
+        raise BadInputError(_describe_error(path, error, follow_links)) from error
     finally:
         os.close(descriptor)
-    if len(content) > limit:
-        raise BadInputError(f"{path} has more than {limit} bytes")
+    if len(content) > status.st_size:
+        raise BadInputError(f"{path} grew while it was read; try again when it is complete")
     return content
 
 
@@ -45,14 +50,14 @@ def check_plain(path: Path) -> None:
     try:
         status = path.lstat()
     except OSError as error:
-        raise BadInputError(_describe_error(path, error)) from error
+        raise BadInputError(_describe_error(path, error, False)) from error
     if not stat.S_ISREG(status.st_mode):
         raise BadInputError(f"{path} is not a regular file; links are not followed")
 
 
-def _describe_error(path: Path, error: OSError) -> str:
+def _describe_error(path: Path, error: OSError, follow_links: bool) -> str:
     """Return the message for a file that cannot be opened."""
-    if path.is_symlink():
+    if path.is_symlink() and not follow_links:
         return f"{path} is a link; links are not followed, replace it by the file itself"
     if isinstance(error, FileNotFoundError):
         return f"{path} is missing"

@@ -1,0 +1,99 @@
+"""Files and their SHA-256: written together, compared, and never mixed up."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from physion import atomic, digests
+from physion.analysis.tables.csv_table import read_csv
+from physion.digests import check_digest, digest_path, has_digest, is_whole, write_with_digest
+from physion.errors import BadInputError
+from physion.sealed import read_sealed, write_sealed
+
+
+def test_a_file_has_its_digest_beside_it(tmp_path: Path) -> None:
+    path = tmp_path / "t.csv"
+    assert not is_whole(path) and not has_digest(path)
+    write_with_digest(path, b"a,b\n1,2\n")
+    assert is_whole(path) and sorted(p.name for p in tmp_path.iterdir()) == [
+        "t.csv", "t.csv.sha256",
+    ]  # fmt: skip
+    program = shutil.which("sha256sum")
+    if program:
+        done = subprocess.run([program, "--check", "t.csv.sha256"], cwd=tmp_path, check=False)
+        assert done.returncode == 0
+
+
+@pytest.mark.parametrize("damage", [b"", b"a,b\n", b"a,b\n1,3\n", b"a,b\n1,2\n\n", b"\xff"])
+def test_any_other_content_is_noticed(tmp_path: Path, damage: bytes) -> None:
+    path = tmp_path / "t.csv"
+    write_with_digest(path, b"a,b\n1,2\n")
+    path.write_bytes(damage)
+    assert not is_whole(path)
+    with pytest.raises(BadInputError, match=r"t\.csv was changed since it was written.*; do this"):
+        check_digest(path, damage, "do this")
+    with pytest.raises(BadInputError, match=r"delete t\.csv\.sha256 to use the table as it is"):
+        read_csv(path, ["a"])
+    digest_path(path).write_bytes(b"\xff\xfe")
+    assert not is_whole(path)
+
+
+def test_tables_of_others_need_no_digest(tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text("a,b\n1,2\n")
+    assert read_csv(tmp_path / "t.csv", ["a"])["b"].tolist() == ["2"]
+
+
+@pytest.mark.parametrize("step", range(3))
+def test_a_fault_between_file_and_digest_leaves_no_wrong_digest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: int
+) -> None:
+    path = tmp_path / "t.csv"
+    write_with_digest(path, b"old")
+    replaced: list[str] = []
+    replace = os.replace
+
+    def failing(source: Path, target: Path) -> None:
+        if len(replaced) == step:
+            raise OSError(28, "No space left on device")
+        replaced.append(str(target))
+        replace(source, target)
+
+    monkeypatch.setattr(atomic.os, "replace", failing)
+    if step < 2:
+        with pytest.raises(OSError, match="No space left"):
+            write_with_digest(path, b"new")
+    else:
+        write_with_digest(path, b"new")
+    content = path.read_bytes()
+    assert content == (b"old" if step == 0 else b"new")
+    check_digest(path, content, "")
+    assert is_whole(path) == (step == 2)
+    assert digests.has_digest(path) == (step == 2)
+
+
+def test_sealed_files_are_bounded_and_nested_shallowly(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "s.json"
+    write_sealed(path, {"b": [1.5, None], "a": "ü"})
+    assert read_sealed(path) == {"a": "ü", "b": [1.5, None]}
+    path.write_text('{"a": ' + "[" * 100_000)
+    with pytest.raises(BadInputError, match=r"s\.json is nested deeper than 100 levels"):
+        read_sealed(path)
+    monkeypatch.setattr("physion.sealed.MAX_BYTES", 10)
+    with pytest.raises(BadInputError, match=r"s\.json has \d+ bytes, more than 10"):
+        read_sealed(path)
+    with pytest.raises(BadInputError, match="is missing"):
+        read_sealed(tmp_path / "none.json")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes with names here")
+def test_a_pipe_in_the_place_of_a_sealed_file_does_not_hang(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "s.json")
+    with pytest.raises(BadInputError, match="is not a regular file"):
+        read_sealed(tmp_path / "s.json")
