@@ -222,10 +222,9 @@ def moving_errors(model: Any, batch: Batch) -> tuple[float, float]:
 
 def boxes(folder: Path, steps: int) -> Rows:
     """Yield which boxes are kept, steps a second, and their ratio to those without kept boxes."""
-    dataset = Dataset(folder)
+    dataset = Dataset(folder, verify=False)
     trials = dataset.trials("training")
-    files = {trial: dataset.paths(trial).trial_file for trial in trials}
-    motions = TrialMotions(files, observed=False)
+    motions = TrialMotions(dataset.files("trial_file"), observed=False)
     lengths = {trial: len(motions[trial].trajectory) for trial in trials}
     first = 0.0
     for kept, most_bytes in (("none", 0), ("of earlier windows", MOST_BYTES), ("all", MOST_BYTES)):
@@ -242,7 +241,7 @@ def boxes(folder: Path, steps: int) -> Rows:
             # One frame compiles and reads what every line needs.
             renderer.read(trial, np.arange(length if kept == "all" else 1))
         movies = movie_files(dataset, observed=False)
-        pictures = MovieReader(movies, model.spec.image_size, verify=False)
+        pictures = MovieReader(movies, model.spec.image_size)
         readers = TrialReaders(lengths, [pictures, renderer])
         source = WholeBatches(ObservedBatches(model.spec, readers), readers)
         start = time.process_time()

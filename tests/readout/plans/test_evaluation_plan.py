@@ -13,6 +13,7 @@ import pytest
 
 from physion.analysis.tables.predictions import read_predictions
 from physion.readout.evaluate import evaluate
+from physion.readout.plans.evaluation_plan import EvaluationPlan
 from physion.readout.plans.results import MEAN, summarise_accuracy
 from physion.readout.plans.selection import Selection
 from physion.readout.plans.tasks import EvaluationTask
@@ -72,7 +73,7 @@ def test_a_plan_predicts_all_readouts_and_a_second_run_only_reads(
 
 def test_a_table_that_was_changed_in_place_is_made_again(dots: Dataset, tmp_path: Path) -> None:
     def plan() -> EvaluationPlan:
-        return make_plan(dots, tmp_path, [UNTRAINED], [Training.ALL], (0,))
+        return make_evaluation_plan(dots, tmp_path, [UNTRAINED], [Training.ALL], (0,))
 
     ((_, done),) = plan().run().tables
     content, stamp = done.path.read_bytes(), done.path.stat()
