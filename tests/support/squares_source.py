@@ -36,9 +36,12 @@ class SquaresSource(ClipSource):
         clipped = [clip_frames(wanted, FRAMES) for wanted in frames]
         rows = [self.trials.index(trial) for trial in trials]
         shown = np.stack([frame for frame, _ in clipped])
+        chosen = np.array(rows)[:, None], shown
+        boxes = self._whole.boxes
         return Batch(
             trials=tuple(trials),
             frames=shown,
             valid=np.stack([valid for _, valid in clipped]),
-            rgb=self._whole.rgb.numpy()[np.array(rows)[:, None], shown],
+            rgb=self._whole.rgb.numpy()[chosen],
+            boxes=None if boxes is None else boxes.numpy()[chosen],
         )

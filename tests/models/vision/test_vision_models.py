@@ -14,13 +14,17 @@ from physion.errors import BadInputError
 from physion.models.batch import Batch
 from physion.models.build import build_model
 from physion.models.checkpoints.checkpoint import (
+    WEIGHTS,
     DamagedFileError,
     read_checkpoint,
     tensors_of,
     write_checkpoint,
 )
 from physion.models.checkpoints.trained import shipped_digests
+from physion.models.settings import TrainingSettings
+from physion.training.train import train_model
 from support.moving_squares import squares, with_arrays
+from support.squares_source import SquaresSource
 
 NAMES = ("cswm", "rpin", "svg", "op3")
 OF_PICTURES = ("svg", "op3")
@@ -138,6 +142,42 @@ def test_equal_steps_give_equal_weights(name: str) -> None:
         steps(model, batch, 3)
         digests.append(model.digest())
     assert digests[0] == digests[1] != model_of(name).digest()
+
+
+class Killed(Exception):
+    """Stands for the end of a process."""
+
+
+def train(model: Any, folder: Path, last: int = 4) -> Path:
+    """Train for 4 steps with a checkpoint after 2; the process ends after step ``last``."""
+
+    def end(what: str, done: int, total: int) -> None:
+        if done == last < total:
+            raise Killed
+
+    source = SquaresSource(model.spec, 6)
+    settings = TrainingSettings(steps=4, batch=2, log_every=2, checkpoint_every=2)
+    result = train_model(
+        model, source, source.trials, seed=1, name="all", folder=folder, settings=settings,
+        accelerator="cpu", progress=end,
+    )  # fmt: skip
+    assert result.folder is not None
+    return result.folder / WEIGHTS
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_a_resumed_training_gives_the_bytes_of_an_uninterrupted_one(
+    name: str, tmp_path: Path
+) -> None:
+    whole = train(model_of(name), tmp_path / "whole").read_bytes()
+    with pytest.raises(Killed):
+        train(model_of(name), tmp_path / "parts", last=3)
+    assert not list((tmp_path / "parts").rglob(WEIGHTS))
+    resumed = model_of(name)
+    path = train(resumed, tmp_path / "parts")
+    assert path.read_bytes() == whole
+    assert model_of(name, weights=str(path.parent)).digest() == resumed.digest()
 
 
 @pytest.mark.parametrize("name", NAMES)
