@@ -131,6 +131,7 @@ def test_the_next_person_at_this_computer(chromium: Any, site: tuple[Study, str]
         assert visit.requests.count(link) == 2
         assert len(references(study)) == before + 2
         visit.page.get_by_text("I do not want to take part").click()
+        visit.page.get_by_role("button", name="I do not take part").click()
         visit.heading("You do not take part")
         visit.page.get_by_text(NEXT).click()
         visit.heading("Taking part in this study")

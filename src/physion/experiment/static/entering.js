@@ -74,7 +74,7 @@ export function takingBack(basis, arrival) {
     const device = await measureDevice();
     const message = { ...arrival.enter, scenario, device, take_back: true };
     message.language = texts.language;
-    if (who === null) message.visit = visitKey(study);
+    if (who === null || message.id) message.visit = visitKey(study, who);
     const entered = await api.post("/api/enter", message);
     api.token = entered.token;
     remember({ token: entered.token, who, link: linkOf(arrival) });
