@@ -14,7 +14,7 @@ import sqlalchemy as sa
 from physion.experiment.store.database import open_database, sqlite_url
 from physion.experiment.store.tables import TOKENS
 from physion.experiment.study.study import Study
-from support.experiment.browser import Visit, chromium, rows_of, served
+from support.experiment.browser import Visit, chromium, rows_of, served, signed_query
 
 __all__ = ["chromium"]
 pytestmark = pytest.mark.slow
@@ -128,7 +128,7 @@ def test_a_refused_answer_is_stored_as_event_before_removal(
     study, url = site
     with Visit(chromium, url) as visit, Visit(chromium, url) as there:
         to_the_test(visit, "?participant=Noted")
-        there.go("?participant=Noted")
+        there.go(signed_query(study, "Noted"))
         there.answer("yes")
         there.page.get_by_text("Trial 2 of 3").wait_for()
         there.page.close()

@@ -12,7 +12,7 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 from physion.experiment.study.orders import trial_order
 from physion.experiment.study.study import Recruitment, Study
-from support.experiment.browser import Visit, chromium, rows_of, served
+from support.experiment.browser import Visit, chromium, rows_of, served, signed_query
 
 __all__ = ["chromium"]
 pytestmark = pytest.mark.slow
@@ -222,7 +222,7 @@ def test_another_device_answers_meanwhile(chromium: Any, site: tuple[Study, str]
     study, url = site
     with Visit(chromium, url) as here, Visit(chromium, url) as there:
         to_the_test(here, "Devices")
-        there.go("?participant=Devices")
+        there.go(signed_query(study, "Devices"))
         there.answer("yes")
         there.page.get_by_text("Trial 2 of 4").wait_for()
         there.answer("yes")

@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 from physion.experiment.study.study import Study
-from support.experiment.browser import Visit, chromium, rows_of, served
+from support.experiment.browser import Visit, chromium, rows_of, served, signed_query
 
 __all__ = ["chromium"]
 pytestmark = pytest.mark.slow
@@ -100,7 +100,7 @@ def test_a_trial_that_is_shown_twice_says_so(chromium: Any, site: tuple[Study, s
     study, url = site
     with Visit(chromium, url) as visit, Visit(chromium, url) as there:
         to_the_test(visit, "Twice")
-        there.go("?participant=Twice")
+        there.go(signed_query(study, "Twice"))
         there.answer("yes")
         there.page.get_by_text("Trial 2 of 2").wait_for()
         there.page.close()

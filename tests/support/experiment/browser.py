@@ -22,6 +22,7 @@ from physion.experiment.simulated.server_process import ServerProcess
 from physion.experiment.store.database import open_database, sqlite_url
 from physion.experiment.store.tables import ANSWERS, EVENTS, SESSIONS
 from physion.experiment.study.identity import Secrets, participant_hash
+from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.study import Plausibility, Recruitment, Study, Timing
 from support.experiment.tiny_study import make_tiny_study
 from support.programs import absent, find_chromium
@@ -59,6 +60,12 @@ def served(folder: Path, **settings: Any) -> Iterator[tuple[Study, ServerProcess
     study = make_tiny_study(folder, **{**given, **settings})
     with ServerProcess(study.folder) as server:
         yield study, server
+
+
+def signed_query(study: Study, raw_id: str) -> str:
+    """Return the query of a link that continues a person's session in another browser."""
+    key = make_pass(Secrets.load(study.folder), "person", "link", raw_id)
+    return f"?participant={raw_id}&pass={key}"
 
 
 class Visit:

@@ -78,10 +78,12 @@ export function dueFeedback(state) {
  */
 export function visitKey(study, who) {
   const name = visitName(study) + (who === null ? "" : `:${who}`);
-  const known = recall(name);
+  const known = recall(name) ?? window.history.state?.[name];
   if (typeof known === "string") return known;
   const key = newKey();
   keep(name, key);
+  // Without storage, the entry of the browser's history outlives a reload.
+  if (!outlivesPage(name)) window.history.replaceState({ [name]: key }, "");
   return key;
 }
 

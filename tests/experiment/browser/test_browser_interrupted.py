@@ -1,0 +1,53 @@
+"""Trials that are interrupted or repeated, in a real browser."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from physion.experiment.study.study import Plausibility
+from support.experiment.browser import SIZE, Visit, chromium, rows_of, served
+
+__all__ = ["chromium"]
+RULES = Plausibility(reading_s=0.0)
+SMALL = {"width": 700, "height": 400}
+
+
+def to_the_test(visit: Visit, query: str) -> None:
+    visit.begin(query)
+    visit.practise(1)
+    visit.begin_test()
+
+
+@pytest.mark.slow
+def test_interrupted_trials_are_shown_again_and_showings_are_counted(
+    chromium: Any, tmp_path: Path
+) -> None:
+    with (
+        served(tmp_path / "s", familiarization=1, plausibility=RULES) as (study, server),
+        Visit(chromium, server.url, "interrupted") as visit,
+    ):
+        to_the_test(visit, "?participant=Ada&language=en")
+        visit.page.locator(".screen").wait_for()
+        visit.page.click("#tools button")  # the question whether to stop
+        visit.page.locator("dialog[open]").wait_for()
+        visit.press("Escape")
+        visit.wait_for_answer()
+        visit.page.reload()  # at the buttons: the movie is shown once more
+        visit.answer("yes")
+        visit.page.locator(".screen").wait_for()
+        visit.page.set_viewport_size(SMALL)
+        visit.heading("Please make the window larger")
+        visit.page.set_viewport_size(SIZE)
+        visit.answer("no")
+        visit.answer("no")
+        visit.finish()
+        session, answers, events = rows_of(study, "Ada")
+    test = [row for row in answers if row.phase == "test"]
+    assert [row.showings for row in test] == [3, 2, 1]
+    assert [row.void for row in test] == [None] * 3
+    assert (session.replayed, session.implausible, session.unfetched) == (1, None, 0)
+    reasons = [row.data["reason"] for row in events if row.kind == "trial_interrupted"]
+    assert reasons == ["dialog", "window"]
