@@ -330,17 +330,23 @@ def test_leaderboard_prints_and_writes(
     command = ["compare", "leaderboard", *map(str, files), "--humans", str(official / "humans")]
     assert main([*command, "--out", str(tmp_path / "out")]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[1].split()[:2] == ["1", "good"] and "made up 1" in lines[1]
+    assert lines[1].split()[:5] == ["1", "1", "to", "1", "good"] and "made up 1" in lines[1]
     assert "left out" in lines[-1]
     table = pd.read_csv(tmp_path / "out" / "leaderboard.csv")
-    anchors = ["recorded outcome", "majority of people", "one person with another"]
-    assert list(table["model"]) == ["good", "weak", *anchors]
-    assert list(table["kind"]) == ["model"] * 2 + ["anchor"] * 3
+    anchors = ["recorded outcome", "majority of people"]
+    person = "one person with another"
+    assert list(table["model"]) == ["good", "weak", person, *anchors]
+    assert list(table["kind"]) == ["model", "model", "people", "anchor", "anchor"]
     assert set(table["stimuli"]) == {1144}
     below = lines[lines.index("Anchors: what a score is worth") + 2 :]
-    assert [line[:20].strip() for line in below[:3]] == [name[:20] for name in anchors]
+    assert [line[:18].strip() for line in below[:2]] == [name[:18].strip() for name in anchors]
+    assert lines[lines.index("People") + 2].startswith(person)
     written = json.loads((tmp_path / "out" / "leaderboard.json").read_text())
-    assert [row["model"] for row in written["anchors"]] == anchors
+    assert [row["model"] for row in written["anchors"]] == [person, *anchors]
+    assert {"Made with", "Date", "Licence"} <= set(written["settings"])
+    assert (tmp_path / "out" / "leaderboard.html").read_text().startswith("<!DOCTYPE html>")
+    scenarios = pd.read_csv(tmp_path / "out" / "leaderboard_by_scenario.csv")
+    assert scenarios.groupby("agent")["scenario"].nunique().eq(8).all()
     assert written["rows"][0]["kappa"] is None and written["rows"][0]["accuracy"] > 0.8
     assert main([*command, "--sort", "rmsd", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["rows"]

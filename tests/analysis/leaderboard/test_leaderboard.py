@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -14,11 +15,12 @@ from sklearn.metrics import cohen_kappa_score
 from physion.analysis import Bootstrap, compare_scores, read_predictions
 from physion.analysis.leaderboard.leaderboard import leaderboard
 from physion.analysis.leaderboard.order import columns, sort_leaderboard
-from physion.analysis.leaderboard.rows import sidecar_versions
+from physion.analysis.leaderboard.submissions import Filters, read_sidecar
 from physion.analysis.people.exclusions import ExclusionRules
 from physion.analysis.people.participants import Responses, clean
 from physion.analysis.people.response_schema import TRIAL_COLUMNS, check_table
 from physion.errors import BadInputError, UnknownNameError
+from physion.report.leaderboard_page import leaderboard_page
 
 QUICK = Bootstrap(resamples=200)
 STEMS = {"collide": "pilot_it2_collision_simple_box", "drop": "pilot_it2_drop_simple_box"}
@@ -152,7 +154,7 @@ def test_a_broken_file_of_versions_refuses_the_file(
 ) -> None:
     (tmp_path / "poor.json").write_text(content)
     with pytest.raises(BadInputError, match=r"poor\.json"):
-        sidecar_versions(files[1])
+        read_sidecar(files[1])
     board = leaderboard(files, humans(), LABELS, bootstrap=QUICK)
     assert len(board.table) == 2 and "poor.json" in board.refused["reason"].item()
 
@@ -308,3 +310,106 @@ def test_a_session_that_lacks_expected_trials_is_flagged(files: list[Path]) -> N
     }
     board = leaderboard(files, None, None, answers(), expected=asked, bootstrap=QUICK)
     assert "1 of 10 sessions" in board.settings["Exclusions"]
+
+
+# --- ranks, groups, filters ---------------------------------------------------------------------
+
+
+def test_models_that_see_the_whole_movie_have_no_rank(files: list[Path], tmp_path: Path) -> None:
+    seen = write(tmp_path / "seen.csv", "seen", 1.0, **{"Readout Type": "A"})
+    table = leaderboard([*files, seen], humans(), LABELS, bootstrap=QUICK).table
+    assert list(table["model"]) == ["good", "middle", "poor", "seen"]
+    assert list(table["kind"]) == ["model"] * 3 + ["detection"]
+    assert list(table["rank"][:3]) == [1, 2, 3] and table["rank"].isna().iloc[3]
+    assert table["first"].isna().iloc[3]
+
+
+def test_equal_scores_have_the_same_rank(files: list[Path], tmp_path: Path) -> None:
+    again = write(tmp_path / "good2.csv", "good", 0.95)
+    table = leaderboard([*files, again], humans(), LABELS, bootstrap=QUICK).table
+    assert list(table["model"]) == ["good", "good", "middle", "poor"]
+    assert list(table["rank"]) == [1, 1, 3, 4]
+    assert table["first"].iloc[0] == table["first"].iloc[1]
+
+
+@pytest.mark.parametrize("by", ["accuracy", "rmsd", "r"])
+def test_ranks_have_intervals_over_draws_of_stimuli(files: list[Path], by: str) -> None:
+    near = write(files[0].parent / "rival.csv", "rival", 0.9)
+    table = leaderboard([*files, near], humans(), LABELS, by=by, bootstrap=QUICK).table
+    assert table["rank"].between(table["rank_low"], table["rank_high"]).all()
+    assert table["first"].sum() >= 1 and table["rank_high"].max() <= 4
+    draws = QUICK
+    if by == "accuracy":  # by hand: accuracy by draw, mean of scenarios
+        right = {
+            row["model"]: read_predictions([Path(row["file"])]).set_index("stimulus")
+            for row in table.to_dict("records")
+        }
+        scores = []
+        for rows in right.values():
+            correct = rows["predicted"] == rows["actual"]
+            parts = []
+            for scenario in STEMS:
+                names = sorted(name for own, name in STIMULI if own == scenario)
+                weights = draws.weights(scenario, len(names))
+                parts.append(weights @ correct.loc[names].to_numpy(float) / len(names))
+            scores.append(np.mean(parts, axis=0))
+        best = np.max(scores, axis=0)
+        expected = [float(np.mean(one >= best - 1e-12)) for one in scores]
+        assert list(table["first"]) == pytest.approx(expected)
+
+
+def test_ranks_draw_people_where_they_are_known(files: list[Path]) -> None:
+    people = answers()
+    board = leaderboard(files, None, None, people, by="kappa", bootstrap=QUICK)
+    assert board.table["rank_low"].notna().all() and list(board.table["rank"]) == [1, 2, 3]
+    pooled = leaderboard(files, None, None, people, by="r", scenario="pooled", bootstrap=QUICK)
+    assert pooled.table["rank_low"].notna().all()
+    averages = leaderboard(files, humans(), LABELS, by="kappa", bootstrap=QUICK).table
+    assert averages["rank_low"].isna().all()
+
+
+def test_scores_are_given_relative_to_what_can_be_reached(files: list[Path]) -> None:
+    board = leaderboard(files, humans(), LABELS, bootstrap=QUICK)
+    people = board.anchors[board.anchors["kind"] == "people"].iloc[0]
+    assert people["agent"] == "one person with another" and board.anchors.index[0] == people.name
+    table = board.table
+    assert table["r_of_ceiling"].tolist() == pytest.approx((table["r"] / table["ceiling"]).tolist())
+    expected = table["kappa_from_averages"] / people["kappa_from_averages"]
+    assert table["kappa_of_people"].tolist() == pytest.approx(expected.tolist())
+    rows = board.by_scenario
+    assert set(rows["scenario"]) == {"collide", "drop"} and rows["r"].notna().any()
+    good = rows[rows["agent"].str.startswith("good")]
+    assert good["accuracy"].mean() == pytest.approx(table["accuracy"].iloc[0])
+
+
+def test_filters_choose_models_before_they_are_ranked(files: list[Path], tmp_path: Path) -> None:
+    other = write(tmp_path / "full.csv", "good too", 0.9, **{"Readout Type": "A"})
+    given = ([*files, other], humans(), LABELS)
+    one = leaderboard(*given, filters=Filters(models=("GOOD",)), bootstrap=QUICK).table
+    assert list(one["model"]) == ["good", "good too"]
+    full = leaderboard(*given, filters=Filters(readouts=("Full",)), bootstrap=QUICK).table
+    assert list(full["model"]) == ["good too"]
+    with pytest.raises(BadInputError, match="no model passes"):
+        leaderboard(*given, filters=Filters(trainings=("none",)), bootstrap=QUICK)
+    partial = cut(tmp_path / "partial.csv", "partial", list(LABELS)[:20])
+    every = leaderboard([*files, partial], humans(), LABELS, complete=True, bootstrap=QUICK).table
+    assert "partial" not in set(every["model"])
+
+
+def test_files_are_named_by_digest_and_licence(files: list[Path], tmp_path: Path) -> None:
+    (tmp_path / "poor.json").write_text(json.dumps({"license": "CC-BY-4.0"}))
+    table = leaderboard(files, humans(), LABELS, bootstrap=QUICK).table.set_index("model")
+    assert table.loc["poor", "license"] == "CC-BY-4.0" and table.loc["good", "license"] == ""
+    assert table.loc["poor", "sha256"] == hashlib.sha256(files[1].read_bytes()).hexdigest()
+
+
+def test_the_page_shows_ranks_groups_and_digests(files: list[Path], tmp_path: Path) -> None:
+    seen = write(tmp_path / "seen.csv", "<seen>", 1.0, **{"Readout Type": "A"})
+    board = leaderboard([*files, seen], humans(), LABELS, bootstrap=QUICK)
+    page = leaderboard_page(board)
+    assert "&lt;seen&gt;" in page and "<seen>" not in page
+    for words in ("not ranked", "one person with another", "drop", "r of its ceiling", "SHA-256"):
+        assert words in page
+    assert board.table["sha256"].iloc[0][:12] in page
+    bare = leaderboard_page(leaderboard(files, bootstrap=QUICK))
+    assert "Models that predict" in bare

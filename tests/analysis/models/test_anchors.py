@@ -363,7 +363,8 @@ def test_the_leaderboard_has_anchors_over_the_stimuli_of_all_files(tmp_path: Pat
     board = leaderboard(files, humans(), LABELS, bootstrap=QUICK)
     assert list(board.table["kind"]) == ["model", "model", "anchor"]
     assert board.table["rank"].tolist() == [1, 2, pd.NA]
-    assert list(board.anchors["model"]) == list(COMPUTED)
+    assert list(board.anchors["model"]) == [TWO_PEOPLE, OUTCOME, MAJORITY]
+    assert list(board.anchors["kind"]) == ["people", "anchor", "anchor"]
     assert set(board.anchors["stimuli"]) == {24} and list(board.anchors) == list(board.table)
     expected = row_of(compared().anchors, MAJORITY)
     found = board.anchors.set_index("model").loc[MAJORITY]

@@ -3,7 +3,8 @@
 Each file is compared separately, on the stimuli that people saw and it predicts, so that files made
 on different sets of trials can be in one table; the column ``stimuli`` counts them. A file that
 cannot be compared is listed in `Leaderboard.refused` with the reason. A model that lacks stimuli
-ranks after those that lack none, whatever its scores. Anchors of the files follow the models.
+ranks after those that lack none, whatever its scores. Models that see the whole movie, and anchors
+of the files, follow the models without a rank.
 """
 
 from __future__ import annotations
@@ -12,22 +13,26 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 
 from physion.analysis.leaderboard.order import (
+    add_normalised,
     columns,
     required_stimuli,
     sort_leaderboard,
     with_required,
 )
-from physion.analysis.leaderboard.rows import (
-    read_submission,
-    score_anchors,
-    score_models,
-)
+from physion.analysis.leaderboard.ranks import COLUMNS as RANK_COLUMNS
+from physion.analysis.leaderboard.ranks import KEY, rank_intervals
+from physion.analysis.leaderboard.rows import score_anchors, score_models
+from physion.analysis.leaderboard.submissions import Filters, Submission, read_submission
+from physion.analysis.metrics import leaderboard_metrics
+from physion.analysis.models.anchors import anchor_scores
 from physion.analysis.models.comparison import compare_scores
 from physion.analysis.models.contradictions import check_coverage
 from physion.analysis.models.observed_contact import observed_contacts
+from physion.analysis.people.answers import ScenarioAnswers
 from physion.analysis.people.completeness import (
     Expected,
     check_expected,
@@ -55,8 +60,10 @@ class Leaderboard:
 
     - ``table``: the models of the files, and the anchors among them; see
       `order.columns`.
-    - ``anchors``: those that are computed on the stimuli of all files (`anchors.COMPUTED`), with
-      the same columns; no file contains them. Empty without people.
+    - ``anchors``: people and the anchors that are computed on the stimuli of all files
+      (`anchors.COMPUTED`), with the same columns; no file contains them. Empty without people.
+    - ``by_scenario``: one row a model, or anchor, and scenario: ``file``, ``agent``, ``scenario``,
+      ``stimuli`` and the metrics that need no single answers, with intervals.
     - ``dropped``: what was left out of each file: ``file``, ``agent``, ``scenario``, ``reason``,
       ``stimuli``.
     - ``refused``: files that could not be compared: ``file``, ``reason``.
@@ -68,6 +75,7 @@ class Leaderboard:
 
     table: pd.DataFrame
     anchors: pd.DataFrame
+    by_scenario: pd.DataFrame
     dropped: pd.DataFrame
     refused: pd.DataFrame
     dropped_answers: pd.DataFrame | None
@@ -88,9 +96,13 @@ def leaderboard(
     exclude: Iterable[str] = (),
     exclude_ledge: bool = True,
     later: bool = False,
+    filters: Filters | None = None,
+    complete: bool = False,
+    by: str = "accuracy",
+    ascending: bool | None = None,
     bootstrap: Bootstrap | None = None,
 ) -> Leaderboard:
-    """Score every model of every file, best accuracy first (`sort_leaderboard`).
+    """Score every model of every file, best first (`sort_leaderboard`).
 
     Parameters
     ----------
@@ -108,14 +120,21 @@ def leaderboard(
     later
         Whether to exclude the trials whose contact was observed, or not known to be observed or
         not (`observed_contact`).
+    filters
+        Which models are on the leaderboard; None: all.
+    complete
+        Whether to leave out models that lack stimuli.
+    by, ascending
+        As in `sort_leaderboard`. The uncertainty of ranks is given for metrics.
     bootstrap
-        Draws for the intervals.
+        Level of the intervals, and draws for the uncertainty of ranks.
 
     Raises
     ------
     BadInputError
-        If no file is given or none can be compared, no session is left, the outcomes of the
-        responses contradict ``labels``, or ``later`` is asked of files that do not contain it.
+        If no file is given or none can be compared, no model passes the filters, no session is
+        left, the outcomes of the responses contradict ``labels``, or ``later`` is asked of files
+        that do not contain it.
     UnknownNameError
         For a name in ``exclude`` that no table contains.
     """
@@ -130,7 +149,7 @@ def leaderboard(
     answers = {} if test is None else {each.scenario: each for each in all_answers(test)}
     read, refused = _read(files)
     known = set() if people is None else set(people["stimulus"])
-    known |= {name for rows, _ in read.values() for name in rows["stimulus"]} | set(outcomes or {})
+    known |= {name for one in read.values() for name in one.rows["stimulus"]} | set(outcomes or {})
     if read:
         check_excluded_names(exclude, known)
     warnings = [REHEARSAL] if responses is not None and responses.simulated_sessions else []
@@ -138,23 +157,32 @@ def leaderboard(
     if humans is not None and labels is not None:
         warnings += check_coverage(humans, labels)
     unwanted = (*exclude, *(_not_later(read) if later else ()))
-    tables, dropped, answered = [], [], []
+    chosen = _filtered(read, filters)
+    tables, dropped, answered, scenarios = [], [], [], []
     settings: Mapping[str, str] = {}
-    for path, (rows, versions) in read.items():
+    for path, submission in chosen.items():
         try:
             comparison = compare_scores(
-                rows,
+                submission.rows,
                 people,
                 outcomes,
                 exclude=unwanted,
                 exclude_ledge=exclude_ledge,
                 bootstrap=draws,
             )
-            scored = score_models(comparison, rows, answers, scenario, draws.level)
+            scored = score_models(comparison, submission.rows, answers, scenario, draws.level)
         except BadInputError as error:
             refused[path] = str(error)
             continue
-        tables.append(scored.assign(file=str(path), versions=scored["agent"].map(versions)))
+        tables.append(
+            scored.assign(
+                file=str(path),
+                versions=scored["agent"].map(submission.versions),
+                license=submission.license,
+                sha256=submission.sha256,
+            )
+        )
+        scenarios.append(_by_scenario(comparison.scores, str(path)))
         dropped.append(comparison.dropped.assign(file=str(path)))
         answered.append(comparison.stimuli.assign(file=str(path)))
         warnings += [f"{path}: {text}" for text in comparison.warnings]
@@ -165,10 +193,16 @@ def leaderboard(
     anchors = score_anchors(stimuli, answers, scenario, draws.level)
     required = required_stimuli(stimuli, left_out)
     table = with_required(pd.concat(tables, ignore_index=True), required, scenario)
+    table = add_normalised(table, anchors)
+    if complete:
+        table = table[table["stimuli"] == table["of_stimuli"]].reset_index(drop=True)
+    table = _with_rank_intervals(table, stimuli, answers, by, scenario, draws)
+    scenarios.append(_by_scenario(anchor_scores(stimuli, draws.level), ""))
     order = ["file", "agent", "scenario", "reason", "stimuli"]
     return Leaderboard(
-        sort_leaderboard(table.reindex(columns=columns())),
+        sort_leaderboard(table.reindex(columns=columns()), by, ascending),
         with_required(anchors, required, scenario).reindex(columns=columns()),
+        pd.concat(scenarios, ignore_index=True),
         left_out[order],
         pd.DataFrame(
             [(str(path), refused[path]) for path in files if path in refused],
@@ -180,10 +214,57 @@ def leaderboard(
     )
 
 
-def _read(
-    files: Sequence[Path],
-) -> tuple[dict[Path, tuple[pd.DataFrame, dict[str, str]]], dict[Path, str]]:
-    """Return the checked rows and versions of each file, and why others were refused."""
+def _with_rank_intervals(
+    table: pd.DataFrame,
+    stimuli: pd.DataFrame,
+    answers: Mapping[str, ScenarioAnswers],
+    by: str,
+    scenario: str,
+    draws: Bootstrap,
+) -> pd.DataFrame:
+    """Add the uncertainty of the ranks of complete models, if they are ranked by a metric."""
+    metric = next((one for one in leaderboard_metrics() if one.name == by), None)
+    whole = (table["kind"] == "model") & (table["stimuli"] == table["of_stimuli"])
+    if (
+        metric is None
+        or not whole.any()
+        or (metric.needs != "outcome" and not _has_people(stimuli))
+    ):
+        return table.assign(**dict.fromkeys(RANK_COLUMNS, np.nan))
+    ranked = stimuli.merge(table.loc[whole, KEY], on=KEY)
+    return table.merge(rank_intervals(ranked, answers, metric, scenario, draws), on=KEY, how="left")
+
+
+def _has_people(stimuli: pd.DataFrame) -> bool:
+    return bool(stimuli["p_yes"].notna().any())
+
+
+def _by_scenario(scores: pd.DataFrame, file: str) -> pd.DataFrame:
+    """Return the rows of single scenarios with the metrics of the leaderboard."""
+    if scores.empty:
+        return pd.DataFrame()
+    named = [one.name for one in leaderboard_metrics() if one.in_scores]
+    bounds = [f"{name}{end}" for name in named for end in ("", "_low", "_high")]
+    rows = scores[~scores["scenario"].isin((MEAN, POOLED))].assign(file=file)
+    return rows[["file", "agent", "kind", "scenario", "stimuli", *bounds]]
+
+
+def _filtered(read: Mapping[Path, Submission], filters: Filters | None) -> dict[Path, Submission]:
+    """Return the submissions with the chosen models, without those that have none."""
+    if filters is None or not read:
+        return dict(read)
+    chosen = {path: filters.apply(submission) for path, submission in read.items()}
+    left = {path: submission for path, submission in chosen.items() if len(submission.rows)}
+    if not left:
+        raise BadInputError(
+            "no model passes the filters; names are in the columns Model, Readout Type and "
+            "Dynamics Training Dataset of the files"
+        )
+    return left
+
+
+def _read(files: Sequence[Path]) -> tuple[dict[Path, Submission], dict[Path, str]]:
+    """Return the checked submission of each file, and why others were refused."""
     read, refused = {}, {}
     for path in files:
         try:
@@ -193,11 +274,11 @@ def _read(
     return read, refused
 
 
-def _not_later(read: Mapping[Path, tuple[pd.DataFrame, dict[str, str]]]) -> list[str]:
+def _not_later(read: Mapping[Path, Submission]) -> list[str]:
     """Return the stimuli whose contact was observed, or not known to be observed or not."""
     if not read:
         return []
-    rows = pd.concat([rows for rows, _ in read.values()], ignore_index=True)
+    rows = pd.concat([one.rows for one in read.values()], ignore_index=True)
     known = observed_contacts(rows)
     if known.empty:
         raise BadInputError(
@@ -245,8 +326,15 @@ def _people(
 
 def _describe_scores(scenario: str, single: bool) -> dict[str, str]:
     descriptions = {
+        "Ranks": "by the column sorted by; equal scores have the same rank, and models that lack "
+        "stimuli rank after those that lack none. In brackets the 95 % interval of the rank over "
+        "draws of stimuli and, where their single answers are known, of people",
+        "Normalised scores": "r of its ceiling: r divided by the expected r of a model that knows "
+        "the true fractions of yes; kappa of people's: kappa from averages divided by that of one "
+        "person with another",
+        "Readout full": "sees the whole movie, so it detects and need not predict: no rank",
         "Leaderboard": "each file by itself, on the stimuli that it shares with people; scores of "
-        + (scenario if scenario in SCENARIOS else f"the row “{scenario}” over scenarios")
+        + (scenario if scenario in SCENARIOS else f"the row “{scenario}” over scenarios"),
     }
     if single:
         descriptions["Kappa"] = (

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from physion.analysis.leaderboard.rows import DETECTION, PEOPLE
 from physion.analysis.metrics import leaderboard_metrics
 from physion.analysis.models.comparison import NOT_PREDICTED
 from physion.analysis.tables.stimuli import MEAN, POOLED
@@ -14,6 +15,9 @@ from physion.errors import UnknownNameError
 
 FIRST_COLUMNS = (
     "rank",
+    "rank_low",
+    "rank_high",
+    "first",
     "kind",
     "model",
     "readout",
@@ -24,19 +28,25 @@ FIRST_COLUMNS = (
     "stimuli",
     "of_stimuli",
 )
-LAST_COLUMNS = ("versions", "agent", "reason")
+NORMALISED = ("ceiling", "r_of_ceiling", "kappa_of_people", "floor")
+LAST_COLUMNS = ("versions", "license", "sha256", "agent", "reason")
 
 
 def columns() -> list[str]:
     """Return the columns of the table: each metric with ``_low`` and ``_high`` between the names.
 
-    ``kind`` is model or anchor; anchors have no rank. ``scenarios`` and ``stimuli`` count what the
-    scores rest on, out of ``of_scenarios`` and ``of_stimuli``: what people saw or, without people,
-    what all files name. ``agent`` is the name by which the file's own rows are told apart;
-    ``reason`` says what a score rests on where that is not everything, and why a score is NaN.
+    ``kind`` is model, detection (a model that sees the whole movie), people or anchor; only models
+    have a ``rank``, equal scores the same one. ``rank_low``, ``rank_high`` and ``first`` are those
+    of `ranks.rank_intervals`. ``ceiling`` is the noise ceiling of r and ``r_of_ceiling`` r divided
+    by it; ``kappa_of_people`` is kappa from averages divided by that of one person with another;
+    ``floor`` is the RMSD of a model that knows the true fractions of yes. ``scenarios`` and
+    ``stimuli`` count what the scores rest on, out of ``of_scenarios`` and ``of_stimuli``: what
+    people saw or, without people, what all files name. ``agent`` is the name by which the file's
+    own rows are told apart; ``reason`` says what a score rests on where that is not everything, and
+    why a score is NaN.
     """
     scores = [f"{one.name}{end}" for one in leaderboard_metrics() for end in ("", "_low", "_high")]
-    return [*FIRST_COLUMNS, *scores, *LAST_COLUMNS]
+    return [*FIRST_COLUMNS, *scores, *NORMALISED, *LAST_COLUMNS]
 
 
 def required_stimuli(answered: pd.DataFrame, dropped: pd.DataFrame) -> pd.Series:
@@ -78,10 +88,11 @@ def sort_leaderboard(
 ) -> pd.DataFrame:
     """Sort the table by any column; ``rank`` follows that order, NaN last, ties by model and file.
 
-    Anchors come after the models, in the same order and without a rank. By a metric, models that
-    lack stimuli come after those that lack none, since means over other scenarios are not
-    comparable. ``ascending`` None puts the best first: large scores, small RMSD, text
-    alphabetically. Raises `UnknownNameError` with the closest columns.
+    Models that see the whole movie, and then anchors, come after the models, in the same order and
+    without a rank. By a metric, models that lack stimuli come after those that lack none, since
+    means over other scenarios are not comparable, and equal scores have the same rank.
+    ``ascending`` None puts the best first: large scores, small RMSD, text alphabetically. Raises
+    `UnknownNameError` with the closest columns.
     """
     if by not in table.columns or by == "rank":
         raise UnknownNameError("column", by, [name for name in table.columns if name != "rank"])
@@ -97,7 +108,25 @@ def sort_leaderboard(
     if metric is not None:
         after = _is_partial(order).astype(int).mask(order[by].isna(), 2)
         order = order.loc[after.sort_values(kind="stable").index]
-    models = order[order["kind"] == "model"]
-    ranked = pd.concat([models, order[order["kind"] != "model"]], ignore_index=True)
+    groups = [order[order["kind"] == "model"], order[order["kind"] == DETECTION],
+              order[~order["kind"].isin(("model", DETECTION))]]  # fmt: skip
+    ranked = pd.concat([group for group in groups if len(group)], ignore_index=True)
     ranks = pd.Series(np.arange(1, len(order) + 1), dtype="Int64")
-    return ranked.assign(rank=ranks.where(ranks <= len(models)))
+    if metric is not None:
+        ranks = _with_ties(ranks, ranked[by], _is_partial(ranked))
+    return ranked.assign(rank=ranks.where(ranks.index < len(groups[0])))
+
+
+def _with_ties(ranks: pd.Series, scores: pd.Series, partial: pd.Series) -> pd.Series:
+    """Return the ranks with the first of them for all rows of one score that follow each other."""
+    same = (scores == scores.shift()) & (partial == partial.shift())
+    return ranks.where(~same).ffill().astype("Int64")
+
+
+def add_normalised(table: pd.DataFrame, anchors: pd.DataFrame) -> pd.DataFrame:
+    """Return the table with ``kappa_of_people``, of models that predict what people saw."""
+    people = anchors.loc[anchors["kind"] == PEOPLE, "kappa_from_averages"] if len(anchors) else []
+    if not len(people):
+        return table.assign(kappa_of_people=np.nan)
+    ratio = table["kappa_from_averages"] / float(people.iloc[0])
+    return table.assign(kappa_of_people=ratio.mask(_is_partial(table)))

@@ -1,10 +1,8 @@
-"""Rows of the leaderboard from one file: its models, their versions and their scores."""
+"""Rows of the leaderboard from one file: its models and their scores."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -21,46 +19,15 @@ from physion.analysis.models.model_people import models_of, sample_of_models
 from physion.analysis.models.sampling_variance import sampling_variances
 from physion.analysis.people.answers import ScenarioAnswers
 from physion.analysis.statistics.jackknife import mean_of
-from physion.analysis.tables.csv_table import read_csv
-from physion.analysis.tables.predictions import REQUIRED, check_predictions, name_models
+from physion.analysis.tables.predictions import READOUTS
 from physion.analysis.tables.stimuli import MEAN, POOLED
 from physion.errors import BadInputError
 
+DETECTION = "detection"
+"""``kind`` of models that see the whole movie, so that they need not predict."""
 
-def read_submission(path: Path) -> tuple[pd.DataFrame, dict[str, str]]:
-    """Read the checked rows of a file, and for each of its models the versions that made it."""
-    raw = read_csv(path, REQUIRED)
-    rows = name_models(check_predictions(raw, str(path)))
-    sidecar = sidecar_versions(path)
-    if "Versions" not in raw.columns:
-        return rows, dict.fromkeys(rows["agent"].unique(), sidecar)
-    # The rows are still in the order of the file.
-    words = raw["Versions"].fillna("").str.strip().reset_index(drop=True)
-    found = words.groupby(rows["agent"].to_numpy()).agg(lambda each: "; ".join(sorted({*each})))
-    return rows, {str(agent): text or sidecar for agent, text in found.items()}
-
-
-def sidecar_versions(path: Path) -> str:
-    """Return the entry ``versions`` of the JSON file next to a table of predictions; empty without
-    one.
-
-    The file has the name of the table, with ``.json`` for or after its ending; ``versions`` is
-    text, or an object of names and versions. Raises `BadInputError` for anything else.
-    """
-    for sidecar in (path.with_suffix(".json"), path.with_name(path.name + ".json")):
-        if not sidecar.is_file():
-            continue
-        try:
-            content = json.loads(sidecar.read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-            raise BadInputError(f"{sidecar} is not a JSON file: {error}") from error
-        versions = content.get("versions", "") if isinstance(content, dict) else None
-        if isinstance(versions, dict):
-            return ", ".join(f"{name} {version}" for name, version in versions.items())
-        if not isinstance(versions, str):
-            raise BadInputError(f"{sidecar}: 'versions' must be text or an object of versions")
-        return versions
-    return ""
+PEOPLE = "people"
+"""``kind`` of the row of one person with another."""
 
 
 def score_models(
@@ -70,8 +37,13 @@ def score_models(
     scenario: str,
     level: float,
 ) -> pd.DataFrame:
-    """Return one row for each model of one file, whose checked rows are ``rows``."""
+    """Return one row for each model of one file, whose checked rows are ``rows``.
+
+    A model whose readout sees the whole movie has the kind `DETECTION`.
+    """
     table = _scored(comparison.scores, comparison.stimuli, answers, scenario, level)
+    sees_outcome = (table["readout"] == READOUTS["A"]) & (table["kind"] == "model")
+    table["kind"] = table["kind"].mask(sees_outcome, DETECTION)
     training = rows.drop_duplicates("agent").set_index("agent")["Dynamics Training Dataset"]
     return table.assign(training=table["agent"].map(training))
 
@@ -82,7 +54,7 @@ def score_anchors(
     scenario: str,
     level: float,
 ) -> pd.DataFrame:
-    """Return one row for each anchor of `anchors.COMPUTED`; empty without people.
+    """Return one row for each anchor of `anchors.COMPUTED`, people first; empty without people.
 
     ``stimuli``: `Comparison.stimuli` of all files; the anchors answer each stimulus once.
     """
@@ -90,9 +62,11 @@ def score_anchors(
     if scores.empty:
         return scores
     rows = pd.concat([given, seen_stimuli(stimuli)], ignore_index=True)
-    return _scored(scores, rows, answers, scenario, level).assign(
-        rank=pd.Series(dtype="Int64"), training="", file="", versions=""
+    table = _scored(scores, rows, answers, scenario, level).assign(
+        rank=pd.Series(dtype="Int64"), training="", file="", versions="", sha256="", license=""
     )
+    table["kind"] = table["kind"].mask(table["agent"] == TWO_PEOPLE, PEOPLE)
+    return table.sort_values("kind", key=lambda kind: kind != PEOPLE, kind="stable")
 
 
 def _scored(
@@ -112,8 +86,9 @@ def _scored(
         if metric.in_scores
         for end in ("", "_low", "_high")
     ]
-    names = ["agent", "kind", "model", "readout", "stimuli", "reason"]
+    names = ["agent", "kind", "model", "readout", "stimuli", "reason", "ceiling", "floor"]
     table = chosen[[*names, *scored]].copy()
+    table["r_of_ceiling"] = table["r"] / table["ceiling"]
     counts = stimuli.groupby("agent")["scenario"].nunique()
     table["scenarios"] = table["agent"].map(counts) if scenario in (MEAN, POOLED) else 1
     if stimuli["p_yes"].isna().all():

@@ -34,7 +34,7 @@ __all__ = ["Checked", "Fault", "Reference", "read_index", "validate"]
 @dataclass(frozen=True)
 class Checked:
     """Result of `validate`: faults in the order of the checks, checks that were not possible and
-    why, and the number of rows of each model.
+    why, and the number of rows of each model, or of responses of ``people`` by scenario.
     """
 
     file: str
@@ -42,6 +42,7 @@ class Checked:
     models: Mapping[str, int]
     faults: tuple[Fault, ...]
     not_checked: tuple[str, ...] = field(default=())
+    people: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def errors(self) -> int:

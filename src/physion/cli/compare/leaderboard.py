@@ -1,4 +1,7 @@
-"""One table of many prediction files: accuracy, r, kappa, RMSD, and the versions that made them.
+"""One table of many prediction files: ranks, accuracy, r, kappa, RMSD, versions and licences.
+
+Ranks have intervals over draws of people and stimuli. Models that see the whole movie (readout
+full) are listed without a rank.
 
 Exit code 1 where a file could not be compared; the others are in the table.
 """
@@ -17,8 +20,19 @@ if TYPE_CHECKING:
 
     from physion.analysis.leaderboard.leaderboard import Leaderboard
 
-SHOWN = ("rank", "model", "readout", "training", "scenarios", "stimuli")
+SHOWN = ("rank", "ranks", "model", "readout", "training", "scenarios", "stimuli")
 """Columns on the console before the metrics, the versions and the file."""
+
+NORMALISED = ("r_of_ceiling", "kappa_of_people")
+"""Scores relative to what can be reached, after the metrics."""
+
+GROUPS = {
+    "model": "",
+    "detection": "Readout full: sees the whole movie, not ranked",
+    "people": "People",
+    "anchor": "Anchors: what a score is worth",
+}
+"""Titles of the groups of rows by ``kind``."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +70,20 @@ class Options:
     """Column to sort by."""
     ascending: bool = False
     """Sort ascending; by default the best is first."""
+    model: tuple[str, ...] = ()
+    """Only models whose names contain one of these."""
+    readout: tuple[str, ...] = ()
+    """Only these readouts, such as observed."""
+    training: tuple[str, ...] = ()
+    """Only models with these trainings, such as all."""
+    complete: bool = False
+    """Only models that predict all stimuli."""
+    license: str = ""
+    """Licence of the table, which the files state."""
+    date: str = ""
+    """Date in the files; that of today (UTC) if not given."""
     out: Path | None = None
-    """Folder for leaderboard.csv and leaderboard.json."""
+    """Folder for leaderboard.html, .csv and .json, and leaderboard_by_scenario.csv."""
     json: bool = False
     """Print one JSON object."""
 
@@ -70,7 +96,7 @@ def main(options: Options) -> int:
     print_warnings(board.warnings)
     record = _record(board)
     if options.out is not None:
-        _write(board, record, options.out)
+        _write(board, record, options.out, options.sort)
     if options.json:
         print(json_module.dumps(record))
     else:
@@ -83,7 +109,7 @@ def _board(options: Options) -> Leaderboard:
     from dataclasses import replace
 
     from physion.analysis.leaderboard.leaderboard import leaderboard
-    from physion.analysis.leaderboard.order import sort_leaderboard
+    from physion.analysis.leaderboard.submissions import Filters
     from physion.analysis.tables.responses import (
         LABELS_FILE,
         find_next_to,
@@ -103,10 +129,35 @@ def _board(options: Options) -> Leaderboard:
         exclude=() if options.exclude is None else read_stimulus_list(options.exclude),
         exclude_ledge=not options.ledge,
         later=options.later,
+        filters=Filters(options.model, options.readout, options.training),
+        complete=options.complete,
+        by=options.sort,
+        ascending=True if options.ascending else None,
         **_people(options),
     )
-    ascending = True if options.ascending else None
-    return replace(board, table=sort_leaderboard(board.table, options.sort, ascending))
+    return replace(board, settings={**board.settings, **_provenance(options, labels)})
+
+
+def _provenance(options: Options, labels: Path | None) -> dict[str, str]:
+    """Return program, date, licence, and the digests of the files about people, as text."""
+    from datetime import UTC, datetime
+
+    from physion.analysis.leaderboard.submissions import file_digest
+    from physion.version import __version__
+
+    given = [*options.responses, options.sessions, labels]
+    files = [path for path in given if path is not None]
+    if options.humans is not None:
+        files += sorted(options.humans.glob("human_accuracy-*.csv"))
+    stated = {
+        "Made with": f"physion {__version__}",
+        "Date": options.date or f"{datetime.now(UTC).date()}",
+        "Licence": options.license or "not stated; each file has its own",
+    }
+    if files:
+        digests = ", ".join(f"{path.name} {file_digest(path)[:12]}" for path in files)
+        stated["People and outcomes, SHA-256"] = digests
+    return stated
 
 
 def _people(options: Options) -> dict[str, Any]:
@@ -139,8 +190,8 @@ def _people(options: Options) -> dict[str, Any]:
 
 def _record(board: Leaderboard) -> dict[str, Any]:
     """Return the board as JSON values; NaN is null."""
-    tables = {"rows": board.table, "anchors": board.anchors, "dropped": board.dropped}
-    tables["refused"] = board.refused
+    tables = {"rows": board.table, "anchors": board.anchors, "by_scenario": board.by_scenario}
+    tables |= {"dropped": board.dropped, "refused": board.refused}
     if board.dropped_answers is not None:
         tables["dropped_answers"] = board.dropped_answers
     record: dict[str, Any] = {
@@ -158,12 +209,15 @@ def _rows(board: Leaderboard) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True)
 
 
-def _write(board: Leaderboard, record: dict[str, Any], folder: Path) -> None:
+def _write(board: Leaderboard, record: dict[str, Any], folder: Path, sorted_by: str) -> None:
     from physion.cli.output import write_text
+    from physion.report.leaderboard_page import leaderboard_page
 
-    table = _rows(board).to_csv(index=False, lineterminator="\n")
-    write_text(folder / "leaderboard.csv", table)
+    tables = {"leaderboard": _rows(board), "leaderboard_by_scenario": board.by_scenario}
+    for name, table in tables.items():
+        write_text(folder / f"{name}.csv", table.to_csv(index=False, lineterminator="\n"))
     write_text(folder / "leaderboard.json", json_module.dumps(record, indent=1) + "\n")
+    write_text(folder / "leaderboard.html", leaderboard_page(board, sorted_by))
 
 
 def _print(table: pd.DataFrame) -> None:
@@ -171,11 +225,13 @@ def _print(table: pd.DataFrame) -> None:
     from physion.cli.text_table import text_table
 
     shown = _shown(table)
-    anchors = (table["kind"] == "anchor").to_numpy()
-    text = [text_table(shown[~anchors])] if not anchors.all() else []
-    if anchors.any():
-        named = shown[anchors].drop(columns=["rank"], errors="ignore")
-        text.append(text_table(named, "Anchors: what a score is worth"))
+    text = []
+    for kind, title in GROUPS.items():
+        own = shown[(table["kind"] == kind).to_numpy()]
+        if kind != "model":
+            own = own.drop(columns=["rank", "ranks"], errors="ignore")
+        if len(own):
+            text.append(text_table(own, title))
     console.print("\n\n".join(text), markup=False, soft_wrap=True)
 
 
@@ -188,7 +244,11 @@ def _shown(table: pd.DataFrame) -> pd.DataFrame:
     if table["kappa"].notna().any():
         hidden.add("kappa_from_averages")
     metrics = [one.name for one in leaderboard_metrics() if one.name not in hidden]
-    shown = table[[*SHOWN, *metrics, "versions", "file"]].copy()
+    spread = [_ranks(row) for row in table.to_dict("records")]
+    columns = [*SHOWN, *metrics, *NORMALISED, "versions", "file"]
+    shown = table.assign(ranks=spread)[columns].copy()
+    for name in NORMALISED:
+        shown[name] = ["" if value != value else f"{value:.2f}" for value in table[name]]
     for name in ("scenarios", "stimuli"):
         shown[name] = [
             f"{row[name]}"
@@ -221,6 +281,12 @@ def _print_notes(board: Leaderboard) -> None:
 
     for note in notes:
         console.print(note, markup=False, soft_wrap=True)
+
+
+def _ranks(row: dict[str, Any]) -> str:
+    """Return the interval of the rank; empty if it is not known."""
+    low, high = row["rank_low"], row["rank_high"]
+    return "" if low != low else f"{low:.0f} to {high:.0f}"
 
 
 def _interval(row: dict[str, Any], name: str) -> str:

@@ -1,12 +1,14 @@
-"""Check files of predictions: columns, stimuli, probabilities, duplicates, leakage of splits.
+"""Check files of predictions, and of responses: columns, values, duplicates, leakage of splits.
 
-Rows are counted from 1 below the header. Exit code 1 where a file has an error, else 0.
+Predictions are also checked against the stimuli and outcomes of the responses. Rows are counted
+from 1 below the header. Exit code 1 where a file has an error, else 0.
 """
 
 from __future__ import annotations
 
 import json as json_module
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -20,8 +22,15 @@ if TYPE_CHECKING:
 class Options:
     """Prediction files, and what they are checked against."""
 
-    predictions: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    predictions: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
     """Prediction files with the official column names."""
+    responses: tuple[Path, ...] = ()
+    """Answers of single participants: our export or the study's raw files."""
+    sessions: Path | None = None
+    """Table of sessions of our export."""
+    expected: Path | None = None
+    """Table of the stimuli that each session must have; if not given, expected.csv beside the
+    responses."""
     humans: Path | None = None
     """Folder with human_accuracy-*.csv; the official outcomes are looked for next to it."""
     labels: Path | None = None
@@ -39,16 +48,42 @@ def main(options: Options) -> int:
     from physion.analysis.tables.submission import validate
     from physion.errors import BadInputError
 
-    if not options.predictions:
-        raise BadInputError("no file of predictions was given")
+    if not options.predictions and not options.responses:
+        raise BadInputError("no file of predictions or --responses was given")
     reference = _reference(options)
-    found = [validate(path, reference) for path in options.predictions]
+    found = []
+    if options.responses:
+        checked, outcomes = _responses(options, reference.labels)
+        found.append(checked)
+        if reference.labels is None and outcomes:
+            reference = replace(reference, labels=outcomes)
+    found += [validate(path, reference) for path in options.predictions]
     if options.json:
         print(json_module.dumps([{**asdict(each), "errors": each.errors} for each in found]))
     else:
         for each in found:
             _print(each)
     return 1 if any(each.errors for each in found) else 0
+
+
+def _responses(
+    options: Options, labels: Mapping[str, bool] | None
+) -> tuple[Checked, dict[str, bool]]:
+    """Check the responses, and return the outcomes of the stimuli that people answered."""
+    from physion.analysis.people.check_responses import check_responses
+    from physion.analysis.people.completeness import find_expected, read_expected
+
+    path = options.expected or find_expected(options.responses)
+    checked, responses = check_responses(
+        options.responses,
+        options.sessions,
+        labels,
+        None if path is None else read_expected(path),
+    )
+    if responses is None:
+        return checked, {}
+    rows = responses.test.drop_duplicates("stimulus")
+    return checked, dict(zip(rows["stimulus"], rows["label"].astype(bool), strict=True))
 
 
 def _reference(options: Options) -> Reference:
@@ -77,5 +112,8 @@ def _print(checked: Checked) -> None:
     for words in checked.not_checked:
         console.print(f"{checked.file}: not checked: {words}", markup=False, soft_wrap=True)
     warnings = len(checked.faults) - checked.errors
-    summary = f"{checked.rows} rows, {len(checked.models)} models, {checked.errors} errors, "
+    counted = f"{len(checked.models)} models"
+    if checked.people:
+        counted = ", ".join(f"{scenario}: {n} people" for scenario, n in checked.people.items())
+    summary = f"{checked.rows} rows, {counted}, {checked.errors} errors, "
     console.print(f"{checked.file}: {summary}{warnings} warnings", markup=False, soft_wrap=True)

@@ -131,20 +131,20 @@ def table(
     rows: Sequence[Sequence[str]],
     caption: str = "",
     below: tuple[str, Sequence[Sequence[str]]] = ("", ()),
+    groups: Sequence[tuple[str, Sequence[Sequence[str]]]] = (),
 ) -> str:
     """Return a table; the header and the caption are text, the cells are HTML.
 
-    ``below``: a second group of rows under a heading of its own (text), if it has rows.
+    ``below``, ``groups``: further groups of rows under headings of their own (text), if they have
+    rows.
     """
     head = "".join(f'<th scope="col">{escape(name)}</th>' for name in header)
     above = f"<caption>{escape(caption)}</caption>" if caption else ""
-    heading, further = below
     group = ""
-    if further:
-        words = (
-            f'<th scope="rowgroup" colspan="{len(header)}"><small>{escape(heading)}</small></th>'
-        )
-        group = f"<tbody>\n<tr>{words}</tr>\n{_lines(further)}\n</tbody>"
+    for heading, further in (below, *groups):
+        if further:
+            words = f'<th scope="rowgroup" colspan="{len(header)}"><small>{escape(heading)}</small>'
+            group += f"<tbody>\n<tr>{words}</th></tr>\n{_lines(further)}\n</tbody>"
     return (
         f'<div class="wide"><table>{above}<thead><tr>{head}</tr></thead>\n'
         f"<tbody>\n{_lines(rows)}\n</tbody>{group}</table></div>\n"
