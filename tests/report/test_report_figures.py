@@ -398,6 +398,9 @@ def test_figures_are_sound_files(make_comparison: Maker, with_people: bool) -> N
     for plot in make_plots(ReportInputs(make_comparison(with_people=with_people))):
         figure = plot.draw(plot.table, theme.LIGHT)
         assert ElementTree.fromstring(theme.figure_bytes(figure, "svg")).tag.endswith("svg")
+        assert b"<text" not in theme.figure_bytes(figure, "svg")
+        assert b"<text" in theme.figure_bytes(figure, "svg", text=True)
+        assert theme.figure_bytes(figure, "pdf").startswith(b"%PDF")
         image = Image.open(io.BytesIO(theme.figure_bytes(figure, "png")))
         assert image.width > 1000 and np.asarray(image.convert("L")).std() > 10
 
@@ -409,6 +412,7 @@ def test_bytes_repeat(make_comparison: Maker) -> None:
 
     assert draw("svg") == draw("svg")
     assert draw("png") == draw("png")
+    assert draw("pdf") == draw("pdf")
 
 
 def test_model_names_are_text_and_not_formulas(make_comparison: Maker) -> None:

@@ -110,7 +110,7 @@ def test_bytes_repeat_in_any_folder(make_comparison: Maker, tmp_path: Path, movi
         *(f"tables/{n}.csv" for n in ("comparison", "people", "stimuli", "changed_outcomes")),
         "tables/left_out.csv",
         "report.json",
-        *(f"figures/{n}.{k}" for n in FIGURES for k in ("svg", "png", "csv")),
+        *(f"figures/{n}.{k}" for n in FIGURES for k in ("svg", "pdf", "png", "csv")),
     }
 
 

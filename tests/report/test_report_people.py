@@ -86,7 +86,7 @@ def test_every_figure_has_its_files(report: Path) -> None:
     assert stems == {"accuracy", "r", "kappa", "effects", "scatter", "thirds", "calibration",
                      "difficulty", "response_time"}  # fmt: skip
     for stem in stems:
-        for kind in ("svg", "png", "csv"):
+        for kind in ("svg", "pdf", "png", "csv"):
             assert (report.parent / "figures" / f"{stem}.{kind}").stat().st_size > 100
 
 
@@ -275,7 +275,7 @@ def test_people_alone(report: Path, tmp_path: Path) -> None:
         assert (tmp_path / "one" / "tables" / table.name).read_bytes() == table.read_bytes()
     figures = {path.name for path in (tmp_path / "one" / "figures").iterdir()}
     assert figures == {f"{name}.{kind}" for name in ("difficulty", "response_time")
-                       for kind in ("svg", "png", "csv")}  # fmt: skip
+                       for kind in ("svg", "pdf", "png", "csv")}  # fmt: skip
     numbers = json.loads((tmp_path / "one" / "report.json").read_text())
     assert numbers["people_by_scenario"] and "comparison" not in numbers
 

@@ -45,7 +45,7 @@ def test_page_shows_published_and_expected_means(built: Path) -> None:
 
 def test_four_panels_with_their_tables(built: Path) -> None:
     names = {path.name for path in (built.parent / "figures").iterdir()}
-    assert names == {f"{name}.{kind}" for name in FIGURES for kind in ("svg", "png", "csv")}
+    assert names == {f"{name}.{kind}" for name in FIGURES for kind in ("svg", "pdf", "png", "csv")}
     values = json.loads((built.parent / "published.json").read_text())
     assert len(values["tables"]["accuracies"]) == 88
     panel = pd.read_csv(built.parent / "figures" / "panel_a.csv")

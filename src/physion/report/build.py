@@ -61,7 +61,7 @@ _LOOKS = {
 
 
 def build_report(inputs: ReportInputs, folder: Path) -> Path:
-    """Write ``report.html``, ``report.json``, ``tables/*.csv`` and ``figures/*.{svg,png,csv}``.
+    """Write ``report.html``, ``report.json``, ``tables/*.csv`` and ``figures/*.{svg,pdf,png,csv}``.
 
     With ``inputs.trial_pages`` also ``trials/*.html``, a page for each stimulus and their list.
     Returns the path of the page, which needs none of the other files. Every file is complete or

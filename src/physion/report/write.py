@@ -23,14 +23,22 @@ def prepare_folder(folder: Path) -> Path:
 
 
 def write_plot(plot: Plot, folder: Path) -> Picture:
-    """Write a figure as SVG and PNG with its table, and return what the page shows of it."""
+    """Write a figure as SVG with text, PDF and PNG with its table; return what the page shows.
+
+    The page shows an SVG with outlined letters, which needs no font.
+    """
     write_csv(folder / f"{plot.name}.csv", plot.table)
     figure = plot.draw(plot.table, theme.LIGHT)
     light = {kind: theme.figure_bytes(figure, kind) for kind in ("svg", "png")}
     # The dark figure is for the page only, so it is made only in the format used there.
     kind = page_kind(light)
     dark = {kind: theme.figure_bytes(plot.draw(plot.table, theme.DARK), kind)}
-    for ending, content in light.items():
+    files = {
+        "svg": theme.figure_bytes(figure, "svg", text=True),
+        "pdf": theme.figure_bytes(figure, "pdf"),
+        "png": light["png"],
+    }
+    for ending, content in files.items():
         write_atomic(folder / f"{plot.name}.{ending}", content)
     return Picture(plot.name, light, dark, plot.words)
 

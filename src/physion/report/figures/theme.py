@@ -107,12 +107,25 @@ def title(axis: Axes, text: str) -> None:
     axis.set_title(text, fontsize=10, fontweight="bold", loc="left")
 
 
-def figure_bytes(figure: Figure, kind: str) -> bytes:
-    """Return a figure as ``svg`` or ``png``, without date, program version or random names."""
-    metadata: dict[str, None] = {"Date": None} if kind == "svg" else {"Software": None}
+_METADATA: dict[str, dict[str, None]] = {
+    "svg": {"Date": None},
+    "png": {"Software": None},
+    "pdf": {"Creator": None, "Producer": None, "CreationDate": None},
+}
+"""Entries that differ with time and program, by format."""
+
+
+def figure_bytes(figure: Figure, kind: str, *, text: bool = False) -> bytes:
+    """Return a figure as ``svg``, ``png`` or ``pdf``, without date, version or random names.
+
+    ``text``: letters of an SVG are text in the font DejaVu Sans, which can be edited and searched;
+    else they are outlines, which look the same everywhere. A PDF embeds its font.
+    """
     buffer = io.BytesIO()
-    with matplotlib.rc_context({"svg.hashsalt": "physion", "svg.fonttype": "path"}):
-        figure.savefig(buffer, format=kind, dpi=150, metadata=metadata)
+    letters = {"svg.hashsalt": "physion", "svg.fonttype": "none" if text else "path",
+               "pdf.fonttype": 42}  # fmt: skip
+    with matplotlib.rc_context(letters):
+        figure.savefig(buffer, format=kind, dpi=150, metadata=_METADATA[kind])
     # The layout is the same for every format and slow to compute.
     figure.set_layout_engine("none")
     return buffer.getvalue()

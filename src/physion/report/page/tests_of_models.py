@@ -48,8 +48,8 @@ def _paired(rows: pd.DataFrame) -> str:
     words = (
         "Every two models on the stimuli that both answered, all scenarios together. Accuracy: "
         "exact test of McNemar. r with the average person: permutation test that swaps the two "
-        f"models stimulus by stimulus ({permutations_of(len(rows))} permutations), interval by "
-        "drawing stimuli. Correction over all pairs: by "
+        f"models stimulus by stimulus ({permutations_of(len(rows))} permutations), jackknife "
+        "interval over stimuli. Correction over all pairs: by "
         "Holm (chance of any false alarm) and by Benjamini and Hochberg (share of false alarms). "
         f"Of {counts['p_accuracy'][2]} pairs, {counts['p_accuracy'][0]} differ in accuracy by "
         f"Holm and {counts['p_accuracy'][1]} by Benjamini and Hochberg (5 %); of "
