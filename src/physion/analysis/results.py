@@ -16,6 +16,7 @@ from physion.analysis.models.model_tests import (
     permutations_of,
     pool_comparison,
 )
+from physion.analysis.models.paired_measures import paired_measures
 from physion.analysis.models.people_comparison import PeopleComparison, compare_everywhere
 from physion.analysis.people.people import accuracy_by_stimulus
 from physion.analysis.people.results import PeopleResults
@@ -34,6 +35,7 @@ class ComparisonResults:
     - ``beside``: models and single participants, from `people_comparison.compare_everywhere`.
     - ``comparison_all``: the comparison with all complete sessions, including flagged ones.
     - ``paired``: from `model_tests.paired_tests`, all scenarios pooled; None for one model.
+    - ``paired_measures``: from `paired_measures.paired_measures`; None for one model or no people.
     - ``calibration``: from `model_tests.calibration_scores`.
     - ``mixed``: from `mixed_fits`.
     - ``warnings``: what may make the results wrong, one sentence each.
@@ -45,6 +47,7 @@ class ComparisonResults:
     beside: PeopleComparison | None = None
     comparison_all: Comparison | None = None
     paired: pd.DataFrame | None = None
+    paired_measures: pd.DataFrame | None = None
     calibration: pd.DataFrame | None = None
     mixed: tuple[MixedTable, ...] = ()
     warnings: tuple[str, ...] = ()
@@ -119,6 +122,9 @@ def _with_averages(
         comparison,
         predictions=predictions,
         paired=paired_tests(pooled, draws) if several else None,
+        paired_measures=paired_measures(pooled, draws.level, seed=draws.seed)
+        if several and comparison.has_people
+        else None,
         calibration=calibration_scores(pooled),
         mixed=tuple(fits_of_models(comparison)),
         warnings=comparison.warnings,
@@ -156,6 +162,7 @@ def _with_participants(
         comparison_all=whole,
         beside=beside,
         paired=beside.tests if agents > 1 else None,
+        paired_measures=beside.measure_tests if agents > 1 else None,
         calibration=beside.calibration,
         mixed=(*fits_of_people(people), *fits_of_models(main)),
         warnings=(*people.warnings, *main.warnings),

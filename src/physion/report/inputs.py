@@ -70,6 +70,7 @@ class ReportInputs(ComparisonResults):
             "changed_outcomes": comparison.changed,
             "left_out": comparison.dropped,
             "paired_tests": self.paired,
+            "paired_measures": self.paired_measures,
             "calibration_scores": self.calibration,
             "comparison_with_flagged": None
             if self.comparison_all is None

@@ -41,12 +41,12 @@ from physion.analysis.statistics.calibration import (
 from physion.analysis.statistics.jackknife import Variance
 from physion.analysis.statistics.kappa import correctness
 from physion.analysis.statistics.paired import (
-    _coins,
     benjamini_hochberg,
     compare_models,
     holm,
     mcnemar_exact,
     r_permutation_p,
+    swap_coins,
 )
 from physion.errors import BadInputError
 from support.simulated_people import study
@@ -460,7 +460,7 @@ def test_permutations_are_those_of_swapping_by_hand() -> None:
     generator = np.random.default_rng(4)
     y, a, b = generator.random((3, 15))
     found = r_permutation_p(a, b, y, permutations=50, seed=2)
-    coins = _coins(50, 15, 2) == 1
+    coins = swap_coins(50, 15, 2) == 1
     one, two = ((x - x.mean()) / x.std() for x in (a, b))
     differences = [
         agreement.pearson(np.where(coin, two, one), y)

@@ -125,8 +125,8 @@ def _with_ties(ranks: pd.Series, scores: pd.Series, partial: pd.Series) -> pd.Se
 
 def add_normalised(table: pd.DataFrame, anchors: pd.DataFrame) -> pd.DataFrame:
     """Return the table with ``kappa_of_people``, of models that predict what people saw."""
-    people = anchors.loc[anchors["kind"] == PEOPLE, "kappa_from_averages"] if len(anchors) else []
-    if not len(people):
+    if anchors.empty:
         return table.assign(kappa_of_people=np.nan)
-    ratio = table["kappa_from_averages"] / float(people.iloc[0])
+    people = float(anchors.loc[anchors["kind"] == PEOPLE, "kappa_from_averages"].iloc[0])
+    ratio = table["kappa_from_averages"] / people
     return table.assign(kappa_of_people=ratio.mask(_is_partial(table)))

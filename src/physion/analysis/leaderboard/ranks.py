@@ -120,7 +120,8 @@ def _by_model(
     rows: pd.DataFrame, column: str, names: Sequence[tuple[str, str]], stimuli: Sequence[str]
 ) -> Array:
     wide = rows.pivot(index=KEY, columns="stimulus", values=column)
-    return wide.reindex(index=list(names), columns=list(stimuli)).to_numpy(dtype=np.float64)
+    complete = wide.reindex(index=list(names), columns=list(stimuli))
+    return np.asarray(complete, dtype=np.float64)
 
 
 def _ranks(values: Array, metric: Metric) -> npt.NDArray[np.int_]:

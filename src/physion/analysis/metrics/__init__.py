@@ -1,6 +1,12 @@
 """Metrics: one registry, and a module for each kind of number in the order of the tables."""
 
-from physion.analysis.metrics import accuracy, average_person, beyond_outcome, participants
+from physion.analysis.metrics import (
+    accuracy,
+    average_person,
+    beyond_outcome,
+    participants,
+    signal_detection,
+)
 from physion.analysis.metrics.registry import (
     Metric,
     all_metrics,
@@ -23,4 +29,5 @@ __all__ = [
     "participants",
     "register_metric",
     "score_metrics",
+    "signal_detection",
 ]

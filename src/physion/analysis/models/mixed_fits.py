@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import pandas as pd
 
 from physion.analysis.mixed.linear import fit_linear
@@ -55,8 +56,8 @@ def _fitted(
 
 
 def fits_of_people(people: PeopleResults) -> list[MixedTable]:
-    """Fit the preregistered models of single answers, and the effect of flags on all complete
-    sessions.
+    """Fit the preregistered models of single answers, response times, and the effect of flags on
+    all complete sessions.
     """
     stimuli = with_attributes(people.tables["by_stimulus"], people.tables["attributes"])
     rows = answer_rows(people.kept.test, stimuli)
@@ -76,6 +77,7 @@ def fits_of_people(people: PeopleResults) -> list[MixedTable]:
         formula = hypothesis.formula if scenario else hypothesis.formula.replace("scenario + ", "")
         about = f"{key}, preregistered: {hypothesis.about} ({hypothesis.family})"
         fits.append(_fitted(key.lower(), about, formula, fitter, rows))
+    fits.append(_response_times(people, scenario))
     flagged = people.tables["flags"].set_index("session")["flagged"]
     whole = people.whole.test
     whole = whole.assign(flagged=whole["session"].map(flagged).astype(float))
@@ -84,6 +86,24 @@ def fits_of_people(people: PeopleResults) -> list[MixedTable]:
         _fitted("flagged", about, f"correct ~ flagged + {scenario}{CROSSED}", fit_logistic, whole)
     )
     return fits
+
+
+def _response_times(people: PeopleResults, scenario: str) -> MixedTable:
+    """Fit the log-normal model of response times: log milliseconds, linear with crossed intercepts.
+
+    ``scenario``: its term in the formula. Coefficients are differences of the logarithm, so exp(b)
+    is the factor by which the median response time changes: ``correct`` for right answers, ``yes``
+    for yes, ``hundred`` by 100 trials.
+    """
+    test = people.kept.test
+    rows = test.assign(
+        correct=test["correct"].astype(np.float64),
+        yes=test["yes"].astype(np.float64),
+        hundred=test["trial"].to_numpy(dtype=np.float64) / 100,
+    )
+    about = "Response times, log-normal: right answers, yes, and practice by 100 trials (linear)"
+    formula = f"log_rt ~ correct + yes + hundred + {scenario}{CROSSED}"
+    return _fitted("response_times", about, formula, fit_linear, rows)
 
 
 def fits_of_models(comparison: Comparison) -> list[MixedTable]:

@@ -10,6 +10,7 @@ from physion.analysis.models.anchors import TWO_PEOPLE, add_anchors, with_kind
 from physion.analysis.models.measures import mean_measures, measure_models, measure_table
 from physion.analysis.models.model_people import model_pairs, models_of
 from physion.analysis.models.model_tests import calibration_scores, paired_tests, pool_scenarios
+from physion.analysis.models.paired_measures import paired_measures
 from physion.analysis.models.zones import human_zones, released_r_zone
 from physion.analysis.people.people import HALVES, all_answers, split_halves
 from physion.analysis.statistics.bootstrap import Bootstrap
@@ -27,7 +28,8 @@ class PeopleComparison:
     - ``zones``: `zones.human_zones` of every scenario, and for several scenarios also the paper's
       band of r (`zones.released_r_zone`), whose scenario is the mean.
     - ``pairs``: `model_people.model_pairs` of every scenario.
-    - ``tests``: `paired.compare_models` on the stimuli of all scenarios together.
+    - ``tests``: `paired.compare_models` on the stimuli of all scenarios together;
+      ``measure_tests``: `paired_measures.paired_measures`.
     - ``calibration``: `calibration.calibration_table`, likewise.
     - ``dropped``: ``agent``, ``scenario``, ``reason``, ``stimuli``.
     """
@@ -36,6 +38,7 @@ class PeopleComparison:
     zones: pd.DataFrame
     pairs: pd.DataFrame
     tests: pd.DataFrame
+    measure_tests: pd.DataFrame
     calibration: pd.DataFrame
     dropped: pd.DataFrame
 
@@ -94,6 +97,7 @@ def compare_everywhere(
         zones=zone,
         pairs=pd.concat(pairs, ignore_index=True),
         tests=paired_tests(pooled, draws, permutations),
+        measure_tests=paired_measures(pooled, draws.level, permutations, draws.seed),
         calibration=calibration_scores(pooled),
         dropped=pd.concat(dropped, ignore_index=True)[["agent", "scenario", "reason", "stimuli"]],
     )

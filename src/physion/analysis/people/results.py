@@ -34,6 +34,7 @@ from physion.analysis.people.exclusions import (
     without_flagged,
 )
 from physion.analysis.people.hypotheses import regress_hypotheses, with_attributes
+from physion.analysis.people.items import item_statistics
 from physion.analysis.people.official_responses import read_official_responses
 from physion.analysis.people.participants import (
     REHEARSAL,
@@ -71,7 +72,8 @@ class PeopleResults:
 
     - ``flags`` (`exclusions.flag_sessions`), ``flag_counts``, ``flag_effects``;
     - ``with_and_without``: `people.accuracy_by_scenario` without and with flagged sessions;
-    - ``participants``, ``by_scenario``, ``by_stimulus`` (`people.accuracy_by_...`);
+    - ``participants``, ``by_scenario``, ``by_stimulus`` (`people.accuracy_by_...`), ``items``
+      (`items.item_statistics`);
     - ``agreement``: agreement among people (`people.agreement_by_scenario`);
     - ``yes_bias``, ``side_bias``, ``learning``, ``background``, ``background_tests``;
     - ``attributes`` of the stimuli that people answered, and ``hypotheses``
@@ -204,6 +206,7 @@ def analyse_people(
     tables["participants"] = accuracy_by_participant(kept.test)
     tables["by_scenario"] = accuracy_by_scenario(kept.test, draws)
     tables["by_stimulus"] = accuracy_by_stimulus(kept.test, draws)
+    tables["items"] = item_statistics(kept.test)
     tables["agreement"] = agreement_by_scenario(kept.test, draws)
     tables["yes_bias"] = yes_bias(kept.test, draws)
     tables["side_bias"] = side_bias(kept.test, draws)

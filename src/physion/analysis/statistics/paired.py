@@ -81,14 +81,14 @@ def r_permutation_p(
     if not np.isfinite(observed):
         return float("nan")
     a, b = (a - a.mean()) / a.std(), (b - b.mean()) / b.std()
-    swap = _coins(permutations, len(a), seed)
+    swap = swap_coins(permutations, len(a), seed)
     r = _swapped_r(a, b, y - y.mean(), swap) - _swapped_r(b, a, y - y.mean(), swap)
     as_large = np.sum(np.abs(r) >= abs(observed) - 1e-12)
     return float((1 + as_large) / (1 + permutations))
 
 
 @lru_cache(maxsize=2)
-def _coins(permutations: int, n: int, seed: int) -> Array:
+def swap_coins(permutations: int, n: int, seed: int) -> Array:
     """Return 0 or 1 for each permutation and stimulus; cached, since all pairs of models share
     them.
     """

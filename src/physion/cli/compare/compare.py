@@ -9,6 +9,7 @@
 `physion compare validate FILE...`: checks files of predictions and names each bad row.
 
 `physion compare leaderboard FILES...`: one table of many files, sorted by any column.
+`physion compare power`: how many people and stimuli a study needs.
 
 A file that is called like one of these words is meant by ./official and so on.
 """
@@ -26,6 +27,7 @@ SUBVERBS = {
     "official": "physion.cli.compare.official",
     "validate": "physion.cli.compare.validate",
     "leaderboard": "physion.cli.compare.leaderboard",
+    "power": "physion.cli.compare.power",
 }
 """Sub-commands and their modules."""
 

@@ -122,8 +122,11 @@ def figure_bytes(figure: Figure, kind: str, *, text: bool = False) -> bytes:
     else they are outlines, which look the same everywhere. A PDF embeds its font.
     """
     buffer = io.BytesIO()
-    letters = {"svg.hashsalt": "physion", "svg.fonttype": "none" if text else "path",
-               "pdf.fonttype": 42}  # fmt: skip
+    letters: Any = {
+        "svg.hashsalt": "physion",
+        "svg.fonttype": "none" if text else "path",
+        "pdf.fonttype": 42,
+    }
     with matplotlib.rc_context(letters):
         figure.savefig(buffer, format=kind, dpi=150, metadata=_METADATA[kind])
     # The layout is the same for every format and slow to compute.

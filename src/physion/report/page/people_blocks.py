@@ -55,6 +55,7 @@ def people_alone(people: PeopleResults, zones: str = "") -> str:
         _biases(tables),
         "<h3>What makes a stimulus hard</h3>",
         _hypotheses(people),
+        details("Stimuli as items of a test", _items(tables["items"])),
     ])  # fmt: skip
 
 
@@ -120,6 +121,37 @@ def _agreement(tables: Mapping[str, pd.DataFrame]) -> str:
     )
     notes = f'<ul class="notes">{"".join(reasons)}</ul>' if reasons else ""
     return table(header, cells, words) + notes
+
+
+def _items(rows: pd.DataFrame) -> str:
+    """Return item statistics by scenario, and the stimuli with the lowest item-rest correlation."""
+    groups = rows.assign(low=rows["item_rest"] < 0).groupby("scenario", sort=False)
+    summary = groups.agg(
+        stimuli=("stimulus", "size"),
+        difficulty=("difficulty", "mean"),
+        item_rest=("item_rest", "mean"),
+        low=("low", "sum"),
+    ).reset_index()
+    columns = [
+        PageColumn("scenario", "scenario", "text"),
+        PageColumn("stimuli", "stimuli", "count"),
+        PageColumn("difficulty", "difficulty", digits=3),
+        PageColumn("item-rest r", "item_rest", digits=3),
+        PageColumn("below 0", "low", "count"),
+    ]
+    words = (
+        "Difficulty: fraction who are right. Item-rest r: over people, of being right at a "
+        "stimulus with the fraction of right answers elsewhere; means over stimuli. Every "
+        "stimulus: tables/people_items.csv"
+    )
+    each = [
+        PageColumn("stimulus", "stimulus", "text"),
+        PageColumn("people", "people", "count"),
+        *columns[2:4],
+    ]
+    lowest = rows[rows["item_rest"] < 0].sort_values(["item_rest", "stimulus"]).head(10)
+    listing = rows_table(lowest, each, "The lowest item-rest r below 0, at most ten")
+    return rows_table(summary, columns, words) + (listing if len(lowest) else "")
 
 
 def _zones(rows: pd.DataFrame) -> str:
