@@ -1,6 +1,7 @@
 """How often 95 % intervals of the analysis contain what they are about.
 
-    nice -n 15 python benchmarks/interval_coverage.py [--repeats 800] [--write]
+    nice -n 15 python benchmarks/interval_coverage.py [--repeats 800] [--size 40x60 100x150]
+        [--write]
 
 Studies are simulated again and again, and every interval that a page prints is computed by the
 package's own functions. An interval is about the expected value of the number with other people,
@@ -362,6 +363,8 @@ def _number(what: str) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=800)
+    sizes = [f"{people}x{stimuli}" for people, stimuli in SIZES]
+    parser.add_argument("--size", nargs="+", default=sizes, help="people x stimuli")
     parser.add_argument("--write", action="store_true", help="write results/interval_coverage.md")
     options = parser.parse_args()
     coverage, began = Coverage(), time.process_time()
@@ -369,7 +372,7 @@ def main() -> None:
     def done(what: str) -> None:
         print(f"{what}: {time.process_time() - began:.0f} s", flush=True)
 
-    for size in SIZES:
+    for size in [(int(n), int(s)) for n, s in (text.split("x") for text in options.size)]:
         for drawn in RESAMPLED:
             measures(coverage, drawn, size, options.repeats)
             done(f"measures, {drawn} drawn, {size}")
@@ -378,6 +381,7 @@ def main() -> None:
         done(f"others, {size}")
     pooled(coverage, SIZES[0], max(2, options.repeats // 4))
     command = f"python benchmarks/interval_coverage.py --repeats {options.repeats}"
+    command += f" --size {' '.join(options.size)}"
     table = coverage.table()
     text = markdown(table, time.process_time() - began, command)
     print(text)
