@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Collection
 from dataclasses import dataclass, replace
@@ -12,6 +11,7 @@ import pandas as pd
 
 from physion.analysis.tables.csv_table import read_csv
 from physion.analysis.tables.predictions import REQUIRED, check_predictions, name_models
+from physion.digests import file_sha256
 from physion.errors import BadInputError
 
 SIDECAR_KEYS = ("versions", "license")
@@ -73,7 +73,7 @@ def read_submission(path: Path) -> Submission:
         words = raw["Versions"].fillna("").str.strip().reset_index(drop=True)
         found = words.groupby(rows["agent"].to_numpy()).agg(lambda each: "; ".join(sorted({*each})))
         versions |= {str(agent): text for agent, text in found.items() if text}
-    return Submission(rows, versions, stated["license"], file_digest(path))
+    return Submission(rows, versions, stated["license"], file_sha256(path))
 
 
 def read_sidecar(path: Path) -> dict[str, str]:
@@ -101,9 +101,3 @@ def read_sidecar(path: Path) -> dict[str, str]:
                 raise BadInputError(f"{sidecar}: {key!r} must be text")
         return stated
     return dict.fromkeys(SIDECAR_KEYS, "")
-
-
-def file_digest(path: Path) -> str:
-    """Return the SHA-256 of a file, hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

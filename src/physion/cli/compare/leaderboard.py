@@ -142,7 +142,7 @@ def _provenance(options: Options, labels: Path | None) -> dict[str, str]:
     """Return program, date, licence, and the digests of the files about people, as text."""
     from datetime import UTC, datetime
 
-    from physion.analysis.leaderboard.submissions import file_digest
+    from physion.digests import file_sha256
     from physion.version import __version__
 
     given = [*options.responses, options.sessions, labels]
@@ -155,7 +155,7 @@ def _provenance(options: Options, labels: Path | None) -> dict[str, str]:
         "Licence": options.license or "not stated; each file has its own",
     }
     if files:
-        digests = ", ".join(f"{path.name} {file_digest(path)[:12]}" for path in files)
+        digests = ", ".join(f"{path.name} {file_sha256(path)[:12]}" for path in files)
         stated["People and outcomes, SHA-256"] = digests
     return stated
 
