@@ -142,6 +142,16 @@ def plain_partial(x: pd.Series, y: pd.Series, outcome: pd.Series) -> float:
                              y - y.groupby(outcome).transform("mean"))  # fmt: skip
 
 
+def plain_detection(said: pd.Series, outcome: pd.Series) -> tuple[float, float]:
+    """d' and criterion, with half an answer added to each cell."""
+    if outcome.all() or not outcome.any():
+        return float("nan"), float("nan")
+    z = [
+        stats.norm.ppf((said[part].sum() + 0.5) / (part.sum() + 1)) for part in (outcome, ~outcome)
+    ]
+    return z[0] - z[1], -(z[0] + z[1]) / 2
+
+
 @given(pairs, st.integers(0, 99))
 def test_metrics_from_sums_are_the_plain_ones(pair: Array, seed: int) -> None:
     rows = rows_of(pair, seed)
@@ -160,6 +170,7 @@ def test_metrics_from_sums_are_the_plain_ones(pair: Array, seed: int) -> None:
     expected["kappa_within_outcomes"] = plain_within(
         rows["predicted"], rows["p_yes"], rows["label"]
     )
+    expected["d_prime"], expected["criterion"] = plain_detection(rows["predicted"], rows["label"])
     model, human = expected["accuracy"], expected["human_accuracy"]
     expected["difference"] = model - human
     expected["kappa_beyond_outcome"] = expected["kappa_from_averages"] - (
