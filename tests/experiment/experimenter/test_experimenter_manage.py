@@ -30,7 +30,8 @@ def session_of(found: Lab, reference: str) -> sa.Row:
 
 def test_recruitment_is_paused_and_resumed(served: tuple[Lab, Visitor]) -> None:
     found, visitor = served
-    going = enter(found.store, "Early")
+    browser = "a-browser-of-early"
+    going = enter(found.store, "Early", visit=browser)
     assert visitor.submit("/recruitment", action="pause").status_code == 403  # no form token
     token = visitor.token("")
     assert "Pause recruitment" in visitor.see().text
@@ -38,7 +39,7 @@ def test_recruitment_is_paused_and_resumed(served: tuple[Lab, Visitor]) -> None:
         assert visitor.submit("/recruitment", token, action="pause").status_code == 303
     assert "Recruitment is paused" in visitor.see().text
     assert refusal(found.store.enter(Enter(id="Late"))).code == "paused"
-    assert run(found.store.enter(Enter(id="Early"))).state.stage == "consent"
+    assert run(found.store.enter(Enter(id="Early", visit=browser))).state.stage == "consent"
     walk(found.store, going, "test")
     assert visitor.submit("/recruitment", token, action="resume").status_code == 303
     assert "Recruitment is paused" not in visitor.see().text

@@ -259,7 +259,7 @@ class TestErrors:
         with caplog.at_level(logging.ERROR, logger="physion.experiment"):
             answer = client.get("/fail?id=5f9c-prolific", headers={"authorization": "Bearer good"})
         assert answer.status_code == 500
-        assert set(answer.json()) == {"error", "message", "state"}
+        assert set(answer.json()) == {"error", "message", "state", "completion"}
         assert answer.json()["error"] == "server_error"
         assert SECRET not in answer.text and "Traceback" not in answer.text
         # The log has the traceback, but neither the participant nor the token.
