@@ -102,22 +102,24 @@ class Shelf:
                 )  # fmt: skip
         self.index = pd.DataFrame(rows)
 
-        SHELVED.update(self.trials)
+        SHELVED.update({name.encode(): trial for name, trial in self.trials.items()})
 
-    def paths(self, name: str) -> Any:
-        return SimpleNamespace(trial_file=Path(name))
+    def files(self, column: str) -> dict[str, Any]:
+        assert column == "trial_file"
+        return {name: SimpleNamespace(read=lambda name=name: name.encode(), path=Path(name))
+                for name in self.trials}  # fmt: skip
 
 
-SHELVED: dict[str, Any] = {}
-"""Trials of all shelves, in place of their files."""
+SHELVED: dict[bytes, Any] = {}
+"""Trials of all shelves by their names, which stand for the bytes of their files."""
 
 
 @pytest.fixture(autouse=True)
 def shelves_in_place_of_files(monkeypatch: pytest.MonkeyPatch) -> None:
-    def opened(path: Path) -> Any:
-        return SHELVED[path.name] if path.name in SHELVED else Trial.open(path)
+    def opened(content: bytes, where: str) -> Any:
+        return SHELVED[content] if content in SHELVED else Trial(content, where)
 
-    monkeypatch.setattr(physion.training.sources.states, "Trial", SimpleNamespace(open=opened))
+    monkeypatch.setattr(physion.training.sources.states, "Trial", opened)
 
 
 def fitted_scale(shelf: Any, model: Any, folder: Path) -> tuple[float, np.ndarray]:

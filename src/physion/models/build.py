@@ -188,14 +188,21 @@ def _as_declared(kind: Any, value: Any, where: str) -> Any:
 
     Values of fields that JSON cannot express, such as functions, stay as they are.
     """
-    origin = typing.get_origin(kind)
-    plain = kind in (bool, int, float, str) or origin in (tuple, types.UnionType)
-    if not plain or dataclasses.is_dataclass(value):
+    if not _is_plain(kind) or dataclasses.is_dataclass(value):
         return value
     # In Python, options may be tuples and numbers of numpy.
     if isinstance(value, tuple | list):
         return read_value(kind, [_without_numpy(item) for item in value], where)
     return read_value(kind, _without_numpy(value), where)
+
+
+def _is_plain(kind: Any) -> bool:
+    """Return whether JSON can express the values of a type."""
+    origin = typing.get_origin(kind)
+    if origin is types.UnionType:
+        parts = typing.get_args(kind)
+        return all(_is_plain(part) or typing.get_origin(part) is Literal for part in parts)
+    return kind in (bool, int, float, str, types.NoneType) or origin is tuple
 
 
 def _without_numpy(value: Any) -> Any:

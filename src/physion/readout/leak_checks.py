@@ -145,10 +145,10 @@ def _poison_motion(dataset: Dataset, name: str, rng: np.random.Generator) -> Non
     trial = Trial.open(path)
     trajectory = trial.trajectory
     changed: dict[str, Any] = {}
-    for name in ("positions", "rotations", "velocities", "angular_velocities", "cloth_vertices"):
-        array = getattr(trajectory, name).copy()
+    for what in ("positions", "rotations", "velocities", "angular_velocities", "cloth_vertices"):
+        array = getattr(trajectory, what).copy()
         array[OBSERVED_FRAMES:] = rng.normal(size=array[OBSERVED_FRAMES:].shape)
-        changed[name] = array
+        changed[what] = array
     observed = trajectory.contacts.frame < OBSERVED_FRAMES
     contacts = {
         field.name: getattr(trajectory.contacts, field.name)[observed]

@@ -343,7 +343,7 @@ def test_weights_of_a_file_are_loaded_and_named(tmp_path: Path) -> None:
     ("options", "words"),
     [
         ({"size": "huge"}, "sizes small, paper and released"),
-        ({"samples": 1.5}, "samples must be a whole number"),
+        ({"samples": 1.5}, "samples of model dpi must be a whole number"),
         ({"samples": 0}, "samples must be a whole number"),
         ({"stride": 2}, "stride must be 1 or 3"),
         ({"spread": -1.0}, "spread must not be negative"),
