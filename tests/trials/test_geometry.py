@@ -27,7 +27,7 @@ PIXELS = 128
 def trial_bytes(scenario: str, seed: int) -> bytes:
     """The bytes of a short trial of a sampled scene."""
     scene = physion.sample_scene(scenario, seed)
-    motion = physion.simulate(scene, frames=20)
+    motion = physion.simulate(scene, frames=45)
     ids = physion.Renderer(scene, motion, PIXELS, PIXELS).render(0, ("ids",)).ids
     assert ids is not None
     meta = replace(make_parts().metadata, width=PIXELS, height=PIXELS, frames=len(motion))
