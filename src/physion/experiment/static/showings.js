@@ -10,10 +10,19 @@ import { newKey } from "./random_key.js";
 const DAY_MS = 86_400_000;
 
 /**
- * A showing. `began`: time of the browser's clock in ms since 1970, which outlives a reload of the
- * page; `stored`: whether the server has acknowledged it.
+ * A showing. `began`: when it began (see `present`); `stored`: whether the server has acknowledged
+ * it.
  * @typedef {{key: string, phase: string, trial: number, began: number, stored: boolean}} Announced
  */
+
+/**
+ * Return the time in ms since 1970. Within a page it only grows, also if the machine's clock is set;
+ * `performance.now` alone starts at 0 again after a reload, which showings in storage outlive.
+ * @returns {number}
+ */
+function present() {
+  return performance.timeOrigin + performance.now();
+}
 
 /**
  * Return the showing that begins now.
@@ -21,7 +30,7 @@ const DAY_MS = 86_400_000;
  * @returns {Announced}
  */
 export function newShowing(phase, trial) {
-  return { key: newKey(), phase, trial, began: Date.now(), stored: false };
+  return { key: newKey(), phase, trial, began: present(), stored: false };
 }
 
 /**
@@ -34,7 +43,7 @@ export function newShowing(phase, trial) {
 export async function announce(api, showing, options = {}) {
   if (showing.stored) return;
   const { key, phase, trial, began } = showing;
-  const body = () => ({ key, phase, trial, ago_ms: Math.min(Math.max(Date.now() - began, 0), DAY_MS) });
+  const body = () => ({ key, phase, trial, ago_ms: Math.min(Math.max(present() - began, 0), DAY_MS) });
   try {
     await api.post("/api/showings", body, { ...options, expects: "showings" });
     showing.stored = true;
