@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -17,15 +18,15 @@ pytestmark = pytest.mark.slow
 PHONE = {"viewport": {"width": 1100, "height": 700}, "has_touch": True, "is_mobile": True}
 
 
-@pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Study, str]]:
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[tuple[Study, str]]:
+    """A study of one participant, of its own for each test: who takes part fills it."""
     ends = {
         "declined": EarlyEnd("NOCONSENT", "no-consent", "https://lab.example/declined"),
         "device_refused": EarlyEnd("PHONE", "phone"),
         "full": EarlyEnd("FULL", "full"),
     }
-    folder = tmp_path_factory.mktemp("study")
-    with served(folder, test=1, familiarization=1, participants=1, **ends) as (study, server):
+    with served(tmp_path, test=1, familiarization=1, participants=1, **ends) as (study, server):
         yield study, server.url
 
 
