@@ -16,8 +16,8 @@ const DAY_MS = 86_400_000;
  */
 
 /**
- * Return the time in ms since 1970. Within a page it only grows, also if the machine's clock is set;
- * `performance.now` alone starts at 0 again after a reload, which showings in storage outlive.
+ * Return the time in ms since 1970. Within a page it only grows, even if the machine's clock is
+ * set; `performance.now` alone starts at 0 again after a reload, which stored showings outlive.
  * @returns {number}
  */
 function present() {
@@ -43,7 +43,8 @@ export function newShowing(phase, trial) {
 export async function announce(api, showing, options = {}) {
   if (showing.stored) return;
   const { key, phase, trial, began } = showing;
-  const body = () => ({ key, phase, trial, ago_ms: Math.min(Math.max(present() - began, 0), DAY_MS) });
+  const ago = () => Math.min(Math.max(present() - began, 0), DAY_MS);
+  const body = () => ({ key, phase, trial, ago_ms: ago() });
   try {
     await api.post("/api/showings", body, { ...options, expects: "showings" });
     showing.stored = true;
