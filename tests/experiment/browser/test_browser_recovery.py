@@ -62,9 +62,12 @@ def test_a_reload_continues_at_the_same_trial(chromium: Any, site: tuple[Study, 
         assert visit.left() == sides
         visit.answer("no")
         visit.page.get_by_text("Trial 3 of 4").wait_for()
-    # The next day, in another browser, by the address that the recruiter gave.
+    # The next day, in another browser: the id alone is not enough, but a signed link is.
     with Visit(chromium, url) as visit:
         visit.go("?participant=Reload")
+        visit.page.get_by_text("Your session began in another browser").wait_for()
+    with Visit(chromium, url) as visit:
+        visit.go(signed_query(study, "Reload"))
         visit.page.get_by_text("Trial 3 of 4").wait_for()
         assert visit.left() == sides
         visit.answer("yes")
@@ -72,7 +75,7 @@ def test_a_reload_continues_at_the_same_trial(chromium: Any, site: tuple[Study, 
         visit.finish()
         assert visit.unexpected() == []
         # A person who has finished finds the result again in this browser ...
-        for query in ("", "?participant=Reload"):
+        for query in ("", signed_query(study, "Reload")):
             visit.go(query)
             visit.heading("Thank you!")
             assert visit.page.inner_text("#code") == "TINY-CODE"
