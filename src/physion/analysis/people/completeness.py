@@ -22,7 +22,7 @@ Expected = Mapping[str, frozenset[str]]
 """Canonical names of the test stimuli by session or, for all sessions of it, by scenario."""
 
 EXPECTED_FILE = "expected.csv"
-"""The study's list in the export of an experiment, beside the responses."""
+"""File with the study's list of stimuli, in the folder of the exported responses."""
 
 NOT_EXPECTED = "stimulus is not on the study's list"
 

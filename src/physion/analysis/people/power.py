@@ -13,8 +13,9 @@ leaning of the person. Two questions can be asked:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from typing import Literal, get_args
 
@@ -106,16 +107,14 @@ def power_table(
         raise BadInputError("power needs the fractions of yes of stimuli that people answered")
     yes = (fractions["p_yes"] * fractions["count"] + 0.5) / (fractions["count"] + 1)
     logit = special.logit(yes.to_numpy(dtype=np.float64))
-    find, shift = _models_differ, 0.0
+    find: Callable[..., bool] = _models_differ
     if planned.question == "groups":
         logit = np.where(fractions["label"].to_numpy(dtype=bool), logit, -logit)
-        find, shift = _groups_differ, _shift_of_groups(logit, planned)
+        find = partial(_groups_differ, shift=_shift_of_groups(logit, planned))
     records = []
     for n, s in product(people, stimuli):
         rng = generator("power", seed, n, s)
-        found = sum(
-            find(rng.choice(logit, s), n, planned, shift, level, rng) for _ in range(repeats)
-        )
+        found = sum(find(rng.choice(logit, s), n, planned, level, rng) for _ in range(repeats))
         interval = stats.binomtest(found, repeats).proportion_ci(0.95, method="wilson")
         records.append(
             (n, s, planned.effect, repeats, found / repeats, interval.low, interval.high)
@@ -127,13 +126,12 @@ def _models_differ(
     logit: Array,
     people: int,
     planned: PlannedEffect,
-    shift: float,
     level: float,
     rng: np.random.Generator,
 ) -> bool:
     """Simulate one study of two models, and return whether the better one is found.
 
-    ``logit`` (s,): log odds of yes; ``shift`` has no meaning here.
+    ``logit`` (s,): log odds of yes.
 
     Notes
     -----
@@ -190,9 +188,10 @@ def _groups_differ(
     logit: Array,
     people: int,
     planned: PlannedEffect,
-    shift: float,
     level: float,
     rng: np.random.Generator,
+    *,
+    shift: float,
 ) -> bool:
     """Simulate one study of two groups, and return whether the worse one is found.
 

@@ -29,8 +29,8 @@ class Options:
     sessions: Path | None = None
     """Table of sessions of our export."""
     expected: Path | None = None
-    """Table of the stimuli that each session must have; if not given, expected.csv beside the
-    responses."""
+    """List of the stimuli that each session must contain (default: expected.csv in the folder of
+    the responses)."""
     humans: Path | None = None
     """Folder with human_accuracy-*.csv; the official outcomes are looked for next to it."""
     labels: Path | None = None

@@ -132,7 +132,7 @@ PAUSES = Table(
     Column("paused_at", Float, primary_key=True, autoincrement=False),
     Column("resumed_at", Float),
 )
-"""Pauses of recruitment; the last one goes on while ``resumed_at`` is empty."""
+"""Pauses of recruitment; ``resumed_at`` is empty while a pause lasts."""
 
 TOKENS = Table(
     "tokens",
