@@ -13,6 +13,7 @@ import sqlalchemy as sa
 from sqlalchemy.exc import OperationalError
 
 from physion.experiment.protocol import messages as wire
+from physion.experiment.protocol.public_study import PublicStudy
 from physion.experiment.store.tables import ANSWERS, RAW_IDS, SESSIONS
 from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.study import Recruitment
@@ -73,7 +74,7 @@ class TestWithoutASession:
         assert packed.content == plain.content
 
     def test_public_settings(self, site: Served) -> None:
-        study = wire.PublicStudy.model_validate_json(site.client.get("/api/study").content)
+        study = PublicStudy.model_validate_json(site.client.get("/api/study").content)
         assert study.scenarios == ["collide", "drop"]
         assert set(study.example) == {"collide", "drop"}
         assert [one.source for one in study.recruiters] == ["prolific", "mturk", "sona", "link"]

@@ -7,7 +7,7 @@ times are milliseconds of the browser's monotonic clock.
 ============================  =========================  ==========================================
 request                       body, answer               meaning
 ============================  =========================  ==========================================
-``GET /api/study``            `PublicStudy`              settings that the page needs before a
+``GET /api/study``            `public_study.PublicStudy`  settings that the page needs before a
                                                          session begins
 ``GET /api/texts/{language}`` flat object of texts       texts of the pages
 ``POST /api/enter``           `Enter`, `Entered`         begin or continue a session
@@ -335,51 +335,6 @@ class Result(Message):
     accuracy: float
     percentile: float | None
     completion: Completion
-
-
-class Recruiter(Message):
-    """Names of the URL parameters by which one recruiter identifies participants.
-
-    A URL belongs to the first recruiter whose ``id`` parameter or one of whose ``preview``
-    parameters it has, else it is a plain link. Parameters named in ``others`` go into
-    ``Enter.recruiter`` if present. ``preview``: a URL with one of these values only shows
-    information, and no session may begin (MTurk). Any URL may have ``scenario``, ``language`` and
-    ``pass``, which are copied into `Enter`.
-    """
-
-    source: Source
-    id: str
-    others: list[str]
-    preview: dict[str, str] = {}
-
-
-class PublicStudy(Message):
-    """Settings of the study that anyone who opens the page may see."""
-
-    title: str
-    contact: str
-    languages: list[str]
-    consent_version: str
-    consent_files: list[str]
-    """Languages in which the consent form can be read as a file, ``/consent/LANGUAGE.pdf``."""
-    scenarios: list[str]
-    id_needed: bool
-    min_width: int
-    min_height: int
-    fullscreen: bool
-    cue_ms: int
-    flash_hz: float
-    break_every: int
-    """Number of test trials between two breaks; 0: no breaks."""
-    preload: int
-    """Number of trials whose media are loaded ahead."""
-    interrupted: Literal["repeat", "void"]  # see `Plausibility`
-    example: dict[str, TrialMedia]
-    """Media of the animated example in the instructions, by scenario."""
-    recruiters: list[Recruiter]
-    """In the order in which they are matched against the URL."""
-    device_refused: dict[Source, Completion]
-    """Completion of participants whose device or browser cannot show the movies."""
 
 
 class Health(Message):

@@ -20,6 +20,7 @@ import httpx2
 
 from physion.errors import PhysionError, UnknownNameError
 from physion.experiment.protocol import messages as wire
+from physion.experiment.protocol.public_study import PublicStudy
 from physion.experiment.simulated.browser import RefusedError, SimulatedBrowser, state_after
 from physion.experiment.simulated.person import TYPICAL_RT_MS, SimulatedPerson
 from physion.experiment.study.identity import Secrets
@@ -128,7 +129,7 @@ class Participation:
 
     async def _run_stages(self) -> None:
         """Enter and run all stages of the session."""
-        public = wire.PublicStudy.model_validate_json(await self._browser.ask("GET", "/api/study"))
+        public = PublicStudy.model_validate_json(await self._browser.ask("GET", "/api/study"))
         await self._browser.ask("GET", f"/api/texts/{public.languages[0]}")
         state = await self._enter(public.languages[0])
         if state.stage == "done":

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl, quote, unquote, urlencode, urlsplit, urlunsplit
 
 from physion.errors import BadInputError
-from physion.experiment.protocol.messages import Completion, Enter, Recruiter, Source
+from physion.experiment.protocol.messages import Completion, Enter, Source
+from physion.experiment.protocol.public_study import Recruiter
 from physion.experiment.study.identity import REFERENCE_LETTERS, check_signature, sign
 from physion.experiment.study.study_checks import NO_CONTACT
 

@@ -17,10 +17,10 @@ from physion.experiment.protocol.messages import (
     Health,
     Jump,
     PageDone,
-    PublicStudy,
     Showing,
     TrialMedia,
 )
+from physion.experiment.protocol.public_study import PublicStudy
 from physion.experiment.study.media_links import sign_media
 from physion.experiment.study.recruitment import RECRUITERS, ending_completion, is_mturk_preview
 from physion.experiment.study.stimuli import PHASES
