@@ -26,7 +26,7 @@ class Options:
     out: Path | None = None
     """Folder for trials, predictions and the report; default: runs/official or runs/sampled."""
     limit: int | None = None
-    """Testing trials per scenario, 12 by default, and as many for the readout (twice as many of
+    """Testing trials per scenario, 10 by default, and as many for the readout (twice as many of
     sampled ones); 0 takes all official ones."""
     size: int = 128
     """Pixels per side of the movies."""

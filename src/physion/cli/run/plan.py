@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from physion.trials.making.plan import TrialTask
 
 SAMPLED_SCENARIOS = ("dominoes", "collide", "drop")
-OFFICIAL_LIMIT, SAMPLED_LIMIT = 12, 12
-"""Testing trials of a scenario, if none are asked for."""
+LIMIT = 10
+"""Testing trials of a scenario, if no number is asked for."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ def plan_sampled(limit: int | None) -> RunPlan:
     """Plan a small set of sampled trials: testing, and twice as many for the readout."""
     from physion.trials.making.plan import plan_dataset
 
-    count = SAMPLED_LIMIT if limit is None else limit
+    count = LIMIT if limit is None else limit
     tasks = plan_dataset("sampled", SAMPLED_SCENARIOS, {"readout": 2 * count, "testing": count})
     return RunPlan(tasks, {}, [])
 
@@ -49,7 +49,7 @@ def plan_official(scenes: Path, humans: Path | None, limit: int | None) -> RunPl
     from physion.stimulus_names import canonical_name
     from physion.trials.making.plan import check_names, plan_scenes
 
-    limit = OFFICIAL_LIMIT if limit is None else limit or None
+    limit = LIMIT if limit is None else limit or None
     seen = set(read_humans(humans)["stimulus"]) if humans is not None else None
     logs = read_trials(scenes)
     logs.require_trials()
