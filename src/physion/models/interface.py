@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from physion.models.batch import Batch, Provenance, Rollout, Spec
+from physion.models.batch import Batch, Motion, Provenance, Rollout, Spec
 from physion.models.settings import TrainingSettings
 
 if TYPE_CHECKING:
@@ -101,6 +101,18 @@ class Learns(Protocol):
 
     def loss(self, batch: Batch) -> Mapping[str, Tensor]:
         """Return the scalar ``loss`` of a batch, and parts of it to be logged."""
+        ...
+
+
+@runtime_checkable
+class ChoosesWindows(Protocol):
+    """Model that is trained on states, and on some windows of a trial more often than on others."""
+
+    def start_probabilities(self, motion: Motion) -> NDArray[np.float64]:
+        """Return how often a window starts at each frame from 0 on; the sum is 1.
+
+        A window that starts at the last of them ends within the trial, if it is long enough.
+        """
         ...
 
 

@@ -22,7 +22,7 @@ from physion.compute.progress import Progress
 from physion.errors import BadInputError
 from physion.models.checkpoints.checkpoint import hash_config, load_tensors, tensors_of, versions
 from physion.models.checkpoints.trained import BUILT_AS
-from physion.models.interface import Calibrates, Learns, features_digest
+from physion.models.interface import Calibrates, ChoosesWindows, Learns, features_digest
 from physion.models.raised import OutOfMemoryError, is_out_of_memory
 from physion.models.settings import TrainingSettings
 from physion.seeds import generator, stable_hash
@@ -225,21 +225,21 @@ def _windows(
 ) -> TrainingData:
     rows, held = hold_out(len(trials), settings.held_out, seed)
     if model.diet != "features":
-        training, held_out = (
-            ClipWindows(source, tuple(trials[row] for row in part), model.window)
-            for part in (rows, held)
-        )
+        chosen, rest = (tuple(trials[row] for row in part) for part in (rows, held))
+        chooses = model if isinstance(model, ChoosesWindows) else None
+        training = ClipWindows(source, chosen, model.window, chooses)
+        held_out = ClipWindows(source, rest, model.window)
         return TrainingData(training, held_out if len(held) else None)
     if features is None:
         raise BadInputError(f"model {model.provenance().model!r} is trained on features")
     with fabric.rank_zero_first():  # which stores them for the others
         values = features(trials)
     frames = [source.length(trial) for trial in trials]
-    chosen, rest = (
+    first, second = (
         FeatureWindows(model.spec, trials, values, frames, part, model.window)
         for part in (rows, held)
     )
-    return TrainingData(chosen, rest if len(held) else None)
+    return TrainingData(first, second if len(held) else None)
 
 
 def _prepare(model: Any, data: TrainingData, seed: int, fabric: Fabric) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from physion.errors import BadInputError
 from physion.models.batch import Batch, Spec, clip_frames
+from physion.models.interface import ChoosesWindows
 from physion.seeds import generator
 from physion.training.sources.source import WholeSource
 
@@ -61,15 +62,21 @@ class Windows(Protocol):
 class ClipWindows:
     """Windows of ``length`` frames, ``spec.stride`` apart, from any frame of a trial.
 
-    A window of a trial that is shorter than a window starts at frame 0.
+    A window of a trial that is shorter than a window starts at frame 0. ``chooses`` says which
+    starts are more frequent than others; without it all are equally frequent.
     """
 
     source: WholeSource
     trials: tuple[str, ...]
     length: int
+    chooses: ChoosesWindows | None = None
+    _probabilities: dict[int, NDArray[np.float64]] = field(default_factory=dict, repr=False)
 
     def starts(self, trials: Sequence[int], rng: np.random.Generator) -> NDArray[np.int64]:
         """Return random first frames such that the windows end within their trials."""
+        if self.chooses is not None:
+            chosen = [self._chosen(self.chooses, row) for row in trials]
+            return np.array([rng.choice(len(p), p=p) for p in chosen], np.int64)
         span = (self.length - 1) * self.source.spec.stride
         lengths = [self.source.length(self.trials[row]) for row in trials]
         return rng.integers(np.maximum(np.array(lengths, np.int64) - span, 1))
@@ -82,6 +89,12 @@ class ClipWindows:
         """Return up to `SAMPLE_CLIPS` random windows."""
         rng = generator("sample", seed)
         return self.read(_draw(self, min(SAMPLE_CLIPS, len(self.trials)), rng, distinct=True))
+
+    def _chosen(self, model: ChoosesWindows, row: int) -> NDArray[np.float64]:
+        if row not in self._probabilities:
+            (motion,) = self.source.whole([self.trials[row]]).state or ()
+            self._probabilities[row] = model.start_probabilities(motion)
+        return self._probabilities[row]
 
 
 class FeatureWindows:

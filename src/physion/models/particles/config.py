@@ -66,6 +66,9 @@ class ParticleConfig:
     - ``pushforward``: steps that follow the first one in training. They start from what the network
       predicted, without gradient, so that it learns to correct its own errors (Brandstetter et al.
       2022, section 3.1).
+    - ``abrupt``: fraction of the training windows that are drawn from moments at which bodies
+      change their velocity abruptly, as at contacts (`windows.start_probabilities`); the others
+      are drawn from all moments.
     - ``rest``: metres a step; in a rollout a body whose centre and rim would move less together
       stays where it is, as bodies sleep in physics engines. Otherwise small errors, which add up as
       a velocity, tip what stands.
@@ -85,6 +88,7 @@ class ParticleConfig:
     velocity_noise: float = 3e-4
     relative_noise: float = 0.02
     pushforward: int = 1
+    abrupt: float = 0.5
     rest: float = 3e-4
     knee: float = 1.0
     gap_spacing: float = 0.04

@@ -57,7 +57,13 @@ from physion.models.particles.rigid_motion import (
     vector_from_rotation,
 )
 from physion.models.particles.rollout import Start, disturbed_start, roll_out
-from physion.models.particles.windows import Window, disturbed, read_window, rotated
+from physion.models.particles.windows import (
+    Window,
+    disturbed,
+    read_window,
+    rotated,
+    start_probabilities,
+)
 from physion.models.threshold import best_threshold
 from physion.models.torch_model import TorchModel, digest_of, initial_weights
 from physion.scenes.scene import FRAME_TIME
@@ -159,6 +165,12 @@ class ParticleSimulator(TorchModel):
             "stride": options.stride,
             "swept": options.swept,
         }
+
+    def start_probabilities(self, motion: Motion) -> F64:
+        """Return how often a training window starts at each frame; see `ParticleConfig.abrupt`."""
+        return start_probabilities(
+            motion.trajectory, self.options.stride, self.window, self.config.abrupt
+        )
 
     def prepare(self, sample: Batch) -> None:
         """Do nothing: the units do not depend on the clips.

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from physion.errors import BadInputError
@@ -27,6 +28,13 @@ from physion.models.particles.layout import (
     rotate_scenes,
 )
 from physion.models.particles.rigid_motion import rotation_from_vector
+from physion.physics.trajectory import Trajectory
+from physion.scenes.scene import FRAME_TIME, GRAVITY
+
+_RIM = 0.2
+"""Metres from the centre at which a spin counts as a velocity: about the size of the objects."""
+_LEAST, _LARGEST = 1.4, 4.5
+"""Changes of velocity in a step, in units of that by gravity, between which they count more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +62,54 @@ def read_window(batch: Batch, settings: ParticleSettings, device: torch.device) 
     layout = join_scenes(particles, device)
     before, now, *later = (join_poses(poses, row, device) for row in range(frames.shape[1]))
     return Window(layout, before, now, tuple(later))
+
+
+def start_probabilities(
+    trajectory: Trajectory, stride: int, length: int, abrupt: float
+) -> NDArray[np.float64]:
+    """Return how often a window starts at each frame of a trial.
+
+    Notes
+    -----
+    Contacts are rare and brief, but decide the outcome. In a step of s seconds gravity changes a
+    velocity by g s. With the change c_k of the body that changes most in the step from frame k on,
+
+        c_k = max_b |v_b(k + s) - v_b(k)| + r |w_b(k + s) - w_b(k)|,
+
+    velocity v, angular velocity w and r = `_RIM`, the weight of a window with the predicted steps
+    K is max_K c_k, but at most `_LARGEST` g s, and 0 below `_LEAST` g s. The fraction ``abrupt`` of
+    the starts is drawn in proportion to the weights, and the others uniformly.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+        Motion of F frames.
+    stride, length : int
+        Frames in a step, and frames of a window; the first two are known.
+    abrupt : float
+        Fraction, 0..1.
+
+    Returns
+    -------
+    probabilities : ndarray
+        (starts,); one start if the trial is shorter than a window.
+    """
+    starts = max(len(trajectory.positions) - (length - 1) * stride, 1)
+    uniform = np.full(starts, 1 / starts)
+    speeds = (trajectory.velocities, trajectory.angular_velocities)
+    linear, angular = (
+        np.linalg.norm(np.nan_to_num(v[stride:] - v[:-stride]), axis=-1) for v in speeds
+    )
+    changes = (linear + _RIM * angular).astype(np.float64) / (GRAVITY * stride * FRAME_TIME)
+    if starts == 1 or not changes.shape[1]:
+        return uniform
+    predicted = range(stride, (length - 1) * stride, stride)
+    steps = np.arange(starts)[:, None] + np.array(predicted)
+    weights = changes.max(axis=1)[steps].max(axis=1)
+    weights = np.where(weights < _LEAST, 0.0, np.minimum(weights, _LARGEST))
+    if not weights.any():
+        return uniform
+    return (1 - abrupt) * uniform + abrupt * weights / weights.sum()
 
 
 def rotated(window: Window) -> Window:

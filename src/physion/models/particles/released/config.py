@@ -74,6 +74,7 @@ def released_config(
         swept=False,
         velocity_noise=NOISE,
         pushforward=0,
+        abrupt=0.0,
         training=_TRAINING,
         keep_rigid=keep_rigid,
     )
