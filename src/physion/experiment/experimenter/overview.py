@@ -12,7 +12,9 @@ from statistics import fmean, median, stdev
 
 from physion.experiment.experimenter.figures import Histogram, accuracy_histogram, rt_histogram
 from physion.experiment.experimenter.statistics.flagging import Flags
-from physion.experiment.experimenter.statistics.summaries import STAGES, STATES, SessionSummary
+from physion.experiment.experimenter.statistics.summaries import STATES, SessionSummary
+from physion.experiment.protocol.stages import Stage, label
+from physion.experiment.store.sessions import stages_of
 from physion.experiment.study.study import Study
 
 RATE_SESSIONS = 20
@@ -157,7 +159,7 @@ def compute_overview(
         Counter(str(summary.facts["kind"]) for summary in summaries),
         rows,
         _total(rows, chosen, flags),
-        funnel(chosen),
+        funnel(chosen, stages_of(study)),
         tuple(_performance(study, name, part) for name, part in by_scenario.items()),
         _display_counts("All", chosen),
         _grouped(chosen, lambda s: browser_label(str(s.facts["device"].get("user_agent", "")))),
@@ -232,9 +234,8 @@ def expected_end(finished: Sequence[float], wanted: int, now: float) -> float | 
     return now + missing * (now - recent[0]) / (len(recent) - 1)
 
 
-def funnel(part: Sequence[SessionSummary]) -> tuple[FunnelStage, ...]:
+def funnel(part: Sequence[SessionSummary], order: Sequence[Stage]) -> tuple[FunnelStage, ...]:
     """Count for each stage the sessions that reached it, are in it, or ended in it."""
-    order = list(STAGES)
     at = {stage: Counter(s.state for s in part if s.stage == stage) for stage in order}
     steps = []
     for index, stage in enumerate(order):
@@ -243,7 +244,7 @@ def funnel(part: Sequence[SessionSummary]) -> tuple[FunnelStage, ...]:
         states = at[stage]
         ended = states["withdrawn"] + states["declined"] + states["void"]
         steps.append(
-            FunnelStage(STAGES[stage], reached, percent, states["going"], states["left"], ended)
+            FunnelStage(label(stage), reached, percent, states["going"], states["left"], ended)
         )
     return tuple(steps)
 

@@ -8,7 +8,8 @@ from typing import Any
 from urllib.parse import urlencode
 
 from physion.experiment.experimenter.statistics.flagging import Flags
-from physion.experiment.experimenter.statistics.summaries import STAGES, STATES, SessionSummary
+from physion.experiment.experimenter.statistics.summaries import STATES, SessionSummary
+from physion.experiment.protocol.stages import label
 
 PAGE = 50
 """Sessions per page."""
@@ -150,7 +151,7 @@ def _line(summary: SessionSummary, flags: Flags) -> SessionLine:
     end = facts["finished_at"] or facts["withdrawn_at"] or facts["last_seen"]
     return SessionLine(
         facts["session"], facts["reference"], facts["scenario"], facts["source"], summary.state,
-        STAGES[summary.stage], facts["started_at"], max(0.0, end - facts["started_at"]) / 60,
+        label(summary.stage), facts["started_at"], max(0.0, end - facts["started_at"]) / 60,
         answered.test, answered.accuracy, answered.median_rt, flags_shown(summary, flags),
         answered.incomplete, answered.hidden,
     )  # fmt: skip

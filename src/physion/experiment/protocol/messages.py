@@ -38,23 +38,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
-Phase = Literal["familiarization", "test"]
-Stage = Literal[
-    "consent",
-    "instructions",
-    "familiarization",
-    "ready",
-    "test",
-    "demographics",
-    "feedback",
-    "done",
-    "declined",
-    "withdrawn",
-]
-"""Stages of a session, in this order; ``declined`` (no consent) and ``withdrawn`` can follow any
-stage but ``done``."""
-ENDED: tuple[Stage, ...] = ("declined", "withdrawn")
-"""Stages of sessions that ended before they were complete."""
+from physion.experiment.protocol.stages import Phase, Stage
+
 Kind = Literal["person", "simulated", "preview"]
 Source = Literal["link", "prolific", "sona", "mturk"]
 
@@ -158,11 +143,17 @@ class Enter(Message):
 
 
 class SessionState(Message):
-    """SessionState of a session. ``trial`` is the next trial of the phase, None outside a phase."""
+    """State of a session. ``trial`` is the next trial of the phase, None outside a phase."""
 
     stage: Stage
+    ended: bool
+    """Whether the session ended before it was complete."""
+    places: list[Stage]
+    """Stages to which a preview can go; empty for others."""
     trial: int | None
     trials: dict[Phase, int]
+    answered: bool
+    """Whether a trial was answered, after which stopping is final."""
     scenario: str
     language: str
     kind: Kind
@@ -206,15 +197,14 @@ class PageDone(Message):
     text}; ``instructions``, ``ready`` and ``withdraw`` {}.
     """
 
-    page: Literal["consent", "instructions", "ready", "demographics", "feedback", "withdraw"]
+    page: Stage | Literal["withdraw"]
     data: Annotated[dict[Name, bool | int | float | Text | None], Field(max_length=20)] = {}
 
 
 class Jump(Message):
     """Page or trial to which a preview goes. ``trial`` counts from 0; ignored for pages."""
 
-    stage: Literal["consent", "instructions", "familiarization", "ready", "test", "demographics",
-                   "feedback", "done"]  # fmt: skip
+    stage: Stage
     trial: Annotated[int, Field(ge=0, le=100_000)] = 0
 
 

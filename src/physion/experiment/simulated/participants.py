@@ -21,6 +21,7 @@ import httpx2
 from physion.errors import PhysionError, UnknownNameError
 from physion.experiment.protocol import messages as wire
 from physion.experiment.protocol.public_study import PublicStudy
+from physion.experiment.protocol.stages import Phase
 from physion.experiment.simulated.browser import RefusedError, SimulatedBrowser, state_after
 from physion.experiment.simulated.person import TYPICAL_RT_MS, SimulatedPerson
 from physion.experiment.study.identity import Secrets
@@ -44,7 +45,7 @@ WINDOW = (1280, 720)
 class Acknowledged:
     """An answer that the server acknowledged as stored."""
 
-    phase: wire.Phase
+    phase: Phase
     trial: int
     key: str
     stimulus: str
@@ -136,7 +137,7 @@ class Participation:
             self._visit.outcome = "done before"
             return
         dropout = self._person.dropout_trial(state.trials["test"], self._plan.dropouts)
-        while state.stage not in ("done", *wire.ENDED):
+        while state.stage != "done" and not state.ended:
             if state.stage in ("familiarization", "test"):
                 state = await self._run_phase(state, dropout)
                 if state.stage == "test" and state.trial == dropout:
@@ -196,7 +197,7 @@ class Participation:
             state = await self._run_trial(phase, trials[state.trial])
         return state
 
-    async def _run_trial(self, phase: wire.Phase, media: wire.TrialMedia) -> wire.SessionState:
+    async def _run_trial(self, phase: Phase, media: wire.TrialMedia) -> wire.SessionState:
         """Fetch the media of a trial and answer it."""
         await self._fetch(media.movie, media.map)
         stimulus = self._find_stimulus(phase, media.movie)
@@ -223,7 +224,7 @@ class Participation:
         """Let ``ms`` milliseconds of a person's time pass, at the speed that the study allows."""
         await asyncio.sleep(ms / 1000 / self._study.plausibility.simulated_speed)
 
-    def _find_stimulus(self, phase: wire.Phase, movie: str) -> Stimulus:
+    def _find_stimulus(self, phase: Phase, movie: str) -> Stimulus:
         """Return the stimulus of a movie path, which only the server's keys can decode."""
         path = read_media_path(self._study, self._secrets, movie)
         for stimulus in self._study.phase(self._visit.scenario, phase):
@@ -243,7 +244,7 @@ class Participation:
 def build_answer(
     study: Study,
     media: wire.TrialMedia,
-    phase: wire.Phase,
+    phase: Phase,
     person: SimulatedPerson,
     stimulus: Stimulus,
 ) -> wire.Answer:

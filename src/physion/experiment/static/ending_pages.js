@@ -20,8 +20,7 @@ export function declineQuestion({ texts }) {
 /** Render the question whether to stop; ends with {stop}. @param {Context} context */
 export function stopQuestion({ texts, study, state }) {
   const { t } = bound(texts);
-  const begun = !["instructions", "familiarization"].includes(state.stage) || state.trial > 0;
-  const text = t(begun ? "stop.text" : "stop.text_unanswered", { contact: study.contact });
+  const text = t(state.answered ? "stop.text" : "stop.text_unanswered", { contact: study.contact });
   const reference = t("common.reference", { reference: state.reference });
   const parts = [el("p", { class: "small" }, reference)];
   return question(t, "stop", text, parts, (stop) => ({ stop }));
@@ -52,7 +51,7 @@ function question(t, name, text, parts, answerOf) {
 }
 
 /**
- * Render the page of a session that was declined or stopped.
+ * Render the page of a session that ended early, with the texts of its stage.
  * @param {Context} context
  * @param {import("./messages.js").SessionEnd} ending
  * @param {(() => void)|null} takeBack Takes part after all; null if the page cannot.
@@ -61,7 +60,6 @@ function question(t, name, text, parts, answerOf) {
 export function endedPage({ texts, study, state, another }, ending, takeBack) {
   const { t } = bound(texts);
   const { completion, can_take_back } = ending;
-  const name = state.stage === "declined" ? "declined" : "withdrawn";
   const told = completion.code || completion.url;
   const changed = () => {
     const control = takeBack && button(t("ended.take_back"), takeBack, { class: "button quiet" });
@@ -69,8 +67,8 @@ export function endedPage({ texts, study, state, another }, ending, takeBack) {
   };
   return (page) => {
     page.append(
-      el("h1", {}, t(`${name}.title`)),
-      ...paragraphs(t(`${name}.text`, study)),
+      el("h1", {}, t(`${state.stage}.title`)),
+      ...paragraphs(t(`${state.stage}.text`, study)),
       ...(told ? [] : [el("p", {}, t("ended.return_submission"))]),
       ...completionParts(completion, t, "ended.go_hint"),
       ...(can_take_back ? [changed()] : []),

@@ -6,14 +6,8 @@
 import { button, el } from "./dom.js";
 import { jumpControl } from "./jump.js";
 
-const STAGES_WITH_STOP_BUTTON = [
-  "instructions",
-  "familiarization",
-  "ready",
-  "test",
-  "demographics",
-  "feedback",
-];
+/** Stages in which there is nothing to stop: not begun yet, or finished. */
+const WITHOUT_STOP_BUTTON = ["consent", "done"];
 const BACK_SHOWN_MS = 4_000;
 
 const byId = (id) => document.getElementById(id);
@@ -61,7 +55,7 @@ export class Frame {
       tools.push(jumpControl(this.texts, state, (to) => this.onJump(to)));
     }
     if (state.stage === "consent") tools.push(this.languageChooser());
-    if (STAGES_WITH_STOP_BUTTON.includes(state.stage)) {
+    if (!state.ended && !WITHOUT_STOP_BUTTON.includes(state.stage)) {
       const stop = button(this.texts.t("stop.open"), () => this.onStop(), { class: "link" });
       tools.push(stop);
     }

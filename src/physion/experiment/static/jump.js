@@ -6,19 +6,8 @@
 import { el } from "./dom.js";
 import { bound } from "./texts.js";
 
-const PLACES = [
-  "consent",
-  "instructions",
-  "familiarization",
-  "ready",
-  "test",
-  "demographics",
-  "feedback",
-  "done",
-];
-
 /**
- * Create the control.
+ * Create the control for the places that the server names.
  * @param {import("./texts.js").Texts} texts
  * @param {import("./messages.js").SessionState} state
  * @param {(to: {stage: string, trial: number}) => void} onJump
@@ -26,7 +15,7 @@ const PLACES = [
  */
 export function jumpControl(texts, state, onJump) {
   const { t } = bound(texts);
-  const options = PLACES.map((stage) =>
+  const options = state.places.map((stage) =>
     el("option", { value: stage, selected: stage === state.stage }, t(`preview.${stage}`)),
   );
   const stages = el("select", { id: "jump-stage", "aria-label": t("preview.page") }, ...options);

@@ -1,17 +1,8 @@
 // Types of the messages of physion/experiment/protocol/messages.py, for the type check alone.
 
 export type Phase = "familiarization" | "test";
-export type Stage =
-  | "consent"
-  | "instructions"
-  | "familiarization"
-  | "ready"
-  | "test"
-  | "demographics"
-  | "feedback"
-  | "done"
-  | "declined"
-  | "withdrawn";
+/** A name of the list in protocol/stages.py. */
+export type Stage = string;
 
 export interface Device {
   user_agent: string;
@@ -37,8 +28,11 @@ export interface Enter {
 
 export interface SessionState {
   stage: Stage;
+  ended: boolean;
+  places: Stage[];
   trial: number | null;
   trials: Record<Phase, number>;
+  answered: boolean;
   scenario: string;
   language: string;
   kind: "person" | "simulated" | "preview";

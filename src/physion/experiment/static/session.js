@@ -151,7 +151,7 @@ export class Session {
   #next() {
     const { stage } = this.state;
     if (stage === "done") return this.#end();
-    return stage === "declined" || stage === "withdrawn" ? this.#ended() : this.#stage();
+    return this.state.ended ? this.#ended() : this.#stage();
   }
 
   /** Show the current page again, in another language. */
@@ -303,7 +303,7 @@ export class Session {
       answered: (data) => {
         const details = { ...data.details, stop_asked: this.#running.asked };
         const answer = answerOf(phase, trial, { ...data, details });
-        this.state = { ...this.state, trial: trial + 1 };
+        this.state = { ...this.state, trial: trial + 1, answered: true };
         if (phase === "familiarization") rememberFeedback(this.state.reference, answer);
         return { answer, stored: this.queue.add(answer, this.#running.showing) };
       },

@@ -10,6 +10,7 @@ from sqlalchemy import Connection, bindparam, select, update
 
 from physion.experiment.protocol.messages import Answer, AnswerStored, Feedback
 from physion.experiment.protocol.refused import Refused
+from physion.experiment.protocol.stages import Course
 from physion.experiment.store.plausibility import (
     TOLERANCE_S,
     Presentation,
@@ -68,7 +69,7 @@ def store_answer(
     connection: Connection,
     study: Study,
     secrets: Secrets,
-    trials: Mapping[str, int],
+    course: Course,
     session: Session,
     answer: Answer,
     details: str,
@@ -83,8 +84,8 @@ def store_answer(
         Connection of the writer, in a transaction.
     study, secrets
         The study and its keys.
-    trials
-        Number of trials in each phase of the session's scenario.
+    course
+        What the session consists of.
     session
         The session; its count of answers is increased.
     answer
@@ -104,16 +105,16 @@ def store_answer(
     """
     known = answered(session, answer.phase)
     if answer.trial < known:
-        response = _read_stored(connection, trials, session, answer)
+        response = _read_stored(connection, course, session, answer)
         duplicate = True
     else:
-        _check_next(trials, session, answer, known)
+        _check_next(course, session, answer, known)
         response = answer.response
         duplicate = False
     # Stimuli cannot change while there are sessions, so an answered trial has this stimulus too.
     stimulus = trial_order(study, session.scenario, session.order_seed)[answer.phase][answer.trial]
     if not duplicate:
-        shown = read_presentation(connection, study, trials, session, answer, fetched_at)
+        shown = read_presentation(connection, study, course, session, answer, fetched_at)
         changes = _judge(study, session, answer, shown, now)
         values = {
             "stimulus": stimulus.stimulus,
@@ -121,16 +122,14 @@ def store_answer(
             "showings": shown.showings or None,
             "details": details,
         }
-        _insert_answer(connection, trials, session, answer, values, changes, now)
+        _insert_answer(connection, course, session, answer, values, changes, now)
     feedback = None
     if answer.phase == PHASES[0]:
         feedback = _build_feedback(study, secrets, session, stimulus, answer.trial, response)
-    return AnswerStored(duplicate=duplicate, feedback=feedback, state=state_of(session, trials))
+    return AnswerStored(duplicate=duplicate, feedback=feedback, state=state_of(session, course))
 
 
-def _read_stored(
-    connection: Connection, trials: Mapping[str, int], session: Session, answer: Answer
-) -> str:
+def _read_stored(connection: Connection, course: Course, session: Session, answer: Answer) -> str:
     """Return the stored response of a trial if it has the same key; else raise `Refused`."""
     row = connection.execute(
         _STORED,
@@ -138,18 +137,18 @@ def _read_stored(
     ).one()
     if row.key != answer.key:
         raise Refused(
-            "already_answered", "This trial is already answered.", state_of(session, trials)
+            "already_answered", "This trial is already answered.", state_of(session, course)
         )
     return str(row.response)
 
 
-def _check_next(trials: Mapping[str, int], session: Session, answer: Answer, known: int) -> None:
+def _check_next(course: Course, session: Session, answer: Answer, known: int) -> None:
     """Raise `Refused` unless this trial is the next one of the session."""
-    stage = stage_of(session, trials)
+    stage = stage_of(session, course)
     if stage not in PHASES:
-        raise Refused("wrong_stage", "No trial is next.", state_of(session, trials))
+        raise Refused("wrong_stage", "No trial is next.", state_of(session, course))
     if stage != answer.phase or answer.trial != known:
-        raise Refused("out_of_order", "Another trial is next.", state_of(session, trials))
+        raise Refused("out_of_order", "Another trial is next.", state_of(session, course))
 
 
 def _judge(
@@ -172,7 +171,7 @@ def _judge(
 
 def _insert_answer(
     connection: Connection,
-    trials: Mapping[str, int],
+    course: Course,
     session: Session,
     answer: Answer,
     values: Mapping[str, Any],
@@ -191,7 +190,7 @@ def _insert_answer(
     # Only a key that another trial has can conflict; then nothing is written.
     if connection.execute(insert_or_skip(connection, ANSWERS), row).rowcount != 1:
         raise Refused(
-            "already_answered", "This key belongs to another trial.", state_of(session, trials)
+            "already_answered", "This key belongs to another trial.", state_of(session, course)
         )
     count = answer.trial + 1
     new = {f"new_{name}": value for name, value in changes.items()}

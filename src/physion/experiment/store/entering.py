@@ -18,8 +18,8 @@ from physion.experiment.store.sessions import (
     ACTIVE_WITHIN,
     ENTERED_AGAIN,
     SESSION_COLUMNS,
+    Courses,
     Session,
-    TrialCounts,
     can_take_back,
     change_session,
     insert_or_skip,
@@ -121,7 +121,7 @@ def identify_visitor(study: Study, secrets: Secrets, enter: Enter, token: str = 
 
 
 def enter_session(
-    connection: Connection, study: Study, secrets: Secrets, trials: TrialCounts, visitor: Visitor
+    connection: Connection, study: Study, secrets: Secrets, courses: Courses, visitor: Visitor
 ) -> Entered:
     """Begin a session, or issue another token for the session that the visitor has begun.
 
@@ -134,8 +134,8 @@ def enter_session(
         Connection of the writer, in a transaction.
     study, secrets
         The study and its keys.
-    trials
-        Numbers of trials of its scenarios.
+    courses
+        The courses of its scenarios.
     visitor
         Who enters.
 
@@ -161,7 +161,7 @@ def enter_session(
         _take_back(connection, ended, visitor)
         session, ended = ended, None
     if session is not None:
-        _continue(connection, trials, session, visitor)
+        _continue(connection, courses, session, visitor)
     elif ended is None:
         done = {each.scenario for each in sessions}
         scenario = _choose_scenario(connection, study, visitor, done)
@@ -174,7 +174,7 @@ def enter_session(
         insert_or_skip(connection, TOKENS),
         {"token_hash": hash_token(visitor.token), "session": session.session, "made": visitor.now},
     )
-    return Entered(token=visitor.token, state=state_of(session, trials.of(session.scenario)))
+    return Entered(token=visitor.token, state=state_of(session, courses.of(session.scenario)))
 
 
 def _check_browser(connection: Connection, session: Session, visitor: Visitor) -> None:
@@ -363,11 +363,9 @@ def _match_language(study: Study, wanted: str) -> str:
     return known.get(wanted) or known.get(wanted.partition("-")[0]) or study.languages[0]
 
 
-def _continue(
-    connection: Connection, trials: TrialCounts, session: Session, visitor: Visitor
-) -> None:
+def _continue(connection: Connection, courses: Courses, session: Session, visitor: Visitor) -> None:
     """Record that the visitor entered an unfinished session again."""
-    marks = mark_loaded(session, trials.of(session.scenario))
+    marks = mark_loaded(session, courses.of(session.scenario))
     browser = {} if session.browser is not None else {"browser": visitor.browser}
     change_session(connection, session, last_seen=visitor.now, **browser, **marks)
     event = {

@@ -7,12 +7,12 @@ from typing import Any
 
 from sqlalchemy import Connection, delete, select, update
 
-from physion.experiment.protocol.messages import ENDED, PageDone, SessionState
+from physion.experiment.protocol.messages import PageDone, SessionState
 from physion.experiment.protocol.refused import Refused
+from physion.experiment.protocol.stages import ENDED, PAGES, STAGES, Course
 from physion.experiment.store.plausibility import reasons
 from physion.experiment.store.sessions import (
     ENTERED_AGAIN,
-    STAGES,
     Session,
     change_session,
     stage_of,
@@ -93,6 +93,8 @@ def check_page(done: PageDone) -> dict[str, Any]:
     Refused
         A field is missing, invalid or unknown; the message names the first one.
     """
+    if done.page not in FIELDS:
+        raise Refused("bad_request", f"page: {done.page} is no page that is submitted")
     optional = OPTIONAL.get(done.page, {})
     expected = {**FIELDS[done.page], **{k: v for k, v in optional.items() if k in done.data}}
     unknown = sorted(set(done.data) - set(expected))
@@ -113,7 +115,7 @@ def check_page(done: PageDone) -> dict[str, Any]:
 def submit_page(
     connection: Connection,
     study: Study,
-    trials: Mapping[str, int],
+    course: Course,
     session: Session,
     page: str,
     values: Mapping[str, Any],
@@ -127,8 +129,8 @@ def submit_page(
         Connection of the writer, in a transaction.
     study
         The study.
-    trials
-        Number of trials in each phase of the session's scenario.
+    course
+        What the session consists of.
     session
         The session; it is updated.
     page, values
@@ -141,22 +143,23 @@ def submit_page(
     Refused
         The page is not the next one.
     """
-    stage = stage_of(session, trials)
+    stage = stage_of(session, course)
     if page == "withdraw" or values.get("agreed") is False:
         if stage == "done":
-            raise Refused("wrong_stage", "This session is finished.", state_of(session, trials))
+            raise Refused("wrong_stage", "This session is finished.", state_of(session, course))
         if stage not in ENDED:
             change_session(connection, session, withdrawn_at=now, last_seen=now)
             if session.consented_at is None:
                 _forget_declined(connection, session)
-        return state_of(session, trials)
+        return state_of(session, course)
     if stage in ENDED or STAGES.index(stage) < STAGES.index(page):  # type: ignore[arg-type]
-        raise Refused("wrong_stage", "This page is not next.", state_of(session, trials))
+        raise Refused("wrong_stage", "This page is not next.", state_of(session, course))
     if stage == page:
         columns = _columns(study, session, page, values, now)
-        times = {"last_seen": now, "progressed_at": now, "next_from": now}
+        times = dict.fromkeys(("last_seen", "progressed_at", "next_from"), now)
+        times |= {PAGES[stage].column: now}
         change_session(connection, session, **times, **columns)
-    return state_of(session, trials)
+    return state_of(session, course)
 
 
 def _forget_declined(connection: Connection, session: Session) -> None:
@@ -176,24 +179,21 @@ def _forget_declined(connection: Connection, session: Session) -> None:
 def _columns(
     study: Study, session: Session, page: str, values: Mapping[str, Any], now: float
 ) -> dict[str, Any]:
-    """Return the columns of SESSIONS that a page sets."""
+    """Return the columns of SESSIONS that a page sets, besides the time at which it was sent."""
     match page:
         case "consent":
             # Store the language in which the consent was read.
             known = values.get("language") in study.languages
             language = {"language": values["language"]} if known else {}
-            return {"consented_at": now, "consent_version": study.consent_version, **language}
-        case "instructions":
-            return {"instructed_at": now}
-        case "ready":
-            return {"ready_at": now}
+            return {"consent_version": study.consent_version, **language}
         case "demographics":
-            return {"demographics_at": now, **values}
-        case _:
+            return dict(values)
+        case "feedback":
             return {
-                "finished_at": now,
                 "implausible": reasons(study, session, now),
                 "difficulty": values["difficulty"],
                 "technical_problems": values["technical_problems"],
                 "feedback": values["text"],
             }
+        case _:
+            return {}

@@ -10,8 +10,9 @@ from typing import Any, cast
 from sqlalchemy import Connection, Table, bindparam, select, update
 from sqlalchemy.dialects import postgresql, sqlite
 
-from physion.experiment.protocol.messages import ENDED, SessionState, Stage
+from physion.experiment.protocol.messages import SessionState
 from physion.experiment.protocol.refused import Refused
+from physion.experiment.protocol.stages import ENDED, PAGES, STAGES, Course, Stage
 from physion.experiment.store.tables import SESSIONS, TOKENS
 from physion.experiment.study.stimuli import PHASES
 from physion.experiment.study.study import Study
@@ -20,10 +21,6 @@ ACTIVE_WITHIN = 15 * 60.0
 """A session counts as active for this many seconds after its last request."""
 ENTERED_AGAIN = "entered_again"
 """Kind of the event stored when a session is entered again; its data are the device."""
-STAGES: tuple[Stage, ...] = (
-    "consent", "instructions", "familiarization", "ready", "test", "demographics", "feedback",
-    "done", *ENDED,
-)  # fmt: skip
 
 
 @dataclass(slots=True)
@@ -68,17 +65,23 @@ _BY_TOKEN = (
 )
 
 
-class TrialCounts:
-    """Number of trials in each phase of each scenario."""
+def stages_of(study: Study) -> tuple[Stage, ...]:
+    """Return the stages of a study's sessions in order, ``done`` last."""
+    return tuple(stage for stage in STAGES if stage not in ENDED)
+
+
+class Courses:
+    """The `Course` of the sessions of each scenario."""
 
     def __init__(self, study: Study) -> None:
-        self._counts: dict[str, dict[str, int]] = {
-            scenario: {phase: len(study.phase(scenario, phase)) for phase in PHASES}
+        stages = stages_of(study)
+        self._courses = {
+            scenario: Course(stages, {phase: len(study.phase(scenario, phase)) for phase in PHASES})
             for scenario in study.scenarios
         }
 
-    def of(self, scenario: str) -> Mapping[str, int]:
-        """Return the numbers of trials by phase.
+    def of(self, scenario: str) -> Course:
+        """Return the course of the sessions of a scenario.
 
         Raises
         ------
@@ -86,16 +89,16 @@ class TrialCounts:
             The study no longer has the scenario, which can only happen to previews
             (`study_record.register`).
         """
-        if scenario not in self._counts:
+        if scenario not in self._courses:
             raise Refused(
                 "unknown_token",
                 "The study no longer has this scenario; open your link again.",
             )
-        return self._counts[scenario]
+        return self._courses[scenario]
 
     def has(self, scenario: str) -> bool:
         """Return whether the study currently has this scenario."""
-        return scenario in self._counts
+        return scenario in self._courses
 
 
 def session_from_row(study: Study, row: Sequence[Any]) -> Session:
@@ -117,7 +120,7 @@ def read_session(connection: Connection, study: Study, token_hash: str) -> Sessi
     return session_from_row(study, row)
 
 
-def stage_of(session: Session, trials: Mapping[str, int]) -> Stage:
+def stage_of(session: Session, course: Course) -> Stage:
     """Return the current stage of a session: the first one that is not complete."""
     if session.withdrawn_at is not None:
         declined = session.consented_at is None and session.closed_at is None
@@ -126,15 +129,14 @@ def stage_of(session: Session, trials: Mapping[str, int]) -> Stage:
         return "done"
     if session.voided_at is not None:
         return "withdrawn"
-    complete = (
-        session.consented_at is not None,
-        session.instructed_at is not None,
-        session.answered_familiarization >= trials["familiarization"],
-        session.ready_at is not None,
-        session.answered_test >= trials["test"],
-        session.demographics_at is not None,
-    )
-    return STAGES[complete.index(False)] if False in complete else "feedback"
+    for stage in course.stages:
+        if stage in PHASES:
+            complete = answered(session, stage) >= course.trials[stage]
+        else:
+            complete = stage in PAGES and getattr(session, PAGES[stage].column) is not None
+        if not complete:
+            return stage
+    raise AssertionError("a session whose last page was sent is finished")
 
 
 def can_take_back(session: Session) -> bool:
@@ -142,9 +144,9 @@ def can_take_back(session: Session) -> bool:
 
     Only while nothing was answered, and the lab has not closed or voided the session.
     """
-    unanswered = session.answered_familiarization == session.answered_test == 0
+    begun = any(answered(session, phase) for phase in PHASES)
     ended_by_lab = session.closed_at is not None or session.voided_at is not None
-    return session.withdrawn_at is not None and unanswered and not ended_by_lab
+    return session.withdrawn_at is not None and not begun and not ended_by_lab
 
 
 def answered(session: Session, phase: str) -> int:
@@ -152,13 +154,16 @@ def answered(session: Session, phase: str) -> int:
     return session.answered_test if phase == "test" else session.answered_familiarization
 
 
-def state_of(session: Session, trials: Mapping[str, int]) -> SessionState:
+def state_of(session: Session, course: Course) -> SessionState:
     """Return the state of a session as sent to the client."""
-    stage = stage_of(session, trials)
+    stage = stage_of(session, course)
     return SessionState(
         stage=stage,
+        ended=stage in ENDED,
+        places=list(course.stages) if session.kind == "preview" else [],
         trial=answered(session, stage) if stage in PHASES else None,
-        trials=cast(Any, dict(trials)),
+        trials=cast(Any, dict(course.trials)),
+        answered=any(answered(session, phase) for phase in PHASES),
         scenario=session.scenario,
         language=session.language,
         kind=cast(Any, session.kind),
@@ -177,12 +182,12 @@ def change_session(connection: Connection, session: Session, **values: Any) -> N
             setattr(session, name, value)
 
 
-def mark_loaded(session: Session, trials: Mapping[str, int]) -> dict[str, Any]:
+def mark_loaded(session: Session, course: Course) -> dict[str, Any]:
     """Return the columns that record a reload of the page at the next trial, if a trial is next.
 
     The page was loaded before for the consent, so a load at a trial is always a reload.
     """
-    stage = stage_of(session, trials)
+    stage = stage_of(session, course)
     if stage not in PHASES:
         return {}
     return {"loaded_at_phase": stage, "loaded_at_trial": answered(session, stage)}

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 from sqlalchemy import Connection, bindparam, func, select
 
 from physion.experiment.protocol.messages import Answer, Showing, Shown
 from physion.experiment.protocol.refused import Refused
+from physion.experiment.protocol.stages import Course
 from physion.experiment.store.plausibility import Presentation
 from physion.experiment.store.sessions import Session, answered, insert_or_skip, stage_of, state_of
 from physion.experiment.store.tables import SHOWINGS
@@ -24,7 +23,7 @@ _OF_TRIAL = select(func.count(), func.max(SHOWINGS.c.began_at)).where(
 
 def store_showing(
     connection: Connection,
-    trials: Mapping[str, int],
+    course: Course,
     session: Session,
     showing: Showing,
     now: float,
@@ -42,10 +41,10 @@ def store_showing(
     phase, trial = showing.phase, showing.trial
     if trial < answered(session, phase):
         return Shown(showings=_read(connection, session, phase, trial)[0])
-    if stage_of(session, trials) != phase:
-        raise Refused("wrong_stage", "No trial of this phase is next.", state_of(session, trials))
+    if stage_of(session, course) != phase:
+        raise Refused("wrong_stage", "No trial of this phase is next.", state_of(session, course))
     if trial != answered(session, phase):
-        raise Refused("out_of_order", "Another trial is next.", state_of(session, trials))
+        raise Refused("out_of_order", "Another trial is next.", state_of(session, course))
     count, _ = _read(connection, session, phase, trial)
     if count < MAX_STORED:
         row = {
@@ -63,7 +62,7 @@ def store_showing(
 def read_presentation(
     connection: Connection,
     study: Study,
-    trials: Mapping[str, int],
+    course: Course,
     session: Session,
     answer: Answer,
     fetched_at: float | None,
@@ -76,8 +75,8 @@ def read_presentation(
         Connection of the writer.
     study
         The study; without its ``server_checks`` a trial need not have been announced.
-    trials
-        Number of trials in each phase of the session's scenario.
+    course
+        What the session consists of.
     session, answer
         The session, and its answer to the next trial.
     fetched_at
@@ -92,7 +91,7 @@ def read_presentation(
     if not study.plausibility.server_checks:
         return Presentation(count, began_at or 0.0, None)
     if began_at is None:
-        raise Refused("not_shown", "This trial was not shown yet.", state_of(session, trials))
+        raise Refused("not_shown", "This trial was not shown yet.", state_of(session, course))
     return Presentation(count, began_at, fetched_at)
 
 

@@ -13,7 +13,6 @@ from sqlalchemy import Connection, Engine, func, insert, select, text
 from sqlalchemy.exc import OperationalError
 
 from physion.experiment.protocol.messages import (
-    ENDED,
     Answer,
     AnswerStored,
     Completion,
@@ -22,7 +21,6 @@ from physion.experiment.protocol.messages import (
     Events,
     Jump,
     PageDone,
-    Phase,
     Result,
     SessionEnd,
     SessionState,
@@ -33,6 +31,7 @@ from physion.experiment.protocol.messages import (
     TrialMedia,
 )
 from physion.experiment.protocol.refused import Refused
+from physion.experiment.protocol.stages import ENDED, Phase
 from physion.experiment.store.answering import encode_details, store_answer
 from physion.experiment.store.database import (
     connect_writer,
@@ -47,8 +46,8 @@ from physion.experiment.store.lab.jumping import jump
 from physion.experiment.store.scores import Scores, percentile
 from physion.experiment.store.sent_pages import check_page, submit_page
 from physion.experiment.store.sessions import (
+    Courses,
     Session,
-    TrialCounts,
     can_take_back,
     change_session,
     mark_loaded,
@@ -85,7 +84,7 @@ class Store:
     def __init__(self, study: Study, secrets: Secrets, engine: Engine, writer: Writer) -> None:
         self.study, self.secrets, self.engine = study, secrets, engine
         self._writer = writer
-        self._trials = TrialCounts(study)
+        self._courses = Courses(study)
         self._scores = Scores(study)
         self.fetched = FetchedMedia()
         self._held = contextlib.ExitStack()
@@ -122,7 +121,7 @@ class Store:
         visitor = identify_visitor(self.study, self.secrets, enter, token)
         return await self._writer.run(
             lambda connection: enter_session(
-                connection, self.study, self.secrets, self._trials, visitor
+                connection, self.study, self.secrets, self._courses, visitor
             )
         )
 
@@ -134,12 +133,12 @@ class Store:
 
         def count(connection: Connection) -> SessionState:
             session = read_session(connection, self.study, hash_token(token))
-            trials = self._trials.of(session.scenario)
-            if stage_of(session, trials) not in ENDED:
-                marks = mark_loaded(session, trials)
+            course = self._courses.of(session.scenario)
+            if stage_of(session, course) not in ENDED:
+                marks = mark_loaded(session, course)
                 loads = session.loads + 1
                 change_session(connection, session, loads=loads, last_seen=now, **marks)
-            return state_of(session, trials)
+            return state_of(session, course)
 
         return await self._writer.run(count)
 
@@ -149,12 +148,12 @@ class Store:
         The lists of both phases are available once consent is given, so that media can be loaded
         ahead.
         """
-        session, trials = self._read(lambda c: self._read_session(c, token))
-        stage = stage_of(session, trials)
+        session, course = self._read(lambda c: self._read_session(c, token))
+        stage = stage_of(session, course)
         if stage in ENDED:
-            raise Refused("wrong_stage", "This session has ended.", state_of(session, trials))
+            raise Refused("wrong_stage", "This session has ended.", state_of(session, course))
         if stage == "consent":
-            raise Refused("not_yet", "Trials come after the consent.", state_of(session, trials))
+            raise Refused("not_yet", "Trials come after the consent.", state_of(session, course))
         return TrialList(phase=phase, trials=self._list_media(session, phase))
 
     async def page(self, token: str, done: PageDone) -> SessionState:
@@ -162,8 +161,8 @@ class Store:
         values, now = check_page(done), time.time()
 
         def submit(connection: Connection) -> SessionState:
-            session, trials = self._read_session(connection, token)
-            return submit_page(connection, self.study, trials, session, done.page, values, now)
+            session, course = self._read_session(connection, token)
+            return submit_page(connection, self.study, course, session, done.page, values, now)
 
         return await self._writer.run(submit)
 
@@ -172,8 +171,8 @@ class Store:
         now = time.time()
 
         def move(connection: Connection) -> SessionState:
-            session, trials = self._read_session(connection, token)
-            return jump(connection, trials, session, to, now)
+            session, course = self._read_session(connection, token)
+            return jump(connection, course, session, to, now)
 
         return await self._writer.run(move)
 
@@ -183,11 +182,11 @@ class Store:
 
         def store(connection: Connection) -> tuple[AnswerStored, str]:
             session = read_session(connection, self.study, token_hash)
-            trials = self._trials.of(session.scenario)
+            course = self._courses.of(session.scenario)
             tag = session_tag(self.secrets, session.session)
             sent_at = self.fetched.sent_at(tag, session.started_at, answer.phase, answer.trial)
             stored = store_answer(
-                connection, self.study, self.secrets, trials, session, answer, details, now, sent_at
+                connection, self.study, self.secrets, course, session, answer, details, now, sent_at
             )
             return stored, tag
 
@@ -201,8 +200,8 @@ class Store:
 
         def store(connection: Connection) -> Shown:
             session = read_session(connection, self.study, token_hash)
-            trials = self._trials.of(session.scenario)
-            return store_showing(connection, trials, session, showing, now)
+            course = self._courses.of(session.scenario)
+            return store_showing(connection, course, session, showing, now)
 
         return await self._writer.run(store)
 
@@ -216,9 +215,9 @@ class Store:
         ]  # fmt: skip
 
         def store(connection: Connection) -> Stored:
-            session, trials = self._read_session(connection, token)
-            if stage_of(session, trials) in ENDED:
-                raise Refused("wrong_stage", "This session has ended.", state_of(session, trials))
+            session, course = self._read_session(connection, token)
+            if stage_of(session, course) in ENDED:
+                raise Refused("wrong_stage", "This session has ended.", state_of(session, course))
             of_session = EVENTS.c.session == session.session
             if events.key is not None:
                 same = select(EVENTS.c.event).where(of_session, EVENTS.c.batch == events.key)
@@ -243,10 +242,10 @@ class Store:
         """Return the end of a session that was declined or stopped."""
 
         def read(connection: Connection) -> SessionEnd:
-            session, trials = self._read_session(connection, token)
-            stage = stage_of(session, trials)
+            session, course = self._read_session(connection, token)
+            stage = stage_of(session, course)
             if stage not in ENDED:
-                raise Refused("wrong_stage", "This session goes on.", state_of(session, trials))
+                raise Refused("wrong_stage", "This session goes on.", state_of(session, course))
             of_session = select(SESSIONS.c.source).where(SESSIONS.c.session == session.session)
             source = connection.execute(of_session).scalar_one()
             part = self.study.declined if stage == "declined" else self.study.stopped
@@ -276,9 +275,9 @@ class Store:
             raise Refused("unavailable", "The server cannot reach its database.") from error
 
     def _read_session(self, connection: Connection, token: str) -> tuple[Session, Any]:
-        """Return the session of a token and its numbers of trials."""
+        """Return the session of a token and its course."""
         session = read_session(connection, self.study, hash_token(token))
-        return session, self._trials.of(session.scenario)
+        return session, self._courses.of(session.scenario)
 
     def _read_state(self, connection: Connection, token: str) -> SessionState:
         """Return the state of the session of a token."""
@@ -309,11 +308,11 @@ class Store:
 
     def _compute_result(self, connection: Connection, token: str) -> Result:
         """Compute the result of a finished session."""
-        session, trials = self._read_session(connection, token)
-        stage = stage_of(session, trials)
+        session, course = self._read_session(connection, token)
+        stage = stage_of(session, course)
         if stage != "done":
             code = "wrong_stage" if stage in ENDED else "not_yet"
-            raise Refused(code, "The result comes at the end.", state_of(session, trials))
+            raise Refused(code, "The result comes at the end.", state_of(session, course))
         scores = dict(self._scores.of(connection, session.scenario, session.kind, session.session))
         correct = scores.pop(session.session, None)
         if correct is None:  # a preview of other stimuli, whose labels are no longer known
@@ -328,8 +327,8 @@ class Store:
         ).first()
         return Result(
             correct=correct,
-            trials=trials["test"],
-            accuracy=correct / trials["test"],
+            trials=course.trials["test"],
+            accuracy=correct / course.trials["test"],
             percentile=percentile(correct, others) if enough else None,
             completion=Completion(code=None, url=None, withheld=True)
             if session.implausible

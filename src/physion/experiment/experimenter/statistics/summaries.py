@@ -9,12 +9,14 @@ from typing import Any
 
 from sqlalchemy import Connection, Engine, Row, select
 
+from physion.experiment.protocol.stages import Course, Stage
 from physion.experiment.store.sessions import (
     ACTIVE_WITHIN,
     SESSION_COLUMNS,
+    Courses,
     Session,
-    TrialCounts,
     stage_of,
+    stages_of,
 )
 from physion.experiment.store.tables import ANSWERS, SESSIONS
 from physion.experiment.study.stimuli import PHASES
@@ -29,18 +31,6 @@ STATES = {
     "void": "Void",
 }
 """States of a session and their labels. Participants who dropped out may still continue."""
-
-STAGES = {
-    "consent": "Consent",
-    "instructions": "Instructions",
-    "familiarization": "Familiarization",
-    "ready": "Start page",
-    "test": "Test",
-    "demographics": "Demographics",
-    "feedback": "Feedback",
-    "done": "Finished",
-}
-"""Stages of a session in order, and their labels."""
 
 _SESSION = (*SESSION_COLUMNS, SESSIONS.c.source, SESSIONS.c.last_seen, SESSIONS.c.device)
 _ANSWER = (
@@ -133,7 +123,7 @@ class SessionSummary:
 
     facts: Mapping[str, Any]
     state: str
-    stage: str
+    stage: Stage
     answered: AnswerCounts
 
 
@@ -150,7 +140,7 @@ class SummaryCache:
     def __init__(self, study: Study, engine: Engine) -> None:
         self._engine = engine
         self._labels = stimulus_labels(study)
-        self._trials = TrialCounts(study)
+        self._courses, self._stages = Courses(study), stages_of(study)
         self._answered: dict[str, AnswerCounts] = {}
 
     def refresh(self, now: float) -> list[SessionSummary]:
@@ -191,14 +181,14 @@ class SummaryCache:
         known = self._answered.get(session, _NOTHING)
         return known.familiarization, known.test
 
-    def _stage(self, facts: Mapping[str, Any]) -> str:
+    def _stage(self, facts: Mapping[str, Any]) -> Stage:
         """Return the stage of a session, or the stage at which it was withdrawn."""
         columns = {column.name: facts[column.name] for column in SESSION_COLUMNS}
         session = Session(**columns | {"withdrawn_at": None})
         # The number of trials is unknown for previews of scenarios that were removed.
-        known = self._trials.has(session.scenario)
-        trials = self._trials.of(session.scenario) if known else dict.fromkeys(PHASES, 1_000_000)
-        return stage_of(session, trials)
+        if self._courses.has(session.scenario):
+            return stage_of(session, self._courses.of(session.scenario))
+        return stage_of(session, Course(self._stages, dict.fromkeys(PHASES, 1_000_000)))
 
 
 def stimulus_labels(study: Study) -> dict[tuple[str, str], bool]:
