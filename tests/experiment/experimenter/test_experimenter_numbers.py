@@ -25,10 +25,12 @@ from physion.experiment.experimenter.statistics.summaries import (
 )
 from physion.experiment.experimenter.statistics.worker import StatisticsWorker
 from physion.experiment.experimenter.templating import minutes
+from physion.experiment.protocol.stages import Stage
 from physion.experiment.store.database import open_database, upgrade
 from physion.experiment.store.tables import ANSWERS, SESSIONS
 from physion.experiment.study.identity import Secrets
 from support.experiment.experimenter_rows import BROWSERS, insert_sessions
+from support.experiment.store_walk import STAGES
 from support.experiment.tiny_study import make_tiny_study
 
 
@@ -50,9 +52,11 @@ def test_there_is_no_expected_end_without_a_rate() -> None:
 
 
 def test_everybody_is_in_the_funnel_once() -> None:
-    stages = [("done", "finished")] * 5 + [("test", "left")] * 2 + [("test", "going")]
+    stages: list[tuple[Stage, str]] = [("done", "finished")] * 5
+    stages += [("test", "left"), ("test", "left"), ("test", "going")]
     stages += [("consent", "declined"), ("demographics", "withdrawn")]
-    steps = funnel([SessionSummary({}, state, stage, AnswerCounts()) for stage, state in stages])
+    part = [SessionSummary({}, state, stage, AnswerCounts()) for stage, state in stages]
+    steps = funnel(part, STAGES)
     assert [step.reached for step in steps] == [10, 9, 9, 9, 9, 6, 5, 5]
     assert [step.left for step in steps] == [0, 0, 0, 0, 2, 0, 0, 0]
     assert [step.withdrawn for step in steps] == [1, 0, 0, 0, 0, 1, 0, 0]

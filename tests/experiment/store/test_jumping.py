@@ -7,11 +7,23 @@ from typing import Any
 import pytest
 
 from physion.experiment.protocol.messages import Jump
+from physion.experiment.store.sessions import stages_of
 from physion.experiment.store.store import Store
 from physion.experiment.store.tables import SESSIONS
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.recruitment import make_pass
-from support.experiment.store_walk import STAGES, enter, give, page, refusal, rows, run, walk
+from physion.experiment.study.study import Study
+from support.experiment.store_walk import (
+    ORDER,
+    STAGES,
+    enter,
+    give,
+    page,
+    refusal,
+    rows,
+    run,
+    walk,
+)
 
 
 def preview(store: Store, secrets: Secrets) -> str:
@@ -36,6 +48,17 @@ def test_a_preview_goes_to_every_page(
     assert store.result(token).trials == 4
 
 
+def test_previews_learn_the_places_and_people_do_not(
+    sqlite_store: Store, small_study: Study, small_secrets: Secrets
+) -> None:
+    token = preview(sqlite_store, small_secrets)
+    places = run(sqlite_store.state(token)).places
+    assert places == list(stages_of(small_study)) and places[-1] == "done"
+    for texts in small_study.texts.values():
+        assert all(f"preview.{stage}" in texts for stage in ORDER)
+    assert run(sqlite_store.state(enter(sqlite_store, "Ada"))).places == []
+
+
 def test_a_trial_can_be_answered_again(store: Store, small_secrets: Secrets) -> None:
     token = walk(store, preview(store, small_secrets), "test")
     give(store, token, 0, response="yes")
@@ -55,5 +78,8 @@ def test_people_and_absent_trials_are_refused(store: Store, small_secrets: Secre
     assert rows(store, SESSIONS) == before
     token = preview(store, small_secrets)
     assert "the last one is 3" in str(refusal(store.jump(token, Jump(stage="test", trial=4))))
+    for stage in ("declined", "questions"):
+        to = Jump.model_validate({"stage": stage})
+        assert f"no {stage}" in str(refusal(store.jump(token, to)))
     simulated = enter(store, "Sim", **{"pass": make_pass(small_secrets, "simulated")})
     assert refusal(store.jump(simulated, Jump(stage="done"))).code == "bad_request"

@@ -14,7 +14,7 @@ from physion.experiment.app import build_app
 from physion.experiment.store.store import Store
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.study import Limits, Study
-from support.experiment.store_walk import PAGES, STAGES, visit_of
+from support.experiment.store_walk import OPTIONAL_PAGES, ORDER, PAGES, visit_of
 from support.experiment.tiny_study import make_tiny_study
 
 FAST = Limits(
@@ -78,7 +78,7 @@ class Person:
         return self.ask("GET", "/api/session")
 
     def page(self, name: str, status: int = 200, **data: Any) -> Any:
-        body = {"page": name, "data": data or PAGES.get(name, {})}
+        body = {"page": name, "data": data or (PAGES | OPTIONAL_PAGES).get(name, {})}
         return self.ask("POST", "/api/page", body, status)
 
     def answer(self, trial: int, phase: str = "test", status: int = 200, **more: Any) -> Any:
@@ -87,7 +87,7 @@ class Person:
     def walk(self, stage: str) -> Person:
         """Submit pages and answers until a stage is reached."""
         while (state := self.state())["stage"] != stage:
-            assert STAGES.index(state["stage"]) < STAGES.index(stage)
+            assert ORDER.index(state["stage"]) < ORDER.index(stage)
             if state["trial"] is None:
                 self.page(state["stage"])
             else:

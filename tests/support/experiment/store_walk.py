@@ -11,11 +11,13 @@ from typing import Any, TypeVar
 import pytest
 from sqlalchemy import select
 
+from physion.experiment.protocol import stages
 from physion.experiment.protocol.messages import Answer, AnswerStored, Enter, PageDone, SessionState
 from physion.experiment.store.store import Refused, Store
 from physion.experiment.store.tables import ANSWERS
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.study import Study
+from support.experiment.own_questions import OWN_ANSWERS
 from support.experiment.tiny_study import make_tiny_study
 
 T = TypeVar("T")
@@ -26,8 +28,11 @@ PAGES: dict[str, dict[str, Any]] = {
     "demographics": {"age": 31, "gender": "woman", "education": "master"},
     "feedback": {"difficulty": 2, "technical_problems": False, "text": "fine"},
 }
-STAGES = ("consent", "instructions", "familiarization", "ready", "test", "demographics",
-          "feedback", "done")  # fmt: skip
+OPTIONAL_PAGES: dict[str, dict[str, Any]] = {"questions": OWN_ANSWERS}
+"""Pages that a study has by its settings alone."""
+ORDER = tuple(stage for stage in stages.STAGES if stage not in stages.ENDED)
+STAGES = tuple(stage for stage in ORDER if stage not in OPTIONAL_PAGES)
+"""Stages of a study without further settings."""
 
 
 def run(coroutine: Coroutine[Any, Any, T]) -> T:
@@ -59,7 +64,8 @@ def give(store: Store, token: str, trial: int, phase: Any = "test", **more: Any)
 
 
 def page(store: Store, token: str, name: Any, **data: Any) -> SessionState:
-    return run(store.page(token, PageDone(page=name, data=data or PAGES.get(name, {}))))
+    usual = (PAGES | OPTIONAL_PAGES).get(name, {})
+    return run(store.page(token, PageDone(page=name, data=data or usual)))
 
 
 def walk(store: Store, token: str, stage: str) -> str:
@@ -68,7 +74,7 @@ def walk(store: Store, token: str, stage: str) -> str:
         state = run(store.state(token))
         if state.stage == stage:
             return token
-        assert STAGES.index(state.stage) < STAGES.index(stage)
+        assert ORDER.index(state.stage) < ORDER.index(stage)
         if state.trial is None:
             page(store, token, state.stage)
         else:

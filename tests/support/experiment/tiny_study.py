@@ -43,6 +43,7 @@ def make_tiny_study(
     password: str = PASSWORD,
     plausibility: Plausibility = UNCHECKED,
     prolific_id: str = "",
+    words: str = "",
     **settings: Any,
 ) -> Study:
     """Write and load a study with alternating labels (the first trial has contact).
@@ -63,6 +64,8 @@ def make_tiny_study(
         Rules of plausible sessions; by default answers may come at any time and without media.
     prolific_id
         Pattern of Prolific's ids; by default any id is allowed.
+    words
+        Lines that are added to the texts of each language.
     settings
         Fields of `Study` (``participants=3``, ``timing=Timing(cue_ms=100)``, ...).
     """
@@ -86,7 +89,9 @@ def make_tiny_study(
     study = replace(study, recruitment=replace(study.recruitment, prolific_id=prolific_id))
     (folder / TEXTS_FOLDER).mkdir(exist_ok=True)
     for language in study.languages:
-        (folder / TEXTS_FOLDER / f"{language}.toml").write_bytes(shipped_file(language))
+        (folder / TEXTS_FOLDER / f"{language}.toml").write_bytes(
+            shipped_file(language) + words.encode()
+        )
     write_settings(study)
     Secrets.create(folder)
     secret = json.loads((folder / SECRET_FILE).read_text())

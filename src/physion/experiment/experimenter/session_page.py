@@ -72,6 +72,15 @@ class SessionPage:
     events_left_out: int
     others: tuple[tuple[str, str, str], ...]
 
+    @property
+    def own_answers(self) -> list[tuple[str, str]]:
+        """Answers to the lab's own questions, by name; empty texts where none was given."""
+        given: Mapping[str, Any] = self.row["own_answers"] or {}
+        return [
+            (name, ", ".join(answer) if isinstance(answer, list) else str(answer or ""))
+            for name, answer in given.items()
+        ]
+
 
 def read_session_page(
     study: Study, engine: Engine, summaries: Sequence[SessionSummary], flags: Flags, session: str

@@ -40,6 +40,8 @@ Sessions with `simulated` = true are of simulated participants."""
 _FILES = """\
 - `trials.csv`, `trials.parquet`: one row per trial.
 - `sessions.csv`, `sessions.parquet`: one row per session.
+- `questions.csv`, `questions.parquet`: one row per session that answered the questions of the lab,
+  if it asks some.
 - `events.csv`, `events.parquet`: other events in the browser.
 - `trial_details.parquet`: times of frames and cues within each trial.
 - `stimuli.csv`: the stimuli and their outcomes. `expected.csv`: the test stimuli by scenario.
@@ -59,12 +61,14 @@ withdrew or did not consent are not included."""
 _PSYCH_DS = """\
 A Psych-DS dataset (psych-ds.github.io). A row of `..._description-trials_data.csv` is identified by
 `session`, `phase` and `trial`, a row of `..._description-sessions_data.csv` by `session`, a row of
-`..._description-events_data.csv` by `session` and `number`."""
+`..._description-events_data.csv` by `session` and `number`. If the lab asks
+questions of its own, a row of `..._description-questions_data.csv` is identified by `session`."""
 
 _BIDS = """\
 A BIDS dataset of behaviour without recordings (bids.neuroimaging.io): one file per participant and
 scenario. Familiarization trials come first; `trial_type` distinguishes them from the test.
-Participants without any answer have no file and are not listed."""
+Participants without any answer have no file and are not listed. `phenotype/questions.tsv`, if the
+lab asks questions of its own, has their answers."""
 
 
 def readme(

@@ -6,6 +6,7 @@
       README.md              description of the files
       trials.csv, .parquet   one row per trial: physion compare --responses
       sessions.csv, .parquet one row per session: physion compare --sessions
+      questions.csv, .parquet    answers to the lab's own questions, if there are any
       events.csv, .parquet   other events in the browser
       trial_details.parquet  times of frames and cues within each trial
       stimuli.csv, expected.csv   the stimuli; the test stimuli of each scenario
@@ -22,7 +23,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -31,7 +32,7 @@ import numpy as np
 import pyarrow.compute as pc
 from sqlalchemy import Connection, Engine, select
 
-from physion.analysis.people.response_schema import data_dictionary
+from physion.analysis.people.response_schema import Column, data_dictionary
 from physion.experiment.export.answer_tables import snapshot
 from physion.experiment.export.conventions.bids import BidsWriter
 from physion.experiment.export.conventions.psych_ds import write_psych_ds
@@ -53,6 +54,7 @@ from physion.version import __version__
 Layout = Literal["both", "psych-ds", "bids"]
 GONE = "its stimulus is no longer in the study folder"
 NO_FILE = "no answer yet, so no file in bids/"
+_PSYCH_DS_TABLES = ("trials", "sessions", "events", "questions")
 _SECRET_SETTINGS = ("recruitment", *EARLY_ENDS, "folder", "stimuli")
 
 
@@ -135,17 +137,22 @@ def export_study(
         report = _report(out, sessions, written)
         _write_stimuli(folder, study)
         _write_json(folder / "study.json", {"states": states})
+        described = TABLES if written.own is None else TABLES | {"questions": written.own[1]}
         dictionary: dict[str, Any] = {
-            name: data_dictionary(columns) for name, columns in TABLES.items()
+            name: data_dictionary(columns) for name, columns in described.items()
         }
         _write_json(folder / "data_dictionary.json", dictionary | {"spreadsheet_safety": RULE})
         if bids is not None:
+            if written.own is not None:
+                bids.write_questions(*written.own)
             without = bids.close(
                 name=study.title, readme=readme(study, "bids"), version=__version__
             )
             report = _with_left_out(report, "session", "any", NO_FILE, without)
         if layout != "bids":
-            _write_psych_ds(folder, study, sessions, report.until)
+            tables = [name for name in described if name in _PSYCH_DS_TABLES]
+            chosen = {name: (folder / f"{name}.csv", described[name]) for name in tables}
+            _write_psych_ds(folder, study, sessions, report.until, chosen)
         (folder / "README.md").write_text(readme(study, "export", report.facts()), "utf-8")
         known = {"package": f"physion {__version__}", "name": study.name}
         write_manifest(folder, known | {"version": study.version} | report.facts())
@@ -208,12 +215,18 @@ def _write_csv(path: Path, header: Sequence[str], rows: Sequence[Sequence[Any]])
     path.write_bytes(lines.getvalue().encode())
 
 
-def _write_psych_ds(folder: Path, study: Study, sessions: SessionTable, until: str | None) -> None:
-    """Write the Psych-DS dataset from the tables already written."""
+def _write_psych_ds(
+    folder: Path,
+    study: Study,
+    sessions: SessionTable,
+    until: str | None,
+    tables: Mapping[str, tuple[Path, Sequence[Column]]],
+) -> None:
+    """Write the Psych-DS dataset from the CSV files and columns of tables already written."""
     began = pc.min(sessions.table.column("started_at")).as_py()
     write_psych_ds(
         folder / "psych-ds",
-        {name: (folder / f"{name}.csv", TABLES[name]) for name in ("trials", "sessions", "events")},
+        tables,
         name=study.name,
         description=study.title,
         readme=readme(study, "psych-ds"),

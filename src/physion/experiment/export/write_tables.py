@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from sqlalchemy import Connection
 
-from physion.analysis.people.response_schema import SESSION_COLUMNS, TRIAL_COLUMNS
+from physion.analysis.people.response_schema import SESSION_COLUMNS, TRIAL_COLUMNS, Column
 from physion.experiment.export.conventions.bids import BidsWriter
 from physion.experiment.export.descriptions import STIMULI_COLUMNS
 from physion.experiment.export.event_tables import (
@@ -21,6 +21,12 @@ from physion.experiment.export.event_tables import (
     EVENT_COLUMNS,
     detail_table,
     read_events,
+)
+from physion.experiment.export.question_table import (
+    KEYS,
+    question_columns,
+    read_own_answers,
+    read_questions,
 )
 from physion.experiment.export.session_rows import SessionTable
 from physion.experiment.export.table_writer import TableWriter
@@ -40,11 +46,24 @@ TABLES = {
 
 @dataclass(frozen=True)
 class WrittenTables:
-    """Rows by table, answers whose stimuli no longer exist, and the latest time in the data."""
+    """What was written.
+
+    Attributes
+    ----------
+    rows
+        Rows by table.
+    gone
+        Answers whose stimuli no longer exist.
+    until
+        Latest time in the data.
+    own
+        Answers to the lab's own questions with their columns; None if there are no questions.
+    """
 
     rows: dict[str, int]
     gone: int
     until: str | None
+    own: tuple[pa.Table, tuple[Column, ...]] | None
 
 
 def write_tables(
@@ -54,7 +73,7 @@ def write_tables(
     sessions: SessionTable,
     bids: BidsWriter | None,
 ) -> WrittenTables:
-    """Write trials, sessions, events and details in one pass over the answers.
+    """Write trials, sessions, questions, events and details in one pass over the answers.
 
     Parameters
     ----------
@@ -87,6 +106,7 @@ def write_tables(
                 bids.write(part)
 
         files["sessions"].write(sessions.table)
+        own = _write_own_answers(folder, connection, study, sessions)
         for events in read_events(connection, sessions.table):
             files["events"].write(events)
         with _BackgroundWriter(write) as behind:
@@ -95,7 +115,23 @@ def write_tables(
                 latest.append(_latest(part.table, "answered_at"))
                 behind(part)
         rows = {name: file.rows for name, file in (*files.items(), ("trial_details", details))}
-    return WrittenTables(rows, gone, max(latest) or None)
+    if own is not None:
+        rows["questions"] = own[0].num_rows
+    return WrittenTables(rows, gone, max(latest) or None, own)
+
+
+def _write_own_answers(
+    folder: Path, connection: Connection, study: Study, sessions: SessionTable
+) -> tuple[pa.Table, tuple[Column, ...]] | None:
+    """Write the table of the lab's own questions, if there are any; return it and its columns."""
+    questions = read_questions(connection, study)
+    if not questions:
+        return None
+    columns = (*KEYS, *question_columns(questions))
+    table = read_own_answers(connection, questions, sessions.table)
+    with TableWriter(folder, "questions", columns) as file:
+        file.write(table)
+    return table, columns
 
 
 def _latest(table: pa.Table, column: str) -> str:

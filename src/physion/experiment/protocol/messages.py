@@ -77,6 +77,7 @@ RawId = Annotated[str, StringConstraints(min_length=1, max_length=200, strip_whi
 Key = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9-]{8,64}$")]
 VisitKey = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9-]{16,64}$")]
 Text = Annotated[str, StringConstraints(max_length=5000)]
+Names = Annotated[list[Name], Field(max_length=50)]
 Milliseconds = Annotated[float, Field(ge=0, le=DAY_MS, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=0, le=1_000_000)]
 Pixels = Annotated[int, Field(ge=0, le=100_000)]
@@ -193,12 +194,14 @@ class PageDone(Message):
     """Submission of a page between the trials; sending it twice changes nothing.
 
     Fields of ``data`` by page: ``consent`` {agreed: bool, language: optional, in which it was
-    read}; ``demographics`` {age, gender, education}; ``feedback`` {difficulty, technical_problems,
-    text}; ``instructions``, ``ready`` and ``withdraw`` {}.
+    read}; ``demographics`` {age, gender, education}; ``questions`` {NAME: answer, for each of
+    `PublicStudy.questions`}; ``feedback`` {difficulty, technical_problems, text}; ``instructions``,
+    ``ready`` and ``withdraw`` {}.
     """
 
     page: Stage | Literal["withdraw"]
-    data: Annotated[dict[Name, bool | int | float | Text | None], Field(max_length=20)] = {}
+    data: Annotated[dict[Name, bool | int | float | Text | Names | None],
+                    Field(max_length=50)] = {}  # fmt: skip
 
 
 class Jump(Message):

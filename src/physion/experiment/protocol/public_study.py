@@ -25,6 +25,16 @@ class Recruiter(Message):
     preview: Annotated[dict[str, str], Field(default_factory=dict)]
 
 
+class AskedQuestion(Message):
+    """A question of the lab; its words are in the texts, ``question.NAME``."""
+
+    name: str
+    kind: Literal["text", "choice", "choices", "scale"]
+    required: bool
+    options: list[str]
+    steps: int
+
+
 class PublicStudy(Message):
     """Settings of the study that anyone who opens the page may see."""
 
@@ -46,6 +56,8 @@ class PublicStudy(Message):
     preload: int
     """Number of trials whose media are loaded ahead."""
     interrupted: Literal["repeat", "void"]  # see `Plausibility`
+    questions: list[AskedQuestion]
+    """The lab's own questions at the end."""
     example: dict[str, TrialMedia]
     """Media of the animated example in the instructions, by scenario."""
     recruiters: list[Recruiter]

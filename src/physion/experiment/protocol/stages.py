@@ -1,8 +1,9 @@
 """Stages of a session: the one list of pages and phases, from which all others are derived.
 
 To add a page: add its stage to `Stage` and its row to `PAGES`, in the order of a session; its
-column to `store.tables` with a migration; its fields to `store.sent_pages.FIELDS`; its rendering to
-``PAGES`` in ``static/session.js``; and its label to the table ``preview`` of the texts.
+column to `store.tables` with a migration, and to `store.sessions.Session`; its fields to
+`store.sent_pages.FIELDS`; its rendering to ``PAGES`` in ``static/session.js``; and its label to the
+table ``preview`` of the texts. `store.sessions.stages_of` says which studies have it.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ Stage = Literal[
     "ready",
     "test",
     "demographics",
+    "questions",
     "feedback",
     "done",
     "declined",
@@ -43,6 +45,7 @@ PAGES: Mapping[Stage, Page] = {
     "instructions": Page("instructed_at", "Instructions"),
     "ready": Page("ready_at", "Start page"),
     "demographics": Page("demographics_at", "Demographics"),
+    "questions": Page("questions_at", "Own questions"),
     "feedback": Page("finished_at", "Feedback"),
 }
 """The pages by stage; the last one finishes the session."""

@@ -21,7 +21,7 @@ import httpx2
 from physion.errors import PhysionError, UnknownNameError
 from physion.experiment.protocol import messages as wire
 from physion.experiment.protocol.public_study import PublicStudy
-from physion.experiment.protocol.stages import Phase
+from physion.experiment.protocol.stages import ENDED, Phase
 from physion.experiment.simulated.browser import RefusedError, SimulatedBrowser, state_after
 from physion.experiment.simulated.person import TYPICAL_RT_MS, SimulatedPerson
 from physion.experiment.study.identity import Secrets
@@ -137,7 +137,7 @@ class Participation:
             self._visit.outcome = "done before"
             return
         dropout = self._person.dropout_trial(state.trials["test"], self._plan.dropouts)
-        while state.stage != "done" and not state.ended:
+        while state.stage not in ("done", *ENDED):
             if state.stage in ("familiarization", "test"):
                 state = await self._run_phase(state, dropout)
                 if state.stage == "test" and state.trial == dropout:
@@ -173,6 +173,7 @@ class Participation:
         filled: dict[str, Any] = {
             "consent": {"agreed": True},
             "demographics": self._person.demographics(),
+            "questions": self._person.own_answers(self._study.questions),
             "feedback": self._person.feedback(),
         }
         page = {"page": state.stage, "data": filled.get(state.stage, {})}

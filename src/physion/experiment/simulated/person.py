@@ -9,11 +9,13 @@ comes back gives the same answer again.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
+from physion.experiment.study.questions import Answer, Question
 from physion.experiment.study.stimuli import Stimulus
 from physion.seeds import generator
 
@@ -85,6 +87,23 @@ class SimulatedPerson:
             "gender": GENDERS[rng.integers(len(GENDERS))],
             "education": EDUCATIONS[rng.integers(len(EDUCATIONS))],
         }
+
+    def own_answers(self, questions: Sequence[Question]) -> dict[str, Answer]:
+        """Return answers to the lab's own questions, drawn at random; texts are marked."""
+        answers: dict[str, Answer] = {}
+        for question in questions:
+            rng = self._rng("question", question.name)
+            match question.kind:
+                case "text":
+                    answers[question.name] = "simulated"
+                case "scale":
+                    answers[question.name] = int(rng.integers(1, question.steps + 1))
+                case "choice":
+                    answers[question.name] = question.options[rng.integers(len(question.options))]
+                case _:
+                    chosen = [option for option in question.options if rng.random() < 0.5]
+                    answers[question.name] = chosen or [question.options[0]]
+        return answers
 
     def feedback(self) -> dict[str, bool | int | float | str | None]:
         """Return the fields of the feedback page, whose text is marked as simulated."""

@@ -4,6 +4,7 @@
  */
 
 import { el, paragraphs } from "./dom.js";
+import { choiceField, complete, field, form, submit, textField } from "./form_fields.js";
 import { bound } from "./texts.js";
 
 const GENDERS = ["female", "male", "other"];
@@ -65,30 +66,28 @@ export function demographicsPage({ texts }) {
  */
 export function feedbackPage({ texts }) {
   const { t } = bound(texts);
+  const required = t("common.required");
+  const [levels, problems] = [[1, 2, 3, 4, 5], ["yes", "no"]];
   return (page, done) => {
-    const difficulty = radios(
+    const difficulty = choiceField(
       "difficulty",
       t("feedback.difficulty"),
-      [1, 2, 3, 4, 5].map((value) => [value, t(`feedback.difficulty_${value}`)]),
-      t,
+      levels.map((value) => [String(value), t(`feedback.difficulty_${value}`)]),
+      { required, style: "radios-5" },
     );
-    const technical = radios(
+    const technical = choiceField(
       "technical",
       t("feedback.technical"),
-      [
-        ["yes", t("feedback.technical_yes")],
-        ["no", t("feedback.technical_no")],
-      ],
-      t,
+      problems.map((value) => [value, t(`feedback.technical_${value}`)]),
+      { required },
     );
-    const text = el("textarea", { id: "text", rows: 3, maxlength: 5000 });
+    const text = textField("text", t("feedback.text"), { most: 5000, required: null });
     const send = () => {
-      const missing = [difficulty, technical].filter((group) => !group.check());
-      if (missing.length > 0) return missing[0].focus();
-      return done({
+      if (!complete([difficulty, technical])) return;
+      done({
         difficulty: Number(difficulty.value()),
         technical_problems: technical.value() === "yes",
-        text: text.value,
+        text: text.value() ?? "",
       });
     };
     page.append(
@@ -97,7 +96,7 @@ export function feedbackPage({ texts }) {
         send,
         difficulty.element,
         technical.element,
-        field("text", t("feedback.text"), text),
+        text.element,
         el("div", { class: "buttons" }, submit(t("feedback.send"))),
       ),
     );
@@ -115,23 +114,6 @@ function readAge(text) {
   return years >= AGES[0] && years <= AGES[1] ? years : NaN;
 }
 
-function form(send, ...children) {
-  const element = el("form", { novalidate: true }, ...children);
-  element.addEventListener("submit", (event) => {
-    event.preventDefault();
-    send();
-  });
-  return element;
-}
-
-function submit(label) {
-  return el("button", { type: "submit", class: "button" }, label);
-}
-
-function field(id, label, control, ...more) {
-  return el("div", { class: "field" }, el("label", { for: id }, label), control, ...more);
-}
-
 /** Create a select box with an empty first option. */
 function selectOf(name, values, t) {
   const options = [
@@ -139,33 +121,4 @@ function selectOf(name, values, t) {
     ...values.map((value) => el("option", { value }, t(`demographics.${name}_${value}`))),
   ];
   return el("select", { id: name }, ...options);
-}
-
-/** Create a group of radio buttons of which one must be chosen. */
-function radios(name, question, choices, t) {
-  const wrong = el("p", { class: "wrong", id: `${name}-wrong`, role: "alert" });
-  const inputs = choices.map(([value]) =>
-    el("input", { type: "radio", name, value, id: `${name}-${value}` }),
-  );
-  const labels = choices.map(([value, label], index) =>
-    el("label", { class: "radio", for: `${name}-${value}` }, inputs[index], label),
-  );
-  const row = el("div", { class: `radios radios-${choices.length}` }, ...labels);
-  const described = { role: "radiogroup", "aria-describedby": wrong.id };
-  const element = el("fieldset", described, el("legend", {}, question), row, wrong);
-  const chosen = () => inputs.find((input) => input.checked);
-  const showError = (text) => {
-    wrong.textContent = text;
-    element.setAttribute("aria-invalid", String(text !== ""));
-  };
-  element.addEventListener("change", () => showError(""));
-  return {
-    element,
-    value: () => chosen()?.value ?? "",
-    focus: () => inputs[0].focus(),
-    check() {
-      showError(chosen() ? "" : t("common.required"));
-      return Boolean(chosen());
-    },
-  };
 }

@@ -148,6 +148,14 @@ export interface Recruiter {
   preview: Record<string, string>;
 }
 
+export interface AskedQuestion {
+  name: string;
+  kind: "text" | "choice" | "choices" | "scale";
+  required: boolean;
+  options: string[];
+  steps: number;
+}
+
 export interface PublicStudy {
   title: string;
   contact: string;
@@ -164,6 +172,7 @@ export interface PublicStudy {
   break_every: number;
   preload: number;
   interrupted: "repeat" | "void";
+  questions: AskedQuestion[];
   example: Record<string, TrialMedia>;
   recruiters: Recruiter[];
   device_refused: Record<string, Completion>;

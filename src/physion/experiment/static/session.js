@@ -17,6 +17,7 @@ import * as pages from "./pages.js";
 import { PredictionTrial } from "./prediction_trial.js";
 import { newKey } from "./random_key.js";
 import { dueFeedback, forgetFeedback, rememberFeedback } from "./remembered.js";
+import { questionPage } from "./question_page.js";
 import { resultPage } from "./result_page.js";
 import { announce, newShowing } from "./showings.js";
 import { feedbackPieces, trialPieces } from "./trial_pieces.js";
@@ -26,6 +27,7 @@ const PAGES = {
   instructions: pages.instructionsPages,
   ready: pages.readyPage,
   demographics: demographicsPage,
+  questions: questionPage,
   feedback: feedbackPage,
 };
 

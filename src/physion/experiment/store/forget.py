@@ -28,7 +28,8 @@ if TYPE_CHECKING:
     from physion.experiment.store.store import Store
 
 _EMPTIED = dict.fromkeys((
-    "instructed_at", "ready_at", "demographics_at", "finished_at", "loaded_at_phase",
+    "instructed_at", "ready_at", "demographics_at", "questions_at", "finished_at", "own_answers",
+    "questions_study", "loaded_at_phase",
     "loaded_at_trial", "browser", "progressed_at", "next_from", "implausible", "age", "gender",
     "education", "difficulty", "technical_problems", "feedback",
 )) | {"answered_familiarization": 0, "answered_test": 0, "fast_answers": 0, "unfetched": 0,

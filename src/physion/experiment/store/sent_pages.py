@@ -20,6 +20,7 @@ from physion.experiment.store.sessions import (
     storable,
 )
 from physion.experiment.store.tables import EVENTS, RAW_IDS, SESSIONS
+from physion.experiment.study.questions import check_answers
 from physion.experiment.study.study import Study
 
 MIN_AGE, MAX_AGE = 18, 130
@@ -85,7 +86,7 @@ OPTIONAL: Mapping[str, Mapping[str, Callable[[Any], Any]]] = {"consent": {"langu
 """Optional fields of each page."""
 
 
-def check_page(done: PageDone) -> dict[str, Any]:
+def check_page(study: Study, done: PageDone) -> dict[str, Any]:
     """Return the validated values of a page.
 
     Raises
@@ -93,6 +94,8 @@ def check_page(done: PageDone) -> dict[str, Any]:
     Refused
         A field is missing, invalid or unknown; the message names the first one.
     """
+    if done.page == "questions":
+        return _check_own_questions(study, done.data)
     if done.page not in FIELDS:
         raise Refused("bad_request", f"page: {done.page} is no page that is submitted")
     optional = OPTIONAL.get(done.page, {})
@@ -110,6 +113,17 @@ def check_page(done: PageDone) -> dict[str, Any]:
         except (ValueError, OverflowError) as error:
             raise Refused("bad_request", f"data.{name}: {error}") from None
     return values
+
+
+def _check_own_questions(study: Study, data: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the validated answers to the lab's own questions."""
+    given = {
+        name: storable(value) if isinstance(value, str) else value for name, value in data.items()
+    }
+    try:
+        return {"own_answers": check_answers(study.questions, given)}
+    except ValueError as error:
+        raise Refused("bad_request", f"data.{error}") from None
 
 
 def submit_page(
@@ -188,6 +202,8 @@ def _columns(
             return {"consent_version": study.consent_version, **language}
         case "demographics":
             return dict(values)
+        case "questions":
+            return {**values, "questions_study": study.digest}
         case "feedback":
             return {
                 "implausible": reasons(study, session, now),

@@ -40,6 +40,7 @@ class Session:
     instructed_at: float | None
     ready_at: float | None
     demographics_at: float | None
+    questions_at: float | None
     finished_at: float | None
     withdrawn_at: float | None
     closed_at: float | None
@@ -67,7 +68,11 @@ _BY_TOKEN = (
 
 def stages_of(study: Study) -> tuple[Stage, ...]:
     """Return the stages of a study's sessions in order, ``done`` last."""
-    return tuple(stage for stage in STAGES if stage not in ENDED)
+    absent = {
+        "demographics": not study.demographics,
+        "questions": not study.questions,
+    }
+    return tuple(stage for stage in STAGES if stage not in ENDED and not absent.get(stage))
 
 
 class Courses:

@@ -158,7 +158,7 @@ class Store:
 
     async def page(self, token: str, done: PageDone) -> SessionState:
         """Store a submitted page and return the new state."""
-        values, now = check_page(done), time.time()
+        values, now = check_page(self.study, done), time.time()
 
         def submit(connection: Connection) -> SessionState:
             session, course = self._read_session(connection, token)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -11,6 +12,7 @@ from sqlalchemy import ColumnElement, Connection, func, select, update
 from physion.errors import BadInputError
 from physion.experiment.store.sessions import insert_or_skip
 from physion.experiment.store.tables import SESSIONS, STUDIES
+from physion.experiment.study.questions import Question, columns_of
 from physion.experiment.study.study import STUDY_FILE, Study
 
 
@@ -22,8 +24,8 @@ def register(connection: Connection, study: Study, now: float) -> None:
     Raises
     ------
     BadInputError
-        There are sessions (of people or simulated participants) with other stimuli, or of a
-        scenario that the study no longer has.
+        There are sessions (of people or simulated participants) with other stimuli, of a scenario
+        that the study no longer has, or with answers to another question of the same name.
     """
     other = SESSIONS.c.session.in_(
         select(SESSIONS.c.session)
@@ -45,6 +47,7 @@ def register(connection: Connection, study: Study, now: float) -> None:
             "links of the other scenarios), or create a new study folder (or give another "
             "database) without it"
         )
+    _check_questions(connection, study)
     # Previews are not data: those that cannot continue are ended.
     ended = (other | gone) & SESSIONS.c.finished_at.is_(None) & SESSIONS.c.withdrawn_at.is_(None)
     connection.execute(update(SESSIONS).where(ended).values(withdrawn_at=now, closed_at=now))
@@ -59,6 +62,28 @@ def register(connection: Connection, study: Study, now: float) -> None:
             "first_served": now,
         },
     )
+
+
+def _check_questions(connection: Connection, study: Study) -> None:
+    """Refuse a question that was of another kind, or had another scale, when it was answered."""
+    forms = {column: form for each in study.questions for column, form in _forms(vars(each))}
+    answered = select(SESSIONS.c.questions_study).where(SESSIONS.c.kind != "preview").distinct()
+    versions = select(STUDIES.c.settings).where(STUDIES.c.digest.in_(answered))
+    for (settings,) in connection.execute(versions):
+        for entry in settings.get("questions", ()):
+            for column, form in _forms(entry):
+                if forms.get(column, form) != form:
+                    raise BadInputError(
+                        f"the question {column} was answered in another form ({form[1]}); give "
+                        f"the changed question another name in {STUDY_FILE}"
+                    )
+
+
+def _forms(entry: Mapping[str, Any]) -> list[tuple[str, tuple[str, str, int]]]:
+    """Return the columns of a question, each with what its values depend on."""
+    question = Question(**{**entry, "options": tuple(entry["options"])})
+    steps = question.steps if question.kind == "scale" else 0
+    return [(column, (question.name, question.kind, steps)) for column in columns_of(question)]
 
 
 def _by_scenario(connection: Connection, which: ColumnElement[bool]) -> dict[str, int]:

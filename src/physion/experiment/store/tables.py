@@ -84,6 +84,8 @@ SESSIONS = Table(
     Column("instructed_at", Float),
     Column("ready_at", Float),
     Column("demographics_at", Float),
+    Column("questions_at", Float),
+    Column("questions_study", String(64)),
     Column("finished_at", Float),
     Column("withdrawn_at", Float),
     Column("closed_at", Float),
@@ -107,6 +109,7 @@ SESSIONS = Table(
     Column("difficulty", Integer),
     Column("technical_problems", Boolean),
     Column("feedback", Text),
+    Column("own_answers", JSON(none_as_null=True)),
     Column("device", JSON, nullable=False),
     UniqueConstraint("participant", "scenario"),
     CheckConstraint("kind IN ('person', 'simulated', 'preview')", name="kind"),
@@ -116,6 +119,8 @@ SESSIONS = Table(
 """Sessions. ``kind`` is written when the session begins and never changed. ``order_number`` is the
 number of the prepared order, 0 if the study has none; ``order_seed`` and the stimuli determine the
 order of the trials. ``loaded_at_*``: the trial that was next when the page was last reloaded.
+``own_answers``: answers to the lab's own questions, by name; ``questions_study``: digest of the
+version of the study that asked them.
 ``closed_at``: when the lab ended the session for good, so that the participant cannot take it up
 again: its data were deleted, or it was a preview of other stimuli. ``voided_at``: when the lab
 decided that the session does not count.

@@ -22,6 +22,8 @@ from typing import Any
 
 from physion.atomic import write_atomic
 from physion.errors import BadInputError
+from physion.experiment.study import questions
+from physion.experiment.study.questions import Question, parse_questions
 from physion.experiment.study.settings import (
     EARLY_ENDS,
     Bonus,
@@ -34,7 +36,13 @@ from physion.experiment.study.settings import (
 )
 from physion.experiment.study.stimuli import MAX_BYTES as MAX_STIMULI_BYTES
 from physion.experiment.study.stimuli import PHASES, STIMULI_FILE, Stimulus, parse_stimuli
-from physion.experiment.study.study_file import check_tables, format_tables, parse_toml
+from physion.experiment.study.study_file import (
+    check_list,
+    check_tables,
+    format_list,
+    format_tables,
+    parse_toml,
+)
 from physion.experiment.study.texts import TEXTS_FOLDER, read_consent_file, read_texts
 from physion.plain_files import check_plain, read_ids, read_plain
 
@@ -87,6 +95,8 @@ class Study:
         Number of other finished participants needed before a percentile is shown.
     preload
         Number of trials loaded ahead of the current one.
+    demographics
+        Whether age, gender and education are asked.
     embed_from
         Sites that may show the pages in a frame (MTurk); none by default.
     timing, screen, plausibility, recruitment, limits
@@ -96,6 +106,8 @@ class Study:
         the movies, and who came when the study was full.
     bonus
         The rule of the bonus in the table of payments.
+    questions
+        The lab's own questions at the end.
     allowed_ids
         Ids of the allow list; None if the study has none.
     stimuli
@@ -124,6 +136,7 @@ class Study:
     exclusions: str = "preregistered"
     percentile_from: int = 10
     preload: int = 8
+    demographics: bool = True
     embed_from: tuple[str, ...] = ()
     timing: Timing = field(default=Timing())
     screen: Screen = field(default=Screen())
@@ -135,6 +148,7 @@ class Study:
     full: EarlyEnd = field(default=EarlyEnd())
     bonus: Bonus = field(default=Bonus())
     limits: Limits = field(default=Limits())
+    questions: tuple[Question, ...] = ()
     stimuli: tuple[Stimulus, ...] = ()
     allowed_ids: frozenset[str] | None = field(default=None, repr=False)
     texts: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
@@ -182,7 +196,9 @@ def load_study(folder: Path | str) -> Study:
     study = replace(parse_settings(parse_toml(path, content), path), folder=folder)
     texts, files, written = {}, {}, []
     for language in study.languages:
-        texts[language], text_file = read_texts(folder / TEXTS_FOLDER, language, study.scenarios)
+        texts[language], text_file = read_texts(
+            folder / TEXTS_FOLDER, language, study.scenarios, own_text_keys(study)
+        )
         written.append(text_file)
         consent = read_consent_file(folder / TEXTS_FOLDER, language)
         if consent is not None:
@@ -210,9 +226,10 @@ def parse_settings(table: Mapping[str, Any], path: Path) -> Study:
     Stimuli and texts are left empty. ``path`` is the path of the file, which need not exist yet.
     Raises the errors of `load_study`.
     """
-    values = check_tables(table, path)
+    values = check_tables(table, path, ("questions",))
     parts = {name: part(**values[name]) for name, part in _PARTS.items()}
-    return Study(folder=path.parent, **values[""], **parts)
+    asked = parse_questions(check_list(table, path, "questions", questions.KEYS), path)
+    return Study(folder=path.parent, **values[""], **parts, questions=asked)
 
 
 def format_settings(study: Study) -> str:
@@ -221,7 +238,16 @@ def format_settings(study: Study) -> str:
     Raises `BadInputError`, naming the key, if a value is not allowed in the file.
     """
     values = {name: vars(getattr(study, name)) for name in _PARTS}
-    return format_tables({"": vars(study), **values}, study.folder / STUDY_FILE)
+    path = study.folder / STUDY_FILE
+    asked = [vars(question) for question in study.questions]
+    return format_tables({"": vars(study), **values}, path) + format_list(
+        "questions", questions.KEYS, questions.ABOUT, asked, path
+    )
+
+
+def own_text_keys(study: Study) -> tuple[str, ...]:
+    """Return the keys of the texts that a study needs for its own questions."""
+    return tuple(key for question in study.questions for key in question.text_keys)
 
 
 def write_settings(study: Study) -> Path:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from physion.errors import BadInputError, UnknownNameError
 from physion.experiment.study.study_checks import KEYS, TABLES, Key
 
+MOST_ENTRIES = 50
+"""Tables of one list."""
 HEAD = """\
 # Settings of this study. Texts are in texts/, stimuli in stimuli.csv (which is never served).
 # To run it: physion experiment serve FOLDER
@@ -25,10 +27,13 @@ def parse_toml(path: Path, content: bytes) -> dict[str, Any]:
         raise BadInputError(f"{path} is not TOML: {error}") from error
 
 
-def check_tables(tables: Mapping[str, Any], path: Path) -> dict[str, dict[str, Any]]:
+def check_tables(
+    tables: Mapping[str, Any], path: Path, lists: Collection[str] = ()
+) -> dict[str, dict[str, Any]]:
     """Check all values of a ``study.toml``; return them by table (empty: top level) and key.
 
-    Optional keys that are missing in the file are missing in the result.
+    Optional keys that are missing in the file are missing in the result. ``lists``: names of lists
+    of tables, which `check_list` reads.
 
     Raises
     ------
@@ -36,20 +41,61 @@ def check_tables(tables: Mapping[str, Any], path: Path) -> dict[str, dict[str, A
         A value is not allowed, or a key is missing or unknown. The message names the file, the key
         and the allowed values, or the known keys closest to an unknown one.
     """
-    top = {key.name for key in KEYS if not key.table} | set(TABLES)
+    top = {key.name for key in KEYS if not key.table} | {*TABLES, *lists}
     _refuse_unknown(path, "", tables, top)
     values: dict[str, dict[str, Any]] = {name: {} for name in ("", *TABLES)}
     for name in TABLES:
         part = tables.get(name, {})
         if not isinstance(part, Mapping):
             raise BadInputError(f"{path}: {name} must be a table, [{name}], not {part!r}")
-        _refuse_unknown(path, name, part, {key.name for key in KEYS if key.table == name})
-    for key in KEYS:
-        given = tables.get(key.table, {}) if key.table else tables
+        _refuse_unknown(path, f"[{name}]", part, {key.name for key in KEYS if key.table == name})
+    for table, part in values.items():
+        given = tables.get(table, {}) if table else tables
+        part |= _check_keys(path, [key for key in KEYS if key.table == table], given)
+    return values
+
+
+def check_list(
+    tables: Mapping[str, Any], path: Path, name: str, keys: Sequence[Key]
+) -> list[dict[str, Any]]:
+    """Check a list of tables ``[[NAME]]`` of a ``study.toml``; return the values of each by key.
+
+    Raises the errors of `check_tables`.
+    """
+    entries = tables.get(name, [])
+    if not isinstance(entries, list) or not all(isinstance(entry, Mapping) for entry in entries):
+        raise BadInputError(f"{path}: {name} must be tables, [[{name}]], not {entries!r:.100}")
+    if len(entries) > MOST_ENTRIES:
+        raise BadInputError(f"{path}: there can be at most {MOST_ENTRIES} tables [[{name}]]")
+    for entry in entries:
+        _refuse_unknown(path, f"[[{name}]]", entry, {key.name for key in keys})
+    return [_check_keys(path, keys, entry) for entry in entries]
+
+
+def format_list(
+    name: str, keys: Sequence[Key], about: str, entries: Sequence[Mapping[str, Any]], path: Path
+) -> str:
+    """Return the text of a list of tables ``[[NAME]]``, as `check_list` reads it.
+
+    ``about`` and the meanings of the keys are written as comments above the list.
+    """
+    comments = [*about.splitlines(), *(f"  {key.name}: {key.about}" for key in keys)]
+    lines = ["\n", *(f"# {line}\n" for line in comments)]
+    for entry in entries:
+        lines.append(f"\n[[{name}]]\n")
+        lines += [f"{k.name} = {_toml(_checked(path, k, entry[k.name]))}\n" for k in keys]
+    return "".join(lines)
+
+
+def _check_keys(path: Path, keys: Sequence[Key], given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the checked values of the given keys; refuse a required one that is missing."""
+    values = {}
+    for key in keys:
         if key.name in given:
-            values[key.table][key.name] = _checked(path, key, given[key.name])
+            values[key.name] = _checked(path, key, given[key.name])
         elif key.required:
-            raise BadInputError(f"{path} lacks {key.name}: {' '.join(key.about.split())}")
+            where = f"{path}, [[{key.table}]]," if key.table else str(path)
+            raise BadInputError(f"{where} lacks {key.name}: {' '.join(key.about.split())}")
     return values
 
 
@@ -83,7 +129,7 @@ def _checked(path: Path, key: Key, value: Any) -> Any:
 def _refuse_unknown(path: Path, table: str, given: Mapping[str, Any], known: set[str]) -> None:
     for name in given:
         if name not in known:
-            where = f"{path}, [{table}]" if table else str(path)
+            where = f"{path}, {table}" if table else str(path)
             raise BadInputError(f"{where}: {UnknownNameError('key', name, known)}")
 
 

@@ -6,7 +6,8 @@ has its own copies, so that a lab can edit every text.
 
 Some texts may be absent: ``study.title``, in place of the title of ``study.toml``;
 ``consent.check_1`` to ``consent.check_9``, boxes that must be ticked to agree; and
-``scenario.NAME.KEY``, in place of the text ``KEY`` in the sessions of one scenario. A file
+``scenario.NAME.KEY``, in place of the text ``KEY`` in the sessions of one scenario. The texts of
+a study's own questions (`questions.Question.text_keys`) are needed in each language. A file
 ``consent-LANGUAGE.pdf`` beside the texts is the consent form as a file.
 """
 
@@ -33,7 +34,7 @@ _PLACEHOLDER = re.compile(r"\{([a-z_]+)\}")
 
 
 def read_texts(
-    folder: Path, language: str, scenarios: Sequence[str] = ()
+    folder: Path, language: str, scenarios: Sequence[str] = (), own: Sequence[str] = ()
 ) -> tuple[dict[str, str], bytes]:
     """Read and check the texts of a language; return them by key, and the bytes of the file.
 
@@ -45,6 +46,8 @@ def read_texts(
         Language of the file to read.
     scenarios
         Scenarios that may have texts of their own.
+    own
+        Keys of the texts of the study's own questions, which are needed too.
 
     Raises
     ------
@@ -57,13 +60,16 @@ def read_texts(
     wanted = shipped_texts()
     for key in texts:
         general = _general_key(key, scenarios)
-        if general not in (*wanted, *OPTIONAL):
+        if general not in (*wanted, *OPTIONAL, *own):
             raise BadInputError(f"{path}: {UnknownNameError('text', general, wanted)}")
     for key, original in wanted.items():
         if key not in texts:
             raise BadInputError(
                 f"{path} lacks the text {key}; in English it is: {original[:100]!r}"
             )
+    for key in own:
+        if key not in texts:
+            raise BadInputError(f"{path} lacks the text {key} of a question of study.toml")
     for key, written in texts.items():
         general = _general_key(key, scenarios)
         known = set(_PLACEHOLDER.findall(wanted.get(general, "")))

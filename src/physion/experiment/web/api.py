@@ -20,7 +20,7 @@ from physion.experiment.protocol.messages import (
     Showing,
     TrialMedia,
 )
-from physion.experiment.protocol.public_study import PublicStudy
+from physion.experiment.protocol.public_study import AskedQuestion, PublicStudy
 from physion.experiment.study.media_links import sign_media
 from physion.experiment.study.recruitment import RECRUITERS, ending_completion, is_mturk_preview
 from physion.experiment.study.stimuli import PHASES
@@ -32,6 +32,7 @@ from physion.experiment.web.refusals import Reply, refuse
 if TYPE_CHECKING:
     from physion.experiment.store.store import Store
     from physion.experiment.study.identity import Secrets
+    from physion.experiment.study.questions import Question
     from physion.experiment.study.study import Study
 
 SHOWN: tuple[Literal["movie"], Literal["map"]] = ("movie", "map")
@@ -55,12 +56,19 @@ def public_study(study: Study, secrets: Secrets) -> PublicStudy:
         break_every=study.timing.break_every,
         preload=study.preload,
         interrupted=cast(Literal["repeat", "void"], study.plausibility.interrupted),
+        questions=[_asked(question) for question in study.questions],
         example={name: _example(study, secrets, name) for name in study.scenarios},
         recruiters=list(RECRUITERS),
         device_refused={
             one.source: ending_completion(study.device_refused, one.source) for one in RECRUITERS
         },
     )
+
+
+def _asked(question: Question) -> AskedQuestion:
+    """Return what the page needs to ask a question of the lab."""
+    values = {**vars(question), "options": list(question.options)}
+    return AskedQuestion.model_validate(values)
 
 
 def _example(study: Study, secrets: Secrets, scenario: str) -> TrialMedia:

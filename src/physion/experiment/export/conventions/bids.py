@@ -8,7 +8,9 @@
 
 If a study has several scenarios, each is a BIDS session: folders and names contain
 ``ses-<scenario>``, and ``sub-<participant>_sessions.tsv`` (with ``sessions.json``) describes the
-sessions. Empty cells are ``n/a``. See bids-specification.readthedocs.io, behavioral experiments.
+sessions. Answers to the lab's own questions are in ``phenotype/questions.tsv``, described in
+``phenotype/questions.json``. Empty cells are ``n/a``. See bids-specification.readthedocs.io,
+behavioral experiments.
 """
 
 from __future__ import annotations
@@ -91,6 +93,30 @@ class BidsWriter:
                 file.write(rows[begin:end])
             begin = end
             self._answered.append(at)
+
+    def write_questions(self, answers: pa.Table, columns: Sequence[Column]) -> None:
+        """Write the answers to the lab's own questions of the sessions that have a file.
+
+        ``columns`` begin with participant and session, which get their BIDS names.
+        """
+        session = self._sessions.column("session").to_pylist()
+        labels = {session[at]: f"ses-{self._labels[self._scenarios[at]]}" for at in self._answered}
+        own = columns[2:]
+        keys = ["participant_id", *(["session_id"] if self._several else [])]
+        lines = [_line([*keys, *(column.name for column in own)])]
+        for row in answers.to_pylist():
+            if row["session"] in labels:
+                names = [f"sub-{row['participant']}", labels[row["session"]]][: len(keys)]
+                lines.append(_line([*names, *(_cell(row[column.name]) for column in own)]))
+        folder = Path(self._folder) / "phenotype"
+        folder.mkdir()
+        (folder / "questions.tsv").write_bytes("".join(lines).encode())
+        tool = {"MeasurementToolMetadata": {"Description": "Questions of the lab at the end"}}
+        described = {"participant_id": _PARTICIPANT, "session_id": _SESSION}
+        _write_json(
+            folder / "questions.json",
+            tool | {key: described[key] for key in keys} | describe(own),
+        )
 
     def close(self, *, name: str, readme: str, version: str) -> int:
         """Write the files of the whole dataset; return how many sessions had no answers.
@@ -177,7 +203,7 @@ def describe(columns: Sequence[Column]) -> dict[str, dict[str, Any]]:
     entries = {}
     for column in columns:
         about = column.about
-        if column.kind == "text" and column.name in _TEXTS:
+        if column.kind == "text" and column.name not in _PLAIN:
             about = f"{about}. {TEXT_RULE}"
         entry: dict[str, Any] = {"Description": about}
         if column.unit:
@@ -188,11 +214,8 @@ def describe(columns: Sequence[Column]) -> dict[str, dict[str, Any]]:
     return entries
 
 
-_TEXTS = frozenset(
-    column.name
-    for column in SESSION_COLUMNS
-    if column.kind == "text" and column.name not in ("participant", "session", "scenario")
-)
+_PLAIN = ("participant", "session", "scenario", "stimulus")
+"""Text columns whose values never need the rule."""
 
 
 def _beh_table(trials: pa.Table) -> pa.Table:

@@ -1,0 +1,60 @@
+"""The page with the lab's own questions, in a real browser."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
+
+from physion.experiment.study.identity import Secrets
+from physion.experiment.study.recruitment import make_pass
+from support.experiment.browser import Visit, chromium, rows_of, served
+from support.experiment.own_questions import OWN_ANSWERS, OWN_QUESTIONS, OWN_WORDS
+
+__all__ = ["chromium"]
+pytestmark = pytest.mark.slow
+
+
+def test_own_questions_are_asked_and_stored(chromium: Any, tmp_path: Path) -> None:
+    asked = {"questions": OWN_QUESTIONS, "words": OWN_WORDS, "demographics": False}
+    with (
+        served(tmp_path, test=1, familiarization=1, **asked) as (study, server),
+        Visit(chromium, server.url, "questions") as visit,
+    ):
+        page = visit.page
+        visit.begin("?participant=Ada&language=en")
+        visit.practise(1)
+        visit.begin_test()
+        visit.answer("yes")
+        visit.heading("Some more questions")
+        visit.picture("empty")
+        visit.main_button().click()
+        assert page.get_by_text("Please answer this question.").count() == 2
+        assert page.evaluate("document.activeElement.name") == "q-games"
+        visit.picture("missing")
+        page.fill("#q-strategy", OWN_ANSWERS["strategy"])
+        page.get_by_label("Often").check()
+        for device in ("Telephone", "Computer"):
+            page.get_by_label(device).check()
+        page.get_by_role("radiogroup", name="How sure were you?").get_by_label("4").check()
+        visit.picture("answered")
+        visit.main_button().click()
+        page.check("#difficulty-4")
+        page.check("#technical-no")
+        visit.main_button().click()
+        page.locator("#code").wait_for()
+        assert visit.unexpected() == []
+        session, _, _ = rows_of(study, "Ada")
+        assert session.own_answers == OWN_ANSWERS | {"devices": ["phone", "computer"]}
+        # The page is in the list of a preview, which the server gives.
+        visit.go(f"?pass={make_pass(Secrets.load(study.folder), 'preview')}")
+        places = page.locator("#jump-stage option")
+        places.first.wait_for(state="attached")
+        named = [place.get_attribute("value") for place in places.all()]
+        assert "questions" in named and "demographics" not in named
+        page.select_option("#jump-stage", "questions")
+        page.get_by_role("button", name="Go there").click()
+        visit.heading("Some more questions")

@@ -1,0 +1,88 @@
+"""The lab's own questions: settings, texts and valid answers."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from physion.errors import BadInputError
+from physion.experiment.study.questions import Question, check_answers, columns_of
+from physion.experiment.study.study import format_settings, load_study, parse_settings
+from support.experiment.own_questions import OWN_ANSWERS, OWN_QUESTIONS, OWN_WORDS
+from support.experiment.tiny_study import make_tiny_study
+
+
+def test_questions_are_written_and_read_back(tmp_path: Path) -> None:
+    study = make_tiny_study(tmp_path, test=1, familiarization=1, questions=OWN_QUESTIONS,
+                            words=OWN_WORDS)  # fmt: skip
+    assert study.questions == OWN_QUESTIONS == load_study(tmp_path).questions
+    assert study.texts["de"]["question.games.options.never"] == "Never"
+    path = tmp_path / "texts" / "de.toml"
+    path.write_text(path.read_text().replace('high = "Very"\n', ""))
+    with pytest.raises(BadInputError, match=r"de\.toml lacks the text question\.confidence\.high"):
+        load_study(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("question", "told"),
+    [
+        ({"name": "Games", "kind": "text"}, "questions.name must be a word of small letters"),
+        ({"name": "games"}, "lacks kind"),
+        ({"name": "games", "kind": "text", "step": 3}, "unknown key"),
+        ({"name": "games", "kind": "choice", "options": ["one"]}, "games needs options"),
+        ({"name": "games", "kind": "scale", "options": ["a", "b"]}, "games has options"),
+        ({"name": "games", "kind": "scale", "steps": 1}, "from 2 to 11"),
+        ({"name": "session", "kind": "text"}, "a second column session"),
+        ({"name": "a_b", "kind": "text"}, "a second column a_b"),
+    ],
+)
+def test_what_is_no_question_is_refused(
+    tmp_path: Path, question: dict[str, Any], told: str
+) -> None:
+    study = make_tiny_study(tmp_path, test=1, familiarization=1)
+    tables = tomllib.loads(format_settings(study))
+    first = {"name": "a", "kind": "choices", "options": ["b", "c"]}
+    with pytest.raises(BadInputError, match=told):
+        parse_settings(tables | {"questions": [first, question]}, tmp_path / "study.toml")
+    texts = [{"name": f"q{number}", "kind": "text"} for number in range(10)]
+    with pytest.raises(BadInputError, match="at most 9"):
+        parse_settings(tables | {"questions": texts}, tmp_path / "study.toml")
+
+
+def test_valid_answers_are_kept() -> None:
+    found = check_answers(OWN_QUESTIONS, OWN_ANSWERS)
+    assert found == OWN_ANSWERS | {"devices": ["phone", "computer"]}
+    left_open = {**OWN_ANSWERS, "strategy": "  ", "devices": []}
+    found = check_answers(OWN_QUESTIONS, left_open)
+    assert found["strategy"] is None and found["devices"] == []
+    assert columns_of(OWN_QUESTIONS[2]) == ("devices_phone", "devices_console", "devices_computer")
+
+
+BAD = {
+    "games": [None, "daily", 1, ["never"]],
+    "confidence": [None, 0, 6, 2.5, True, "3"],
+    "strategy": [3, "x" * 2001],
+    "devices": [None, "phone", ["phone", "phone"], ["tablet"], [["phone"]]],
+}
+
+
+@pytest.mark.parametrize(("name", "value"), [(n, v) for n, values in BAD.items() for v in values])
+def test_invalid_answers_are_refused(name: str, value: Any) -> None:
+    with pytest.raises(ValueError, match=name):
+        check_answers(OWN_QUESTIONS, OWN_ANSWERS | {name: value})
+
+
+def test_each_question_is_answered_and_no_other() -> None:
+    for name in OWN_ANSWERS:
+        with pytest.raises(ValueError, match=f"{name} is missing"):
+            check_answers(OWN_QUESTIONS, {k: v for k, v in OWN_ANSWERS.items() if k != name})
+    with pytest.raises(ValueError, match="'other' is no question"):
+        check_answers(OWN_QUESTIONS, OWN_ANSWERS | {"other": "x"})
+    needed = replace(OWN_QUESTIONS[2], required=True)
+    with pytest.raises(ValueError, match="an answer is required"):
+        check_answers([needed], {"devices": []})
+    assert check_answers([Question("a", "scale")], {"a": None}) == {"a": None}
