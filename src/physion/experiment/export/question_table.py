@@ -1,6 +1,6 @@
 """The exported table of answers to the lab's own questions: one row per session that sent them.
 
-Columns are the questions of all versions of the study that were served; the latest words describe
+Columns are the questions of all versions of the study that were served; the latest texts describe
 them. A question with any number of options has one column for each option.
 """
 
@@ -58,7 +58,7 @@ def question_columns(
 
 
 def _columns(question: Question, texts: Mapping[str, str]) -> list[Column]:
-    """Return the columns of one question, described in its words."""
+    """Return the columns of one question, described by its texts."""
     key = f"question.{question.name}"
     words = " ".join(texts[f"{key}.text"].split())
     labels = {option: texts[f"{key}.options.{option}"] for option in question.options}

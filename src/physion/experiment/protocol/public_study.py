@@ -26,7 +26,7 @@ class Recruiter(Message):
 
 
 class AskedQuestion(Message):
-    """A question of the lab; its words are in the texts, ``question.NAME``."""
+    """A question of the lab; its text has the key ``question.NAME.text``."""
 
     name: str
     kind: Literal["text", "choice", "choices", "scale"]

@@ -1,6 +1,6 @@
 """Questions of the lab: their settings in ``study.toml``, the keys of their texts, valid answers.
 
-``study.toml`` has one table ``[[questions]]`` for each question. Its words are in the texts of each
+``study.toml`` has one table ``[[questions]]`` for each question. Its texts are in the file of each
 language, in ``[question.NAME]``: ``text``; ``low`` and ``high``, the ends of a scale; and a table
 ``[question.NAME.options]`` with a label for each option.
 """
@@ -75,7 +75,7 @@ KEYS = (
     Key("questions", "steps", whole(2, MOST_STEPS), f"Steps of a scale, 2 to {MOST_STEPS}."),
 )  # fmt: skip
 ABOUT = """\
-Your own questions at the end: one table [[questions]] for each, with the keys below. Their words
+Your own questions at the end: one table [[questions]] for each, with the keys below. Their texts
 are in texts/: [question.NAME] with text and, for a scale, low and high, the labels of its ends;
 [question.NAME.options] with a label for each option."""
 
