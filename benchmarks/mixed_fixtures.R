@@ -15,6 +15,25 @@ keep_table <- function(fitter, estimates, columns)
   for (quantity in names(columns))
     keep(fitter, quantity, rownames(estimates), estimates[, columns[[quantity]]])
 
+# Standard deviations and correlations of the random effects; an intercept has the name of its group.
+# Uncorrelated effects of a group are named GROUP, GROUP.1 and so on in R.
+keep_random <- function(fitter, spread) {
+  group <- sub("[.][0-9]+$", "", spread$grp)
+  slope <- !is.na(spread$var1) & spread$var1 != "(Intercept)"
+  pair <- !is.na(spread$var2)
+  term <- ifelse(slope, paste0(group, ": ", spread$var1), group)
+  keep(fitter, "sd", term[!pair], spread$sdcor[!pair])
+  if (any(pair)) keep(fitter, "r", paste0(group, ": ", spread$var2)[pair], spread$sdcor[pair])
+}
+as_rows <- function(covariances) do.call(rbind, lapply(names(covariances), function(group) {
+  sd <- attr(covariances[[group]], "stddev"); r <- attr(covariances[[group]], "correlation")
+  rows <- data.frame(grp = group, var1 = names(sd), var2 = NA, sdcor = sd)
+  if (length(sd) == 2 && isTRUE(r[1, 2] != 0))
+    rows <- rbind(rows, data.frame(grp = group, var1 = names(sd)[1], var2 = names(sd)[2],
+                                   sdcor = r[1, 2]))
+  rows
+}))
+
 if (kind == "logistic") {
   fitters <- strsplit(arguments[6], ",")[[1]]
   if ("lme4" %in% fitters) {
@@ -22,23 +41,20 @@ if (kind == "logistic") {
       control = glmerControl(optimizer = "bobyqa", tolPwrss = 1e-10,
                              optCtrl = list(maxfun = 1e5))))[["elapsed"]]
     keep_table("lme4", coef(summary(fit)), list(b = 1, se = 2, p = 4))
-    spread <- as.data.frame(VarCorr(fit))
-    keep("lme4", "sd", spread$grp, spread$sdcor)
+    keep_random("lme4", as.data.frame(VarCorr(fit)))
     keep("lme4", "loglik", "", logLik(fit)); keep("lme4", "seconds", "", seconds)
   }
   if ("glmmTMB" %in% fitters) {
     seconds <- system.time(fit <- glmmTMB(model, data, family = binomial))[["elapsed"]]
     keep_table("glmmTMB", coef(summary(fit))$cond, list(b = 1, se = 2, p = 4))
-    spread <- VarCorr(fit)$cond
-    keep("glmmTMB", "sd", names(spread), sapply(spread, function(one) attr(one, "stddev")))
+    keep_random("glmmTMB", as_rows(VarCorr(fit)$cond))
     keep("glmmTMB", "loglik", "", logLik(fit)); keep("glmmTMB", "seconds", "", seconds)
   }
 } else {
   seconds <- system.time(fit <- lmerTest::lmer(model, data, REML = TRUE))[["elapsed"]]
   seconds <- seconds + system.time(estimates <- coef(summary(fit)))[["elapsed"]]
   keep_table("lme4", estimates, list(b = 1, se = 2, df = 3, statistic = 4, p = 5))
-  spread <- as.data.frame(VarCorr(fit))
-  keep("lme4", "sd", spread$grp, spread$sdcor)
+  keep_random("lme4", as.data.frame(VarCorr(fit)))
   keep("lme4", "loglik", "", logLik(fit))
   keep("lme4", "singular", "", isSingular(fit)); keep("lme4", "seconds", "", seconds)
   joint <- anova(fit)

@@ -479,5 +479,7 @@ def test_too_many_left_out_is_one_line_and_stray_answers_are_warned_of(
     told = capsys.readouterr()
     assert told.err.count("\n") == 1
     assert "'incomplete' leaves out 8 of 8 sessions of collide" in told.err
-    assert main([*command, "--accept-rules", "incomplete"]) == 0
+    assert main([*command, "--accept-rules", "incomplete", "--out", str(tmp_path / "out")]) == 0
     assert "8 of 16 sessions flagged" in capsys.readouterr().out
+    page = (tmp_path / "out" / "leaderboard.html").read_text(encoding="utf-8")
+    assert "Rules confirmed" in page and "incomplete (collide 8 of 8)" in page

@@ -201,6 +201,22 @@ def test_no_session_left_is_refused(tmp_path: Path) -> None:
         build(tmp_path, answers=answers, accept_rules=["streak"])
 
 
+def test_confirmed_rules_are_listed(report: Path, tmp_path: Path) -> None:
+    answers = responses()
+    lazy = (answers["scenario"] == "drop") & answers["participant"].isin(
+        answers.loc[answers["scenario"] == "drop", "participant"].unique()[:4]
+    )
+    answers.loc[lazy, "response"] = "yes"
+    with pytest.raises(ExclusionError, match="'streak' leaves out 4 of 8 sessions of drop"):
+        build(tmp_path, answers=answers)
+    page = build(tmp_path, answers=answers, accept_rules=["streak", "slow"])
+    words = "confirmed by --accept-rules"
+    assert words not in text_of(report)
+    text = text_of(page)
+    assert text.count(words) == 2  # under the sessions left out, and how the page was made
+    assert "streak (drop 4 of 8); slow (no scenario needed it)" in text
+
+
 def test_a_rehearsal_with_simulated_participants_is_marked_on_every_page(
     report: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -219,11 +235,21 @@ def test_a_rehearsal_with_simulated_participants_is_marked_on_every_page(
     assert "16 sessions" in text_of(page) and f"{PERSON} 1 16" in text_of(page)
     assert json.loads((page.parent / "report.json").read_text())["warnings"] == [REHEARSAL]
     assert "Rehearsal" not in report.read_text(encoding="utf-8")
+    files = [*(page.parent / "tables").glob("*.csv"), *(page.parent / "figures").glob("*.csv")]
+    assert len(files) > 20
+    for path in files:
+        assert set(pd.read_csv(path, dtype=str)["rehearsal"]) <= {"simulated participants"}, path
+        original = report.parent / path.relative_to(page.parent)
+        assert "rehearsal" not in pd.read_csv(original).columns if original.exists() else True
     command = ["compare", "leaderboard", str(tmp_path / "predictions.csv"), "--responses",
                str(tmp_path / "both.csv")]  # fmt: skip
     both.to_csv(tmp_path / "both.csv", index=False)
-    assert main([*command, "--simulated"]) == 0
+    assert main([*command, "--simulated", "--out", str(tmp_path / "board")]) == 0
     assert f"physion: warning: {REHEARSAL}" in capsys.readouterr().err
+    for name in ("leaderboard", "leaderboard_by_scenario"):
+        rows = pd.read_csv(tmp_path / "board" / f"{name}.csv")
+        assert set(rows["rehearsal"]) == {"simulated participants"}
+    assert REHEARSAL in (tmp_path / "board" / "leaderboard.html").read_text(encoding="utf-8")
 
 
 def test_warnings_stand_above_everything(tmp_path: Path) -> None:

@@ -71,8 +71,8 @@ def build_report(inputs: ReportInputs, folder: Path) -> Path:
     check_movies(inputs.movies, shown_stimuli(inputs))
     pictures = prepare_folder(folder)
     for name, table in inputs.tables().items():
-        write_csv(folder / "tables" / f"{name}.csv", table)
-    shown = [write_plot(plot, pictures) for plot in make_plots(inputs)]
+        write_csv(folder / "tables" / f"{name}.csv", table, bool(inputs.mark))
+    shown = [write_plot(plot, pictures, bool(inputs.mark)) for plot in make_plots(inputs)]
     text = json.dumps(report_numbers(inputs), indent=1, ensure_ascii=False, allow_nan=False)
     write_atomic(folder / "report.json", f"{text}\n".encode())
     if inputs.trial_pages:

@@ -58,7 +58,7 @@ def leaderboard_page(
         Section("Files", _files(board)),
         Section("Settings", definition_list(board.settings) + _definitions()),
     ]
-    return render_document(title, lead, sections)
+    return render_document(title, lead, sections, board.mark)
 
 
 def _metrics(rows: pd.DataFrame) -> list[Metric]:

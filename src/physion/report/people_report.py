@@ -51,13 +51,14 @@ def build_people_report(report: PeopleReport, folder: Path) -> Path:
     """
     pictures = prepare_folder(folder)
     tables = {f"people_{name}": t for name, t in report.people.tables.items() if len(t.columns)}
+    rehearsal = bool(report.people.mark)
     for name, table in tables.items():
-        write_csv(folder / "tables" / f"{name}.csv", table)
+        write_csv(folder / "tables" / f"{name}.csv", table, rehearsal)
     numbers: dict[str, Any] = {
         name: json.loads(table.to_json(orient="records", double_precision=15))
         for name, table in tables.items()
     }
-    shown = [write_plot(plot, pictures) for plot in make_plots(report.people)]
+    shown = [write_plot(plot, pictures, rehearsal) for plot in make_plots(report.people)]
     warnings = list(report.people.warnings)
     content = {"methods": _methods(report), "warnings": warnings, **numbers}
     text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)

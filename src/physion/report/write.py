@@ -22,12 +22,13 @@ def prepare_folder(folder: Path) -> Path:
     return folder / "figures"
 
 
-def write_plot(plot: Plot, folder: Path) -> Picture:
+def write_plot(plot: Plot, folder: Path, rehearsal: bool = False) -> Picture:
     """Write a figure as SVG with text, PDF and PNG with its table; return what the page shows.
 
-    The page shows an SVG with outlined letters, which needs no font.
+    The page shows an SVG with outlined letters, which needs no font. ``rehearsal``: as in
+    `write_csv`.
     """
-    write_csv(folder / f"{plot.name}.csv", plot.table)
+    write_csv(folder / f"{plot.name}.csv", plot.table, rehearsal)
     figure = plot.draw(plot.table, theme.LIGHT)
     light = {kind: theme.figure_bytes(figure, kind) for kind in ("svg", "png")}
     # The dark figure is for the page only, so it is made only in the format used there.
@@ -43,6 +44,15 @@ def write_plot(plot: Plot, folder: Path) -> Picture:
     return Picture(plot.name, light, dark, plot.words)
 
 
-def write_csv(path: Path, table: pd.DataFrame) -> None:
-    """Write a table as CSV, completely or not at all."""
-    write_atomic(path, table.to_csv(index=False, lineterminator="\n").encode())
+def write_csv(path: Path, table: pd.DataFrame, rehearsal: bool = False) -> None:
+    """Write a table as CSV, completely or not at all.
+
+    ``rehearsal``: the participants are simulated, which every row then states.
+    """
+    marked = mark_rehearsal(table) if rehearsal else table
+    write_atomic(path, marked.to_csv(index=False, lineterminator="\n").encode())
+
+
+def mark_rehearsal(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the table with the column ``rehearsal``, which states that nothing is about people."""
+    return table.assign(rehearsal="simulated participants")

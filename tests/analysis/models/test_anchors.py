@@ -125,15 +125,40 @@ def test_two_people_agree_as_all_pairs_of_them_do() -> None:
     human = people["accuracy"].mean()
     assert row["accuracy"] == pytest.approx(human)
     assert row["kappa_beyond_outcome"] == pytest.approx(expected - (2 * human - 1) ** 2)
-    assert row[["r", "rmsd", "r_beyond_outcome", "difference"]].isna().all()
+    assert row[["rmsd", "r_beyond_outcome", "difference"]].isna().all()
     low, high = row[["kappa_from_averages_low", "kappa_from_averages_high"]]
     assert low < expected < high
+
+
+def test_r_of_one_person_is_that_with_the_average_of_the_others() -> None:
+    rng = np.random.default_rng(0)
+    count, stimuli = 12, 3000
+    yes = (rng.random((count, stimuli)) < rng.beta(2, 1.5, stimuli)).astype(float)
+    # Other people at each stimulus: nobody has an own fraction of yes.
+    yes = rng.permuted(yes, axis=0)
+    p_yes = yes.mean(axis=0)
+    rows = pd.DataFrame({"p_contact": 0.5, "predicted": True, "label": True, "simulated": True,
+                         "p_yes": p_yes, "human_accuracy": p_yes, "count": count})  # fmt: skip
+    found = metrics.get("r").of_two_people(sample_of_rows(rows, np.ones((1, stimuli))))[0, 0]
+    others = (yes.sum(axis=0) - yes) / (count - 1)
+    each = [np.corrcoef(one, rest)[0, 1] for one, rest in zip(yes, others, strict=True)]
+    assert found == pytest.approx(np.mean(each), abs=0.003)
+    # An average that contains the person would count the noise of their answers twice.
+    included = [np.corrcoef(one, p_yes)[0, 1] for one in yes]
+    assert np.mean(included) > found + 0.03
+    row = row_of(compared().anchors, TWO_PEOPLE, POOLED)
+    assert row["r_low"] < row["r"] < row["r_high"]
+
+
+def test_people_who_all_agree_have_an_r_of_one() -> None:
+    row = row_of(compared(people=humans(np.ones(24))).anchors, TWO_PEOPLE, POOLED)
+    assert row["r"] == pytest.approx(1)
 
 
 def test_one_person_alone_makes_no_pair() -> None:
     people = humans(np.arange(24) % 3 / 2, count=1)
     row = row_of(compared(people=people).anchors, TWO_PEOPLE)
-    assert np.isnan(row["kappa_from_averages"]) and np.isfinite(row["accuracy"])
+    assert row[["kappa_from_averages", "r"]].isna().all() and np.isfinite(row["accuracy"])
     assert "kappa: undefined in collide, drop" in row["reason"]
 
 
@@ -406,6 +431,7 @@ def test_anchors_of_the_official_people(official: Path) -> None:
     anchors = compare_scores(given, people, labels, bootstrap=QUICK).anchors
     two = row_of(anchors, TWO_PEOPLE)
     assert two["accuracy"] == pytest.approx(0.745, abs=0.0005)
+    assert two["r"] == pytest.approx(0.69, abs=0.03)
     outcome = row_of(anchors, OUTCOME)
     assert outcome["kappa_from_averages"] == pytest.approx(0.49, abs=0.005)
     assert row_of(anchors, OUTCOME, POOLED)["r"] == pytest.approx(0.683, abs=0.0005)

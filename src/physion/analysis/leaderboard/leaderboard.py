@@ -43,6 +43,7 @@ from physion.analysis.people.exclusions import (
     PREREGISTERED,
     ExclusionRules,
     check_excluded,
+    describe_confirmed,
     flag_sessions,
     without_flagged,
 )
@@ -71,6 +72,7 @@ class Leaderboard:
       answers.
     - ``settings``: the settings as text, by name.
     - ``warnings``: what may make the scores wrong, one sentence each.
+    - ``mark``: what must stand at the top of its page: `REHEARSAL` for simulated participants.
     """
 
     table: pd.DataFrame
@@ -81,6 +83,7 @@ class Leaderboard:
     dropped_answers: pd.DataFrame | None
     settings: Mapping[str, str]
     warnings: tuple[str, ...] = ()
+    mark: str = ""
 
 
 def leaderboard(
@@ -152,7 +155,8 @@ def leaderboard(
     known |= {name for one in read.values() for name in one.rows["stimulus"]} | set(outcomes or {})
     if read:
         check_excluded_names(exclude, known)
-    warnings = [REHEARSAL] if responses is not None and responses.simulated_sessions else []
+    mark = REHEARSAL if responses is not None and responses.simulated_sessions else ""
+    warnings = [mark] if mark else []
     warnings += [] if responses is None else completeness_warnings(responses, expected)
     if humans is not None and labels is not None:
         warnings += check_coverage(humans, labels)
@@ -211,6 +215,7 @@ def leaderboard(
         None if kept is None else kept.dropped,
         {**settings, **_describe_scores(scenario, test is not None), **flagging},
         tuple(warnings),
+        mark,
     )
 
 
@@ -307,7 +312,8 @@ def _unflagged(
         f"“{rules.name}” and left out"
     )
     kept = without_flagged(drop_unexpected(responses, expected), flags)
-    return kept, {"Exclusions": words}
+    confirmed = describe_confirmed(flags, accept_rules)
+    return kept, {"Exclusions": words} | ({"Rules confirmed": confirmed} if confirmed else {})
 
 
 def _people(

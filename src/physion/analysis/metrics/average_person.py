@@ -12,18 +12,47 @@ ROUNDING = 1e-12
 """Distance from 1 below which agreement by chance counts as 1."""
 
 
+def r_of_two_people(sample: Sample) -> Array:
+    """Return the expected r of one person's answers with the average of all others, (b, 1).
+
+    Notes
+    -----
+    A person is drawn anew for each stimulus and left out of the average. With the fraction p who
+    say yes, the fraction d of pairs of different people who answer differently, and means over
+    stimuli::
+
+        c = mean(p - d / 2) - mean(p)^2               covariance of two different people
+        V = mean(p^2) - mean(p)^2 = c + D / n         variance of the average of all n people
+        r = c / sqrt(mean(p) (1 - mean(p)) (c + D / (n - 1))),  D = mean(d) / 2
+
+    V gives n, so that the numbers of people by stimulus need not be known. NaN if all answers are
+    alike, if fewer than two people answered, or if V is less than c.
+    """
+    sums = sample.of_people.sums
+    centred = sums.y / sums.n_people
+    yes, noise = centred + 0.5, sums.differ / sums.n_people / 2
+    covariance = yes - noise - yes**2
+    of_all = sums.yy / sums.n_people - centred**2 - covariance
+    # D / (n - 1) from D and D / n; nobody differs: the others agree exactly too.
+    of_others = np.where(noise > 0, of_all * noise / (noise - of_all), 0.0)
+    variance = np.where(of_others >= 0, covariance + of_others, np.nan)
+    spread = yes * (1 - yes) * variance
+    return np.where(spread > ROUNDING, covariance / np.sqrt(spread), np.nan)
+
+
 @register_metric(
     "r",
     label="r",
     heading="Pearson r",
     definition="correlation over stimuli of P(contact) with the fraction of people who say yes, "
-    "that is, with the average person",
+    "that is, with the average person; of one person: with the average of the others",
     better="higher",
     scale="correlation",
     needs="people",
     in_scores=True,
     in_measures=True,
     on_leaderboard=True,
+    two_people=r_of_two_people,
 )
 def pearson_r(sample: Sample) -> Array:
     """Return Pearson's r of P(contact) with P(yes); NaN if either is constant or for less than 3

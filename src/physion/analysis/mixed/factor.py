@@ -90,20 +90,29 @@ class Factor:
             by_slot[narrow] += (inverse.narrow[k] * square) @ scale[narrow]
         return self._groupings.by_grouping(by_slot)
 
-    def at_rows(self, inverse: Inverse) -> Array:
-        """Return z'Lambda H^-1 Lambda z for each row's indicators z, shape (n,)."""
-        scale, groupings = self._scale, self._groupings
-        result = groupings.spread(inverse.diagonal * scale**2)
+    def leverages(self, inverse: Inverse) -> list[Array]:
+        """Return for each grouping the entries (n,) of Z Lambda H^-1 at each row and its level."""
+        groupings = self._groupings
+        entries = [groupings.entries(k, self._scale) for k in range(len(groupings.rows))]
+        result = [
+            entry * inverse.diagonal[rows]
+            for entry, rows in zip(entries, groupings.rows, strict=True)
+        ]
         cross = np.concatenate([block.ravel() for block in inverse.cross])
-        wide = scale[groupings.rows[groupings.wide]]
-        for k, cells in groupings.cells.items():
-            result += 2 * wide * scale[groupings.rows[k]] * cross[cells]
         square = np.concatenate([block.ravel() for block in inverse.narrow])
-        for (k, m), pairs in groupings.pairs.items():
-            if k != m:
-                product = scale[groupings.rows[k]] * scale[groupings.rows[m]]
-                result += 2 * product * square[pairs]
+        linked = [(groupings.wide, k, cross[cells]) for k, cells in groupings.cells.items()]
+        linked += [(k, m, square[pairs]) for (k, m), pairs in groupings.pairs.items() if k != m]
+        for k, m, values in linked:
+            result[k] += entries[m] * values
+            result[m] += entries[k] * values
         return result
+
+    def at_rows(self, leverages: list[Array]) -> Array:
+        """Return z'Lambda H^-1 Lambda z for each row z of Z, shape (n,), from `leverages`."""
+        total = np.zeros(self._groupings.n)
+        for k, one in enumerate(leverages):
+            total += self._groupings.entries(k, self._scale) * one
+        return total
 
     def _parts(self) -> Iterator[tuple[tuple[slice, slice], Array, Array]]:
         return zip(self._places, self._ratio, self._lower, strict=True)

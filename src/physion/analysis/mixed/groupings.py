@@ -9,6 +9,7 @@ designs give one larger block and the same result. `factor` solves the equations
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -47,7 +48,8 @@ class Groupings:
 
     ``codes``: one array (n,) a grouping with values 0..levels-1, all present. Positions in the
     vectors of random effects ("slots", q in all) are by block, wide levels first;
-    ``slots[k][code]`` maps a level to its slot and ``rows[k]`` each row.
+    ``slots[k][code]`` maps a level to its slot and ``rows[k]`` each row. Random slopes are
+    groupings of the same codes whose entries of Z are not 1: see `with_values`.
     """
 
     def __init__(self, codes: Sequence[Codes]) -> None:
@@ -62,7 +64,28 @@ class Groupings:
         self.owner = np.empty(self.q, dtype=np.int64)
         for k, slot in enumerate(self.slots):
             self.owner[slot] = k
+        self._values: Sequence[Array] | None = None
         self._index_cells()
+
+    def with_values(self, values: Sequence[Array]) -> Groupings:
+        """Return the same groupings with ``values[k]`` (n,) as the entries of Z in place of 1."""
+        result = copy.copy(self)
+        result._values = values
+        return result
+
+    def entries(self, k: int, scale: Array) -> Array:
+        """Return the entries (n,) of Z Lambda for grouping ``k``; ``scale`` by slot (q,)."""
+        entries = scale[self.rows[k]]
+        return entries if self._values is None else entries * self._values[k]
+
+    def _weighted(self, weights: Array | None, *of: int) -> Array | None:
+        """Return ``weights`` times the entries of Z of the groupings ``of``."""
+        if self._values is None:
+            return weights
+        product = weights
+        for k in of:
+            product = self._values[k] if product is None else product * self._values[k]
+        return product
 
     def _sort_into_blocks(self, codes: Sequence[Codes]) -> list[Codes]:
         """Return the slots of each grouping's levels; set the bounds of the blocks."""
@@ -123,13 +146,15 @@ class Groupings:
 
     def counts(self, weights: Array | None = None) -> Counts:
         """Return Z'WZ for weights of shape (n,), or weights of one."""
-        wide = np.bincount(self.rows[self.wide], weights, self.q_wide).astype(np.float64)
+        squared = self._weighted(weights, self.wide, self.wide)
+        wide = np.bincount(self.rows[self.wide], squared, self.q_wide).astype(np.float64)
         cross = np.zeros(self._cross_starts[-1])
-        for cells in self.cells.values():
-            cross += np.bincount(cells, weights, len(cross))
+        for k, cells in self.cells.items():
+            cross += np.bincount(cells, self._weighted(weights, self.wide, k), len(cross))
         flat = np.zeros(self._narrow_starts[-1])
         for (k, m), pairs in self.pairs.items():
-            one = np.bincount(pairs, weights, len(flat)).astype(np.float64)
+            products = self._weighted(weights, k, m)
+            one = np.bincount(pairs, products, len(flat)).astype(np.float64)
             flat += one
             if k != m:
                 blocks = self._split(one, self._narrow_starts, square=True)
@@ -145,15 +170,15 @@ class Groupings:
         if values.ndim == 2:
             return np.stack([self.sums(column) for column in values.T], axis=1)
         total = np.zeros(self.q)
-        for rows in self.rows:
-            total += np.bincount(rows, values, self.q)
+        for k, rows in enumerate(self.rows):
+            total += np.bincount(rows, self._weighted(values, k), self.q)
         return total
 
     def spread(self, effects: Array) -> Array:
         """Return Z times ``effects`` (q,): values by row (n,)."""
-        total = effects[self.rows[0]]
-        for rows in self.rows[1:]:
-            total = total + effects[rows]
+        total = self.entries(0, effects)
+        for k in range(1, len(self.rows)):
+            total = total + self.entries(k, effects)
         return total
 
     def by_grouping(self, values: Array) -> Array:

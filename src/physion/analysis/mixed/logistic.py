@@ -1,4 +1,4 @@
-"""Logistic regression with crossed random intercepts (maximum likelihood, Laplace approximation).
+"""Logistic regression with crossed random effects (maximum likelihood, Laplace approximation).
 
 Of the maintained fitters none is both fast and correct at the size of the study (800 participants,
 120 000 answers). ``python benchmarks/mixed.py --r --others`` compares them; its last results are in
@@ -16,6 +16,8 @@ from the whole Hessian, so that they contain the uncertainty of the variances.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
@@ -24,7 +26,8 @@ from scipy.special import expit
 from physion.analysis.mixed.design import Design, build_design
 from physion.analysis.mixed.factor import Factor
 from physion.analysis.mixed.groupings import Groupings
-from physion.analysis.mixed.optimum import Optimum, find_optimum
+from physion.analysis.mixed.optimum import find_optimum
+from physion.analysis.mixed.random_effects import RandomEffects
 from physion.analysis.mixed.result import MixedFit, collect
 from physion.analysis.mixed.separation import refuse_separation
 from physion.errors import BadInputError
@@ -40,7 +43,7 @@ FAR = 30.0
 
 
 def fit_logistic(formula: str, data: pd.DataFrame, level: float = 0.95) -> MixedFit:
-    """Fit a logistic mixed model such as ``correct ~ scenario + x + (1|participant) +
+    """Fit a logistic mixed model such as ``correct ~ scenario + x + (1 + x|participant) +
     (1|stimulus)``.
 
     The response is a column of True/False or 0/1; `mixed.formula` lists what formulas may contain.
@@ -55,35 +58,42 @@ def fit_logistic(formula: str, data: pd.DataFrame, level: float = 0.95) -> Mixed
         raise BadInputError(f"{design.response!r} is not of two classes; give True/False or 0/1")
     refuse_separation(design)
     model = LogisticModel(design)
-    optimum = find_optimum(model.objective, *model.start(), spreads=len(design.groups))
+    even = np.concatenate([np.zeros(model.p, dtype=bool), model.random.even])
+    optimum = find_optimum(model.objective, *model.start(), even)
     covariance = np.linalg.pinv(optimum.hessian, hermitian=True)[: model.p, : model.p]
     back = np.linalg.inv(model.triangle)
     at = optimum.at
+    roots = model.random.roots(at[model.p :])
     return collect(
         design,
         kind="logistic, maximum likelihood (Laplace)",
         b=back @ at[: model.p],
         covariance=back @ covariance @ back.T,
-        spreads=at[model.p :],
+        roots=roots,
+        singular=model.random.singular(at[model.p :]),
         log_likelihood=-optimum.value,
         effects=model.effects(at),
         converged=optimum.converged,
-        notes=_notes(design, optimum, model.p),
+        notes=_notes(design, roots),
         level=level,
     )
 
 
-def _notes(design: Design, optimum: Optimum, p: int) -> list[str]:
-    wide = [
-        f"the standard deviation of {group.name!r} is {spread:.1f} logits: its levels answer "
-        "almost all alike, and the Laplace approximation is not to be trusted"
-        for group, spread in zip(design.groups, optimum.at[p:], strict=True)
-        if spread > FAR / 6
-    ]
+def _notes(design: Design, roots: Sequence[Array]) -> list[str]:
+    """Return warnings of fits whose approximation is poor; ``roots`` from `RandomEffects.roots`."""
+    wide = []
+    for group, root in zip(design.groups, roots, strict=True):
+        # The standard deviation of the effects over the rows, in logits.
+        spread = float(np.sqrt(np.mean(((group.columns @ root) ** 2).sum(axis=1))))
+        if spread > FAR / 6:
+            wide.append(
+                f"the standard deviation of {group.name!r} is {spread:.1f} logits: its levels "
+                "answer almost all alike, and the Laplace approximation is not to be trusted"
+            )
     few = [
         f"{group.name!r} has hardly more rows than levels: the Laplace approximation is poor"
         for group in design.groups
-        if len(design.y) < 2 * group.levels
+        if len(design.y) < 2 * group.levels * len(group.effects)
     ]
     return wide + few
 
@@ -91,8 +101,9 @@ def _notes(design: Design, optimum: Optimum, p: int) -> list[str]:
 class LogisticModel:
     """Negative Laplace log-likelihood of one design, with its gradient.
 
-    Parameters: coefficients of the orthonormal fixed effects (p,), then standard deviations. Random
-    effects are u of unit variance, by slot; each search starts at the last mode.
+    Parameters: coefficients of the orthonormal fixed effects (p,), then those of `RandomEffects`:
+    standard deviations, if there are no slopes. Random effects are u of unit variance, by slot;
+    each search starts at the last mode.
     """
 
     def __init__(self, design: Design) -> None:
@@ -102,20 +113,21 @@ class LogisticModel:
         self.x = np.ascontiguousarray(orthonormal * np.sqrt(len(self.y)))
         self.triangle = triangle / np.sqrt(len(self.y))
         self.p = self.x.shape[1]
-        self.groupings = Groupings([group.codes for group in design.groups])
+        self.random = RandomEffects(design.groups)
+        self.groupings = self.random.groupings
         self.u = np.zeros(self.groupings.q)
 
     def start(self) -> tuple[Array, Array]:
         """Return penalised quasi-likelihood estimates, and steps of one standard error as
         columns.
         """
-        groupings = self.groupings
+        groupings, random = self.groupings, self.random
         beta, spread = np.zeros(self.p), np.ones(len(groupings.levels))
         for _ in range(12):
             before = spread
-            scale = spread[groupings.owner]
+            matrix = random.at(random.from_diagonal(spread))
             for _ in range(3):
-                beta, factor, information = self._joint_step(beta, scale)
+                beta, factor, information = self._joint_step(beta, matrix)
             diagonal = factor.inverse().diagonal
             used = np.asarray(groupings.levels) - groupings.by_grouping(diagonal)
             square = groupings.by_grouping(self.u**2)
@@ -125,16 +137,22 @@ class LogisticModel:
             self.u *= (before / spread)[groupings.owner]
             if np.abs(spread - before).max() < 0.02:
                 break
-        steps = np.zeros((self.p + len(spread),) * 2)
+        steps = np.zeros((self.p + len(random.levels),) * 2)
         steps[: self.p, : self.p] = np.linalg.cholesky(np.linalg.inv(information))
         tail = np.arange(self.p, len(steps))
-        steps[tail, tail] = spread / np.sqrt(2 * np.maximum(used, 1.0))
-        return np.concatenate([beta, spread]), steps
+        each = spread / np.sqrt(2 * np.maximum(used, 1.0))
+        steps[tail, tail] = each[[r for r, _ in random.entry_of]]
+        return np.concatenate([beta, random.from_diagonal(spread)]), steps
 
-    def _joint_step(self, beta: Array, scale: Array) -> tuple[Array, Factor, Array]:
-        """Take one Newton step for fixed and random effects together; changes ``u``."""
-        groupings = self.groupings
-        mean = expit(self._linear(beta, scale))
+    def _joint_step(
+        self, beta: Array, matrix: tuple[Groupings, Array]
+    ) -> tuple[Array, Factor, Array]:
+        """Take one Newton step for fixed and random effects together; changes ``u``.
+
+        ``matrix``: groupings and scale from `RandomEffects.at`.
+        """
+        groupings, scale = matrix
+        mean = expit(self.x @ beta + groupings.spread(scale * self.u))
         weight, residual = mean * (1 - mean), self.y - mean
         factor = Factor(groupings, groupings.counts(weight), scale)
         weighted = self.x * weight[:, None]
@@ -146,18 +164,16 @@ class LogisticModel:
         self.u = self.u + solved[:, -1] - solved[:, :-1] @ step
         return beta + step, factor, information
 
-    def _linear(self, beta: Array, scale: Array, u: Array | None = None) -> Array:
-        return self.x @ beta + self.groupings.spread(scale * (self.u if u is None else u))
-
     def _penalised(self, eta: Array, u: Array) -> float:
         return float(self.y @ eta - np.logaddexp(0, eta).sum() - u @ u / 2)
 
-    def find_mode(self, beta: Array, scale: Array) -> tuple[Array, Factor]:
+    def find_mode(self, beta: Array, matrix: tuple[Groupings, Array]) -> tuple[Array, Factor]:
         """Set ``u`` to its mode by Newton steps, halved if needed; return the logits there and
-        H.
+        H. ``matrix``: groupings and scale from `RandomEffects.at`.
         """
-        groupings = self.groupings
-        eta = self._linear(beta, scale)
+        groupings, scale = matrix
+        fixed = self.x @ beta
+        eta = fixed + groupings.spread(scale * self.u)
         height = self._penalised(eta, self.u)
         for _ in range(100):
             mean = expit(eta)
@@ -169,7 +185,7 @@ class LogisticModel:
                 break
             for _ in range(40):
                 trial = self.u + step
-                moved = self._linear(beta, scale, trial)
+                moved = fixed + groupings.spread(scale * trial)
                 reached = self._penalised(moved, trial)
                 if reached >= height - 1e-9 * abs(height):
                     break
@@ -178,30 +194,30 @@ class LogisticModel:
         return eta, factor
 
     def objective(self, at: Array) -> tuple[float, Array]:
-        """Return the negative log-likelihood and its gradient at (coefficients, standard
-        deviations).
+        """Return the negative log-likelihood and its gradient at (coefficients, parameters of the
+        random effects).
         """
-        beta, spread = at[: self.p], at[self.p :]
-        if np.abs(spread).max() > FAR:
+        beta, parameters = at[: self.p], at[self.p :]
+        if np.abs(parameters).max() > FAR:
             return np.inf, np.zeros_like(at)
-        groupings = self.groupings
-        scale = spread[groupings.owner]
-        eta, factor = self.find_mode(beta, scale)
+        groupings, scale = matrix = self.random.at(parameters)
+        eta, factor = self.find_mode(beta, matrix)
         mean = expit(eta)
         value = self._penalised(eta, self.u) - factor.log_determinant / 2
-        inverse = factor.inverse()
+        leverages = factor.leverages(factor.inverse())
         residual, weight = self.y - mean, mean * (1 - mean)
         # How -log|H|/2 changes with the linear predictor of each row, the mode held.
-        tilt = -0.5 * factor.at_rows(inverse) * weight * (1 - 2 * mean)
+        tilt = -0.5 * factor.at_rows(leverages) * weight * (1 - 2 * mean)
         # ... and through the mode, which moves with the parameters.
         pull = factor.solve(scale * groupings.sums(tilt))
         felt = residual + tilt - weight * groupings.spread(scale * pull)
-        by_slot = self.u * groupings.sums(felt) + pull * groupings.sums(residual)
-        slope_spread = groupings.by_grouping(by_slot) - factor.slopes(inverse)
-        return -value, -np.concatenate([self.x.T @ felt, slope_spread])
+        by_entry = [
+            self.u[rows] * felt + pull[rows] * residual - weight * leverage
+            for rows, leverage in zip(groupings.rows, leverages, strict=True)
+        ]
+        return -value, -np.concatenate([self.x.T @ felt, self.random.gradient(by_entry)])
 
     def effects(self, at: Array) -> list[Array]:
-        """Return the modes of the random effects (logits) of each grouping, by level."""
-        scale = at[self.p :][self.groupings.owner]
-        self.find_mode(at[: self.p], scale)
-        return [(scale * self.u)[slot] for slot in self.groupings.slots]
+        """Return for each group the modes (levels, k) of its random effects, in logits."""
+        self.find_mode(at[: self.p], self.random.at(at[self.p :]))
+        return self.random.effects(at[self.p :], self.u)

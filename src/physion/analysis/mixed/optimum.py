@@ -1,7 +1,8 @@
 """The minimum of a smooth function with a gradient, its curvature there, and proof that it is one.
 
 Standard deviations are searched over the whole line: the functions are even in them, so that a
-variance of zero, where others need a bound, is an ordinary minimum.
+variance of zero, where others need a bound, is an ordinary minimum. So they are in the last
+diagonal entry of the triangle of correlated effects, which is zero for a correlation of 1.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy.typing as npt
 from scipy.optimize import minimize
 
 Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
 Objective = Callable[[Array], tuple[float, Array]]
 
 STEP = 1e-3
@@ -23,18 +25,20 @@ CLOSE = 1e-6
 """Expected further decrease of the function below which the search has converged."""
 
 SMALL = 0.05
-"""Standard deviations below which zero is tried as well."""
+"""Size of even parameters below which zero is tried as well."""
 
 
 @dataclass(frozen=True)
 class Optimum:
-    """Result of the search; ``left`` is the expected decrease by a further Newton step."""
+    """Result of the search; ``left`` is the expected decrease by a further Newton step, ``zero``
+    (k,) whether an even parameter is zero.
+    """
 
     at: Array
     value: float
     hessian: Array
     left: float
-    zero: npt.NDArray[np.bool_]
+    zero: Flags
 
     @property
     def converged(self) -> bool:
@@ -42,8 +46,8 @@ class Optimum:
         return bool(np.isfinite(self.left) and abs(self.left) < CLOSE)
 
 
-def find_optimum(objective: Objective, start: Array, scale: Array, spreads: int) -> Optimum:
-    """Minimise ``objective`` from ``start`` (k,); the last ``spreads`` are standard deviations.
+def find_optimum(objective: Objective, start: Array, scale: Array, even: Flags) -> Optimum:
+    """Minimise ``objective`` from ``start`` (k,); it is even in the parameters ``even`` (k,).
 
     ``scale`` is a matrix (k, k) whose columns are steps of about one standard error: the search is
     in their coordinates. Quasi-Newton first, then Newton steps on differences of the gradient,
@@ -57,14 +61,14 @@ def find_optimum(objective: Objective, start: Array, scale: Array, spreads: int)
     options = {"gtol": 1e-4, "maxiter": 200}
     found = minimize(scaled, np.zeros(len(start)), jac=True, method="BFGS", options=options)
     at = start + scale @ found.x
-    at[len(at) - spreads :] = np.abs(at[len(at) - spreads :])
+    at[even] = np.abs(at[even])
     size = np.sqrt((scale**2).sum(axis=1))
     best = objective(at)
     for _ in range(4):
-        at, best, zero = _try_zero(objective, at, best, spreads)
+        at, best, zero = _try_zero(objective, at, best, even)
         hessian = difference_gradient(objective, at, size)
         step, left = _newton(hessian, best[1])
-        step[len(at) - spreads :][zero] = 0.0
+        step[zero] = 0.0
         trial = objective(at - step) if np.isfinite(left) else (np.inf, best[1])
         if trial[0] > best[0]:
             break
@@ -84,15 +88,14 @@ def _newton(hessian: Array, gradient: Array) -> tuple[Array, float]:
 
 
 def _try_zero(
-    objective: Objective, at: Array, best: tuple[float, Array], spreads: int
-) -> tuple[Array, tuple[float, Array], npt.NDArray[np.bool_]]:
-    """Set small standard deviations to zero if that does not increase the function."""
-    zero = np.zeros(spreads, dtype=bool)
-    first = len(at) - spreads
-    for k in range(spreads):
-        if abs(at[first + k]) < SMALL:
+    objective: Objective, at: Array, best: tuple[float, Array], even: Flags
+) -> tuple[Array, tuple[float, Array], Flags]:
+    """Set small even parameters to zero if that does not increase the function."""
+    zero = np.zeros(len(at), dtype=bool)
+    for k in np.flatnonzero(even):
+        if abs(at[k]) < SMALL:
             trial = at.copy()
-            trial[first + k] = 0.0
+            trial[k] = 0.0
             value, gradient = objective(trial)
             if value <= best[0] + 1e-9 * max(1.0, abs(best[0])) ** 0.5:
                 at, best, zero[k] = trial, (value, gradient), True

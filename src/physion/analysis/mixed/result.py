@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pandas as pd
 from scipy import stats
 
-from physion.analysis.mixed.design import Design
+from physion.analysis.mixed.design import INTERCEPT, Design, Group
 from physion.errors import UnknownNameError
 
 Array = npt.NDArray[np.float64]
@@ -37,14 +37,19 @@ class MixedFit:
 
     - ``table``: one row a fixed effect: ``term``, ``b``, ``se``, ``t`` (linear) or ``z``
       (logistic), ``df`` (Satterthwaite; infinite for z), ``p`` (two-sided), ``low``, ``high``;
-    - ``random``: one row a grouping: ``group``, ``levels``, ``sd``; linear models end with the row
-      ``residual`` (its levels are the rows of data);
+    - ``random``: one row a random effect: ``group``, ``effect`` (``Intercept`` or the column of a
+      slope), ``levels``, ``sd``; linear models end with the row ``residual`` (its levels are the
+      rows of data);
+    - ``correlations``: one row a pair of correlated effects: ``group``, ``first``, ``second``,
+      ``r`` (NaN if one does not vary);
     - ``log_likelihood``: restricted for linear models, so that it compares only models of the same
       fixed effects;
     - ``rows``: used; ``left_out``: left out for a missing value; ``missing``: by column;
-    - ``singular``: a variance was estimated as zero; ``converged``: the optimum is one;
+    - ``singular``: a variance was estimated as zero, or a correlation as 1 or -1; ``converged``:
+      the optimum is one;
     - ``warnings``: in words, what a reader should know;
-    - ``effects``: for each grouping the modes (means, if linear) of its random intercepts;
+    - ``effects``: modes (means, if linear) of the random effects by level: intercepts under the
+      name of their grouping, slopes under ``GROUP: EFFECT``;
     - ``covariance``: of the fixed effects, in the order of the table.
     """
 
@@ -52,6 +57,7 @@ class MixedFit:
     kind: str
     table: pd.DataFrame
     random: pd.DataFrame
+    correlations: pd.DataFrame
     log_likelihood: float
     rows: int
     left_out: int
@@ -67,8 +73,8 @@ class MixedFit:
 
     @property
     def parameters(self) -> int:
-        """Number of parameters: fixed effects and variances, including the residual one."""
-        return len(self.table) + len(self.random)
+        """Number of parameters: fixed effects, variances with the residual one, correlations."""
+        return len(self.table) + len(self.random) + len(self.correlations)
 
     def joint_test(self, term: str) -> JointTest:
         """Test that every coefficient of ``term`` is zero (Wald), others as in the model.
@@ -103,15 +109,20 @@ class MixedFit:
             f"{self.rows} rows ({self.left_out} left out), log-likelihood "
             f"{self.log_likelihood:.3f}, {'converged' if self.converged else 'NOT CONVERGED'}",
         ]
-        tables = [one.to_string(index=False, float_format=_short) for one in self._tables()]
-        return "\n".join([*head, "", tables[0], "", tables[1], *self.warnings])
-
-    def _tables(self) -> tuple[pd.DataFrame, pd.DataFrame]:
-        return self.table, self.random
+        tables = [self.table, self.random]
+        if len(self.correlations):
+            tables.append(self.correlations)
+        texts = ["\n" + one.to_string(index=False, float_format=_short) for one in tables]
+        return "\n".join([*head, *texts, *self.warnings])
 
 
 def _short(value: float) -> str:
     return f"{value:.4g}"
+
+
+def effect_name(group: str, effect: str) -> str:
+    """Return the name of a random effect: an intercept has that of its group."""
+    return f"{group}: {effect}" if effect not in (INTERCEPT, "") else group
 
 
 def _combine(each: Sequence[float]) -> float:
@@ -133,7 +144,8 @@ def collect(
     kind: str,
     b: Array,
     covariance: Array,
-    spreads: Array,
+    roots: Sequence[Array],
+    singular: Sequence[bool],
     log_likelihood: float,
     effects: Sequence[Array],
     converged: bool,
@@ -142,8 +154,10 @@ def collect(
     residual: float | None = None,
     df: DegreesOfFreedom | None = None,
 ) -> MixedFit:
-    """Collect tables and warnings of a fit; ``spreads`` are the standard deviations of the
-    groupings.
+    """Collect tables and warnings of a fit.
+
+    For each group: ``roots``, a matrix B with the covariance B B' of its effects; ``singular``,
+    whether that is singular; ``effects`` (levels, k).
     """
     variance = np.diag(covariance)
     # If the search failed, the curvature can be negative: no standard error then.
@@ -163,28 +177,27 @@ def collect(
             "high": b + reach,
         }
     )
-    names = [group.name for group in design.groups]
-    levels = [group.levels for group in design.groups]
-    sds = [abs(float(one)) for one in spreads]
+    random, correlations = _random_tables(design, roots)
     if residual is not None:
-        names, levels, sds = [*names, "residual"], [*levels, len(design.y)], [*sds, residual]
-    zero = [name for name, sd in zip(names, sds, strict=True) if sd == 0]
+        random.loc[len(random)] = ["residual", "", len(design.y), residual]
     return MixedFit(
         formula=design.formula,
         kind=kind,
         table=table,
-        random=pd.DataFrame({"group": names, "levels": levels, "sd": sds}),
+        random=random,
+        correlations=correlations,
         log_likelihood=log_likelihood,
         rows=len(design.y),
         left_out=design.left_out,
         missing=dict(design.missing),
         converged=converged,
-        singular=bool(zero),
-        warnings=(*_warnings(design, zero, converged), *notes),
+        singular=any(singular),
+        warnings=(*_warnings(design, singular, converged), *notes),
         covariance=covariance,
         effects={
-            group.name: pd.Series(values, index=list(group.labels), name=group.name)
-            for group, values in zip(design.groups, effects, strict=True)
+            name: pd.Series(values, index=list(group.labels), name=name)
+            for group, by_level in zip(design.groups, effects, strict=True)
+            for name, values in zip(_names(group), by_level.T, strict=True)
         },
         terms=dict(design.terms),
         level=level,
@@ -192,17 +205,56 @@ def collect(
     )
 
 
-def _warnings(design: Design, zero: Sequence[str], converged: bool) -> list[str]:
+def _names(group: Group) -> list[str]:
+    return [effect_name(group.name, effect) for effect in group.effects]
+
+
+def _random_tables(design: Design, roots: Sequence[Array]) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return standard deviations of all random effects, and correlations of those of a group."""
+    spreads, pairs = [], []
+    for group, root in zip(design.groups, roots, strict=True):
+        sd = np.sqrt((root**2).sum(axis=1))
+        spreads += [
+            (group.name, effect, group.levels, float(one))
+            for effect, one in zip(group.effects, sd, strict=True)
+        ]
+        with np.errstate(invalid="ignore"):
+            correlation = root @ root.T / np.outer(sd, sd)
+        pairs += [
+            (group.name, group.effects[j], group.effects[k], float(correlation[j, k]))
+            for j in range(len(sd))
+            for k in range(j + 1, len(sd))
+        ]
+    return (
+        pd.DataFrame(spreads, columns=["group", "effect", "levels", "sd"]),
+        pd.DataFrame(pairs, columns=["group", "first", "second", "r"]),
+    )
+
+
+def _warnings(design: Design, singular: Sequence[bool], converged: bool) -> list[str]:
     found = []
     if design.left_out:
         each = ", ".join(f"{name} ({count})" for name, count in design.missing.items())
         total = design.left_out + len(design.y)
         found.append(f"{design.left_out} of {total} rows are left out for missing values: {each}")
+    lost = [group for group, one in zip(design.groups, singular, strict=True) if one]
+    zero = [_names(group)[0] for group in lost if len(group.effects) == 1]
     if zero:
         found.append(
             f"boundary (singular) fit: the variance of {' and '.join(zero)} is estimated as zero; "
             "the standard errors are those of the model without it"
         )
+    found += [
+        f"boundary (singular) fit: the effects {' and '.join(group.effects)} of {group.name} are "
+        "estimated as perfectly correlated or as constant; the data do not determine all of them, "
+        f"so write them uncorrelated, (... || {group.name}), or leave one out"
+        for group in lost
+        if len(group.effects) > 1
+    ]
     if not converged:
-        found.append("the search did not converge: do not use these numbers")
+        hint = any(len(group.effects) > 1 for group in design.groups)
+        found.append(
+            "the search did not converge: do not use these numbers"
+            + ("; try uncorrelated random effects, (... || group)" if hint else "")
+        )
     return found

@@ -225,6 +225,23 @@ def flag_sessions(
     return table.assign(flagged=table[list(RULES)].any(axis=1))
 
 
+def large_exclusions(flags: pd.DataFrame) -> pd.DataFrame:
+    """Return the rules that flag more than `MOST_EXCLUDED` of the sessions of a scenario.
+
+    Columns: ``scenario``, ``rule``, ``flagged``, ``sessions``.
+    """
+    rows = []
+    for scenario in in_order(flags["scenario"]):
+        part = flags[flags["scenario"] == scenario]
+        counts = {rule: int(part[rule].sum()) for rule in RULES}
+        rows += [
+            (scenario, rule, count, len(part))
+            for rule, count in counts.items()
+            if count > MOST_EXCLUDED * len(part)
+        ]
+    return pd.DataFrame(rows, columns=["scenario", "rule", "flagged", "sessions"])
+
+
 def check_excluded(flags: pd.DataFrame, accept_rules: Collection[str] = ()) -> None:
     """Refuse a rule that leaves out more than `MOST_EXCLUDED` of the sessions of a scenario.
 
@@ -235,12 +252,25 @@ def check_excluded(flags: pd.DataFrame, accept_rules: Collection[str] = ()) -> N
     for name in accept_rules:
         if name not in RULES:
             raise UnknownNameError("exclusion rule", name, RULES)
-    for scenario in in_order(flags["scenario"]):
-        part = flags[flags["scenario"] == scenario]
-        for rule in RULES:
-            flagged = int(part[rule].sum())
-            if flagged > MOST_EXCLUDED * len(part) and rule not in accept_rules:
-                raise ExclusionError(rule, scenario, flagged, len(part))
+    for row in large_exclusions(flags).itertuples():
+        if row.rule not in accept_rules:
+            raise ExclusionError(row.rule, row.scenario, row.flagged, row.sessions)
+
+
+def describe_confirmed(flags: pd.DataFrame, accept_rules: Collection[str]) -> str:
+    """Describe what the rules in ``accept_rules`` leave out; empty without any."""
+    large = large_exclusions(flags)
+    words = []
+    for rule in dict.fromkeys(accept_rules):
+        own = large[large["rule"] == rule]
+        counts = ", ".join(f"{r.scenario} {r.flagged} of {r.sessions}" for r in own.itertuples())
+        words.append(f"{rule.replace('_', ' ')} ({counts or 'no scenario needed it'})")
+    if not words:
+        return ""
+    return (
+        "confirmed by --accept-rules, although more than a third of a scenario's sessions are left "
+        f"out: {'; '.join(words)}"
+    )
 
 
 def without_flagged(responses: Responses, flags: pd.DataFrame) -> Responses:

@@ -28,6 +28,7 @@ from physion.analysis.people.exclusions import (
     ExclusionRules,
     check_excluded,
     count_flags,
+    describe_confirmed,
     flag_effect,
     flag_sessions,
     with_and_without,
@@ -81,7 +82,8 @@ class PeopleResults:
     - ``left_out``: dropped answers, with their reasons.
 
     ``warnings``: what may make the results wrong, one sentence each; ``stimuli``: names of all
-    stimuli of the responses, also of excluded ones.
+    stimuli of the responses, also of excluded ones; ``confirmed``: rules that may leave out more
+    than a third of a scenario's sessions, as text.
     """
 
     kept: Responses
@@ -90,6 +92,7 @@ class PeopleResults:
     tables: dict[str, pd.DataFrame]
     warnings: tuple[str, ...] = ()
     stimuli: frozenset[str] = frozenset()
+    confirmed: str = ""
 
     @property
     def mark(self) -> str:
@@ -221,7 +224,8 @@ def analyse_people(
     mark = (REHEARSAL,) if responses.simulated_sessions else ()
     warnings = (*mark, *completeness_warnings(responses, expected))
     stimuli = frozenset(responses.trials["stimulus"])
-    return PeopleResults(kept, whole, rules, tables, warnings, stimuli)
+    confirmed = describe_confirmed(flags, accept_rules)
+    return PeopleResults(kept, whole, rules, tables, warnings, stimuli, confirmed)
 
 
 def _sets(shown: Responses, flags: pd.DataFrame) -> tuple[Responses, Responses]:

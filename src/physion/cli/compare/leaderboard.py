@@ -212,10 +212,12 @@ def _rows(board: Leaderboard) -> pd.DataFrame:
 def _write(board: Leaderboard, record: dict[str, Any], folder: Path, sorted_by: str) -> None:
     from physion.cli.output import write_text
     from physion.report.leaderboard_page import leaderboard_page
+    from physion.report.write import write_csv
 
+    folder.mkdir(parents=True, exist_ok=True)
     tables = {"leaderboard": _rows(board), "leaderboard_by_scenario": board.by_scenario}
     for name, table in tables.items():
-        write_text(folder / f"{name}.csv", table.to_csv(index=False, lineterminator="\n"))
+        write_csv(folder / f"{name}.csv", table, bool(board.mark))
     write_text(folder / "leaderboard.json", json_module.dumps(record, indent=1) + "\n")
     write_text(folder / "leaderboard.html", leaderboard_page(board, sorted_by))
 

@@ -31,7 +31,10 @@ def sessions(inputs: ReportInputs) -> str:
 def sessions_alone(people: PeopleResults, models: str = "") -> str:
     """Return the same without models; ``models``: their scores without and with these sessions."""
     result = people.tables
-    parts = [paragraph(describe_rules(people.rules)), _flag_counts(result["flag_counts"])]
+    parts = [paragraph(describe_rules(people.rules))]
+    if people.confirmed:
+        parts.append(paragraph(f"Rules {people.confirmed}."))
+    parts.append(_flag_counts(result["flag_counts"]))
     parts.append(_with_and_without(people) + models)
     if len(result["flag_effects"]):
         columns = [
@@ -168,7 +171,8 @@ def methods(inputs: ReportInputs) -> dict[str, str]:
 
 def rules_text(people: PeopleResults) -> dict[str, str]:
     """Return the exclusion rules as text."""
-    return {
+    words = {
         "Exclusions": describe_rules(people.rules),
         "Rules applied": ", ".join(name.replace("_", " ") for name in RULES),
     }
+    return words | ({"Rules confirmed": people.confirmed} if people.confirmed else {})

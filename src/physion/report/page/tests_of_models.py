@@ -7,6 +7,7 @@ from html import escape
 import numpy as np
 import pandas as pd
 
+from physion.analysis.mixed.result import effect_name
 from physion.analysis.models.mixed_fits import MixedTable
 from physion.analysis.models.model_tests import permutations_of
 from physion.report.inputs import ReportInputs
@@ -29,9 +30,9 @@ def tests(inputs: ReportInputs) -> str:
 
 
 _MIXED = (
-    "Random intercepts as the formula says. Logistic models: maximum likelihood by Laplace "
-    "approximation, Wald z. Linear models: restricted maximum likelihood, t with degrees of "
-    "freedom by Satterthwaite. b of a logistic model is in log odds. Rows of one model and "
+    "Random intercepts and slopes as the formula says. Logistic models: maximum likelihood by "
+    "Laplace approximation, Wald z. Linear models: restricted maximum likelihood, t with degrees "
+    "of freedom by Satterthwaite. b of a logistic model is in log odds. Rows of one model and "
     "scenario that differ in readout or training share their stimuli, which the models of "
     "accuracies do not know: their p are too small; the paired tests above do without that."
 )
@@ -136,11 +137,14 @@ def _mixed(model: MixedTable) -> str:
     logistic = "z" in rows
     known = [c for c in columns if c.key in rows and not (logistic and c.key == "df")]
     spreads = ", ".join(
-        f"{row['group']} {number(row['sd'], 3)} ({int(row['levels'])})"
+        f"{effect_name(row['group'], row['effect'])} {number(row['sd'], 3)} ({int(row['levels'])})"
         for _, row in fit.random.iterrows()
     )
-    note = f"{fit.rows} rows, {fit.left_out} left out; standard deviations (levels): {spreads}. "
-    note += " ".join(fit.warnings)
+    note = f"{fit.rows} rows, {fit.left_out} left out; standard deviations (levels): {spreads}"
+    for _, row in fit.correlations.iterrows():
+        note += f"; correlation of {row['first']} and {row['second']} by {row['group']}: "
+        note += number(row["r"])
+    note = ". ".join([note, *fit.warnings]) + "."
     listing = rows_table(rows, known) + f'<p class="note">{escape(note)}</p>'
     return details(f"{model.about}{_together(model)}", formula + listing)
 
