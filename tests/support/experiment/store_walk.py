@@ -28,7 +28,7 @@ PAGES: dict[str, dict[str, Any]] = {
     "demographics": {"age": 31, "gender": "woman", "education": "master"},
     "feedback": {"difficulty": 2, "technical_problems": False, "text": "fine"},
 }
-OPTIONAL_PAGES: dict[str, dict[str, Any]] = {"questions": OWN_ANSWERS}
+OPTIONAL_PAGES: dict[str, dict[str, Any]] = {"questions": OWN_ANSWERS, "block": {}}
 """Pages that a study has by its settings alone."""
 ORDER = tuple(stage for stage in stages.STAGES if stage not in stages.ENDED)
 STAGES = tuple(stage for stage in ORDER if stage not in OPTIONAL_PAGES)
@@ -74,7 +74,8 @@ def walk(store: Store, token: str, stage: str) -> str:
         state = run(store.state(token))
         if state.stage == stage:
             return token
-        assert ORDER.index(state.stage) < ORDER.index(stage)
+        in_blocks = state.stage == "block" or state.block > 0
+        assert in_blocks or ORDER.index(state.stage) < ORDER.index(stage)
         if state.trial is None:
             page(store, token, state.stage)
         else:

@@ -52,10 +52,10 @@ def _must(name: str, kind: Kind, about: str, **rest: Any) -> Column:
 TRIAL_COLUMNS: tuple[Column, ...] = (
     _must("participant", "text", "Keyed hash of the participant's id; never the id itself"),
     _must("session", "text", "One run through the experiment by one participant, unique"),
-    _must("scenario", "text", "Scenario of the session"),
+    _must("scenario", "text", "Scenario of the trial"),
     _must("stimulus", "text", "Name of the trial that was shown"),
     _must("phase", "choice", "With feedback (familiarization) or without (test)", choices=PHASES),
-    _must("trial", "integer", "Place in the order of its phase, from 0", low=0),
+    _must("trial", "integer", "Place in the order of its phase in the session, from 0", low=0),
     Column(
         "response",
         "choice",
@@ -112,13 +112,20 @@ TRIAL_COLUMNS: tuple[Column, ...] = (
         choices=("hidden", "dialog", "window"),
     ),
     Column("answered_at", "time", "When the server stored the answer"),
+    Column(
+        "block",
+        "integer",
+        "Index of the block in a session of several scenarios, from 0; empty: a session of one",
+        low=0,
+    ),
 )
 """One row a participant and trial."""
 
 SESSION_COLUMNS: tuple[Column, ...] = (
     _must("participant", "text", "As in the trials"),
     _must("session", "text", "As in the trials; unique here"),
-    _must("scenario", "text", "Scenario of the session"),
+    _must("scenario", "text", "Scenario of the session; several, one block each, in the order "
+          "shown and separated by spaces"),
     _must("simulated", "flag", "As in the trials"),
     Column("study", "text", "Name and version of the study"),
     Column("recruited_by", "text", "Where the participant came from"),
@@ -127,7 +134,8 @@ SESSION_COLUMNS: tuple[Column, ...] = (
     Column("consent_version", "text", "Version of the consent text that was agreed to"),
     Column("consented_at", "time", "When it was agreed to"),
     Column("instructed_at", "time", "When the instructions were done"),
-    Column("ready_at", "time", "When the page between practice and test was sent"),
+    Column("ready_at", "time", "When the page between practice and test was sent; of the last "
+           "block begun, if there are several"),
     Column("buttons", "choice", "The buttons from left to right", choices=("yes-no", "no-yes")),
     Column("language", "text", "Language of the pages"),
     Column("order_number", "integer", "Prepared order of trials, from 1; 0: an order of its own",

@@ -49,7 +49,7 @@ def main(options: Options) -> int:
     if options.json:
         print(json_module.dumps({"links": [asdict(link) for link in all_links]}, indent=1))
         return 0
-    for scenario in study.scenarios:
+    for scenario in study.offered:
         print(scenario)
         for link in all_links:
             if link.scenario == scenario:

@@ -12,9 +12,13 @@ from statistics import fmean, median, stdev
 
 from physion.experiment.experimenter.figures import Histogram, accuracy_histogram, rt_histogram
 from physion.experiment.experimenter.statistics.flagging import Flags
-from physion.experiment.experimenter.statistics.summaries import STATES, SessionSummary
-from physion.experiment.protocol.stages import Stage, label
-from physion.experiment.store.sessions import stages_of
+from physion.experiment.experimenter.statistics.summaries import (
+    STATES,
+    SessionSummary,
+    stages_shown,
+)
+from physion.experiment.protocol.stages import label
+from physion.experiment.study.orders import session_trials
 from physion.experiment.study.study import Study
 
 RATE_SESSIONS = 20
@@ -148,7 +152,7 @@ def compute_overview(
     """
     chosen = [summary for summary in summaries if summary.facts["kind"] == kind]
     by_scenario = {
-        name: [s for s in chosen if s.facts["scenario"] == name] for name in study.scenarios
+        name: [s for s in chosen if s.facts["scenario"] == name] for name in study.offered
     }
     rows = tuple(
         _progress(name, study.participants, part, flags, now) for name, part in by_scenario.items()
@@ -159,7 +163,7 @@ def compute_overview(
         Counter(str(summary.facts["kind"]) for summary in summaries),
         rows,
         _total(rows, chosen, flags),
-        funnel(chosen, stages_of(study)),
+        funnel(chosen, stages_shown(study)),
         tuple(_performance(study, name, part) for name, part in by_scenario.items()),
         _display_counts("All", chosen),
         _grouped(chosen, lambda s: browser_label(str(s.facts["device"].get("user_agent", "")))),
@@ -234,7 +238,7 @@ def expected_end(finished: Sequence[float], wanted: int, now: float) -> float | 
     return now + missing * (now - recent[0]) / (len(recent) - 1)
 
 
-def funnel(part: Sequence[SessionSummary], order: Sequence[Stage]) -> tuple[FunnelStage, ...]:
+def funnel(part: Sequence[SessionSummary], order: Sequence[str]) -> tuple[FunnelStage, ...]:
     """Count for each stage the sessions that reached it, are in it, or ended in it."""
     at = {stage: Counter(s.state for s in part if s.stage == stage) for stage in order}
     steps = []
@@ -251,7 +255,7 @@ def funnel(part: Sequence[SessionSummary], order: Sequence[Stage]) -> tuple[Funn
 
 def _performance(study: Study, name: str, part: Sequence[SessionSummary]) -> ScenarioPerformance:
     """Return accuracy and response times of the people who completed one scenario."""
-    trials = len(study.phase(name, "test"))
+    trials = session_trials(study, name, 0)["test"]  # the same in all orders
     counted = [s for s in part if s.state != "void"]
     complete = [s.answered for s in counted if trials and s.answered.test >= trials]
     accuracies = [answered.correct / answered.test for answered in complete]

@@ -135,7 +135,7 @@ class _Pages:
         """Show the table of sessions."""
         if self._context.access.login(request) is None:
             return redirect("/login")
-        choice = SessionFilter.from_query(request.query_params, self._context.study.scenarios)
+        choice = SessionFilter.from_query(request.query_params, self._context.study.offered)
         result = await self._context.query_statistics(request, "sessions", choice=choice)
         if isinstance(result, Response):
             return result

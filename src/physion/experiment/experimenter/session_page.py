@@ -11,8 +11,9 @@ from sqlalchemy import Connection, Engine, select
 
 from physion.experiment.experimenter.session_list import flags_shown
 from physion.experiment.experimenter.statistics.flagging import Flags
-from physion.experiment.experimenter.statistics.summaries import SessionSummary, stimulus_labels
+from physion.experiment.experimenter.statistics.summaries import SessionSummary
 from physion.experiment.store.tables import ANSWERS, EVENTS, SESSIONS, STUDIES
+from physion.experiment.study.blocks import stimuli_by_session
 from physion.experiment.study.study import Study
 
 EVENTS_SHOWN = 500
@@ -129,7 +130,7 @@ def _answers(
     study: Study, connection: Connection, session: str, scenario: str
 ) -> tuple[AnswerLine, ...]:
     """Read the answers of a session in order."""
-    labels = stimulus_labels(study)
+    labels = {key: each.label for key, each in stimuli_by_session(study).items()}
     table = ANSWERS.c
     rows = connection.execute(
         select(*(column for column in table if column.name != "details"))

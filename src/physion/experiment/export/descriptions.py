@@ -27,8 +27,20 @@ STIMULI_COLUMNS: tuple[Column, ...] = (
 
 _TASK = """\
 Participants saw the first part of a movie, in whose first frame the agent was marked in red and the
-patient in yellow, and predicted whether the agent would touch the patient. A session is one
+patient in yellow, and predicted whether the agent would touch the patient."""
+
+_ONE_SCENARIO = """ A session is one
 participant in one scenario: familiarization with feedback, then the test without feedback."""
+
+_BLOCKS = """ A session has
+all scenarios of the study, one block each, in an order of its own: the column `scenario` of the
+sessions names them in this order, and the column `block` of the trials counts them from 0. Trials
+are counted over the whole session. {practice}, with feedback; a test has no
+feedback."""
+_PRACTICE = {
+    "each": "Each block begins with a familiarization",
+    "first": "The first block begins with a familiarization",
+}
 
 _PEOPLE = """\
 `participant` is a keyed hash: the same for all sessions of a person in this study, and of no use
@@ -80,12 +92,15 @@ def readme(
 
     ``facts``, if given, are the counts of `ExportReport.facts`, which are appended.
     """
-    special = {"export": _FILES, "psych-ds": _PSYCH_DS, "bids": _BIDS}[layout]
+    files = _FILES
+    if study.blocks.all_scenarios:
+        files = files.replace("the test stimuli by scenario", "the test stimuli of each session")
+    special = {"export": files, "psych-ds": _PSYCH_DS, "bids": _BIDS}[layout]
     rule = RULE if layout != "bids" else f"{TEXT_RULE}. {RULE}"
     parts = [
         f"# {study.title}",
         f"Study {study.name}, version {study.version}. Contact: {study.contact}",
-        _TASK,
+        _TASK + _structure(study),
         special,
         _PEOPLE,
         fill(rule, 100),
@@ -93,6 +108,13 @@ def readme(
     if facts is not None:
         parts.append("## Counts\n\n" + "\n".join(count_lines(facts, "- ")))
     return "\n\n".join(parts) + "\n"
+
+
+def _structure(study: Study) -> str:
+    """Return the description of a session."""
+    if not study.blocks.all_scenarios:
+        return _ONE_SCENARIO
+    return _BLOCKS.format(practice=_PRACTICE[study.blocks.familiarization])
 
 
 def count_lines(facts: Mapping[str, Any], bullet: str = "") -> list[str]:

@@ -9,7 +9,7 @@
       questions.csv, .parquet    answers to the lab's own questions, if there are any
       events.csv, .parquet   other events in the browser
       trial_details.parquet  times of frames and cues within each trial
-      stimuli.csv, expected.csv   the stimuli; the test stimuli of each scenario
+      stimuli.csv, expected.csv   the stimuli; the test stimuli of each scenario or session
       data_dictionary.json   description of every column of every table
       study.json             settings and texts of the study, without codes and keys
       psych-ds/, bids/       the same data in two conventions
@@ -37,6 +37,7 @@ from physion.experiment.export.answer_tables import snapshot
 from physion.experiment.export.conventions.bids import BidsWriter
 from physion.experiment.export.conventions.psych_ds import write_psych_ds
 from physion.experiment.export.descriptions import STIMULI_COLUMNS, readme
+from physion.experiment.export.expected import expected_stimuli
 from physion.experiment.export.export_folder import atomic_folder, write_manifest
 from physion.experiment.export.iso_times import iso_times
 from physion.experiment.export.session_rows import (
@@ -134,8 +135,9 @@ def export_study(
                 bids = BidsWriter(folder / "bids", study, sessions.table)
             written = write_tables(folder, connection, study, sessions, bids)
             states = _states(connection, sessions)
+            expected = expected_stimuli(connection, study, sessions)
         report = _report(out, sessions, written)
-        _write_stimuli(folder, study)
+        _write_stimuli(folder, study, expected)
         _write_json(folder / "study.json", {"states": states})
         described = TABLES if written.own is None else TABLES | {"questions": written.own[1]}
         dictionary: dict[str, Any] = {
@@ -199,13 +201,12 @@ def _states(connection: Connection, sessions: SessionTable) -> list[dict[str, An
     return states
 
 
-def _write_stimuli(folder: Path, study: Study) -> None:
-    """Write ``stimuli.csv`` and ``expected.csv``."""
+def _write_stimuli(folder: Path, study: Study, expected: Sequence[Sequence[str]]) -> None:
+    """Write ``stimuli.csv`` and ``expected.csv``, whose rows are ``expected``."""
     names = [column.name for column in STIMULI_COLUMNS]
     shown = [[getattr(stimulus, name) for name in names] for stimulus in study.stimuli]
     _write_csv(folder / "stimuli.csv", names, shown)
-    test = [[s.stimulus, s.scenario] for s in study.stimuli if s.phase == "test"]
-    _write_csv(folder / "expected.csv", ["stimulus", "scenario"], test)
+    _write_csv(folder / "expected.csv", expected[0], expected[1:])
 
 
 def _write_csv(path: Path, header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:

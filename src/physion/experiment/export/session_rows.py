@@ -16,6 +16,7 @@ from physion.errors import UnknownNameError
 from physion.experiment.export.arrow_types import ARROW_TYPES, arrow_schema
 from physion.experiment.export.iso_times import iso_times
 from physion.experiment.store.tables import SESSIONS, STUDIES
+from physion.experiment.study.blocks import block_scenarios
 from physion.experiment.study.study import Study
 
 EXPORTED_KINDS = ("person", "simulated")
@@ -70,8 +71,8 @@ def read_sessions(
     for kind in wanted.kinds:
         if kind not in EXPORTED_KINDS:
             raise UnknownNameError("kind of session", kind, EXPORTED_KINDS)
-    if wanted.scenario is not None and wanted.scenario not in study.scenarios:
-        raise UnknownNameError("scenario", wanted.scenario, study.scenarios)
+    if wanted.scenario is not None and wanted.scenario not in study.offered:
+        raise UnknownNameError("scenario", wanted.scenario, study.offered)
     query = select(*SESSIONS.c, STUDIES.c.name, STUDIES.c.version).join(
         STUDIES, STUDIES.c.digest == SESSIONS.c.study
     )
@@ -88,7 +89,7 @@ def read_sessions(
     # Sorted here because databases differ in how they order text.
     kept.sort(key=lambda row: (row.started_at, row.session))
     digests = tuple(dict.fromkeys(row.study for row in kept))
-    return SessionTable(_session_table(kept), states, left_out, digests)
+    return SessionTable(_session_table(kept, study), states, left_out, digests)
 
 
 def _why_not(row: _Row, wanted: SessionSelection, study: Study) -> str | None:
@@ -105,18 +106,18 @@ def _why_not(row: _Row, wanted: SessionSelection, study: Study) -> str | None:
         return NO_CONSENT
     if row.withdrawn_at is not None:
         return WITHDRAWN
-    if row.scenario not in study.scenarios:
+    if row.scenario not in study.offered:
         return GONE_SCENARIO.format(scenario=row.scenario)
     if wanted.finished_only and row.finished_at is None:
         return UNFINISHED
     return None
 
 
-def _session_table(rows: Sequence[_Row]) -> pa.Table:
+def _session_table(rows: Sequence[_Row], study: Study) -> pa.Table:
     """Return the exported table of these sessions."""
     columns: dict[str, pa.Array] = {}
     for column in SESSION_COLUMNS:
-        values = [_session_value(row, column.name) for row in rows]
+        values = [_session_value(row, column.name, study) for row in rows]
         if column.kind == "time":
             columns[column.name] = iso_times(np.array(values, dtype=np.float64))
         else:
@@ -124,9 +125,11 @@ def _session_table(rows: Sequence[_Row]) -> pa.Table:
     return pa.table(columns, arrow_schema(SESSION_COLUMNS))
 
 
-def _session_value(row: _Row, name: str) -> Any:
+def _session_value(row: _Row, name: str, study: Study) -> Any:
     """Return the value of one exported column; None for an empty cell."""
     match name:
+        case "scenario":
+            return " ".join(block_scenarios(study, row.scenario, row.order_seed))
         case "simulated":
             return row.kind == "simulated"
         case "study":

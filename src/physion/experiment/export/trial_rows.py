@@ -133,13 +133,25 @@ def _fetch(connection: Connection, names: Sequence[str], details: bool) -> list[
 
 
 class _Stimuli:
-    """Names, labels and looks of all stimuli as arrays, and their indices by name."""
+    """Scenarios, names, labels and looks of all stimuli as arrays, and their indices by name."""
 
     def __init__(self, stimuli: Sequence[Stimulus]) -> None:
         self.indices = {(s.scenario, s.stimulus): index for index, s in enumerate(stimuli)}
+        self.scenarios = pa.array([s.scenario for s in stimuli], pa.string())
         self.names = pa.array([s.stimulus for s in stimuli], pa.string())
         self.labels = np.array([s.label for s in stimuli], dtype=bool)
         self.looks = np.array([LOOKS.index(s.look) for s in stimuli], dtype=np.int64)
+
+    def find(self, blocks: Sequence[str], name: str) -> tuple[int, float]:
+        """Return the index of a stimulus of a session, -1 if it is unknown, and its block.
+
+        ``blocks``: the scenarios of the session. The block is `_ABSENT` if there is only one.
+        """
+        for number, scenario in enumerate(blocks):
+            index = self.indices.get((scenario, name), -1)
+            if index >= 0:
+                return index, number if len(blocks) > 1 else _ABSENT
+        return -1, _ABSENT
 
 
 def _trials(
@@ -149,20 +161,20 @@ def _trials(
     known: _Stimuli,
     details: bool,
 ) -> TrialBatch:
-    """Convert fetched rows to a sorted table; answers to unknown stimuli are left out."""
+    """Convert fetched rows to a table in the order shown; unknown stimuli are left out."""
     texts = 3 if details else 2
     ranks = {name: rank for rank, name in enumerate(sessions.column("session").to_pylist())}
-    scenarios = sessions.column("scenario").to_pylist()
+    blocks = [cell.split(" ") for cell in sessions.column("scenario").to_pylist()]
     rank = np.array([ranks[row[0]] for row in rows], dtype=np.int64)
-    stimulus = np.array(
-        [known.indices.get((scenarios[ranks[row[0]]], row[1]), -1) for row in rows], dtype=np.int64
-    )
+    found = [known.find(blocks[ranks[row[0]]], row[1]) for row in rows]
+    stimulus, block = np.array(found, dtype=np.int64).reshape(-1, 2).T
     unknown = tuple(rows[at][1] for at in np.flatnonzero(stimulus < 0))
     flat = chain.from_iterable(row[texts:] for row in rows)
     width = len(_NUMBERS)
     numbers = np.fromiter(flat, np.float64, len(rows) * width).reshape(-1, width).T
     values = dict(zip(_NUMBERS, numbers, strict=True))
-    order = np.lexsort((values["trial"], values["phase"], rank))
+    values["block"] = block.astype(np.float64)
+    order = np.lexsort((values["trial"], values["phase"], block, rank))
     order = order[stimulus[order] >= 0]
     values = {name: column[order] for name, column in values.items()}
     rank, stimulus = rank[order], stimulus[order]
@@ -195,13 +207,14 @@ def _trial_table(
     stimulus
         Index of the stimulus of each answer.
     values
-        Columns of `_NUMBERS`.
+        Columns of `_NUMBERS`, and ``block``.
     """
-    of_session = sessions.select(["participant", "session", "scenario", "simulated", "buttons"])
+    of_session = sessions.select(["participant", "session", "simulated", "buttons"])
     of_session = of_session.take(pa.array(rank))
     label = known.labels[stimulus]
     columns: dict[str, Any] = {name: of_session.column(name) for name in of_session.column_names}
     columns |= {
+        "scenario": known.scenarios.take(pa.array(stimulus)),
         "stimulus": known.names.take(pa.array(stimulus)),
         "label": pa.array(label),
         "correct": pa.array((values["response"] == _RESPONSES.index("yes")) == label),

@@ -143,8 +143,21 @@ class Enter(Message):
     device: Device = Device()
 
 
+class BlockTrials(Message):
+    """A block of a session: its scenario, and the first trial and the end (exclusive) by phase."""
+
+    scenario: str
+    familiarization: tuple[int, int]
+    test: tuple[int, int]
+
+
 class SessionState(Message):
-    """State of a session. ``trial`` is the next trial of the phase, None outside a phase."""
+    """State of a session.
+
+    ``trial`` is the next trial of the phase, None outside a phase. Trials are counted over the
+    whole session. ``block``: index of the current block, whose scenario is ``scenario``; a session
+    with one scenario has one block.
+    """
 
     stage: Stage
     ended: bool
@@ -155,6 +168,8 @@ class SessionState(Message):
     trials: dict[Phase, int]
     answered: bool
     """Whether a trial was answered, after which stopping is final."""
+    block: int
+    blocks: list[BlockTrials]
     scenario: str
     language: str
     kind: Kind
@@ -195,8 +210,8 @@ class PageDone(Message):
 
     Fields of ``data`` by page: ``consent`` {agreed: bool, language: optional, in which it was
     read}; ``demographics`` {age, gender, education}; ``questions`` {NAME: answer, for each of
-    `PublicStudy.questions`}; ``feedback`` {difficulty, technical_problems, text}; ``instructions``,
-    ``ready`` and ``withdraw`` {}.
+    `PublicStudy.questions`}; ``feedback`` {difficulty, technical_problems, text}; ``ready`` and
+    ``block`` {block: optional, index of the current block}; ``instructions`` and ``withdraw`` {}.
     """
 
     page: Stage | Literal["withdraw"]
@@ -205,7 +220,11 @@ class PageDone(Message):
 
 
 class Jump(Message):
-    """Page or trial to which a preview goes. ``trial`` counts from 0; ignored for pages."""
+    """Page or trial to which a preview goes.
+
+    ``trial`` counts from 0; for ``ready`` and ``block`` it is the index of the block, for ``block``
+    of the one that the page ends; ignored for other pages.
+    """
 
     stage: Stage
     trial: Annotated[int, Field(ge=0, le=100_000)] = 0

@@ -8,7 +8,7 @@ table ``preview`` of the texts. `store.sessions.stages_of` says which studies ha
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -19,6 +19,7 @@ Stage = Literal[
     "familiarization",
     "ready",
     "test",
+    "block",
     "demographics",
     "questions",
     "feedback",
@@ -26,10 +27,15 @@ Stage = Literal[
     "declined",
     "withdrawn",
 ]
-"""Stages of a session, in this order; the `ENDED` ones can follow any other but ``done``."""
+"""Stages of a session, in this order; the `ENDED` ones can follow any other but ``done``. After
+``block``, the page between blocks, the next block begins with ``familiarization`` or ``test``."""
 STAGES: tuple[Stage, ...] = get_args(Stage)
 ENDED: tuple[Stage, ...] = ("declined", "withdrawn")
 """Stages of sessions that ended before they were complete: no consent, or stopped."""
+
+
+OF_BLOCK: tuple[Stage, ...] = ("familiarization", "ready", "test", "block")
+"""Stages that each block of a session has."""
 
 
 @dataclass(frozen=True)
@@ -44,11 +50,51 @@ PAGES: Mapping[Stage, Page] = {
     "consent": Page("consented_at", "Consent"),
     "instructions": Page("instructed_at", "Instructions"),
     "ready": Page("ready_at", "Start page"),
+    "block": Page("block_at", "Page between blocks"),
     "demographics": Page("demographics_at", "Demographics"),
     "questions": Page("questions_at", "Own questions"),
     "feedback": Page("finished_at", "Feedback"),
 }
 """The pages by stage; the last one finishes the session."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """A block of a session.
+
+    Attributes
+    ----------
+    scenario
+        The scenario of its trials.
+    familiarization, test
+        Indices of its trials in each phase, counted over the whole session.
+    """
+
+    scenario: str
+    familiarization: range
+    test: range
+
+    def of(self, phase: str) -> range:
+        """Return the indices of the trials of a phase."""
+        return self.test if phase == "test" else self.familiarization
+
+
+@dataclass(frozen=True)
+class SessionTrials(Mapping[str, int]):
+    """Numbers of trials of a session by phase, and its blocks."""
+
+    blocks: tuple[Block, ...]
+
+    def __getitem__(self, phase: str) -> int:
+        if phase not in get_args(Phase):
+            raise KeyError(phase)
+        return self.blocks[-1].of(phase).stop
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(get_args(Phase))
+
+    def __len__(self) -> int:
+        return len(get_args(Phase))
 
 
 @dataclass(frozen=True)
@@ -60,15 +106,19 @@ class Course:
     stages
         Its pages and phases in order, ``done`` last.
     trials
-        Number of trials in each phase.
+        Number of trials in each phase, and blocks.
     """
 
     stages: tuple[Stage, ...]
-    trials: Mapping[str, int]
+    trials: SessionTrials
 
 
-def label(stage: Stage) -> str:
-    """Return the name of a stage on the experimenter's pages."""
-    if stage in PAGES:
-        return PAGES[stage].label
-    return "Finished" if stage == "done" else stage.capitalize()
+def label(stage: str) -> str:
+    """Return the name of a stage on the experimenter's pages.
+
+    The stage may be followed by the number of a block: ``test 2``.
+    """
+    name, _, number = stage.partition(" ")
+    known = {page: about.label for page, about in PAGES.items()} | {"done": "Finished"}
+    words = known.get(name, name.capitalize())
+    return f"{words}, block {number}" if number else words

@@ -26,9 +26,10 @@ from physion.experiment.simulated.browser import RefusedError, SimulatedBrowser,
 from physion.experiment.simulated.person import TYPICAL_RT_MS, SimulatedPerson
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.media_links import read_media_path
+from physion.experiment.study.orders import trial_order
 from physion.experiment.study.recruitment import make_pass
 from physion.experiment.study.stimuli import PHASES, Stimulus
-from physion.experiment.study.study import Study
+from physion.experiment.study.study import ALL_SCENARIOS, Study
 
 DEVICE = wire.Device(
     user_agent="physion simulate",
@@ -153,7 +154,7 @@ class Participation:
         """Enter by the pilot link and return the state of the session."""
         who = {
             "id": f"simulated-{self._plan.seed}-{self._visit.number}",
-            "scenario": self._visit.scenario,
+            "scenario": None if self._visit.scenario == ALL_SCENARIOS else self._visit.scenario,
             "language": language,
             "pass": make_pass(self._secrets, "simulated"),
             "device": DEVICE,
@@ -228,8 +229,9 @@ class Participation:
     def _find_stimulus(self, phase: Phase, movie: str) -> Stimulus:
         """Return the stimulus of a movie path, which only the server's keys can decode."""
         path = read_media_path(self._study, self._secrets, movie)
-        for stimulus in self._study.phase(self._visit.scenario, phase):
-            if self._study.folder / stimulus.movie == path:
+        for stimulus in self._study.stimuli:
+            several = self._visit.scenario in (ALL_SCENARIOS, stimulus.scenario)
+            if several and stimulus.phase == phase and self._study.folder / stimulus.movie == path:
                 return stimulus
         raise PhysionError(
             f"{movie} is not a movie of {self._study.folder}; does the server serve another study?"
@@ -294,8 +296,9 @@ def minutes_each(study: Study, scenario: str) -> float:
     """Return about how many minutes a simulated participant takes, without breaks."""
     cross_ms = sum(study.timing.fixation_ms) / 2
     seconds = study.plausibility.reading_s
+    order = trial_order(study, scenario, 0)
     for phase in PHASES:
-        for stimulus in study.phase(scenario, phase):
+        for stimulus in order[phase]:
             trial_ms = cross_ms + study.timing.cue_ms + TYPICAL_RT_MS
             seconds += trial_ms / 1000 + (stimulus.frames + stimulus.full_frames) / stimulus.rate
     return seconds / 60 / study.plausibility.simulated_speed
@@ -328,9 +331,9 @@ async def simulate(
     UnknownNameError
         The study has no such scenario.
     """
-    if plan.scenario is not None and plan.scenario not in study.scenarios:
-        raise UnknownNameError("scenario", plan.scenario, study.scenarios)
-    scenarios = study.scenarios if plan.scenario is None else (plan.scenario,)
+    if plan.scenario is not None and plan.scenario not in study.offered:
+        raise UnknownNameError("scenario", plan.scenario, study.offered)
+    scenarios = study.offered if plan.scenario is None else (plan.scenario,)
     visits = [Visit(n, scenarios[n % len(scenarios)]) for n in range(plan.participants)]
     slots = asyncio.Semaphore(plan.at_once)
     limits = httpx2.Limits(max_connections=plan.at_once, max_keepalive_connections=plan.at_once)

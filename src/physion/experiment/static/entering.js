@@ -64,7 +64,7 @@ export async function enter({ api, texts, study, log, frame }, arrival) {
  * page was reloaded and no longer knows the participant's id.
  * @param {import("./session.js").Basis} basis
  * @param {Arrival} arrival
- * @returns {((scenario: string) => Promise<SessionState>)|null}
+ * @returns {((scenario?: string) => Promise<SessionState>)|null}
  */
 export function takingBack(basis, arrival) {
   if (!arrival.named && !cameWithoutId()) return null;

@@ -3,6 +3,7 @@
  * @module frame
  */
 
+import { hasBlocks, sessionProgress } from "./blocks.js";
 import { button, el } from "./dom.js";
 import { jumpControl } from "./jump.js";
 
@@ -77,12 +78,16 @@ export class Frame {
    * @param {import("./messages.js").Phase} phase @param {number} trial
    */
   progress(phase, trial) {
-    const trials = this.state.trials[phase];
+    const { state, texts } = this;
+    const trials = state.trials[phase];
     const key = phase === "test" ? "common.progress" : "common.practice_progress";
-    const text = this.texts.t(key, { trial: trial + 1, trials });
+    const text = texts.t(key, { trial: trial + 1, trials });
+    const several = hasBlocks(state);
+    const part = { block: state.block + 1, blocks: state.blocks.length };
+    const { before, all } = sessionProgress(state, phase, trial);
     byId("progress").replaceChildren(
-      el("label", { for: "bar" }, text),
-      el("progress", { id: "bar", max: trials, value: trial }),
+      el("label", { for: "bar" }, several ? `${texts.t("block.progress", part)} · ${text}` : text),
+      el("progress", { id: "bar", max: several ? all : trials, value: several ? before : trial }),
     );
   }
 

@@ -15,6 +15,9 @@ import { bound } from "./texts.js";
  */
 export function jumpControl(texts, state, onJump) {
   const { t } = bound(texts);
+  const blocks = state.blocks.length;
+  // A page that each block has is chosen by the number of the block.
+  const numbers = { ...state.trials, ready: blocks, block: blocks - 1 };
   const options = state.places.map((stage) =>
     el("option", { value: stage, selected: stage === state.stage }, t(`preview.${stage}`)),
   );

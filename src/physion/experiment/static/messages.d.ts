@@ -26,6 +26,12 @@ export interface Enter {
   device?: Device;
 }
 
+export interface BlockTrials {
+  scenario: string;
+  familiarization: [number, number];
+  test: [number, number];
+}
+
 export interface SessionState {
   stage: Stage;
   ended: boolean;
@@ -33,6 +39,8 @@ export interface SessionState {
   trial: number | null;
   trials: Record<Phase, number>;
   answered: boolean;
+  block: number;
+  blocks: BlockTrials[];
   scenario: string;
   language: string;
   kind: "person" | "simulated" | "preview";

@@ -3,6 +3,7 @@
  * @module pages
  */
 
+import { currentBlock, hasBlocks, size } from "./blocks.js";
 import { button, el, paragraphs, sleep } from "./dom.js";
 import { showExample } from "./example.js";
 import { focusHeading } from "./page_trial.js";
@@ -37,7 +38,9 @@ export function instructionsPages(context) {
   const { texts, state } = context;
   const { t } = bound(texts);
   const prompt = t("trial.prompt");
-  const practice = state.trials.familiarization;
+  const block = currentBlock(state);
+  const practice = size(block, "familiarization");
+  const several = { blocks: state.blocks.length, trials: state.trials.test };
   const parts = [
     () => [
       el("h1", {}, t("instructions.title_task")),
@@ -51,7 +54,8 @@ export function instructionsPages(context) {
     ],
     () => [
       el("h1", {}, t("instructions.title_answer")),
-      ...paragraphs(t("instructions.answer", { practice, trials: state.trials.test })),
+      ...paragraphs(t("instructions.answer", { practice, trials: size(block, "test") })),
+      ...(hasBlocks(state) ? paragraphs(t("instructions.blocks", several)) : []),
     ],
   ];
   return (page, done, signal) => {
@@ -82,7 +86,7 @@ export function instructionsPages(context) {
 /** Render the page between practice and test. @param {Context} context @returns {Render} */
 export function readyPage(context) {
   const { t } = bound(context.texts);
-  const { test } = context.state.trials;
+  const test = size(currentBlock(context.state), "test");
   const every = context.study.break_every;
   const values = { trials: test, minutes: minutes(context.study, 0, test) };
   const breaks = every > 0 && every < test ? paragraphs(t("ready.breaks", { every })) : [];

@@ -4,6 +4,7 @@
  * @module remembered
  */
 
+import { currentBlock } from "./blocks.js";
 import { newKey } from "./random_key.js";
 import { keep, outlivesPage, recall } from "./storage.js";
 
@@ -64,7 +65,8 @@ export function forgetFeedback() {
 export function dueFeedback(state) {
   const due = recall("feedback");
   if (due?.session !== state.reference || !due.answer) return null;
-  const answered = state.stage === "ready" ? state.trials.familiarization : state.trial;
+  const [, end] = currentBlock(state).familiarization;
+  const answered = state.stage === "ready" ? end : state.trial;
   const practises = state.stage === "familiarization" || state.stage === "ready";
   return practises && answered === due.answer.trial + 1 ? due.answer : null;
 }

@@ -6,6 +6,7 @@
  */
 
 import { Refused } from "./api.js";
+import { blockPage, currentBlock, hasBlocks } from "./blocks.js";
 import { consentPage } from "./consent_page.js";
 import { ask } from "./dialog.js";
 import { endedPage, stopQuestion } from "./ending_pages.js";
@@ -26,6 +27,7 @@ const PAGES = {
   consent: consentPage,
   instructions: pages.instructionsPages,
   ready: pages.readyPage,
+  block: blockPage,
   demographics: demographicsPage,
   questions: questionPage,
   feedback: feedbackPage,
@@ -47,7 +49,7 @@ const FINAL = ["unknown_token", "bad_link", "id_needed", "already_took_part", "s
  * @property {string} address The URL by which the participant came.
  * @property {(language: string) => Promise<void>} [setLanguage] Changes the language.
  * @property {(() => void)|null} [another] Starts the study for another person; null if it cannot.
- * @property {((scenario: string) => Promise<SessionState>)|null} [takeBack] Takes up a session again that was
+ * @property {((scenario?: string) => Promise<SessionState>)|null} [takeBack] Takes up a session again that was
  *   declined or stopped; null if the participant is not known any more.
  */
 
@@ -231,7 +233,7 @@ export class Session {
     const due = dueFeedback(this.state);
     if (due) await this.#showFeedback(due);
     if (stage === "familiarization" || stage === "test") return this.#phase(stage);
-    if (stage !== "ready") leaveFullscreen();
+    if (stage !== "ready" && stage !== "block") leaveFullscreen();
     return this.#page(stage, PAGES[stage](this.context));
   }
 
@@ -241,6 +243,7 @@ export class Session {
     let outcome = null;
     const store = async (data) => {
       if (page === "consent") data.language = this.basis.texts.language;
+      if (page === "ready" || page === "block") data.block = this.state.block;
       const post = this.basis.api.post("/api/page", { page, data }, { signal });
       // Refusals are handled by `run`; the page has ended in any case.
       outcome = await post.catch((error) => ({ error }));
@@ -256,11 +259,18 @@ export class Session {
     return patiently(this.basis.frame.main, pages.openingPage(this.context), awaited);
   }
 
-  /** Run the remaining trials of a phase. @returns {Promise<SessionState>} The state after them. */
+  /**
+   * Run the remaining trials of a phase in the current block.
+   * @returns {Promise<SessionState>} The state after them.
+   */
   async #phase(phase) {
     const { api } = this.basis;
     const { signal } = this.#part;
-    const list = async () => (await api.get(`/api/trials/${phase}`, { signal })).trials;
+    const end = currentBlock(this.state)[phase][1];
+    const list = async () => {
+      const { trials } = await api.get(`/api/trials/${phase}`, { signal });
+      return trials.filter((media) => media.trial < end);
+    };
     const trials = await this.#patiently(list());
     this.media.start(trials, this.state.trial, list);
     const remaining = trials.filter((trial) => trial.trial >= this.state.trial);
@@ -353,7 +363,7 @@ export class Session {
     const { signal } = this.#part;
     const ending = await this.#patiently(api.get("/api/ending", { signal }));
     return new Promise((resolve, reject) => {
-      const { scenario } = this.state;
+      const scenario = hasBlocks(this.state) ? undefined : this.state.scenario;
       const retake = takeBack && (() => takeBack(scenario).then(resolve, reject));
       showPage(frame.main, endedPage(this.context, ending, retake));
       signal.addEventListener("abort", () => reject(signal.reason));

@@ -33,6 +33,13 @@ export class Texts {
     );
   }
 
+  /** Return these texts in another scenario. @param {string} scenario @returns {Texts} */
+  inScenario(scenario) {
+    const texts = new Texts(this.language, this.words);
+    texts.scenario = scenario;
+    return texts;
+  }
+
   /** Return whether there is a text for a key. @param {string} key @returns {boolean} */
   has(key) {
     return `scenario.${this.scenario}.${key}` in this.words || key in this.words;

@@ -5,6 +5,7 @@
  */
 
 import { Refused } from "./api.js";
+import { currentBlock } from "./blocks.js";
 import { FeedbackTrial } from "./feedback_trial.js";
 import { fullscreenPage, offersFullscreen } from "./fullscreen.js";
 import { windowFits } from "./gate.js";
@@ -75,7 +76,9 @@ export function feedbackPieces(context, media, given) {
  */
 function breakBefore(context, phase, number, rested) {
   const every = context.study.break_every;
-  if (phase !== "test" || every === 0 || number === 0 || number % every !== 0) return [];
+  // The page between blocks is a break too.
+  const [first] = currentBlock(context.state).test;
+  if (phase !== "test" || every === 0 || number === first || number % every !== 0) return [];
   let start = 0;
   return [
     {

@@ -29,11 +29,11 @@ if TYPE_CHECKING:
 
 _EMPTIED = dict.fromkeys((
     "instructed_at", "ready_at", "demographics_at", "questions_at", "finished_at", "own_answers",
-    "questions_study", "loaded_at_phase",
-    "loaded_at_trial", "browser", "progressed_at", "next_from", "implausible", "age", "gender",
+    "questions_study", "loaded_at_phase", "loaded_at_trial", "block_at",
+    "browser", "progressed_at", "next_from", "implausible", "age", "gender",
     "education", "difficulty", "technical_problems", "feedback",
-)) | {"answered_familiarization": 0, "answered_test": 0, "fast_answers": 0, "unfetched": 0,
-      "replayed": 0, "loads": 0, "device": {}}  # fmt: skip
+)) | {"answered_familiarization": 0, "answered_test": 0, "block": 0, "fast_answers": 0,
+      "unfetched": 0, "replayed": 0, "loads": 0, "device": {}}  # fmt: skip
 """Column values that replace the data of a forgotten session."""
 
 

@@ -10,6 +10,7 @@ from itertools import islice
 from sqlalchemy import Connection, bindparam, or_, select
 
 from physion.experiment.store.tables import ANSWERS, SESSIONS, STUDIES
+from physion.experiment.study.blocks import stimuli_by_session
 from physion.experiment.study.study import Study
 
 _CHUNK = 500
@@ -36,11 +37,7 @@ class Scores:
     """Cache of the numbers of correct test answers of finished sessions, which are final."""
 
     def __init__(self, study: Study) -> None:
-        self._labels = {
-            (stimulus.scenario, stimulus.stimulus): stimulus.label
-            for stimulus in study.stimuli
-            if stimulus.phase == "test"
-        }
+        self._labels = {key: each.label for key, each in stimuli_by_session(study).items()}
         self._stimuli = study.stimuli_digest
         self._correct: dict[str, int] = {}
         self._lock = threading.Lock()

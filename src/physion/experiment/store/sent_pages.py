@@ -69,10 +69,18 @@ def _check_text(value: Any) -> str:
     return storable(value).strip()
 
 
+def _check_index(value: Any) -> int:
+    """Validate an index from 0."""
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= 100_000:
+        raise ValueError("a whole number of at least 0")
+    return value
+
+
 FIELDS: Mapping[str, Mapping[str, Callable[[Any], Any]]] = {
     "consent": {"agreed": _check_bool},
     "instructions": {},
     "ready": {},
+    "block": {},
     "demographics": {"age": _check_age, "gender": _check_label, "education": _check_label},
     "feedback": {
         "difficulty": _check_difficulty,
@@ -82,7 +90,11 @@ FIELDS: Mapping[str, Mapping[str, Callable[[Any], Any]]] = {
     "withdraw": {},
 }
 """Required fields of each page with their validators; null means "prefer not to say"."""
-OPTIONAL: Mapping[str, Mapping[str, Callable[[Any], Any]]] = {"consent": {"language": _check_label}}
+OPTIONAL: Mapping[str, Mapping[str, Callable[[Any], Any]]] = {
+    "consent": {"language": _check_label},
+    "ready": {"block": _check_index},
+    "block": {"block": _check_index},
+}
 """Optional fields of each page."""
 
 
@@ -166,6 +178,8 @@ def submit_page(
             if session.consented_at is None:
                 _forget_declined(connection, session)
         return state_of(session, course)
+    if "block" in values and values["block"] < session.block and stage not in ENDED:
+        return state_of(session, course)  # a page of an earlier block, sent again
     if stage in ENDED or STAGES.index(stage) < STAGES.index(page):  # type: ignore[arg-type]
         raise Refused("wrong_stage", "This page is not next.", state_of(session, course))
     if stage == page:
@@ -200,6 +214,8 @@ def _columns(
             known = values.get("language") in study.languages
             language = {"language": values["language"]} if known else {}
             return {"consent_version": study.consent_version, **language}
+        case "block":
+            return {"block": session.block + 1, "ready_at": None}
         case "demographics":
             return dict(values)
         case "questions":

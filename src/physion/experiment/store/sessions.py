@@ -10,10 +10,11 @@ from typing import Any, cast
 from sqlalchemy import Connection, Table, bindparam, select, update
 from sqlalchemy.dialects import postgresql, sqlite
 
-from physion.experiment.protocol.messages import SessionState
+from physion.experiment.protocol.messages import BlockTrials, SessionState
 from physion.experiment.protocol.refused import Refused
-from physion.experiment.protocol.stages import ENDED, PAGES, STAGES, Course, Stage
+from physion.experiment.protocol.stages import ENDED, PAGES, STAGES, Block, Course, Stage
 from physion.experiment.store.tables import SESSIONS, TOKENS
+from physion.experiment.study.orders import session_trials
 from physion.experiment.study.stimuli import PHASES
 from physion.experiment.study.study import Study
 
@@ -53,6 +54,8 @@ class Session:
     implausible: str | None
     answered_familiarization: int
     answered_test: int
+    block: int
+    block_at: float | None
     loads: int
     loaded_at_phase: str | None
     loaded_at_trial: int | None
@@ -69,6 +72,7 @@ _BY_TOKEN = (
 def stages_of(study: Study) -> tuple[Stage, ...]:
     """Return the stages of a study's sessions in order, ``done`` last."""
     absent = {
+        "block": not study.blocks.all_scenarios,
         "demographics": not study.demographics,
         "questions": not study.questions,
     }
@@ -76,17 +80,13 @@ def stages_of(study: Study) -> tuple[Stage, ...]:
 
 
 class Courses:
-    """The `Course` of the sessions of each scenario."""
+    """The `Course` of the sessions of a study."""
 
     def __init__(self, study: Study) -> None:
-        stages = stages_of(study)
-        self._courses = {
-            scenario: Course(stages, {phase: len(study.phase(scenario, phase)) for phase in PHASES})
-            for scenario in study.scenarios
-        }
+        self._study, self._stages = study, stages_of(study)
 
-    def of(self, scenario: str) -> Course:
-        """Return the course of the sessions of a scenario.
+    def of(self, session: Session) -> Course:
+        """Return the course of a session.
 
         Raises
         ------
@@ -94,16 +94,17 @@ class Courses:
             The study no longer has the scenario, which can only happen to previews
             (`study_record.register`).
         """
-        if scenario not in self._courses:
+        if not self.has(session):
             raise Refused(
                 "unknown_token",
                 "The study no longer has this scenario; open your link again.",
             )
-        return self._courses[scenario]
+        trials = session_trials(self._study, session.scenario, session.order_seed)
+        return Course(self._stages, trials)
 
-    def has(self, scenario: str) -> bool:
-        """Return whether the study currently has this scenario."""
-        return scenario in self._courses
+    def has(self, session: Session) -> bool:
+        """Return whether the study currently has the scenario of a session."""
+        return session.scenario in self._study.offered
 
 
 def session_from_row(study: Study, row: Sequence[Any]) -> Session:
@@ -126,7 +127,10 @@ def read_session(connection: Connection, study: Study, token_hash: str) -> Sessi
 
 
 def stage_of(session: Session, course: Course) -> Stage:
-    """Return the current stage of a session: the first one that is not complete."""
+    """Return the current stage of a session: the first one that is not complete.
+
+    A block without familiarization has no page between practice and test.
+    """
     if session.withdrawn_at is not None:
         declined = session.consented_at is None and session.closed_at is None
         return "declined" if declined else "withdrawn"
@@ -134,14 +138,25 @@ def stage_of(session: Session, course: Course) -> Stage:
         return "done"
     if session.voided_at is not None:
         return "withdrawn"
+    block = block_of(session, course)
     for stage in course.stages:
         if stage in PHASES:
-            complete = answered(session, stage) >= course.trials[stage]
+            complete = answered(session, stage) >= block.of(stage).stop
+        elif stage == "block":
+            complete = block is course.trials.blocks[-1]
+        elif stage == "ready" and not block.familiarization:
+            complete = True
         else:
             complete = stage in PAGES and getattr(session, PAGES[stage].column) is not None
         if not complete:
             return stage
     raise AssertionError("a session whose last page was sent is finished")
+
+
+def block_of(session: Session, course: Course) -> Block:
+    """Return the current block of a session."""
+    blocks = course.trials.blocks
+    return blocks[min(session.block, len(blocks) - 1)]
 
 
 def can_take_back(session: Session) -> bool:
@@ -161,7 +176,7 @@ def answered(session: Session, phase: str) -> int:
 
 def state_of(session: Session, course: Course) -> SessionState:
     """Return the state of a session as sent to the client."""
-    stage = stage_of(session, course)
+    stage, block = stage_of(session, course), block_of(session, course)
     return SessionState(
         stage=stage,
         ended=stage in ENDED,
@@ -169,12 +184,25 @@ def state_of(session: Session, course: Course) -> SessionState:
         trial=answered(session, stage) if stage in PHASES else None,
         trials=cast(Any, dict(course.trials)),
         answered=any(answered(session, phase) for phase in PHASES),
-        scenario=session.scenario,
+        block=course.trials.blocks.index(block),
+        blocks=[
+            BlockTrials(
+                scenario=each.scenario,
+                familiarization=_ends(each.familiarization),
+                test=_ends(each.test),
+            )
+            for each in course.trials.blocks
+        ],
+        scenario=block.scenario,
         language=session.language,
         kind=cast(Any, session.kind),
         buttons=cast(Any, session.buttons),
         reference=session.reference,
     )
+
+
+def _ends(indices: range) -> tuple[int, int]:
+    return indices.start, indices.stop
 
 
 def change_session(connection: Connection, session: Session, **values: Any) -> None:

@@ -40,7 +40,8 @@ from physion.experiment.store.database import (
     sqlite_url,
     upgrade,
 )
-from physion.experiment.store.entering import enter_session, identify_visitor
+from physion.experiment.store.entering import enter_session
+from physion.experiment.store.entry.visitor import identify_visitor
 from physion.experiment.store.fetched_media import FetchedMedia
 from physion.experiment.store.lab.jumping import jump
 from physion.experiment.store.scores import Scores, percentile
@@ -133,7 +134,7 @@ class Store:
 
         def count(connection: Connection) -> SessionState:
             session = read_session(connection, self.study, hash_token(token))
-            course = self._courses.of(session.scenario)
+            course = self._courses.of(session)
             if stage_of(session, course) not in ENDED:
                 marks = mark_loaded(session, course)
                 loads = session.loads + 1
@@ -182,7 +183,7 @@ class Store:
 
         def store(connection: Connection) -> tuple[AnswerStored, str]:
             session = read_session(connection, self.study, token_hash)
-            course = self._courses.of(session.scenario)
+            course = self._courses.of(session)
             tag = session_tag(self.secrets, session.session)
             sent_at = self.fetched.sent_at(tag, session.started_at, answer.phase, answer.trial)
             stored = store_answer(
@@ -200,7 +201,7 @@ class Store:
 
         def store(connection: Connection) -> Shown:
             session = read_session(connection, self.study, token_hash)
-            course = self._courses.of(session.scenario)
+            course = self._courses.of(session)
             return store_showing(connection, course, session, showing, now)
 
         return await self._writer.run(store)
@@ -277,7 +278,7 @@ class Store:
     def _read_session(self, connection: Connection, token: str) -> tuple[Session, Any]:
         """Return the session of a token and its course."""
         session = read_session(connection, self.study, hash_token(token))
-        return session, self._courses.of(session.scenario)
+        return session, self._courses.of(session)
 
     def _read_state(self, connection: Connection, token: str) -> SessionState:
         """Return the state of the session of a token."""

@@ -32,13 +32,13 @@ def register(connection: Connection, study: Study, now: float) -> None:
         .join(STUDIES, STUDIES.c.digest == SESSIONS.c.study)
         .where(STUDIES.c.stimuli_digest != study.stimuli_digest)
     )
-    gone = SESSIONS.c.scenario.not_in(study.scenarios)
+    gone = SESSIONS.c.scenario.not_in(study.offered)
     count = sum(_by_scenario(connection, other).values())
     if count:
         raise BadInputError(
-            f"{count} sessions were made with another stimuli.csv or other media; their orders of "
-            "trials would change. Restore the old stimuli, or create a new study folder (or give "
-            "another database) for the new ones"
+            f"{count} sessions were made with another stimuli.csv, other media or other blocks; "
+            "their orders of trials would change. Restore the old stimuli and settings, or create "
+            "a new study folder (or give another database) for the new ones"
         )
     for scenario, of_scenario in _by_scenario(connection, gone).items():
         raise BadInputError(

@@ -95,6 +95,8 @@ SESSIONS = Table(
     Column("next_from", Float),
     Column("answered_familiarization", Integer, nullable=False, default=0),
     Column("answered_test", Integer, nullable=False, default=0),
+    Column("block", Integer, nullable=False, server_default="0"),
+    Column("block_at", Float),
     Column("fast_answers", Integer, nullable=False, server_default="0"),
     Column("unfetched", Integer, nullable=False, server_default="0"),
     Column("replayed", Integer, nullable=False, server_default="0"),
@@ -118,7 +120,9 @@ SESSIONS = Table(
 )
 """Sessions. ``kind`` is written when the session begins and never changed. ``order_number`` is the
 number of the prepared order, 0 if the study has none; ``order_seed`` and the stimuli determine the
-order of the trials. ``loaded_at_*``: the trial that was next when the page was last reloaded.
+order of the trials. ``scenario`` is `study.ALL_SCENARIOS` in sessions of several scenarios, and
+``block`` the index of the current block, to which ``ready_at`` belongs; ``block_at``: when the page
+before it was sent. ``loaded_at_*``: the trial that was next when the page was last reloaded.
 ``own_answers``: answers to the lab's own questions, by name; ``questions_study``: digest of the
 version of the study that asked them.
 ``closed_at``: when the lab ended the session for good, so that the participant cannot take it up

@@ -93,7 +93,7 @@ def read_media(study: Study, secrets: Secrets, path: str) -> SignedMedia:
         raise BadInputError("no such movie or picture")
     item, letter, trial, kind, encrypted, tag, signature = match.groups()
     order_seed = int(encrypted, 16) ^ _pad(secrets, signature)
-    for scenario in study.scenarios:
+    for scenario in dict.fromkeys((*study.offered, *study.scenarios)):
         parts = _signed_parts(study, scenario, order_seed, item, tag)
         if check_signature(secrets, signature, *parts):
             break

@@ -18,6 +18,7 @@ from physion.errors import BadInputError
 from physion.experiment.protocol.messages import Completion, Enter, Source
 from physion.experiment.protocol.public_study import Recruiter
 from physion.experiment.study.identity import REFERENCE_LETTERS, check_signature, sign
+from physion.experiment.study.settings import ALL_SCENARIOS
 from physion.experiment.study.study_checks import NO_CONTACT
 
 if TYPE_CHECKING:
@@ -179,7 +180,7 @@ class Link:
     name
         Recruiter, ``link``, ``preview`` or ``simulated``.
     scenario
-        Scenario that the link leads to.
+        Scenario that the link leads to, or `study.ALL_SCENARIOS`.
     address
         The URL.
     goes_to
@@ -222,16 +223,17 @@ def links(study: Study, secrets: Secrets, base_url: str) -> tuple[Link, ...]:
     """
     root = _root(base_url)
     result = []
-    for scenario in study.scenarios:
+    for scenario in study.offered:
         for name, goes_to in GOES_TO.items():
-            query = [f"scenario={quote(scenario, safe='')}"]
+            named = scenario != ALL_SCENARIOS
+            query = [f"scenario={quote(scenario, safe='')}"] if named else []
             if name in ("preview", "simulated"):
                 query.append(f"pass={make_pass(secrets, name)}")
             elif study.recruitment.signed_links == "study":
                 query.append(f"pass={make_pass(secrets, 'study', name)}")
             if name in PLACEHOLDERS:
                 query.append(PLACEHOLDERS[name])
-            address = f"{root}/?{'&'.join(query)}"
+            address = f"{root}/?{'&'.join(query)}" if query else f"{root}/"
             result.append(Link(name, scenario, address, goes_to, _lacks(study, name)))
     return tuple(result)
 
@@ -256,11 +258,11 @@ def signed_links(
             )
     return tuple(
         (scenario, raw_id, f"{root}/?{urlencode(query)}")
-        for scenario in study.scenarios
+        for scenario in study.offered
         for raw_id in ids
         for query in (
             {
-                "scenario": scenario,
+                **({} if scenario == ALL_SCENARIOS else {"scenario": scenario}),
                 "pass": make_pass(secrets, "person", source, raw_id),
                 name: raw_id,
             },

@@ -31,6 +31,27 @@ class Timing:
 
 
 @dataclass(frozen=True)
+class Blocks:
+    """Several scenarios in one session, one block each.
+
+    Attributes
+    ----------
+    all_scenarios
+        Whether a session runs through all scenarios of the study, in an order of its own.
+    familiarization
+        ``each``: every block begins with the familiarization trials of its scenario; ``first``: the
+        first block alone does.
+    trials
+        Number of test trials of a block, drawn anew for each session with as many of either outcome
+        as possible; 0: all test trials of the scenario.
+    """
+
+    all_scenarios: bool = False
+    familiarization: str = "each"
+    trials: int = 0
+
+
+@dataclass(frozen=True)
 class Screen:
     """Smallest browser window in which participants may take part, in CSS pixels.
 
@@ -174,5 +195,7 @@ class Limits:
     sessions_at_once: int = 200
 
 
+ALL_SCENARIOS = "all scenarios"
+"""In place of a scenario: a session of all scenarios. No scenario can have this name."""
 EARLY_ENDS = ("declined", "stopped", "device_refused", "full")
 """The tables of ``study.toml`` that are an `EarlyEnd`."""

@@ -14,7 +14,9 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -25,7 +27,9 @@ from physion.errors import BadInputError
 from physion.experiment.study import questions
 from physion.experiment.study.questions import Question, parse_questions
 from physion.experiment.study.settings import (
+    ALL_SCENARIOS,
     EARLY_ENDS,
+    Blocks,
     Bonus,
     EarlyEnd,
     Limits,
@@ -45,9 +49,12 @@ from physion.experiment.study.study_file import (
 )
 from physion.experiment.study.texts import TEXTS_FOLDER, read_consent_file, read_texts
 from physion.plain_files import check_plain, read_ids, read_plain
+from physion.stimulus_names import canonical_name
 
 __all__ = [
+    "ALL_SCENARIOS",
     "EARLY_ENDS",
+    "Blocks",
     "Bonus",
     "EarlyEnd",
     "Limits",
@@ -99,7 +106,7 @@ class Study:
         Whether age, gender and education are asked.
     embed_from
         Sites that may show the pages in a frame (MTurk); none by default.
-    timing, screen, plausibility, recruitment, limits
+    timing, blocks, screen, plausibility, recruitment, limits
         The tables of ``study.toml``.
     declined, stopped, device_refused, full
         Codes and URLs of participants who gave no consent, who stopped, whose device cannot show
@@ -119,7 +126,7 @@ class Study:
     digest
         SHA-256 of study.toml, texts, consent forms and stimuli.csv.
     stimuli_digest
-        SHA-256 of stimuli.csv.
+        SHA-256 of stimuli.csv; with blocks, also of the settings that choose trials from it.
     """
 
     folder: Path
@@ -139,6 +146,7 @@ class Study:
     demographics: bool = True
     embed_from: tuple[str, ...] = ()
     timing: Timing = field(default=Timing())
+    blocks: Blocks = field(default=Blocks())
     screen: Screen = field(default=Screen())
     plausibility: Plausibility = field(default=Plausibility())
     recruitment: Recruitment = field(default=Recruitment())
@@ -156,6 +164,11 @@ class Study:
     digest: str = ""
     stimuli_digest: str = ""
 
+    @property
+    def offered(self) -> tuple[str, ...]:
+        """What a session can be of: one of the scenarios, or `ALL_SCENARIOS`."""
+        return (ALL_SCENARIOS,) if self.blocks.all_scenarios else self.scenarios
+
     def phase(self, scenario: str, phase: str) -> tuple[Stimulus, ...]:
         """Return the stimuli of one phase of a scenario, sorted by place."""
         chosen = [s for s in self.stimuli if (s.scenario, s.phase) == (scenario, phase)]
@@ -164,6 +177,7 @@ class Study:
 
 _PARTS: dict[str, type[Any]] = {
     "timing": Timing,
+    "blocks": Blocks,
     "screen": Screen,
     "plausibility": Plausibility,
     "recruitment": Recruitment,
@@ -209,6 +223,7 @@ def load_study(folder: Path | str) -> Study:
     rows = read_plain(listed, MAX_STIMULI_BYTES)
     stimuli = tuple(s for s in parse_stimuli(listed, rows) if s.scenario in study.scenarios)
     _check_stimuli(study, stimuli, listed)
+    _check_blocks(study, stimuli, listed)
     return replace(
         study,
         stimuli=stimuli,
@@ -216,7 +231,7 @@ def load_study(folder: Path | str) -> Study:
         texts=texts,
         consent_files=files,
         digest=_digest(content, *written, rows),
-        stimuli_digest=_digest(rows),
+        stimuli_digest=_digest(rows, *_block_settings(study)),
     )
 
 
@@ -270,6 +285,37 @@ def _check_stimuli(study: Study, stimuli: tuple[Stimulus, ...], path: Path) -> N
     for stimulus in stimuli:
         for name in filter(None, (stimulus.movie, stimulus.map, stimulus.full)):
             check_plain(study.folder / name)
+
+
+def _check_blocks(study: Study, stimuli: tuple[Stimulus, ...], path: Path) -> None:
+    """Check that the blocks of a session have the trials that they need, and distinct stimuli."""
+    wanted, settings = study.blocks.trials, study.folder / STUDY_FILE
+    if not study.blocks.all_scenarios:
+        return
+    if len(study.scenarios) < 2:
+        raise BadInputError(f"{settings}: blocks.all_scenarios needs at least two scenarios")
+    counts = Counter(s.scenario for s in stimuli if s.phase == "test")
+    for scenario in study.scenarios:
+        if wanted > counts[scenario]:
+            raise BadInputError(
+                f"{settings}: blocks.trials is {wanted}, but {scenario} has {counts[scenario]} "
+                "test stimuli"
+            )
+    seen: dict[str, str] = {}
+    for stimulus in stimuli:
+        first = seen.setdefault(canonical_name(stimulus.stimulus), stimulus.scenario)
+        if first != stimulus.scenario:
+            raise BadInputError(
+                f"{path}: {stimulus.stimulus} is a stimulus of {first} and of {stimulus.scenario}; "
+                "with blocks.all_scenarios a session has both, so give them different names"
+            )
+
+
+def _block_settings(study: Study) -> tuple[bytes, ...]:
+    """Return the settings that choose the trials of blocks, as JSON; nothing without blocks."""
+    if not study.blocks.all_scenarios:
+        return ()
+    return (json.dumps([study.scenarios, vars(study.blocks)]).encode(),)
 
 
 def _digest(*parts: bytes) -> str:

@@ -236,6 +236,14 @@ KEYS: tuple[Key, ...] = (
         "More than 3 could harm people with photosensitive epilepsy."),
     Key("timing", "break_every", whole(0, 100_000),
         "Test trials after which people can rest for as long as they like; 0: no breaks."),
+    Key("blocks", "all_scenarios", flag,
+        "Whether a session runs through all scenarios, one block each, in an order of its own;\n"
+        "all orders are used about equally often. false: a session has one scenario."),
+    Key("blocks", "familiarization", one_of("each", "first"),
+        "\"each\": every block begins with the familiarization trials of its scenario;\n"
+        "\"first\": the first block alone does."),
+    Key("blocks", "trials", whole(0, 100_000),
+        "Test trials of a block, drawn for each session, half of them with contact; 0: all."),
     Key("screen", "min_width", whole(320, 10_000), "Smallest browser window, in CSS pixels."),
     Key("screen", "min_height", whole(320, 10_000), ""),
     Key("screen", "fullscreen", flag,
@@ -305,6 +313,7 @@ KEYS: tuple[Key, ...] = (
 
 TABLES = {
     "timing": "Durations within a trial.",
+    "blocks": "Several scenarios in one session.",
     "screen": "In a smaller window participants are asked to enlarge it; telephones are refused.",
     "plausibility": "Sessions that no person can have made, repeated and interrupted movies.",
     "recruitment": "Recruitment and completion credit.",

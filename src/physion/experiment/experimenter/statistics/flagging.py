@@ -16,7 +16,6 @@ from sqlalchemy import Engine
 
 from physion.errors import PhysionError
 from physion.experiment.study.study import Study
-from physion.stimulus_names import canonical_name
 
 LOG = logging.getLogger(__name__)
 MAX_WAIT = 2.0
@@ -114,12 +113,11 @@ def find_flags(study: Study, engine: Engine) -> Mapping[str, Flags]:
     from physion.analysis.people.exclusions import RULE_SETS, RULES, flag_sessions
     from physion.analysis.people.participants import clean
     from physion.experiment.export.answer_tables import read_tables
+    from physion.experiment.export.expected import expected_names
 
     trials, sessions = read_tables(engine, study)
-    expected = {
-        name.lower(): frozenset(canonical_name(each.stimulus) for each in study.phase(name, "test"))
-        for name in study.scenarios
-    }
+    with engine.connect() as connection:
+        expected = expected_names(connection, study)
     result = {"preview": Flags(study.exclusions, problem="previews are never analysed")}
     for kind, simulated in (("person", False), ("simulated", True)):
         rows = trials[trials["simulated"] == simulated]

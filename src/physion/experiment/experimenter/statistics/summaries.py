@@ -9,7 +9,7 @@ from typing import Any
 
 from sqlalchemy import Connection, Engine, Row, select
 
-from physion.experiment.protocol.stages import Course, Stage
+from physion.experiment.protocol.stages import OF_BLOCK, Block, Course, SessionTrials
 from physion.experiment.store.sessions import (
     ACTIVE_WITHIN,
     SESSION_COLUMNS,
@@ -19,7 +19,7 @@ from physion.experiment.store.sessions import (
     stages_of,
 )
 from physion.experiment.store.tables import ANSWERS, SESSIONS
-from physion.experiment.study.stimuli import PHASES
+from physion.experiment.study.blocks import stimuli_by_session
 from physion.experiment.study.study import Study
 
 STATES = {
@@ -119,15 +119,20 @@ class AnswerCounts:
 
 @dataclass
 class SessionSummary:
-    """Summary of a session: its database row (``facts``), state, stage and answer counts."""
+    """Summary of a session: its database row (``facts``), state, stage and answer counts.
+
+    In a session of several blocks, some stages have the number of the block from 1: ``test 2``.
+    """
 
     facts: Mapping[str, Any]
     state: str
-    stage: Stage
+    stage: str
     answered: AnswerCounts
 
 
 _NOTHING = AnswerCounts()
+_UNKNOWN = SessionTrials((Block("", range(1_000_000), range(1_000_000)),))
+"""Trials of previews of scenarios that were removed."""
 
 
 class SummaryCache:
@@ -139,7 +144,7 @@ class SummaryCache:
 
     def __init__(self, study: Study, engine: Engine) -> None:
         self._engine = engine
-        self._labels = stimulus_labels(study)
+        self._stimuli = stimuli_by_session(study)
         self._courses, self._stages = Courses(study), stages_of(study)
         self._answered: dict[str, AnswerCounts] = {}
 
@@ -173,27 +178,35 @@ class SummaryCache:
             answers = connection.execute(chosen.order_by(ANSWERS.c.session)).all()
             counts = {session: AnswerCounts() for session in part}
             for answer in answers:
-                label = self._labels.get((scenarios[answer.session], answer.stimulus))
-                counts[answer.session].add(answer, label)
+                stimulus = self._stimuli.get((scenarios[answer.session], answer.stimulus))
+                counts[answer.session].add(answer, stimulus.label if stimulus else None)
             self._answered |= counts
 
     def _counts(self, session: str) -> tuple[int, int]:
         known = self._answered.get(session, _NOTHING)
         return known.familiarization, known.test
 
-    def _stage(self, facts: Mapping[str, Any]) -> Stage:
+    def _stage(self, facts: Mapping[str, Any]) -> str:
         """Return the stage of a session, or the stage at which it was withdrawn."""
         columns = {column.name: facts[column.name] for column in SESSION_COLUMNS}
         session = Session(**columns | {"withdrawn_at": None})
         # The number of trials is unknown for previews of scenarios that were removed.
-        if self._courses.has(session.scenario):
-            return stage_of(session, self._courses.of(session.scenario))
-        return stage_of(session, Course(self._stages, dict.fromkeys(PHASES, 1_000_000)))
+        known = self._courses.has(session)
+        course = self._courses.of(session) if known else Course(self._stages, _UNKNOWN)
+        stage = stage_of(session, course)
+        several = len(course.trials.blocks) > 1 and stage in OF_BLOCK
+        return f"{stage} {session.block + 1}" if several else stage
 
 
-def stimulus_labels(study: Study) -> dict[tuple[str, str], bool]:
-    """Return the label (contact or not) of each stimulus, by scenario and name."""
-    return {(each.scenario, each.stimulus): each.label for each in study.stimuli}
+def stages_shown(study: Study) -> list[str]:
+    """Return the stages of the sessions of a study in order, as in `SessionSummary`."""
+    stages = stages_of(study)
+    if not study.blocks.all_scenarios:
+        return list(stages)
+    of_block = [stage for stage in stages if stage in OF_BLOCK]
+    shown = [f"{stage} {n}" for n in range(1, len(study.scenarios) + 1) for stage in of_block]
+    before = stages.index(of_block[0])
+    return [*stages[:before], *shown[:-1], *stages[before + len(of_block) :]]
 
 
 def session_state(facts: Mapping[str, Any], now: float) -> str:

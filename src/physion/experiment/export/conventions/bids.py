@@ -8,9 +8,10 @@
 
 If a study has several scenarios, each is a BIDS session: folders and names contain
 ``ses-<scenario>``, and ``sub-<participant>_sessions.tsv`` (with ``sessions.json``) describes the
-sessions. Answers to the lab's own questions are in ``phenotype/questions.tsv``, described in
-``phenotype/questions.json``. Empty cells are ``n/a``. See bids-specification.readthedocs.io,
-behavioral experiments.
+sessions. If a session has several scenarios, its task is ``allscenarios``, and a column names the
+scenario of each trial. Answers to the lab's own questions are in ``phenotype/questions.tsv``,
+described in ``phenotype/questions.json``. Empty cells are ``n/a``. See
+bids-specification.readthedocs.io, behavioral experiments.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from physion.analysis.people.response_schema import SESSION_COLUMNS, TRIAL_COLUM
 from physion.experiment.export.conventions.column_labels import column_levels, unique_file_labels
 from physion.experiment.export.spreadsheet import guard_cell
 from physion.experiment.export.trial_rows import TrialBatch
-from physion.experiment.study.study import Study
+from physion.experiment.study.study import ALL_SCENARIOS, Study
 
 VERSION = "1.10.0"
 EMPTY = "n/a"
@@ -52,6 +53,8 @@ BEH_COLUMNS = (
     RESPONSE_TIME,
     *(column for column in TRIAL_COLUMNS if column.name not in _IN_NAMES),
 )
+SCENARIO = next(column for column in TRIAL_COLUMNS if column.name == "scenario")
+"""In the files of sessions of several scenarios."""
 PERSON_COLUMNS = tuple(
     column
     for column in SESSION_COLUMNS
@@ -70,17 +73,21 @@ class BidsWriter:
     def __init__(self, folder: Path, study: Study, sessions: pa.Table) -> None:
         folder.mkdir(parents=True)
         self._folder, self._sessions = str(folder), sessions
-        self._several = len(study.scenarios) > 1
-        self._labels = unique_file_labels(study.scenarios)
+        self._several = len(study.offered) > 1
+        self._labels = unique_file_labels(study.offered)
         self._participants = sessions.column("participant").to_pylist()
         self._scenarios = sessions.column("scenario").to_pylist()
+        self._columns = BEH_COLUMNS
+        if study.blocks.all_scenarios:
+            self._scenarios = [ALL_SCENARIOS] * len(self._participants)
+            self._columns = (TRIAL_TYPE, RESPONSE_TIME, SCENARIO, *BEH_COLUMNS[2:])
         self._made: set[str] = set()
         self._answered: list[int] = []
 
     def write(self, trials: TrialBatch) -> None:
         """Write the files of a batch of sessions; sessions without answers get no file."""
-        header = "\t".join(column.name for column in BEH_COLUMNS).encode() + b"\n"
-        rows = _tsv(_beh_table(trials.table))
+        header = "\t".join(column.name for column in self._columns).encode() + b"\n"
+        rows = _tsv(_beh_table(trials.table, self._columns))
         ends = np.flatnonzero(np.frombuffer(rows, np.uint8) == ord("\n")) + 1
         begin, row = 0, 0
         for at, count in zip(trials.sessions, trials.counts, strict=True):
@@ -137,10 +144,10 @@ class BidsWriter:
             "GeneratedBy": [{"Name": "physion", "Version": version}],
         })  # fmt: skip
         (folder / "README.md").write_text(readme, encoding="utf-8")
-        scenarios = set(answered.column("scenario").to_pylist())
+        scenarios = {self._scenarios[at] for at in self._answered}
         for scenario, label in self._labels.items():
             if scenario in scenarios:
-                described = describe(BEH_COLUMNS)
+                described = describe(self._columns)
                 task = {"TaskName": label, "TaskDescription": TASK}
                 _write_json(folder / f"task-{label}_beh.json", task | described)
         self._write_people(folder, answered)
@@ -218,10 +225,10 @@ _PLAIN = ("participant", "session", "scenario", "stimulus")
 """Text columns whose values never need the rule."""
 
 
-def _beh_table(trials: pa.Table) -> pa.Table:
+def _beh_table(trials: pa.Table, wanted: Sequence[Column]) -> pa.Table:
     """Return the answers with BIDS column names, and ``n/a`` in empty cells."""
     columns = []
-    for column in BEH_COLUMNS:
+    for column in wanted:
         if column is TRIAL_TYPE:
             values = trials.column("phase")
         elif column is RESPONSE_TIME:
@@ -231,7 +238,7 @@ def _beh_table(trials: pa.Table) -> pa.Table:
         if values.null_count:
             values = pc.fill_null(pc.cast(values, pa.string()), EMPTY)
         columns.append(values)
-    return pa.table(columns, names=[column.name for column in BEH_COLUMNS])
+    return pa.table(columns, names=[column.name for column in wanted])
 
 
 def _tsv(table: pa.Table) -> bytes:

@@ -41,17 +41,34 @@ def jump(
         raise Refused("bad_request", "Only a preview can go to any page.")
     if to.stage not in course.stages:
         raise Refused("bad_request", f"stage: the study has no {to.stage}")
-    if to.stage in PHASES and to.trial >= course.trials[to.stage]:
-        raise Refused("bad_request", f"trial: the last one is {course.trials[to.stage] - 1}")
+    block = _block_of(course, to)
     done = course.stages[: course.stages.index(to.stage)]
     values: dict[str, Any] = {"withdrawn_at": None, "closed_at": None}
     for stage, page in PAGES.items():
         values[page.column] = now if stage in done else None
     for phase in PHASES:
-        here = to.trial if phase == to.stage else 0
-        values[f"answered_{phase}"] = course.trials[phase] if phase in done else here
+        own = course.trials.blocks[block].of(phase)
+        here = to.trial if phase == to.stage else own.start
+        values[f"answered_{phase}"] = own.stop if phase in done else here
         open_from = values[f"answered_{phase}"]
         of_phase = (ANSWERS.c.session == session.session) & (ANSWERS.c.phase == phase)
         connection.execute(delete(ANSWERS).where(of_phase, ANSWERS.c.trial >= open_from))
-    change_session(connection, session, **values)
+    change_session(connection, session, block=block, **values)
     return state_of(session, course)
+
+
+def _block_of(course: Course, to: Jump) -> int:
+    """Return the index of the block to which a jump goes; `Refused` if there is none."""
+    last = len(course.trials.blocks) - 1
+    if to.stage in PHASES:
+        for index, block in enumerate(course.trials.blocks):
+            if to.trial in block.of(to.stage):
+                return index
+        raise Refused("bad_request", f"trial: the last one is {course.trials[to.stage] - 1}")
+    if to.stage == "block" or (to.stage == "ready" and last > 0):
+        # No page follows the last block.
+        most = last - 1 if to.stage == "block" else last
+        if to.trial > most:
+            raise Refused("bad_request", f"trial: the last such block is {most}")
+        return to.trial
+    return 0 if course.stages.index(to.stage) <= course.stages.index("ready") else last

@@ -1,0 +1,53 @@
+"""The test stimuli that a complete session has answered: of its scenario, or of its blocks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sqlalchemy import Connection, select
+
+from physion.experiment.export.session_rows import SessionTable
+from physion.experiment.store.tables import SESSIONS
+from physion.experiment.study.orders import trial_order
+from physion.experiment.study.stimuli import Stimulus
+from physion.experiment.study.study import ALL_SCENARIOS, Study
+from physion.stimulus_names import canonical_name
+
+
+def expected_stimuli(
+    connection: Connection, study: Study, sessions: SessionTable
+) -> list[tuple[str, ...]]:
+    """Return the rows of ``expected.csv`` with their header: stimulus and scenario.
+
+    If sessions have several scenarios, each has rows of its own, with the column ``session``.
+    """
+    if not study.blocks.all_scenarios:
+        rows = [(s.stimulus, s.scenario) for s in study.stimuli if s.phase == "test"]
+        return [("stimulus", "scenario"), *rows]
+    seeds = read_block_seeds(connection)
+    found: list[tuple[str, ...]] = [("stimulus", "scenario", "session")]
+    for session in sessions.table.column("session").to_pylist():
+        order = trial_order(study, ALL_SCENARIOS, seeds[session])["test"]
+        found += [(each.stimulus, each.scenario, session) for each in order]
+    return found
+
+
+def expected_names(connection: Connection, study: Study) -> dict[str, frozenset[str]]:
+    """Return the expected stimuli as the analysis takes them, by scenario or by session."""
+    if not study.blocks.all_scenarios:
+        return {name.lower(): _names(study.phase(name, "test")) for name in study.scenarios}
+    return {
+        session: _names(trial_order(study, ALL_SCENARIOS, seed)["test"])
+        for session, seed in read_block_seeds(connection).items()
+    }
+
+
+def _names(stimuli: Sequence[Stimulus]) -> frozenset[str]:
+    return frozenset(canonical_name(each.stimulus) for each in stimuli)
+
+
+def read_block_seeds(connection: Connection) -> dict[str, int]:
+    """Return the seeds of the sessions that have several scenarios."""
+    columns = SESSIONS.c
+    chosen = select(columns.session, columns.order_seed).where(columns.scenario == ALL_SCENARIOS)
+    return dict(connection.execute(chosen).all())
