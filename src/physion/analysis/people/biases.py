@@ -203,6 +203,8 @@ def accuracy_by_background(test: pd.DataFrame, sessions: pd.DataFrame) -> pd.Dat
     by_person["relative"] = by_person["accuracy"] - by_person.groupby("scenario")[
         "accuracy"
     ].transform("mean")
+    # A session of several scenarios counts once.
+    by_person = by_person.groupby("session", as_index=False, sort=False)["relative"].mean()
     joined = by_person.merge(sessions.drop(columns=["participant", "scenario"], errors="ignore"),
                        on="session", how="left")  # fmt: skip
     asked = [column for column in BACKGROUND if column in joined]

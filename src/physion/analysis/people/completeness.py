@@ -10,9 +10,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 
-from physion.analysis.people.participants import Responses
+from physion.analysis.people.participants import Responses, scenarios_in
 from physion.analysis.tables.csv_table import read_table
 from physion.analysis.tables.stimuli import in_order
 from physion.errors import BadInputError
@@ -53,7 +54,7 @@ def find_expected(responses: Sequence[Path]) -> Path | None:
 
 def check_expected(responses: Responses, expected: Expected | None) -> None:
     """Raise `BadInputError` for a list that names none of these sessions and scenarios."""
-    known = {*responses.sessions["session"], *responses.sessions["scenario"]}
+    known = {*responses.sessions["session"], *_each(responses.sessions["scenario"])}
     if expected is not None and not known & set(expected):
         raise BadInputError(
             f"the list of expected stimuli names {next(iter(expected), 'nothing')!r}, which is "
@@ -78,16 +79,16 @@ def expected_by_session(
 ) -> dict[str, frozenset[str]]:
     """Return the stimuli that each session must have answered.
 
-    Those of the list of the session, else of its scenario, else `stimuli_of_most`; none for a
+    Those of the list of the session, else of its scenarios, else `stimuli_of_most`; none for a
     scenario without either.
     """
     given = dict(expected or {})
     of_scenario = {**stimuli_of_most(responses.test), **given}
-    pairs = responses.sessions[["session", "scenario"]].to_numpy()
-    return {
-        str(session): given.get(session, of_scenario.get(scenario, frozenset()))
-        for session, scenario in pairs
-    }
+    found = {}
+    for session, scenarios in responses.sessions[["session", "scenario"]].to_numpy():
+        parts = [of_scenario.get(name, frozenset()) for name in scenarios_in(scenarios)]
+        found[str(session)] = given.get(session, frozenset().union(*parts))
+    return found
 
 
 def drop_unexpected(responses: Responses, expected: Expected | None) -> Responses:
@@ -138,8 +139,14 @@ def completeness_warnings(responses: Responses, expected: Expected | None) -> li
 def _listed(responses: Responses, expected: Expected) -> set[str]:
     """Return the sessions for which the list names stimuli, by session or by scenario."""
     rows = responses.sessions
-    given = rows["session"].isin(set(expected)) | rows["scenario"].isin(set(expected))
+    of_scenario = [any(name in expected for name in scenarios_in(s)) for s in rows["scenario"]]
+    given = rows["session"].isin(set(expected)) | np.array(of_scenario, dtype=bool)
     return set(rows.loc[given, "session"])
+
+
+def _each(sets: pd.Series) -> set[str]:
+    """Return each scenario of some `scenario_set`."""
+    return {name for scenarios in sets.unique() for name in scenarios_in(scenarios)}
 
 
 def _not_expected(responses: Responses, expected: Expected | None) -> pd.Series:

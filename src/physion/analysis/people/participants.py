@@ -18,6 +18,7 @@ import pandas as pd
 
 from physion.analysis.people.response_schema import SESSION_COLUMNS, TRIAL_COLUMNS, check_table
 from physion.analysis.tables.csv_table import read_table, refuse_duplicates
+from physion.analysis.tables.stimuli import in_order
 from physion.errors import BadInputError
 from physion.stimulus_names import OFFICIAL_SCENARIOS, canonical_name, is_ledge
 
@@ -36,6 +37,8 @@ REHEARSAL = "Rehearsal: participants are simulated, so no number here is about p
 EXCLUDED = "on the list of stimuli to leave out"
 LEDGE = "Roll stimulus with a ledge"
 VOID = "the movie was interrupted"
+SEVERAL = " + "
+"""Between the scenarios of a session that has several."""
 NO_TIME = "no response time above 0: the answer counts, its time does not"
 
 DROPPED_COLUMNS = ("step", "scenario", "reason", "sessions", "rows")
@@ -51,7 +54,7 @@ class Responses:
       (bool), ``rt_ms`` (from the moment of the buttons; NaN where not known), ``log_rt`` (natural
       logarithm of it; NaN where not above 0), and whatever else of `TRIAL_COLUMNS` was given.
     - ``sessions``: one row a session (`SESSION_COLUMNS`, as far as given), in the order in which
-      they began, or else in which they stand in the file.
+      they began, or else in which they stand in the file. ``scenario`` is a `scenario_set`.
     - ``dropped``: what was left out: ``step``, ``scenario``, ``reason``, ``sessions`` (with at
       least one such row) and ``rows``.
     """
@@ -177,7 +180,8 @@ def clean(
 ) -> Responses:
     """Return the responses of a table that `check_table` has typed; see `read_responses`.
 
-    Raises `BadInputError` for a session with two participants or scenarios, a stimulus with two
+    Raises `BadInputError` for a session with two participants, or with two scenarios in one block
+    or without blocks, a stimulus with two
     labels or in two scenarios, a ``correct`` that contradicts response and label, or a trial whose
     session is not in ``sessions``.
     """
@@ -208,23 +212,31 @@ def _ours(name: str) -> str:
 
 
 def _sessions(trials: pd.DataFrame, given: pd.DataFrame | None, where: str) -> pd.DataFrame:
-    """Return the table of sessions, checked against the trials."""
+    """Return the table of sessions, checked against the trials.
+
+    The scenario of a session of several blocks is the `scenario_set` of its scenarios.
+    """
     keys = ["session", "participant", "scenario"]
-    cleaned = trials[keys].drop_duplicates().reset_index(drop=True)
-    twice = cleaned[cleaned["session"].duplicated()]
+    pairs = trials[keys[:2]].drop_duplicates()
+    twice = pd.concat([pairs[pairs["session"].duplicated()], _unexplained_scenarios(trials)])
     if len(twice):
         raise BadInputError(
-            f"{where}: session {twice['session'].iloc[0]!r} belongs to two participants or to "
-            "two scenarios"
+            f"{where}: session {twice['session'].iloc[0]!r} belongs to two participants or, "
+            "without blocks, to two scenarios"
         )
+    answered = trials.groupby("session", sort=False)["scenario"].unique()
+    cleaned = pairs.assign(scenario=pairs["session"].map(answered.map(scenario_set)))
+    cleaned = cleaned.reset_index(drop=True)
     if given is None:
         return cleaned
     refuse_duplicates(given["session"], "table of sessions")
-    given = given.assign(scenario=_scenarios(given["scenario"]))
+    listed = given["scenario"].str.split().map(lambda names: scenario_set(map(_ours, names)))
+    given = given.assign(scenario=listed)
     joined = cleaned.merge(given[keys], on="session", how="left", suffixes=("", "_given"))
-    wrong = (joined["participant"] != joined["participant_given"]) | (
-        joined["scenario"] != joined["scenario_given"]
-    )
+    # An unfinished session lacks the scenarios of its last blocks.
+    both = zip(joined["scenario"], joined["scenario_given"].fillna(""), strict=True)
+    absent = [not set(scenarios_in(here)) <= set(scenarios_in(there)) for here, there in both]
+    wrong = (joined["participant"] != joined["participant_given"]) | np.array(absent, dtype=bool)
     if wrong.any():
         raise BadInputError(
             f"{where}: session {joined.loc[wrong, 'session'].iloc[0]!r} is not, or is another one, "
@@ -234,6 +246,25 @@ def _sessions(trials: pd.DataFrame, given: pd.DataFrame | None, where: str) -> p
         began = pd.to_datetime(given["started_at"], errors="coerce", utc=True, format="ISO8601")
         given = given.loc[began.sort_values(kind="stable", na_position="last").index]
     return given.reset_index(drop=True)
+
+
+def _unexplained_scenarios(trials: pd.DataFrame) -> pd.DataFrame:
+    """Return rows of sessions with two scenarios that are not, one each, those of their blocks."""
+    pairs = trials.assign(block=trials.get("block", pd.NA))
+    pairs = pairs[["session", "block", "scenario"]].drop_duplicates()
+    several = pairs[pairs.groupby("session")["scenario"].transform("nunique") > 1]
+    own = several.groupby(["session", "block"], dropna=False)["scenario"].transform("nunique")
+    return several[several["block"].isna() | (own > 1)]
+
+
+def scenario_set(scenarios: Iterable[str]) -> str:
+    """Return the scenarios of a session as one text, the same for all orders of its blocks."""
+    return SEVERAL.join(in_order(pd.Series(list(scenarios), dtype=str)))
+
+
+def scenarios_in(name: str) -> list[str]:
+    """Return the scenarios of a `scenario_set`."""
+    return name.split(SEVERAL)
 
 
 def _known(

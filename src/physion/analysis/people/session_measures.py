@@ -43,6 +43,8 @@ def _longest_run(same: npt.NDArray[np.bool_]) -> int:
 def session_measures(responses: Responses, expected: Expected | None = None) -> pd.DataFrame:
     """Return the measures for the rules, one row a session, in the order of ``responses.sessions``.
 
+    A session of several blocks is measured as a whole, over the answers in the order given.
+
     ``expected``: the test stimuli by scenario, or by session if people see subsets; by default
     those that at least half of the scenario's sessions answered (`completeness`). Columns:
     ``session``, ``participant``, ``scenario``, ``expected`` (number of stimuli), ``missing`` (those
@@ -66,8 +68,9 @@ def session_measures(responses: Responses, expected: Expected | None = None) -> 
     for session, scenario in responses.sessions[["session", "scenario"]].to_numpy():
         if session in by_session:
             begins.setdefault(scenario, bool(by_session[session]["yes"].iloc[0]))
+    scenario_of = dict(responses.sessions[["session", "scenario"]].to_numpy())
     records = {
-        session: _session_record(rows, begins[str(rows["scenario"].iloc[0])])
+        session: _session_record(rows, begins[scenario_of[session]])
         for session, rows in by_session.items()
     }
     nothing = {"trials": 0, "longest_streak": 0, "longest_alternation": 0,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Literal
 
 from pydantic import Field
 
@@ -22,7 +22,7 @@ class Recruiter(Message):
     source: Source
     id: str
     others: list[str]
-    preview: Annotated[dict[str, str], Field(default_factory=dict)]
+    preview: dict[str, str] = Field(default_factory=dict)
 
 
 class AskedQuestion(Message):

@@ -119,6 +119,7 @@ def label(stage: str) -> str:
     The stage may be followed by the number of a block: ``test 2``.
     """
     name, _, number = stage.partition(" ")
-    known = {page: about.label for page, about in PAGES.items()} | {"done": "Finished"}
+    known: dict[str, str] = {page: about.label for page, about in PAGES.items()}
+    known["done"] = "Finished"
     words = known.get(name, name.capitalize())
     return f"{words}, block {number}" if number else words
