@@ -30,9 +30,10 @@ export function jumpControl(texts, state, onJump) {
     "aria-label": t("preview.trial"),
   });
   const choose = () => {
-    const trials = state.trials[stages.value];
-    number.hidden = trials === undefined;
-    number.max = String(trials ?? 1);
+    const most = numbers[stages.value];
+    const single = stages.value === "ready" && blocks === 1;
+    number.hidden = most === undefined || single;
+    number.max = String(most ?? 1);
   };
   stages.addEventListener("change", choose);
   choose();
