@@ -25,8 +25,9 @@ EXTRAS = {
     ),
     "dev": (
         *("pytest", "pytest-xdist", "hypothesis", "ruff", "mypy", "import-linter"),
-        *("playwright", "trimesh"),
+        *("playwright", "trimesh", "hatchling", "nbclient", "nbformat", "ipykernel"),
     ),
+    "docs": ("mkdocs-material",),
 }
 CORE = (
     *("numpy", "scipy", "mujoco", "numba", "h5py", "hdf5plugin", "av", "pillow"),

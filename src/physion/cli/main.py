@@ -7,35 +7,10 @@ the output closed it, as ``head`` does.
 
 from __future__ import annotations
 
-import importlib
 import os
 import sys
 
-VERBS = {
-    "run": "run the whole pipeline: scenes, trials, models, readout, comparison, report",
-    "generate": "sample scenes and write trials",
-    "replay": "simulate official command logs and compare with the recorded outcomes",
-    "train": "train models on trials, without labels",
-    "evaluate": "train models and readouts on trials and write their predictions",
-    "compare": "compare predictions with people",
-    "experiment": "run the experiment with people: init, serve, export",
-    "view": "write a page that shows a dataset: movies, passes, motion in 3D",
-    "export": "write the official layout, webdataset shards, or a dataset card",
-    "import": "convert official HDF5 files and movies to trials",
-    "import-official": "convert a checkout of the original study: scenes, outcomes, people",
-    "verify": "check every byte, label and motion of a dataset",
-    "ls": "list scenarios, presets, shapes, props, materials, models, readers, engines",
-    "doctor": "check this machine and print what to install",
-}
-
-MODULES = {
-    "import": "import_trials",
-    "import-official": "official.import_official",
-    "run": "run.run",
-    "compare": "compare.compare",
-    "experiment": "experiment.experiment",
-}
-"""Modules of verbs that are Python keywords or have sub-verbs."""
+from physion.cli.help.verbs import VERBS, find_module
 
 OUTPUT_CLOSED = 141
 """Exit code that shells show for programs that write to a closed pipe: 128 + SIGPIPE."""
@@ -98,15 +73,14 @@ def _run_verb(args: list[str]) -> int:
         raise UnknownNameError("verb", args[0], VERBS)
     import tyro
 
-    module = importlib.import_module(f"physion.cli.{MODULES.get(args[0], args[0])}")
-    taken = 1
-    if args[1:2] and args[1] in getattr(module, "SUBVERBS", {}):
-        module, taken = importlib.import_module(module.SUBVERBS[args[1]]), 2
+    from physion.cli.help.examples import describe
+
+    module, taken = find_module(args)
     options = tyro.cli(
         module.Options,
         args=args[taken:],
         prog=" ".join(["physion", *args[:taken]]),
-        description=module.__doc__,
+        description=describe(module.__doc__, args[:taken]),
     )
     return int(module.main(options))
 

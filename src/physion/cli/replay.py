@@ -29,6 +29,7 @@ from physion.errors import BadInputError
 from physion.physics.engine import DEFAULT_ENGINE, can_simulate, engines
 from physion.physics.replay import Replay, ReplayRow, ReplayTask, replay_trial, summarise
 from physion.scenes.tdw.read_logs import TrialSet
+from physion.version import MADE_WITH
 
 SHOWN_FAILURES = 5
 COLUMNS = {
@@ -187,6 +188,7 @@ def _as_json(result: ReplayResult, logs: TrialSet) -> str:
         return {key: None if value != value else value for key, value in values.items()}
 
     content = {
+        "package": MADE_WITH,
         "scenarios": [as_dict(row) for row in result.rows],
         "trials": [as_dict(replay) for replay in result.replays],
         "duplicates": result.copies,

@@ -14,6 +14,7 @@ import pandas as pd
 from physion.digests import write_with_digest
 from physion.models.batch import Provenance
 from physion.readout.protocols import Readout
+from physion.version import MADE_WITH
 
 OFFICIAL_COLUMNS = (
     "Model",
@@ -75,6 +76,7 @@ OWN_COLUMNS = (
 - ``Fit Trials``: number of trials in the fit. ``Fold``: fold of a cross-validation, or -1.
 - ``Reader``: what turned features or rollouts into probabilities. ``Noise Scale`` and
   ``Gap Threshold`` (metres): what it fitted. ``Copy-last Loss``: of the trivial predictor.
+- ``Versions``: of this package and of those that the model used.
 - The others are empty where they do not apply.
 """
 
@@ -135,6 +137,9 @@ def make_table(
     Accuracies are means over all folds of a protocol and scenario.
     """
     truth = index.set_index("trial")
+    versions = provenance.versions
+    if "physion " not in versions:
+        versions = f"{versions}, {MADE_WITH}" if versions else MADE_WITH
     rows = []
     for part in predictions:
         for trial, p in zip(part.trials, part.probability, strict=True):
@@ -176,7 +181,7 @@ def make_table(
                     "Validation Loss": part.validation_loss,
                     "Copy-last Loss": part.copy_last_loss,
                     "Note": part.note,
-                    "Versions": provenance.versions,
+                    "Versions": versions,
                 }
             )
     table = pd.DataFrame(rows, columns=[*OFFICIAL_COLUMNS, *OWN_COLUMNS])

@@ -47,6 +47,7 @@ from physion.report.settings_text import (
     read_by_model,
 )
 from physion.report.write import prepare_folder, write_csv, write_plot
+from physion.version import MADE_WITH
 
 ZONE_FILE = "human_accuracy_by_scenario.csv"
 
@@ -94,7 +95,8 @@ def report_numbers(inputs: ReportInputs) -> dict[str, Any]:
         if name != "stimuli"
     }
     methods = {**inputs.methods, **inputs.comparison.settings}
-    return {"methods": methods, "warnings": list(inputs.warnings), **values}
+    warnings = list(inputs.warnings)
+    return {"package": MADE_WITH, "methods": methods, "warnings": warnings, **values}
 
 
 # --- from files ---------------------------------------------------------------------------------

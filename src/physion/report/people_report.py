@@ -23,6 +23,7 @@ from physion.report.page import blocks, people_blocks, session_blocks
 from physion.report.page.document import Picture, Section, figure, render_document
 from physion.report.words import plural
 from physion.report.write import prepare_folder, write_csv, write_plot
+from physion.version import MADE_WITH
 
 TITLE = "People on physical prediction"
 
@@ -60,7 +61,8 @@ def build_people_report(report: PeopleReport, folder: Path) -> Path:
     }
     shown = [write_plot(plot, pictures, rehearsal) for plot in make_plots(report.people)]
     warnings = list(report.people.warnings)
-    content = {"methods": _methods(report), "warnings": warnings, **numbers}
+    methods = _methods(report)
+    content = {"package": MADE_WITH, "methods": methods, "warnings": warnings, **numbers}
     text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
     write_atomic(folder / "report.json", f"{text}\n".encode())
     page = folder / "report.html"

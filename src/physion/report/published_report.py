@@ -29,6 +29,7 @@ from physion.report.page.blocks import PageColumn, details, p_value, paragraph, 
 from physion.report.page.document import Section, figure, render_document
 from physion.report.words import number
 from physion.report.write import prepare_folder, write_csv, write_plot
+from physion.version import MADE_WITH
 
 TITLE = "The published results of the original study, recomputed from its released tables"
 
@@ -56,7 +57,7 @@ def published_numbers(results: PublishedResults) -> dict[str, Any]:
         name: json.loads(rows.to_json(orient="records", double_precision=15))
         for name, rows in results.tables.items()
     }
-    return {"tables": tables, "words": dict(results.descriptions)}
+    return {"package": MADE_WITH, "tables": tables, "words": dict(results.descriptions)}
 
 
 # --- figures ------------------------------------------------------------------------------------

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
 
+from physion.version import MADE_WITH
+
 SVG_LIMIT = 500_000
 """Bytes above which a figure is embedded as PNG: thousands of points are slow to draw as SVG."""
 
@@ -58,6 +60,7 @@ def render_document(title: str, lead: str, sections: Sequence[Section], mark: st
         window=escape(f"{mark}: {title}" if mark else title),
         mark=f'<p class="mark">{escape(mark)}</p>\n' if mark else "",
         title=escape(title),
+        made_with=MADE_WITH,
         style=_style(),
         body="\n".join([lead, nav, *parts]),
     )
@@ -69,6 +72,7 @@ _TEMPLATE = """<!DOCTYPE html>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <meta name="color-scheme" content="light dark">
+<meta name="generator" content="{made_with}">
 <meta http-equiv="Content-Security-Policy" content="default-src 'none'; img-src data:; \
 media-src data:; style-src 'unsafe-inline'">
 <title>{window}</title>

@@ -17,6 +17,7 @@ from string import Template
 from typing import Any
 
 from physion.errors import BadInputError
+from physion.version import MADE_WITH
 
 SCRIPTS = (
     "dom",
@@ -66,6 +67,7 @@ def render_viewer(
     return Template(_part("page.html")).substitute(
         policy=_policy(style, script),
         title=escape(title),
+        made_with=MADE_WITH,
         style=style,
         blocks="\n".join(blocks),
         script=script,

@@ -1,0 +1,1 @@
+"""What the command line tells about itself: examples and completion in the shell."""

@@ -1,0 +1,52 @@
+"""Tables and pages say which version of the package made them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from physion.cli.main import main
+from physion.models.batch import Provenance
+from physion.readout.protocols import Readout
+from physion.readout.table import ScenarioPredictions, make_table
+from physion.report.page.document import render_document
+from physion.report.viewer.text import render_viewer
+from physion.version import MADE_WITH, __version__
+
+GENERATOR = f'<meta name="generator" content="physion {__version__}">'
+
+
+def test_pages_name_the_version() -> None:
+    assert GENERATOR in render_document("title", "", [])
+    assert GENERATOR in render_viewer("title", [], {}, {})
+
+
+@pytest.mark.parametrize(
+    ("stated", "written"),
+    [
+        ("torch 2.11", f"torch 2.11, {MADE_WITH}"),
+        (f"engine 3, {MADE_WITH}", f"engine 3, {MADE_WITH}"),
+        ("", MADE_WITH),
+    ],
+)
+def test_each_row_of_predictions_names_the_version(stated: str, written: str) -> None:
+    trials = ("a", "b")
+    part = ScenarioPredictions(
+        "drop", next(iter(Readout)), trials, np.array([0.2, 0.7]), 1.0, 4, -1, ""
+    )
+    index = pd.DataFrame(
+        {"trial": trials, "contact": True, "observed_contact": False, "recorded_contact": None}
+    )
+    table = make_table([part], Provenance("model", "none", versions=stated), index)
+    assert list(table["Versions"]) == [written] * 2
+
+
+def test_numbers_of_a_replay_name_the_version(tmp_path: Path) -> None:
+    path = tmp_path / "replay.json"
+    command = ["replay", "--scenario", "drop", "--limit", "1", "--workers", "1"]
+    assert main([*command, "--json", str(path)]) == 0
+    assert json.loads(path.read_text())["package"] == MADE_WITH
