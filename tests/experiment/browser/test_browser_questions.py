@@ -12,14 +12,14 @@ pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.recruitment import make_pass
 from support.experiment.browser import Visit, chromium, rows_of, served
-from support.experiment.own_questions import OWN_ANSWERS, OWN_QUESTIONS, OWN_WORDS
+from support.experiment.own_questions import OWN_ANSWERS, OWN_QUESTIONS, OWN_TEXTS
 
 __all__ = ["chromium"]
 pytestmark = pytest.mark.slow
 
 
 def test_own_questions_are_asked_and_stored(chromium: Any, tmp_path: Path) -> None:
-    asked = {"questions": OWN_QUESTIONS, "words": OWN_WORDS, "demographics": False}
+    asked = {"questions": OWN_QUESTIONS, "more_texts": OWN_TEXTS, "demographics": False}
     with (
         served(tmp_path, test=1, familiarization=1, **asked) as (study, server),
         Visit(chromium, server.url, "questions") as visit,

@@ -22,7 +22,7 @@ from physion.experiment.study.identity import Secrets
 from physion.experiment.study.questions import Question
 from physion.experiment.study.study import Study, load_study, write_settings
 from physion.experiment.study.texts import shipped_file
-from support.experiment.own_questions import OWN_ANSWERS, OWN_QUESTIONS, OWN_WORDS
+from support.experiment.own_questions import OWN_ANSWERS, OWN_QUESTIONS, OWN_TEXTS
 from support.experiment.store_walk import enter, page, refusal, rows, run, walk
 from support.experiment.tiny_study import make_tiny_study
 
@@ -31,7 +31,7 @@ from support.experiment.tiny_study import make_tiny_study
 def asking(tmp_path: Path) -> Study:
     return make_tiny_study(
         tmp_path / "study", test=2, familiarization=1, scenarios=("collide", "drop"), size=64,
-        demographics=False, questions=OWN_QUESTIONS, words=OWN_WORDS,
+        demographics=False, questions=OWN_QUESTIONS, more_texts=OWN_TEXTS,
     )  # fmt: skip
 
 
@@ -121,7 +121,7 @@ def test_an_answered_question_keeps_its_form(asking: Study, tmp_path: Path) -> N
     with pytest.raises(BadInputError, match="confidence was answered in another form"):
         serve_with(replace(OWN_QUESTIONS[3], steps=7), *OWN_QUESTIONS[:3])
     for language in asking.languages:
-        words = OWN_WORDS.split("[question.games]")[1].split("[question.devices]")[0]
+        words = OWN_TEXTS.split("[question.games]")[1].split("[question.devices]")[0]
         path = asking.folder / "texts" / f"{language}.toml"
         path.write_bytes(shipped_file(language) + f"[question.games]{words}".encode())
     store = serve_with(OWN_QUESTIONS[1])  # the others are asked no more, and still exported

@@ -12,13 +12,13 @@ import pytest
 from physion.errors import BadInputError
 from physion.experiment.study.questions import Question, check_answers, columns_of
 from physion.experiment.study.study import format_settings, load_study, parse_settings
-from support.experiment.own_questions import OWN_ANSWERS, OWN_QUESTIONS, OWN_WORDS
+from support.experiment.own_questions import OWN_ANSWERS, OWN_QUESTIONS, OWN_TEXTS
 from support.experiment.tiny_study import make_tiny_study
 
 
 def test_questions_are_written_and_read_back(tmp_path: Path) -> None:
     study = make_tiny_study(tmp_path, test=1, familiarization=1, questions=OWN_QUESTIONS,
-                            words=OWN_WORDS)  # fmt: skip
+                            more_texts=OWN_TEXTS)  # fmt: skip
     assert study.questions == OWN_QUESTIONS == load_study(tmp_path).questions
     assert study.texts["de"]["question.games.options.never"] == "Never"
     path = tmp_path / "texts" / "de.toml"

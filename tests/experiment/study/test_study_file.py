@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from physion.errors import BadInputError
 from physion.experiment.study.study import (
     Bonus,
+    Comprehension,
     EarlyEnd,
     Limits,
     Plausibility,
@@ -28,7 +29,7 @@ from physion.experiment.study.study import (
     write_settings,
 )
 from physion.experiment.study.study_checks import KEYS, TABLES
-from support.experiment.own_questions import OWN_QUESTIONS
+from support.experiment.own_questions import COMPREHENSION, OWN_QUESTIONS
 from support.experiment.tiny_study import make_tiny_study
 
 NAMES = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,40}", fullmatch=True)
@@ -63,6 +64,8 @@ STUDIES = st.builds(
     percentile_from=st.integers(1, 10**6),
     preload=st.integers(1, 1000),
     demographics=st.booleans(),
+    comprehension_questions=st.sampled_from([(), COMPREHENSION]),
+    comprehension=st.builds(Comprehension, st.integers(1, 100)),
     questions=st.sampled_from([(), OWN_QUESTIONS]),
     embed_from=st.lists(st.sampled_from(["https://www.mturk.com", "https://*.a-b.org:8443"]),
                         unique=True).map(tuple),
@@ -99,6 +102,7 @@ STUDIES = st.builds(
         link_address=ADDRESSES,
     ),
     declined=EARLY_ENDS,
+    screened_out=EARLY_ENDS,
     stopped=EARLY_ENDS,
     device_refused=EARLY_ENDS,
     full=EARLY_ENDS,
@@ -125,7 +129,7 @@ def test_every_setting_is_written_with_its_comment(tmp_path: Path) -> None:
         assert all(f"# {line}" in text for line in key.about.splitlines())
     # Each field of the types is a key, so that none can be forgotten.
     others = {"folder", "stimuli", "allowed_ids", "texts", "consent_files", "digest",
-              "stimuli_digest", "questions", *TABLES}  # fmt: skip
+              "stimuli_digest", "questions", "comprehension_questions", *TABLES}  # fmt: skip
     assert {key.name for key in KEYS if not key.table} == {
         field.name for field in dataclasses.fields(Study)
     } - others

@@ -1,9 +1,10 @@
-"""Questions of a lab, one of each kind, with their words and answers to them."""
+"""Questions of a lab, one of each kind, with their texts and answers to them."""
 
 from __future__ import annotations
 
 from typing import Any
 
+from physion.experiment.study.comprehension import ComprehensionQuestion
 from physion.experiment.study.questions import Question
 
 OWN_QUESTIONS = (
@@ -12,7 +13,7 @@ OWN_QUESTIONS = (
     Question("devices", "choices", options=("phone", "console", "computer")),
     Question("confidence", "scale", required=True, steps=5),
 )
-OWN_WORDS = """
+OWN_TEXTS = """
 [question.strategy]
 text = "Did you follow a strategy?"
 [question.games]
@@ -37,3 +38,23 @@ OWN_ANSWERS: dict[str, Any] = {
     "devices": ["computer", "phone"],
     "confidence": 4,
 }
+
+COMPREHENSION = (
+    ComprehensionQuestion("task", ("fall", "touch"), "touch"),
+    ComprehensionQuestion("colour", ("red", "green", "yellow"), "red"),
+)
+COMPREHENSION_TEXTS = """
+[comprehension_question.task]
+text = "What do you predict?"
+[comprehension_question.task.options]
+fall = "What falls"
+touch = "What touches"
+[comprehension_question.colour]
+text = "Which object moves?"
+[comprehension_question.colour.options]
+red = "The red one"
+green = "The green one"
+yellow = "The yellow one"
+"""
+RIGHT: dict[str, Any] = {"task": "touch", "colour": "red"}
+WRONG: dict[str, Any] = {"task": "touch", "colour": "green"}

@@ -17,7 +17,7 @@ from physion.experiment.store.store import Refused, Store
 from physion.experiment.store.tables import ANSWERS
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.study import Study
-from support.experiment.own_questions import OWN_ANSWERS
+from support.experiment.own_questions import OWN_ANSWERS, RIGHT
 from support.experiment.tiny_study import make_tiny_study
 
 T = TypeVar("T")
@@ -28,7 +28,11 @@ PAGES: dict[str, dict[str, Any]] = {
     "demographics": {"age": 31, "gender": "woman", "education": "master"},
     "feedback": {"difficulty": 2, "technical_problems": False, "text": "fine"},
 }
-OPTIONAL_PAGES: dict[str, dict[str, Any]] = {"questions": OWN_ANSWERS, "block": {}}
+OPTIONAL_PAGES: dict[str, dict[str, Any]] = {
+    "comprehension": RIGHT,
+    "questions": OWN_ANSWERS,
+    "block": {},
+}
 """Pages that a study has by its settings alone."""
 ORDER = tuple(stage for stage in stages.STAGES if stage not in stages.ENDED)
 STAGES = tuple(stage for stage in ORDER if stage not in OPTIONAL_PAGES)

@@ -43,7 +43,7 @@ def make_tiny_study(
     password: str = PASSWORD,
     plausibility: Plausibility = UNCHECKED,
     prolific_id: str = "",
-    words: str = "",
+    more_texts: str = "",
     **settings: Any,
 ) -> Study:
     """Write and load a study with alternating labels (the first trial has contact).
@@ -64,7 +64,7 @@ def make_tiny_study(
         Rules of plausible sessions; by default answers may come at any time and without media.
     prolific_id
         Pattern of Prolific's ids; by default any id is allowed.
-    words
+    more_texts
         Lines that are added to the texts of each language.
     settings
         Fields of `Study` (``participants=3``, ``timing=Timing(cue_ms=100)``, ...).
@@ -90,7 +90,7 @@ def make_tiny_study(
     (folder / TEXTS_FOLDER).mkdir(exist_ok=True)
     for language in study.languages:
         (folder / TEXTS_FOLDER / f"{language}.toml").write_bytes(
-            shipped_file(language) + words.encode()
+            shipped_file(language) + more_texts.encode()
         )
     write_settings(study)
     Secrets.create(folder)

@@ -134,6 +134,10 @@ SESSION_COLUMNS: tuple[Column, ...] = (
     Column("consent_version", "text", "Version of the consent text that was agreed to"),
     Column("consented_at", "time", "When it was agreed to"),
     Column("instructed_at", "time", "When the instructions were done"),
+    Column("comprehension_attempts", "integer",
+           "How often the questions about the instructions were answered", low=0),
+    Column("screened_out", "choice", "Which check ended the session early; empty: none did",
+           choices=("comprehension", "practice")),
     Column("ready_at", "time", "When the page between practice and test was sent; of the last "
            "block begun, if there are several"),
     Column("buttons", "choice", "The buttons from left to right", choices=("yes-no", "no-yes")),

@@ -160,7 +160,7 @@ def _print(values: dict[str, Any], json: bool) -> None:
     if json:
         print(json_module.dumps(values))
         return
-    outcomes = ("done", "done_before", "left", "refused", "failed")
+    outcomes = ("done", "done_before", "left", "screened_out", "refused", "failed")
     counts = [f"{values[name]} {name.replace('_', ' ')}" for name in outcomes if name in values]
     repeated = f"{values['asked_again']} requests repeated"
     line = f"{', '.join(counts)}; {values['answers']} answers, {repeated}"

@@ -246,7 +246,7 @@ def funnel(part: Sequence[SessionSummary], order: Sequence[str]) -> tuple[Funnel
         reached = sum(at[later].total() for later in order[index:])
         percent = 100.0 * reached / len(part) if part else 0.0
         states = at[stage]
-        ended = states["withdrawn"] + states["declined"] + states["void"]
+        ended = sum(states[name] for name in ("withdrawn", "declined", "screened_out", "void"))
         steps.append(
             FunnelStage(label(stage), reached, percent, states["going"], states["left"], ended)
         )

@@ -134,6 +134,8 @@ def _session_value(row: _Row, name: str, study: Study) -> Any:
             return row.kind == "simulated"
         case "study":
             return f"{row.name} {row.version}"
+        case "screened_out":
+            return row.screened_out_by
         case "recruited_by":
             return row.source
         case "user_agent" | "refresh_hz" | "screen_width" | "screen_height":

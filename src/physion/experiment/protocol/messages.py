@@ -166,6 +166,8 @@ class SessionState(Message):
     """Stages to which a preview can go; empty for others."""
     trial: int | None
     trials: dict[Phase, int]
+    comprehension_attempts: int
+    """How often the comprehension check was answered."""
     answered: bool
     """Whether a trial was answered, after which stopping is final."""
     block: int
@@ -209,7 +211,8 @@ class PageDone(Message):
     """Submission of a page between the trials; sending it twice changes nothing.
 
     Fields of ``data`` by page: ``consent`` {agreed: bool, language: optional, in which it was
-    read}; ``demographics`` {age, gender, education}; ``questions`` {NAME: answer, for each of
+    read}; ``comprehension`` {NAME: option, for each of `PublicStudy.comprehension_questions`};
+    ``demographics`` {age, gender, education}; ``questions`` {NAME: answer, for each of
     `PublicStudy.questions`}; ``feedback`` {difficulty, technical_problems, text}; ``ready`` and
     ``block`` {block: optional, index of the current block}; ``instructions`` and ``withdraw`` {}.
     """
@@ -324,7 +327,7 @@ class Completion(Message):
 
 
 class SessionEnd(Message):
-    """End of a session that was declined or stopped.
+    """End of a session before it was complete.
 
     ``can_take_back``: nothing was answered, so that the participant can still take part
     (`Enter.take_back`).

@@ -35,6 +35,14 @@ class AskedQuestion(Message):
     steps: int
 
 
+class CheckedQuestion(Message):
+    """A question of the comprehension check, without its right answer; its text has the key
+    ``comprehension_question.NAME.text``."""
+
+    name: str
+    options: list[str]
+
+
 class PublicStudy(Message):
     """Settings of the study that anyone who opens the page may see."""
 
@@ -56,6 +64,9 @@ class PublicStudy(Message):
     preload: int
     """Number of trials whose media are loaded ahead."""
     interrupted: Literal["repeat", "void"]  # see `Plausibility`
+    comprehension_questions: list[CheckedQuestion]
+    comprehension_limit: int
+    """How often the comprehension check can be answered."""
     questions: list[AskedQuestion]
     """The lab's own questions at the end."""
     example: dict[str, TrialMedia]

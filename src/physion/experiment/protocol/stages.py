@@ -16,6 +16,7 @@ Phase = Literal["familiarization", "test"]
 Stage = Literal[
     "consent",
     "instructions",
+    "comprehension",
     "familiarization",
     "ready",
     "test",
@@ -26,12 +27,14 @@ Stage = Literal[
     "done",
     "declined",
     "withdrawn",
+    "screened_out",
 ]
 """Stages of a session, in this order; the `ENDED` ones can follow any other but ``done``. After
 ``block``, the page between blocks, the next block begins with ``familiarization`` or ``test``."""
 STAGES: tuple[Stage, ...] = get_args(Stage)
-ENDED: tuple[Stage, ...] = ("declined", "withdrawn")
-"""Stages of sessions that ended before they were complete: no consent, or stopped."""
+ENDED: tuple[Stage, ...] = ("declined", "withdrawn", "screened_out")
+"""Stages of sessions that ended before they were complete: no consent, stopped, or ended by the
+study since the participant failed the comprehension check."""
 
 
 OF_BLOCK: tuple[Stage, ...] = ("familiarization", "ready", "test", "block")
@@ -49,6 +52,7 @@ class Page:
 PAGES: Mapping[Stage, Page] = {
     "consent": Page("consented_at", "Consent"),
     "instructions": Page("instructed_at", "Instructions"),
+    "comprehension": Page("comprehended_at", "Comprehension check"),
     "ready": Page("ready_at", "Start page"),
     "block": Page("block_at", "Page between blocks"),
     "demographics": Page("demographics_at", "Demographics"),

@@ -60,7 +60,7 @@ class Visit:
 
     number: int
     scenario: str
-    outcome: Literal["done", "done before", "left", "refused", "failed"] = "failed"
+    outcome: Literal["done", "done before", "left", "screened out", "refused", "failed"] = "failed"
     reference: str = ""
     reason: str = ""
     retries: int = 0
@@ -146,6 +146,9 @@ class Participation:
                     return
             else:
                 state = await self._submit_page(state)
+        if state.ended:
+            self._visit.outcome = "screened out"
+            return
         answer = await self._browser.ask("GET", "/api/result")
         self._visit.result = wire.Result.model_validate_json(answer)
         self._visit.outcome = "done"
@@ -174,6 +177,9 @@ class Participation:
         filled: dict[str, Any] = {
             "consent": {"agreed": True},
             "demographics": self._person.demographics(),
+            "comprehension": {
+                each.name: each.right for each in self._study.comprehension_questions
+            },
             "questions": self._person.own_answers(self._study.questions),
             "feedback": self._person.feedback(),
         }

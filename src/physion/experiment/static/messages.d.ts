@@ -38,6 +38,7 @@ export interface SessionState {
   places: Stage[];
   trial: number | null;
   trials: Record<Phase, number>;
+  comprehension_attempts: number;
   answered: boolean;
   block: number;
   blocks: BlockTrials[];
@@ -164,6 +165,11 @@ export interface AskedQuestion {
   steps: number;
 }
 
+export interface CheckedQuestion {
+  name: string;
+  options: string[];
+}
+
 export interface PublicStudy {
   title: string;
   contact: string;
@@ -180,6 +186,8 @@ export interface PublicStudy {
   break_every: number;
   preload: number;
   interrupted: "repeat" | "void";
+  comprehension_questions: CheckedQuestion[];
+  comprehension_limit: number;
   questions: AskedQuestion[];
   example: Record<string, TrialMedia>;
   recruiters: Recruiter[];

@@ -4,6 +4,7 @@
  */
 
 import { currentBlock, hasBlocks, size } from "./blocks.js";
+import { wrongAttempt } from "./comprehension_page.js";
 import { button, el, paragraphs, sleep } from "./dom.js";
 import { showExample } from "./example.js";
 import { focusHeading } from "./page_trial.js";
@@ -41,9 +42,11 @@ export function instructionsPages(context) {
   const block = currentBlock(state);
   const practice = size(block, "familiarization");
   const several = { blocks: state.blocks.length, trials: state.trials.test };
+  const checked = context.study.comprehension_questions.length > 0;
   const parts = [
     () => [
       el("h1", {}, t("instructions.title_task")),
+      ...wrongAttempt(context),
       ...paragraphs(t("instructions.task", { prompt })),
     ],
     (signal) => [
@@ -74,7 +77,7 @@ export function instructionsPages(context) {
           { class: "buttons" },
           el("span", { class: "small" }, t("common.page_of", { page: number + 1, pages: 3 })),
           button(t("common.back"), back, { class: "button quiet", disabled: number === 0 }),
-          button(t(last ? "instructions.start" : "common.next"), next),
+          button(t(last && !checked ? "instructions.start" : "common.next"), next),
         ),
       );
       focusHeading(page);

@@ -7,6 +7,7 @@
 
 import { Refused } from "./api.js";
 import { blockPage, currentBlock, hasBlocks } from "./blocks.js";
+import { comprehensionPage } from "./comprehension_page.js";
 import { consentPage } from "./consent_page.js";
 import { ask } from "./dialog.js";
 import { endedPage, stopQuestion } from "./ending_pages.js";
@@ -26,6 +27,7 @@ import { feedbackPieces, trialPieces } from "./trial_pieces.js";
 const PAGES = {
   consent: consentPage,
   instructions: pages.instructionsPages,
+  comprehension: comprehensionPage,
   ready: pages.readyPage,
   block: blockPage,
   demographics: demographicsPage,

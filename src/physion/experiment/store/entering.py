@@ -113,6 +113,7 @@ def _find_unfinished(sessions: list[Session], scenario: str | None) -> Session |
         if session.finished_at is None
         and session.withdrawn_at is None
         and session.voided_at is None
+        and session.screened_out_at is None
         and scenario in (None, session.scenario)
     ]
     return max(unfinished, key=lambda session: session.started_at, default=None)
@@ -122,8 +123,11 @@ def _find_ended(study: Study, sessions: list[Session], scenario: str | None) -> 
     """Return the latest session, of ``scenario`` if it is given, if it was declined or stopped.
 
     None if another scenario is left in which the visitor may begin, and for sessions that the lab
-    ended.
+    ended. Who was screened out cannot begin in another scenario.
     """
+    screened_out = [session for session in sessions if session.screened_out_at is not None]
+    if screened_out:
+        return max(screened_out, key=lambda session: session.started_at)
     known = {session.scenario for session in sessions}
     wanted = [session for session in sessions if scenario in (None, session.scenario)]
     if not wanted or (scenario is None and not set(study.offered) <= known):

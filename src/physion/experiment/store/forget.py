@@ -28,12 +28,12 @@ if TYPE_CHECKING:
     from physion.experiment.store.store import Store
 
 _EMPTIED = dict.fromkeys((
-    "instructed_at", "ready_at", "demographics_at", "questions_at", "finished_at", "own_answers",
-    "questions_study", "loaded_at_phase", "loaded_at_trial", "block_at",
-    "browser", "progressed_at", "next_from", "implausible", "age", "gender",
-    "education", "difficulty", "technical_problems", "feedback",
-)) | {"answered_familiarization": 0, "answered_test": 0, "block": 0, "fast_answers": 0,
-      "unfetched": 0, "replayed": 0, "loads": 0, "device": {}}  # fmt: skip
+    "instructed_at", "comprehended_at", "screened_out_at", "screened_out_by", "ready_at",
+    "demographics_at", "questions_at", "questions_study", "own_answers", "finished_at",
+    "loaded_at_phase", "loaded_at_trial", "block_at", "browser", "progressed_at", "next_from",
+    "implausible", "age", "gender", "education", "difficulty", "technical_problems", "feedback",
+)) | {"answered_familiarization": 0, "answered_test": 0, "block": 0, "comprehension_attempts": 0,
+      "fast_answers": 0, "unfetched": 0, "replayed": 0, "loads": 0, "device": {}}  # fmt: skip
 """Column values that replace the data of a forgotten session."""
 
 

@@ -10,6 +10,7 @@ from sqlalchemy import Connection, delete, select, update
 from physion.experiment.protocol.messages import PageDone, SessionState
 from physion.experiment.protocol.refused import Refused
 from physion.experiment.protocol.stages import ENDED, PAGES, STAGES, Course
+from physion.experiment.store.comprehension import judge_attempt
 from physion.experiment.store.plausibility import reasons
 from physion.experiment.store.sessions import (
     ENTERED_AGAIN,
@@ -20,6 +21,7 @@ from physion.experiment.store.sessions import (
     storable,
 )
 from physion.experiment.store.tables import EVENTS, RAW_IDS, SESSIONS
+from physion.experiment.study.comprehension import check_attempt
 from physion.experiment.study.questions import check_answers
 from physion.experiment.study.study import Study
 
@@ -108,6 +110,11 @@ def check_page(study: Study, done: PageDone) -> dict[str, Any]:
     """
     if done.page == "questions":
         return _check_own_questions(study, done.data)
+    if done.page == "comprehension":
+        try:
+            return dict(check_attempt(study.comprehension_questions, done.data))
+        except ValueError as error:
+            raise Refused("bad_request", f"data.{error}") from None
     if done.page not in FIELDS:
         raise Refused("bad_request", f"page: {done.page} is no page that is submitted")
     optional = OPTIONAL.get(done.page, {})
@@ -183,9 +190,11 @@ def submit_page(
     if stage in ENDED or STAGES.index(stage) < STAGES.index(page):  # type: ignore[arg-type]
         raise Refused("wrong_stage", "This page is not next.", state_of(session, course))
     if stage == page:
-        columns = _columns(study, session, page, values, now)
+        if stage == "comprehension":
+            columns = judge_attempt(connection, study, session, values, now)
+        else:
+            columns = {PAGES[stage].column: now, **_columns(study, session, page, values, now)}
         times = dict.fromkeys(("last_seen", "progressed_at", "next_from"), now)
-        times |= {PAGES[stage].column: now}
         change_session(connection, session, **times, **columns)
     return state_of(session, course)
 

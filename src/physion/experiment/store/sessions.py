@@ -39,12 +39,15 @@ class Session:
     started_at: float
     consented_at: float | None
     instructed_at: float | None
+    comprehended_at: float | None
+    comprehension_attempts: int
     ready_at: float | None
     demographics_at: float | None
     questions_at: float | None
     finished_at: float | None
     withdrawn_at: float | None
     closed_at: float | None
+    screened_out_at: float | None
     voided_at: float | None
     browser: str | None
     next_from: float | None
@@ -73,6 +76,7 @@ def stages_of(study: Study) -> tuple[Stage, ...]:
     """Return the stages of a study's sessions in order, ``done`` last."""
     absent = {
         "block": not study.blocks.all_scenarios,
+        "comprehension": not study.comprehension_questions,
         "demographics": not study.demographics,
         "questions": not study.questions,
     }
@@ -138,6 +142,8 @@ def stage_of(session: Session, course: Course) -> Stage:
         return "done"
     if session.voided_at is not None:
         return "withdrawn"
+    if session.screened_out_at is not None:
+        return "screened_out"
     block = block_of(session, course)
     for stage in course.stages:
         if stage in PHASES:
@@ -183,6 +189,7 @@ def state_of(session: Session, course: Course) -> SessionState:
         places=list(course.stages) if session.kind == "preview" else [],
         trial=answered(session, stage) if stage in PHASES else None,
         trials=cast(Any, dict(course.trials)),
+        comprehension_attempts=session.comprehension_attempts,
         answered=any(answered(session, phase) for phase in PHASES),
         block=course.trials.blocks.index(block),
         blocks=[

@@ -240,7 +240,7 @@ class Store:
         return self._read(lambda connection: self._compute_result(connection, token))
 
     def ending(self, token: str) -> SessionEnd:
-        """Return the end of a session that was declined or stopped."""
+        """Return the end of a session that ended before it was complete."""
 
         def read(connection: Connection) -> SessionEnd:
             session, course = self._read_session(connection, token)
@@ -249,9 +249,10 @@ class Store:
                 raise Refused("wrong_stage", "This session goes on.", state_of(session, course))
             of_session = select(SESSIONS.c.source).where(SESSIONS.c.session == session.session)
             source = connection.execute(of_session).scalar_one()
-            part = self.study.declined if stage == "declined" else self.study.stopped
+            ends = {"declined": self.study.declined, "withdrawn": self.study.stopped}
+            end = ends.get(stage, self.study.screened_out)
             return SessionEnd(
-                completion=ending_completion(part, source), can_take_back=can_take_back(session)
+                completion=ending_completion(end, source), can_take_back=can_take_back(session)
             )
 
         return self._read(read)

@@ -82,6 +82,8 @@ SESSIONS = Table(
     Column("consent_version", String(200)),
     Column("consented_at", Float),
     Column("instructed_at", Float),
+    Column("comprehended_at", Float),
+    Column("comprehension_attempts", Integer, nullable=False, server_default="0"),
     Column("ready_at", Float),
     Column("demographics_at", Float),
     Column("questions_at", Float),
@@ -90,6 +92,8 @@ SESSIONS = Table(
     Column("withdrawn_at", Float),
     Column("closed_at", Float),
     Column("voided_at", Float),
+    Column("screened_out_at", Float),
+    Column("screened_out_by", String(20)),
     Column("browser", String(32)),
     Column("progressed_at", Float),
     Column("next_from", Float),
@@ -128,6 +132,8 @@ version of the study that asked them.
 ``closed_at``: when the lab ended the session for good, so that the participant cannot take it up
 again: its data were deleted, or it was a preview of other stimuli. ``voided_at``: when the lab
 decided that the session does not count.
+``screened_out_at``: when the session ended since the participant failed the check
+``screened_out_by``; ``comprehension_attempts``: how often the comprehension check was answered.
 ``browser``: keyed hash of the key of the browser that began the session, empty if it sent none,
 NULL in sessions of older versions. ``progressed_at``: time of the last page or answer.
 ``next_from``: earliest time at which the next trial can have begun. ``fast_answers``,

@@ -61,16 +61,16 @@ class Question:
         return tuple(f"question.{self.name}.{key}" for key in ("text", *ends, *options))
 
 
-_word = pattern("[a-z][a-z0-9_]{0,39}", "a word of small letters, digits and _, at most 40")
+NAME = pattern("[a-z][a-z0-9_]{0,39}", "a word of small letters, digits and _, at most 40")
 KEYS = (
-    Key("questions", "name", _word,
+    Key("questions", "name", NAME,
         "A word of small letters, digits and _: the name of its column in the data.",
         required=True),
     Key("questions", "kind", one_of(*KINDS),
         "\"text\", \"choice\" (of one option), \"choices\" (of any number) or \"scale\".",
         required=True),
     Key("questions", "required", flag, "Whether it must be answered."),
-    Key("questions", "options", listed(_word, 0, 50),
+    Key("questions", "options", listed(NAME, 0, 50),
         "Names of the options of a choice, such as [\"never\", \"often\"]."),
     Key("questions", "steps", whole(2, MOST_STEPS), f"Steps of a scale, 2 to {MOST_STEPS}."),
 )  # fmt: skip

@@ -52,6 +52,16 @@ class Blocks:
 
 
 @dataclass(frozen=True)
+class Comprehension:
+    """The comprehension check after the instructions.
+
+    ``attempts``: how often its questions can be answered before the session ends.
+    """
+
+    attempts: int = 3
+
+
+@dataclass(frozen=True)
 class Screen:
     """Smallest browser window in which participants may take part, in CSS pixels.
 
@@ -197,5 +207,5 @@ class Limits:
 
 ALL_SCENARIOS = "all scenarios"
 """In place of a scenario: a session of all scenarios. No scenario can have this name."""
-EARLY_ENDS = ("declined", "stopped", "device_refused", "full")
+EARLY_ENDS = ("declined", "stopped", "screened_out", "device_refused", "full")
 """The tables of ``study.toml`` that are an `EarlyEnd`."""

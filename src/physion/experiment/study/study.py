@@ -24,13 +24,15 @@ from typing import Any
 
 from physion.atomic import write_atomic
 from physion.errors import BadInputError
-from physion.experiment.study import questions
+from physion.experiment.study import comprehension, questions
+from physion.experiment.study.comprehension import ComprehensionQuestion, parse_comprehension
 from physion.experiment.study.questions import Question, parse_questions
 from physion.experiment.study.settings import (
     ALL_SCENARIOS,
     EARLY_ENDS,
     Blocks,
     Bonus,
+    Comprehension,
     EarlyEnd,
     Limits,
     Plausibility,
@@ -56,6 +58,7 @@ __all__ = [
     "EARLY_ENDS",
     "Blocks",
     "Bonus",
+    "Comprehension",
     "EarlyEnd",
     "Limits",
     "Plausibility",
@@ -106,15 +109,18 @@ class Study:
         Whether age, gender and education are asked.
     embed_from
         Sites that may show the pages in a frame (MTurk); none by default.
-    timing, blocks, screen, plausibility, recruitment, limits
+    timing, blocks, comprehension, screen, plausibility, recruitment, limits
         The tables of ``study.toml``.
-    declined, stopped, device_refused, full
-        Codes and URLs of participants who gave no consent, who stopped, whose device cannot show
-        the movies, and who came when the study was full.
+    declined, stopped, screened_out, device_refused, full
+        Codes and URLs of participants who gave no consent, who stopped, who failed the
+        comprehension check, whose device cannot show the movies, and who came when the study was
+        full.
     bonus
         The rule of the bonus in the table of payments.
     questions
         The lab's own questions at the end.
+    comprehension_questions
+        Questions of the comprehension check; none: there is no check.
     allowed_ids
         Ids of the allow list; None if the study has none.
     stimuli
@@ -147,16 +153,19 @@ class Study:
     embed_from: tuple[str, ...] = ()
     timing: Timing = field(default=Timing())
     blocks: Blocks = field(default=Blocks())
+    comprehension: Comprehension = field(default=Comprehension())
     screen: Screen = field(default=Screen())
     plausibility: Plausibility = field(default=Plausibility())
     recruitment: Recruitment = field(default=Recruitment())
     declined: EarlyEnd = field(default=EarlyEnd())
     stopped: EarlyEnd = field(default=EarlyEnd())
+    screened_out: EarlyEnd = field(default=EarlyEnd())
     device_refused: EarlyEnd = field(default=EarlyEnd())
     full: EarlyEnd = field(default=EarlyEnd())
     bonus: Bonus = field(default=Bonus())
     limits: Limits = field(default=Limits())
     questions: tuple[Question, ...] = ()
+    comprehension_questions: tuple[ComprehensionQuestion, ...] = ()
     stimuli: tuple[Stimulus, ...] = ()
     allowed_ids: frozenset[str] | None = field(default=None, repr=False)
     texts: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
@@ -178,6 +187,7 @@ class Study:
 _PARTS: dict[str, type[Any]] = {
     "timing": Timing,
     "blocks": Blocks,
+    "comprehension": Comprehension,
     "screen": Screen,
     "plausibility": Plausibility,
     "recruitment": Recruitment,
@@ -241,10 +251,18 @@ def parse_settings(table: Mapping[str, Any], path: Path) -> Study:
     Stimuli and texts are left empty. ``path`` is the path of the file, which need not exist yet.
     Raises the errors of `load_study`.
     """
-    values = check_tables(table, path, ("questions",))
+    values = check_tables(table, path, ("questions", "comprehension_questions"))
     parts = {name: part(**values[name]) for name, part in _PARTS.items()}
     asked = parse_questions(check_list(table, path, "questions", questions.KEYS), path)
-    return Study(folder=path.parent, **values[""], **parts, questions=asked)
+    entries = check_list(table, path, "comprehension_questions", comprehension.KEYS)
+    checked = parse_comprehension(entries, path)
+    return Study(
+        folder=path.parent,
+        **values[""],
+        **parts,
+        questions=asked,
+        comprehension_questions=checked,
+    )
 
 
 def format_settings(study: Study) -> str:
@@ -254,15 +272,17 @@ def format_settings(study: Study) -> str:
     """
     values = {name: vars(getattr(study, name)) for name in _PARTS}
     path = study.folder / STUDY_FILE
-    asked = [vars(question) for question in study.questions]
-    return format_tables({"": vars(study), **values}, path) + format_list(
-        "questions", questions.KEYS, questions.ABOUT, asked, path
-    )
+    text = format_tables({"": vars(study), **values}, path)
+    for name, kind in (("comprehension_questions", comprehension), ("questions", questions)):
+        entries = [vars(question) for question in getattr(study, name)]
+        text += format_list(name, kind.KEYS, kind.ABOUT, entries, path)
+    return text
 
 
 def own_text_keys(study: Study) -> tuple[str, ...]:
     """Return the keys of the texts that a study needs for its own questions."""
-    return tuple(key for question in study.questions for key in question.text_keys)
+    asked = (*study.comprehension_questions, *study.questions)
+    return tuple(key for question in asked for key in question.text_keys)
 
 
 def write_settings(study: Study) -> Path:

@@ -176,6 +176,7 @@ _site = pattern(
 _EARLY_ENDS = {
     "declined": "For participants who do not consent.",
     "stopped": "For participants who stop; they learn the code, so it should not pay in full.",
+    "screened_out": "For participants who failed the comprehension check.",
     "device_refused": "For participants whose device or browser cannot show the movies.",
     "full": "For participants who come when the study is full.",
 }
@@ -244,6 +245,9 @@ KEYS: tuple[Key, ...] = (
         "\"first\": the first block alone does."),
     Key("blocks", "trials", whole(0, 100_000),
         "Test trials of a block, drawn for each session, half of them with contact; 0: all."),
+    Key("comprehension", "attempts", whole(1, 100),
+        "How often comprehension_questions (below) can be answered. After\n"
+        "a wrong answer the instructions are shown again; after the last one the session ends."),
     Key("screen", "min_width", whole(320, 10_000), "Smallest browser window, in CSS pixels."),
     Key("screen", "min_height", whole(320, 10_000), ""),
     Key("screen", "fullscreen", flag,
@@ -314,6 +318,7 @@ KEYS: tuple[Key, ...] = (
 TABLES = {
     "timing": "Durations within a trial.",
     "blocks": "Several scenarios in one session.",
+    "comprehension": "Comprehension check after the instructions.",
     "screen": "In a smaller window participants are asked to enlarge it; telephones are refused.",
     "plausibility": "Sessions that no person can have made, repeated and interrupted movies.",
     "recruitment": "Recruitment and completion credit.",

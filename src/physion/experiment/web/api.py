@@ -20,7 +20,7 @@ from physion.experiment.protocol.messages import (
     Showing,
     TrialMedia,
 )
-from physion.experiment.protocol.public_study import AskedQuestion, PublicStudy
+from physion.experiment.protocol.public_study import AskedQuestion, CheckedQuestion, PublicStudy
 from physion.experiment.study.media_links import sign_media
 from physion.experiment.study.recruitment import RECRUITERS, ending_completion, is_mturk_preview
 from physion.experiment.study.stimuli import PHASES
@@ -56,6 +56,11 @@ def public_study(study: Study, secrets: Secrets) -> PublicStudy:
         break_every=study.timing.break_every,
         preload=study.preload,
         interrupted=cast(Literal["repeat", "void"], study.plausibility.interrupted),
+        comprehension_questions=[
+            CheckedQuestion(name=each.name, options=list(each.options))
+            for each in study.comprehension_questions
+        ],
+        comprehension_limit=study.comprehension.attempts,
         questions=[_asked(question) for question in study.questions],
         example={name: _example(study, secrets, name) for name in study.scenarios},
         recruiters=list(RECRUITERS),
@@ -182,7 +187,7 @@ def build_api(study: Study, secrets: Secrets, store: Store) -> APIRouter:
 
     @router.get("/ending")
     async def get_ending(request: Request) -> Response:
-        """Return the end of a session that was declined or stopped."""
+        """Return the end of a session that ended before it was complete."""
         return Reply(await run_in_threadpool(store.ending, token_of(request)))
 
     @router.api_route("/health", methods=["GET", "HEAD"])

@@ -28,6 +28,7 @@ STATES = {
     "left": "Dropped out",
     "withdrawn": "Withdrawn",
     "declined": "Declined",
+    "screened_out": "Screened out",
     "void": "Void",
 }
 """States of a session and their labels. Participants who dropped out may still continue."""
@@ -189,7 +190,7 @@ class SummaryCache:
     def _stage(self, facts: Mapping[str, Any]) -> str:
         """Return the stage of a session, or the stage at which it was withdrawn."""
         columns = {column.name: facts[column.name] for column in SESSION_COLUMNS}
-        session = Session(**columns | {"withdrawn_at": None})
+        session = Session(**columns | {"withdrawn_at": None, "screened_out_at": None})
         # The number of trials is unknown for previews of scenarios that were removed.
         known = self._courses.has(session)
         course = self._courses.of(session) if known else Course(self._stages, _UNKNOWN)
@@ -220,6 +221,8 @@ def session_state(facts: Mapping[str, Any], now: float) -> str:
         return "finished"
     if facts["withdrawn_at"] is not None:
         return "declined" if facts["consented_at"] is None else "withdrawn"
+    if facts["screened_out_at"] is not None:
+        return "screened_out"
     return "going" if now - facts["last_seen"] <= ACTIVE_WITHIN else "left"
 
 

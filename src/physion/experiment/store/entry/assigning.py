@@ -76,6 +76,7 @@ def _count_sessions(
             columns.kind == visitor.kind,
             columns.withdrawn_at.is_(None),
             columns.voided_at.is_(None),
+            columns.screened_out_at.is_(None),
             or_(finished, active, held),
         )
         .group_by(columns.scenario)
@@ -132,6 +133,7 @@ def _least_used_blocks(connection: Connection, study: Study, visitor: Visitor) -
             columns.kind == visitor.kind,
             columns.withdrawn_at.is_(None),
             columns.voided_at.is_(None),
+            columns.screened_out_at.is_(None),
             columns.implausible.is_(None),
             or_(*_in_use(study, visitor.now)),
         )
@@ -156,6 +158,7 @@ def _least_used_order(connection: Connection, study: Study, scenario: str, kind:
             columns.kind == kind,
             columns.withdrawn_at.is_(None),
             columns.voided_at.is_(None),
+            columns.screened_out_at.is_(None),
         )
         .group_by(columns.order_number)
     )

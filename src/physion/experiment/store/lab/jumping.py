@@ -13,6 +13,9 @@ from physion.experiment.store.sessions import Session, change_session, state_of
 from physion.experiment.store.tables import ANSWERS
 from physion.experiment.study.stimuli import PHASES
 
+_ENDS = ("withdrawn_at", "closed_at", "screened_out_at", "screened_out_by")
+"""Columns of sessions that ended early."""
+
 
 def jump(
     connection: Connection, course: Course, session: Session, to: Jump, now: float
@@ -43,7 +46,8 @@ def jump(
         raise Refused("bad_request", f"stage: the study has no {to.stage}")
     block = _block_of(course, to)
     done = course.stages[: course.stages.index(to.stage)]
-    values: dict[str, Any] = {"withdrawn_at": None, "closed_at": None}
+    values: dict[str, Any] = dict.fromkeys(_ENDS)
+    values["comprehension_attempts"] = 0
     for stage, page in PAGES.items():
         values[page.column] = now if stage in done else None
     for phase in PHASES:

@@ -1,0 +1,52 @@
+/**
+ * The questions about the instructions. Whether an answer is right, the server alone knows.
+ * @module comprehension_page
+ */
+
+import { el, paragraphs } from "./dom.js";
+import { choiceField, complete, form, submit } from "./form_fields.js";
+import { bound } from "./texts.js";
+
+/**
+ * Render the comprehension check; all questions must be answered.
+ * @param {import("./pages.js").Context} context
+ * @returns {import("./pages.js").Render}
+ */
+export function comprehensionPage({ texts, study }) {
+  const { t } = bound(texts);
+  const required = t("common.required");
+  return (page, done) => {
+    const fields = study.comprehension_questions.map(({ name, options }) => {
+      const own = (key) => t(`comprehension_question.${name}.${key}`);
+      /** @type {Array<[string, string]>} */
+      const choices = options.map((option) => [option, own(`options.${option}`)]);
+      return choiceField(`c-${name}`, own("text"), choices, { required, style: "radios-list" });
+    });
+    const send = () => {
+      if (!complete(fields)) return;
+      const named = study.comprehension_questions.map(({ name }, index) => [name, fields[index].value()]);
+      done(Object.fromEntries(named));
+    };
+    page.append(
+      el("h1", {}, t("comprehension.title")),
+      ...paragraphs(t("comprehension.text")),
+      form(
+        send,
+        ...fields.map((each) => each.element),
+        el("div", { class: "buttons" }, submit(t("comprehension.send"))),
+      ),
+    );
+  };
+}
+
+/**
+ * Return what stands above the instructions after a wrong attempt; nothing before the first one.
+ * @param {import("./pages.js").Context} context
+ * @returns {HTMLElement[]}
+ */
+export function wrongAttempt({ texts, study, state }) {
+  const { comprehension_attempts: attempts } = state;
+  if (attempts === 0) return [];
+  const left = study.comprehension_limit - attempts;
+  return [el("p", { class: "notice", role: "alert" }, texts.t("comprehension.again", { left }))];
+}
