@@ -35,7 +35,9 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "physion compare leaderboard runs/models/predictions/*.csv --humans official",
     ),
     "compare power": ("physion compare power --effect 0.1 --people 20 40 --stimuli 60 100",),
-    "compare diffusion": ("physion compare diffusion --responses data/trials.csv --out diffusion.csv",),
+    "compare diffusion": (
+        "physion compare diffusion --responses data/trials.csv --out diffusion.csv",
+    ),
     "experiment": ("physion experiment init study --trials trials",),
     "experiment init": (
         "physion experiment init study --trials trials --test 80 --languages en",
