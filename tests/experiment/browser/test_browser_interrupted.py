@@ -51,3 +51,34 @@ def test_interrupted_trials_are_shown_again_and_showings_are_counted(
     assert (session.replayed, session.implausible, session.unfetched) == (1, None, 0)
     reasons = [row.data["reason"] for row in events if row.kind == "trial_interrupted"]
     assert reasons == ["dialog", "window"]
+
+
+@pytest.mark.slow
+def test_interrupted_trials_go_on_and_are_void(chromium: Any, tmp_path: Path) -> None:
+    """The movie plays once, and its answer says what interrupted it; later trials count again."""
+    rules = Plausibility(reading_s=0.0, interrupted="void")
+    with (
+        served(tmp_path / "s", familiarization=1, test=3, plausibility=rules) as (study, server),
+        Visit(chromium, server.url, "void") as visit,
+    ):
+        to_the_test(visit, "?participant=Bo&language=en")
+        visit.page.locator(".screen").wait_for()
+        visit.page.click("#tools button")  # the question whether to stop
+        visit.page.locator("dialog[open]").wait_for()
+        visit.press("Escape")
+        visit.answer("yes")
+        visit.page.locator(".screen").wait_for()
+        visit.page.set_viewport_size(SMALL)
+        visit.wait_for_answer()
+        visit.page.set_viewport_size(SIZE)
+        visit.answer("no")
+        visit.answer("no")
+        visit.finish()
+        assert visit.unexpected() == []
+    session, answers, events = rows_of(study, "Bo")
+    test = [row for row in answers if row.phase == "test"]
+    assert [row.void for row in test] == ["dialog", "window", None]
+    assert [row.showings for row in test] == [1, 1, 1]
+    assert [row.frames_shown > 0 for row in test] == [True] * 3
+    assert (session.replayed, session.implausible) == (0, None)
+    assert not [row for row in events if row.kind == "trial_interrupted"]

@@ -22,8 +22,9 @@ from physion.errors import BadInputError, PhysionError
 from physion.experiment.export import export_study as export
 from physion.experiment.export import write_tables as export_tables
 from physion.experiment.export.answer_tables import read_tables
-from physion.experiment.export.export_study import GONE, NO_FILE, TABLES, export_study
+from physion.experiment.export.export_study import GONE, NO_FILE, export_study
 from physion.experiment.export.spreadsheet import restore_cell
+from physion.experiment.export.write_tables import TABLES
 from physion.experiment.store.database import open_database, sqlite_url, upgrade
 from physion.experiment.store.tables import ANSWERS, RAW_IDS, SESSIONS, STUDIES
 from physion.experiment.study.identity import Secrets

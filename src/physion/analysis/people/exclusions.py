@@ -34,11 +34,13 @@ RULES = (
     "repeated",
     "implausible",
     "replayed",
+    "failed_checks",
 )
 """The rules, each a column of the table of flags. ``incomplete`` sessions lack answers;
-``repeated`` ones are a participant's second and later sessions in a scenario. The last two are not
-of the preregistration; the experiment's server finds them: sessions that no person can have made,
-and sessions with trials that were shown more often than the study allows."""
+``repeated`` ones are a participant's second and later sessions in a scenario. The last three are
+not of the preregistration; the experiment's server finds them: sessions that no person can have
+made, sessions with trials that were shown more often than the study allows, and sessions that
+failed a check of the lab."""
 
 
 MOST_EXCLUDED = 1 / 3
@@ -220,6 +222,7 @@ def flag_sessions(
         "repeated": flag_repeated(measures),
         "implausible": flag_from_server(responses, measures, "implausible"),
         "replayed": flag_from_server(responses, measures, "replayed"),
+        "failed_checks": flag_from_server(responses, measures, "failed_checks"),
     }
     table = measures.assign(**{name: flag.astype(bool) for name, flag in flags.items()})
     return table.assign(flagged=table[list(RULES)].any(axis=1))

@@ -148,6 +148,11 @@ SESSION_COLUMNS: tuple[Column, ...] = (
     Column("replayed", "integer", "Trials shown more often than the study allows", low=0),
     Column("implausible", "text", "Why no person can have made the session, as the server judged: "
            "fast answers, no media, short; empty: nothing is wrong"),
+    Column("practice_repeats", "integer",
+           "How often the practice was repeated; in the last block begun, if there are several",
+           low=0),
+    Column("failed_checks", "text", "Checks of the lab that the session failed: practice; empty: "
+           "none"),
     Column("age", "integer", "Age", unit="years", low=0, high=130),
     Column("gender", "text", "Gender, in the words of the questionnaire"),
     Column("education", "text", "Highest education, in the words of the questionnaire"),

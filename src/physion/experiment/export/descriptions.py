@@ -54,6 +54,8 @@ _FILES = """\
 - `sessions.csv`, `sessions.parquet`: one row per session.
 - `questions.csv`, `questions.parquet`: one row per session that answered the questions of the lab,
   if it asks some.
+- `practice_repeats.csv`, `practice_repeats.parquet`: answers to practice trials that were repeated
+  afterwards, if there are some; `trials` has the last repeat.
 - `events.csv`, `events.parquet`: other events in the browser.
 - `trial_details.parquet`: times of frames and cues within each trial.
 - `stimuli.csv`: the stimuli and their outcomes. `expected.csv`: the test stimuli by scenario.

@@ -7,6 +7,7 @@
       trials.csv, .parquet   one row per trial: physion compare --responses
       sessions.csv, .parquet one row per session: physion compare --sessions
       questions.csv, .parquet    answers to the lab's own questions, if there are any
+      practice_repeats.csv, .parquet  answers to practice trials that were repeated, if any
       events.csv, .parquet   other events in the browser
       trial_details.parquet  times of frames and cues within each trial
       stimuli.csv, expected.csv   the stimuli; the test stimuli of each scenario or session
@@ -47,7 +48,7 @@ from physion.experiment.export.session_rows import (
     read_sessions,
 )
 from physion.experiment.export.spreadsheet import RULE
-from physion.experiment.export.write_tables import TABLES, WrittenTables, write_tables
+from physion.experiment.export.write_tables import WrittenTables, write_tables
 from physion.experiment.store.tables import STUDIES
 from physion.experiment.study.study import EARLY_ENDS, Study
 from physion.version import __version__
@@ -55,7 +56,7 @@ from physion.version import __version__
 Layout = Literal["both", "psych-ds", "bids"]
 GONE = "its stimulus is no longer in the study folder"
 NO_FILE = "no answer yet, so no file in bids/"
-_PSYCH_DS_TABLES = ("trials", "sessions", "events", "questions")
+_PSYCH_DS_TABLES = ("trials", "sessions", "events", "questions", "practice_repeats")
 _SECRET_SETTINGS = ("recruitment", *EARLY_ENDS, "folder", "stimuli")
 
 
@@ -139,9 +140,8 @@ def export_study(
         report = _report(out, sessions, written)
         _write_stimuli(folder, study, expected)
         _write_json(folder / "study.json", {"states": states})
-        described = TABLES if written.own is None else TABLES | {"questions": written.own[1]}
         dictionary: dict[str, Any] = {
-            name: data_dictionary(columns) for name, columns in described.items()
+            name: data_dictionary(columns) for name, columns in written.described.items()
         }
         _write_json(folder / "data_dictionary.json", dictionary | {"spreadsheet_safety": RULE})
         if bids is not None:
@@ -152,8 +152,11 @@ def export_study(
             )
             report = _with_left_out(report, "session", "any", NO_FILE, without)
         if layout != "bids":
-            tables = [name for name in described if name in _PSYCH_DS_TABLES]
-            chosen = {name: (folder / f"{name}.csv", described[name]) for name in tables}
+            chosen = {
+                name: (folder / f"{name}.csv", columns)
+                for name, columns in written.described.items()
+                if name in _PSYCH_DS_TABLES
+            }
             _write_psych_ds(folder, study, sessions, report.until, chosen)
         (folder / "README.md").write_text(readme(study, "export", report.facts()), "utf-8")
         known = {"package": f"physion {__version__}", "name": study.name}

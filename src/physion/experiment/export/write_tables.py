@@ -14,6 +14,7 @@ import pyarrow.compute as pc
 from sqlalchemy import Connection
 
 from physion.analysis.people.response_schema import SESSION_COLUMNS, TRIAL_COLUMNS, Column
+from physion.experiment.export import practice_table
 from physion.experiment.export.conventions.bids import BidsWriter
 from physion.experiment.export.descriptions import STIMULI_COLUMNS
 from physion.experiment.export.event_tables import (
@@ -22,6 +23,7 @@ from physion.experiment.export.event_tables import (
     detail_table,
     read_events,
 )
+from physion.experiment.export.practice_table import read_practice_repeats
 from physion.experiment.export.question_table import (
     KEYS,
     question_columns,
@@ -58,12 +60,15 @@ class WrittenTables:
         Latest time in the data.
     own
         Answers to the lab's own questions with their columns; None if there are no questions.
+    described
+        Columns of each written table.
     """
 
     rows: dict[str, int]
     gone: int
     until: str | None
     own: tuple[pa.Table, tuple[Column, ...]] | None
+    described: dict[str, tuple[Column, ...]]
 
 
 def write_tables(
@@ -115,9 +120,16 @@ def write_tables(
                 latest.append(_latest(part.table, "answered_at"))
                 behind(part)
         rows = {name: file.rows for name, file in (*files.items(), ("trial_details", details))}
+    described = dict(TABLES)
     if own is not None:
-        rows["questions"] = own[0].num_rows
-    return WrittenTables(rows, gone, max(latest) or None, own)
+        rows["questions"], described["questions"] = own[0].num_rows, own[1]
+    repeats = read_practice_repeats(connection, study, sessions.table)
+    if repeats.num_rows:
+        with TableWriter(folder, "practice_repeats", practice_table.COLUMNS) as file:
+            file.write(repeats)
+        rows["practice_repeats"] = repeats.num_rows
+        described["practice_repeats"] = practice_table.COLUMNS
+    return WrittenTables(rows, gone, max(latest) or None, own, described)
 
 
 def _write_own_answers(

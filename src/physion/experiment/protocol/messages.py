@@ -168,6 +168,8 @@ class SessionState(Message):
     trials: dict[Phase, int]
     comprehension_attempts: int
     """How often the comprehension check was answered."""
+    practice_repeats: int
+    """How often the practice of the current block was repeated."""
     answered: bool
     """Whether a trial was answered, after which stopping is final."""
     block: int

@@ -67,6 +67,8 @@ class PublicStudy(Message):
     comprehension_questions: list[CheckedQuestion]
     comprehension_limit: int
     """How often the comprehension check can be answered."""
+    practice_min_correct: int
+    """Right answers needed in the practice; 0: no criterion."""
     questions: list[AskedQuestion]
     """The lab's own questions at the end."""
     example: dict[str, TrialMedia]

@@ -39,6 +39,7 @@ export interface SessionState {
   trial: number | null;
   trials: Record<Phase, number>;
   comprehension_attempts: number;
+  practice_repeats: number;
   answered: boolean;
   block: number;
   blocks: BlockTrials[];
@@ -188,6 +189,7 @@ export interface PublicStudy {
   interrupted: "repeat" | "void";
   comprehension_questions: CheckedQuestion[];
   comprehension_limit: number;
+  practice_min_correct: number;
   questions: AskedQuestion[];
   example: Record<string, TrialMedia>;
   recruiters: Recruiter[];

@@ -102,6 +102,19 @@ export function readyPage(context) {
     );
 }
 
+/** Render the page before a practice that is repeated. @param {Context} context @returns {Render} */
+export function repeatPage({ texts, study, state }) {
+  const { t } = bound(texts);
+  const trials = size(currentBlock(state), "familiarization");
+  const needed = Math.min(study.practice_min_correct, trials);
+  return (page, done) =>
+    page.append(
+      el("h1", {}, t("practice.repeat_title")),
+      ...paragraphs(t("practice.repeat_text", { needed, trials })),
+      el("div", { class: "buttons" }, button(t("practice.repeat"), () => done())),
+    );
+}
+
 /**
  * Render the break before a test trial; ends when the participant goes on.
  * @param {Context} context

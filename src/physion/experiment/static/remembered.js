@@ -68,7 +68,8 @@ export function dueFeedback(state) {
   const [, end] = currentBlock(state).familiarization;
   const answered = state.stage === "ready" ? end : state.trial;
   const practises = state.stage === "familiarization" || state.stage === "ready";
-  return practises && answered === due.answer.trial + 1 ? due.answer : null;
+  const repeats = state.practice_repeats > 0 && due.answer.trial >= answered;
+  return practises && (repeats || answered === due.answer.trial + 1) ? due.answer : null;
 }
 
 /**

@@ -22,7 +22,7 @@ import { dueFeedback, forgetFeedback, rememberFeedback } from "./remembered.js";
 import { questionPage } from "./question_page.js";
 import { resultPage } from "./result_page.js";
 import { announce, newShowing } from "./showings.js";
-import { feedbackPieces, trialPieces } from "./trial_pieces.js";
+import { feedbackPieces, repeatBefore, trialPieces } from "./trial_pieces.js";
 
 const PAGES = {
   consent: consentPage,
@@ -277,13 +277,17 @@ export class Session {
     this.media.start(trials, this.state.trial, list);
     const remaining = trials.filter((trial) => trial.trial >= this.state.trial);
     await this.#timeline([
+      ...repeatBefore(this.context, phase),
       ...remaining.flatMap((media) => this.#trial(phase, media)),
       {
         timeline: [{ type: PageTrial, render: this.#waiting() }],
         conditional_function: () => this.queue.length > 0,
       },
     ]);
-    return this.#patiently(api.get("/api/session", { signal }));
+    const next = await this.#patiently(api.get("/api/session", { signal }));
+    // A repeated practice shows its scenes anew.
+    if (next.practice_repeats > this.state.practice_repeats) this.#shown.clear();
+    return next;
   }
 
   /** Show the feedback of a practice trial that the participant has not seen to its end. */

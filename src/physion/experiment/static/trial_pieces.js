@@ -56,6 +56,19 @@ export function trialPieces(context, phase, media, session) {
 }
 
 /**
+ * Return the page before a practice that is repeated, at its first trial.
+ * @param {import("./pages.js").Context} context
+ * @param {import("./messages.js").Phase} phase
+ * @returns {Array<Object>}
+ */
+export function repeatBefore(context, phase) {
+  const { state } = context;
+  const first = phase === "familiarization" && state.trial === currentBlock(state).familiarization[0];
+  if (!first || state.practice_repeats === 0) return [];
+  return [{ type: PageTrial, render: pages.repeatPage(context) }];
+}
+
+/**
  * Return the timeline that shows the feedback of an answered practice trial once more.
  * @param {import("./pages.js").Context} context
  * @param {TrialMedia} media

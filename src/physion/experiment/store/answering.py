@@ -19,6 +19,7 @@ from physion.experiment.store.plausibility import (
     reasons,
     speed,
 )
+from physion.experiment.store.practice import judge_practice, repeated_response
 from physion.experiment.store.sessions import Session, answered, insert_or_skip, stage_of, state_of
 from physion.experiment.store.showings import read_presentation
 from physion.experiment.store.tables import ANSWERS, SESSIONS
@@ -104,7 +105,10 @@ def store_answer(
         or cannot have been shown until now.
     """
     known = answered(session, answer.phase)
-    if answer.trial < known:
+    repeated = repeated_response(connection, session, answer)
+    if repeated is not None:
+        response, duplicate = repeated, True
+    elif answer.trial < known:
         response = _read_stored(connection, course, session, answer)
         duplicate = True
     else:
@@ -114,6 +118,8 @@ def store_answer(
     # Stimuli cannot change while there are sessions, so an answered trial has this stimulus too.
     stimulus = trial_order(study, session.scenario, session.order_seed)[answer.phase][answer.trial]
     if not duplicate:
+        if answer.phase == PHASES[0] and session.practice_repeats > 0:
+            fetched_at = None  # the browser may still have the media of the first practice
         shown = read_presentation(connection, study, course, session, answer, fetched_at)
         changes = _judge(study, session, answer, shown, now)
         values = {
@@ -123,6 +129,8 @@ def store_answer(
             "details": details,
         }
         _insert_answer(connection, course, session, answer, values, changes, now)
+        if answer.phase == PHASES[0]:
+            judge_practice(connection, study, course, session, now)
     feedback = None
     if answer.phase == PHASES[0]:
         feedback = _build_feedback(study, secrets, session, stimulus, answer.trial, response)

@@ -22,18 +22,29 @@ from physion.experiment.store.database import (
     open_database,
     server_lock,
 )
-from physion.experiment.store.tables import ANSWERS, EVENTS, RAW_IDS, SESSIONS, SHOWINGS, TOKENS
+from physion.experiment.store.tables import (
+    ANSWERS,
+    EVENTS,
+    PRACTICE_REPEATS,
+    RAW_IDS,
+    SESSIONS,
+    SHOWINGS,
+    TOKENS,
+)
 
 if TYPE_CHECKING:
     from physion.experiment.store.store import Store
 
+_OF_SESSION = (ANSWERS, PRACTICE_REPEATS, SHOWINGS, EVENTS, TOKENS)
+"""Tables whose rows of a forgotten session are deleted."""
 _EMPTIED = dict.fromkeys((
-    "instructed_at", "comprehended_at", "screened_out_at", "screened_out_by", "ready_at",
-    "demographics_at", "questions_at", "questions_study", "own_answers", "finished_at",
+    "instructed_at", "comprehended_at", "screened_out_at", "screened_out_by", "failed_checks",
+    "ready_at", "demographics_at", "questions_at", "questions_study", "own_answers", "finished_at",
     "loaded_at_phase", "loaded_at_trial", "block_at", "browser", "progressed_at", "next_from",
     "implausible", "age", "gender", "education", "difficulty", "technical_problems", "feedback",
 )) | {"answered_familiarization": 0, "answered_test": 0, "block": 0, "comprehension_attempts": 0,
-      "fast_answers": 0, "unfetched": 0, "replayed": 0, "loads": 0, "device": {}}  # fmt: skip
+      "practice_repeats": 0, "fast_answers": 0, "unfetched": 0, "replayed": 0, "loads": 0,
+      "device": {}}  # fmt: skip
 """Column values that replace the data of a forgotten session."""
 
 
@@ -80,7 +91,7 @@ def forget_sessions(url: str, references: Sequence[str]) -> int:
             _forget_session(connection, reference, now)
         return len(wanted)
 
-    return _run_exclusively(url, work, (RAW_IDS, ANSWERS, SHOWINGS, EVENTS, TOKENS, SESSIONS))
+    return _run_exclusively(url, work, (RAW_IDS, *_OF_SESSION, SESSIONS))
 
 
 def _run_exclusively(url: str, work: Callable[[Connection], int], tables: Sequence[Table]) -> int:
@@ -161,7 +172,7 @@ def _forget_session(connection: Connection, reference: str, now: float) -> None:
             "deleted"
         )
     session, participant, withdrawn_at = rows[0]
-    for table in (ANSWERS, SHOWINGS, EVENTS, TOKENS):
+    for table in _OF_SESSION:
         connection.execute(delete(table).where(table.c.session == session))
     values = _EMPTIED | {"withdrawn_at": withdrawn_at or now, "closed_at": now}
     connection.execute(update(SESSIONS).where(columns.session == session).values(**values))

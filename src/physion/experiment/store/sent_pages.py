@@ -224,7 +224,7 @@ def _columns(
             language = {"language": values["language"]} if known else {}
             return {"consent_version": study.consent_version, **language}
         case "block":
-            return {"block": session.block + 1, "ready_at": None}
+            return {"block": session.block + 1, "ready_at": None, "practice_repeats": 0}
         case "demographics":
             return dict(values)
         case "questions":

@@ -41,6 +41,8 @@ class Session:
     instructed_at: float | None
     comprehended_at: float | None
     comprehension_attempts: int
+    practice_repeats: int
+    failed_checks: str | None
     ready_at: float | None
     demographics_at: float | None
     questions_at: float | None
@@ -190,6 +192,7 @@ def state_of(session: Session, course: Course) -> SessionState:
         trial=answered(session, stage) if stage in PHASES else None,
         trials=cast(Any, dict(course.trials)),
         comprehension_attempts=session.comprehension_attempts,
+        practice_repeats=session.practice_repeats,
         answered=any(answered(session, phase) for phase in PHASES),
         block=course.trials.blocks.index(block),
         blocks=[
@@ -210,6 +213,12 @@ def state_of(session: Session, course: Course) -> SessionState:
 
 def _ends(indices: range) -> tuple[int, int]:
     return indices.start, indices.stop
+
+
+def with_check(session: Session, check: str) -> dict[str, str]:
+    """Return the column of the failed checks of a session, with one more."""
+    known = session.failed_checks.split(", ") if session.failed_checks else []
+    return {"failed_checks": ", ".join(known if check in known else [*known, check])}
 
 
 def change_session(connection: Connection, session: Session, **values: Any) -> None:

@@ -6,6 +6,8 @@ trials, correctness) are not stored; labels are in the study folder only.
 
 from __future__ import annotations
 
+from typing import Any
+
 from sqlalchemy import (
     JSON,
     BigInteger,
@@ -97,6 +99,8 @@ SESSIONS = Table(
     Column("browser", String(32)),
     Column("progressed_at", Float),
     Column("next_from", Float),
+    Column("practice_repeats", Integer, nullable=False, server_default="0"),
+    Column("failed_checks", String(100)),
     Column("answered_familiarization", Integer, nullable=False, default=0),
     Column("answered_test", Integer, nullable=False, default=0),
     Column("block", Integer, nullable=False, server_default="0"),
@@ -134,6 +138,8 @@ again: its data were deleted, or it was a preview of other stimuli. ``voided_at`
 decided that the session does not count.
 ``screened_out_at``: when the session ended since the participant failed the check
 ``screened_out_by``; ``comprehension_attempts``: how often the comprehension check was answered.
+``practice_repeats``: how often the practice of the current block was repeated; ``failed_checks``:
+names of the lab's checks that flag the session, separated by commas; NULL without any.
 ``browser``: keyed hash of the key of the browser that began the session, empty if it sent none,
 NULL in sessions of older versions. ``progressed_at``: time of the last page or answer.
 ``next_from``: earliest time at which the next trial can have begun. ``fast_answers``,
@@ -158,38 +164,58 @@ TOKENS = Table(
 )
 """SHA-256 hashes of tokens; each token gives access to one session."""
 
+
+def _answer_columns() -> list[Column[Any]]:
+    """Return new columns of what is stored of an answer, besides session, phase and trial."""
+    return [
+        Column("key", String(64), nullable=False),
+        Column("stimulus", String(200), nullable=False),
+        Column("response", String(3), nullable=False),
+        Column("rt_ms", Float, nullable=False),
+        Column("input", String(8), nullable=False),
+        Column("fixation_ms", Float),
+        Column("cue_ms", Float),
+        Column("frames_expected", Integer, nullable=False),
+        Column("frames_shown", Integer),
+        Column("frames_dropped", Integer),
+        Column("movie_ms", Float),
+        Column("visibility_changes", Integer),
+        Column("window_width", Integer),
+        Column("window_height", Integer),
+        Column("break_ms", Float),
+        Column("resumed", Boolean, nullable=False),
+        Column("showings", Integer),
+        Column("void", String(10)),
+        Column("answered_at", Float, nullable=False),
+        Column("details", Text, nullable=False),
+    ]
+
+
 ANSWERS = Table(
     "answers",
     METADATA,
     Column("session", ForeignKey("sessions.session"), primary_key=True),
     Column("phase", String(15), primary_key=True),
     Column("trial", Integer, primary_key=True),
-    Column("key", String(64), nullable=False),
-    Column("stimulus", String(200), nullable=False),
-    Column("response", String(3), nullable=False),
-    Column("rt_ms", Float, nullable=False),
-    Column("input", String(8), nullable=False),
-    Column("fixation_ms", Float),
-    Column("cue_ms", Float),
-    Column("frames_expected", Integer, nullable=False),
-    Column("frames_shown", Integer),
-    Column("frames_dropped", Integer),
-    Column("movie_ms", Float),
-    Column("visibility_changes", Integer),
-    Column("window_width", Integer),
-    Column("window_height", Integer),
-    Column("break_ms", Float),
-    Column("resumed", Boolean, nullable=False),
-    Column("showings", Integer),
-    Column("void", String(10)),
-    Column("answered_at", Float, nullable=False),
-    Column("details", Text, nullable=False),
+    *_answer_columns(),
     UniqueConstraint("session", "key"),
     UniqueConstraint("session", "phase", "stimulus"),
     CheckConstraint("response IN ('yes', 'no')", name="response"),
 )
 """Answers, one row per session and trial; ``details`` is JSON text. ``showings``: how often the
 movie was shown, counted over all loads of the page; ``void``: what interrupted the movie."""
+
+PRACTICE_REPEATS = Table(
+    "practice_repeats",
+    METADATA,
+    Column("session", ForeignKey("sessions.session"), primary_key=True),
+    Column("phase", String(15), primary_key=True),
+    Column("trial", Integer, primary_key=True),
+    Column("repeat", Integer, primary_key=True),
+    *_answer_columns(),
+)
+"""Answers to practice trials that were repeated afterwards. ``repeat``: how often the practice had
+been repeated before, from 0."""
 
 SHOWINGS = Table(
     "showings",

@@ -62,6 +62,25 @@ class Comprehension:
 
 
 @dataclass(frozen=True)
+class Practice:
+    """The criterion of the familiarization of a session, or of each block.
+
+    Attributes
+    ----------
+    min_correct
+        Number of right answers that are needed; 0: no criterion.
+    repeats
+        How often the practice is repeated with fewer.
+    failed
+        What happens then: ``end`` ends the session, ``flag`` goes on and flags it.
+    """
+
+    min_correct: int = 0
+    repeats: int = 1
+    failed: str = "end"
+
+
+@dataclass(frozen=True)
 class Screen:
     """Smallest browser window in which participants may take part, in CSS pixels.
 

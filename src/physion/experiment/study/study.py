@@ -36,6 +36,7 @@ from physion.experiment.study.settings import (
     EarlyEnd,
     Limits,
     Plausibility,
+    Practice,
     Recruitment,
     Screen,
     Timing,
@@ -62,6 +63,7 @@ __all__ = [
     "EarlyEnd",
     "Limits",
     "Plausibility",
+    "Practice",
     "Recruitment",
     "Screen",
     "Study",
@@ -109,12 +111,12 @@ class Study:
         Whether age, gender and education are asked.
     embed_from
         Sites that may show the pages in a frame (MTurk); none by default.
-    timing, blocks, comprehension, screen, plausibility, recruitment, limits
+    timing, blocks, comprehension, practice, screen, plausibility, recruitment, limits
         The tables of ``study.toml``.
     declined, stopped, screened_out, device_refused, full
         Codes and URLs of participants who gave no consent, who stopped, who failed the
-        comprehension check, whose device cannot show the movies, and who came when the study was
-        full.
+        comprehension check or the practice, whose device cannot show the movies, and who came when
+        the study was full.
     bonus
         The rule of the bonus in the table of payments.
     questions
@@ -154,6 +156,7 @@ class Study:
     timing: Timing = field(default=Timing())
     blocks: Blocks = field(default=Blocks())
     comprehension: Comprehension = field(default=Comprehension())
+    practice: Practice = field(default=Practice())
     screen: Screen = field(default=Screen())
     plausibility: Plausibility = field(default=Plausibility())
     recruitment: Recruitment = field(default=Recruitment())
@@ -188,6 +191,7 @@ _PARTS: dict[str, type[Any]] = {
     "timing": Timing,
     "blocks": Blocks,
     "comprehension": Comprehension,
+    "practice": Practice,
     "screen": Screen,
     "plausibility": Plausibility,
     "recruitment": Recruitment,
@@ -281,6 +285,7 @@ def format_settings(study: Study) -> str:
 
 def own_text_keys(study: Study) -> tuple[str, ...]:
     """Return the keys of the texts that a study needs for its own questions."""
+    asked: tuple[ComprehensionQuestion | Question, ...]
     asked = (*study.comprehension_questions, *study.questions)
     return tuple(key for question in asked for key in question.text_keys)
 

@@ -176,7 +176,7 @@ _site = pattern(
 _EARLY_ENDS = {
     "declined": "For participants who do not consent.",
     "stopped": "For participants who stop; they learn the code, so it should not pay in full.",
-    "screened_out": "For participants who failed the comprehension check.",
+    "screened_out": "For participants who failed the comprehension check or the practice.",
     "device_refused": "For participants whose device or browser cannot show the movies.",
     "full": "For participants who come when the study is full.",
 }
@@ -248,6 +248,12 @@ KEYS: tuple[Key, ...] = (
     Key("comprehension", "attempts", whole(1, 100),
         "How often comprehension_questions (below) can be answered. After\n"
         "a wrong answer the instructions are shown again; after the last one the session ends."),
+    Key("practice", "min_correct", whole(0, 1000),
+        "Right answers needed in the familiarization (of each block); 0: no criterion."),
+    Key("practice", "repeats", whole(0, 20),
+        "How often the practice is repeated with fewer right answers."),
+    Key("practice", "failed", one_of("end", "flag"),
+        "What happens then: \"end\" ends the session, \"flag\" goes on and flags it."),
     Key("screen", "min_width", whole(320, 10_000), "Smallest browser window, in CSS pixels."),
     Key("screen", "min_height", whole(320, 10_000), ""),
     Key("screen", "fullscreen", flag,
@@ -319,6 +325,7 @@ TABLES = {
     "timing": "Durations within a trial.",
     "blocks": "Several scenarios in one session.",
     "comprehension": "Comprehension check after the instructions.",
+    "practice": "Criterion of the practice.",
     "screen": "In a smaller window participants are asked to enlarge it; telephones are refused.",
     "plausibility": "Sessions that no person can have made, repeated and interrupted movies.",
     "recruitment": "Recruitment and completion credit.",

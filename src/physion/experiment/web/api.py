@@ -61,6 +61,7 @@ def public_study(study: Study, secrets: Secrets) -> PublicStudy:
             for each in study.comprehension_questions
         ],
         comprehension_limit=study.comprehension.attempts,
+        practice_min_correct=study.practice.min_correct,
         questions=[_asked(question) for question in study.questions],
         example={name: _example(study, secrets, name) for name in study.scenarios},
         recruiters=list(RECRUITERS),

@@ -10,7 +10,7 @@ from physion.experiment.protocol.messages import Jump, SessionState
 from physion.experiment.protocol.refused import Refused
 from physion.experiment.protocol.stages import PAGES, Course
 from physion.experiment.store.sessions import Session, change_session, state_of
-from physion.experiment.store.tables import ANSWERS
+from physion.experiment.store.tables import ANSWERS, PRACTICE_REPEATS
 from physion.experiment.study.stimuli import PHASES
 
 _ENDS = ("withdrawn_at", "closed_at", "screened_out_at", "screened_out_by")
@@ -47,7 +47,9 @@ def jump(
     block = _block_of(course, to)
     done = course.stages[: course.stages.index(to.stage)]
     values: dict[str, Any] = dict.fromkeys(_ENDS)
-    values["comprehension_attempts"] = 0
+    values |= {"comprehension_attempts": 0, "practice_repeats": 0, "failed_checks": None}
+    repeated = PRACTICE_REPEATS.c.session == session.session
+    connection.execute(delete(PRACTICE_REPEATS).where(repeated))
     for stage, page in PAGES.items():
         values[page.column] = now if stage in done else None
     for phase in PHASES:
