@@ -28,10 +28,17 @@ from physion.experiment.experimenter.access.login import (
     MAX_LOGINS,
     LoginRegistry,
 )
-from physion.experiment.study.identity import Secrets, check_password, set_password
+from physion.experiment.study.identity import (
+    FIRST_ACCOUNT,
+    Account,
+    Secrets,
+    check_password,
+    set_password,
+)
 from support.experiment.experimenter_client import BASE, Lab, lab
 from support.experiment.tiny_study import PASSWORD
 
+OWNER = Account(FIRST_ACCOUNT, "owner", "hash")
 PAGES = ("", "/", "/sessions", "/sessions/abc", "/payments", "/export", "?auto=1")
 ACTIONS = ("/logout", "/payments", "/payments/forget", "/export")
 
@@ -117,13 +124,13 @@ def test_addresses_are_kept_in_bounds() -> None:
 
 def test_a_login_ends_when_idle_and_in_any_case() -> None:
     logins = LoginRegistry()
-    token = logins.open(0.0)
+    token = logins.open(OWNER, 0.0)
     assert logins.find(token, IDLE_TIMEOUT) is not None
     assert logins.find(token, IDLE_TIMEOUT + 100, by_person=False) is not None
     assert logins.find(token, 2 * IDLE_TIMEOUT + 1) is None, (
         "pages that refresh do not keep it open"
     )
-    token, now = logins.open(0.0), 0.0
+    token, now = logins.open(OWNER, 0.0), 0.0
     while now + IDLE_TIMEOUT <= MAX_DURATION:
         now += IDLE_TIMEOUT
         assert logins.find(token, now) is not None
@@ -132,7 +139,7 @@ def test_a_login_ends_when_idle_and_in_any_case() -> None:
 
 def test_no_token_is_kept_and_logins_are_bounded() -> None:
     logins = LoginRegistry()
-    tokens = [logins.open(0.0) for _ in range(MAX_LOGINS + 1)]
+    tokens = [logins.open(OWNER, 0.0) for _ in range(MAX_LOGINS + 1)]
     assert len(set(tokens)) == MAX_LOGINS + 1 and all(len(token) >= 43 for token in tokens)
     assert not any(token in repr(vars(logins)) for token in tokens)
     assert logins.find(tokens[0], 0.0) is None and logins.find(tokens[1], 0.0) is not None
@@ -289,24 +296,24 @@ def test_a_new_password_ends_all_logins(tmp_path: Path) -> None:
 
 
 def test_a_password_that_changes_while_it_is_looked_at_opens_nothing(tmp_path: Path) -> None:
-    """In three steps: it is right, then changed, and someone else's page tells the server."""
+    """In two steps: it is right, then changed."""
     set_up = Secrets.create(tmp_path, PASSWORD)
     kept = [set_up]
     gate = access_control.AccessControl(lambda: kept[0])
-    token = gate.logins.open(0.0)
+    token = gate.logins.open(OWNER, 0.0)
 
-    def change(secrets: Secrets, password: str) -> bool:
-        right = check_password(secrets, password)
+    def change(secrets: Secrets, password: str, name: str) -> bool:
+        right = check_password(secrets, password, name)
         kept[0] = set_password(tmp_path, "another password")
-        gate.login(request)
         return right
 
     request = Request({"type": "http", "headers": [(b"cookie", f"{COOKIE}={token}".encode())]})
     try:
-        assert asyncio.run(gate.try_password(request, PASSWORD)) is None
+        found = asyncio.run(gate.try_password(request, FIRST_ACCOUNT, PASSWORD))
+        assert found == set_up.account(FIRST_ACCOUNT)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(access_control, "check_password", change)
-            assert asyncio.run(gate.try_password(request, PASSWORD)) == 0.0
+            assert asyncio.run(gate.try_password(request, FIRST_ACCOUNT, PASSWORD)) == 0.0
     finally:
         gate.close()
 

@@ -38,9 +38,9 @@ class Visitor(TestClient):
         data = fields | ({} if form_token is None else {"form_token": form_token})
         return self.post(f"{BASE}{path}", data=data, follow_redirects=False)
 
-    def log_in(self, password: str = PASSWORD) -> Any:
-        """Submit the password on the login page."""
-        return self.submit("/login", self.token(), password=password)
+    def log_in(self, password: str = PASSWORD, user: str = "experimenter") -> Any:
+        """Submit name and password on the login page."""
+        return self.submit("/login", self.token(), password=password, user=user)
 
     def open_payments(self) -> Any:
         """Submit the password once more and return the payments page."""

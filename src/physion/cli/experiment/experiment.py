@@ -12,6 +12,8 @@
 
 `physion experiment password DIR`: set a new password for the experimenter's pages.
 
+`physion experiment accounts DIR`: list, add, change and remove accounts of several experimenters.
+
 `physion experiment backup DIR`: copy the database, settings and texts while the study is served.
 
 `physion experiment forget DIR`: delete recruiters' ids, or all data of a session.
@@ -36,6 +38,7 @@ SUBVERBS = {
     "simulate": "physion.cli.experiment.simulate",
     "links": "physion.cli.experiment.links",
     "password": "physion.cli.experiment.password",
+    "accounts": "physion.cli.experiment.accounts",
     "backup": "physion.cli.experiment.backup",
     "forget": "physion.cli.experiment.forget",
 }
@@ -49,7 +52,7 @@ class Options:
     """Options of ``physion experiment`` without a sub-verb."""
 
     words: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """One of init, serve, links, simulate, export, password, backup, forget."""
+    """One of init, serve, links, simulate, export, password, accounts, backup, forget."""
 
 
 def main(options: Options) -> int:

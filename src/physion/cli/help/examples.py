@@ -48,6 +48,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "experiment simulate": ("physion experiment simulate study --participants 50",),
     "experiment export": ("physion experiment export study --layout psych-ds",),
     "experiment password": ("physion experiment password study",),
+    "experiment accounts": ("physion experiment accounts study --add grace --role analyst",),
     "experiment backup": ("physion experiment backup study --out backups",),
     "experiment forget": ("physion experiment forget study --participant 5f0c1e",),
     "view": (

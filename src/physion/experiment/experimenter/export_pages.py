@@ -6,6 +6,7 @@ import shutil
 import tempfile
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from starlette.background import BackgroundTask
 from starlette.concurrency import run_in_threadpool
@@ -15,8 +16,11 @@ from starlette.responses import FileResponse, Response
 from physion.errors import PhysionError
 from physion.experiment.experimenter.access.access_control import HEADERS
 from physion.experiment.experimenter.archive import file_name
-from physion.experiment.experimenter.page_context import PageContext, redirect
+from physion.experiment.experimenter.page_context import PageContext, note
 from physion.experiment.experimenter.statistics.process import StatisticsProcess
+
+if TYPE_CHECKING:
+    from physion.experiment.store.store import Store
 
 EXPORT_TIMEOUT = 900.0
 """Maximum duration of an export in seconds."""
@@ -25,14 +29,12 @@ EXPORT_TIMEOUT = 900.0
 class ExportPages:
     """Request handlers of the export page; only one export (``running``) at a time."""
 
-    def __init__(self, context: PageContext) -> None:
-        self._context = context
+    def __init__(self, context: PageContext, store: Store) -> None:
+        self._context, self._store = context, store
         self.running = False
 
     async def show(self, request: Request) -> Response:
         """Show the form."""
-        if self._context.access.login(request) is None:
-            return redirect("/login")
         return self._context.render(request, "export.html", here="export", problem="")
 
     async def make(self, request: Request) -> Response:
@@ -55,6 +57,8 @@ class ExportPages:
             raise
         finally:
             self.running = False
+        what = "with simulated participants" if fields.get("simulated") == "yes" else "people alone"
+        await self._store.write(lambda c: note(c, request, "exported", what))
         day = time.strftime("%Y-%m-%d", time.gmtime())
         return FileResponse(
             packed, media_type="application/zip", headers=dict(HEADERS),

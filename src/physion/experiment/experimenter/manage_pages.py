@@ -1,4 +1,6 @@
-"""Forms that change a study while it is served: recruitment, void sessions, deleted data."""
+"""Forms that change a study while it is served (recruitment, void sessions, deleted data), and the
+log of who did so.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +8,21 @@ import logging
 import time
 from typing import TYPE_CHECKING
 
-from sqlalchemy import select
+from sqlalchemy import Connection, select
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import Response
 
 from physion.errors import PhysionError
 from physion.experiment.experimenter.export_pages import ExportPages
-from physion.experiment.experimenter.page_context import FORGET_WORD, PageContext, redirect
+from physion.experiment.experimenter.page_context import (
+    FORGET_WORD,
+    PageContext,
+    note,
+    redirect,
+)
+from physion.experiment.experimenter.session_list import page_number
+from physion.experiment.store.lab.actions import Action, LogPage, read_log
 from physion.experiment.store.lab.managing import is_paused, set_paused, set_voided
 from physion.experiment.store.tables import SESSIONS
 
@@ -46,7 +55,14 @@ class ManagePages:
         action, now = sent[1].get("action"), time.time()
         if action not in ("pause", "resume"):
             return self._context.render_problem(request, "This form was not understood.", 422)
-        await self._store.write(lambda c: set_paused(c, action == "pause", now))
+        pause = action == "pause"
+
+        def change(connection: Connection) -> None:
+            if set_paused(connection, pause, now):
+                done: Action = "paused recruitment" if pause else "resumed recruitment"
+                note(connection, request, done)
+
+        await self._store.write(change)
         LOG.warning("an experimenter asked to %s recruitment", action)
         return redirect("")
 
@@ -61,8 +77,14 @@ class ManagePages:
             return self._context.render_problem(request, "There is no such session.", 404)
         if action not in ("void", "count"):
             return self._context.render_problem(request, "This form was not understood.", 422)
-        session = request.path_params["session"]
-        await self._store.write(lambda c: set_voided(c, session, action == "void", now))
+        session, void = request.path_params["session"], action == "void"
+
+        def change(connection: Connection) -> None:
+            if set_voided(connection, session, void, now):
+                done: Action = "made a session void" if void else "counted a session again"
+                note(connection, request, done, reference)
+
+        await self._store.write(change)
         LOG.warning("an experimenter asked to %s session %s", action, reference)
         return redirect(f"/sessions/{session}")
 
@@ -86,10 +108,22 @@ class ManagePages:
             # A concurrent reader would keep the deleted bytes in the database's write-ahead log.
             async with self._context.statistics.stopped():
                 await forget_session(self._store, reference)
+                await self._store.write(lambda c: note(c, request, "deleted a session", reference))
         except PhysionError as error:
             return self._context.render_problem(request, str(error), 503)
         LOG.warning("the data of session %s were deleted by an experimenter", reference)
         return redirect(f"/sessions/{request.path_params['session']}")
+
+    async def log(self, request: Request) -> Response:
+        """Show the log."""
+        number = page_number(request.query_params.get("page", ""))
+
+        def read() -> LogPage:
+            with self._store.engine.connect() as connection:
+                return read_log(connection, number)
+
+        log = await run_in_threadpool(read)
+        return await self._context.render_in_thread(request, "log.html", here="log", log=log)
 
     async def _reference(self, request: Request) -> str | None:
         """Return the reference of the session in the path, or None if there is none."""

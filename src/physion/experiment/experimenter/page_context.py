@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from sqlalchemy import Connection
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
@@ -18,6 +19,7 @@ from physion.experiment.experimenter.session_list import KINDS
 from physion.experiment.experimenter.statistics.process import StatisticsProcess
 from physion.experiment.experimenter.statistics.summaries import STATES
 from physion.experiment.experimenter.templating import make_environment
+from physion.experiment.store.lab.actions import Action, note_action
 from physion.experiment.store.sessions import ACTIVE_WITHIN
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.study import Study
@@ -27,6 +29,7 @@ REFRESH_SECONDS = 30
 FORGET_WORD = "delete"
 """Word that must be typed to confirm the deletion of raw ids."""
 WRONG_PASSWORD = "This is not the password."
+WRONG_LOGIN = "There is no such name with this password."
 WRONG_FORM = "This form was no longer valid. Please try again."
 
 
@@ -62,14 +65,10 @@ class PageContext:
     ) -> tuple[Login, dict[str, str]] | Response:
         """Return the login and the fields of a submitted form.
 
-        If the browser is not logged in, return a redirect to the login instead; if the form token
-        is invalid, the response of ``form``, which shows the form again.
+        If the form token is invalid, return the response of ``form``, which shows the form again.
         """
-        login = self.access.login(request)
-        if login is None:
-            return redirect("/login")
         fields = await self.access.form(request)
-        return form(request, WRONG_FORM, 403) if fields is None else (login, fields)
+        return form(request, WRONG_FORM, 403) if fields is None else (login_of(request), fields)
 
     async def query_statistics(self, request: Request, name: str, **arguments: Any) -> Any:
         """Return a result of the statistics process, or an error page."""
@@ -80,13 +79,21 @@ class PageContext:
 
     def render_problem(self, request: Request, problem: str, status: int) -> Response:
         """Return an error page, or a redirect to the login if the browser is not logged in."""
-        if self.access.login(request) is None:
+        login = self.access.login(request)
+        if login is None:
             return redirect("/login")
+        request.state.login = login
         return self.render(request, "problem.html", status, here="", problem=problem)
 
     def render(self, request: Request, template: str, status: int = 200, **values: Any) -> Response:
         """Render a page whose forms are bound to the browser's cookie."""
-        return self.render_with_token(template, self.access.token(request), status, **values)
+        return self.render_with_token(
+            template,
+            self.access.token(request),
+            status,
+            account=login_of(request).account,
+            **values,
+        )
 
     async def render_in_thread(self, *given: Any, **values: Any) -> Response:
         """Render a page in a thread; for pages that take milliseconds."""
@@ -101,15 +108,34 @@ class PageContext:
         return Response(text, status, HEADERS, "text/html; charset=utf-8")
 
     def refuse_password(
-        self, request: Request, wait: float, form: Callable[..., Response]
+        self,
+        request: Request,
+        wait: float,
+        form: Callable[..., Response],
+        wrong: str = WRONG_PASSWORD,
     ) -> Response:
-        """Show ``form`` again with the message for a result of `AccessControl.try_password`."""
+        """Show ``form`` again with the message for a result of `AccessControl.try_password`.
+
+        ``wrong``: the message for a wrong password.
+        """
         if wait == 0:
-            return form(request, WRONG_PASSWORD, 403)
+            return form(request, wrong, 403)
         seconds = math.ceil(wait)
         unit = "second" if seconds == 1 else "seconds"
         problem = f"Too many attempts. Please wait {seconds} {unit} and try again."
         return form(request, problem, 429, wait)
+
+
+def login_of(request: Request) -> Login:
+    """Return the login that was found for a request of a page that needs one."""
+    login: Login = request.state.login
+    return login
+
+
+def note(connection: Connection, request: Request, action: Action, subject: str = "") -> None:
+    """Add what the account of a request did to the log, in the writer's transaction."""
+    account = login_of(request).account
+    note_action(connection, action, subject, account.name, account.role)
 
 
 def redirect(path: str) -> Response:

@@ -14,10 +14,17 @@ from physion.errors import PhysionError
 from physion.experiment.experimenter.access.access_control import HEADERS
 from physion.experiment.experimenter.archive import file_name
 from physion.experiment.experimenter.export_pages import ExportPages
-from physion.experiment.experimenter.page_context import FORGET_WORD, PageContext, redirect
+from physion.experiment.experimenter.page_context import (
+    FORGET_WORD,
+    PageContext,
+    login_of,
+    note,
+    redirect,
+)
 from physion.experiment.experimenter.payment_table import bonus_of, payment_csv
 from physion.experiment.experimenter.payments import Payments, read_payments
 from physion.experiment.experimenter.session_list import page_number
+from physion.experiment.study.identity import Account
 
 if TYPE_CHECKING:
     from physion.experiment.store.store import Store
@@ -33,9 +40,7 @@ class PaymentPages:
 
     async def show(self, request: Request) -> Response:
         """Show the payments, or the password form if it was not confirmed recently."""
-        login = self._context.access.login(request)
-        if login is None:
-            return redirect("/login")
+        login = login_of(request)
         if not login.may_see_payments(self._context.access.clock()):
             return self._confirm_form(request)
         return await self._list(request)
@@ -46,9 +51,12 @@ class PaymentPages:
         if isinstance(sent, Response):
             return sent
         login, fields = sent
-        wait = await self._context.access.try_password(request, fields.get("password", ""))
-        if wait is not None:
-            return self._context.refuse_password(request, wait, self._confirm_form)
+        found = await self._context.access.try_password(
+            request, login.account.name, fields.get("password", "")
+        )
+        if not isinstance(found, Account):
+            return self._context.refuse_password(request, found, self._confirm_form)
+        await self._store.write(lambda c: note(c, request, "opened the payments"))
         login.confirmed = self._context.access.clock()
         return redirect("/payments")
 
@@ -73,14 +81,13 @@ class PaymentPages:
                 deleted = await forget_raw_ids(self._store)
         except PhysionError as error:
             return await self._list(request, str(error), 503)
+        await self._store.write(lambda c: note(c, request, "deleted ids", f"{deleted}"))
         LOG.warning("%d raw ids were deleted by an experimenter", deleted)
         return await self._list(request, f"{deleted} ids were deleted.")
 
     async def download(self, request: Request) -> Response:
         """Send the selected payments as CSV."""
-        login = self._context.access.login(request)
-        if login is None:
-            return redirect("/login")
+        login = login_of(request)
         if not login.may_see_payments(self._context.access.clock()):
             return self._confirm_form(request)
         known = await self._context.query_statistics(request, "payments")
@@ -88,6 +95,8 @@ class PaymentPages:
             return known
         payments = await self._read(request, None)
         content = payment_csv(payments.rows, known, self._context.study.bonus)
+        count = f"{len(payments.rows)} sessions"
+        await self._store.write(lambda c: note(c, request, "downloaded the payments", count))
         name = f"{file_name(self._context.study)}-payments.csv"
         headers = {**HEADERS, "content-disposition": f'attachment; filename="{name}"'}
         return Response(content, 200, headers, "text/csv; charset=utf-8")

@@ -5,9 +5,9 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from fastapi import APIRouter, FastAPI
 from starlette.requests import Request
@@ -16,10 +16,17 @@ from starlette.responses import Response
 from physion.experiment.experimenter.access.access_control import drop_cookie, set_cookie
 from physion.experiment.experimenter.export_pages import ExportPages
 from physion.experiment.experimenter.manage_pages import ManagePages
-from physion.experiment.experimenter.page_context import WRONG_FORM, PageContext, redirect
+from physion.experiment.experimenter.page_context import (
+    WRONG_FORM,
+    WRONG_LOGIN,
+    WRONG_PASSWORD,
+    PageContext,
+    redirect,
+)
 from physion.experiment.experimenter.payment_pages import PaymentPages
 from physion.experiment.experimenter.session_list import KINDS, SessionFilter
-from physion.experiment.study.identity import Secrets
+from physion.experiment.store.lab.actions import note_action
+from physion.experiment.study.identity import FIRST_ACCOUNT, Account, Permission, Secrets
 from physion.experiment.study.study import Study
 from physion.experiment.web.page_files import read_page_files
 
@@ -27,14 +34,20 @@ if TYPE_CHECKING:
     from physion.experiment.store.store import Store
 
 LOG = logging.getLogger(__name__)
+Handler = Callable[[Request], Awaitable[Response]]
+PUBLIC: Literal["public"] = "public"
+"""In place of a permission: a page that needs no login."""
+ANY_ROLE: Literal["any role"] = "any role"
+"""In place of a permission: a page of every account."""
 
 
 def build_router(study: Study, secrets: Secrets, store: Store) -> APIRouter:
     """Return the router of the pages of a study, to be included under ``/experimenter``."""
     context = PageContext(study, secrets, store.engine.url.render_as_string(hide_password=False))
-    exports = ExportPages(context)
+    exports = ExportPages(context, store)
     manage = ManagePages(context, store, exports)
-    pages, payments = _Pages(context, manage), PaymentPages(context, store, exports)
+    pages = _Pages(context, manage, store)
+    payments = PaymentPages(context, store, exports)
 
     @contextlib.asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -42,34 +55,58 @@ def build_router(study: Study, secrets: Secrets, store: Store) -> APIRouter:
         await context.close()
 
     router = APIRouter(lifespan=lifespan, include_in_schema=False)
-    for method, path, page in (
-        ("GET", "", pages.overview),
-        ("GET", "/", pages.overview),
-        ("GET", "/login", pages.login_page),
-        ("POST", "/login", pages.login),
-        ("POST", "/logout", pages.logout),
-        ("GET", "/sessions", pages.sessions),
-        ("GET", "/sessions/{session}", pages.session),
-        ("POST", "/sessions/{session}/void", manage.set_voided),
-        ("POST", "/sessions/{session}/forget", manage.forget),
-        ("POST", "/recruitment", manage.set_recruitment),
-        ("GET", "/payments", payments.show),
-        ("POST", "/payments", payments.confirm),
-        ("GET", "/payments.csv", payments.download),
-        ("POST", "/payments/forget", payments.forget),
-        ("GET", "/export", exports.show),
-        ("POST", "/export", exports.make),
-        ("GET", "/static/{name}", pages.static),
+    for method, path, permission, page in (
+        ("GET", "", "progress", pages.overview),
+        ("GET", "/", "progress", pages.overview),
+        ("GET", "/login", PUBLIC, pages.login_page),
+        ("POST", "/login", PUBLIC, pages.login),
+        ("POST", "/logout", ANY_ROLE, pages.logout),
+        ("GET", "/sessions", "sessions", pages.sessions),
+        ("GET", "/sessions/{session}", "sessions", pages.session),
+        ("POST", "/sessions/{session}/void", "manage", manage.set_voided),
+        ("POST", "/sessions/{session}/forget", "manage", manage.forget),
+        ("POST", "/recruitment", "recruitment", manage.set_recruitment),
+        ("GET", "/payments", "payments", payments.show),
+        ("POST", "/payments", "payments", payments.confirm),
+        ("GET", "/payments.csv", "payments", payments.download),
+        ("POST", "/payments/forget", "manage", payments.forget),
+        ("GET", "/export", "export", exports.show),
+        ("POST", "/export", "export", exports.make),
+        ("GET", "/log", "log", manage.log),
+        ("GET", "/static/{name}", PUBLIC, pages.static),
     ):
-        router.add_api_route(path, page, methods=[method], response_model=None)
+        handler = page if permission == PUBLIC else _guarded(context, permission, page)
+        router.add_api_route(path, handler, methods=[method], response_model=None)
     return router
+
+
+def _guarded(
+    context: PageContext, permission: Permission | Literal["any role"], page: Handler
+) -> Handler:
+    """Return a handler that calls ``page`` for accounts whose role has the permission.
+
+    Others are sent to the login, or shown that their role does not allow the page.
+    """
+
+    async def handler(request: Request) -> Response:
+        by_person = request.query_params.get("auto") != "1"
+        login = context.access.login(request, by_person)
+        if login is None:
+            return redirect("/login")
+        request.state.login = login
+        if permission != ANY_ROLE and not login.account.may(permission):
+            problem = f"The role of this account ({login.account.role}) does not allow this."
+            return context.render_problem(request, problem, 403)
+        return await page(request)
+
+    return handler
 
 
 class _Pages:
     """Request handlers of login, overview, sessions and static files."""
 
-    def __init__(self, context: PageContext, manage: ManagePages) -> None:
-        self._context, self._manage = context, manage
+    def __init__(self, context: PageContext, manage: ManagePages, store: Store) -> None:
+        self._context, self._manage, self._store = context, manage, store
         self._files = read_page_files(Path(__file__).parent / "static")
 
     async def login_page(self, request: Request) -> Response:
@@ -79,21 +116,25 @@ class _Pages:
         return self._login_form(request)
 
     async def login(self, request: Request) -> Response:
-        """Check the password and log in."""
-        fields = await self._context.access.form(request)
+        """Check name and password, and log in."""
+        access = self._context.access
+        fields = await access.form(request)
         if fields is None:
             return self._login_form(request, WRONG_FORM, 403)
-        wait = await self._context.access.try_password(request, fields.get("password", ""))
-        if wait is None:
-            LOG.info("an experimenter logged in")
-            self._context.access.logins.close(self._context.access.token(request))
-            response = redirect("")
-            set_cookie(
-                request, response, self._context.access.logins.open(self._context.access.clock())
-            )
-            return response
-        LOG.warning("a login of an experimenter was refused")
-        return self._context.refuse_password(request, wait, self._login_form)
+        name = fields.get("user", FIRST_ACCOUNT).strip()
+        found = await access.try_password(request, name, fields.get("password", ""))
+        if not isinstance(found, Account):
+            LOG.warning("a login of an experimenter was refused")
+            wrong = WRONG_LOGIN if access.has_names() else WRONG_PASSWORD
+            return self._context.refuse_password(request, found, self._login_form, wrong)
+        LOG.info("an experimenter logged in")
+        await self._store.write(
+            lambda c: note_action(c, "logged in", account=found.name, role=found.role)
+        )
+        access.logins.close(access.token(request))
+        response = redirect("")
+        set_cookie(request, response, access.logins.open(found, access.clock()))
+        return response
 
     async def logout(self, request: Request) -> Response:
         """Log out."""
@@ -109,7 +150,9 @@ class _Pages:
     ) -> Response:
         """Show the login form, with a cookie to which it is bound."""
         visit = self._context.access.visit(request)
-        response = self._context.render_with_token("login.html", visit, status, problem=problem)
+        response = self._context.render_with_token(
+            "login.html", visit, status, problem=problem, named=self._context.access.has_names()
+        )
         set_cookie(request, response, visit)
         if wait:
             response.headers["retry-after"] = str(math.ceil(wait))
@@ -117,9 +160,6 @@ class _Pages:
 
     async def overview(self, request: Request) -> Response:
         """Show the overview."""
-        by_person = request.query_params.get("auto") != "1"
-        if self._context.access.login(request, by_person) is None:
-            return redirect("/login")
         kind = request.query_params.get("kind", "")
         kind = kind if kind in KINDS else "person"
         result = await self._context.query_statistics(request, "overview", kind=kind)
@@ -133,8 +173,6 @@ class _Pages:
 
     async def sessions(self, request: Request) -> Response:
         """Show the table of sessions."""
-        if self._context.access.login(request) is None:
-            return redirect("/login")
         choice = SessionFilter.from_query(request.query_params, self._context.study.offered)
         result = await self._context.query_statistics(request, "sessions", choice=choice)
         if isinstance(result, Response):
@@ -147,8 +185,6 @@ class _Pages:
 
     async def session(self, request: Request) -> Response:
         """Show one session."""
-        if self._context.access.login(request) is None:
-            return redirect("/login")
         result = await self._context.query_statistics(
             request, "session", session=request.path_params["session"][:100]
         )

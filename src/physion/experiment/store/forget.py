@@ -22,6 +22,7 @@ from physion.experiment.store.database import (
     open_database,
     server_lock,
 )
+from physion.experiment.store.lab.actions import note_action
 from physion.experiment.store.tables import (
     ANSWERS,
     EVENTS,
@@ -62,9 +63,13 @@ def forget(url: str, participants: Sequence[str] | None) -> int:
         The study is being served, or another program reads the database.
     """
     _check_participants(participants)
-    return _run_exclusively(
-        url, lambda connection: _delete_raw_ids(connection, participants), (RAW_IDS,)
-    )
+
+    def work(connection: Connection) -> int:
+        count = _delete_raw_ids(connection, participants)
+        note_action(connection, "deleted ids", f"{count}")
+        return count
+
+    return _run_exclusively(url, work, (RAW_IDS,))
 
 
 def forget_sessions(url: str, references: Sequence[str]) -> int:
@@ -89,6 +94,7 @@ def forget_sessions(url: str, references: Sequence[str]) -> int:
     def work(connection: Connection) -> int:
         for reference in wanted:
             _forget_session(connection, reference, now)
+            note_action(connection, "deleted a session", reference)
         return len(wanted)
 
     return _run_exclusively(url, work, (RAW_IDS, *_OF_SESSION, SESSIONS))

@@ -244,3 +244,16 @@ EVENTS = Table(
 )
 """Other events in the browser or of the session. ``batch`` is the key under which the browser sent
 several events together."""
+
+ACTIONS = Table(
+    "actions",
+    METADATA,
+    Column("action_number", Integer, primary_key=True, autoincrement=True),
+    Column("at", Float, nullable=False),
+    Column("account", String(40), nullable=False),
+    Column("role", String(20), nullable=False),
+    Column("action", String(40), nullable=False),
+    Column("subject", String(200), nullable=False),
+)
+"""Log of what experimenters did, one row an action; ``account`` is empty for the command line.
+``subject``: reference of a session, or a number; never an id or an answer."""

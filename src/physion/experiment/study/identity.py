@@ -1,4 +1,4 @@
-"""Secret keys of a study, and what is derived from them: id hashes, tokens, signatures, password.
+"""Secret keys of a study, and what is derived from them: id hashes, tokens, signatures; accounts.
 
 All secrets are in ``secret.json`` of the study folder, which only its owner may read. Without this
 file the server can neither recognise returning participants nor verify signed links.
@@ -10,11 +10,14 @@ import hashlib
 import hmac
 import json
 import os
+import re
 import stat
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from secrets import token_hex, token_urlsafe
-from typing import Any
+from typing import Any, Literal
 
 from physion.atomic import write_atomic
 from physion.errors import BadInputError
@@ -25,14 +28,45 @@ VERSION = 1
 KEY_BYTES = 32
 MIN_PASSWORD = 8
 MAX_PASSWORD = 1000
-MAX_BYTES = 10_000
+MAX_BYTES = 50_000
+MAX_ACCOUNTS = 100
+FIRST_ACCOUNT = "experimenter"
+"""Name of the account that every study has: an owner, whose password init prints."""
 REFERENCE_LETTERS = "23456789ABCDEFGHJKLMNPQRSTUVWXYZ"
 """32 letters and digits without look-alikes (no 0, O, 1, I)."""
 
 
+Permission = Literal["progress", "sessions", "recruitment", "payments", "export", "manage", "log"]
+"""What the experimenter's pages allow: see the overview; see sessions and their answers; pause
+recruitment; see ids, codes and payments; export; void and delete; see the log."""
+
+ROLES: Mapping[str, frozenset[Permission]] = {
+    "owner": frozenset(
+        ("progress", "sessions", "recruitment", "payments", "export", "manage", "log")
+    ),
+    "recruiter": frozenset(("progress", "recruitment", "payments")),
+    "analyst": frozenset(("progress", "sessions", "export")),
+    "viewer": frozenset(("progress", "sessions")),
+}
+"""Permissions of each role."""
+
+
+@dataclass(frozen=True)
+class Account:
+    """Account of an experimenter; ``password_hash`` is an argon2id hash."""
+
+    name: str
+    role: str
+    password_hash: str = field(repr=False)
+
+    def may(self, permission: Permission) -> bool:
+        """Return whether the account's role has this permission."""
+        return permission in ROLES[self.role]
+
+
 @dataclass(frozen=True)
 class Secrets:
-    """Secret keys of a study.
+    """Secret keys of a study, and the accounts of its experimenters.
 
     Attributes
     ----------
@@ -41,13 +75,25 @@ class Secrets:
     link_key
         HMAC key for signatures of links, media URLs and forms.
     password_hash
-        argon2id hash of the experimenter's password. Empty if none was set; then login is
-        impossible.
+        argon2id hash of the password of the first account. Empty if it was removed or none was set.
+    others
+        Further accounts.
     """
 
     hash_key: bytes = field(repr=False)
     link_key: bytes = field(repr=False)
     password_hash: str = field(default="", repr=False)
+    others: tuple[Account, ...] = ()
+
+    @property
+    def accounts(self) -> tuple[Account, ...]:
+        """All accounts; without any, nobody can log in."""
+        first = Account(FIRST_ACCOUNT, "owner", self.password_hash)
+        return (first, *self.others) if self.password_hash else self.others
+
+    def account(self, name: str) -> Account | None:
+        """Return the account of this name, or None."""
+        return next((account for account in self.accounts if account.name == name), None)
 
     @classmethod
     def create(cls, folder: Path, password: str | None = None) -> Secrets:
@@ -59,8 +105,8 @@ class Secrets:
             )
         secrets = cls(os.urandom(KEY_BYTES), os.urandom(KEY_BYTES))
         if password is not None:
-            secrets = replace(secrets, password_hash=_hash_password(password))
-        _write(path, secrets)
+            secrets = replace(secrets, password_hash=hash_password(password))
+        write_secrets(folder, secrets)
         return secrets
 
     @classmethod
@@ -78,15 +124,18 @@ class Secrets:
         return _parse(path, content)
 
 
-def _write(path: Path, secrets: Secrets) -> None:
-    """Write the secrets file, readable by its owner only."""
-    content = {
+def write_secrets(folder: Path, secrets: Secrets) -> None:
+    """Write the secrets file of a study folder, readable by its owner only."""
+    content: dict[str, Any] = {
         "version": VERSION,
         "hash_key": secrets.hash_key.hex(),
         "link_key": secrets.link_key.hex(),
         "password_hash": secrets.password_hash,
     }
-    write_atomic(path, (json.dumps(content, indent=1) + "\n").encode(), mode=0o600)
+    if secrets.others:
+        content["accounts"] = [asdict(account) for account in secrets.others]
+    encoded = (json.dumps(content, indent=1) + "\n").encode()
+    write_atomic(folder / SECRET_FILE, encoded, mode=0o600)
 
 
 def _parse(path: Path, content: bytes) -> Secrets:
@@ -97,12 +146,24 @@ def _parse(path: Path, content: bytes) -> Secrets:
             raise BadInputError(f"{path} has version {values['version']!r}, not {VERSION}")
         keys = [bytes.fromhex(values[name]) for name in ("hash_key", "link_key")]
         password_hash = values["password_hash"]
+        others = tuple(Account(**account) for account in values.get("accounts", ()))
         good = all(len(key) == KEY_BYTES for key in keys) and isinstance(password_hash, str)
-    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        good = good and all(
+            account.role in ROLES and is_account_name(account.name) and account.password_hash
+            for account in others
+        )
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise BadInputError(f"{path} is damaged; restore it from a backup") from error
     if not good:
         raise BadInputError(f"{path} is damaged; restore it from a backup")
-    return Secrets(keys[0], keys[1], password_hash)
+    return Secrets(keys[0], keys[1], password_hash, others)
+
+
+def is_account_name(name: str) -> bool:
+    """Return whether a name can be that of an account: 1 to 40 letters, digits, ``.``, ``-``, ``_``
+    and ``@``.
+    """
+    return re.fullmatch(r"[\w.@-]{1,40}", name) is not None
 
 
 def participant_hash(secrets: Secrets, source: str, raw_id: str) -> str:
@@ -148,26 +209,40 @@ def check_signature(secrets: Secrets, signature: str, *parts: str) -> bool:
 
 
 def set_password(folder: Path, password: str) -> Secrets:
-    """Set a new experimenter password; the keys are kept."""
-    secrets = replace(Secrets.load(folder), password_hash=_hash_password(password))
-    _write(folder / SECRET_FILE, secrets)
+    """Set a new password of the first account; keys and other accounts are kept."""
+    secrets = replace(Secrets.load(folder), password_hash=hash_password(password))
+    write_secrets(folder, secrets)
     return secrets
 
 
-def check_password(secrets: Secrets, password: str) -> bool:
-    """Return whether this is the experimenter's password (deliberately slow, about 50 ms)."""
+def check_password(secrets: Secrets, password: str, name: str = FIRST_ACCOUNT) -> bool:
+    """Return whether this is the password of an account (deliberately slow, about 50 ms).
+
+    For a name without an account it takes as long, so that names cannot be found out.
+    """
     from argon2 import PasswordHasher
     from argon2.exceptions import InvalidHashError, VerificationError
 
-    if not secrets.password_hash or len(password) > MAX_PASSWORD:
+    if len(password) > MAX_PASSWORD:
         return False
+    account = secrets.account(name)
     try:
-        return PasswordHasher().verify(secrets.password_hash, password)
+        right = PasswordHasher().verify(
+            _nobodys_hash() if account is None else account.password_hash, password
+        )
     except (VerificationError, InvalidHashError, UnicodeEncodeError):
         return False
+    return right and account is not None
 
 
-def _hash_password(password: str) -> str:
+@cache
+def _nobodys_hash() -> str:
+    """Return the hash of a random password that nobody knows."""
+    return hash_password(token_urlsafe(32))
+
+
+def hash_password(password: str) -> str:
+    """Return the argon2id hash of a new password."""
     from argon2 import PasswordHasher
 
     if not MIN_PASSWORD <= len(password) <= MAX_PASSWORD:

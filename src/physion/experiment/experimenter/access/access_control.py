@@ -20,7 +20,7 @@ from physion.experiment.experimenter.access.login import (
     LoginRegistry,
     new_cookie_token,
 )
-from physion.experiment.study.identity import Secrets, check_password
+from physion.experiment.study.identity import Account, Secrets, check_password
 
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
@@ -56,10 +56,23 @@ class AccessControl:
     def login(self, request: Request, by_person: bool = True) -> Login | None:
         """Return the login of the browser, or None if it must give the password first.
 
-        ``by_person``: the request was made by a person, not by an automatic refresh.
+        ``by_person``: the request was made by a person, not by an automatic refresh. A login ends
+        when its account is removed or has a new password; a new role counts at once.
         """
-        self.logins.set_password_hash(self._read_secrets().password_hash)
-        return self.logins.find(self.token(request), self.clock(), by_person)
+        token = self.token(request)
+        login = self.logins.find(token, self.clock(), by_person)
+        if login is None:
+            return None
+        account = self._read_secrets().account(login.account.name)
+        if account is None or account.password_hash != login.account.password_hash:
+            self.logins.close(token)
+            return None
+        login.account = account
+        return login
+
+    def has_names(self) -> bool:
+        """Return whether logging in needs a name: there are more accounts than the first."""
+        return bool(self._read_secrets().others)
 
     def token(self, request: Request) -> str:
         """Return the token in the browser's cookie, or an empty text."""
@@ -75,14 +88,14 @@ class AccessControl:
         good = self.logins.is_form_token(self.token(request), fields.get("form_token", ""))
         return fields if good else None
 
-    async def try_password(self, request: Request, password: str) -> float | None:
-        """Check a password.
+    async def try_password(self, request: Request, name: str, password: str) -> Account | float:
+        """Check the password of an account.
 
         Returns
         -------
-        float or None
-            None if the password is right, 0 if it is wrong, otherwise the seconds to wait before
-            the next attempt (the password was not checked).
+        Account or float
+            The account if the password is right, 0 if name or password is wrong, otherwise the
+            seconds to wait before the next attempt (the password was not checked).
         """
         address = request.client.host if request.client else ""
         if self._waiting >= CHECKS_WAITING:
@@ -91,18 +104,20 @@ class AccessControl:
         if wait > 0:
             return wait
         secrets = self._read_secrets()
-        self.logins.set_password_hash(secrets.password_hash)
+        account = secrets.account(name)
         self._waiting += 1
         try:
             loop = asyncio.get_running_loop()
-            right = await loop.run_in_executor(self._threads, check_password, secrets, password)
+            right = await loop.run_in_executor(
+                self._threads, check_password, secrets, password, name
+            )
         finally:
             self._waiting -= 1
         # The password may have been changed during the check.
-        if not right or self.logins.password_hash != secrets.password_hash:
+        if not right or account is None or self._read_secrets().account(name) != account:
             return 0.0
         self._attempts.succeeded(address)
-        return None
+        return account
 
     def close(self) -> None:
         """Stop the threads that check passwords."""

@@ -1,6 +1,7 @@
 """Logins of experimenters: kept in memory, identified by a cookie; and tokens of forms.
 
-Nothing is written to disk: a restart of the server or a new password ends all logins.
+Nothing is written to disk: a restart of the server ends all logins, a new password those of its
+account.
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ import hmac
 import secrets
 from collections import OrderedDict
 from dataclasses import dataclass
+
+from physion.experiment.study.identity import Account
 
 COOKIE = "physion_experimenter"
 PATH = "/experimenter"
@@ -25,8 +28,12 @@ MAX_LOGINS = 100
 
 @dataclass
 class Login:
-    """Login of one browser; times are seconds of a monotonic clock."""
+    """Login of one browser; times are seconds of a monotonic clock.
 
+    ``account``: whose login it is, as the account was last read.
+    """
+
+    account: Account
     made: float
     seen: float
     confirmed: float | None = None
@@ -46,19 +53,11 @@ class LoginRegistry:
     def __init__(self) -> None:
         self._open: OrderedDict[str, Login] = OrderedDict()
         self._form_key = secrets.token_bytes(32)
-        self.password_hash = ""
-        """Hash of the password with which the current logins were opened."""
 
-    def set_password_hash(self, password_hash: str) -> None:
-        """Set the hash of the current password; if it has changed, all logins end."""
-        if password_hash != self.password_hash:
-            self._open.clear()
-            self.password_hash = password_hash
-
-    def open(self, now: float) -> str:
+    def open(self, account: Account, now: float) -> str:
         """Open a login; return its token for the cookie, of which only the hash is kept."""
         token = new_cookie_token()
-        self._open[_hashed(token)] = Login(now, now)
+        self._open[_hashed(token)] = Login(account, now, now)
         while len(self._open) > MAX_LOGINS:
             self._open.popitem(last=False)
         return token

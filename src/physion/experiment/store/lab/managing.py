@@ -13,8 +13,8 @@ def is_paused(connection: Connection) -> bool:
     return connection.execute(going).first() is not None
 
 
-def set_paused(connection: Connection, paused: bool, now: float) -> None:
-    """Pause or resume recruitment; nothing changes if it is so already.
+def set_paused(connection: Connection, paused: bool, now: float) -> bool:
+    """Pause or resume recruitment; return whether anything changed.
 
     Parameters
     ----------
@@ -26,16 +26,17 @@ def set_paused(connection: Connection, paused: bool, now: float) -> None:
         Time of the server in seconds since 1970.
     """
     if is_paused(connection) == paused:
-        return
+        return False
     if paused:
         connection.execute(insert(PAUSES), {"paused_at": now, "resumed_at": None})
     else:
         going = PAUSES.c.resumed_at.is_(None)
         connection.execute(update(PAUSES).where(going).values(resumed_at=now))
+    return True
 
 
-def set_voided(connection: Connection, session: str, voided: bool, now: float) -> None:
-    """Void a session, or count it again; nothing changes if it is so already.
+def set_voided(connection: Connection, session: str, voided: bool, now: float) -> bool:
+    """Void a session, or count it again; return whether anything changed.
 
     A void session is not exported, gives no completion code if it is not finished, and its place is
     given to another participant. Its answers are kept.
@@ -54,4 +55,5 @@ def set_voided(connection: Connection, session: str, voided: bool, now: float) -
     columns = SESSIONS.c
     change = columns.voided_at.is_(None) if voided else columns.voided_at.is_not(None)
     values = {"voided_at": now if voided else None}
-    connection.execute(update(SESSIONS).where(columns.session == session, change).values(**values))
+    changed = update(SESSIONS).where(columns.session == session, change).values(**values)
+    return connection.execute(changed).rowcount > 0
