@@ -1,0 +1,108 @@
+"""Export of sessions that run through several scenarios, and its analysis."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
+
+from physion.analysis.people.check_responses import check_responses
+from physion.analysis.people.completeness import read_expected
+from physion.analysis.people.exclusions import flag_sessions
+from physion.experiment.experimenter.overview import compute_overview
+from physion.experiment.experimenter.statistics.flagging import Flags, find_flags
+from physion.experiment.experimenter.statistics.summaries import SummaryCache
+from physion.experiment.export.export_study import export_study
+from physion.experiment.store.store import Store
+from physion.experiment.store.tables import SESSIONS
+from physion.experiment.study.blocks import block_scenarios
+from physion.experiment.study.identity import Secrets
+from physion.experiment.study.study import ALL_SCENARIOS, Blocks
+from support.experiment.store_walk import enter, rows, walk
+from support.experiment.tiny_study import make_tiny_study
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Store]:
+    """The export of four finished sessions and one that ended after its first block."""
+    folder = tmp_path_factory.mktemp("several")
+    study = make_tiny_study(
+        folder / "study", test=4, familiarization=1, scenarios=("collide", "drop"), size=32,
+        blocks=Blocks(all_scenarios=True, trials=2),
+    )  # fmt: skip
+    store = Store.open(study, Secrets.load(study.folder))
+    for person in range(4):
+        walk(store, enter(store, f"person {person}"), "done")
+    walk(store, enter(store, "leaves"), "block")
+    export_study(store.engine, study, folder / "out")
+    yield folder / "out", store
+    store.close()
+
+
+def test_every_row_has_block_and_scenario(exported: tuple[Path, Store]) -> None:
+    out, store = exported
+    trials = pd.read_csv(out / "trials.csv")
+    sessions = pd.read_csv(out / "sessions.csv").set_index("session")
+    for row in rows(store, SESSIONS):
+        order = block_scenarios(store.study, ALL_SCENARIOS, row.order_seed)
+        assert sessions.loc[row.session, "scenario"] == " ".join(order)
+        own = trials[trials["session"] == row.session]
+        shown = list(zip(own["block"], own["scenario"], own["phase"], own["trial"], strict=True))
+        wanted = [
+            (0, order[0], "familiarization", 0), (0, order[0], "test", 0), (0, order[0], "test", 1),
+            (1, order[1], "familiarization", 1), (1, order[1], "test", 2), (1, order[1], "test", 3),
+        ]  # fmt: skip
+        assert shown == (wanted if row.finished_at else wanted[:3])
+    assert (trials["stimulus"].str.split("_").str[0] == trials["scenario"]).all()
+    assert "one block each" in (out / "README.md").read_text()
+
+
+def test_completeness_and_flags_are_judged_by_the_trials_of_each_session(
+    exported: tuple[Path, Store],
+) -> None:
+    out, store = exported
+    expected = read_expected(out / "expected.csv")
+    assert {len(names) for names in expected.values()} == {4} and len(expected) == 5
+    checked, responses = check_responses(
+        [out / "trials.csv"], out / "sessions.csv", expected=expected
+    )
+    assert checked.errors == 0 and responses is not None
+    flags = flag_sessions(responses, expected=expected).set_index("session")
+    unfinished = [row.session for row in rows(store, SESSIONS) if row.finished_at is None]
+    assert list(flags.index[flags["incomplete"]]) == unfinished
+    shown = find_flags(store.study, store.engine)["person"]
+    assert not shown.problem
+    assert [name for name in shown.by_session if "incomplete" in shown.of(name)] == unfinished
+
+
+def test_a_bids_file_has_all_blocks_of_a_session(exported: tuple[Path, Store]) -> None:
+    out, _ = exported
+    files = sorted((out / "bids").glob("sub-*/beh/*_task-allscenarios_beh.tsv"))
+    assert len(files) == 5
+    with files[0].open(newline="") as file:
+        lines = list(csv.DictReader(file, delimiter="\t"))
+    assert {line["scenario"] for line in lines} <= {"collide", "drop"}
+    described = json.loads((out / "bids" / "task-allscenarios_beh.json").read_text())
+    assert {"scenario", "block"} <= set(described)
+
+
+def test_the_overview_counts_sessions_and_the_stages_of_each_block(
+    exported: tuple[Path, Store],
+) -> None:
+    _, store = exported
+    summaries = SummaryCache(store.study, store.engine).refresh(2e9)
+    page = compute_overview(store.study, summaries, Flags("preregistered"), 2e9, "person")
+    (progress,) = page.progress
+    assert (progress.scenario, progress.counted) == (ALL_SCENARIOS, 4)
+    reached = {stage.name: stage.reached for stage in page.funnel}
+    assert reached["Test, block 1"] == 5 and reached["Page between blocks, block 1"] == 5
+    assert (
+        reached["Familiarization, block 2"] == 4 and "Page between blocks, block 2" not in reached
+    )
+    (performance,) = page.performance
+    assert performance.people == 4 and performance.accuracy == 0.5
