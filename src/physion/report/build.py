@@ -114,6 +114,7 @@ def compare_files(
     expected: Path | Expected | None = None,
     accept_rules: Collection[str] = (),
     simulated: bool = False,
+    where: Sequence[str] = (),
     attributes: Path | pd.DataFrame | None = None,
     zone: Path | None = None,
     exclude: Path | None = None,
@@ -154,6 +155,8 @@ def compare_files(
     simulated
         Whether to rehearse the analysis with the simulated participants of ``responses``, who are
         left out otherwise. Every page is marked.
+    where
+        Values that the sessions must have, as in `selection.keep_where`.
     attributes
         Elements, distractors and occluders of one's own stimuli: a table of
         `attributes.attributes_from_table`, its file, or a dataset.
@@ -200,9 +203,12 @@ def compare_files(
             accept_rules=accept_rules,
             participants="simulated" if simulated else "people",
             attributes=read_attributes(attributes) if isinstance(attributes, Path) else attributes,
+            where=where,
         )  # fmt: skip
         choices.setdefault("Official outcomes", "those recorded with the responses")
-        choices.setdefault("People", describe_people(responses, people))
+        described = describe_people(responses, people)
+        chosen = f"; of the sessions with {', '.join(where)} alone" if where else ""
+        choices.setdefault("People", described + chosen)
         choices.setdefault(
             "Trials of a whole session", describe_expected(people, expected is not None)
         )
@@ -217,10 +223,10 @@ def compare_files(
     else:
         assert rows is not None
         about = (sessions, expected, attributes)
-        if any(one is not None for one in about) or accept_rules or simulated:
+        if any(one is not None for one in about) or accept_rules or simulated or where:
             raise BadInputError(
-                "sessions, expected, attributes, accepted rules and simulated participants are "
-                "about responses: give those"
+                "sessions, expected, attributes, accepted rules, chosen values (where) and "
+                "simulated participants are about responses: give those"
             )
         settings: dict[str, Any] = {"exclude": excluded, "exclude_ledge": exclude_ledge}
         results, words = _with_averages(

@@ -15,6 +15,7 @@ from physion.analysis.people.results import (
     read_any_responses,
     rules_called,
 )
+from physion.analysis.people.selection import keep_where
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.tables.csv_table import read_csv
 from physion.report.words import plural
@@ -48,10 +49,11 @@ def people_from_files(
     accept_rules: Collection[str] = (),
     participants: Kind = "people",
     attributes: pd.DataFrame | None = None,
+    where: Sequence[str] = (),
 ) -> PeopleResults:
     """Read responses and run every analysis of people."""
     chosen = rules_called(rules)
-    read = read_any_responses(responses, sessions, participants)
+    read = keep_where(read_any_responses(responses, sessions, participants), where)
     if labels is not None:
         check_labels(read, labels)
     return analyse_people(

@@ -18,8 +18,8 @@ from physion.analysis.tables.stimuli import in_order
 
 Array = npt.NDArray[np.float64]
 
-BACKGROUND = ("age", "gender", "education", "difficulty", "technical_problems")
-"""Columns of the sessions about the participant and about problems."""
+BACKGROUND = ("condition", "age", "gender", "education", "difficulty", "technical_problems")
+"""Columns of the sessions about the condition, the participant and problems."""
 
 
 # --- yes or no ----------------------------------------------------------------------------------
@@ -169,9 +169,7 @@ def background(sessions: pd.DataFrame) -> pd.DataFrame:
     (fraction).
     """
     parts = []
-    for column in BACKGROUND:
-        if column not in sessions:
-            continue
+    for column in _asked(sessions):
         values = sessions[column].astype(object)
         named = values.where(values.notna() & (values != ""), "(none)")
         counts = named.value_counts(sort=False)
@@ -207,8 +205,13 @@ def accuracy_by_background(test: pd.DataFrame, sessions: pd.DataFrame) -> pd.Dat
     by_person = by_person.groupby("session", as_index=False, sort=False)["relative"].mean()
     joined = by_person.merge(sessions.drop(columns=["participant", "scenario"], errors="ignore"),
                        on="session", how="left")  # fmt: skip
-    asked = [column for column in BACKGROUND if column in joined]
-    return pd.DataFrame([_association(joined, column) for column in asked])
+    return pd.DataFrame([_association(joined, column) for column in _asked(joined)])
+
+
+def _asked(table: pd.DataFrame) -> list[str]:
+    """Return the columns of `BACKGROUND` that a table has; no condition if all cells are empty."""
+    known = "condition" in table and (table["condition"].fillna("") != "").any()
+    return [name for name in BACKGROUND if name in table and (name != "condition" or known)]
 
 
 def _association(joined: pd.DataFrame, column: str) -> dict[str, Any]:

@@ -121,6 +121,20 @@ def accuracy_by_scenario(test: pd.DataFrame, bootstrap: Bootstrap | None = None)
     return pd.concat([table, pd.DataFrame([mean])], ignore_index=True)
 
 
+def accuracy_by_condition(test: pd.DataFrame, bootstrap: Bootstrap | None = None) -> pd.DataFrame:
+    """Return the rows of `accuracy_by_scenario` for each between-subject condition.
+
+    The first column is ``condition``. Empty for responses without conditions.
+    """
+    known = test["condition"].fillna("") if "condition" in test else pd.Series("", test.index)
+    parts = []
+    for condition in sorted(set(known) - {""}):
+        rows = accuracy_by_scenario(test[known == condition], bootstrap)
+        rows.insert(0, "condition", condition)
+        parts.append(rows)
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=["condition"])
+
+
 def _scenario_record(
     answers: ScenarioAnswers, by_person: Array, resampled: Array, draws: Bootstrap
 ) -> dict[str, Any]:

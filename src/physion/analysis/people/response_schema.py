@@ -118,6 +118,7 @@ TRIAL_COLUMNS: tuple[Column, ...] = (
         "Index of the block in a session of several scenarios, from 0; empty: a session of one",
         low=0,
     ),
+    Column("condition", "text", "Between-subject condition of the session; empty: there is none"),
 )
 """One row a participant and trial."""
 
@@ -166,6 +167,7 @@ SESSION_COLUMNS: tuple[Column, ...] = (
     Column("screen_height", "integer", "Height of the screen", unit="px", low=0),
     Column("pixel_ratio", "number", "Device pixels in one CSS pixel", low=0, high=100),
     Column("touch", "flag", "Does the device have a touch screen?"),
+    Column("condition", "text", "Between-subject condition; empty: the study has none"),
 )  # fmt: skip
 """One row a session; demographics are asked at its end, so that they are empty in broken ones."""
 

@@ -45,6 +45,7 @@ from physion.analysis.people.participants import (
     read_responses,
 )
 from physion.analysis.people.people import (
+    accuracy_by_condition,
     accuracy_by_participant,
     accuracy_by_scenario,
     accuracy_by_stimulus,
@@ -73,8 +74,8 @@ class PeopleResults:
 
     - ``flags`` (`exclusions.flag_sessions`), ``flag_counts``, ``flag_effects``;
     - ``with_and_without``: `people.accuracy_by_scenario` without and with flagged sessions;
-    - ``participants``, ``by_scenario``, ``by_stimulus`` (`people.accuracy_by_...`), ``items``
-      (`items.item_statistics`);
+    - ``participants``, ``by_scenario``, ``by_condition``, ``by_stimulus``
+      (`people.accuracy_by_...`), ``items`` (`items.item_statistics`);
     - ``agreement``: agreement among people (`people.agreement_by_scenario`);
     - ``yes_bias``, ``side_bias``, ``learning``, ``background``, ``background_tests``;
     - ``attributes`` of the stimuli that people answered, and ``hypotheses``
@@ -208,6 +209,7 @@ def analyse_people(
     )
     tables["participants"] = accuracy_by_participant(kept.test)
     tables["by_scenario"] = accuracy_by_scenario(kept.test, draws)
+    tables["by_condition"] = accuracy_by_condition(kept.test, draws)
     tables["by_stimulus"] = accuracy_by_stimulus(kept.test, draws)
     tables["items"] = item_statistics(kept.test)
     tables["agreement"] = agreement_by_scenario(kept.test, draws)

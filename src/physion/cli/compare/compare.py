@@ -61,6 +61,9 @@ class Options:
     alternation, familiarization, low_accuracy, slow, incomplete, repeated."""
     simulated: bool = False
     """Rehearse with the simulated participants of --responses alone; every page is marked."""
+    where: tuple[str, ...] = ()
+    """Only the sessions with these values, such as condition=fast; columns: condition, language,
+    recruited_by, gender, education, buttons, study."""
     attributes: Path | None = None
     """Elements, distractors, occluders of the stimuli: a table (CSV, parquet) or a dataset; if not
     given, by official names."""
@@ -118,7 +121,7 @@ def _given(options: Options) -> dict[str, Any]:
     from physion.report.page.movies import movies_of
 
     same = ("responses", "sessions", "rules", "expected", "accept_rules", "attributes", "zone",
-            "dominoes", "exclude", "trial_pages", "simulated")  # fmt: skip
+            "dominoes", "exclude", "trial_pages", "simulated", "where")  # fmt: skip
     found = {name: getattr(options, name) for name in same if getattr(options, name)}
     if options.rollout_error:
         found["rollout_errors"] = options.rollout_error

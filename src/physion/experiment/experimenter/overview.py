@@ -20,6 +20,7 @@ from physion.experiment.experimenter.statistics.summaries import (
 from physion.experiment.protocol.stages import label
 from physion.experiment.study.orders import session_trials
 from physion.experiment.study.study import Study
+from physion.experiment.study.variants import variants
 
 RATE_SESSIONS = 20
 """The current rate is estimated from at most this many of the last finished sessions, ..."""
@@ -116,6 +117,21 @@ class DisplayCounts:
 
 
 @dataclass(frozen=True)
+class ConditionCounts:
+    """Row of the table of conditions: sessions by state, flagged ones, and mean accuracy.
+
+    ``counted``, ``flagged`` and ``accuracy`` are as in `ScenarioProgress` and
+    `ScenarioPerformance`, the latter of finished sessions that count.
+    """
+
+    name: str
+    states: Mapping[str, int]
+    counted: int
+    flagged: int | None
+    accuracy: float | None
+
+
+@dataclass(frozen=True)
 class Overview:
     """Content of the overview page, for sessions of one kind."""
 
@@ -130,6 +146,7 @@ class Overview:
     browsers: tuple[DisplayCounts, ...]
     refresh_rates: tuple[DisplayCounts, ...]
     rules: tuple[tuple[str, tuple[int, ...]], ...]
+    conditions: tuple[ConditionCounts, ...]
 
 
 def compute_overview(
@@ -169,6 +186,7 @@ def compute_overview(
         _grouped(chosen, lambda s: browser_label(str(s.facts["device"].get("user_agent", "")))),
         _grouped(chosen, lambda s: refresh_rate_label(s.facts["device"].get("refresh_hz"))),
         _rules(list(by_scenario.values()), flags),
+        _conditions(study, chosen, flags),
     )
 
 
@@ -182,6 +200,28 @@ def _progress(
     finished = [float(s.facts["finished_at"]) for s in counted]
     end = expected_end(finished, wanted, now)
     return ScenarioProgress(name, wanted, counts, len(counted), _flagged(part, flags), end)
+
+
+def _conditions(
+    study: Study, part: Sequence[SessionSummary], flags: Flags
+) -> tuple[ConditionCounts, ...]:
+    """Return the rows of the table of conditions, in the order of the study."""
+    rows = []
+    for condition in study.conditions:
+        own = [s for s in part if s.facts["condition"] == condition.name]
+        states = Counter(summary.state for summary in own)
+        done = [s for s in own if s.state == "finished" and s.facts["implausible"] is None]
+        accuracies = [s.answered.accuracy for s in done if s.answered.accuracy is not None]
+        rows.append(
+            ConditionCounts(
+                condition.name,
+                {state: states[state] for state in STATES},
+                len(done),
+                _flagged(own, flags),
+                fmean(accuracies) if accuracies else None,
+            )
+        )
+    return tuple(rows)
 
 
 def _total(
@@ -255,7 +295,9 @@ def funnel(part: Sequence[SessionSummary], order: Sequence[str]) -> tuple[Funnel
 
 def _performance(study: Study, name: str, part: Sequence[SessionSummary]) -> ScenarioPerformance:
     """Return accuracy and response times of the people who completed one scenario."""
-    trials = session_trials(study, name, 0)["test"]  # the same in all orders
+    # The same in all orders; conditions may have fewer blocks.
+    offering = [each for each in variants(study) if name in each.offered] or [study]
+    trials = min(session_trials(each, name, 0)["test"] for each in offering)
     counted = [s for s in part if s.state != "void"]
     complete = [s.answered for s in counted if trials and s.answered.test >= trials]
     accuracies = [answered.correct / answered.test for answered in complete]

@@ -11,6 +11,7 @@ from physion.experiment.store.tables import SESSIONS
 from physion.experiment.study.orders import trial_order
 from physion.experiment.study.stimuli import Stimulus
 from physion.experiment.study.study import ALL_SCENARIOS, Study
+from physion.experiment.study.variants import under
 from physion.stimulus_names import canonical_name
 
 
@@ -24,10 +25,11 @@ def expected_stimuli(
     if not study.blocks.all_scenarios:
         rows = [(s.stimulus, s.scenario) for s in study.stimuli if s.phase == "test"]
         return [("stimulus", "scenario"), *rows]
-    seeds = read_block_seeds(connection)
+    seeds = _seeds(connection)
     found: list[tuple[str, ...]] = [("stimulus", "scenario", "session")]
     for session in sessions.table.column("session").to_pylist():
-        order = trial_order(study, ALL_SCENARIOS, seeds[session])["test"]
+        seed, condition = seeds[session]
+        order = trial_order(under(study, condition), ALL_SCENARIOS, seed)["test"]
         found += [(each.stimulus, each.scenario, session) for each in order]
     return found
 
@@ -37,8 +39,8 @@ def expected_names(connection: Connection, study: Study) -> dict[str, frozenset[
     if not study.blocks.all_scenarios:
         return {name.lower(): _names(study.phase(name, "test")) for name in study.scenarios}
     return {
-        session: _names(trial_order(study, ALL_SCENARIOS, seed)["test"])
-        for session, seed in read_block_seeds(connection).items()
+        session: _names(trial_order(under(study, condition), ALL_SCENARIOS, seed)["test"])
+        for session, (seed, condition) in _seeds(connection).items()
     }
 
 
@@ -46,8 +48,9 @@ def _names(stimuli: Sequence[Stimulus]) -> frozenset[str]:
     return frozenset(canonical_name(each.stimulus) for each in stimuli)
 
 
-def read_block_seeds(connection: Connection) -> dict[str, int]:
-    """Return the seeds of the sessions that have several scenarios."""
+def _seeds(connection: Connection) -> dict[str, tuple[int, str | None]]:
+    """Return seed and condition of the sessions that have several scenarios."""
     columns = SESSIONS.c
-    chosen = select(columns.session, columns.order_seed).where(columns.scenario == ALL_SCENARIOS)
-    return dict(connection.execute(chosen).all())
+    chosen = select(columns.session, columns.order_seed, columns.condition)
+    rows = connection.execute(chosen.where(columns.scenario == ALL_SCENARIOS))
+    return {session: (seed, condition) for session, seed, condition in rows}

@@ -18,6 +18,7 @@ from physion.experiment.export.iso_times import iso_times
 from physion.experiment.store.tables import SESSIONS, STUDIES
 from physion.experiment.study.blocks import block_scenarios
 from physion.experiment.study.study import Study
+from physion.experiment.study.variants import under
 
 EXPORTED_KINDS = ("person", "simulated")
 """Kinds of sessions that can be exported; previews cannot."""
@@ -129,7 +130,8 @@ def _session_value(row: _Row, name: str, study: Study) -> Any:
     """Return the value of one exported column; None for an empty cell."""
     match name:
         case "scenario":
-            return " ".join(block_scenarios(study, row.scenario, row.order_seed))
+            variant = under(study, row.condition)
+            return " ".join(block_scenarios(variant, row.scenario, row.order_seed))
         case "simulated":
             return row.kind == "simulated"
         case "study":

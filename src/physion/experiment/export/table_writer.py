@@ -15,7 +15,7 @@ from physion.analysis.people.response_schema import Column
 from physion.experiment.export.arrow_types import arrow_schema
 from physion.experiment.export.spreadsheet import guard_cell
 
-NAMES = frozenset({"participant", "session", "scenario", "stimulus", "kind"})
+NAMES = frozenset({"participant", "session", "scenario", "condition", "stimulus", "kind"})
 """Text columns that need no protection against formulas: their values are hashes or consist of
 letters, digits and ._+- and start with a letter or digit."""
 

@@ -209,7 +209,7 @@ def _trial_table(
     values
         Columns of `_NUMBERS`, and ``block``.
     """
-    of_session = sessions.select(["participant", "session", "simulated", "buttons"])
+    of_session = sessions.select(["participant", "session", "simulated", "buttons", "condition"])
     of_session = of_session.take(pa.array(rank))
     label = known.labels[stimulus]
     columns: dict[str, Any] = {name: of_session.column(name) for name in of_session.column_names}

@@ -119,6 +119,8 @@ class Enter(Message):
         the raw id.
     scenario, language
         Wanted scenario and language; the server chooses if they are absent.
+    condition
+        The condition that the link fixes; the link must be signed for it.
     take_back
         Take part after all in a session that was declined or stopped before the first answer.
     pass_
@@ -135,6 +137,7 @@ class Enter(Message):
     recruiter: Annotated[dict[Name, Annotated[str, StringConstraints(max_length=500)]],
                          Field(max_length=10)] = {}  # fmt: skip
     scenario: Name | None = None
+    condition: Name | None = None
     language: Annotated[str, StringConstraints(max_length=20)] = ""
     take_back: bool = False
     pass_: Annotated[str, StringConstraints(max_length=200)] | None = Field(
@@ -151,12 +154,21 @@ class BlockTrials(Message):
     test: tuple[int, int]
 
 
+class SessionSettings(Message):
+    """Settings of the study in the condition of the session, in place of those of `PublicStudy`."""
+
+    cue_ms: int
+    flash_hz: float
+    break_every: int
+    familiarization_feedback: bool
+
+
 class SessionState(Message):
     """State of a session.
 
     ``trial`` is the next trial of the phase, None outside a phase. Trials are counted over the
     whole session. ``block``: index of the current block, whose scenario is ``scenario``; a session
-    with one scenario has one block.
+    with one scenario has one block. ``condition``: empty if the study has no conditions.
     """
 
     stage: Stage
@@ -174,6 +186,8 @@ class SessionState(Message):
     """Whether a trial was answered, after which stopping is final."""
     block: int
     blocks: list[BlockTrials]
+    condition: str
+    settings: SessionSettings
     scenario: str
     language: str
     kind: Kind

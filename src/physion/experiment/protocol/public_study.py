@@ -61,6 +61,7 @@ class PublicStudy(Message):
     flash_hz: float
     break_every: int
     """Number of test trials between two breaks; 0: no breaks."""
+    familiarization_feedback: bool
     preload: int
     """Number of trials whose media are loaded ahead."""
     interrupted: Literal["repeat", "void"]  # see `Plausibility`

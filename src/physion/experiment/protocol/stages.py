@@ -9,7 +9,7 @@ table ``preview`` of the texts. `store.sessions.stages_of` says which studies ha
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 Phase = Literal["familiarization", "test"]
@@ -111,10 +111,14 @@ class Course:
         Its pages and phases in order, ``done`` last.
     trials
         Number of trials in each phase, and blocks.
+    settings
+        Settings of the study that may differ between sessions: the fields of
+        `messages.SessionSettings`.
     """
 
     stages: tuple[Stage, ...]
     trials: SessionTrials
+    settings: Mapping[str, float] = field(default_factory=dict)
 
 
 def label(stage: str) -> str:

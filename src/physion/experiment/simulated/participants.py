@@ -202,18 +202,20 @@ class Participation:
         while state.stage == phase and state.trial is not None:
             if phase == "test" and state.trial == dropout:
                 break
-            state = await self._run_trial(phase, trials[state.trial])
+            state = await self._run_trial(phase, trials[state.trial], state.settings.cue_ms)
         return state
 
-    async def _run_trial(self, phase: Phase, media: wire.TrialMedia) -> wire.SessionState:
+    async def _run_trial(
+        self, phase: Phase, media: wire.TrialMedia, cue_ms: int
+    ) -> wire.SessionState:
         """Fetch the media of a trial and answer it."""
         await self._fetch(media.movie, media.map)
         stimulus = self._find_stimulus(phase, media.movie)
-        body = build_answer(self._study, media, phase, self._person, stimulus)
+        body = build_answer(cue_ms, media, phase, self._person, stimulus)
         showing = wire.Showing(key=uuid.uuid4().hex, phase=phase, trial=media.trial)
         try:
             await self._browser.ask("POST", "/api/showings", showing)
-            await self._live(media.fixation_ms + self._study.timing.cue_ms)
+            await self._live(media.fixation_ms + cue_ms)
             await self._live(1000 * media.frames / media.rate + body.rt_ms)
             await asyncio.sleep(self._plan.pace)
             answer = await self._browser.ask("POST", "/api/answers", body)
@@ -251,7 +253,7 @@ class Participation:
 
 
 def build_answer(
-    study: Study,
+    cue_ms: int,
     media: wire.TrialMedia,
     phase: Phase,
     person: SimulatedPerson,
@@ -261,8 +263,8 @@ def build_answer(
 
     Parameters
     ----------
-    study
-        The study, for the timing of the trial.
+    cue_ms
+        Duration of the cue in the condition of the session.
     media
         The trial as the server listed it.
     phase
@@ -287,7 +289,7 @@ def build_answer(
         rt_ms=prediction.rt_ms,
         input="keyboard" if person.number % 2 else "mouse",
         fixation_ms=media.fixation_ms,
-        cue_ms=study.timing.cue_ms,
+        cue_ms=cue_ms,
         frames_shown=media.frames,
         frames_dropped=0,
         movie_ms=frame_times[-1],

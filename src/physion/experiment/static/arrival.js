@@ -36,7 +36,7 @@ export function readArrival(search, recruiters) {
   enter.recruiter = Object.fromEntries(
     others.map((name) => [name, given.get(name).slice(0, LONGEST_OTHER)]),
   );
-  for (const name of ["scenario", "pass"]) {
+  for (const name of ["scenario", "condition", "pass"]) {
     const value = given.get(name);
     if (value) enter[name] = value.slice(0, LONGEST_ID);
   }

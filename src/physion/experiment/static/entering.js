@@ -125,7 +125,8 @@ export const cameWithoutId = () => remembered()?.who === null;
 /** Return the query with the parameters that do not identify a person. @param {Arrival} arrival */
 function linkOf({ enter, language }) {
   const pass = enter.pass && isOfStudy(enter.pass) ? enter.pass : null;
-  const named = Object.entries({ scenario: enter.scenario, language, pass });
+  const condition = pass ? enter.condition : null; // it is signed
+  const named = Object.entries({ scenario: enter.scenario, condition, language, pass });
   const query = new URLSearchParams(named.filter(([, value]) => value)).toString();
   return query && `?${query}`;
 }

@@ -103,10 +103,11 @@ async function changeLanguage(basis, session, language) {
  */
 async function setLanguage(basis, language) {
   if (language === basis.texts.language) return;
-  const { scenario } = basis.texts;
+  const { scenario, condition } = basis.texts;
   try {
     basis.texts = await loadTexts(basis.api, language);
     basis.texts.scenario = scenario;
+    basis.texts.condition = condition;
   } catch (error) {
     if (!(error instanceof Refused)) throw error;
     basis.log.add("no_texts", { language });

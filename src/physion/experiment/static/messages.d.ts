@@ -20,6 +20,7 @@ export interface Enter {
   visit?: string;
   recruiter?: Record<string, string>;
   scenario?: string;
+  condition?: string;
   language?: string;
   take_back?: boolean;
   pass?: string;
@@ -30,6 +31,13 @@ export interface BlockTrials {
   scenario: string;
   familiarization: [number, number];
   test: [number, number];
+}
+
+export interface SessionSettings {
+  cue_ms: number;
+  flash_hz: number;
+  break_every: number;
+  familiarization_feedback: boolean;
 }
 
 export interface SessionState {
@@ -43,6 +51,8 @@ export interface SessionState {
   answered: boolean;
   block: number;
   blocks: BlockTrials[];
+  condition: string;
+  settings: SessionSettings;
   scenario: string;
   language: string;
   kind: "person" | "simulated" | "preview";
@@ -185,6 +195,7 @@ export interface PublicStudy {
   cue_ms: number;
   flash_hz: number;
   break_every: number;
+  familiarization_feedback: boolean;
   preload: number;
   interrupted: "repeat" | "void";
   comprehension_questions: CheckedQuestion[];

@@ -93,7 +93,8 @@ export class Session {
 
   /** The objects that pages use. @returns {import("./pages.js").Context} */
   get context() {
-    return { ...this.basis, media: this.media, state: this.state };
+    const study = { ...this.basis.study, ...this.state?.settings };
+    return { ...this.basis, study, media: this.media, state: this.state };
   }
 
   /** Continue from the server's state after the refusal of an answer. @param {Refused} error */
@@ -142,6 +143,7 @@ export class Session {
       const { stage } = this.state;
       const reading = stage === "consent" || stage === "declined";
       this.basis.texts.scenario = this.state.scenario;
+      this.basis.texts.condition = this.state.condition;
       if (!reading) await this.basis.setLanguage(this.state.language);
       this.basis.frame.show(this.context);
       try {
@@ -322,7 +324,8 @@ export class Session {
         const details = { ...data.details, stop_asked: this.#running.asked };
         const answer = answerOf(phase, trial, { ...data, details });
         this.state = { ...this.state, trial: trial + 1, answered: true };
-        if (phase === "familiarization") rememberFeedback(this.state.reference, answer);
+        const feedback = this.state.settings.familiarization_feedback;
+        if (phase === "familiarization" && feedback) rememberFeedback(this.state.reference, answer);
         return { answer, stored: this.queue.add(answer, this.#running.showing) };
       },
     });

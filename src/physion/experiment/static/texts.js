@@ -14,6 +14,8 @@ export class Texts {
     this.words = words;
     /** Scenario of the session, which may have texts of its own. */
     this.scenario = "";
+    /** Condition of the session, which may have texts of its own too. */
+    this.condition = "";
   }
 
   /**
@@ -23,7 +25,7 @@ export class Texts {
    * @returns {string}
    */
   t(key, values = {}) {
-    const text = this.words[`scenario.${this.scenario}.${key}`] ?? this.words[key];
+    const text = this.words[this.#place(key)];
     if (text === undefined) {
       console.error(`the texts of ${this.language} have no ${key}`);
       return key;
@@ -37,12 +39,19 @@ export class Texts {
   inScenario(scenario) {
     const texts = new Texts(this.language, this.words);
     texts.scenario = scenario;
+    texts.condition = this.condition;
     return texts;
   }
 
   /** Return whether there is a text for a key. @param {string} key @returns {boolean} */
   has(key) {
-    return `scenario.${this.scenario}.${key}` in this.words || key in this.words;
+    return this.#place(key) in this.words;
+  }
+
+  /** Return the key of the text that stands in place of `key` in this condition and scenario. */
+  #place(key) {
+    const own = [`condition.${this.condition}.${key}`, `scenario.${this.scenario}.${key}`];
+    return own.find((special) => special in this.words) ?? key;
   }
 }
 

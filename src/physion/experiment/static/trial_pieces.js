@@ -42,6 +42,7 @@ export function trialPieces(context, phase, media, session) {
   let given = null;
   /** Duration of the break before the trial. @type {number|null} */
   let break_ms = null;
+  const withFeedback = phase === "familiarization" && context.study.familiarization_feedback;
   const prediction = predictionOf(context, phase, media, session);
   const answered = (data) => {
     // Without a response the trial was left.
@@ -51,7 +52,7 @@ export function trialPieces(context, phase, media, session) {
     ...breakBefore(context, phase, media.trial, (ms) => (break_ms = ms)),
     ...beforeTrial(context, media.trial),
     { ...prediction, on_finish: answered },
-    ...(phase === "familiarization" ? [feedbackOf(context, media, () => given)] : []),
+    ...(withFeedback ? [feedbackOf(context, media, () => given)] : []),
   ];
 }
 

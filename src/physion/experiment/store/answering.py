@@ -132,7 +132,7 @@ def store_answer(
         if answer.phase == PHASES[0]:
             judge_practice(connection, study, course, session, now)
     feedback = None
-    if answer.phase == PHASES[0]:
+    if answer.phase == PHASES[0] and study.familiarization_feedback:
         feedback = _build_feedback(study, secrets, session, stimulus, answer.trial, response)
     return AnswerStored(duplicate=duplicate, feedback=feedback, state=state_of(session, course))
 

@@ -6,7 +6,11 @@ from sqlalchemy import Connection, insert, select
 
 from physion.experiment.protocol.messages import Entered
 from physion.experiment.protocol.refused import Refused
-from physion.experiment.store.entry.assigning import assign_order, choose_scenario
+from physion.experiment.store.entry.assigning import (
+    assign_order,
+    choose_course,
+    choose_scenario,
+)
 from physion.experiment.store.entry.visitor import Visitor
 from physion.experiment.store.sessions import (
     ENTERED_AGAIN,
@@ -25,6 +29,7 @@ from physion.experiment.store.tables import EVENTS, PARTICIPANTS, RAW_IDS, SESSI
 from physion.experiment.study.identity import Secrets, hash_token
 from physion.experiment.study.orders import draw_buttons
 from physion.experiment.study.study import Study
+from physion.experiment.study.variants import under
 
 
 def enter_session(
@@ -59,20 +64,24 @@ def enter_session(
         )
     ]
     session = _find_unfinished(sessions, visitor.enter.scenario)
-    ended = None if session is not None else _find_ended(study, sessions, visitor.enter.scenario)
+    own = next((each.condition for each in sessions if each.condition), None)
+    ended = None
+    if session is None:
+        ended = _find_ended(under(study, own), sessions, visitor.enter.scenario)
     begun = session or ended
     if begun is not None:
         _check_browser(connection, begun, visitor)
     if ended is not None and visitor.enter.take_back and can_take_back(ended):
-        choose_scenario(connection, study, visitor, set(study.offered) - {ended.scenario})
+        offered = set(under(study, own).offered)
+        choose_scenario(connection, under(study, own), visitor, offered - {ended.scenario})
         _take_back(connection, ended, visitor)
         session, ended = ended, None
     if session is not None:
         _continue(connection, courses, session, visitor)
     elif ended is None:
         done = {each.scenario for each in sessions}
-        scenario = choose_scenario(connection, study, visitor, done)
-        session = _begin_session(connection, study, secrets, scenario, visitor)
+        chosen, scenario = choose_course(connection, study, visitor, done, own)
+        session = _begin_session(connection, chosen, secrets, scenario, visitor)
     if ended is None:
         _keep_raw_id(connection, visitor)  # not of somebody who declined
     session = session or ended
@@ -146,7 +155,7 @@ def _take_back(connection: Connection, session: Session, visitor: Visitor) -> No
 def _begin_session(
     connection: Connection, study: Study, secrets: Secrets, scenario: str, visitor: Visitor
 ) -> Session:
-    """Insert a new session and return it."""
+    """Insert a new session under the condition of ``study``, and return it."""
     number, seed = assign_order(connection, study, secrets, scenario, visitor)
     connection.execute(
         insert_or_skip(connection, PARTICIPANTS),
@@ -156,6 +165,7 @@ def _begin_session(
         "session": visitor.session,
         "participant": visitor.participant,
         "scenario": scenario,
+        "condition": study.condition or None,
         "kind": visitor.kind,
         "source": visitor.enter.source,
         "study": study.digest,

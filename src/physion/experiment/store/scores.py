@@ -7,8 +7,9 @@ from collections import defaultdict
 from collections.abc import Sequence
 from itertools import islice
 
-from sqlalchemy import Connection, bindparam, or_, select
+from sqlalchemy import Connection, bindparam, func, or_, select
 
+from physion.experiment.store.sessions import Session
 from physion.experiment.store.tables import ANSWERS, SESSIONS, STUDIES
 from physion.experiment.study.blocks import stimuli_by_session
 from physion.experiment.study.study import Study
@@ -20,6 +21,7 @@ _FINISHED = (
     .where(
         SESSIONS.c.scenario == bindparam("of_scenario"),
         SESSIONS.c.kind == bindparam("of_kind"),
+        func.coalesce(SESSIONS.c.condition, "") == bindparam("of_condition"),
         SESSIONS.c.finished_at.is_not(None),
         SESSIONS.c.withdrawn_at.is_(None),
         SESSIONS.c.voided_at.is_(None),
@@ -42,21 +44,22 @@ class Scores:
         self._correct: dict[str, int] = {}
         self._lock = threading.Lock()
 
-    def of(self, connection: Connection, scenario: str, kind: str, session: str) -> dict[str, int]:
-        """Return the number of correct answers of each finished session of a scenario and kind.
+    def of(self, connection: Connection, session: Session) -> dict[str, int]:
+        """Return the number of correct answers of each finished session like ``session``.
 
-        Sessions with other than the current stimuli are left out, and implausible ones except
-        ``session`` itself.
+        Those of its scenario, condition and kind. Sessions with other than the current stimuli are
+        left out, and implausible ones except ``session`` itself.
         """
-        values = {"of_scenario": scenario, "of_kind": kind, "of_stimuli": self._stimuli,
-                  "of_session": session}  # fmt: skip
+        values = {"of_scenario": session.scenario, "of_kind": session.kind,
+                  "of_condition": session.condition or "", "of_stimuli": self._stimuli,
+                  "of_session": session.session}  # fmt: skip
         rows = connection.execute(_FINISHED, values)
-        finished = [session for (session,) in rows]
+        finished = [name for (name,) in rows]
         with self._lock:
-            new = iter([session for session in finished if session not in self._correct])
+            new = iter([name for name in finished if name not in self._correct])
             while chunk := list(islice(new, _CHUNK)):
-                self._count(connection, scenario, chunk)
-            return {session: self._correct[session] for session in finished}
+                self._count(connection, session.scenario, chunk)
+            return {name: self._correct[name] for name in finished}
 
     def _count(self, connection: Connection, scenario: str, sessions: list[str]) -> None:
         """Count the correct answers of these sessions and cache the counts."""

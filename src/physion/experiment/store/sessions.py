@@ -10,13 +10,14 @@ from typing import Any, cast
 from sqlalchemy import Connection, Table, bindparam, select, update
 from sqlalchemy.dialects import postgresql, sqlite
 
-from physion.experiment.protocol.messages import BlockTrials, SessionState
+from physion.experiment.protocol.messages import BlockTrials, SessionSettings, SessionState
 from physion.experiment.protocol.refused import Refused
 from physion.experiment.protocol.stages import ENDED, PAGES, STAGES, Block, Course, Stage
 from physion.experiment.store.tables import SESSIONS, TOKENS
 from physion.experiment.study.orders import session_trials
 from physion.experiment.study.stimuli import PHASES
 from physion.experiment.study.study import Study
+from physion.experiment.study.variants import under
 
 ACTIVE_WITHIN = 15 * 60.0
 """A session counts as active for this many seconds after its last request."""
@@ -61,6 +62,7 @@ class Session:
     answered_test: int
     block: int
     block_at: float | None
+    condition: str | None
     loads: int
     loaded_at_phase: str | None
     loaded_at_trial: int | None
@@ -105,12 +107,19 @@ class Courses:
                 "unknown_token",
                 "The study no longer has this scenario; open your link again.",
             )
-        trials = session_trials(self._study, session.scenario, session.order_seed)
-        return Course(self._stages, trials)
+        study = under(self._study, session.condition)
+        trials = session_trials(study, session.scenario, session.order_seed)
+        settings = {
+            "cue_ms": study.timing.cue_ms,
+            "flash_hz": study.timing.flash_hz,
+            "break_every": study.timing.break_every,
+            "familiarization_feedback": study.familiarization_feedback,
+        }
+        return Course(self._stages, trials, settings)
 
     def has(self, session: Session) -> bool:
         """Return whether the study currently has the scenario of a session."""
-        return session.scenario in self._study.offered
+        return session.scenario in under(self._study, session.condition).offered
 
 
 def session_from_row(study: Study, row: Sequence[Any]) -> Session:
@@ -203,6 +212,8 @@ def state_of(session: Session, course: Course) -> SessionState:
             )
             for each in course.trials.blocks
         ],
+        condition=session.condition or "",
+        settings=SessionSettings.model_validate(course.settings),
         scenario=block.scenario,
         language=session.language,
         kind=cast(Any, session.kind),

@@ -66,6 +66,7 @@ from physion.experiment.study.media_links import MediaKind, session_tag, sign_me
 from physion.experiment.study.orders import fixations, trial_order
 from physion.experiment.study.recruitment import completion, ending_completion
 from physion.experiment.study.study import Study
+from physion.experiment.study.variants import under
 
 __all__ = ["Refused", "Store"]
 T = TypeVar("T")
@@ -163,7 +164,8 @@ class Store:
 
         def submit(connection: Connection) -> SessionState:
             session, course = self._read_session(connection, token)
-            return submit_page(connection, self.study, course, session, done.page, values, now)
+            study = under(self.study, session.condition)
+            return submit_page(connection, study, course, session, done.page, values, now)
 
         return await self._writer.run(submit)
 
@@ -184,10 +186,11 @@ class Store:
         def store(connection: Connection) -> tuple[AnswerStored, str]:
             session = read_session(connection, self.study, token_hash)
             course = self._courses.of(session)
+            study = under(self.study, session.condition)
             tag = session_tag(self.secrets, session.session)
             sent_at = self.fetched.sent_at(tag, session.started_at, answer.phase, answer.trial)
             stored = store_answer(
-                connection, self.study, self.secrets, course, session, answer, details, now, sent_at
+                connection, study, self.secrets, course, session, answer, details, now, sent_at
             )
             return stored, tag
 
@@ -287,7 +290,8 @@ class Store:
 
     def _list_media(self, session: Session, phase: Phase) -> list[TrialMedia]:
         """Return the signed media and timing of the trials of a phase."""
-        study, scenario, seed = self.study, session.scenario, session.order_seed
+        study = under(self.study, session.condition)
+        scenario, seed = session.scenario, session.order_seed
         crosses = fixations(study, scenario, seed, phase)
         tag = session_tag(self.secrets, session.session)
 
@@ -315,7 +319,7 @@ class Store:
         if stage != "done":
             code = "wrong_stage" if stage in ENDED else "not_yet"
             raise Refused(code, "The result comes at the end.", state_of(session, course))
-        scores = dict(self._scores.of(connection, session.scenario, session.kind, session.session))
+        scores = self._scores.of(connection, session)
         correct = scores.pop(session.session, None)
         if correct is None:  # a preview of other stimuli, whose labels are no longer known
             raise Refused("unknown_token", "The stimuli have changed since; open your link again.")

@@ -47,6 +47,7 @@ def register(connection: Connection, study: Study, now: float) -> None:
             "links of the other scenarios), or create a new study folder (or give another "
             "database) without it"
         )
+    _check_conditions(connection, study)
     _check_questions(connection, study)
     # Previews are not data: those that cannot continue are ended.
     ended = (other | gone) & SESSIONS.c.finished_at.is_(None) & SESSIONS.c.withdrawn_at.is_(None)
@@ -62,6 +63,18 @@ def register(connection: Connection, study: Study, now: float) -> None:
             "first_served": now,
         },
     )
+
+
+def _check_conditions(connection: Connection, study: Study) -> None:
+    """Refuse a study that lacks the condition of a session."""
+    names = [condition.name for condition in study.conditions]
+    lost = SESSIONS.c.condition.is_not(None) & SESSIONS.c.condition.not_in(names)
+    found = select(SESSIONS.c.condition, func.count()).where(lost, SESSIONS.c.kind != "preview")
+    for name, count in connection.execute(found.group_by(SESSIONS.c.condition)):
+        raise BadInputError(
+            f"{count} sessions are of the condition {name}, which {STUDY_FILE} no longer has: put "
+            "it back, or create a new study folder (or give another database) without it"
+        )
 
 
 def _check_questions(connection: Connection, study: Study) -> None:

@@ -105,6 +105,7 @@ SESSIONS = Table(
     Column("answered_test", Integer, nullable=False, default=0),
     Column("block", Integer, nullable=False, server_default="0"),
     Column("block_at", Float),
+    Column("condition", String(40)),
     Column("fast_answers", Integer, nullable=False, server_default="0"),
     Column("unfetched", Integer, nullable=False, server_default="0"),
     Column("replayed", Integer, nullable=False, server_default="0"),
@@ -130,7 +131,8 @@ SESSIONS = Table(
 number of the prepared order, 0 if the study has none; ``order_seed`` and the stimuli determine the
 order of the trials. ``scenario`` is `study.ALL_SCENARIOS` in sessions of several scenarios, and
 ``block`` the index of the current block, to which ``ready_at`` belongs; ``block_at``: when the page
-before it was sent. ``loaded_at_*``: the trial that was next when the page was last reloaded.
+before it was sent. ``condition``: name of the between-subject condition; NULL without conditions.
+``loaded_at_*``: the trial that was next when the page was last reloaded.
 ``own_answers``: answers to the lab's own questions, by name; ``questions_study``: digest of the
 version of the study that asked them.
 ``closed_at``: when the lab ended the session for good, so that the participant cannot take it up

@@ -13,6 +13,7 @@ movie is available only by the URL that is sent with the feedback. Decoding need
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, cast
@@ -22,6 +23,7 @@ from physion.experiment.study.identity import Secrets, check_signature, sign
 from physion.experiment.study.orders import trial_order
 from physion.experiment.study.stimuli import PHASES
 from physion.experiment.study.study import Study
+from physion.experiment.study.variants import StudyKey, variants
 
 MediaKind = Literal["movie", "map", "full"]
 PREFIX = "/media/"
@@ -64,7 +66,7 @@ def sign_media(
     Parameters
     ----------
     study, secrets
-        The study and its keys.
+        The study, under the condition of the session, and its keys.
     scenario, order_seed
         Scenario and trial order of the session.
     phase, trial
@@ -93,13 +95,13 @@ def read_media(study: Study, secrets: Secrets, path: str) -> SignedMedia:
         raise BadInputError("no such movie or picture")
     item, letter, trial, kind, encrypted, tag, signature = match.groups()
     order_seed = int(encrypted, 16) ^ _pad(secrets, signature)
-    for scenario in dict.fromkeys((*study.offered, *study.scenarios)):
-        parts = _signed_parts(study, scenario, order_seed, item, tag)
+    for variant, scenario in _courses(study):
+        parts = _signed_parts(variant, scenario, order_seed, item, tag)
         if check_signature(secrets, signature, *parts):
             break
     else:
         raise BadInputError("no such movie or picture")
-    stimuli = trial_order(study, scenario, order_seed)[_PHASES[letter]]
+    stimuli = trial_order(variant, scenario, order_seed)[_PHASES[letter]]
     name: str = getattr(stimuli[int(trial)], kind) if int(trial) < len(stimuli) else ""
     if not name:
         raise BadInputError("no such movie or picture")
@@ -107,11 +109,19 @@ def read_media(study: Study, secrets: Secrets, path: str) -> SignedMedia:
     return SignedMedia(file, tag, _PHASES[letter], int(trial), cast(MediaKind, kind))
 
 
+def _courses(study: Study) -> Iterator[tuple[Study, str]]:
+    """Yield the conditions of a study, and the study itself, with the scenarios of sessions."""
+    for variant in dict.fromkeys(map(StudyKey, (*variants(study), study))):
+        for scenario in dict.fromkeys((*variant.study.offered, *variant.study.scenarios)):
+            yield variant.study, scenario
+
+
 def _signed_parts(
     study: Study, scenario: str, order_seed: int, item: str, tag: str
 ) -> tuple[str, ...]:
     """Return the texts that the signature of a URL covers."""
-    return "media", study.stimuli_digest, scenario, str(order_seed), item, tag
+    own = (study.condition,) if study.condition else ()
+    return "media", study.stimuli_digest, scenario, str(order_seed), item, tag, *own
 
 
 def _pad(secrets: Secrets, signature: str) -> int:

@@ -17,6 +17,7 @@ from physion.experiment.study.blocks import block_scenarios, draw_test, seed_wit
 from physion.experiment.study.identity import Secrets, sign
 from physion.experiment.study.stimuli import PHASES, Stimulus
 from physion.experiment.study.study import ALL_SCENARIOS, Study
+from physion.experiment.study.variants import StudyKey
 from physion.seeds import stable_hash
 
 Order = dict[str, tuple[Stimulus, ...]]
@@ -50,32 +51,17 @@ def trial_order(study: Study, scenario: str, order_seed: int) -> Order:
 
     If the session has several scenarios, each phase has the trials of all blocks, block by block.
     """
-    return dict(_order(_StudyKey(study), scenario, order_seed))
+    return dict(_order(StudyKey(study), scenario, order_seed))
 
 
 def session_trials(study: Study, scenario: str, order_seed: int) -> SessionTrials:
     """Return the numbers of trials of a session, and its blocks."""
-    return _trials(_StudyKey(study), scenario, block_scenarios(study, scenario, order_seed))
-
-
-class _StudyKey:
-    """Cache key of a study, compared by object identity, since studies are not hashable."""
-
-    __slots__ = ("study",)
-
-    def __init__(self, study: Study) -> None:
-        self.study = study
-
-    def __hash__(self) -> int:
-        return id(self.study)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _StudyKey) and self.study is other.study
+    return _trials(StudyKey(study), scenario, block_scenarios(study, scenario, order_seed))
 
 
 # Cached because every request needs the numbers of its session.
 @lru_cache(maxsize=1024)
-def _trials(key: _StudyKey, scenario: str, blocks: tuple[str, ...]) -> SessionTrials:
+def _trials(key: StudyKey, scenario: str, blocks: tuple[str, ...]) -> SessionTrials:
     study = key.study
     several = scenario == ALL_SCENARIOS
     found: list[Block] = []
@@ -91,7 +77,7 @@ def _trials(key: _StudyKey, scenario: str, blocks: tuple[str, ...]) -> SessionTr
 
 # Cached because every request for a movie needs the order of its session.
 @lru_cache(maxsize=4096)
-def _order(key: _StudyKey, scenario: str, order_seed: int) -> Order:
+def _order(key: StudyKey, scenario: str, order_seed: int) -> Order:
     study = key.study
     practice: list[Stimulus] = []
     test: list[Stimulus] = []

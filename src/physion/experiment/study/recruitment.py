@@ -20,6 +20,7 @@ from physion.experiment.protocol.public_study import Recruiter
 from physion.experiment.study.identity import REFERENCE_LETTERS, check_signature, sign
 from physion.experiment.study.settings import ALL_SCENARIOS
 from physion.experiment.study.study_checks import NO_CONTACT
+from physion.experiment.study.variants import under
 
 if TYPE_CHECKING:
     from physion.experiment.study.identity import Secrets
@@ -83,7 +84,7 @@ def make_pass(secrets: Secrets, key: str, *signed: str) -> str:
         One of `LINK_KEYS`.
     signed
         Nothing for ``preview`` and ``simulated``, the recruiter for ``study``, recruiter and id for
-        ``person``.
+        ``person``; then, if the link fixes the condition, the word ``condition`` and its name.
     """
     return f"{key}-{sign(secrets, 'pass', key, *signed)}"
 
@@ -92,6 +93,7 @@ def read_pass(secrets: Secrets, enter: Enter) -> str | None:
     """Return which of `LINK_KEYS` signed the link of a visitor; None if there is no valid one."""
     key, _, signature = (enter.pass_ or "").partition("-")
     signed = {"study": (enter.source,), "person": (enter.source, enter.id or "")}.get(key, ())
+    signed = (*signed, *(("condition", enter.condition) if enter.condition else ()))
     if key not in LINK_KEYS or (key == "person" and not enter.id):
         return None
     return key if check_signature(secrets, signature, "pass", key, *signed) else None
@@ -181,6 +183,8 @@ class Link:
         Recruiter, ``link``, ``preview`` or ``simulated``.
     scenario
         Scenario that the link leads to, or `study.ALL_SCENARIOS`.
+    condition
+        The condition that the link fixes; empty: the one with the fewest sessions.
     address
         The URL.
     goes_to
@@ -194,6 +198,7 @@ class Link:
     address: str
     goes_to: str
     lacks: str = ""
+    condition: str = ""
 
 
 PLACEHOLDERS = {
@@ -214,7 +219,9 @@ GOES_TO = {
 
 
 def links(study: Study, secrets: Secrets, base_url: str) -> tuple[Link, ...]:
-    """Return all entry links of the study, by scenario and recruiter.
+    """Return all entry links of the study, by scenario, condition and recruiter.
+
+    Links that fix a condition are signed, so that nobody can choose another one.
 
     Raises
     ------
@@ -223,19 +230,29 @@ def links(study: Study, secrets: Secrets, base_url: str) -> tuple[Link, ...]:
     """
     root = _root(base_url)
     result = []
-    for scenario in study.offered:
-        for name, goes_to in GOES_TO.items():
-            named = scenario != ALL_SCENARIOS
-            query = [f"scenario={quote(scenario, safe='')}"] if named else []
-            if name in ("preview", "simulated"):
-                query.append(f"pass={make_pass(secrets, name)}")
-            elif study.recruitment.signed_links == "study":
-                query.append(f"pass={make_pass(secrets, 'study', name)}")
-            if name in PLACEHOLDERS:
-                query.append(PLACEHOLDERS[name])
-            address = f"{root}/?{'&'.join(query)}" if query else f"{root}/"
-            result.append(Link(name, scenario, address, goes_to, _lacks(study, name)))
+    for condition in ("", *(each.name for each in study.conditions)):
+        for scenario in under(study, condition).offered:
+            for name in GOES_TO:
+                query = _query(study, secrets, scenario, name, condition)
+                address = f"{root}/?{'&'.join(query)}" if query else f"{root}/"
+                lacks = _lacks(study, name)
+                result.append(Link(name, scenario, address, GOES_TO[name], lacks, condition))
     return tuple(result)
+
+
+def _query(study: Study, secrets: Secrets, scenario: str, name: str, condition: str) -> list[str]:
+    """Return the parts of the query of an entry link."""
+    query = [] if scenario == ALL_SCENARIOS else [f"scenario={quote(scenario, safe='')}"]
+    fixed = ("condition", condition) if condition else ()
+    if condition:
+        query.append(f"condition={quote(condition, safe='')}")
+    if name in ("preview", "simulated"):
+        query.append(f"pass={make_pass(secrets, name, *fixed)}")
+    elif study.recruitment.signed_links == "study" or condition:
+        query.append(f"pass={make_pass(secrets, 'study', name, *fixed)}")
+    if name in PLACEHOLDERS:
+        query.append(PLACEHOLDERS[name])
+    return query
 
 
 def signed_links(

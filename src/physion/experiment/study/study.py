@@ -24,8 +24,9 @@ from typing import Any
 
 from physion.atomic import write_atomic
 from physion.errors import BadInputError
-from physion.experiment.study import comprehension, questions
+from physion.experiment.study import comprehension, conditions, questions
 from physion.experiment.study.comprehension import ComprehensionQuestion, parse_comprehension
+from physion.experiment.study.conditions import Condition, parse_conditions
 from physion.experiment.study.questions import Question, parse_questions
 from physion.experiment.study.settings import (
     ALL_SCENARIOS,
@@ -107,6 +108,8 @@ class Study:
         Number of other finished participants needed before a percentile is shown.
     preload
         Number of trials loaded ahead of the current one.
+    familiarization_feedback
+        Whether familiarization answers get feedback: the outcome and the full movie.
     demographics
         Whether age, gender and education are asked.
     embed_from
@@ -123,6 +126,10 @@ class Study:
         The lab's own questions at the end.
     comprehension_questions
         Questions of the comprehension check; none: there is no check.
+    conditions
+        Between-subject conditions.
+    condition
+        The condition whose settings these are (`variants.under`); empty: those of the study.
     allowed_ids
         Ids of the allow list; None if the study has none.
     stimuli
@@ -151,6 +158,7 @@ class Study:
     exclusions: str = "preregistered"
     percentile_from: int = 10
     preload: int = 8
+    familiarization_feedback: bool = True
     demographics: bool = True
     embed_from: tuple[str, ...] = ()
     timing: Timing = field(default=Timing())
@@ -169,6 +177,8 @@ class Study:
     limits: Limits = field(default=Limits())
     questions: tuple[Question, ...] = ()
     comprehension_questions: tuple[ComprehensionQuestion, ...] = ()
+    conditions: tuple[Condition, ...] = ()
+    condition: str = ""
     stimuli: tuple[Stimulus, ...] = ()
     allowed_ids: frozenset[str] | None = field(default=None, repr=False)
     texts: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
@@ -225,7 +235,11 @@ def load_study(folder: Path | str) -> Study:
     texts, files, written = {}, {}, []
     for language in study.languages:
         texts[language], text_file = read_texts(
-            folder / TEXTS_FOLDER, language, study.scenarios, own_text_keys(study)
+            folder / TEXTS_FOLDER,
+            language,
+            study.scenarios,
+            own_text_keys(study),
+            [condition.name for condition in study.conditions],
         )
         written.append(text_file)
         consent = read_consent_file(folder / TEXTS_FOLDER, language)
@@ -255,17 +269,20 @@ def parse_settings(table: Mapping[str, Any], path: Path) -> Study:
     Stimuli and texts are left empty. ``path`` is the path of the file, which need not exist yet.
     Raises the errors of `load_study`.
     """
-    values = check_tables(table, path, ("questions", "comprehension_questions"))
+    values = check_tables(table, path, ("questions", "comprehension_questions", "conditions"))
     parts = {name: part(**values[name]) for name, part in _PARTS.items()}
     asked = parse_questions(check_list(table, path, "questions", questions.KEYS), path)
     entries = check_list(table, path, "comprehension_questions", comprehension.KEYS)
     checked = parse_comprehension(entries, path)
+    listed = check_list(table, path, "conditions", conditions.KEYS)
+    groups = parse_conditions(listed, values[""]["scenarios"], path)
     return Study(
         folder=path.parent,
         **values[""],
         **parts,
         questions=asked,
         comprehension_questions=checked,
+        conditions=groups,
     )
 
 
@@ -277,17 +294,23 @@ def format_settings(study: Study) -> str:
     values = {name: vars(getattr(study, name)) for name in _PARTS}
     path = study.folder / STUDY_FILE
     text = format_tables({"": vars(study), **values}, path)
-    for name, kind in (("comprehension_questions", comprehension), ("questions", questions)):
-        entries = [vars(question) for question in getattr(study, name)]
+    for name, kind in (
+        ("comprehension_questions", comprehension),
+        ("questions", questions),
+        ("conditions", conditions),
+    ):
+        entries = [vars(entry) for entry in getattr(study, name)]
         text += format_list(name, kind.KEYS, kind.ABOUT, entries, path)
     return text
 
 
 def own_text_keys(study: Study) -> tuple[str, ...]:
-    """Return the keys of the texts that a study needs for its own questions."""
+    """Return the keys of the texts that a study needs for its own questions and conditions."""
     asked: tuple[ComprehensionQuestion | Question, ...]
     asked = (*study.comprehension_questions, *study.questions)
-    return tuple(key for question in asked for key in question.text_keys)
+    several = study.blocks.all_scenarios
+    of_conditions = conditions.own_text_keys(study.conditions, blocks=several)
+    return (*(key for question in asked for key in question.text_keys), *of_conditions)
 
 
 def write_settings(study: Study) -> Path:
@@ -317,8 +340,9 @@ def _check_blocks(study: Study, stimuli: tuple[Stimulus, ...], path: Path) -> No
     wanted, settings = study.blocks.trials, study.folder / STUDY_FILE
     if not study.blocks.all_scenarios:
         return
-    if len(study.scenarios) < 2:
-        raise BadInputError(f"{settings}: blocks.all_scenarios needs at least two scenarios")
+    for scenarios in (study.scenarios, *(each.scenarios for each in study.conditions)):
+        if scenarios is not None and len(scenarios) < 2:
+            raise BadInputError(f"{settings}: blocks.all_scenarios needs at least two scenarios")
     counts = Counter(s.scenario for s in stimuli if s.phase == "test")
     for scenario in study.scenarios:
         if wanted > counts[scenario]:
@@ -340,7 +364,9 @@ def _block_settings(study: Study) -> tuple[bytes, ...]:
     """Return the settings that choose the trials of blocks, as JSON; nothing without blocks."""
     if not study.blocks.all_scenarios:
         return ()
-    return (json.dumps([study.scenarios, vars(study.blocks)]).encode(),)
+    own = [[each.name, each.scenarios] for each in study.conditions if each.scenarios]
+    chosen = [study.scenarios, vars(study.blocks), *([own] if own else [])]
+    return (json.dumps(chosen).encode(),)
 
 
 def _digest(*parts: bytes) -> str:

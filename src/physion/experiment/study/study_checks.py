@@ -224,6 +224,9 @@ KEYS: tuple[Key, ...] = (
     Key("", "percentile_from", whole(1, 1_000_000),
         "Number of other finished participants needed before a percentile is shown."),
     Key("", "preload", whole(1, 1000), "Number of trials loaded ahead."),
+    Key("", "familiarization_feedback", flag,
+        "Whether familiarization answers get feedback: the outcome and the full movie. Without\n"
+        "it, change the texts that speak of it."),
     Key("", "demographics", flag, "Ask age, gender and education at the end."),
     Key("", "embed_from", listed(_site, 0),
         "Sites that may show the pages in a frame (MTurk: https://www.mturk.com); usually none."),

@@ -77,13 +77,15 @@ def format_list(
 ) -> str:
     """Return the text of a list of tables ``[[NAME]]``, as `check_list` reads it.
 
-    ``about`` and the meanings of the keys are written as comments above the list.
+    ``about`` and the meanings of the keys are written as comments above the list. Keys whose value
+    is None are left out.
     """
     comments = [*about.splitlines(), *(f"  {key.name}: {key.about}" for key in keys)]
     lines = ["\n", *(f"# {line}\n" for line in comments)]
     for entry in entries:
         lines.append(f"\n[[{name}]]\n")
-        lines += [f"{k.name} = {_toml(_checked(path, k, entry[k.name]))}\n" for k in keys]
+        given = [key for key in keys if entry[key.name] is not None]
+        lines += [f"{k.name} = {_toml(_checked(path, k, entry[k.name]))}\n" for k in given]
     return "".join(lines)
 
 

@@ -6,7 +6,8 @@ has its own copies, so that a lab can edit every text.
 
 Some texts may be absent: ``study.title``, in place of the title of ``study.toml``;
 ``consent.check_1`` to ``consent.check_9``, boxes that must be ticked to agree; and
-``scenario.NAME.KEY``, in place of the text ``KEY`` in the sessions of one scenario. The texts of
+``scenario.NAME.KEY`` and ``condition.NAME.KEY``, in place of the text ``KEY`` in the sessions of
+one scenario or condition (the condition comes first). The texts of
 a study's own questions (`questions.Question.text_keys`) are needed in each language. A file
 ``consent-LANGUAGE.pdf`` beside the texts is the consent form as a file.
 """
@@ -34,7 +35,11 @@ _PLACEHOLDER = re.compile(r"\{([a-z_]+)\}")
 
 
 def read_texts(
-    folder: Path, language: str, scenarios: Sequence[str] = (), own: Sequence[str] = ()
+    folder: Path,
+    language: str,
+    scenarios: Sequence[str] = (),
+    own: Sequence[str] = (),
+    conditions: Sequence[str] = (),
 ) -> tuple[dict[str, str], bytes]:
     """Read and check the texts of a language; return them by key, and the bytes of the file.
 
@@ -47,7 +52,9 @@ def read_texts(
     scenarios
         Scenarios that may have texts of their own.
     own
-        Keys of the texts of the study's own questions, which are needed too.
+        Keys of the texts of the study's own questions and conditions, which are needed too.
+    conditions
+        Conditions that may have texts of their own.
 
     Raises
     ------
@@ -58,8 +65,10 @@ def read_texts(
     content = read_plain(path, MAX_BYTES)
     texts = _parse(path, content)
     wanted = shipped_texts()
+    special = [*(f"condition.{name}." for name in conditions),
+               *(f"scenario.{name}." for name in scenarios)]  # fmt: skip
     for key in texts:
-        general = _general_key(key, scenarios)
+        general = _general_key(key, special)
         if general not in (*wanted, *OPTIONAL, *own):
             raise BadInputError(f"{path}: {UnknownNameError('text', general, wanted)}")
     for key, original in wanted.items():
@@ -69,9 +78,9 @@ def read_texts(
             )
     for key in own:
         if key not in texts:
-            raise BadInputError(f"{path} lacks the text {key} of a question of study.toml")
+            raise BadInputError(f"{path} lacks the text {key}, which study.toml needs")
     for key, written in texts.items():
-        general = _general_key(key, scenarios)
+        general = _general_key(key, special)
         known = set(_PLACEHOLDER.findall(wanted.get(general, "")))
         for name in set(_PLACEHOLDER.findall(written)) - known:
             allowed = ", ".join(f"{{{one}}}" for one in sorted(known)) or "none"
@@ -96,11 +105,14 @@ def read_consent_file(folder: Path, language: str) -> bytes | None:
     return content
 
 
-def _general_key(key: str, scenarios: Sequence[str]) -> str:
-    """Return the key of the text that ``key`` replaces in one scenario, or ``key`` itself."""
-    for scenario in scenarios:
-        if key.startswith(f"scenario.{scenario}."):
-            return key.removeprefix(f"scenario.{scenario}.")
+def _general_key(key: str, special: Sequence[str]) -> str:
+    """Return the key of the text that ``key`` replaces in a scenario or condition, or ``key``.
+
+    ``special``: what the keys of single scenarios and conditions begin with.
+    """
+    for beginning in special:
+        if key.startswith(beginning):
+            return key.removeprefix(beginning)
     return key
 
 

@@ -54,6 +54,7 @@ def public_study(study: Study, secrets: Secrets) -> PublicStudy:
         cue_ms=study.timing.cue_ms,
         flash_hz=study.timing.flash_hz,
         break_every=study.timing.break_every,
+        familiarization_feedback=study.familiarization_feedback,
         preload=study.preload,
         interrupted=cast(Literal["repeat", "void"], study.plausibility.interrupted),
         comprehension_questions=[

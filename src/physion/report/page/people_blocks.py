@@ -49,6 +49,7 @@ def people_alone(people: PeopleResults, zones: str = "") -> str:
     tables = people.tables
     return "\n".join([
         _accuracy(tables),
+        _conditions(tables),
         _agreement(tables),
         *([details("What single people reach", zones)] if zones else []),
         "<h3>Inclinations, practice, background</h3>",
@@ -57,6 +58,21 @@ def people_alone(people: PeopleResults, zones: str = "") -> str:
         _hypotheses(people),
         details("Stimuli as items of a test", _items(tables["items"])),
     ])  # fmt: skip
+
+
+def _conditions(tables: Mapping[str, pd.DataFrame]) -> str:
+    """Return the table of between-subject conditions, or nothing without any."""
+    if tables["by_condition"].empty:
+        return ""
+    columns = [
+        PageColumn("condition", "condition", "text"),
+        PageColumn("scenario", "scenario", "text"),
+        PageColumn("people", "people", "count"),
+        PageColumn("accuracy", "accuracy", "interval", 3),
+        PageColumn("sd over people", "sd", digits=3),
+    ]
+    words = "Accuracy by condition; its test is under “Accuracy by who people are”"
+    return rows_table(tables["by_condition"], columns, words)
 
 
 def _accuracy(tables: Mapping[str, pd.DataFrame]) -> str:

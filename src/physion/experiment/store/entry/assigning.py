@@ -1,4 +1,4 @@
-"""Assign scenario and order of trials to a new session, those that the fewest sessions have."""
+"""Assign condition, scenario and order of trials to a new session: those that the fewest have."""
 
 from __future__ import annotations
 
@@ -18,7 +18,85 @@ from physion.experiment.study.identity import Secrets
 from physion.experiment.study.orders import individual_order_seed, prepared_order_seed
 from physion.experiment.study.recruitment import ending_completion
 from physion.experiment.study.study import ALL_SCENARIOS, Study
+from physion.experiment.study.variants import under, variants
 from physion.seeds import stable_hash
+
+
+def choose_course(
+    connection: Connection, study: Study, visitor: Visitor, done: set[str], own: str | None
+) -> tuple[Study, str]:
+    """Return the study under the condition of a new session, and its scenario.
+
+    The condition is that of the person's earlier sessions, else the one that the link fixes, else
+    the one with the fewest sessions among those that have a place left in a wanted scenario.
+
+    Parameters
+    ----------
+    connection
+        Connection of the writer.
+    study, visitor
+        The study, and who enters.
+    done
+        Scenarios in which the visitor has a session already.
+    own
+        Condition of these sessions, if there are any.
+
+    Raises
+    ------
+    Refused
+        As `choose_scenario` does, for all conditions.
+    """
+    fixed = own or visitor.enter.condition
+    ranked = variants(study) if fixed is None else (under(study, fixed),)
+    if len(ranked) > 1:
+        ranked = _fewest_first(connection, study, visitor)
+    refused: Refused | None = None
+    for variant in ranked:
+        if visitor.enter.scenario not in (None, *variant.offered):
+            continue
+        try:
+            return variant, choose_scenario(connection, variant, visitor, done)
+        except Refused as error:
+            refused = refused or error
+    raise refused or Refused("bad_link", "This link names a scenario that its condition lacks.")
+
+
+def _fewest_first(connection: Connection, study: Study, visitor: Visitor) -> tuple[Study, ...]:
+    """Return the study under each condition, fewest sessions first; equal ones by seed.
+
+    Sessions that ended early, are void or implausible, or that nobody goes on with, do not count.
+    If the link names a scenario, sessions of this scenario alone do.
+    """
+    columns = SESSIONS.c
+    wanted = visitor.enter.scenario
+    statement = (
+        select(columns.condition, func.count())
+        .where(
+            *_counted(study, visitor),
+            *([] if wanted is None else [columns.scenario == wanted]),
+        )
+        .group_by(columns.condition)
+    )
+    used: dict[str | None, int] = dict(connection.execute(statement).all())
+
+    def rank(variant: Study) -> tuple[int, int]:
+        tie = stable_hash("condition", study.seed, visitor.participant, variant.condition)
+        return used.get(variant.condition, 0), tie
+
+    return tuple(sorted(variants(study), key=rank))
+
+
+def _counted(study: Study, visitor: Visitor) -> tuple[ColumnElement[bool], ...]:
+    """Return the conditions for plausible sessions of the visitor's kind that did not end early."""
+    columns = SESSIONS.c
+    return (
+        columns.kind == visitor.kind,
+        columns.withdrawn_at.is_(None),
+        columns.voided_at.is_(None),
+        columns.screened_out_at.is_(None),
+        columns.implausible.is_(None),
+        or_(*_in_use(study, visitor.now)),
+    )
 
 
 def choose_scenario(connection: Connection, study: Study, visitor: Visitor, done: set[str]) -> str:
@@ -130,12 +208,8 @@ def _least_used_blocks(connection: Connection, study: Study, visitor: Visitor) -
         select(index, func.count())
         .where(
             columns.scenario == ALL_SCENARIOS,
-            columns.kind == visitor.kind,
-            columns.withdrawn_at.is_(None),
-            columns.voided_at.is_(None),
-            columns.screened_out_at.is_(None),
-            columns.implausible.is_(None),
-            or_(*_in_use(study, visitor.now)),
+            func.coalesce(columns.condition, "") == study.condition,
+            *_counted(study, visitor),
         )
         .group_by(index)
     )
@@ -155,6 +229,7 @@ def _least_used_order(connection: Connection, study: Study, scenario: str, kind:
         select(columns.order_number, func.count())
         .where(
             columns.scenario == scenario,
+            func.coalesce(columns.condition, "") == study.condition,
             columns.kind == kind,
             columns.withdrawn_at.is_(None),
             columns.voided_at.is_(None),

@@ -48,8 +48,8 @@ def identify_visitor(study: Study, secrets: Secrets, enter: Enter, token: str = 
     Raises
     ------
     Refused
-        The link has an invalid key, an unknown scenario or an unfilled placeholder for the id, or
-        lacks a required signature or id; or the study does not allow the id.
+        The link has an invalid key, an unknown scenario or condition, or an unfilled placeholder
+        for the id, or lacks a required signature or id; or the study does not allow the id.
     """
     key = read_pass(secrets, enter)
     kind: Kind = "preview" if key == "preview" else "simulated" if key == "simulated" else "person"
@@ -71,6 +71,10 @@ def identify_visitor(study: Study, secrets: Secrets, enter: Enter, token: str = 
         raise Refused("id_refused", "This study does not know the id of this link.")
     if enter.scenario is not None and enter.scenario not in study.offered:
         raise Refused("bad_link", "This link names a scenario that no session of the study is of.")
+    if enter.condition is not None and (
+        key is None or enter.condition not in [each.name for each in study.conditions]
+    ):
+        raise Refused("bad_link", "This link is not signed for its condition; copy all of it.")
     # A simulated or preview session must not block a person with the same id.
     source = enter.source if kind == "person" else f"{kind} {enter.source}"
     if raw_id is not None:
