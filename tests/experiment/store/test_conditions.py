@@ -1,0 +1,215 @@
+"""Between-subject conditions: assignment, settings, links and texts."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import update
+
+from physion.errors import BadInputError
+from physion.experiment.protocol.messages import Enter
+from physion.experiment.store.lab.managing import set_voided
+from physion.experiment.store.store import Store
+from physion.experiment.store.tables import SESSIONS
+from physion.experiment.study.conditions import Condition
+from physion.experiment.study.identity import Secrets
+from physion.experiment.study.media_links import read_media_path
+from physion.experiment.study.recruitment import links, make_pass
+from physion.experiment.study.study import Blocks, Study, Timing, load_study, write_settings
+from physion.experiment.study.texts import TEXTS_FOLDER
+from physion.experiment.study.variants import under
+from support.experiment.store_walk import enter, give, page, refusal, request, rows, run, walk
+from support.experiment.tiny_study import make_tiny_study
+
+PLAIN = Condition("plain")
+BRIEF = Condition("brief", cue_ms=100, flash_hz=1.0, break_every=2, familiarization_feedback=False)
+OTHER = Condition("other", scenarios=("drop",))
+OWN_TEXTS = """
+[condition.brief.instructions]
+answer = "{practice} and {trials} movies."
+[condition.brief.ready]
+text = "{trials} movies follow."
+[condition.brief.trial]
+prompt = "Do they meet?"
+"""
+
+
+@pytest.fixture(scope="module")
+def groups(tmp_path_factory: pytest.TempPathFactory) -> Study:
+    """A study with two scenarios, of 1 familiarization and 2 test trials, and three conditions."""
+    folder = tmp_path_factory.mktemp("groups") / "study"
+    study = make_tiny_study(
+        folder, test=2, familiarization=1, scenarios=("collide", "drop"), size=32,
+        languages=("en",), percentile_from=1, timing=Timing(cue_ms=700),
+    )  # fmt: skip
+    with (folder / TEXTS_FOLDER / "en.toml").open("a") as texts:
+        texts.write(OWN_TEXTS)
+    write_settings(replace(study, conditions=(PLAIN, BRIEF, OTHER)))
+    return load_study(folder)
+
+
+@pytest.fixture
+def groups_store(groups: Study, database_url: str) -> Iterator[Store]:
+    opened = Store.open(groups, Secrets.load(groups.folder), database_url)
+    yield opened
+    opened.close()
+
+
+def conditions_of(store: Store) -> Counter[str]:
+    kept = (r for r in rows(store, SESSIONS) if r.withdrawn_at is None and r.voided_at is None)
+    return Counter(row.condition for row in kept)
+
+
+def test_conditions_are_filled_equally_and_places_are_given_back(groups_store: Store) -> None:
+    store = groups_store
+    tokens = [enter(store, f"person {index}") for index in range(9)]
+    assert conditions_of(store) == {"plain": 3, "brief": 3, "other": 3}
+    by_condition: dict[str, list[tuple[str, str]]] = {}
+    for token, row in zip(tokens, rows(store, SESSIONS), strict=True):
+        by_condition.setdefault(row.condition, []).append((token, row.session))
+    for token, _ in by_condition["brief"][:2]:
+        page(store, walk(store, token, "instructions"), "withdraw")
+    run(store.write(lambda c: set_voided(c, by_condition["other"][0][1], True, 1.0)))
+    for index in range(3):
+        enter(store, f"new {index}")
+    assert conditions_of(store) == {"plain": 3, "brief": 3, "other": 3}
+    left = by_condition["plain"][0][1]
+    gone = update(SESSIONS).where(SESSIONS.c.session == left).values(last_seen=1.0)
+    run(store.write(lambda c: c.execute(gone)))
+    enter(store, "last")
+    assert conditions_of(store)["plain"] == 4, "nobody goes on with the session that was left"
+
+
+def test_ties_are_broken_by_seed(groups: Study, tmp_path: Path) -> None:
+    first = []
+    for seed in range(12):
+        study = replace(groups, seed=seed)
+        url = f"sqlite:///{tmp_path}/{seed}.sqlite"
+        store = Store.open(study, Secrets.load(study.folder), url)
+        enter(store, "ada")
+        first += [row.condition for row in rows(store, SESSIONS)]
+        store.close()
+    assert len(set(first)) == 3
+
+
+def test_a_person_keeps_the_condition_in_further_sessions(groups: Study, tmp_path: Path) -> None:
+    study = replace(groups, conditions=(PLAIN, BRIEF))
+    store = Store.open(study, Secrets.load(study.folder), f"sqlite:///{tmp_path}/a.sqlite")
+    for person in ("ada", "bob", "cleo"):
+        for _ in range(2):
+            walk(store, enter(store, person), "done")
+    found = rows(store, SESSIONS)
+    assert len(found) == 6
+    for person in {row.participant for row in found}:
+        assert len({row.condition for row in found if row.participant == person}) == 1
+    store.close()
+
+
+def link_to(store: Store, condition: str, kind: str = "study", **more: Any) -> Enter:
+    signed = ("link",) if kind == "study" else ()
+    key = make_pass(store.secrets, kind, *signed, "condition", condition)
+    return request(more.pop("person", "ada"), condition=condition, **{"pass": key}, **more)
+
+
+def test_a_signed_link_fixes_the_condition(groups_store: Store) -> None:
+    store = groups_store
+    for index in range(3):
+        run(store.enter(link_to(store, "brief", person=f"person {index}")))
+    assert conditions_of(store) == {"brief": 3}
+    unsigned = request("eve", condition="plain")
+    assert refusal(store.enter(unsigned)).code == "bad_link"
+    for_brief = make_pass(store.secrets, "study", "link", "condition", "brief")
+    other = request("eve", condition="plain", **{"pass": for_brief})
+    assert refusal(store.enter(other)).code == "bad_link"
+    without = request("eve", **{"pass": for_brief})
+    assert refusal(store.enter(without)).code == "bad_link"
+    assert refusal(store.enter(link_to(store, "absent", person="eve"))).code == "bad_link"
+    wrong = link_to(store, "other", person="eve", scenario="collide")
+    assert refusal(store.enter(wrong)).code == "bad_link"
+    found = links(store.study, store.secrets, "https://lab.example.org")
+    fixed = [link for link in found if link.condition == "other"]
+    assert {link.scenario for link in fixed} == {"drop"}
+    assert all("condition=other&pass=" in link.address for link in fixed)
+
+
+def test_a_session_has_the_settings_of_its_condition(groups_store: Store) -> None:
+    store = groups_store
+    token = run(store.enter(link_to(store, "brief", scenario="drop"))).token
+    state = run(store.state(walk(store, token, "familiarization")))
+    assert state.condition == "brief"
+    assert state.settings.model_dump() == {
+        "cue_ms": 100, "flash_hz": 1.0, "break_every": 2, "familiarization_feedback": False,
+    }  # fmt: skip
+    assert give(store, token, 0, "familiarization").feedback is None
+    listed = store.trials(token, "test").trials
+    found = {read_media_path(store.study, store.secrets, trial.movie) for trial in listed}
+    assert found == {store.study.folder / s.movie for s in store.study.phase("drop", "test")}
+    usual = run(store.enter(link_to(store, "plain", person="bob", scenario="drop"))).token
+    state = run(store.state(walk(store, usual, "familiarization")))
+    assert state.settings.cue_ms == 700
+    assert give(store, usual, 0, "familiarization").feedback is not None
+
+
+def test_percentiles_are_among_people_of_the_same_condition(groups_store: Store) -> None:
+    store = groups_store
+    for person, condition in (("ada", "plain"), ("bob", "brief")):
+        token = run(store.enter(link_to(store, condition, person=person, scenario="drop"))).token
+        assert store.result(walk(store, token, "done")).percentile is None
+    token = run(store.enter(link_to(store, "plain", person="cleo", scenario="drop"))).token
+    assert store.result(walk(store, token, "done")).percentile == 50.0
+
+
+def test_conditions_may_have_blocks_of_their_own(groups: Study, tmp_path: Path) -> None:
+    three = Condition("three", scenarios=("collide", "drop", "roll"))
+    two = Condition("two", scenarios=("roll", "drop"))
+    study = make_tiny_study(
+        tmp_path / "study", test=1, familiarization=1, scenarios=("collide", "drop", "roll"),
+        size=32, blocks=Blocks(all_scenarios=True), conditions=(three, two),
+    )  # fmt: skip
+    store = Store.open(study, Secrets.load(study.folder))
+    for index in range(2):
+        token = walk(store, enter(store, f"person {index}"), "instructions")
+        state = run(store.state(token))
+        names = {block.scenario for block in state.blocks}
+        assert names == set(under(study, state.condition).scenarios)
+        listed = store.trials(token, "test").trials
+        shown = [read_media_path(study, store.secrets, trial.movie).name for trial in listed]
+        wanted = [s for name in names for s in study.phase(name, "test")]
+        assert sorted(shown) == sorted(Path(s.movie).name for s in wanted)
+        walk(store, token, "done")
+    store.close()
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ((PLAIN,), "at least two"),
+        ((PLAIN, PLAIN), "two conditions are called plain"),
+        ((PLAIN, Condition("b", scenarios=("roll",))), "the scenario roll, which is not in"),
+        ((BRIEF, Condition("b", familiarization_feedback=False)), "lacks the text condition.b"),
+    ],
+)
+def test_conditions_that_cannot_be_served_are_refused(
+    groups: Study, changed: tuple[Condition, ...], said: str
+) -> None:
+    try:
+        write_settings(replace(groups, conditions=changed))
+        with pytest.raises(BadInputError, match=said):
+            load_study(groups.folder)
+    finally:
+        write_settings(groups)
+
+
+def test_a_condition_with_sessions_cannot_be_removed(groups: Study, tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/a.sqlite"
+    secrets = Secrets.load(groups.folder)
+    store = Store.open(groups, secrets, url)
+    run(store.enter(link_to(store, "brief")))
+    store.close()
+    with pytest.raises(BadInputError, match="condition brief"):
+        Store.open(replace(groups, conditions=(PLAIN, OTHER)), secrets, url)
