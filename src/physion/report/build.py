@@ -156,7 +156,7 @@ def compare_files(
         Whether to rehearse the analysis with the simulated participants of ``responses``, who are
         left out otherwise. Every page is marked.
     where
-        Values that the sessions must have, as in `selection.keep_where`.
+        Values that the sessions must have, as in `select_sessions.keep_where`.
     attributes
         Elements, distractors and occluders of one's own stimuli: a table of
         `attributes.attributes_from_table`, its file, or a dataset.

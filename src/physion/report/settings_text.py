@@ -15,7 +15,7 @@ from physion.analysis.people.results import (
     read_any_responses,
     rules_called,
 )
-from physion.analysis.people.selection import keep_where
+from physion.analysis.select_sessions import keep_where
 from physion.analysis.statistics.bootstrap import Bootstrap
 from physion.analysis.tables.csv_table import read_csv
 from physion.report.words import plural

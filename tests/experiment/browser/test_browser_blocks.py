@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("fastapi", reason="the extra 'experiment' is not installed")
 
 from physion.experiment.simulated.server_process import ServerProcess
-from physion.experiment.study.blocks import block_scenarios
+from physion.experiment.study.courses.blocks import block_scenarios
 from physion.experiment.study.study import Blocks, Plausibility, Recruitment
 from physion.experiment.study.texts import TEXTS_FOLDER
 from support.experiment.browser import SHORT, Visit, chromium, rows_of

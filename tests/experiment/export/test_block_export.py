@@ -20,7 +20,7 @@ from physion.experiment.experimenter.statistics.summaries import SummaryCache
 from physion.experiment.export.export_study import export_study
 from physion.experiment.store.store import Store
 from physion.experiment.store.tables import SESSIONS
-from physion.experiment.study.blocks import block_scenarios
+from physion.experiment.study.courses.blocks import block_scenarios
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.study import ALL_SCENARIOS, Blocks
 from support.experiment.store_walk import enter, rows, walk

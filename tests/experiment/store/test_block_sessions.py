@@ -12,7 +12,7 @@ from physion.errors import BadInputError
 from physion.experiment.protocol.messages import Jump, PageDone
 from physion.experiment.store.store import Store
 from physion.experiment.store.tables import SESSIONS
-from physion.experiment.study.blocks import block_scenarios, order_number
+from physion.experiment.study.courses.blocks import block_scenarios, order_number
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.media_links import read_media_path
 from physion.experiment.study.orders import trial_order

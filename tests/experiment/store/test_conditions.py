@@ -17,12 +17,12 @@ from physion.experiment.store.lab.managing import set_voided
 from physion.experiment.store.store import Store
 from physion.experiment.store.tables import SESSIONS
 from physion.experiment.study.conditions import Condition
+from physion.experiment.study.courses.variants import under
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.media_links import read_media_path
 from physion.experiment.study.recruitment import links, make_pass
 from physion.experiment.study.study import Blocks, Study, Timing, load_study, write_settings
 from physion.experiment.study.texts import TEXTS_FOLDER
-from physion.experiment.study.variants import under
 from support.experiment.store_walk import enter, give, page, refusal, request, rows, run, walk
 from support.experiment.tiny_study import make_tiny_study
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from physion.errors import BadInputError
-from physion.experiment.study.blocks import (
+from physion.experiment.study.courses.blocks import (
     block_orders,
     block_scenarios,
     seed_with_order,

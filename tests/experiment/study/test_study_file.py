@@ -132,7 +132,8 @@ def test_every_setting_is_written_with_its_comment(tmp_path: Path) -> None:
         assert all(f"# {line}" in text for line in key.about.splitlines())
     # Each field of the types is a key, so that none can be forgotten.
     others = {"folder", "stimuli", "allowed_ids", "texts", "consent_files", "digest",
-              "stimuli_digest", "questions", "comprehension_questions", *TABLES}  # fmt: skip
+              "stimuli_digest", "questions", "comprehension_questions", "conditions", "condition",
+              *TABLES}  # fmt: skip
     assert {key.name for key in KEYS if not key.table} == {
         field.name for field in dataclasses.fields(Study)
     } - others

@@ -8,10 +8,10 @@ from sqlalchemy import Connection, select
 
 from physion.experiment.export.session_rows import SessionTable
 from physion.experiment.store.tables import SESSIONS
+from physion.experiment.study.courses.variants import under
 from physion.experiment.study.orders import trial_order
 from physion.experiment.study.stimuli import Stimulus
 from physion.experiment.study.study import ALL_SCENARIOS, Study
-from physion.experiment.study.variants import under
 from physion.stimulus_names import canonical_name
 
 

@@ -16,9 +16,9 @@ from physion.errors import UnknownNameError
 from physion.experiment.export.arrow_types import ARROW_TYPES, arrow_schema
 from physion.experiment.export.iso_times import iso_times
 from physion.experiment.store.tables import SESSIONS, STUDIES
-from physion.experiment.study.blocks import block_scenarios
+from physion.experiment.study.courses.blocks import block_scenarios
+from physion.experiment.study.courses.variants import under
 from physion.experiment.study.study import Study
-from physion.experiment.study.variants import under
 
 EXPORTED_KINDS = ("person", "simulated")
 """Kinds of sessions that can be exported; previews cannot."""

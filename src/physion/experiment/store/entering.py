@@ -26,10 +26,10 @@ from physion.experiment.store.sessions import (
     storable_values,
 )
 from physion.experiment.store.tables import EVENTS, PARTICIPANTS, RAW_IDS, SESSIONS, TOKENS
+from physion.experiment.study.courses.variants import under
 from physion.experiment.study.identity import Secrets, hash_token
 from physion.experiment.study.orders import draw_buttons
 from physion.experiment.study.study import Study
-from physion.experiment.study.variants import under
 
 
 def enter_session(

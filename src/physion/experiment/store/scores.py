@@ -11,7 +11,7 @@ from sqlalchemy import Connection, bindparam, func, or_, select
 
 from physion.experiment.store.sessions import Session
 from physion.experiment.store.tables import ANSWERS, SESSIONS, STUDIES
-from physion.experiment.study.blocks import stimuli_by_session
+from physion.experiment.study.courses.blocks import stimuli_by_session
 from physion.experiment.study.study import Study
 
 _CHUNK = 500

@@ -61,12 +61,12 @@ from physion.experiment.store.showings import store_showing
 from physion.experiment.store.study_record import register
 from physion.experiment.store.tables import EVENTS, RAW_IDS, SESSIONS
 from physion.experiment.store.writer import Writer
+from physion.experiment.study.courses.variants import under
 from physion.experiment.study.identity import Secrets, hash_token
 from physion.experiment.study.media_links import MediaKind, session_tag, sign_media
 from physion.experiment.study.orders import fixations, trial_order
 from physion.experiment.study.recruitment import completion, ending_completion
 from physion.experiment.study.study import Study
-from physion.experiment.study.variants import under
 
 __all__ = ["Refused", "Store"]
 T = TypeVar("T")

@@ -19,11 +19,11 @@ from pathlib import Path
 from typing import Literal, cast
 
 from physion.errors import BadInputError
+from physion.experiment.study.courses.variants import StudyKey, variants
 from physion.experiment.study.identity import Secrets, check_signature, sign
 from physion.experiment.study.orders import trial_order
 from physion.experiment.study.stimuli import PHASES
 from physion.experiment.study.study import Study
-from physion.experiment.study.variants import StudyKey, variants
 
 MediaKind = Literal["movie", "map", "full"]
 PREFIX = "/media/"

@@ -13,11 +13,11 @@ from functools import lru_cache
 from typing import Literal
 
 from physion.experiment.protocol.stages import Block, SessionTrials
-from physion.experiment.study.blocks import block_scenarios, draw_test, seed_with_order
+from physion.experiment.study.courses.blocks import block_scenarios, draw_test, seed_with_order
+from physion.experiment.study.courses.variants import StudyKey
 from physion.experiment.study.identity import Secrets, sign
 from physion.experiment.study.stimuli import PHASES, Stimulus
 from physion.experiment.study.study import ALL_SCENARIOS, Study
-from physion.experiment.study.variants import StudyKey
 from physion.seeds import stable_hash
 
 Order = dict[str, tuple[Stimulus, ...]]

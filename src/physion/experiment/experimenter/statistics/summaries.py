@@ -19,7 +19,7 @@ from physion.experiment.store.sessions import (
     stages_of,
 )
 from physion.experiment.store.tables import ANSWERS, SESSIONS
-from physion.experiment.study.blocks import stimuli_by_session
+from physion.experiment.study.courses.blocks import stimuli_by_session
 from physion.experiment.study.study import Study
 
 STATES = {

@@ -13,12 +13,12 @@ from physion.experiment.store.entry.visitor import Visitor
 from physion.experiment.store.lab.managing import is_paused
 from physion.experiment.store.sessions import ACTIVE_WITHIN
 from physion.experiment.store.tables import SESSIONS
-from physion.experiment.study.blocks import block_orders
+from physion.experiment.study.courses.blocks import block_orders
+from physion.experiment.study.courses.variants import under, variants
 from physion.experiment.study.identity import Secrets
 from physion.experiment.study.orders import individual_order_seed, prepared_order_seed
 from physion.experiment.study.recruitment import ending_completion
 from physion.experiment.study.study import ALL_SCENARIOS, Study
-from physion.experiment.study.variants import under, variants
 from physion.seeds import stable_hash
 
 

@@ -1,0 +1,1 @@
+"""What sessions consist of: the blocks of several scenarios, and the settings of conditions."""
