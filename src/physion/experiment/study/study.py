@@ -129,7 +129,7 @@ class Study:
     conditions
         Between-subject conditions.
     condition
-        The condition whose settings these are (`courses.variants.under`); empty: those of the study.
+        The condition whose settings these are (`courses.variants.under`); empty: the study's own.
     allowed_ids
         Ids of the allow list; None if the study has none.
     stimuli
