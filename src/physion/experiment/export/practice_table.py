@@ -12,8 +12,8 @@ from physion.analysis.people.response_schema import TRIAL_COLUMNS, Column
 from physion.experiment.export.arrow_types import ARROW_TYPES, arrow_schema
 from physion.experiment.export.iso_times import iso_times
 from physion.experiment.store.tables import PRACTICE_REPEATS
-from physion.experiment.study.blocks import stimuli_by_session
-from physion.experiment.study.study import Study
+from physion.experiment.study.courses.blocks import stimuli_by_session
+from physion.experiment.study.study import ALL_SCENARIOS, Study
 
 _NAMES = ("participant", "session", "stimulus", "trial", "response", "label", "correct", "rt_ms",
           "input", "frames_shown", "answered_at")  # fmt: skip
@@ -33,7 +33,11 @@ def read_practice_repeats(connection: Connection, study: Study, sessions: pa.Tab
     """
     names = ("session", "participant", "scenario")
     keys = zip(*(sessions.column(name).to_pylist() for name in names), strict=True)
-    rank = {session: (at, who, where) for at, (session, who, where) in enumerate(keys)}
+    several = study.blocks.all_scenarios
+    rank = {
+        session: (at, who, ALL_SCENARIOS if several else where)
+        for at, (session, who, where) in enumerate(keys)
+    }
     labels = {key: each.label for key, each in stimuli_by_session(study).items()}
     rows = [
         (rank[row.session], row, labels[rank[row.session][2], row.stimulus])
